@@ -1,0 +1,1 @@
+"""Cooperative localisation of connected vehicles as a standard multi-agent environment."""

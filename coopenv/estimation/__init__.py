@@ -1,0 +1,1 @@
+"""Observers, observability and the measures by which an estimate is judged."""

@@ -1,0 +1,71 @@
+"""The record of one run: what was true, what was estimated, and what was in view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from pathlib import Path
+
+import numpy as np
+
+from coopenv.errors import DataError
+
+
+class Sight(IntEnum):
+    """Why a target is or is not measured by a camera at one tick."""
+
+    NOT_A_NEIGHBOUR = 0
+    VISIBLE = 1
+    OUT_OF_VIEW = 2
+    OCCLUDED_BY_BUILDING = 3
+    OCCLUDED_BY_BODY = 4
+    MISSED = 5
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """K camera ticks (t = 0 included) of N vehicles and T targets (landmarks first, then vehicles).
+
+    Frames: `position*` in the map frame; `rotation*` maps body to map; velocities in the body frame;
+    `covariance` is the observer's P over (2 lambda, p), p being the position in the body frame.
+    """
+
+    t: np.ndarray  # (K,) s
+    position: np.ndarray  # (K, N, 3) m
+    rotation: np.ndarray  # (K, N, 3, 3)
+    position_estimate: np.ndarray  # (K, N, 3) m
+    rotation_estimate: np.ndarray  # (K, N, 3, 3)
+    position_error: np.ndarray  # (K, N) m
+    orientation_error: np.ndarray  # (K, N) deg, geodesic
+    covariance: np.ndarray  # (K, N, 6, 6) rad^2, rad m, m^2
+    nees: np.ndarray  # (K, N)
+    velocity: np.ndarray  # (K, N, 3) m/s, truth
+    angular_velocity: np.ndarray  # (K, N, 3) rad/s, truth
+    target_position: np.ndarray  # (K, T, 3) m, truth
+    visible: np.ndarray  # (K, N, T) bool
+    sight: np.ndarray  # (K, N, T) uint8, values of `Sight`
+    vehicles: np.ndarray  # (N,) names
+    targets: np.ndarray  # (T,) names
+    target_moving: np.ndarray  # (T,) bool: vehicles and moving landmarks
+
+    def save(self, path: Path) -> None:
+        """Write every array into a compressed `.npz` under its field name."""
+        np.savez_compressed(path, **{f.name: getattr(self, f.name) for f in fields(self)})
+
+    @classmethod
+    def load(cls, path: Path) -> Trajectory:
+        """Read a file written by `save`.
+
+        Raises:
+            DataError: the file is no such record, or arrays are missing.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                missing = [f.name for f in fields(cls) if f.name not in data]
+                if missing:
+                    raise DataError(f"{path}: not a trajectory, arrays missing: {', '.join(missing)}")
+                return cls(**{f.name: data[f.name] for f in fields(cls)})
+        except (OSError, ValueError) as error:
+            if isinstance(error, DataError):
+                raise
+            raise DataError(f"{path}: not a readable .npz file ({error})") from None
