@@ -1,0 +1,134 @@
+"""Small symmetric linear algebra as Warp functions, generic in the precision.
+
+The Riccati equation lives in 6x6 matrices over (2 lambda, p); they are handled as 3x3 blocks
+[[A, B], [B^T, D]] because that is how the observer's matrices arise and because 3x3 products stay in registers.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+
+@wp.func
+def symmetric_part(A: Any):
+    """Return (A + A^T) / 2, exactly symmetric in floating point."""
+    return (A + wp.transpose(A)) * A.dtype(0.5)
+
+
+@wp.func
+def cholesky3(A: Any):
+    """Return the lower-triangular L with A = L L^T of a symmetric positive definite 3x3 matrix."""
+    o = A.dtype(0.0)
+    tiny = A.dtype(1.0e-30)
+    l00 = wp.sqrt(wp.max(A[0, 0], tiny))
+    l10 = A[1, 0] / l00
+    l20 = A[2, 0] / l00
+    l11 = wp.sqrt(wp.max(A[1, 1] - l10 * l10, tiny))
+    l21 = (A[2, 1] - l20 * l10) / l11
+    l22 = wp.sqrt(wp.max(A[2, 2] - l20 * l20 - l21 * l21, tiny))
+    return type(A)(l00, o, o, l10, l11, o, l20, l21, l22)
+
+
+@wp.func
+def inverse_lower3(L: Any):
+    """Return the inverse of a lower-triangular 3x3 matrix."""
+    o = L.dtype(0.0)
+    one = L.dtype(1.0)
+    i00 = one / L[0, 0]
+    i11 = one / L[1, 1]
+    i22 = one / L[2, 2]
+    i10 = -L[1, 0] * i00 * i11
+    i21 = -L[2, 1] * i11 * i22
+    i20 = -(L[2, 0] * i00 + L[2, 1] * i10) * i22
+    return type(L)(i00, o, o, i10, i11, o, i20, i21, i22)
+
+
+@wp.func
+def cholesky6(A: Any, B: Any, D: Any):
+    """Return the blocks (L11, L21, L22) of the Cholesky factor of [[A, B], [B^T, D]]."""
+    L11 = cholesky3(A)
+    L21 = wp.transpose(inverse_lower3(L11) * B)
+    L22 = cholesky3(D - L21 * wp.transpose(L21))
+    return L11, L21, L22
+
+
+@wp.func
+def join6(A: Any, B: Any, C: Any, D: Any, zero: Any):
+    """Return the 6x6 matrix [[A, B], [C, D]]; `zero` is a 6x6 matrix of the same precision."""
+    M = zero
+    for i in range(3):
+        for j in range(3):
+            M[i, j] = A[i, j]
+            M[i, j + 3] = B[i, j]
+            M[i + 3, j] = C[i, j]
+            M[i + 3, j + 3] = D[i, j]
+    return M
+
+
+@wp.func
+def block3(M: Any, row: int, column: int, zero: Any):
+    """Return the 3x3 block of the 6x6 matrix M that starts at (row, column)."""
+    A = zero
+    for i in range(3):
+        for j in range(3):
+            A[i, j] = M[row + i, column + j]
+    return A
+
+
+@wp.func
+def jacobi_rotation(a_pp: Any, a_qq: Any, a_pq: Any):
+    """Return (cosine, sine) of the plane rotation that annihilates a_pq (Golub and Van Loan, 8.5)."""
+    one = type(a_pq)(1.0)
+    theta = (a_qq - a_pp) / (type(a_pq)(2.0) * a_pq)
+    tangent = one / (wp.abs(theta) + wp.sqrt(theta * theta + one))
+    if theta < type(a_pq)(0.0):
+        tangent = -tangent
+    cosine = one / wp.sqrt(tangent * tangent + one)
+    return cosine, tangent * cosine
+
+
+@wp.func
+def eigen_symmetric6(M: Any, identity: Any):
+    """Return (D, U) with M = U D U^T, D diagonal up to rounding, by cyclic Jacobi sweeps."""
+    A = M
+    U = identity
+    for sweep in range(12):
+        off = A.dtype(0.0)
+        scale = A.dtype(0.0)
+        for i in range(6):
+            scale += A[i, i] * A[i, i]
+            for j in range(i):
+                off += A[i, j] * A[i, j]
+        if off > scale * A.dtype(1.0e-32):
+            for p in range(5):
+                for q in range(p + 1, 6):
+                    # An entry lost in the rounding of its diagonal is zero already.
+                    if A[p, q] * A[p, q] > wp.abs(A[p, p] * A[q, q]) * A.dtype(1.0e-36):
+                        c, s = jacobi_rotation(A[p, p], A[q, q], A[p, q])
+                        for k in range(6):
+                            akp = A[k, p]
+                            akq = A[k, q]
+                            A[k, p] = c * akp - s * akq
+                            A[k, q] = s * akp + c * akq
+                            ukp = U[k, p]
+                            ukq = U[k, q]
+                            U[k, p] = c * ukp - s * ukq
+                            U[k, q] = s * ukp + c * ukq
+                        for k in range(6):
+                            apk = A[p, k]
+                            aqk = A[q, k]
+                            A[p, k] = c * apk - s * aqk
+                            A[q, k] = s * apk + c * aqk
+    return A, U
+
+
+@wp.func
+def smallest_eigenvalue6(M: Any, identity: Any):
+    """Return the smallest eigenvalue of a symmetric 6x6 matrix."""
+    D, _ = eigen_symmetric6(M, identity)
+    smallest = D[0, 0]
+    for i in range(1, 6):
+        smallest = wp.min(smallest, D[i, i])
+    return smallest

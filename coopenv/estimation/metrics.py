@@ -1,0 +1,228 @@
+"""The measures by which an estimate is judged, in NumPy, over any leading axes.
+
+Position errors are in the map frame (m), orientation errors are geodesic angles (deg), and Rtilde = Rhat^T R
+as in the paper. Nothing is aligned before it is compared: the maps are global, and an alignment would hide
+the mirrored solution (orientation half a turn off), which a bearing-only observer without a sign test can
+fall into.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.stats import theilslopes
+
+from coopenv.estimation.trajectory import Trajectory
+
+MIRROR_ANGLE_DEG = 150.0
+"""An orientation error above this at the end of a run is the mirrored solution, not a slow one."""
+
+SETTLED_POSITION_M = 0.1
+SETTLED_ORIENTATION_DEG = 1.0
+
+_FIT_SAMPLES = 400  # Theil-Sen looks at every pair: 80 000 slopes
+_FIT_SAMPLES_MIN = 10
+
+
+class RateFit(NamedTuple):
+    """An exponential rate (1/s, positive when the error falls), its 95 % bounds and its sample count."""
+
+    rate: float
+    low: float
+    high: float
+    samples: int
+
+
+def position_error(position: np.ndarray, position_estimate: np.ndarray) -> np.ndarray:
+    """Return |pbar - pbarhat| in m, of positions (..., 3) in the map frame."""
+    return np.linalg.norm(np.asarray(position, float) - np.asarray(position_estimate, float), axis=-1)
+
+
+def error_rotation(rotation: np.ndarray, rotation_estimate: np.ndarray) -> np.ndarray:
+    """Return Rtilde = Rhat^T R of rotations (..., 3, 3) that map body to map frame."""
+    return np.swapaxes(np.asarray(rotation_estimate, float), -1, -2) @ np.asarray(rotation, float)
+
+
+def quaternion_wxyz(rotation: np.ndarray) -> np.ndarray:
+    """Return the unit quaternions (..., 4) of rotations (..., 3, 3), scalar part first and never negative.
+
+    Each row of 4 q q^T, which is linear in R, is a multiple of q; the row of the largest component is well
+    conditioned at every angle. For small angles this takes the vector part from the skew part of R, without
+    cancellation.
+    """
+    R = np.asarray(rotation, float)
+    x, y, z = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    outer = np.empty((*R.shape[:-2], 4, 4))
+    outer[..., 0, 0] = 1 + x + y + z
+    outer[..., 1, 1] = 1 + x - y - z
+    outer[..., 2, 2] = 1 - x + y - z
+    outer[..., 3, 3] = 1 - x - y + z
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        outer[..., 0, i + 1] = outer[..., i + 1, 0] = R[..., k, j] - R[..., j, k]
+        outer[..., j + 1, k + 1] = outer[..., k + 1, j + 1] = R[..., j, k] + R[..., k, j]
+    best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    q = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0, -q, q)
+
+
+def orientation_error_deg(rotation: np.ndarray, rotation_estimate: np.ndarray) -> np.ndarray:
+    """Return the geodesic angle between rotations (..., 3, 3) in degrees, in [0, 180].
+
+    2 atan2(|lambda|, scalar part) keeps its accuracy at both ends, where acos of the trace has none: 1e-12
+    deg is told from zero, and a half turn is 180 deg exactly.
+    """
+    q = quaternion_wxyz(error_rotation(rotation, rotation_estimate))
+    return np.degrees(2 * np.arctan2(np.linalg.norm(q[..., 1:], axis=-1), q[..., 0]))
+
+
+def roll_pitch_yaw_deg(rotation: np.ndarray) -> np.ndarray:
+    """Return (..., 3) roll, pitch, yaw in degrees with R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    R = np.asarray(rotation, float)
+    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
+    pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 0, 0], R[..., 1, 0]))
+    yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    return np.degrees(np.stack([roll, pitch, yaw], axis=-1))
+
+
+def error_coordinates(
+    position: np.ndarray, rotation: np.ndarray, position_estimate: np.ndarray, rotation_estimate: np.ndarray
+) -> np.ndarray:
+    """Return the observer's error (2 lambda, p - phat) as (..., 6), in rad and m.
+
+    lambda is the vector part of the unit quaternion of Rtilde; p = R^T pbar and phat = Rhat^T pbarhat are the
+    positions in the true and in the estimated body frame. These are the coordinates of the observer's P.
+    """
+    twice_lambda = 2 * quaternion_wxyz(error_rotation(rotation, rotation_estimate))[..., 1:]
+    p = np.einsum("...ji,...j->...i", np.asarray(rotation, float), np.asarray(position, float))
+    p_hat = np.einsum(
+        "...ji,...j->...i", np.asarray(rotation_estimate, float), np.asarray(position_estimate, float)
+    )
+    return np.concatenate([twice_lambda, p - p_hat], axis=-1)
+
+
+def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return the normalised estimation error squared e^T P^-1 e of errors (..., n).
+
+    For a consistent observer it is chi-square distributed with n degrees of freedom. The error must be in the
+    coordinates of P (see `error_coordinates`); mixing them is the usual mistake. NaN where P is not positive
+    definite, as for an observer that declares no covariance.
+    """
+    e, P = np.asarray(error, float), np.asarray(covariance, float)
+    finite = np.isfinite(P).all(axis=(-1, -2))
+    P = np.where(finite[..., None, None], P, -np.eye(P.shape[-1]))
+    definite = np.linalg.eigvalsh(P)[..., 0] > 0
+    P = np.where(definite[..., None, None], P, np.eye(P.shape[-1]))
+    weighted = np.linalg.solve(P, e[..., None])[..., 0]
+    return np.where(definite, np.einsum("...i,...i->...", e, weighted), np.nan)
+
+
+def settling_time(
+    t: np.ndarray,
+    position_error: np.ndarray,
+    orientation_error: np.ndarray,
+    position_tolerance: float = SETTLED_POSITION_M,
+    orientation_tolerance: float = SETTLED_ORIENTATION_DEG,
+) -> np.ndarray:
+    """Return the first time from which both errors stay below their tolerance until the end of the record.
+
+    Args:
+        t: (K,) s.
+        position_error: (K, ...) m.
+        orientation_error: (K, ...) deg.
+        position_tolerance: m.
+        orientation_tolerance: deg.
+
+    Returns:
+        (...) s; NaN where the last tick is not below both, so that a passing visit does not count as settled.
+    """
+    below = (position_error < position_tolerance) & (orientation_error < orientation_tolerance)
+    settled = np.logical_and.accumulate(below[::-1], axis=0)[::-1]
+    return np.where(settled[-1], np.asarray(t, float)[np.argmax(settled, axis=0)], np.nan)
+
+
+def steady_rmse(t: np.ndarray, error: np.ndarray, steady_from: float) -> np.ndarray:
+    """Return the root mean square of errors (K, ...) over the ticks with t > steady_from; NaN if none."""
+    return np.sqrt(_mean(np.square(error[t > steady_from])))
+
+
+def mean_targets_in_view(visible: np.ndarray) -> np.ndarray:
+    """Return (N,) targets measured per tick, on average, of `visible` (K, N, T)."""
+    return _mean(np.sum(visible, axis=-1))
+
+
+def mirrored(orientation_error: np.ndarray) -> np.ndarray:
+    """Return whether a run (K, ...) ends with an orientation error above `MIRROR_ANGLE_DEG`."""
+    return np.asarray(orientation_error)[-1] > MIRROR_ANGLE_DEG
+
+
+def fit_exponential_rate(t: np.ndarray, error: np.ndarray, noise_floor: float | None = None) -> RateFit:
+    """Fit error ~ exp(-rate t) to the final descent of one error (K,), robustly (Theil-Sen).
+
+    The fit takes the ticks after the error was last above half of its initial value, up to the first within
+    three times the noise floor: before, the transient is not exponential (P falls as 1/t); after, there is
+    only noise. The bounds assume independent residuals, which neighbouring ticks are not: they are a lower
+    limit of the uncertainty.
+
+    Args:
+        t: (K,) s.
+        error: (K,), any unit, not negative.
+        noise_floor: in the unit of `error`; by default the median over the last fifth of the record.
+
+    Returns:
+        The rate, or NaN with the number of samples found when there are fewer than ten.
+    """
+    t, error = np.asarray(t, float), np.asarray(error, float)
+    floor = float(np.median(error[-max(1, len(error) // 5) :])) if noise_floor is None else noise_floor
+    high = np.flatnonzero(~(error <= 0.5 * error[0]))
+    start = high[-1] + 1 if high.size else 0
+    low = np.flatnonzero(error[start:] <= max(3 * floor, np.finfo(float).tiny))
+    index = np.arange(start, start + low[0] if low.size else len(error))
+    if len(index) < _FIT_SAMPLES_MIN:
+        return RateFit(math.nan, math.nan, math.nan, len(index))
+    index = index[:: math.ceil(len(index) / _FIT_SAMPLES)]
+    slope, _, slope_low, slope_high = theilslopes(np.log(error[index]), t[index], alpha=0.95)
+    return RateFit(float(-slope), float(-slope_high), float(-slope_low), len(index))
+
+
+def summarise(trajectory: Trajectory, steady_from: float) -> list[dict[str, Any]]:
+    """Return one dict of plain Python values per vehicle, units in the keys; what does not exist is NaN.
+
+    Args:
+        trajectory: the record of a run.
+        steady_from: s; steady RMSE and mean NEES are over the ticks after it.
+    """
+    t, position, orientation = trajectory.t, trajectory.position_error, trajectory.orientation_error
+    columns = {
+        "initial_position_error_m": position[0],
+        "initial_orientation_error_deg": orientation[0],
+        "settle_time_s": settling_time(t, position, orientation),
+        "steady_position_rmse_m": steady_rmse(t, position, steady_from),
+        "steady_orientation_rmse_deg": steady_rmse(t, orientation, steady_from),
+        "mean_targets_in_view": mean_targets_in_view(trajectory.visible),
+        "mean_nees": _mean(trajectory.nees[t > steady_from]),
+        "final_position_error_m": position[-1],
+        "final_orientation_error_deg": orientation[-1],
+        "rate_per_s": np.array([fit_exponential_rate(t, error).rate for error in position.T]),
+        "mirrored": mirrored(orientation),
+    }
+    names = [str(name) for name in trajectory.vehicles]
+    return [{"vehicle": n, **{k: v[i].item() for k, v in columns.items()}} for i, n in enumerate(names)]
+
+
+def json_ready(value: Any) -> Any:
+    """Return `value` as plain Python, with None for the numbers that JSON lacks (NaN, inf)."""
+    if isinstance(value, dict):
+        return {key: json_ready(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [json_ready(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return json_ready(value.tolist())
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _mean(values: np.ndarray) -> np.ndarray:
+    """Return the mean over the first axis, NaN when it is empty."""
+    return np.mean(values, axis=0) if len(values) else np.full(values.shape[1:], np.nan)

@@ -1,0 +1,178 @@
+"""Uniform observability of (A_i, C*_i) along a run: the condition of the paper's theorem, evaluated.
+
+For vehicle i and the targets j that it sees at a tick, the rows of C*_i = C_i(0, p_i, t) are [-Pi_g S(R_i^T
+pbar_j), Pi_g] over the state (2 lambda, p), with Pi_g = I - g g^T. The projection is even in g, so it does
+not matter which way the bearing points. With A_i = blkdiag(-S(omega), -S(omega)), the transition matrix is
+Phi(tau, t) = blkdiag(E, E), E = R(tau)^T R(t), and
+
+    W(t) = (1/window) int_t^{t+window} Phi^T C*^T C* Phi dtau.
+
+Since Phi is a rotation, C* Phi = R(tau)^T [-Pi S(pbar_j), Pi] blkdiag(R(t), R(t)) with Pi in the map frame:
+the integrand is summed once along the run in map axes, and every window is a difference of two sums.
+
+Moving the origin by c is the congruence W -> T^T W T, T = [[I, 0], [S(c), I]]. It leaves the rank of W, so
+whether there is observability at all, but not the eigenvalues: far from the origin the smallest one falls as
+1/|c|^2 with the same geometry, and the rows mix rad and m. The verdict is therefore taken about the vehicle's
+own position, in a unit of length that the geometry brings along (`Observability.local_eigenvalue`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from coopenv.estimation.trajectory import Trajectory
+
+DEFAULT_WINDOW = 1.0
+DEFAULT_THRESHOLD = 1e-4
+
+
+class Interval(NamedTuple):
+    """A stretch [start, end] (s) of equal verdict."""
+
+    start: float
+    end: float
+    observable: bool
+
+
+@dataclass(frozen=True)
+class Observability:
+    """The Gramian's figures for M windows of N vehicles.
+
+    The default threshold of 1e-4 on `local_eigenvalue` mu: with bearing noise sigma (rad) and n camera ticks
+    in the window, least squares leaves a standard deviation of L sigma / sqrt(n mu) in the worst direction, L
+    being the rms range of the targets. At mu = 1e-4 that is 100 / sqrt(n) times the lateral error L sigma of
+    one bearing, or 0.6 m at 60 Hz, 3 mrad and 15 m: below it the window tells less than odometry would keep.
+    Exact degeneracies (two targets, all targets on one line, the vehicle resting on their danger cylinder)
+    give rounding, 1e-12 or less; three well-spread targets give 1e-3 to 0.5.
+    """
+
+    t: np.ndarray  # (M,) s, start of each window
+    window: float  # s, shortened to the record if that is shorter
+    threshold: float  # on `local_eigenvalue`
+    min_eigenvalue: np.ndarray  # (M, N) of W as in the theorem, about the map origin; mixed units
+    condition_number: np.ndarray  # (M, N) of W as in the theorem; inf where singular to rounding
+    local_eigenvalue: (
+        np.ndarray
+    )  # (M, N) smallest, about the vehicle and with lambda scaled by L: no unit, no origin
+    vehicles: np.ndarray  # (N,) names
+
+    @property
+    def observable(self) -> np.ndarray:
+        """(M, N) bool: the verdict of each window."""
+        return self.local_eigenvalue >= self.threshold
+
+    def intervals(self, vehicle: int) -> list[Interval]:
+        """Return one vehicle's stretches of equal verdict in order; the last ends with its last window."""
+        if not len(self.t):
+            return []
+        verdict = self.observable[:, vehicle]
+        first = np.flatnonzero(np.diff(verdict, prepend=~verdict[0]))
+        ends = [*self.t[first[1:]], self.t[-1] + self.window]
+        return [
+            Interval(float(self.t[k]), float(end), bool(verdict[k]))
+            for k, end in zip(first, ends, strict=True)
+        ]
+
+
+def analyse_observability(
+    trajectory: Trajectory, window: float = DEFAULT_WINDOW, threshold: float = DEFAULT_THRESHOLD
+) -> Observability:
+    """Evaluate W(t) for every camera tick at which a whole window begins.
+
+    True poses and the visibility of the run are used: the question is what could be seen, not what was made
+    of it. Neighbours count as known, as in the theorem, which takes the vehicles one after the other along
+    the graph.
+
+    Args:
+        trajectory: the record of a run.
+        window: s.
+        threshold: verdict on the local eigenvalue, see `Observability`.
+    """
+    window = min(window, float(trajectory.t[-1] - trajectory.t[0]))
+    start, W, anchor = _windows_about_anchor(trajectory, window)
+    eigenvalues = np.linalg.eigvalsh(_move_origin(W, -anchor))
+    smallest, largest = eigenvalues[..., 0], eigenvalues[..., -1]
+    regular = smallest > np.finfo(float).eps * largest
+    condition = np.where(regular, largest / np.where(regular, smallest, 1.0), np.inf)
+    local = _scaled(_move_origin(W, trajectory.position[start] - anchor))
+    return Observability(
+        t=trajectory.t[start],
+        window=window,
+        threshold=threshold,
+        min_eigenvalue=np.maximum(smallest, 0.0),
+        condition_number=condition,
+        local_eigenvalue=np.maximum(np.linalg.eigvalsh(local)[..., 0], 0.0),
+        vehicles=trajectory.vehicles,
+    )
+
+
+def observability_gramian(
+    trajectory: Trajectory, window: float = DEFAULT_WINDOW
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the window starts (M,) in s and W(t) (M, N, 6, 6) over (2 lambda, p) in the body frame at t."""
+    start, W, anchor = _windows_about_anchor(trajectory, window)
+    R = trajectory.rotation[start]
+    blocks = np.zeros((*R.shape[:-2], 6, 6))
+    blocks[..., :3, :3] = blocks[..., 3:, 3:] = R
+    return trajectory.t[start], np.swapaxes(blocks, -1, -2) @ _move_origin(W, -anchor) @ blocks
+
+
+def _windows_about_anchor(trajectory: Trajectory, window: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return start ticks (M,), W in map axes (M, N, 6, 6), and the points (N, 3) in m that it is taken about.
+
+    A point amid the vehicle's path keeps the running sums, and so the rounding of their differences, small.
+    """
+    anchor = trajectory.position.mean(axis=0)
+    t, rate = trajectory.t, _information_rate(trajectory, anchor)
+    step = np.diff(t)[:, None, None, None]
+    total = np.concatenate([np.zeros_like(rate[:1]), np.cumsum(0.5 * step * (rate[1:] + rate[:-1]), axis=0)])
+    slack = 1e-6 * max(window, np.finfo(float).tiny)
+    start = np.arange(np.searchsorted(t, t[-1] - window + slack, side="right") if window > 0 else 0)
+    end = np.searchsorted(t, t[start] + window - slack)
+    length = (t[end] - t[start])[:, None, None, None]
+    return start, (total[end] - total[start]) / length, anchor
+
+
+def _information_rate(trajectory: Trajectory, anchor: np.ndarray) -> np.ndarray:
+    """Return C*^T C* (K, N, 6, 6) in map axes, about one point (N, 3) per vehicle."""
+    offset = trajectory.target_position[:, None] - trajectory.position[:, :, None]  # (K, N, T, 3)
+    distance = np.linalg.norm(offset, axis=-1, keepdims=True)
+    bearing = offset / np.where(distance > 0, distance, 1.0)
+    seen = trajectory.visible & (distance[..., 0] > 0)
+    projection = (np.eye(3) - bearing[..., :, None] * bearing[..., None, :]) * seen[..., None, None]
+    lever = _skew(trajectory.target_position[:, None] - anchor[:, None])  # (K, N, T, 3, 3)
+    cross = lever @ projection  # = (-Pi S)^T Pi
+    rate = np.empty((*trajectory.position.shape[:2], 6, 6))
+    rate[..., :3, :3] = -(cross @ lever).sum(axis=2)
+    rate[..., :3, 3:] = cross.sum(axis=2)
+    rate[..., 3:, :3] = np.swapaxes(rate[..., :3, 3:], -1, -2)
+    rate[..., 3:, 3:] = projection.sum(axis=2)
+    return rate
+
+
+def _move_origin(W: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Return T^T W T, T = [[I, 0], [S(shift), I]]: W about a point `shift` (m) further in map axes."""
+    T = np.broadcast_to(np.eye(6), (*shift.shape[:-1], 6, 6)).copy()
+    T[..., 3:, :3] = _skew(shift)
+    return np.swapaxes(T, -1, -2) @ W @ T
+
+
+def _scaled(W: np.ndarray) -> np.ndarray:
+    """Return W over (2 lambda L, p), L^2 = tr W_lambda / tr W_p: the targets' mean square range."""
+    lever = np.trace(W[..., :3, :3], axis1=-2, axis2=-1)
+    count = np.trace(W[..., 3:, 3:], axis1=-2, axis2=-1)
+    length = np.sqrt(np.where(count > 0, lever, 1.0) / np.where(count > 0, count, 1.0))
+    scale = np.ones((*length.shape, 6))
+    scale[..., :3] = 1.0 / length[..., None]
+    return scale[..., :, None] * W * scale[..., None, :]
+
+
+def _skew(v: np.ndarray) -> np.ndarray:
+    """Return S(v) (..., 3, 3) of vectors (..., 3), with S(v) y = v x y."""
+    S = np.zeros((*v.shape, 3))
+    S[..., 2, 1], S[..., 0, 2], S[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
+    S[..., 1, 2], S[..., 2, 0], S[..., 0, 1] = -v[..., 0], -v[..., 1], -v[..., 2]
+    return S

@@ -1,0 +1,98 @@
+"""Rotations and rigid motions as Warp functions, generic in the precision.
+
+R maps body to inertial coordinates; a held body twist (v, omega) moves the pose along
+R(t) = R Exp(omega t), pbar(t) = pbar + R J_l(omega t) v t.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+
+@wp.func
+def skew(v: Any):
+    """Return S(v) with S(v) y = v x y (paper, section Notation)."""
+    o = v.dtype(0.0)
+    return wp.matrix_from_rows(type(v)(o, -v[2], v[1]), type(v)(v[2], o, -v[0]), type(v)(-v[1], v[0], o))
+
+
+@wp.func
+def identity3(v: Any):
+    """Return the 3x3 identity in the precision of the vector `v`."""
+    o = v.dtype(0.0)
+    i = v.dtype(1.0)
+    return wp.matrix_from_rows(type(v)(i, o, o), type(v)(o, i, o), type(v)(o, o, i))
+
+
+@wp.func
+def exp_so3(w: Any):
+    """Return Exp(w), the rotation by |w| rad about w (Rodrigues)."""
+    square = wp.dot(w, w)
+    a = w.dtype(1.0) - square / w.dtype(6.0)  # sin(x)/x
+    b = w.dtype(0.5) - square / w.dtype(24.0)  # (1-cos(x))/x^2
+    if square > w.dtype(1.0e-8):
+        angle = wp.sqrt(square)
+        a = wp.sin(angle) / angle
+        half = wp.sin(angle * w.dtype(0.5))
+        b = w.dtype(2.0) * half * half / square
+    return (w.dtype(1.0) - b * square) * identity3(w) + a * skew(w) + b * wp.outer(w, w)
+
+
+@wp.func
+def left_jacobian(w: Any):
+    """Return J_l(w) = int_0^1 Exp(s w) ds, which turns a held velocity into a displacement."""
+    square = wp.dot(w, w)
+    b = w.dtype(0.5) - square / w.dtype(24.0)  # (1-cos(x))/x^2
+    c = w.dtype(1.0 / 6.0) - square / w.dtype(120.0)  # (x-sin(x))/x^3
+    if square > w.dtype(1.0e-4):
+        angle = wp.sqrt(square)
+        half = wp.sin(angle * w.dtype(0.5))
+        b = w.dtype(2.0) * half * half / square
+        c = (angle - wp.sin(angle)) / (square * angle)
+    return (w.dtype(1.0) - c * square) * identity3(w) + b * skew(w) + c * wp.outer(w, w)
+
+
+@wp.func
+def orthonormalise(R: Any):
+    """Return the rotation nearest to an almost orthogonal R, by one Newton step of the polar factor."""
+    G = wp.transpose(R) * R
+    return R.dtype(1.5) * R - R.dtype(0.5) * (R * G)
+
+
+@wp.func
+def rotation_vector_sine(R: Any, zero: Any):
+    """Return the axis of R times the sine of its angle: the vector of the skew part of R."""
+    h = zero.dtype(0.5)
+    return type(zero)((R[2, 1] - R[1, 2]) * h, (R[0, 2] - R[2, 0]) * h, (R[1, 0] - R[0, 1]) * h)
+
+
+@wp.func
+def rotation_angle(R: Any, zero: Any):
+    """Return the geodesic angle of R in rad, accurate near 0 and near pi."""
+    sine = wp.length(rotation_vector_sine(R, zero))
+    cosine = (wp.trace(R) - R.dtype(1.0)) * R.dtype(0.5)
+    return wp.atan2(sine, cosine)
+
+
+@wp.func
+def quaternion_vector(R: Any, zero: Any):
+    """Return lambda, the vector part of the unit quaternion of R with non-negative scalar part."""
+    sine = rotation_vector_sine(R, zero)  # axis sin(angle) = 2 scalar lambda
+    scalar_squared = (R.dtype(1.0) + wp.trace(R)) * R.dtype(0.25)
+    if scalar_squared > R.dtype(1.0e-2):
+        return sine / (R.dtype(2.0) * wp.sqrt(scalar_squared))
+    # Near half a turn the skew part vanishes: take the axis from the largest column of R + R^T.
+    best = int(0)
+    if R[1, 1] > R[0, 0]:
+        best = int(1)
+    if R[2, 2] > R[best, best]:
+        best = int(2)
+    column = type(zero)(R[0, best] + R[best, 0], R[1, best] + R[best, 1], R[2, best] + R[best, 2])
+    shift = R.dtype(1.0) - wp.trace(R)
+    column[best] = column[best] + shift
+    axis = wp.normalize(column)
+    if wp.dot(axis, sine) < R.dtype(0.0):
+        axis = -axis
+    return axis * wp.sqrt(wp.max(R.dtype(1.0) - scalar_squared, R.dtype(0.0)))

@@ -1,0 +1,15 @@
+"""What a world is: typed, validated, read from `envs/*.toml`."""
+
+from coopenv.scenario.checks import ScenarioWarning
+from coopenv.scenario.files import data_directory, list_envs, load_scenario, parse_scenario, scenario_path
+from coopenv.scenario.schema import Scenario
+
+__all__ = [
+    "Scenario",
+    "ScenarioWarning",
+    "data_directory",
+    "list_envs",
+    "load_scenario",
+    "parse_scenario",
+    "scenario_path",
+]

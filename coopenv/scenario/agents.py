@@ -1,0 +1,216 @@
+"""Who and what is in the scene: landmarks, vehicles, buildings, and how they move."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from coopenv.scenario.base import (
+    NonNegative,
+    NonNegativeVector3,
+    Part,
+    Positive,
+    PositiveVector3,
+    QuaternionWxyz,
+    Vector2,
+    Vector3,
+)
+
+
+class Body(Part):
+    """An oriented box that occludes and collides."""
+
+    size: PositiveVector3
+    """Length, width and height in m along the body's x, y and z axes."""
+    center: Vector3 = (0.0, 0.0, 0.0)
+    """Centre of the box in the body frame, m."""
+
+
+class Obstacle(Part):
+    """A building: a box that stands still."""
+
+    name: str = Field(min_length=1)
+    center: Vector3
+    """Centre in the coordinates of this file, m."""
+    size: PositiveVector3
+    """Length, width and height, m."""
+    yaw: float = 0.0
+    """Rotation about z, rad."""
+
+
+class Road(Part):
+    """A straight strip drawn under the top view; it has no effect on the motion."""
+
+    start: Vector2
+    end: Vector2
+    width: Positive
+
+
+class StaticMotion(Part):
+    """Stands still."""
+
+    kind: Literal["static"] = "static"
+
+
+class ConstantMotion(Part):
+    """Keeps one body twist for ever."""
+
+    kind: Literal["constant"] = "constant"
+    linear: Vector3
+    """Linear velocity in the body frame, m/s."""
+    angular: Vector3 = (0.0, 0.0, 0.0)
+    """Angular velocity in the body frame, rad/s."""
+
+
+class TwistSegment(Part):
+    """One body twist held for a while."""
+
+    duration: Positive
+    """s"""
+    linear: Vector3 = (0.0, 0.0, 0.0)
+    """Linear velocity in the body frame, m/s."""
+    angular: Vector3 = (0.0, 0.0, 0.0)
+    """Angular velocity in the body frame, rad/s."""
+
+
+class SegmentMotion(Part):
+    """Drives a list of held body twists (straight lines and circular arcs), then stands still."""
+
+    kind: Literal["segments"] = "segments"
+    segments: tuple[TwistSegment, ...] = Field(min_length=1)
+
+
+class Waypoint(Part):
+    """A place to be at a time."""
+
+    time: NonNegative
+    """s"""
+    position: Vector3
+    """In the coordinates of this file, m."""
+
+
+class WaypointMotion(Part):
+    """Follows a cubic spline in time through waypoints, heading along the path, then stands still."""
+
+    kind: Literal["waypoints"] = "waypoints"
+    waypoints: tuple[Waypoint, ...] = Field(min_length=2)
+    heading: Literal["path", "fixed"] = "path"
+    """`path` turns the body's x axis along the horizontal velocity, `fixed` keeps the initial orientation."""
+
+    @model_validator(mode="after")
+    def _times_increase(self) -> WaypointMotion:
+        times = [w.time for w in self.waypoints]
+        if times[0] != 0.0 or any(b <= a for a, b in zip(times, times[1:], strict=False)):
+            raise ValueError("waypoint times must start at 0 and increase")
+        return self
+
+
+class DrivenMotion(Part):
+    """Driven by the agent's actions through the kinematic bicycle of `[dynamics]`."""
+
+    kind: Literal["driven"] = "driven"
+    initial_speed: float = 0.0
+    """m/s"""
+
+
+LandmarkMotion = Annotated[
+    StaticMotion | ConstantMotion | SegmentMotion | WaypointMotion, Field(discriminator="kind")
+]
+VehicleMotion = Annotated[
+    StaticMotion | ConstantMotion | SegmentMotion | WaypointMotion | DrivenMotion,
+    Field(discriminator="kind"),
+]
+
+
+class InitialPose(Part):
+    """Where an agent starts, fixed or drawn anew at each reset."""
+
+    position: Vector3
+    """In the coordinates of this file, m."""
+    yaw: float | None = None
+    """Rotation about z, rad (0 when neither yaw nor a quaternion is given)."""
+    quaternion_wxyz: QuaternionWxyz | None = None
+    """Full orientation, body to map."""
+    position_spread: NonNegativeVector3 = (0.0, 0.0, 0.0)
+    """Half-widths of a uniform offset along the start's own x, y, z axes, m."""
+    yaw_spread: NonNegative = 0.0
+    """Half-width of a uniform turn about the body's z axis, rad."""
+
+    @model_validator(mode="after")
+    def _one_orientation(self) -> InitialPose:
+        if self.yaw is not None and self.quaternion_wxyz is not None:
+            raise ValueError("give yaw or quaternion_wxyz, not both")
+        return self
+
+
+class InitialEstimate(Part):
+    """What the observer believes at t = 0, fixed or drawn anew at each reset."""
+
+    position: Vector3 | None = None
+    """Believed position in the coordinates of this file, m (default: the true one)."""
+    position_offset: Vector3 = (0.0, 0.0, 0.0)
+    """Added to the believed position, map axes, m."""
+    position_radius: NonNegative = 0.0
+    """A further offset is drawn uniformly from a ball of this radius, m."""
+    orientation_offset_wxyz: QuaternionWxyz = (1.0, 0.0, 0.0, 0.0)
+    """Rhat(0) = R(0) Rot(offset)."""
+    orientation_angle: NonNegative | Literal["uniform"] = 0.0
+    """A further turn about a random axis by an angle drawn from [0, this] rad; `uniform`: over SO(3)."""
+    yaw: float | None = None
+    """Absolute believed yaw, rad; replaces R(0) above."""
+    quaternion_wxyz: QuaternionWxyz | None = None
+    """Absolute believed orientation; replaces R(0) above."""
+
+    @model_validator(mode="after")
+    def _one_orientation(self) -> InitialEstimate:
+        if self.yaw is not None and self.quaternion_wxyz is not None:
+            raise ValueError("give yaw or quaternion_wxyz, not both")
+        return self
+
+
+class Goal(Part):
+    """Where a driven vehicle wants to go."""
+
+    position: Vector3
+    """In the coordinates of this file, m."""
+    radius: Positive = 0.5
+    """The vehicle has arrived within this horizontal distance, m."""
+
+
+class Landmark(Part):
+    """A target whose position is known to everybody, static or moving."""
+
+    name: str = Field(min_length=1, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
+    position: Vector3
+    """Position (of its origin, at t = 0) in the coordinates of this file, m."""
+    yaw: float = 0.0
+    """Orientation of a moving landmark's body at t = 0, rad."""
+    motion: LandmarkMotion = StaticMotion()
+    body: Body | None = None
+    """A landmark with a body occludes what is behind it."""
+    marker: Vector3 = (0.0, 0.0, 0.0)
+    """The point that cameras see, in the landmark's body frame, m."""
+
+
+class Vehicle(Part):
+    """A connected vehicle that estimates its own pose; named vehicle_1, vehicle_2, ... in file order."""
+
+    initial_pose: InitialPose | None = None
+    """Needed unless the motion is by waypoints, which start at the first waypoint."""
+    initial_estimate: InitialEstimate = InitialEstimate()
+    motion: VehicleMotion = StaticMotion()
+    body: Body | None = None
+    marker: Vector3 = (0.0, 0.0, 0.0)
+    """The point of this vehicle that other cameras see, in its body frame, m."""
+    neighbours: tuple[str, ...] | None = None
+    """Targets it may measure: landmark names and vehicle names (default: every landmark and every leader)."""
+    goal: Goal | None = None
+
+    @model_validator(mode="after")
+    def _has_a_start(self) -> Vehicle:
+        if self.motion.kind == "waypoints" and self.initial_pose is not None:
+            raise ValueError("initial_pose: a motion by waypoints starts at its first waypoint; leave this out")
+        if self.motion.kind != "waypoints" and self.initial_pose is None:
+            raise ValueError("initial_pose: needed, with at least a position")
+        return self

@@ -1,0 +1,34 @@
+"""What every part of a scenario shares: frozen, typed, and strict about its keys."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+
+class Part(BaseModel):
+    """A frozen section of a scenario file; unknown keys are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+def _unit_quaternion(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    norm = math.sqrt(sum(x * x for x in q))
+    if abs(norm - 1.0) > 1e-3:
+        raise ValueError(f"a rotation needs a unit quaternion, this one has norm {norm:.4g}")
+    return (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
+
+
+Vector2 = tuple[float, float]
+Vector3 = tuple[float, float, float]
+QuaternionWxyz = Annotated[tuple[float, float, float, float], AfterValidator(_unit_quaternion)]
+Positive = Annotated[float, Field(gt=0.0)]
+NonNegative = Annotated[float, Field(ge=0.0)]
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+Loss = Annotated[float, Field(ge=0.0, lt=1.0)]
+PositiveVector2 = tuple[Positive, Positive]
+PositiveVector3 = tuple[Positive, Positive, Positive]
+NonNegativeVector3 = tuple[NonNegative, NonNegative, NonNegative]
+Sample = Literal["sample"]

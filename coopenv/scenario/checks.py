@@ -1,0 +1,188 @@
+"""Checks that span several sections of a scenario. Each failure is one line that names the field."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Sequence
+from graphlib import CycleError, TopologicalSorter
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from coopenv.errors import suggest
+
+if TYPE_CHECKING:
+    from coopenv.scenario.schema import Scenario
+
+FAR_FROM_ORIGIN = 50.0
+"""m; beyond it the paper's observer loses accuracy, because it is not invariant to the map origin."""
+
+
+class ScenarioWarning(UserWarning):
+    """The scenario is possible but the theory's conditions may not hold."""
+
+
+def landmark_names(names: Sequence[str]) -> None:
+    """Refuse names that occur twice or that vehicles have."""
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"landmark name '{name}' is used twice")
+        if re.fullmatch(r"vehicle_\d+", name):
+            raise ValueError(f"landmark name '{name}' is reserved for vehicles")
+
+
+def everything(scenario: Scenario) -> None:
+    """Run all checks on a parsed scenario.
+
+    Raises:
+        ValueError: the first impossibility found.
+    """
+    neighbour_sets(scenario)
+    processing_order(scenario)
+    gains(scenario)
+    starts(scenario)
+    limits(scenario)
+    observability(scenario)
+
+
+def neighbour_sets(scenario: Scenario) -> list[list[int]]:
+    """Return, per vehicle, the indices of the targets that it may measure.
+
+    Without an explicit list these are all landmarks and, under the acyclic restriction, the vehicles before it
+    (paper, Assumption 1: N_i within {1, ..., i-1}), otherwise all other vehicles.
+    """
+    landmarks = len(scenario.landmarks)
+    targets = scenario.target_names
+    result = []
+    for i, vehicle in enumerate(scenario.vehicles):
+        if vehicle.neighbours is None:
+            others = range(i) if scenario.topology.acyclic else range(len(scenario.vehicles))
+            result.append([*range(landmarks), *(landmarks + j for j in others if j != i)])
+            continue
+        where = f"vehicles.{i}.neighbours"
+        for name in vehicle.neighbours:
+            if name not in targets:
+                raise ValueError(
+                    f"{where}: unknown target '{name}'{suggest(name, targets)}; known: {', '.join(targets)}"
+                )
+            if name == f"vehicle_{i + 1}":
+                raise ValueError(f"{where}: a vehicle cannot be its own neighbour")
+        result.append(sorted({scenario.target_index(name) for name in vehicle.neighbours}))
+    return result
+
+
+def processing_order(scenario: Scenario) -> list[int]:
+    """Return vehicle indices so that leaders come before their followers.
+
+    Raises:
+        ValueError: the neighbour sets contain a cycle although `topology.acyclic` is set.
+    """
+    landmarks = len(scenario.landmarks)
+    graph = {
+        i: {j - landmarks for j in targets if j >= landmarks}
+        for i, targets in enumerate(neighbour_sets(scenario))
+    }
+    if not scenario.topology.acyclic:
+        return sorted(graph)
+    sorter = TopologicalSorter(graph)
+    try:
+        sorter.prepare()
+    except CycleError as error:
+        cycle = " -> ".join(f"vehicle_{i + 1}" for i in error.args[1])
+        raise ValueError(
+            f"topology: the neighbours form a cycle ({cycle}); the paper's Assumption 1 needs an acyclic order "
+            "(or set topology.acyclic = false)"
+        ) from None
+    order: list[int] = []
+    while sorter.is_active():
+        ready = sorted(sorter.get_ready())
+        order += ready
+        sorter.done(*ready)
+    return order
+
+
+def gains(scenario: Scenario) -> None:
+    """Check per-vehicle and per-target gains against the names that exist."""
+    k = scenario.observer.k
+    if isinstance(k, tuple) and len(k) != len(scenario.vehicles):
+        raise ValueError(f"observer.k: {len(k)} values for {len(scenario.vehicles)} vehicles")
+    if isinstance(scenario.observer.q, dict):
+        targets = scenario.target_names
+        for name in scenario.observer.q:
+            if name not in targets:
+                raise ValueError(f"observer.q: unknown target '{name}'{suggest(name, targets)}")
+
+
+def start_position(scenario: Scenario, vehicle: int) -> np.ndarray:
+    """Return the nominal start of a vehicle in the file's coordinates, (3,) m."""
+    description = scenario.vehicles[vehicle]
+    if description.motion.kind == "waypoints":
+        return np.array(description.motion.waypoints[0].position)
+    assert description.initial_pose is not None
+    return np.array(description.initial_pose.position)
+
+
+def starts(scenario: Scenario) -> None:
+    """Refuse vehicles that start inside a building or in one another's place."""
+    positions = [start_position(scenario, i) for i in range(len(scenario.vehicles))]
+    for i, position in enumerate(positions):
+        reach = np.array(scenario.vehicles[i].body.size).min() / 2 if scenario.vehicles[i].body else 0.0
+        for obstacle in scenario.obstacles:
+            local = Rotation.from_euler("z", -obstacle.yaw).apply(position - np.array(obstacle.center))
+            if np.all(np.abs(local) < np.array(obstacle.size) / 2 + reach):
+                raise ValueError(
+                    f"vehicles.{i}.initial_pose: vehicle_{i + 1} starts inside obstacle '{obstacle.name}'"
+                )
+        for j in range(i):
+            if np.linalg.norm(position - positions[j]) < 1e-6:
+                raise ValueError(
+                    f"vehicles.{i}.initial_pose: vehicle_{i + 1} starts in the place of vehicle_{j + 1}"
+                )
+
+
+def limits(scenario: Scenario) -> None:
+    """Check quantities of one section against those of another."""
+    decision = 1.0 / scenario.rates.decision
+    if scenario.dynamics.latency > decision:
+        raise ValueError(
+            f"dynamics.latency: {scenario.dynamics.latency:g} s is longer than one decision ({decision:g} s)"
+        )
+    steering = scenario.action.steering
+    if steering is not None and steering > scenario.dynamics.max_steering:
+        raise ValueError(
+            f"action.steering: {steering:g} rad is above dynamics.max_steering "
+            f"({scenario.dynamics.max_steering:g} rad)"
+        )
+
+
+def observability(scenario: Scenario) -> None:
+    """Warn where the paper's conditions for convergence are not met by construction."""
+    count = len(scenario.landmarks)
+    if count < 3:
+        warnings.warn(
+            f"only {count} landmark{'s' if count != 1 else ''}: with fewer than three the paper's Assumption 2 "
+            "fails and observability is not guaranteed",
+            ScenarioWarning,
+            stacklevel=2,
+        )
+    for i, targets in enumerate(neighbour_sets(scenario)):
+        if count >= 3 and len(targets) < 3:
+            warnings.warn(
+                f"vehicle_{i + 1} has fewer than three neighbours: observability is not guaranteed",
+                ScenarioWarning,
+                stacklevel=2,
+            )
+    origin = np.array(scenario.map.origin)
+    for landmark in scenario.landmarks:
+        distance = float(np.linalg.norm(np.array(landmark.position) - origin))
+        if distance > FAR_FROM_ORIGIN:
+            warnings.warn(
+                f"landmark '{landmark.name}' lies {distance:.0f} m from the map origin: the paper's observer is "
+                f"not invariant to the origin and degrades beyond {FAR_FROM_ORIGIN:.0f} m; set map.origin inside "
+                "the scene",
+                ScenarioWarning,
+                stacklevel=2,
+            )
+            break

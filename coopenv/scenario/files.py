@@ -1,0 +1,184 @@
+"""Find, read, override and validate scenario files."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from coopenv.errors import ScenarioError, UnknownEnvironmentError, suggest
+from coopenv.scenario.schema import Scenario
+
+DEFAULTS_KEY = "vehicle_defaults"
+"""A table of the file whose entries every vehicle takes over unless it says otherwise."""
+
+
+@cache
+def data_directory(kind: str) -> Path:
+    """Return the folder of `envs` or `agents`: inside the installed wheel, else beside the checkout's package."""
+    package = Path(__file__).resolve().parents[1]
+    shipped = package / "data" / kind
+    return shipped if shipped.is_dir() else package.parent / kind
+
+
+def list_envs() -> list[str]:
+    """Return the names of the environments that ship with coopenv: the file stems of `envs/`."""
+    return sorted(path.stem for path in data_directory("envs").glob("*.toml"))
+
+
+def scenario_path(name_or_path: str | Path) -> Path:
+    """Return the file behind an environment name or a path.
+
+    Raises:
+        UnknownEnvironmentError: there is no such environment or file.
+    """
+    text = str(name_or_path)
+    if text.endswith(".toml") or "/" in text or "\\" in text:
+        path = Path(text).expanduser()
+        if not path.is_file():
+            raise UnknownEnvironmentError(f"no such scenario file: {path}")
+        return path
+    if text not in list_envs():
+        raise UnknownEnvironmentError(
+            f"unknown environment '{text}'{suggest(text, list_envs())}; known: {', '.join(list_envs())}"
+        )
+    return data_directory("envs") / f"{text}.toml"
+
+
+def load_scenario(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scenario:
+    """Read a scenario and apply dotted overrides such as `{"noise.enabled": False}`.
+
+    Args:
+        name_or_path: file stem of `envs/`, or the path of a TOML file.
+        overrides: dotted key to value; list entries by index or `*` for all (`vehicles.*.goal.radius`).
+
+    Raises:
+        UnknownEnvironmentError: no such environment.
+        ScenarioError: the file or an override does not describe a possible world.
+    """
+    path = scenario_path(name_or_path)
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ScenarioError(f"{path.name}: cannot be read ({error})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{path.name}: not valid TOML: {error}") from None
+    raw = apply_vehicle_defaults(raw)
+    for key, value in (overrides or {}).items():
+        override(raw, str(key), value)
+    return parse_scenario(raw, path.name)
+
+
+def parse_scenario(raw: Mapping[str, Any], where: str) -> Scenario:
+    """Validate plain data; `where` names its origin in the error.
+
+    Raises:
+        ScenarioError: one line that names the field and, for unknown keys, the nearest valid one.
+    """
+    try:
+        return Scenario.model_validate(raw)
+    except ValidationError as error:
+        raise ScenarioError(_one_line(error, where)) from None
+
+
+def apply_vehicle_defaults(raw: dict[str, Any]) -> dict[str, Any]:
+    """Merge the table `vehicle_defaults` under every entry of `vehicles`."""
+    raw = dict(raw)
+    defaults = raw.pop(DEFAULTS_KEY, None)
+    vehicles = raw.get("vehicles")
+    if isinstance(defaults, dict) and isinstance(vehicles, list):
+        raw["vehicles"] = [_merged(defaults, v) if isinstance(v, dict) else v for v in vehicles]
+    return raw
+
+
+def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    result = dict(under)
+    for key, value in over.items():
+        below = result.get(key)
+        result[key] = _merged(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+    return result
+
+
+def override(raw: Any, key: str, value: Any) -> None:
+    """Set one dotted key in nested plain data, in place.
+
+    Raises:
+        ScenarioError: a list index does not exist, or the path runs through a plain value.
+    """
+    _descend(raw, key.split("."), value, key)
+
+
+def _descend(node: Any, path: list[str], value: Any, key: str) -> None:
+    head, rest = path[0], path[1:]
+    if isinstance(node, list):
+        for index in _indices(node, head, key):
+            if rest:
+                node[index] = dict(node[index]) if isinstance(node[index], dict) else node[index]
+                _descend(node[index], rest, value, key)
+            else:
+                node[index] = value
+    elif isinstance(node, dict):
+        if rest:
+            below = node.get(head, {})
+            node[head] = dict(below) if isinstance(below, dict) else below
+            _descend(node[head], rest, value, key)
+        else:
+            node[head] = value
+    else:
+        raise ScenarioError(f"override '{key}': '{head}' lies below a plain value")
+
+
+def _indices(node: list[Any], head: str, key: str) -> range | list[int]:
+    if head == "*":
+        return range(len(node))
+    names = [entry.get("name") if isinstance(entry, dict) else None for entry in node]
+    if head in names:
+        return [names.index(head)]
+    number = head.removeprefix("vehicle_")
+    index = int(number) - (1 if head != number else 0) if number.isdigit() else -1
+    if not 0 <= index < len(node):
+        raise ScenarioError(f"override '{key}': no entry '{head}' (there are {len(node)}; 0..{len(node) - 1} or *)")
+    return [index]
+
+
+def _one_line(error: ValidationError, where: str) -> str:
+    details = error.errors(include_url=False)
+    first = details[0]
+    location = [str(part) for part in first["loc"] if not str(part).startswith("function-")]
+    more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+    if first["type"] == "extra_forbidden":
+        valid = _valid_keys(first["loc"][:-1])
+        name = location[-1]
+        hint = suggest(name, valid) or f"; allowed: {', '.join(valid)}"
+        return f"{where}: {'.'.join(location)}: unknown key{hint}{more}"
+    message = first["msg"].removeprefix("Value error, ")
+    got = first.get("input")
+    shown = f", got {got!r}" if isinstance(got, bool | int | float | str) and first["type"] != "value_error" else ""
+    return f"{where}: {'.'.join([*location, message]) if not location else '.'.join(location) + ': ' + message}{shown}{more}"
+
+
+def _valid_keys(location: tuple[int | str, ...]) -> list[str]:
+    """Return the keys allowed at a location of a validation error, by walking the model's annotations."""
+    models: list[Any] = [Scenario]
+    for part in location:
+        if isinstance(part, int):
+            continue
+        nested = [
+            inner
+            for model in models
+            if isinstance(part, str) and part in model.model_fields
+            for inner in _models_in(model.model_fields[part].annotation)
+        ]
+        tagged = [m for m in models if "kind" in m.model_fields and m.model_fields["kind"].default == part]
+        models = nested or tagged or models
+    return sorted({name for model in models for name in model.model_fields})
+
+
+def _models_in(annotation: Any) -> list[Any]:
+    if isinstance(annotation, type):
+        return [annotation] if issubclass(annotation, BaseModel) else []
+    return [model for inner in getattr(annotation, "__args__", ()) for model in _models_in(inner)]

@@ -1,0 +1,150 @@
+"""How vehicles sense, talk and estimate: camera, rates, noise, topology, V2X, observer."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, PositiveInt, model_validator
+
+from coopenv.scenario.base import (
+    Loss,
+    NonNegative,
+    Part,
+    Positive,
+    PositiveVector2,
+    Probability,
+    QuaternionWxyz,
+    Sample,
+    Vector2,
+    Vector3,
+)
+
+
+class Camera(Part):
+    """The camera that every vehicle carries; optical frame: x right, y down, z forward."""
+
+    model: Literal["pinhole", "omnidirectional"] = "omnidirectional"
+    """`omnidirectional` sees in every direction; `pinhole` is bounded by its image."""
+    position: Vector3 = (0.0, 0.0, 0.0)
+    """Optical centre in the body frame, m."""
+    orientation: Literal["forward", "body"] | QuaternionWxyz = "forward"
+    """Camera to body: `forward` looks along the body's x axis, `body` has the body's own axes."""
+    image_size: tuple[PositiveInt, PositiveInt] = (316, 208)
+    """Width and height, pixels."""
+    focal_length: PositiveVector2 = (213.161906, 213.521038)
+    """fx and fy, pixels."""
+    principal_point: Vector2 = (154.841998, 114.98398)
+    """cx and cy, pixels."""
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3 of the plumb-bob model."""
+    undistort: bool = True
+    """Whether bearings are computed from undistorted pixels."""
+    quantise: bool = False
+    """Whether detections come in whole pixels."""
+    range: Positive | None = None
+    """Farthest distance at which a target is detected, m (none: unlimited)."""
+    miss_probability: Probability = 0.0
+    """Chance that a detection in view is lost, drawn per target and frame."""
+
+
+class Rates(Part):
+    """Rates in Hz; the sensors are asynchronous."""
+
+    camera: Positive = 60.0
+    odometry: Positive = 100.0
+    observer: Positive | None = None
+    """Rate of the observer's corrections (none: at every camera frame)."""
+    decision: Positive = 10.0
+    """Rate of the policy's actions; the camera rate must be a multiple."""
+
+    @model_validator(mode="after")
+    def _whole_ticks(self) -> Rates:
+        ratio = self.camera / self.decision
+        if ratio < 1.0 - 1e-9 or abs(ratio - round(ratio)) > 1e-9:
+            raise ValueError(
+                f"decision: the camera rate ({self.camera:g} Hz) must be a whole multiple of the decision rate "
+                f"({self.decision:g} Hz)"
+            )
+        return self
+
+
+class BearingNoise(Part):
+    """Noise of a bearing."""
+
+    model: Literal["paper", "isotropic"] = "isotropic"
+    """`paper`: uniform noise on the coordinates of the image plane across `axis`; `isotropic`: Gaussian in
+    the tangent plane of the bearing."""
+    scale: NonNegative = 0.0
+    """`paper`: largest deviation (image plane at distance 1); `isotropic`: standard deviation per axis, rad."""
+    axis: Vector3 = (0.0, 0.0, 1.0)
+    """Optical axis of the paper's formula, in the camera frame."""
+    rate: Positive | Sample = "sample"
+    """Camera rate in Hz at which the scale holds (other rates keep its density), or `sample`: at any rate."""
+
+    @model_validator(mode="after")
+    def _axis_points_somewhere(self) -> BearingNoise:
+        if sum(x * x for x in self.axis) < 1e-12:
+            raise ValueError("axis: must not be zero")
+        return self
+
+
+class Noise(Part):
+    """Measurement noise."""
+
+    enabled: bool = True
+    velocity: NonNegative = 0.0
+    """Standard deviation of each component of a linear velocity sample, m/s."""
+    angular_velocity: NonNegative = 0.0
+    """Standard deviation of each component of an angular velocity sample, rad/s."""
+    odometry_rate: Positive | Sample = "sample"
+    """Odometry rate in Hz at which these hold (other rates keep their density), or `sample`: at any rate."""
+    bearing: BearingNoise = BearingNoise()
+
+
+class Topology(Part):
+    """Who may measure and hear whom."""
+
+    mode: Literal["fixed", "sensed"] = "fixed"
+    """`fixed`: every neighbour at every tick; `sensed`: those in the field of view and not occluded."""
+    acyclic: bool = True
+    """Restrict to the directed acyclic leader-follower order of the paper's Assumption 1."""
+
+
+class V2x(Part):
+    """The radio that carries pose estimates between vehicles."""
+
+    delay: int = Field(default=0, ge=0, le=600)
+    """Camera ticks from sending to receiving; 0: a leader's estimate of the same tick."""
+    period: PositiveInt = 1
+    """Camera ticks between messages."""
+    loss: Loss = 0.0
+    """Chance that one receiver loses one message."""
+    range: Positive | None = None
+    """Farthest distance at which messages are received, m (none: unlimited)."""
+    staleness: Positive | None = None
+    """Messages older than this are not used, s (none: used for ever)."""
+
+
+class Observer(Part):
+    """The estimator that every vehicle runs, and its gains."""
+
+    name: str = "riccati"
+    k: Positive | tuple[Positive, ...] = 1.0
+    """Gain k_i > 0.5, one for all vehicles or one per vehicle."""
+    q: Positive | dict[str, Positive] = 10.0
+    """Weight q_ij of a bearing, one for all targets or one per target name (others: 10)."""
+    V: PositiveVector2 = (0.1, 1.0)
+    """V = diag(V[0] I3, V[1] I3) over (2 lambda, p)."""
+    P0: PositiveVector2 = (1.0, 100.0)
+    """P(0) = diag(P0[0] I3, P0[1] I3)."""
+    max_turn: Positive = 0.05
+    """The correction is re-linearised whenever the attitude has turned by this much within a tick, rad."""
+    gramian_window: Positive = 1.0
+    """Length of the sliding window of the observability Gramian, s."""
+
+    @model_validator(mode="after")
+    def _gain_is_stable(self) -> Observer:
+        gains = self.k if isinstance(self.k, tuple) else (self.k,)
+        if not gains or min(gains) <= 0.5:
+            raise ValueError("k: the observer is stable for k > 0.5 only (paper, definition of K_i)")
+        return self

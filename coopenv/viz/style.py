@@ -1,0 +1,108 @@
+"""What the figures share: a palette safe for colour-blind readers, the paper's names, time-axis helpers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from coopenv.estimation.trajectory import Trajectory
+
+# Okabe and Ito (2008), without the yellow that vanishes on white.
+BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
+INK, GREY, RULE = "#222222", "#7F7F7F", "#D9D9D9"
+SHADE = "#DCEAF6"  # a moving target is in view
+DARK_BLUE = "#00264D"  # landmarks, as in the paper
+AXES_COLOURS = (VERMILION, GREEN, BLUE)  # x, y, z and roll, pitch, yaw
+VEHICLE_COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, INK, GREY)
+
+DPI = 130
+LINE = 1.2  # pt
+SMALL, NORMAL = 7.5, 9.0  # pt
+MAX_POINTS = 1500  # of a line: more than the pixels it crosses
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure (inches) with its own Agg canvas, unknown to pyplot."""
+    figure = Figure(figsize=(width, height), dpi=DPI)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a PNG and return its path."""
+    figure.savefig(path, dpi=DPI, format="png")
+    return path
+
+
+def vehicle_colour(index: int) -> str:
+    """Return the colour of a vehicle, the same in every figure."""
+    return VEHICLE_COLOURS[index % len(VEHICLE_COLOURS)]
+
+
+def vehicle_label(name: str) -> str:
+    """Return the paper's f_1 for `vehicle_1`, any other name as it is."""
+    match = re.fullmatch(r"vehicle_(\d+)", str(name))
+    return f"$f_{{{match[1]}}}$" if match else str(name)
+
+
+def target_labels(trajectory: Trajectory) -> list[str]:
+    """Return the paper's SL1 (static) or ML1 (moving) for `landmark_1`, and f_1 for `vehicle_1`."""
+    labels = []
+    for name, moving in zip(trajectory.targets, trajectory.target_moving, strict=True):
+        match = re.fullmatch(r"landmark_(\d+)", str(name))
+        labels.append(f"{'ML' if moving else 'SL'}{match[1]}" if match else vehicle_label(name))
+    return labels
+
+
+def thinned(count: int) -> np.ndarray:
+    """Return the indices of at most `MAX_POINTS` of `count` samples, first and last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, MAX_POINTS)).round().astype(int))
+
+
+def runs(t: np.ndarray, mask: np.ndarray) -> list[tuple[float, float]]:
+    """Return (start, duration) in s of the stretches where `mask` (K,) holds, a tick lasting to the next."""
+    edges = np.append(t, t[-1] + (np.median(np.diff(t)) if len(t) > 1 else 0.0))
+    change = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
+    starts, ends = edges[change[::2]], edges[change[1::2]]
+    return list(zip(starts.tolist(), (ends - starts).tolist(), strict=True))
+
+
+def moving_target_seen(trajectory: Trajectory, vehicle: int) -> np.ndarray:
+    """Return (K,) whether a vehicle's camera detects a vehicle or a moving landmark."""
+    return np.any(trajectory.visible[:, vehicle] & trajectory.target_moving, axis=-1)
+
+
+def shade(ax: Axes, stretches: Sequence[tuple[float, float]]) -> None:
+    """Shade stretches of time over the whole height of `ax`."""
+    ax.broken_barh(
+        stretches, (0, 1), transform=ax.get_xaxis_transform(), facecolor=SHADE, edgecolor="none", zorder=0
+    )
+
+
+def tidy(ax: Axes, *, x_label: str = "", y_label: str = "") -> None:
+    """Give axes the house look: small ticks, a light grid behind the data, no box."""
+    ax.set_axisbelow(True)
+    ax.grid(True, color=RULE, linewidth=0.5)
+    ax.tick_params(labelsize=SMALL, length=2.5, width=0.6, colors=INK)
+    ax.tick_params(which="minor", length=0)
+    for side in ("top", "right"):
+        ax.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        ax.spines[side].set_linewidth(0.6)
+    ax.set_xlabel(x_label, fontsize=NORMAL, color=INK)
+    ax.set_ylabel(y_label, fontsize=NORMAL, color=INK)
+
+
+def time_axis(ax: Axes, t: np.ndarray, *, labelled: bool) -> None:
+    """Span the record in time, with labels only where asked for."""
+    end = float(t[-1]) if t[-1] > t[0] else float(t[0]) + 1.0
+    ax.set_xlim(float(t[0]), end)
+    ax.tick_params(labelbottom=labelled)
+    if labelled:
+        ax.set_xlabel("time [s]", fontsize=NORMAL, color=INK)

@@ -1,0 +1,109 @@
+"""The switching sensing topology: which target each camera measures, and why not."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from coopenv.estimation.trajectory import Sight, Trajectory
+from coopenv.viz.style import (
+    BLUE,
+    GREY,
+    INK,
+    NORMAL,
+    ORANGE,
+    SHADE,
+    SMALL,
+    VERMILION,
+    moving_target_seen,
+    new_figure,
+    runs,
+    shade,
+    target_labels,
+    tidy,
+    time_axis,
+    vehicle_label,
+)
+
+_LOOKS: dict[Sight, dict[str, Any]] = {
+    Sight.VISIBLE: {"facecolor": BLUE, "edgecolor": "none", "label": "visible"},
+    Sight.OCCLUDED_BY_BODY: {
+        "facecolor": "white",
+        "edgecolor": VERMILION,
+        "hatch": "//////",
+        "label": "occluded by a moving body",
+    },
+    Sight.OCCLUDED_BY_BUILDING: {
+        "facecolor": "white",
+        "edgecolor": ORANGE,
+        "hatch": "......",
+        "label": "occluded by a building",
+    },
+    Sight.OUT_OF_VIEW: {"facecolor": GREY, "edgecolor": "none", "label": "out of view"},
+    Sight.MISSED: {"facecolor": INK, "edgecolor": "none", "label": "missed"},
+}
+_BAR = {Sight.VISIBLE: 0.62, Sight.OUT_OF_VIEW: 0.14}  # share of a row; 0.62 for the occlusions too
+_LANE, _PANEL_GAP, _HEAD, _FOOT = 0.19, 0.36, 0.55, 0.5  # inches
+
+
+def topology_figure(trajectory: Trajectory) -> Figure:
+    """Draw, per vehicle, one lane per target against time, the bar telling what became of the sight line.
+
+    Targets that are never a vehicle's neighbours have no lane. Blue shading: a moving target is detected, or
+    a moving body hides a target.
+    """
+    lanes = [_neighbours(trajectory, vehicle) for vehicle in range(len(trajectory.vehicles))]
+    rows = [max(1, len(targets)) * _LANE for targets in lanes]
+    height = _HEAD + _FOOT + sum(rows) + _PANEL_GAP * (len(rows) - 1)
+    figure = new_figure(9.0, height)
+    top = height - _HEAD
+    for vehicle, targets in enumerate(lanes):
+        bottom = top - rows[vehicle]
+        ax = figure.add_axes((0.105, bottom / height, 0.875, rows[vehicle] / height))
+        _draw_lanes(ax, trajectory, vehicle, targets)
+        time_axis(ax, trajectory.t, labelled=vehicle == len(lanes) - 1)
+        top = bottom - _PANEL_GAP
+    figure.legend(
+        handles=[
+            *(Patch(**look) for look in _LOOKS.values()),
+            Patch(facecolor=SHADE, label="moving target involved"),
+        ],
+        loc="upper center",
+        ncols=6,
+        fontsize=SMALL,
+        frameon=False,
+        handlelength=1.8,
+        columnspacing=1.3,
+    )
+    return figure
+
+
+def _neighbours(trajectory: Trajectory, vehicle: int) -> np.ndarray:
+    return np.flatnonzero(np.any(trajectory.sight[:, vehicle] != Sight.NOT_A_NEIGHBOUR, axis=0))
+
+
+def _draw_lanes(ax: Axes, trajectory: Trajectory, vehicle: int, targets: np.ndarray) -> None:
+    sight, names = trajectory.sight[:, vehicle], target_labels(trajectory)
+    tidy(ax)
+    ax.grid(False, axis="y")
+    involved = moving_target_seen(trajectory, vehicle) | np.any(sight == Sight.OCCLUDED_BY_BODY, axis=-1)
+    shade(ax, runs(trajectory.t, involved))
+    for lane, target in enumerate(targets):
+        for kind, look in _LOOKS.items():
+            stretches = runs(trajectory.t, sight[:, target] == kind)
+            if stretches:
+                width = _BAR.get(kind, 0.62)
+                ax.broken_barh(stretches, (lane - width / 2, width), linewidth=0.4, **look)
+    ax.set_yticks(range(len(targets)), [names[target] for target in targets])
+    ax.set_ylim(max(1, len(targets)) - 0.5, -0.5)
+    if not len(targets):
+        ax.text(0.5, 0.5, "no neighbours", transform=ax.transAxes, ha="center", va="center", color=GREY)
+    ax.set_title(
+        vehicle_label(trajectory.vehicles[vehicle]), fontsize=NORMAL + 2, loc="left", pad=2.5, color=INK
+    )
+    seen = trajectory.visible[:, vehicle].sum(axis=-1).mean()
+    ax.set_title(f"{seen:.2f} targets in view on average", fontsize=SMALL, loc="right", pad=2.5, color=INK)

@@ -1,0 +1,1 @@
+"""Truth and sensing as Warp kernels, one file per stage, batched over worlds and vehicles."""

@@ -1,0 +1,201 @@
+"""Stage 3, camera: which targets are in view and not occluded, and their noisy unit bearings.
+
+A bearing is stored as the unit vector from the observing camera to the target, in the camera's optical frame.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.world.random import BEARING, draw, gaussian_pair, signed_uniform, uniform
+
+wp.set_module_options({"enable_backward": False})
+
+NOT_A_NEIGHBOUR = wp.constant(wp.uint8(0))
+VISIBLE = wp.constant(wp.uint8(1))
+OUT_OF_VIEW = wp.constant(wp.uint8(2))
+OCCLUDED_BY_BUILDING = wp.constant(wp.uint8(3))
+OCCLUDED_BY_BODY = wp.constant(wp.uint8(4))
+MISSED = wp.constant(wp.uint8(5))
+
+
+@wp.func
+def marker_position(model: Any, state: Any, world: int, agent: int):
+    """Return the point of an agent that cameras see, map frame."""
+    return state.position[world, agent] + state.rotation[world, agent] * model.scene.marker[agent]
+
+
+@wp.func
+def segment_hits_box(origin: Any, direction: Any, R: Any, center: Any, half: Any) -> bool:
+    """Return whether the segment origin + s direction, 0 < s < 1, passes through an oriented box (slab test)."""
+    reach = origin.dtype(1.0e-12)
+    Rt = wp.transpose(R)
+    to_center = center - origin
+    along = wp.clamp(
+        wp.dot(to_center, direction) / wp.max(wp.dot(direction, direction), reach),
+        origin.dtype(0.0),
+        origin.dtype(1.0),
+    )
+    miss = to_center - along * direction
+    if wp.dot(miss, miss) > wp.dot(half, half):
+        return False
+    o = Rt * (origin - center)
+    d = Rt * direction
+    enter = origin.dtype(0.0)
+    leave = origin.dtype(1.0)
+    for axis in range(3):
+        if wp.abs(d[axis]) < reach:
+            if wp.abs(o[axis]) > half[axis]:
+                return False
+        else:
+            a = (-half[axis] - o[axis]) / d[axis]
+            b = (half[axis] - o[axis]) / d[axis]
+            enter = wp.max(enter, wp.min(a, b))
+            leave = wp.min(leave, wp.max(a, b))
+    return enter < leave
+
+
+@wp.func
+def occlusion(model: Any, state: Any, world: int, observer: int, target: int, origin: Any, direction: Any):
+    """Return VISIBLE, or what blocks the line of sight; neither end's own body does."""
+    for k in range(model.obstacles):
+        if segment_hits_box(
+            origin,
+            direction,
+            model.scene.obstacle_rotation[k],
+            model.scene.obstacle_center[k],
+            model.scene.obstacle_half[k],
+        ):
+            return OCCLUDED_BY_BUILDING
+    for agent in range(model.agents):
+        half = model.scene.body_half[agent]
+        if agent != observer and agent != target and half[0] > half.dtype(0.0):
+            R = state.rotation[world, agent]
+            center = state.position[world, agent] + R * model.scene.body_center[agent]
+            if segment_hits_box(origin, direction, R, center, half):
+                return OCCLUDED_BY_BODY
+    return VISIBLE
+
+
+@wp.func
+def distort(camera: Any, x: Any, y: Any):
+    """Return distorted image coordinates (plumb-bob model, both at distance 1)."""
+    two = type(x)(2.0)
+    r2 = x * x + y * y
+    radial = type(x)(1.0) + r2 * (camera.k1 + r2 * (camera.k2 + r2 * camera.k3))
+    dx = two * camera.p1 * x * y + camera.p2 * (r2 + two * x * x)
+    dy = camera.p1 * (r2 + two * y * y) + two * camera.p2 * x * y
+    return x * radial + dx, y * radial + dy
+
+
+@wp.func
+def undistort(camera: Any, xd: Any, yd: Any):
+    """Return undistorted image coordinates by fixed-point iteration."""
+    x = xd
+    y = yd
+    for _ in range(20):
+        ex, ey = distort(camera, x, y)
+        x = x + (xd - ex)
+        y = y + (yd - ey)
+    return x, y
+
+
+@wp.func
+def project(camera: Any, bearing: Any):
+    """Return (pixel u, pixel v, 1 if inside the image) of a bearing in the optical frame."""
+    o = bearing.dtype(0.0)
+    if bearing[2] <= bearing.dtype(1.0e-6):
+        return o, o, 0
+    x = bearing[0] / bearing[2]
+    y = bearing[1] / bearing[2]
+    if x * x + y * y > camera.max_radius * camera.max_radius:
+        return o, o, 0
+    xd, yd = distort(camera, x, y)
+    u = camera.focal_length[0] * xd + camera.principal_point[0]
+    v = camera.focal_length[1] * yd + camera.principal_point[1]
+    inside = int(0)
+    if u >= o and v >= o and u < camera.image_size[0] and v < camera.image_size[1]:
+        inside = int(1)
+    return u, v, inside
+
+
+@wp.func
+def through_pixels(camera: Any, bearing: Any):
+    """Return the bearing that is computed from the detection's pixel: rounding, distortion, its removal."""
+    u, v, _ = project(camera, bearing)
+    if camera.quantise == 1:
+        u = wp.round(u)
+        v = wp.round(v)
+    x = (u - camera.principal_point[0]) / camera.focal_length[0]
+    y = (v - camera.principal_point[1]) / camera.focal_length[1]
+    if camera.undistort == 1:
+        x, y = undistort(camera, x, y)
+    return wp.normalize(type(bearing)(x, y, bearing.dtype(1.0)))
+
+
+@wp.func
+def noisy_bearing(noise: Any, bearing: Any, words: Any):
+    """Return a noisy unit bearing: the paper's image-plane formula about an axis, or isotropic in the tangent plane."""
+    one = bearing.dtype(1.0)
+    if noise.bearing_paper == 1:
+        g = wp.transpose(noise.axis) * bearing
+        depth = g[2]
+        tiny = bearing.dtype(1.0e-6)
+        if wp.abs(depth) < tiny:  # the formula divides by it; see F7 of the method page
+            depth = wp.where(depth < bearing.dtype(0.0), -tiny, tiny)
+        x = g[0] / depth + noise.bearing * signed_uniform(words[0], one)
+        y = g[1] / depth + noise.bearing * signed_uniform(words[1], one)
+        return wp.normalize(noise.axis * type(bearing)(x, y, one)) * wp.sign(depth)
+    n1, n2 = gaussian_pair(words[0], words[1], one)
+    helper = type(bearing)(one, one - one, one - one)
+    if wp.abs(bearing[0]) > bearing.dtype(0.7):
+        helper = type(bearing)(one - one, one, one - one)
+    first = wp.normalize(wp.cross(bearing, helper))
+    second = wp.cross(bearing, first)
+    return wp.normalize(bearing + noise.bearing * (n1 * first + n2 * second))
+
+
+@wp.func
+def sight_of(model: Any, state: Any, world: int, vehicle: int, target: int, origin: Any, line: Any, b: Any):
+    """Return whether a neighbour is in view now, and if not, why."""
+    distance = wp.length(line)
+    if model.sensed == 1:
+        if distance > model.camera.range:
+            return OUT_OF_VIEW
+        if model.camera.pinhole == 1:
+            _, _, inside = project(model.camera, b)
+            if inside == 0:
+                return OUT_OF_VIEW
+        return occlusion(model, state, world, model.landmarks + vehicle, target, origin, line)
+    return VISIBLE
+
+
+@wp.func
+def observe(model: Any, before: Any, after: Any, world: int, vehicle: int, tick: int):
+    """Take one camera frame of one vehicle; `after` already holds the truth of this tick."""
+    agent = model.landmarks + vehicle
+    R = after.rotation[world, agent]
+    origin = after.position[world, agent] + R * model.camera.position
+    to_camera = wp.transpose(R * model.camera.rotation)
+    zero = origin.dtype(0.0)
+    random = model.camera.miss > zero or model.noise.bearing > zero
+    for target in range(model.agents):
+        sight = NOT_A_NEIGHBOUR
+        if model.neighbour[vehicle, target] == 1:
+            line = marker_position(model, after, world, target) - origin
+            b = wp.normalize(to_camera * line)
+            sight = sight_of(model, after, world, vehicle, target, origin, line, b)
+            if sight == VISIBLE and random:
+                words = draw(before.seed[world], before.episode[world], tick, vehicle * 65536 + target, BEARING)
+                if uniform(words[2], zero) < model.camera.miss:
+                    sight = MISSED
+                if model.noise.bearing > zero:
+                    b = noisy_bearing(model.noise, b, words)
+            if sight == VISIBLE:
+                if model.camera.pinhole == 1 and model.sensed == 1:
+                    b = through_pixels(model.camera, b)
+                after.bearing[world, vehicle, target] = b
+                after.bearing_tick[world, vehicle, target] = tick
+        after.sight[world, vehicle, target] = sight

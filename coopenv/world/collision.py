@@ -1,0 +1,92 @@
+"""Stage 6, contact and arrival: boxes that touch (separating axes in the plane and heights), and goals reached."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+UNDER_WAY = wp.constant(0)
+ARRIVED = wp.constant(1)
+COLLIDED = wp.constant(2)
+
+
+@wp.func
+def separated_along(axis: Any, offset: Any, Ra: Any, ha: Any, Rb: Any, hb: Any) -> bool:
+    """Return whether a horizontal axis separates the footprints of two boxes."""
+    reach_a = ha[0] * wp.abs(axis[0] * Ra[0, 0] + axis[1] * Ra[1, 0])
+    reach_a += ha[1] * wp.abs(axis[0] * Ra[0, 1] + axis[1] * Ra[1, 1])
+    reach_b = hb[0] * wp.abs(axis[0] * Rb[0, 0] + axis[1] * Rb[1, 0])
+    reach_b += hb[1] * wp.abs(axis[0] * Rb[0, 1] + axis[1] * Rb[1, 1])
+    return wp.abs(axis[0] * offset[0] + axis[1] * offset[1]) > reach_a + reach_b
+
+
+@wp.func
+def boxes_touch(ca: Any, Ra: Any, ha: Any, cb: Any, Rb: Any, hb: Any) -> bool:
+    """Return whether two upright boxes overlap."""
+    offset = cb - ca
+    if wp.abs(offset[2]) > ha[2] + hb[2]:
+        return False
+    reach = wp.length(ha) + wp.length(hb)
+    if wp.dot(offset, offset) > reach * reach:
+        return False
+    for k in range(2):
+        if separated_along(type(ca)(Ra[0, k], Ra[1, k], ha[0] - ha[0]), offset, Ra, ha, Rb, hb):
+            return False
+        if separated_along(type(ca)(Rb[0, k], Rb[1, k], ha[0] - ha[0]), offset, Ra, ha, Rb, hb):
+            return False
+    return True
+
+
+@wp.func
+def touches_anything(model: Any, state: Any, world: int, vehicle: int) -> int:
+    """Return 1 when a vehicle's box overlaps a building or another body."""
+    agent = model.landmarks + vehicle
+    half = model.scene.body_half[agent]
+    if half[0] <= half.dtype(0.0):
+        return 0
+    R = state.rotation[world, agent]
+    center = state.position[world, agent] + R * model.scene.body_center[agent]
+    for k in range(model.obstacles):
+        if boxes_touch(
+            center,
+            R,
+            half,
+            model.scene.obstacle_center[k],
+            model.scene.obstacle_rotation[k],
+            model.scene.obstacle_half[k],
+        ):
+            return 1
+    for other in range(model.agents):
+        other_half = model.scene.body_half[other]
+        if other != agent and other_half[0] > half.dtype(0.0):
+            other_R = state.rotation[world, other]
+            other_center = state.position[world, other] + other_R * model.scene.body_center[other]
+            if boxes_touch(center, R, half, other_center, other_R, other_half):
+                return 1
+    return 0
+
+
+@wp.func
+def goal_distance(model: Any, state: Any, world: int, vehicle: int):
+    """Return the horizontal distance to the vehicle's goal, m."""
+    to_goal = model.scene.goal[vehicle] - state.position[world, model.landmarks + vehicle]
+    return wp.sqrt(to_goal[0] * to_goal[0] + to_goal[1] * to_goal[1])
+
+
+@wp.func
+def referee(model: Any, before: Any, after: Any, world: int, vehicle: int):
+    """Mark contact, and end the vehicle's episode on a collision or an arrival that counts."""
+    touching = touches_anything(model, after, world, vehicle)
+    ended = before.ended[world, vehicle]
+    if ended == UNDER_WAY:
+        radius = model.scene.goal_radius[vehicle]
+        if touching == 1 and model.scene.end_on_collision == 1:
+            ended = COLLIDED
+        elif model.scene.end_on_arrival == 1 and radius > radius - radius:
+            if goal_distance(model, after, world, vehicle) < radius:
+                ended = ARRIVED
+    after.collided[world, vehicle] = touching
+    after.ended[world, vehicle] = ended

@@ -1,0 +1,106 @@
+"""Stage 1, truth: prescribed motion as a closed form, and the kinematic bicycle with its actuators."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.estimation.so3 import exp_so3, left_jacobian, orthonormalise
+
+wp.set_module_options({"enable_backward": False})
+
+PRESCRIBED = wp.constant(1)
+DRIVEN = wp.constant(2)
+LONGEST_SUBSTEP = wp.constant(wp.float64(0.0100001))
+"""s; the bicycle's twist is held over no longer than this."""
+
+
+@wp.func
+def segment_at(model: Any, agent: int, t: wp.float64) -> int:
+    """Return the index of the segment of an agent's prescribed motion that holds at time t."""
+    low = model.motion.first[agent]
+    high = model.motion.first[agent + 1] - 1
+    while low < high:
+        middle = (low + high + 1) // 2
+        if model.motion.start[middle] <= t:
+            low = middle
+        else:
+            high = middle - 1
+    return low
+
+
+@wp.func
+def prescribe(model: Any, before: Any, after: Any, world: int, agent: int, t: wp.float64):
+    """Set an agent's pose and twist to its prescribed motion at time t."""
+    segment = segment_at(model, agent, t)
+    v = model.motion.linear[segment]
+    w = model.motion.angular[segment]
+    h = v.dtype(t - model.motion.start[segment])
+    step = w * h
+    relative_R = model.motion.rotation[segment]
+    relative_p = model.motion.position[segment] + relative_R * (left_jacobian(step) * (v * h))
+    R0 = before.start_rotation[world, agent]
+    after.rotation[world, agent] = R0 * (relative_R * exp_so3(step))
+    after.position[world, agent] = before.start_position[world, agent] + R0 * relative_p
+    after.velocity[world, agent] = v
+    after.angular_velocity[world, agent] = w
+
+
+@wp.func
+def approach(value: Any, target: Any, dt: Any, lag: Any, rate: Any):
+    """Return the value after a first-order lag towards a target, its rate limited."""
+    change = target - value
+    if lag > type(lag)(0.0):
+        change = change * (type(lag)(1.0) - wp.exp(-dt / lag))
+    return value + wp.clamp(change, -rate * dt, rate * dt)
+
+
+@wp.func
+def actuate(model: Any, speed: Any, steering: Any, command: Any, dt: Any):
+    """Return (speed, steering) after dt under a command in [-1, 1]^2."""
+    d = model.dynamics
+    zero = type(speed)(0.0)
+    one = type(speed)(1.0)
+    if d.acceleration_mode == 1:
+        new_speed = speed + command[0] * d.max_acceleration * dt
+    else:
+        span = (d.max_speed - d.min_speed) * type(speed)(0.5)
+        target = d.min_speed + (command[0] + one) * span
+        new_speed = approach(speed, target, dt, d.speed_lag, d.max_acceleration)
+    angle = wp.clamp(command[1] * d.action_steering, -d.max_steering, d.max_steering)
+    new_steering = approach(steering, angle, dt, d.steering_lag, d.max_steering_rate)
+    return wp.clamp(new_speed, d.min_speed, d.max_speed) + zero, new_steering
+
+
+@wp.func
+def drive(model: Any, before: Any, after: Any, world: int, vehicle: int, command: Any, duration: wp.float64):
+    """Advance a driven vehicle: rear-axle bicycle, its twist held at the mid-point over short steps."""
+    agent = model.landmarks + vehicle
+    R = before.rotation[world, agent]
+    position = before.position[world, agent]
+    speed = before.speed[world, vehicle]
+    steering = before.steering[world, vehicle]
+    v = before.velocity[world, agent]
+    zero = speed - speed
+    steps = int(wp.ceil(duration / LONGEST_SUBSTEP))
+    dt = type(speed)(duration / wp.float64(wp.max(steps, 1)))
+    half = type(speed)(0.5)
+    for _ in range(steps):
+        new_speed, new_steering = actuate(model, speed, steering, command, dt)
+        if before.ended[world, vehicle] != 0:
+            new_speed = zero
+            speed = zero
+        mid_speed = (speed + new_speed) * half
+        rate = mid_speed * wp.tan((steering + new_steering) * half) / model.dynamics.wheelbase
+        step = type(v)(zero, zero, rate * dt)
+        position = position + R * (left_jacobian(step) * type(v)(mid_speed * dt, zero, zero))
+        R = R * exp_so3(step)
+        speed = new_speed
+        steering = new_steering
+    after.rotation[world, agent] = orthonormalise(R)
+    after.position[world, agent] = position
+    after.speed[world, vehicle] = speed
+    after.steering[world, vehicle] = steering
+    after.velocity[world, agent] = type(v)(speed, zero, zero)
+    after.angular_velocity[world, agent] = type(v)(zero, zero, speed * wp.tan(steering) / model.dynamics.wheelbase)

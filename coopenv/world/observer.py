@@ -1,0 +1,202 @@
+"""Stage 5, the embedded observer: the paper's Riccati observer on the measurements of one vehicle.
+
+It reads bearings, odometry increments and received messages only; truth enters through landmarks alone, whose
+positions are known to everybody.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.estimation.linalg import block3, cholesky6, join6
+from coopenv.estimation.riccati import (
+    accumulate_information,
+    correct_kalman,
+    correct_modes,
+    correction_modes,
+    covariance_modes,
+    predict_covariance,
+    predict_pose,
+)
+from coopenv.estimation.so3 import exp_so3, identity3, orthonormalise, skew
+from coopenv.world.camera import VISIBLE, marker_position
+from coopenv.world.v2x import fresh
+
+wp.set_module_options({"enable_backward": False})
+
+MOST_SUBSTEPS = wp.constant(200)
+"""Re-linearisations per tick; the last one takes what remains of the tick."""
+
+
+@wp.func
+def usable(model: Any, state: Any, world: int, vehicle: int, target: int, tick: int) -> bool:
+    """Return whether the observer can use this target now: seen, and its position known or heard."""
+    if state.sight[world, vehicle, target] != VISIBLE:
+        return False
+    if target < model.landmarks:
+        return True
+    return fresh(model, state, world, vehicle, target - model.landmarks, tick)
+
+
+@wp.func
+def known_position(model: Any, state: Any, world: int, vehicle: int, target: int):
+    """Return where a target is: a landmark's known place, or a neighbour's message (Rhat_j phat_j)."""
+    if target < model.landmarks:
+        return marker_position(model, state, world, target)
+    sender = target - model.landmarks
+    R = state.inbox_rotation[world, vehicle, sender]
+    return state.inbox_position[world, vehicle, sender] + R * model.scene.marker[target]
+
+
+@wp.func
+def information(model: Any, state: Any, world: int, vehicle: int, tick: int, R: Any, p: Any):
+    """Return the blocks of M = C^T Q C and r = C^T Q (y - C_2 phat) over all usable targets at (Rhat, phat)."""
+    o = p - p
+    M11 = R - R
+    M12 = R - R
+    M22 = R - R
+    r1 = o
+    r2 = o
+    for target in range(model.agents):
+        if usable(model, state, world, vehicle, target, tick):
+            b = model.camera.rotation * state.bearing[world, vehicle, target]
+            a = wp.transpose(R) * known_position(model, state, world, vehicle, target)
+            e = a - model.camera.position - p
+            M11, M12, M22, r1, r2 = accumulate_information(
+                a, b, e, model.observer.q[target], M11, M12, M22, r1, r2
+            )
+    return M11, M12, M22, r1, r2
+
+
+@wp.func
+def predict(model: Any, before: Any, after: Any, world: int, vehicle: int, dt: Any):
+    """Carry the estimate and P through one tick of odometry."""
+    rotation = after.increment_rotation[world, vehicle]
+    R, p = predict_pose(
+        before.estimate_rotation[world, vehicle],
+        before.estimate_position[world, vehicle],
+        rotation,
+        after.increment_translation[world, vehicle],
+    )
+    P = before.covariance[world, vehicle]
+    E = wp.transpose(rotation)
+    o = R - R
+    A, B, D = predict_covariance(
+        E,
+        block3(P, 0, 0, o),
+        block3(P, 0, 3, o),
+        block3(P, 3, 3, o),
+        model.observer.v1 * dt,
+        model.observer.v2 * dt,
+    )
+    after.estimate_rotation[world, vehicle] = R
+    after.estimate_position[world, vehicle] = p
+    after.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D, P - P)
+
+
+@wp.func
+def shrink(turn: Any, limit: Any):
+    """Return the factor by which to shorten a correction that would turn the attitude too far."""
+    return wp.clamp(type(turn)(0.9) * limit / turn, type(turn)(0.1), type(turn)(0.9))
+
+
+@wp.func
+def correct(model: Any, state: Any, world: int, vehicle: int, tick: int, duration: Any):
+    """Let the bearings act for `duration`, re-linearising whenever the attitude has turned by max_turn."""
+    R = state.estimate_rotation[world, vehicle]
+    p = state.estimate_position[world, vehicle]
+    P = state.covariance[world, vehicle]
+    k = model.observer.k[vehicle]
+    limit = model.observer.max_turn
+    one = type(duration)(1.0)
+    zero6 = P - P
+    identity6 = join6(identity3(p), R - R, R - R, identity3(p), zero6)
+    A = block3(P, 0, 0, R - R)
+    B = block3(P, 0, 3, R - R)
+    D = block3(P, 3, 3, R - R)
+    remaining = duration
+    substeps = int(0)
+    while remaining > duration * type(duration)(1.0e-9):
+        M11, M12, M22, r1, r2 = information(model, state, world, vehicle, tick, R, p)
+        L11, L21, L22 = cholesky6(A, B, D)
+        h = remaining
+        substeps += 1
+        if k == one:
+            dx1, dx2, A1, B1, D1 = correct_kalman(h, M11, M12, M22, L11, L21, L22, r1, r2)
+            turn = wp.length(dx1)
+            while turn > limit and substeps < MOST_SUBSTEPS:
+                h = h * shrink(turn, limit)
+                dx1, dx2, A1, B1, D1 = correct_kalman(h, M11, M12, M22, L11, L21, L22, r1, r2)
+                turn = wp.length(dx1)
+        else:
+            T, spectrum = correction_modes(M11, M12, M22, L11, L21, L22, zero6, identity6)
+            dx1, dx2 = correct_modes(k, h, T, spectrum, r1, r2)
+            turn = wp.length(dx1)
+            while turn > limit and substeps < MOST_SUBSTEPS:
+                h = h * shrink(turn, limit)
+                dx1, dx2 = correct_modes(k, h, T, spectrum, r1, r2)
+                turn = wp.length(dx1)
+            P1 = covariance_modes(h, T, spectrum)
+            A1 = block3(P1, 0, 0, R - R)
+            B1 = block3(P1, 0, 3, R - R)
+            D1 = block3(P1, 3, 3, R - R)
+        R = orthonormalise(R * exp_so3(dx1))
+        p = p + dx2
+        A = A1
+        B = B1
+        D = D1
+        remaining = remaining - h
+    state.estimate_rotation[world, vehicle] = R
+    state.estimate_position[world, vehicle] = p
+    state.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D, zero6)
+
+
+@wp.func
+def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: int, dt: Any):
+    """Add this tick's C^T C dt to the current block of the sliding observability Gramian.
+
+    In map axes the transition matrix of A_i is the identity, so that blocks simply add up; the spectrum is the same
+    as in the body frame of the window's start. C is taken at the estimate, as the observer itself knows it.
+    """
+    block = (tick // model.observer.block_ticks) % model.observer.blocks
+    R = state.estimate_rotation[world, vehicle]
+    p = state.estimate_position[world, vehicle]
+    G11 = R - R
+    G12 = R - R
+    G22 = R - R
+    time = dt - dt
+    if tick % model.observer.block_ticks != 0:
+        G11 = state.gramian_11[world, vehicle, block]
+        G12 = state.gramian_12[world, vehicle, block]
+        G22 = state.gramian_22[world, vehicle, block]
+        time = state.gramian_time[world, vehicle, block]
+    i3 = identity3(p)
+    for target in range(model.agents):
+        if usable(model, state, world, vehicle, target, tick):
+            b = R * (model.camera.rotation * state.bearing[world, vehicle, target])
+            z = known_position(model, state, world, vehicle, target)
+            m = wp.cross(z, b)
+            G11 += dt * (wp.dot(z, z) * i3 - wp.outer(z, z) - wp.outer(m, m))
+            G12 += dt * (skew(z) - wp.outer(m, b))
+            G22 += dt * (i3 - wp.outer(b, b))
+    state.gramian_11[world, vehicle, block] = G11
+    state.gramian_12[world, vehicle, block] = G12
+    state.gramian_22[world, vehicle, block] = G22
+    state.gramian_time[world, vehicle, block] = time + dt
+
+
+@wp.func
+def estimate(model: Any, before: Any, after: Any, world: int, vehicle: int, tick: int):
+    """Run one tick of the observer of one vehicle: predict, and correct when its rate says so."""
+    dt = type(model.observer.max_turn)(wp.float64(1.0) / model.camera_rate)
+    predict(model, before, after, world, vehicle, dt)
+    due_before = wp.floor(wp.float64(tick - 1) * model.observer.rate / model.camera_rate + wp.float64(1.0e-9))
+    due_now = wp.floor(wp.float64(tick) * model.observer.rate / model.camera_rate + wp.float64(1.0e-9))
+    last = before.corrected_tick[world, vehicle]
+    if due_now > due_before:
+        correct(model, after, world, vehicle, tick, dt * type(dt)(tick - last))
+        last = tick
+    after.corrected_tick[world, vehicle] = last
+    accumulate_gramian(model, after, world, vehicle, tick, dt)

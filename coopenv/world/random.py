@@ -1,0 +1,87 @@
+"""Counter-based random numbers: Philox4x32-10 (Salmon, Moraes, Dror, Shaw, SC 2011).
+
+A draw is a pure function of (seed, episode, index, subject, stream), so a world has the same noise whatever the
+batch size, the order of execution and the device. `index` is a tick or a sample number, `subject` packs the agents
+concerned, and `stream` is one of the constants below.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+vec4u = wp.types.vector(4, wp.uint32)
+
+RESET_POSE = wp.constant(wp.uint32(1))
+RESET_ESTIMATE_POSITION = wp.constant(wp.uint32(2))
+RESET_ESTIMATE_ORIENTATION = wp.constant(wp.uint32(3))
+ODOMETRY_LINEAR = wp.constant(wp.uint32(4))
+ODOMETRY_ANGULAR = wp.constant(wp.uint32(5))
+BEARING = wp.constant(wp.uint32(6))
+RADIO = wp.constant(wp.uint32(7))
+
+
+@wp.func
+def philox(counter: vec4u, key0: wp.uint32, key1: wp.uint32) -> vec4u:
+    """Return four independent 32-bit words for a 128-bit counter and a 64-bit key."""
+    c = counter
+    k0 = key0
+    k1 = key1
+    for _ in range(10):
+        product0 = wp.uint64(wp.uint32(0xD2511F53)) * wp.uint64(c[0])
+        product1 = wp.uint64(wp.uint32(0xCD9E8D57)) * wp.uint64(c[2])
+        high0 = wp.uint32(product0 >> wp.uint64(32))
+        high1 = wp.uint32(product1 >> wp.uint64(32))
+        c = vec4u(high1 ^ c[1] ^ k0, wp.uint32(product1), high0 ^ c[3] ^ k1, wp.uint32(product0))
+        k0 = k0 + wp.uint32(0x9E3779B9)
+        k1 = k1 + wp.uint32(0xBB67AE85)
+    return c
+
+
+@wp.func
+def draw(seed: wp.uint64, episode: wp.uint32, index: int, subject: int, stream: wp.uint32) -> vec4u:
+    """Return four random words of one stream."""
+    counter = vec4u(wp.uint32(index), wp.uint32(subject), stream, episode)
+    return philox(counter, wp.uint32(seed), wp.uint32(seed >> wp.uint64(32)))
+
+
+@wp.func
+def uniform(word: wp.uint32, one: Any):
+    """Return a number in (0, 1), in the precision of `one`."""
+    return (type(one)(word) + type(one)(0.5)) * type(one)(2.3283064365386963e-10)
+
+
+@wp.func
+def signed_uniform(word: wp.uint32, one: Any):
+    """Return a number in (-1, 1)."""
+    return uniform(word, one) * type(one)(2.0) - one
+
+
+@wp.func
+def gaussian_pair(word0: wp.uint32, word1: wp.uint32, one: Any):
+    """Return two independent standard normal numbers (Box-Muller)."""
+    radius = wp.sqrt(type(one)(-2.0) * wp.log(uniform(word0, one)))
+    angle = uniform(word1, one) * type(one)(6.283185307179586)
+    return radius * wp.cos(angle), radius * wp.sin(angle)
+
+
+@wp.func
+def gaussian3(words: vec4u, zero: Any):
+    """Return a vector of three independent standard normal numbers, in the type of `zero`."""
+    one = zero.dtype(1.0)
+    x, y = gaussian_pair(words[0], words[1], one)
+    z, _ = gaussian_pair(words[2], words[3], one)
+    return type(zero)(x, y, z)
+
+
+@wp.func
+def unit_vector(word0: wp.uint32, word1: wp.uint32, zero: Any):
+    """Return a direction uniform on the sphere."""
+    one = zero.dtype(1.0)
+    z = signed_uniform(word0, one)
+    r = wp.sqrt(wp.max(one - z * z, zero.dtype(0.0)))
+    angle = uniform(word1, one) * zero.dtype(6.283185307179586)
+    return type(zero)(r * wp.cos(angle), r * wp.sin(angle), z)

@@ -1,0 +1,164 @@
+"""Start an episode: draw poses and initial estimates, take the first frame, send the first messages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.estimation.linalg import join6
+from coopenv.estimation.so3 import exp_so3, identity3, orthonormalise
+from coopenv.world.camera import observe
+from coopenv.world.collision import touches_anything
+from coopenv.world.dynamics import DRIVEN, PRESCRIBED, prescribe
+from coopenv.world.random import (
+    RESET_ESTIMATE_ORIENTATION,
+    RESET_ESTIMATE_POSITION,
+    RESET_POSE,
+    draw,
+    gaussian_pair,
+    signed_uniform,
+    uniform,
+    unit_vector,
+)
+from coopenv.world.v2x import broadcast, deliver
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def place_agent(model: Any, state: Any, world: int, agent: int):
+    """Draw the true start pose of one agent and set its motion going."""
+    position = model.start.position[agent]
+    R = model.start.rotation[agent]
+    spread = model.start.position_spread[agent]
+    o = position - position
+    one = o.dtype(1.0)
+    words = draw(state.seed[world], state.episode[world], 0, agent, RESET_POSE)
+    offset = type(o)(
+        spread[0] * signed_uniform(words[0], one),
+        spread[1] * signed_uniform(words[1], one),
+        spread[2] * signed_uniform(words[2], one),
+    )
+    turn = model.start.yaw_spread[agent] * signed_uniform(words[3], one)
+    position = position + R * offset
+    if turn != o[0]:
+        R = R * exp_so3(type(o)(o[0], o[0], turn))
+    state.start_position[world, agent] = position
+    state.start_rotation[world, agent] = R
+    state.position[world, agent] = position
+    state.rotation[world, agent] = R
+    state.velocity[world, agent] = o
+    state.angular_velocity[world, agent] = o
+    if model.motion.kind[agent] == PRESCRIBED:
+        prescribe(model, state, state, world, agent, wp.float64(0.0))
+
+
+@wp.func
+def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
+    """Reset the vehicle's actuators, odometry and counters."""
+    agent = model.landmarks + vehicle
+    o = state.velocity[world, agent] - state.velocity[world, agent]
+    speed = model.start.speed[vehicle]
+    state.speed[world, vehicle] = speed
+    state.steering[world, vehicle] = o[0]
+    # The action in force before the first decision keeps the start speed, or accelerates by nothing.
+    level = o[0]
+    if model.dynamics.acceleration_mode == 0:
+        span = model.dynamics.max_speed - model.dynamics.min_speed
+        level = (speed - model.dynamics.min_speed) * o.dtype(2.0) / span - o.dtype(1.0)
+    command = state.command[world, vehicle]
+    state.command[world, vehicle] = type(command)(level, o[0])
+    if model.motion.kind[agent] == DRIVEN:
+        state.velocity[world, agent] = type(o)(speed, o[0], o[0])
+    state.ended[world, vehicle] = 0
+    state.odometry_velocity[world, vehicle] = o
+    state.odometry_angular_velocity[world, vehicle] = o
+    state.odometry_samples[world, vehicle] = 0
+    state.increment_rotation[world, vehicle] = identity3(o)
+    state.increment_translation[world, vehicle] = o
+    state.corrected_tick[world, vehicle] = 0
+    for target in range(model.agents):
+        state.bearing[world, vehicle, target] = o
+        state.bearing_tick[world, vehicle, target] = -1
+    for slot in range(model.radio.slots):
+        state.outbox_tick[world, vehicle, slot] = -1
+    for sender in range(model.vehicles):
+        state.inbox_tick[world, vehicle, sender] = -1
+        state.inbox_position[world, vehicle, sender] = o
+        state.inbox_rotation[world, vehicle, sender] = identity3(o)
+    for block in range(model.observer.blocks):
+        R = state.rotation[world, agent]
+        state.gramian_11[world, vehicle, block] = R - R
+        state.gramian_12[world, vehicle, block] = R - R
+        state.gramian_22[world, vehicle, block] = R - R
+        state.gramian_time[world, vehicle, block] = o[0]
+
+
+@wp.func
+def random_turn(largest: Any, words: Any, zero: Any):
+    """Return a random rotation vector: angle uniform in [0, largest]; uniform over SO(3) if largest < 0.
+
+    Over SO(3) the angle's distribution is (angle - sin(angle)) / pi; it is inverted by bisection.
+    """
+    axis = unit_vector(words[0], words[1], zero)
+    u = uniform(words[2], zero[0])
+    if largest >= zero[0]:
+        return axis * (largest * u)
+    pi = zero.dtype(3.141592653589793)
+    low = zero[0]
+    high = pi
+    for _ in range(50):
+        middle = (low + high) * zero.dtype(0.5)
+        if (middle - wp.sin(middle)) / pi < u:
+            low = middle
+        else:
+            high = middle
+    return axis * ((low + high) * zero.dtype(0.5))
+
+
+@wp.func
+def believe(model: Any, state: Any, world: int, vehicle: int):
+    """Draw the initial estimate and set P(0)."""
+    agent = model.landmarks + vehicle
+    seed = state.seed[world]
+    episode = state.episode[world]
+    o = state.position[world, agent] - state.position[world, agent]
+    position = model.start.estimate_position[vehicle]
+    if model.start.estimate_fixed[vehicle] == 0:
+        position = position + state.position[world, agent]
+    words = draw(seed, episode, 0, vehicle, RESET_ESTIMATE_POSITION)
+    third = o.dtype(1.0 / 3.0)
+    radius = model.start.estimate_radius[vehicle] * wp.pow(uniform(words[2], third), third)
+    position = position + unit_vector(words[0], words[1], o) * radius
+    R = model.start.estimate_rotation[vehicle]
+    if model.start.orientation_fixed[vehicle] == 0:
+        R = state.rotation[world, agent] * R
+    words = draw(seed, episode, 0, vehicle, RESET_ESTIMATE_ORIENTATION)
+    turn = random_turn(model.start.orientation_angle[vehicle], words, o)
+    R = orthonormalise(R * exp_so3(turn))
+    state.estimate_rotation[world, vehicle] = R
+    state.estimate_position[world, vehicle] = wp.transpose(R) * position
+    P = state.covariance[world, vehicle]
+    i3 = identity3(o)
+    state.covariance[world, vehicle] = join6(
+        model.observer.p1 * i3, R - R, R - R, model.observer.p2 * i3, P - P
+    )
+
+
+@wp.func
+def reset_world(model: Any, state: Any, world: int):
+    """Start a new episode in one world; its seed and episode number are already set."""
+    state.tick[world] = 0
+    for agent in range(model.agents):
+        place_agent(model, state, world, agent)
+    for vehicle in range(model.vehicles):
+        place_vehicle(model, state, world, vehicle)
+        believe(model, state, world, vehicle)
+    for vehicle in range(model.vehicles):
+        state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
+    for place in range(model.vehicles):
+        vehicle = model.order[place]
+        observe(model, state, state, world, vehicle, 0)
+        deliver(model, state, state, world, vehicle, 0)
+        broadcast(model, state, state, world, vehicle, 0)

@@ -1,0 +1,77 @@
+"""The pipeline of one camera tick, and the kernels that run it for every world."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.world.camera import observe
+from coopenv.world.collision import referee
+from coopenv.world.dynamics import PRESCRIBED, prescribe
+from coopenv.world.observer import estimate
+from coopenv.world.odometry import measure_motion
+from coopenv.world.reset import reset_world
+from coopenv.world.v2x import broadcast, deliver
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def command_in_force(model: Any, before: Any, world: int, vehicle: int, action: Any, elapsed: int):
+    """Return the action that the actuators follow `elapsed` ticks after a decision, given their dead time."""
+    if elapsed < model.dynamics.latency_ticks:
+        return before.command[world, vehicle]
+    return action
+
+
+@wp.func
+def move(model: Any, before: Any, after: Any, actions: Any, world: int, tick: int, elapsed: int):
+    """Carry all truth of one world to the tick's end and sample odometry on the way."""
+    t = wp.float64(tick) / model.camera_rate
+    for agent in range(model.agents):
+        if model.motion.kind[agent] == PRESCRIBED:
+            prescribe(model, before, after, world, agent, t)
+    for vehicle in range(model.vehicles):
+        command = command_in_force(model, before, world, vehicle, actions[world, vehicle], elapsed)
+        measure_motion(model, before, after, world, vehicle, command, tick)
+
+
+@wp.func
+def tick_world(model: Any, before: Any, after: Any, actions: Any, world: int, elapsed: int):
+    """Run one camera tick of one world: truth -> camera -> V2X -> observer -> V2X, leaders before followers."""
+    tick = before.tick[world] + 1
+    move(model, before, after, actions, world, tick, elapsed)
+    for vehicle in range(model.vehicles):
+        referee(model, before, after, world, vehicle)
+    for place in range(model.vehicles):
+        vehicle = model.order[place]
+        observe(model, before, after, world, vehicle, tick)
+        deliver(model, before, after, world, vehicle, tick)
+        estimate(model, before, after, world, vehicle, tick)
+        broadcast(model, before, after, world, vehicle, tick)
+    after.tick[world] = tick
+
+
+@wp.kernel
+def advance_kernel(model: Any, before: Any, after: Any, actions: wp.array2d(dtype=Any), ticks: int):
+    """Advance every world by up to `ticks` camera ticks, not beyond the horizon. One thread per world."""
+    world = wp.tid()
+    first = before.tick[world]
+    count = wp.min(ticks, model.horizon_ticks - first)
+    for elapsed in range(count):
+        if elapsed == 0:
+            tick_world(model, before, after, actions, world, elapsed)
+        else:
+            tick_world(model, after, after, actions, world, elapsed)
+    if count > 0:
+        for vehicle in range(model.vehicles):
+            after.command[world, vehicle] = actions[world, vehicle]
+
+
+@wp.kernel
+def reset_kernel(model: Any, state: Any, mask: wp.array(dtype=wp.int32)):
+    """Start a new episode in every world whose mask is set. One thread per world."""
+    world = wp.tid()
+    if mask[world] != 0:
+        reset_world(model, state, world)

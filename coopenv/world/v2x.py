@@ -1,0 +1,64 @@
+"""Stage 4, V2X: pose estimates travel with delay, period, loss and limited range."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.world.random import RADIO, draw, uniform
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def broadcast(model: Any, before: Any, after: Any, world: int, vehicle: int, tick: int):
+    """Put this vehicle's estimate (Rhat, Rhat phat) on the air if a message is due."""
+    slot = tick % model.radio.slots
+    sent = int(-1)
+    if tick % model.radio.period == 0:
+        sent = tick
+        R = after.estimate_rotation[world, vehicle]
+        after.outbox_rotation[world, vehicle, slot] = R
+        after.outbox_position[world, vehicle, slot] = R * after.estimate_position[world, vehicle]
+    after.outbox_tick[world, vehicle, slot] = sent
+
+
+@wp.func
+def deliver(model: Any, before: Any, after: Any, world: int, receiver: int, tick: int):
+    """Receive what arrives at this tick from the neighbours that may be heard.
+
+    With delay 0 a follower hears its leaders' estimates of this very tick; a sender later in the order than
+    its receiver (possible only without the acyclic restriction) is heard one tick late.
+    """
+    here = after.position[world, model.landmarks + receiver]
+    for sender in range(model.vehicles):
+        if model.neighbour[receiver, model.landmarks + sender] == 1:
+            lag = model.radio.delay
+            if lag == 0 and model.rank[sender] > model.rank[receiver]:
+                lag = int(1)
+            due = tick - lag
+            slot = wp.max(due, 0) % model.radio.slots
+            if due >= 0 and after.outbox_tick[world, sender, slot] == due:
+                heard = int(1)
+                there = after.position[world, model.landmarks + sender]
+                if wp.length(there - here) > model.radio.range:
+                    heard = int(0)
+                if model.radio.loss > model.radio.loss - model.radio.loss:
+                    subject = receiver * 65536 + sender
+                    words = draw(before.seed[world], before.episode[world], tick, subject, RADIO)
+                    if uniform(words[0], model.radio.loss) < model.radio.loss:
+                        heard = int(0)
+                if heard == 1:
+                    after.inbox_rotation[world, receiver, sender] = after.outbox_rotation[world, sender, slot]
+                    after.inbox_position[world, receiver, sender] = after.outbox_position[world, sender, slot]
+                    after.inbox_tick[world, receiver, sender] = due
+
+
+@wp.func
+def fresh(model: Any, state: Any, world: int, receiver: int, sender: int, tick: int) -> bool:
+    """Return whether a message has been heard and is not older than the staleness limit."""
+    sent = state.inbox_tick[world, receiver, sender]
+    if sent < 0:
+        return False
+    return wp.float64(tick - sent) / model.camera_rate <= model.radio.staleness

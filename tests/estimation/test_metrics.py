@@ -1,0 +1,230 @@
+"""The measures against SciPy's rotations, closed forms and a synthetic run whose errors are known by construction."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from coopenv.estimation import metrics
+from tests.synthetic import INITIAL_ERROR, RATE, make_trajectory
+
+unit_vectors = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-2)
+angles_deg = st.one_of(
+    st.floats(0, 180), st.floats(-12, -1).map(lambda e: 10**e), st.floats(-9, -1).map(lambda e: 180 - 10**e)
+)
+
+
+def rotation(axis: tuple[float, ...], angle_deg: float) -> np.ndarray:
+    return Rotation.from_rotvec(np.radians(angle_deg) * np.array(axis) / np.linalg.norm(axis)).as_matrix()
+
+
+@given(unit_vectors, angles_deg)
+def test_quaternion_is_axis_sine_of_half_the_angle(axis: tuple[float, ...], angle: float) -> None:
+    q = metrics.quaternion_wxyz(rotation(axis, angle))
+    half = math.radians(angle) / 2
+    expected = np.array([math.cos(half), *(math.sin(half) * np.array(axis) / np.linalg.norm(axis))])
+    if angle > 180 - 1e-6:  # q and -q are one rotation, and which one rounding decides
+        expected *= np.sign(expected @ q)
+    assert_allclose(q, expected, atol=4e-16)
+    assert q[0] >= 0
+
+
+@given(unit_vectors, angles_deg)
+def test_orientation_error_is_accurate_at_both_ends(axis: tuple[float, ...], angle: float) -> None:
+    error = float(metrics.orientation_error_deg(np.eye(3), rotation(axis, angle)))
+    assert error == pytest.approx(angle, rel=1e-12, abs=1e-14)
+
+
+@pytest.mark.parametrize("angle", [1e-12, 1e-9, 1e-6, 1e-3])
+def test_orientation_error_resolves_tiny_angles_where_acos_does_not(angle: float) -> None:
+    R = Rotation.from_euler("zyx", [0.3, -0.7, 1.1]).as_matrix()
+    error = float(metrics.orientation_error_deg(R, R @ rotation((1, 2, 3), angle)))
+    assert error == pytest.approx(angle, abs=3e-14)
+
+
+def test_orientation_error_of_half_turns_is_180_exactly() -> None:
+    half_turns = np.array([np.diag(d) for d in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1])], float)
+    assert metrics.orientation_error_deg(half_turns, np.eye(3)).tolist() == [180.0] * 3
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=30)
+def test_orientation_error_is_symmetric_and_independent_of_the_frames(seed: int) -> None:
+    R, R_hat, Q = Rotation.random(3, random_state=seed).as_matrix()
+    error = metrics.orientation_error_deg(R, R_hat)
+    assert_allclose(metrics.orientation_error_deg(R_hat, R), error, atol=1e-10)
+    assert_allclose(metrics.orientation_error_deg(Q @ R, Q @ R_hat), error, atol=1e-10)
+    assert_allclose(metrics.orientation_error_deg(R @ Q, R_hat @ Q), error, atol=1e-10)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=30)
+def test_roll_pitch_yaw_agrees_with_scipy(seed: int) -> None:
+    R = Rotation.random(20, random_state=seed)
+    assert_allclose(metrics.roll_pitch_yaw_deg(R.as_matrix()), R.as_euler("xyz", degrees=True), atol=1e-9)
+
+
+def test_position_error_is_the_distance() -> None:
+    assert metrics.position_error(np.array([[1.0, 2, 3]]), np.array([[1.0, 5, 7]])).tolist() == [5.0]
+
+
+def test_error_coordinates_to_first_order() -> None:
+    """A turn theta and a shift delta of the estimate, both in its body frame: (2 lambda, p - phat) to first order."""
+    rng = np.random.default_rng(3)
+    R = Rotation.random(random_state=3).as_matrix()
+    position, theta, delta = (
+        rng.standard_normal(3),
+        1e-6 * rng.standard_normal(3),
+        1e-6 * rng.standard_normal(3),
+    )
+    R_hat = R @ Rotation.from_rotvec(theta).as_matrix().T  # Rtilde = Exp(theta)
+    position_estimate = R_hat @ (R.T @ position - delta)
+    error = metrics.error_coordinates(position, R, position_estimate, R_hat)
+    assert_allclose(error, np.concatenate([theta, delta]), atol=1e-12)
+
+
+def test_synthetic_errors_and_nees_are_recovered() -> None:
+    run = make_trajectory(ticks=200, noise=0.02, yaw_rate=0.4)
+    assert_allclose(
+        metrics.position_error(run.position, run.position_estimate), run.position_error, rtol=1e-10
+    )
+    assert_allclose(
+        metrics.orientation_error_deg(run.rotation, run.rotation_estimate), run.orientation_error, rtol=1e-9
+    )
+    error = metrics.error_coordinates(
+        run.position, run.rotation, run.position_estimate, run.rotation_estimate
+    )
+    assert_allclose(metrics.nees(error, run.covariance), run.nees, rtol=1e-8)
+
+
+def test_nees_of_a_consistent_observer_has_the_mean_and_variance_of_chi_square() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((6, 6))
+    errors = rng.standard_normal((40_000, 6)) @ root.T
+    values = metrics.nees(errors, np.broadcast_to(root @ root.T, (40_000, 6, 6)))
+    assert values.mean() == pytest.approx(6.0, abs=0.1)
+    assert values.var() == pytest.approx(12.0, abs=0.6)
+
+
+def test_nees_is_nan_where_there_is_no_covariance() -> None:
+    P = np.stack([np.eye(6), np.zeros((6, 6)), np.full((6, 6), np.nan), -np.eye(6)])
+    assert_allclose(metrics.nees(np.ones((4, 6)), P), [6.0, np.nan, np.nan, np.nan])
+
+
+@pytest.mark.parametrize(
+    ("position", "orientation", "expected"),
+    [
+        ([1, 0.05, 0.05, 0.05], [0, 0, 0, 0], 1.0),
+        ([0.05, 0.05, 0.2, 0.05], [0, 0, 0, 0], 3.0),  # a passing visit does not count
+        ([0.05, 0.05, 0.05, 0.05], [5, 5, 0.5, 0.5], 2.0),  # both errors must be small
+        ([0.05, 0.05, 0.05, 0.1], [0, 0, 0, 0], math.nan),  # the tolerance itself is not below it
+        ([0.05, 0.05, math.nan, 0.05], [0, 0, 0, 0], 3.0),
+        ([0, 0, 0, 0], [0, 0, 0, 0], 0.0),
+    ],
+)
+def test_settling_time(position: list[float], orientation: list[float], expected: float) -> None:
+    t = np.arange(4.0)
+    assert_allclose(metrics.settling_time(t, np.array(position), np.array(orientation)), expected)
+
+
+def test_settling_time_of_an_exponential_in_closed_form() -> None:
+    run = make_trajectory()
+    settled = metrics.settling_time(run.t, run.position_error, run.orientation_error)
+    need_position = np.log(np.linalg.norm(INITIAL_ERROR, axis=-1) / 0.1) / RATE
+    need_orientation = np.log(90.0) / RATE
+    expected = np.maximum(need_position, need_orientation)
+    assert np.all((settled >= expected) & (settled < expected + 1 / 60 + 1e-9))
+
+
+def test_steady_rmse_counts_only_the_ticks_after_the_burn_in() -> None:
+    t, error = np.arange(4.0), np.array([[100.0], [50.0], [3.0], [4.0]])
+    assert_allclose(metrics.steady_rmse(t, error, 1.0), [math.sqrt(12.5)])
+    assert np.isnan(metrics.steady_rmse(t, error, 10.0)).all()
+
+
+@given(st.floats(0.05, 5), st.floats(0.1, 100), st.floats(1e-4, 1e-2))
+@settings(max_examples=40)
+def test_rate_fit_recovers_an_exponential(rate: float, scale: float, floor: float) -> None:
+    t = np.linspace(0, 12 / rate, 2000)
+    fit = metrics.fit_exponential_rate(t, scale * np.exp(-rate * t), noise_floor=scale * floor)
+    assert fit.rate == pytest.approx(rate, rel=1e-9)
+    assert fit.low <= fit.rate * (1 + 1e-9) and fit.high >= fit.rate * (1 - 1e-9)
+
+
+def test_rate_fit_is_robust_and_bounded_by_the_noise_floor() -> None:
+    rng = np.random.default_rng(1)
+    t = np.linspace(0, 30, 1801)
+    error = 10 * np.exp(-0.8 * t + 0.05 * rng.standard_normal(len(t))) + 0.02 * np.abs(
+        rng.standard_normal(len(t))
+    )
+    error[::17] *= 1.6
+    fit = metrics.fit_exponential_rate(t, error)
+    assert fit.rate == pytest.approx(0.8, abs=0.03)
+    assert 0 < fit.low < fit.rate < fit.high
+    assert fit.high - fit.low < 0.06
+    last = np.log(10 / (3 * np.median(error[-360:]))) / 0.8  # the noise floor, not the record, ends the fit
+    assert fit.samples <= (last - np.log(2) / 0.8 + 1) * 60
+
+
+def test_rate_fit_starts_after_the_last_excursion() -> None:
+    t = np.linspace(0, 40, 2401)
+    error = np.where(t < 10, 10.0 + 12.0 * np.sin(t) ** 2, 10.0 * np.exp(-0.5 * (t - 10)))
+    assert metrics.fit_exponential_rate(t, error).rate == pytest.approx(0.5, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    "error", [np.full(100, 4.0), np.zeros(100), np.full(100, np.nan), np.append(9.0, np.full(99, 1e-9))]
+)
+def test_rate_fit_without_a_descent_is_nan(error: np.ndarray) -> None:
+    fit = metrics.fit_exponential_rate(np.arange(100.0), error)
+    assert np.isnan([fit.rate, fit.low, fit.high]).all()
+    assert fit.samples < 10
+
+
+def test_summary_of_the_synthetic_run() -> None:
+    rows = metrics.summarise(make_trajectory(), steady_from=40.0)
+    assert [row["vehicle"] for row in rows] == [f"vehicle_{i}" for i in range(1, 6)]
+    for row, initial, rate in zip(rows, np.linalg.norm(INITIAL_ERROR, axis=-1), RATE, strict=True):
+        assert row["initial_position_error_m"] == pytest.approx(initial)
+        assert row["initial_orientation_error_deg"] == pytest.approx(90.0)
+        assert row["rate_per_s"] == pytest.approx(rate, rel=1e-6)
+        mean_square = initial**2 * (math.exp(-80 * rate) - math.exp(-100 * rate)) / (2 * rate * 10)
+        assert row["steady_position_rmse_m"] == pytest.approx(math.sqrt(mean_square), rel=0.02)
+        assert row["steady_orientation_rmse_deg"] == pytest.approx(
+            90 / initial * math.sqrt(mean_square), rel=0.02
+        )
+        assert row["final_position_error_m"] == pytest.approx(initial * math.exp(-50 * rate))
+        assert row["mirrored"] is False
+    assert rows[3]["mean_targets_in_view"] == pytest.approx(
+        3 - np.mean(np.sin(3 * np.arange(3001) / 60) > 0.97)
+    )
+
+
+def test_mirror_is_told_by_the_end_of_the_run() -> None:
+    assert metrics.mirrored(np.array([[179.0, 10.0, 0.0], [2.0, 178.0, 149.0]])).tolist() == [
+        False,
+        True,
+        False,
+    ]
+
+
+def test_json_ready_survives_a_strict_encoder() -> None:
+    value = {
+        "a": np.float64("nan"),
+        "b": [math.inf, np.int64(3), np.array([1.0, np.nan])],
+        "c": (True, "x", None),
+    }
+    encoded = json.dumps(metrics.json_ready(value), allow_nan=False)
+    assert json.loads(encoded) == {"a": None, "b": [None, 3, [1.0, None]], "c": [True, "x", None]}
+    assert all(
+        isinstance(v, str | float | bool)
+        for row in metrics.summarise(make_trajectory(60), 9.0)
+        for v in row.values()
+    )

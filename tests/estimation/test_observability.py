@@ -1,0 +1,226 @@
+"""The Gramian against an ODE solver on the theorem's own formula, and against geometries with known rank."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from coopenv.estimation.observability import analyse_observability, observability_gramian
+from coopenv.estimation.trajectory import Sight, Trajectory
+from tests.synthetic import LANDMARKS, NEIGHBOURS, START, VELOCITY, make_trajectory
+
+YAW_RATE = 0.7
+
+
+def skew(v: np.ndarray) -> np.ndarray:
+    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+
+
+def scene(position: np.ndarray, targets: np.ndarray, ticks: int = 61) -> Trajectory:
+    """Return one vehicle along `position` (K, 3) or resting at a point (3,), seeing all of the resting `targets` (T, 3)."""
+    run = make_trajectory(ticks)
+    path = np.broadcast_to(position, (ticks, 3))[:, None]
+    per_vehicle = {
+        field.name: getattr(run, field.name)[:, :1]
+        for field in dataclasses.fields(run)
+        if field.name not in ("t", "vehicles", "targets", "target_moving", "target_position")
+    }
+    seen = np.ones((ticks, 1, len(targets)), bool)
+    return dataclasses.replace(
+        run,
+        **per_vehicle
+        | {"position": path, "visible": seen, "sight": np.where(seen, Sight.VISIBLE, 0)}
+        | {"target_position": np.broadcast_to(targets, (ticks, *targets.shape))}
+        | {"vehicles": run.vehicles[:1], "targets": np.array([f"landmark_{i}" for i in range(len(targets))])}
+        | {"target_moving": np.zeros(len(targets), bool)},
+    )
+
+
+def shifted(run: Trajectory, offset: np.ndarray) -> Trajectory:
+    return dataclasses.replace(
+        run, position=run.position + offset, target_position=run.target_position + offset
+    )
+
+
+def local_eigenvalue(position: np.ndarray, targets: np.ndarray) -> float:
+    return float(analyse_observability(scene(position, targets)).local_eigenvalue[0, 0])
+
+
+def reference_gramian(vehicle: int, start: float, window: float) -> np.ndarray:
+    """Integrate Phi' = A Phi and W' = Phi^T C*^T C* Phi with the body-frame formulas of the theorem."""
+    A = np.zeros((6, 6))
+    A[:3, :3] = A[3:, 3:] = -skew(np.array([0, 0, YAW_RATE]))
+
+    def target(j: int, t: float) -> np.ndarray:
+        return LANDMARKS[j] if j < 3 else START[j - 3] + VELOCITY[j - 3] * t
+
+    def flow(t: float, state: np.ndarray) -> np.ndarray:
+        Phi = state[:36].reshape(6, 6)
+        R = Rotation.from_euler("z", YAW_RATE * t).as_matrix()
+        information = np.zeros((6, 6))
+        for j in NEIGHBOURS[vehicle]:
+            z, p = R.T @ target(j, t), R.T @ target(vehicle + 3, t)
+            g = (p - z) / np.linalg.norm(p - z)
+            Pi = np.eye(3) - np.outer(g, g)
+            C = np.hstack([-Pi @ skew(z), Pi])
+            information += C.T @ C
+        return np.concatenate([(A @ Phi).ravel(), (Phi.T @ information @ Phi).ravel()])
+
+    begin = np.concatenate([np.eye(6).ravel(), np.zeros(36)])
+    solution = solve_ivp(flow, (start, start + window), begin, rtol=1e-11, atol=1e-11, method="DOP853")
+    return solution.y[36:, -1].reshape(6, 6) / window
+
+
+@pytest.mark.parametrize("vehicle", [0, 1, 3])
+def test_gramian_agrees_with_an_ode_solver_while_the_body_turns(vehicle: int) -> None:
+    run = make_trajectory(ticks=121, yaw_rate=YAW_RATE)
+    run = dataclasses.replace(run, visible=run.sight != Sight.NOT_A_NEIGHBOUR)
+    t, W = observability_gramian(run, window=1.0)
+    assert len(t) == 61
+    reference = reference_gramian(vehicle, t[30], 1.0)
+    assert_allclose(W[30, vehicle], reference, atol=2e-6 * np.abs(reference).max())
+    result = analyse_observability(run, window=1.0)
+    eigenvalues = np.linalg.eigvalsh(reference)
+    assert result.min_eigenvalue[30, vehicle] == pytest.approx(eigenvalues[0], rel=1e-3)
+    assert result.condition_number[30, vehicle] == pytest.approx(eigenvalues[-1] / eigenvalues[0], rel=1e-3)
+
+
+def test_gramian_agrees_with_the_notes_on_the_busy_intersection() -> None:
+    """The instantaneous condition number of f1 at the start, computed independently beforehand, is 1.9e3."""
+    result = analyse_observability(make_trajectory(ticks=10), window=1 / 60)
+    assert result.condition_number[0, 0] == pytest.approx(1.9e3, rel=0.05)
+
+
+def test_switching_visibility_is_integrated_over_time() -> None:
+    """A target seen during half of the window weighs half: the trapezoid across the switch, tick by tick."""
+    run = scene(np.zeros(3), LANDMARKS[:1])
+    seen = np.arange(61)[:, None, None] < 30
+    half = dataclasses.replace(run, visible=seen)
+    _, W = observability_gramian(run)
+    _, W_half = observability_gramian(half)
+    assert_allclose(W_half[0, 0], W[0, 0] * 29.5 / 60, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("targets", "reason"),
+    [
+        (LANDMARKS[:2], "turning everything about the line through two targets changes no bearing"),
+        (np.array([[4.0, k, 2 * k] for k in range(4)]), "so it is with any number on one line"),
+        (np.empty((0, 3)), "nothing is seen"),
+    ],
+)
+def test_degenerate_targets_are_not_observable_even_in_motion(targets: np.ndarray, reason: str) -> None:
+    path = np.array([-10.0, -3, 1]) + np.linspace(0, 1, 61)[:, None] * np.array([3.0, 1, 0.5])
+    result = analyse_observability(scene(path, targets))
+    assert result.local_eigenvalue.max() < 1e-12, reason
+    assert not result.observable.any()
+    assert result.condition_number.min() > 1e12
+
+
+@given(st.floats(0, 2 * np.pi), st.floats(-8, 8), st.floats(2, 12))
+@settings(max_examples=30, deadline=None)
+def test_danger_cylinder_is_singular_at_rest_and_not_off_it(
+    angle: float, height: float, radius: float
+) -> None:
+    """Three targets on a circle: singular exactly on the cylinder through it (Thompson 1966), not inside of it."""
+    targets = radius * np.array([[np.cos(a), np.sin(a), 0] for a in (0.0, 2.1, 4.2)])
+    on = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
+    if np.linalg.norm(targets - on, axis=-1).min() < 0.3 * radius:
+        return  # beside a target every other smallness is small too
+    assert local_eigenvalue(on, targets) < 1e-12
+    assert local_eigenvalue(on * [0.2, 0.2, 0] + [0, 0, 1.5 * radius], targets) > 1e-3
+
+
+@given(st.tuples(*[st.floats(-2000, 2000)] * 3))
+@settings(max_examples=15, deadline=None)
+def test_verdict_does_not_depend_on_the_map_origin(offset: tuple[float, float, float]) -> None:
+    run = make_trajectory(ticks=121)
+    near, far = analyse_observability(run), analyse_observability(shifted(run, np.array(offset)))
+    assert_allclose(far.local_eigenvalue, near.local_eigenvalue, rtol=1e-5, atol=1e-11)
+
+
+def test_theorems_eigenvalue_falls_with_the_square_of_the_distance_to_the_origin() -> None:
+    run = make_trajectory(ticks=61)
+    at = [analyse_observability(shifted(run, np.array([d, d, 0.0]))).min_eigenvalue[0] for d in (1e3, 2e3)]
+    assert_allclose(at[0] / at[1], 4.0, rtol=0.05)
+
+
+@given(st.floats(0.01, 1000))
+@settings(max_examples=20, deadline=None)
+def test_local_eigenvalue_has_no_unit(scale: float) -> None:
+    position = np.array([-3.0, -9, 1])
+    assert local_eigenvalue(scale * position, scale * LANDMARKS) == pytest.approx(
+        local_eigenvalue(position, LANDMARKS), rel=1e-9
+    )
+
+
+def test_threshold_is_the_accuracy_it_is_argued_to_be() -> None:
+    """L sigma / sqrt(n mu) is the worst standard deviation that least squares leaves: by Monte Carlo over windows."""
+    run = scene(np.array([-17.0, 2, 3]), LANDMARKS)
+    mu = float(analyse_observability(run).local_eigenvalue[0, 0])
+    offsets = LANDMARKS - run.position[0, 0]
+    distance = np.linalg.norm(offsets, axis=-1)
+    length, sigma, ticks = np.sqrt(np.mean(distance**2)), 3e-3, 60
+    rows = []
+    for offset, d in zip(offsets, distance, strict=True):
+        Pi = np.eye(3) - np.outer(offset, offset) / d**2
+        rows.append(np.hstack([-Pi @ skew(offset) / length, Pi]))
+    C = np.vstack(rows)
+    rng = np.random.default_rng(0)
+    noise = length * sigma / np.sqrt(ticks) * rng.standard_normal((4000, len(C)))
+    estimates = noise @ np.linalg.pinv(C).T
+    worst = np.sqrt(np.linalg.eigvalsh(np.cov(estimates.T))[-1])
+    assert worst == pytest.approx(length * sigma / np.sqrt(ticks * mu), rel=0.05)
+
+
+def test_intervals_tile_the_record_and_follow_visibility() -> None:
+    result = analyse_observability(make_trajectory())
+    for vehicle in range(5):
+        intervals = result.intervals(vehicle)
+        assert intervals[0].start == 0.0 and intervals[-1].end == pytest.approx(50.0)
+        for before, after in zip(intervals, intervals[1:], strict=False):
+            assert before.end == after.start and before.observable != after.observable
+    first, second, *_ = (result.intervals(v) for v in range(5))
+    assert [i.observable for i in first] == [True, False]  # one of three landmarks is lost at 38 s for good
+    assert first[1].start == pytest.approx(38.0, abs=0.1)
+    assert [i.observable for i in second] == [True, False, True]
+    assert (second[1].start, second[1].end) == pytest.approx((12.0, 17.0), abs=0.1)  # windows reach 1 s ahead
+
+
+@pytest.mark.parametrize("ticks", [1, 2, 30])
+def test_short_records_give_one_window_or_none(ticks: int) -> None:
+    result = analyse_observability(make_trajectory(ticks=ticks))
+    assert len(result.t) == (1 if ticks > 1 else 0)
+    assert len(result.intervals(0)) == len(result.t)
+    assert result.window == pytest.approx((ticks - 1) / 60)
+
+
+def test_uneven_ticks_weigh_by_their_duration() -> None:
+    even = make_trajectory(ticks=121)
+    keep = np.sort(np.random.default_rng(2).permutation(np.arange(1, 120))[:90])
+    keep = np.concatenate([[0], keep, [120]])
+    uneven = {
+        f.name: getattr(even, f.name)[keep]
+        for f in dataclasses.fields(even)
+        if f.name not in ("vehicles", "targets", "target_moving")
+    }
+    window = 2.0
+    _, W = observability_gramian(dataclasses.replace(even, **uneven), window)
+    _, W_even = observability_gramian(even, window)
+    for vehicle in (0, 1, 2):  # whose visibility does not switch in this time
+        assert_allclose(W[0, vehicle], W_even[0, vehicle], atol=1e-4 * np.abs(W_even[0, vehicle]).max())
+
+
+def test_a_full_run_takes_well_under_a_second() -> None:
+    run = make_trajectory()
+    begin = time.process_time()
+    analyse_observability(run)
+    assert time.process_time() - begin < 1.0

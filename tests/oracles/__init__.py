@@ -1,0 +1,1 @@
+"""Reference implementations that share no code with coopenv, for its tests to compare against."""

@@ -1,0 +1,157 @@
+"""Camera and occlusion geometry: pinhole field of view, plumb_bob distortion, segment against oriented box.
+
+The occlusion test asks how far inside a box a segment comes: the depth of a point is the smallest of its
+six signed distances to the faces (positive inside), concave along the segment, and its maximum is found
+either as a linear programme (`depth_by_linear_programme`) or by enumerating the breakpoints
+(`depth_by_enumeration`). The segment passes through the open box when that depth is positive; its size
+says how far the case is from grazing.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import linprog
+
+Array = NDArray[np.float64]
+
+#: Columns are the optical axes (x right, y down, z forward) in the body frame (x forward, y left, z up).
+OPTICAL_TO_BODY_FORWARD: Array = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def point_in_camera(
+    target: ArrayLike,
+    R: ArrayLike,
+    position: ArrayLike,
+    lever_arm: ArrayLike = (0.0, 0.0, 0.0),
+    optical_to_body: ArrayLike = OPTICAL_TO_BODY_FORWARD,
+) -> Array:
+    """Return inertial points (..., 3) in the optical frame of a camera at body point `lever_arm`."""
+    in_body = (np.asarray(target, float) - np.asarray(position, float)) @ np.asarray(R, float)
+    return (in_body - np.asarray(lever_arm, float)) @ np.asarray(optical_to_body, float)
+
+
+def bearing(
+    target: ArrayLike, R: ArrayLike, position: ArrayLike, lever_arm: ArrayLike = (0.0, 0.0, 0.0)
+) -> Array:
+    """Return the body-frame unit vectors from the camera to inertial points (..., 3)."""
+    d = (np.asarray(target, float) - np.asarray(position, float)) @ np.asarray(R, float)
+    d = d - np.asarray(lever_arm, float)
+    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def project(
+    point: ArrayLike, fx: float, fy: float, cx: float, cy: float, distortion: ArrayLike = ()
+) -> Array:
+    """Return the pixels (..., 2) of optical-frame points (..., 3); NaN for points that are not in front."""
+    point = np.asarray(point, float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        xy = np.where(point[..., 2:] > 0.0, point[..., :2] / point[..., 2:], np.nan)
+    if np.size(distortion):
+        xy = distort_plumb_bob(xy, distortion)
+    return xy * np.array([fx, fy]) + np.array([cx, cy])
+
+
+def in_field_of_view(
+    point: ArrayLike,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    width: float,
+    height: float,
+    distortion: ArrayLike = (),
+) -> NDArray[np.bool_]:
+    """Tell which optical-frame points (..., 3) are in front with 0 <= u < width and 0 <= v < height."""
+    uv = project(point, fx, fy, cx, cy, distortion)
+    return (uv >= 0.0).all(axis=-1) & (uv[..., 0] < width) & (uv[..., 1] < height)
+
+
+def in_field_of_view_by_planes(
+    point: ArrayLike, fx: float, fy: float, cx: float, cy: float, width: float, height: float
+) -> NDArray[np.bool_]:
+    """Do the same without distortion and without dividing: inside the four planes of the view pyramid."""
+    x, y, z = np.moveaxis(np.asarray(point, float), -1, 0)
+    sides = (fx * x + cx * z >= 0.0) & (fx * x + (cx - width) * z < 0.0)
+    return (z > 0.0) & sides & (fy * y + cy * z >= 0.0) & (fy * y + (cy - height) * z < 0.0)
+
+
+def in_range(point: ArrayLike, minimum: float = 0.0, maximum: float = np.inf) -> NDArray[np.bool_]:
+    """Tell which camera-relative points (..., 3) are at a distance in [minimum, maximum]."""
+    distance = np.linalg.norm(np.asarray(point, float), axis=-1)
+    return (distance >= minimum) & (distance <= maximum)
+
+
+def distort_plumb_bob(xy: ArrayLike, coefficients: ArrayLike) -> Array:
+    """Apply the plumb_bob model (k1, k2, p1, p2, k3) to normalised image points (..., 2)."""
+    k1, k2, p1, p2, k3 = np.resize(np.append(np.asarray(coefficients, float), np.zeros(5)), 5)
+    x, y = np.moveaxis(np.asarray(xy, float), -1, 0)
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    x_distorted = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    y_distorted = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return np.stack([x_distorted, y_distorted], axis=-1)
+
+
+def undistort_plumb_bob(xy: ArrayLike, coefficients: ArrayLike, iterations: int = 50) -> Array:
+    """Invert `distort_plumb_bob` by Newton's method with a difference quotient for the Jacobian."""
+    target = np.asarray(xy, float)
+    guess, step = target.copy(), 1e-6
+    for _ in range(iterations):
+        residual = distort_plumb_bob(guess, coefficients) - target
+        ahead = [distort_plumb_bob(guess + e, coefficients) for e in step * np.eye(2)]
+        behind = [distort_plumb_bob(guess - e, coefficients) for e in step * np.eye(2)]
+        jacobian = (np.stack(ahead, axis=-1) - np.stack(behind, axis=-1)) / (2.0 * step)
+        guess = guess - np.linalg.solve(jacobian, residual[..., None])[..., 0]
+    return guess
+
+
+def _segment_in_box(start: ArrayLike, end: ArrayLike, centre: ArrayLike, R: ArrayLike) -> tuple[Array, Array]:
+    """Return both ends of the segment in the box frame; `R` maps box axes to inertial axes."""
+    centre, R = np.asarray(centre, float), np.asarray(R, float)
+    a = np.einsum("...ji,...j->...i", R, np.asarray(start, float) - centre)
+    b = np.einsum("...ji,...j->...i", R, np.asarray(end, float) - centre)
+    return a, b
+
+
+def depth_by_linear_programme(
+    start: ArrayLike, end: ArrayLike, centre: ArrayLike, R: ArrayLike, half_extents: ArrayLike
+) -> float:
+    """Return the depth of one segment in one box: max t such that some point keeps t to all six faces."""
+    a, b = _segment_in_box(start, end, centre, R)
+    half = np.asarray(half_extents, float)
+    rows = np.vstack([np.eye(3), -np.eye(3)])
+    # n.(a + s (b - a)) + t <= half, 0 <= s <= 1
+    upper = np.column_stack([rows @ (b - a), np.ones(6)])
+    limit = np.tile(half, 2) - rows @ a
+    solution = linprog([0.0, -1.0], A_ub=upper, b_ub=limit, bounds=[(0.0, 1.0), (None, None)])
+    if not solution.success:
+        raise RuntimeError(solution.message)
+    return float(solution.x[1])
+
+
+def depth_by_enumeration(
+    start: ArrayLike, end: ArrayLike, centre: ArrayLike, R: ArrayLike, half_extents: ArrayLike
+) -> Array:
+    """Return the depth of segments in boxes, over leading axes: the best breakpoint of the six lines."""
+    a, b = _segment_in_box(start, end, centre, R)
+    half = np.asarray(half_extents, float)
+    a, b, half = np.broadcast_arrays(a, b, half)
+    at_start = np.concatenate([half - a, half + a], axis=-1)  # signed distances to the six faces
+    slope = np.concatenate([a - b, b - a], axis=-1)
+    candidates = [np.zeros(a.shape[:-1]), np.ones(a.shape[:-1])]
+    for i, j in combinations(range(6), 2):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            s = (at_start[..., j] - at_start[..., i]) / (slope[..., i] - slope[..., j])
+        candidates.append(np.clip(np.nan_to_num(s, nan=0.0, posinf=1.0, neginf=0.0), 0.0, 1.0))
+    s = np.stack(candidates, axis=-1)[..., None]
+    return (at_start[..., None, :] + s * slope[..., None, :]).min(axis=-1).max(axis=-1)
+
+
+def is_occluded(
+    start: ArrayLike, end: ArrayLike, centre: ArrayLike, R: ArrayLike, half_extents: ArrayLike
+) -> NDArray[np.bool_]:
+    """Tell whether segments pass through the inside of boxes, broadcast over leading axes."""
+    return depth_by_enumeration(start, end, centre, R, half_extents) > 0.0

@@ -1,0 +1,216 @@
+"""The oracles against each other, the paper's figures and published known answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from . import continuous, geometry, philox, splitting
+
+SETTLE = (2.95, 7.90, 10.55, 11.65, 29.9)  # s, f1 .. f5
+PIXY = {"fx": 213.161906, "fy": 213.521038, "cx": 154.841998, "cy": 114.98398, "width": 316, "height": 208}
+PLUMB_BOB = (-0.352043, 0.137879, 0.001953, 0.000628, 0.0)
+
+
+@pytest.fixture(scope="module")
+def busy() -> continuous.Result:
+    return continuous.solve(continuous.busy_intersection(), 50.0)
+
+
+def test_continuous_settle_times(busy: continuous.Result) -> None:
+    np.testing.assert_allclose(busy.settle_times(), SETTLE, atol=0.051)
+    assert np.linalg.norm(busy.position_error[-1], axis=-1).max() < 1e-6
+
+
+def test_continuous_does_not_depend_on_the_solver(busy: continuous.Result) -> None:
+    other = continuous.solve(continuous.busy_intersection(), 50.0, method="LSODA", rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(other.settle_times(), busy.settle_times(), atol=0.051)
+    late = busy.t > 1.0
+    np.testing.assert_allclose(other.P[late], busy.P[late], rtol=1e-2, atol=1e-3)
+
+
+def test_continuous_keeps_rotations_and_symmetry(busy: continuous.Result) -> None:
+    gram = np.swapaxes(busy.R_hat, -1, -2) @ busy.R_hat
+    np.testing.assert_allclose(gram, np.broadcast_to(np.eye(3), gram.shape), atol=1e-6)
+    np.testing.assert_allclose(busy.P, np.swapaxes(busy.P, -1, -2), atol=1e-9)
+    assert np.linalg.eigvalsh(busy.P).min() > 0.0
+
+
+def test_transposed_start_falls_into_the_mirror() -> None:
+    result = continuous.solve(continuous.busy_intersection(mirror=True), 50.0)
+    assert (result.angle_error_deg[-1] > 170.0).all()
+    assert np.isnan(result.settle_times()).all()
+
+
+def test_true_pose_is_an_equilibrium() -> None:
+    case = continuous.small_error_case(lever_arm=(0.3, 0.0, 0.2), angle=0.0, offset=0.0)
+    result = continuous.solve(case, 2.0)
+    assert np.abs(result.position_error).max() < 1e-7
+    assert result.angle_error_deg.max() < 1e-5
+
+
+def test_pose_obeys_the_kinematics() -> None:
+    case = continuous.small_error_case()
+    t, step = 1.7, 1e-5
+    (R0, x0), (R, _), (R1, x1) = (case.pose(s) for s in (t - step, t, t + step))
+    np.testing.assert_allclose((R1 - R0) / (2 * step), R @ continuous.skew(case.angular_velocity), atol=1e-8)
+    np.testing.assert_allclose((x1 - x0) / (2 * step), (R @ case.velocity[..., None])[..., 0], atol=1e-8)
+
+
+def test_splitting_busy_intersection_at_60_hz() -> None:
+    result = splitting.run(continuous.busy_intersection(), 50.0, 60.0)
+    np.testing.assert_allclose(result.settle_times(), (2.95, 7.85, 10.4, 11.45, 30.1), atol=0.06)
+
+
+@pytest.mark.parametrize(("k", "q"), [(1.0, 10.0), (5.0, 10.0), (80.0, 25.0)])
+def test_splitting_tends_to_continuous(k: float, q: float) -> None:
+    case = continuous.small_error_case(k, q, lever_arm=(0.3, 0.0, 0.2), angle=0.02, offset=0.05)
+    reference = continuous.solve(case, 2.0, method="LSODA", sample=0.5)
+    rates = (60, 240)
+    errors = []
+    for rate in rates:
+        result = splitting.run(case, 2.0, rate)
+        at = slice(None, None, rate // 2)
+        errors.append(
+            [
+                np.abs(getattr(result, name)[at] - getattr(reference, name)).max()
+                for name in ("position_error", "R_hat", "P")
+            ]
+        )
+    coarse, fine = np.array(errors)
+    assert (fine < [1e-3, 1e-3, 4e-3]).all()
+    assert ((fine < 0.7 * coarse) | (fine < 1e-7)).all()
+
+
+def test_correction_is_the_kalman_update_for_unit_gain() -> None:
+    x, bearings, positions = _one_view()
+    dt, q = 0.02, 7.0
+    corrected, substeps = splitting.correct(x, bearings, positions, q, 1.0, dt, theta_max=np.inf)
+    C = np.vstack(
+        [
+            np.hstack([-(Pi := np.eye(3) - np.outer(b, b)) @ continuous.skew(x.R.T @ z), Pi])
+            for b, z in zip(bearings, positions, strict=True)
+        ]
+    )
+    y = np.zeros(len(C))
+    for row, (b, z) in enumerate(zip(bearings, positions, strict=True)):
+        y[3 * row : 3 * row + 3] = (np.eye(3) - np.outer(b, b)) @ (x.R.T @ z - x.p)
+    S = C @ x.P @ C.T + np.eye(len(C)) / (q * dt)
+    K = x.P @ C.T @ np.linalg.inv(S)
+    assert substeps == 1
+    np.testing.assert_allclose(corrected.P, x.P - K @ C @ x.P, atol=1e-10)
+    np.testing.assert_allclose(corrected.p, x.p + (K @ y)[3:], atol=1e-10)
+    np.testing.assert_allclose(corrected.R, x.R @ continuous.exponential((K @ y)[:3]), atol=1e-10)
+
+
+@pytest.mark.parametrize("k", [1.0, 5.0, 80.0])
+def test_frozen_flow_composes(k: float) -> None:
+    x, bearings, positions = _one_view()
+    M, r = splitting.information(x, bearings, positions, np.full(3, 10.0), np.zeros(3))
+    whole = splitting.frozen_flow(x.P, M, r, k)
+    half = splitting.frozen_flow(x.P, M, r, k)
+    dx = half.dx(0.01)
+    rest = splitting.frozen_flow(half.covariance(0.01), M, r - M @ dx, k)
+    np.testing.assert_allclose(dx + rest.dx(0.01), whole.dx(0.02), atol=1e-9)
+    np.testing.assert_allclose(rest.covariance(0.01), whole.covariance(0.02), atol=1e-9)
+
+
+def test_substeps_bound_the_turn_and_cover_the_tick() -> None:
+    x, bearings, positions = _one_view(angle=0.8)
+    one, substeps = splitting.correct(x, bearings, positions, 25.0, 80.0, 1 / 60)
+    finer, more = splitting.correct(x, bearings, positions, 25.0, 80.0, 1 / 60, theta_max=0.005)
+    last, few = splitting.correct(x, bearings, positions, 25.0, 80.0, 1 / 60, max_substeps=3)
+    assert 3 < substeps < more <= splitting.MAX_SUBSTEPS
+    assert few == 3
+    assert np.linalg.norm(one.p - finer.p) < 0.1 * np.linalg.norm(one.p - x.p)
+    assert np.linalg.eigvalsh(last.P).min() > 0.0
+
+
+def test_no_bearing_leaves_the_prediction() -> None:
+    x, _, _ = _one_view()
+    assert splitting.correct(x, [], [], 1.0, 1.0, 0.1) == (x, 0)
+
+
+def _one_view(angle: float = 0.2) -> tuple[splitting.Estimate, np.ndarray, np.ndarray]:
+    positions = np.array([[3.0, 3.0, 2.0], [-3.0, 2.5, 1.0], [0.5, 4.0, 3.0]])
+    bearings = geometry.bearing(positions, np.eye(3), np.zeros(3))
+    R_hat = continuous.exponential(angle * np.array([0.36, 0.48, 0.8]))
+    P = np.diag([1.0, 1.1, 0.9, 10.0, 11.0, 9.0])
+    P[0, 4] = P[4, 0] = 0.5
+    return splitting.initial_estimate(R_hat, [0.2, -0.3, 0.1], P), bearings, positions
+
+
+def test_field_of_view_two_ways() -> None:
+    points = np.random.default_rng(0).uniform(-2.0, 2.0, (20000, 3))
+    inside = geometry.in_field_of_view(points, **PIXY)
+    np.testing.assert_array_equal(inside, geometry.in_field_of_view_by_planes(points, **PIXY))
+    assert 0.02 < inside.mean() < 0.3
+
+
+def test_field_of_view_angles() -> None:
+    right, up = np.radians(36.0), np.radians(27.0)
+    ray = [
+        [np.sin(right), 0, np.cos(right)],
+        [-np.sin(right), 0, np.cos(right)],
+        [0, -np.sin(up), np.cos(up)],
+    ]
+    assert geometry.in_field_of_view(ray, **PIXY).tolist() == [True, False, True]
+    assert not geometry.in_field_of_view([0.0, 0.0, -1.0], **PIXY)
+
+
+def test_camera_axes() -> None:
+    R = continuous.exponential([0.0, 0.0, np.pi / 2])  # heading north
+    seen = geometry.point_in_camera([0.1, 2.0, 0.5], R, [0.0, 0.0, 0.0], (0.3, 0.0, 0.2))
+    np.testing.assert_allclose(seen, [0.1, -0.3, 1.7], atol=1e-12)
+
+
+def test_range() -> None:
+    assert geometry.in_range([[0, 0, 1], [0, 3, 4], [0, 6, 8]], 2.0, 5.0).tolist() == [False, True, False]
+
+
+def test_distortion_and_back() -> None:
+    xy = np.random.default_rng(1).uniform(-0.7, 0.7, (200, 2)) * [1.0, 0.7]
+    distorted = geometry.distort_plumb_bob(xy, PLUMB_BOB)
+    np.testing.assert_allclose(geometry.undistort_plumb_bob(distorted, PLUMB_BOB), xy, atol=1e-10)
+    # by hand at (0.5, 0): r2 = 0.25, radial = 0.9206066875
+    np.testing.assert_allclose(
+        geometry.distort_plumb_bob([0.5, 0.0], PLUMB_BOB),
+        [0.5 * 0.9206066875 + 0.000628 * 0.75, 0.001953 * 0.25],
+        atol=1e-12,
+    )
+
+
+def test_occlusion_two_ways_and_by_sampling() -> None:
+    rng = np.random.default_rng(2)
+    depths = []
+    for _ in range(100):
+        start, end, centre = rng.uniform(-2.0, 2.0, (3, 3))
+        box = (centre, continuous.exponential(rng.normal(size=3)), rng.uniform(0.3, 1.5, 3))
+        depth = geometry.depth_by_enumeration(start, end, *box)
+        assert depth == pytest.approx(geometry.depth_by_linear_programme(start, end, *box), abs=1e-9)
+        points = start + np.linspace(0.0, 1.0, 4001)[:, None] * (end - start)
+        sampled = (box[2] - np.abs((points - centre) @ box[1])).min(axis=-1).max()
+        assert sampled <= depth + 1e-12
+        assert depth - sampled < 2e-3
+        depths.append(depth)
+    assert 0.1 < np.mean(np.array(depths) > 0.0) < 0.9
+
+
+def test_occlusion_broadcasts() -> None:
+    ends = np.array([[2.0, 0.0, 0.0], [0.2, 0.0, 0.0], [2.0, 2.0, 0.0]])
+    hidden = geometry.is_occluded([0.0, 0.0, 0.0], ends, [1.0, 0.0, 0.0], np.eye(3), [0.5, 0.2, 0.2])
+    assert hidden.tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize(("counter", "key", "expected"), philox.KNOWN_ANSWERS)
+def test_philox_known_answers(counter: philox.Words4, key: tuple[int, int], expected: philox.Words4) -> None:
+    assert philox.philox4x32(counter, key) == expected
+
+
+def test_philox_array_agrees_with_integers() -> None:
+    rng = np.random.default_rng(3)
+    counters = rng.integers(0, 2**32, (50, 4), dtype=np.uint64)
+    keys = rng.integers(0, 2**32, (50, 2), dtype=np.uint64)
+    words = philox.philox4x32_array(counters, keys)
+    for c, k, w in zip(counters.tolist(), keys.tolist(), words.tolist(), strict=True):
+        assert philox.philox4x32(tuple(c), tuple(k)) == tuple(w)
