@@ -94,18 +94,21 @@ def eigen_symmetric6(M: Any, identity: Any):
     """Return (D, U) with M = U D U^T, D diagonal up to rounding, by cyclic Jacobi sweeps."""
     A = M
     U = identity
-    for sweep in range(12):
+    rounding = A.dtype(1.0e-33)
+    if A.dtype(1.0) + A.dtype(1.0e-9) == A.dtype(1.0):
+        rounding = A.dtype(1.0e-15)
+    for _ in range(12):
         off = A.dtype(0.0)
         scale = A.dtype(0.0)
         for i in range(6):
             scale += A[i, i] * A[i, i]
             for j in range(i):
                 off += A[i, j] * A[i, j]
-        if off > scale * A.dtype(1.0e-32):
+        if off > scale * rounding:
             for p in range(5):
                 for q in range(p + 1, 6):
                     # An entry lost in the rounding of its diagonal is zero already.
-                    if A[p, q] * A[p, q] > wp.abs(A[p, p] * A[q, q]) * A.dtype(1.0e-36):
+                    if A[p, q] * A[p, q] > wp.abs(A[p, p] * A[q, q]) * rounding * rounding:
                         c, s = jacobi_rotation(A[p, p], A[q, q], A[p, q])
                         for k in range(6):
                             akp = A[k, p]
@@ -125,10 +128,75 @@ def eigen_symmetric6(M: Any, identity: Any):
 
 
 @wp.func
-def smallest_eigenvalue6(M: Any, identity: Any):
-    """Return the smallest eigenvalue of a symmetric 6x6 matrix."""
-    D, _ = eigen_symmetric6(M, identity)
-    smallest = D[0, 0]
-    for i in range(1, 6):
-        smallest = wp.min(smallest, D[i, i])
-    return smallest
+def tridiagonal6(M: Any):
+    """Return (diagonal, squared off-diagonal) of Q^T M Q, M symmetric 6x6, by Householder reflections."""
+    A = M
+    zero = A.dtype(0.0)
+    for k in range(4):
+        tail = zero
+        for i in range(k + 2, 6):
+            tail += A[i, k] * A[i, k]
+        if tail > zero:
+            head = A[k + 1, k]
+            norm = wp.sqrt(head * head + tail)
+            if head > zero:
+                norm = -norm
+            v = A[0] - A[0]
+            v[k + 1] = head - norm
+            for i in range(k + 2, 6):
+                v[i] = A[i, k]
+            beta = A.dtype(2.0) / wp.dot(v, v)
+            w = beta * (A * v)
+            w = w - (A.dtype(0.5) * beta * wp.dot(w, v)) * v
+            A = A - wp.outer(v, w) - wp.outer(w, v)
+    diagonal = A[0] - A[0]
+    off = A[0] - A[0]
+    for i in range(6):
+        diagonal[i] = A[i, i]
+        if i < 5:
+            off[i] = A[i + 1, i] * A[i + 1, i]
+    return diagonal, off
+
+
+@wp.func
+def smallest_eigenvalue6(M: Any):
+    """Return the smallest eigenvalue of a positive semidefinite 6x6 matrix.
+
+    Laguerre's iteration from 0 on the characteristic polynomial of the tridiagonal form: monotone, since all roots
+    are real and lie to the right, and cubic near a simple root.
+    """
+    scale = wp.trace(M)
+    zero = M.dtype(0.0)
+    one = M.dtype(1.0)
+    if scale <= zero:
+        return zero
+    d, e = tridiagonal6(M * (one / scale))
+    x = zero
+    for _ in range(30):
+        p0 = one
+        p = d[0] - x
+        q0 = zero
+        q = -one
+        r0 = zero
+        r = zero
+        for i in range(1, 6):
+            factor = d[i] - x
+            new_p = factor * p - e[i - 1] * p0
+            new_q = factor * q - p - e[i - 1] * q0
+            new_r = factor * r - M.dtype(2.0) * q - e[i - 1] * r0
+            p0 = p
+            q0 = q
+            r0 = r
+            p = new_p
+            q = new_q
+            r = new_r
+        if p <= zero:  # past the root by rounding: it has been found
+            return wp.max(x, zero) * scale
+        G = q / p
+        H = G * G - r / p
+        root = wp.sqrt(wp.max(M.dtype(5.0) * (M.dtype(6.0) * H - G * G), zero))
+        step = M.dtype(6.0) / (root - G)
+        x = x + step
+        if step <= x * M.dtype(1.0e-9):
+            return wp.max(x, zero) * scale
+    return wp.max(x, zero) * scale

@@ -18,7 +18,6 @@ import warp as wp
 from coopenv.estimation.linalg import cholesky6, eigen_symmetric6, inverse_lower3, join6, symmetric_part
 from coopenv.estimation.so3 import exp_so3, identity3, left_jacobian, orthonormalise, skew
 
-wp.set_module_options({"enable_backward": False})
 
 
 @wp.func

@@ -11,7 +11,6 @@ import warp as wp
 
 from coopenv.world.random import BEARING, draw, gaussian_pair, signed_uniform, uniform
 
-wp.set_module_options({"enable_backward": False})
 
 NOT_A_NEIGHBOUR = wp.constant(wp.uint8(0))
 VISIBLE = wp.constant(wp.uint8(1))

@@ -6,7 +6,6 @@ from typing import Any
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
 
 UNDER_WAY = wp.constant(0)
 ARRIVED = wp.constant(1)

@@ -8,7 +8,6 @@ import warp as wp
 
 from coopenv.estimation.so3 import exp_so3, left_jacobian, orthonormalise
 
-wp.set_module_options({"enable_backward": False})
 
 PRESCRIBED = wp.constant(1)
 DRIVEN = wp.constant(2)

@@ -24,7 +24,6 @@ from coopenv.estimation.so3 import exp_so3, identity3, orthonormalise, skew
 from coopenv.world.camera import VISIBLE, marker_position
 from coopenv.world.v2x import fresh
 
-wp.set_module_options({"enable_backward": False})
 
 MOST_SUBSTEPS = wp.constant(200)
 """Re-linearisations per tick; the last one takes what remains of the tick."""

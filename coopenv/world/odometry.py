@@ -15,7 +15,6 @@ from coopenv.estimation.so3 import identity3
 from coopenv.world.dynamics import DRIVEN, drive, segment_at
 from coopenv.world.random import ODOMETRY_ANGULAR, ODOMETRY_LINEAR, draw, gaussian3
 
-wp.set_module_options({"enable_backward": False})
 
 
 @wp.func

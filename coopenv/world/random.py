@@ -11,9 +11,13 @@ from typing import Any
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
 
 vec4u = wp.types.vector(4, wp.uint32)
+
+MULTIPLIER_0 = wp.constant(wp.uint64(0xD2511F53))
+MULTIPLIER_1 = wp.constant(wp.uint64(0xCD9E8D57))
+WEYL_0 = wp.constant(wp.uint32(0x9E3779B9))
+WEYL_1 = wp.constant(wp.uint32(0xBB67AE85))
 
 RESET_POSE = wp.constant(wp.uint32(1))
 RESET_ESTIMATE_POSITION = wp.constant(wp.uint32(2))
@@ -31,13 +35,13 @@ def philox(counter: vec4u, key0: wp.uint32, key1: wp.uint32) -> vec4u:
     k0 = key0
     k1 = key1
     for _ in range(10):
-        product0 = wp.uint64(wp.uint32(0xD2511F53)) * wp.uint64(c[0])
-        product1 = wp.uint64(wp.uint32(0xCD9E8D57)) * wp.uint64(c[2])
+        product0 = MULTIPLIER_0 * wp.uint64(c[0])
+        product1 = MULTIPLIER_1 * wp.uint64(c[2])
         high0 = wp.uint32(product0 >> wp.uint64(32))
         high1 = wp.uint32(product1 >> wp.uint64(32))
         c = vec4u(high1 ^ c[1] ^ k0, wp.uint32(product1), high0 ^ c[3] ^ k1, wp.uint32(product0))
-        k0 = k0 + wp.uint32(0x9E3779B9)
-        k1 = k1 + wp.uint32(0xBB67AE85)
+        k0 = k0 + WEYL_0
+        k1 = k1 + WEYL_1
     return c
 
 

@@ -23,7 +23,6 @@ from coopenv.world.random import (
 )
 from coopenv.world.v2x import broadcast, deliver
 
-wp.set_module_options({"enable_backward": False})
 
 
 @wp.func

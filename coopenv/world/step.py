@@ -14,7 +14,6 @@ from coopenv.world.odometry import measure_motion
 from coopenv.world.reset import reset_world
 from coopenv.world.v2x import broadcast, deliver
 
-wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
@@ -53,7 +52,7 @@ def tick_world(model: Any, before: Any, after: Any, actions: Any, world: int, el
     after.tick[world] = tick
 
 
-@wp.kernel
+
 def advance_kernel(model: Any, before: Any, after: Any, actions: wp.array2d(dtype=Any), ticks: int):
     """Advance every world by up to `ticks` camera ticks, not beyond the horizon. One thread per world."""
     world = wp.tid()
@@ -69,7 +68,7 @@ def advance_kernel(model: Any, before: Any, after: Any, actions: wp.array2d(dtyp
             after.command[world, vehicle] = actions[world, vehicle]
 
 
-@wp.kernel
+
 def reset_kernel(model: Any, state: Any, mask: wp.array(dtype=wp.int32)):
     """Start a new episode in every world whose mask is set. One thread per world."""
     world = wp.tid()

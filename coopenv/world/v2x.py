@@ -8,7 +8,6 @@ import warp as wp
 
 from coopenv.world.random import RADIO, draw, uniform
 
-wp.set_module_options({"enable_backward": False})
 
 
 @wp.func

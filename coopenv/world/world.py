@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 from coopenv.scenario import Scenario
+from coopenv.world.launch import Launcher
 from coopenv.world.model import build_model
 from coopenv.world.precision import check_device, precision
 from coopenv.world.state import allocate_state, read_state, write_state
@@ -41,8 +41,8 @@ class World:
         self.state = allocate_state(self.model, worlds, self.precision, self.device)
         N = self.model.vehicles
         self.actions = wp.zeros((worlds, N), dtype=self.precision.vec2, device=self.device)
-        self._mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
-        self._launches: dict[Any, Any] = {}
+        self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
+        self._launch = Launcher(worlds, self.device, dtype)
 
     def reset(self, seeds: Sequence[int] | np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
         """Start a new episode in the worlds of `mask` (all by default).
@@ -60,22 +60,14 @@ class World:
             seed, episode = np.where(chosen, wanted, seed), np.where(chosen, np.uint32(0), episode)
         self.state.seed.assign(seed.astype(np.uint64))
         self.state.episode.assign(episode.astype(np.uint32))
-        self._mask.assign(chosen.astype(np.int32))
-        self._launch("reset", reset_kernel, [self.model, self.state, self._mask])
+        self.mask.assign(chosen.astype(np.int32))
+        self._launch("reset", reset_kernel, [self.model, self.state, self.mask])
 
     def advance(self, ticks: int) -> None:
         """Run camera ticks under `self.actions`, stopping each world at its horizon."""
         self._launch(
             ("advance", ticks), advance_kernel, [self.model, self.state, self.state, self.actions, ticks]
         )
-
-    def _launch(self, key: Any, kernel: Any, arguments: list[Any]) -> None:
-        """Launch a kernel over worlds, recording it the first time: replays cost about a microsecond."""
-        recorded = self._launches.get(key)
-        if recorded is None:
-            recorded = wp.launch(kernel, dim=self.worlds, inputs=arguments, device=self.device, record_cmd=True)
-            self._launches[key] = recorded
-        recorded.launch()
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return a copy of everything that changes, random streams included (they are seeds and counters)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ def skew(v: np.ndarray) -> np.ndarray:
 
 
 def scene(position: np.ndarray, targets: np.ndarray, ticks: int = 61) -> Trajectory:
-    """Return one vehicle along `position` (K, 3) or resting at a point (3,), seeing all of the resting `targets` (T, 3)."""
+    """Return one vehicle along `position` (K, 3), or at rest (3,), that sees all fixed `targets` (T, 3)."""
     run = make_trajectory(ticks)
     path = np.broadcast_to(position, (ticks, 3))[:, None]
     per_vehicle = {
@@ -130,7 +131,7 @@ def test_degenerate_targets_are_not_observable_even_in_motion(targets: np.ndarra
 def test_danger_cylinder_is_singular_at_rest_and_not_off_it(
     angle: float, height: float, radius: float
 ) -> None:
-    """Three targets on a circle: singular exactly on the cylinder through it (Thompson 1966), not inside of it."""
+    """Three targets on a circle: singular exactly on the cylinder through it, not inside of it."""
     targets = radius * np.array([[np.cos(a), np.sin(a), 0] for a in (0.0, 2.1, 4.2)])
     on = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
     if np.linalg.norm(targets - on, axis=-1).min() < 0.3 * radius:
@@ -163,7 +164,7 @@ def test_local_eigenvalue_has_no_unit(scale: float) -> None:
 
 
 def test_threshold_is_the_accuracy_it_is_argued_to_be() -> None:
-    """L sigma / sqrt(n mu) is the worst standard deviation that least squares leaves: by Monte Carlo over windows."""
+    """L sigma / sqrt(n mu) is the worst standard deviation that least squares leaves, by Monte Carlo."""
     run = scene(np.array([-17.0, 2, 3]), LANDMARKS)
     mu = float(analyse_observability(run).local_eigenvalue[0, 0])
     offsets = LANDMARKS - run.position[0, 0]
@@ -186,7 +187,7 @@ def test_intervals_tile_the_record_and_follow_visibility() -> None:
     for vehicle in range(5):
         intervals = result.intervals(vehicle)
         assert intervals[0].start == 0.0 and intervals[-1].end == pytest.approx(50.0)
-        for before, after in zip(intervals, intervals[1:], strict=False):
+        for before, after in pairwise(intervals):
             assert before.end == after.start and before.observable != after.observable
     first, second, *_ = (result.intervals(v) for v in range(5))
     assert [i.observable for i in first] == [True, False]  # one of three landmarks is lost at 38 s for good

@@ -1,0 +1,1 @@
+"""The standard faces of a world: PettingZoo, Gymnasium, spaces, rewards."""

@@ -1,0 +1,104 @@
+"""The batched core under every face: worlds plus reports, with constant Python work per step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from coopenv.api.layout import layout_size, observation_layout
+from coopenv.api.observation import observation_plan
+from coopenv.api.report import MEMORY, allocate_report, begin_kernel, report_kernel
+from coopenv.api.rewards import reward_weights
+from coopenv.scenario import Scenario
+from coopenv.world.launch import Launcher
+from coopenv.world.state import state_fields
+from coopenv.world.world import World
+
+
+class Engine:
+    """`worlds` worlds with their observations, rewards and judgements.
+
+    Host views: `view(name)` gives a field of the report or the state as a NumPy array, (W, N, ...) or (W, A, ...),
+    without a copy on the CPU; copy what must outlive the next step.
+    """
+
+    def __init__(
+        self, scenario: Scenario, worlds: int = 1, dtype: str = "float32", device: str = "cpu"
+    ) -> None:
+        """Build everything.
+
+        Raises:
+            DeviceError: unknown precision or device.
+            ValueError: no worlds.
+        """
+        self.world = World(scenario, worlds, dtype, device)
+        self.layout = observation_layout(scenario)
+        self.report = allocate_report(
+            self.world.model, worlds, layout_size(self.layout), self.world.precision, self.world.device
+        )
+        self._plan = observation_plan(scenario, self.layout)
+        self._weights = wp.array(reward_weights(scenario), dtype=wp.float32, device=self.world.device)
+        self._launch = Launcher((worlds, self.world.model.vehicles), self.world.device, dtype)
+        self._state_fields = set(state_fields(self.world.precision))
+        self._views: dict[str, np.ndarray] = {}
+
+    def reset(self, seeds: Sequence[int] | np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
+        """Start new episodes, see `World.reset`."""
+        self.world.reset(seeds, mask)
+        self._launch("begin", begin_kernel, [self.world.model, self.world.state, self.report, self.world.mask])
+        self.refresh()
+
+    def step(self, actions: np.ndarray | None = None, ticks: int | None = None) -> None:
+        """Advance by one decision (or `ticks` camera ticks) under actions (W, N, 2) in [-1, 1]."""
+        if actions is not None:
+            self.set_actions(actions)
+        self.world.advance(self.world.model.ticks_per_decision if ticks is None else ticks)
+        self.refresh()
+
+    def set_actions(self, actions: np.ndarray) -> None:
+        """Copy host actions, (W, N, 2), to the device."""
+        if self.world.device == "cpu":
+            self.view("actions")[...] = actions
+        else:
+            self.world.actions.assign(np.ascontiguousarray(actions, dtype=self.world.precision.numpy))
+
+    def refresh(self) -> None:
+        """Recompute the report from the present state."""
+        self._launch(
+            "report",
+            report_kernel,
+            [self.world.model, self.world.state, self._plan, self._weights, self.report],
+        )
+
+    def view(self, name: str) -> np.ndarray:
+        """Return a field of the report, the state or the actions on the host."""
+        view = self._views.get(name)
+        if view is None:
+            view = self._array(name).numpy()
+            if self.world.device == "cpu":
+                self._views[name] = view
+        return view
+
+    def _array(self, name: str) -> Any:
+        if name == "actions":
+            return self.world.actions
+        return getattr(self.world.state if name in self._state_fields else self.report, name)
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Return a copy of everything that the next step depends on."""
+        memory = {name: getattr(self.report, name).numpy().copy() for name in MEMORY}
+        return {**self.world.get_state(), **memory}
+
+    def set_state(self, values: dict[str, np.ndarray]) -> None:
+        """Restore what `get_state` returned.
+
+        Raises:
+            ValueError: a field is missing or has another shape.
+        """
+        self.world.set_state(values)
+        self.refresh()
+        for name in MEMORY:
+            getattr(self.report, name).assign(values[name])

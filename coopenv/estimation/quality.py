@@ -1,0 +1,62 @@
+"""How good an estimate is, as Warp functions: errors, NEES, log-determinant, smallest Gramian eigenvalue."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.estimation.linalg import block3, cholesky6, inverse_lower3, join6, smallest_eigenvalue6
+from coopenv.estimation.so3 import quaternion_vector
+
+
+
+@wp.func
+def log_determinant(L11: Any, L22: Any):
+    """Return log det P from the diagonal blocks of its Cholesky factor."""
+    total = L11.dtype(0.0)
+    for i in range(3):
+        total += wp.log(L11[i, i]) + wp.log(L22[i, i])
+    return L11.dtype(2.0) * total
+
+
+@wp.func
+def normalised_error_squared(L11: Any, L21: Any, L22: Any, e1: Any, e2: Any):
+    """Return e^T P^-1 e for e = (e1, e2) and P = L L^T."""
+    x1 = inverse_lower3(L11) * e1
+    x2 = inverse_lower3(L22) * (e2 - L21 * x1)
+    return wp.dot(x1, x1) + wp.dot(x2, x2)
+
+
+@wp.func
+def observer_error(R: Any, position: Any, R_hat: Any, p_hat: Any):
+    """Return (2 lambda, p - phat), the error coordinates of P: Rtilde = Rhat^T R, p = R^T pbar (paper, sec. IV)."""
+    R_tilde = wp.transpose(R_hat) * R
+    lam = quaternion_vector(R_tilde, p_hat)
+    return lam * p_hat.dtype(2.0), wp.transpose(R) * position - p_hat
+
+
+@wp.func
+def gramian_smallest_eigenvalue(model: Any, state: Any, world: int, vehicle: int):
+    """Return the smallest eigenvalue of (1/T) int Phi^T C^T C Phi dt over the sliding window; 0 before any data."""
+    G11 = state.gramian_11[world, vehicle, 0]
+    G12 = state.gramian_12[world, vehicle, 0]
+    G22 = state.gramian_22[world, vehicle, 0]
+    time = state.gramian_time[world, vehicle, 0]
+    for block in range(1, model.observer.blocks):
+        G11 += state.gramian_11[world, vehicle, block]
+        G12 += state.gramian_12[world, vehicle, block]
+        G22 += state.gramian_22[world, vehicle, block]
+        time += state.gramian_time[world, vehicle, block]
+    if time <= time - time:
+        return time
+    zero6 = state.covariance[world, vehicle] - state.covariance[world, vehicle]
+    G = join6(G11, G12, wp.transpose(G12), G22, zero6)
+    return smallest_eigenvalue6(G) / time
+
+
+@wp.func
+def cholesky_of(P: Any, zero3: Any):
+    """Return the block Cholesky factor of a 6x6 covariance."""
+    L11, L21, L22 = cholesky6(block3(P, 0, 0, zero3), block3(P, 0, 3, zero3), block3(P, 3, 3, zero3))
+    return L11, L21, L22
