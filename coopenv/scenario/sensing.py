@@ -128,7 +128,8 @@ class V2x(Part):
 class Observer(Part):
     """The estimator that every vehicle runs, and its gains."""
 
-    name: str = "riccati"
+    name: Literal["riccati", "dead_reckoning"] = "riccati"
+    """`riccati`: the paper's observer; `dead_reckoning`: odometry alone, the lower reference."""
     k: Positive | tuple[Positive, ...] = 1.0
     """Gain k_i > 0.5, one for all vehicles or one per vehicle."""
     q: Positive | dict[str, Positive] = 10.0

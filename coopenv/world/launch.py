@@ -14,16 +14,12 @@ import warp as wp
 
 wp.config.log_level = wp.LOG_ERROR
 
-LARGEST_UNROLLED = 6
-"""Loops up to the size of the state are unrolled; longer ones would only swell the code."""
-
 
 @cache
 def kernel(function: Callable[..., None], precision_name: str) -> wp.Kernel:
     """Return a plain Python function as a Warp kernel whose module serves one precision only."""
     module = wp.get_module(f"{function.__module__}.{function.__name__}.{precision_name}")
     module.options["enable_backward"] = False
-    module.options["max_unroll"] = LARGEST_UNROLLED
     return wp.Kernel(func=function, key=function.__name__, module=module)
 
 

@@ -135,6 +135,7 @@ def model_struct(p: Precision) -> Any:
     class Observer:
         """Gains of the Riccati observer."""
 
+        corrects: wp.int32  # 0: dead reckoning
         k: wp.array(dtype=scalar)  # (N,)
         q: wp.array(dtype=scalar)  # (A,)
         v1: scalar
@@ -411,6 +412,7 @@ def _fill_radio(radio: Any, scenario: Scenario) -> None:
 def _fill_observer(observer: Any, scenario: Scenario, fill: _Filler) -> None:
     o = scenario.observer
     count = len(scenario.vehicles)
+    observer.corrects = int(o.name != "dead_reckoning")
     observer.k = fill.array(o.k if isinstance(o.k, tuple) else [o.k] * count, fill.p.scalar)
     q = o.q
     weights = [q.get(name, 10.0) if isinstance(q, dict) else q for name in scenario.target_names]

@@ -195,7 +195,8 @@ def estimate(model: Any, before: Any, after: Any, world: int, vehicle: int, tick
     due_now = wp.floor(wp.float64(tick) * model.observer.rate / model.camera_rate + wp.float64(1.0e-9))
     last = before.corrected_tick[world, vehicle]
     if due_now > due_before:
-        correct(model, after, world, vehicle, tick, dt * type(dt)(tick - last))
+        if model.observer.corrects == 1:
+            correct(model, after, world, vehicle, tick, dt * type(dt)(tick - last))
         last = tick
     after.corrected_tick[world, vehicle] = last
     accumulate_gramian(model, after, world, vehicle, tick, dt)

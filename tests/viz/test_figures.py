@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from matplotlib.lines import Line2D
 from scipy.stats import chi2
 
 from coopenv.errors import OutputError
@@ -54,17 +55,21 @@ def no_warnings() -> Iterator[None]:
 
 def spans(ax: Axes, colour: str) -> list[tuple[float, float]]:
     """Return (start, end) of the horizontal bars of one face colour, in order."""
-    found = []
+    found: list[tuple[float, float]] = []
     for collection in ax.collections:
-        if isinstance(collection, PolyCollection):
-            for path, face in zip(
-                collection.get_paths(),
-                np.resize(collection.get_facecolor(), (len(collection.get_paths()), 4)),
-                strict=True,
-            ):
-                if np.allclose(face, mpl.colors.to_rgba(colour)):
-                    found.append((path.vertices[:, 0].min(), path.vertices[:, 0].max()))
+        faces = collection.get_facecolor()
+        if isinstance(collection, PolyCollection) and np.array_equal(faces, mpl.colors.to_rgba_array(colour)):
+            x = [np.asarray(path.vertices)[:, 0] for path in collection.get_paths()]
+            found += [(values.min(), values.max()) for values in x]
     return sorted(found)
+
+
+def xdata(line: Line2D) -> np.ndarray:
+    return np.asarray(line.get_xdata(), float)
+
+
+def ydata(line: Line2D) -> np.ndarray:
+    return np.asarray(line.get_ydata(), float)
 
 
 def texts(figure: Figure) -> set[str]:
@@ -129,14 +134,12 @@ def test_error_figure_shows_the_errors_and_marks_settling_and_moving_targets(run
     lines = [line for line in linear.lines if line.get_color() in style.AXES_COLOURS]
     error = run.position[:, 0] - run.position_estimate[:, 0]
     for line, component in zip(lines, error.T, strict=True):
-        np.testing.assert_allclose(
-            line.get_ydata(), np.interp(line.get_xdata(), run.t, component), atol=1e-12
-        )
-        assert line.get_xdata()[0] == run.t[0] and line.get_xdata()[-1] == run.t[-1]
+        np.testing.assert_allclose(ydata(line), np.interp(xdata(line), run.t, component), atol=1e-12)
+        assert xdata(line)[0] == run.t[0] and xdata(line)[-1] == run.t[-1]
     yaw = next(line for line in figure.axes[2].lines if line.get_color() == style.AXES_COLOURS[2])
-    assert yaw.get_ydata()[0] == pytest.approx(90, abs=0.1)  # the synthetic start is a quarter turn about z
+    assert ydata(yaw)[0] == pytest.approx(90, abs=0.1)  # the synthetic start is a quarter turn about z
     assert spans(linear, style.SHADE) == [pytest.approx((21, 25), abs=0.05)]  # f1 sees f2
-    settled = [x[0] for x in (line.get_xdata() for line in log.lines) if x[0] == x[1]]  # upright
+    settled = [x[0] for x in (xdata(line) for line in log.lines) if x[0] == x[1]]  # upright
     assert settled == [pytest.approx(np.log(90) / 1.2, abs=0.5)]
     assert {"position error\n[m]", "orientation error\n[deg]", "time [s]", "$f_{5}$"} <= texts(figure)
 
@@ -190,10 +193,10 @@ def test_plan_is_to_scale_and_shows_truth_dotted_and_estimate_solid(run: Traject
     metres = np.diff(ax.get_xlim())[0], np.diff(ax.get_ylim())[0]
     assert box.width / metres[0] == pytest.approx(box.height / metres[1], rel=1e-6)
     dotted = [line for line in ax.lines if line.get_color() == style.INK and line.get_linestyle() == "--"]
-    solid = [line for line in ax.lines if len(line.get_xdata()) > 1 and line.get_linestyle() == "-"]
+    solid = [line for line in ax.lines if len(xdata(line)) > 1 and line.get_linestyle() == "-"]
     assert len(dotted) == len(solid) == 5
-    np.testing.assert_allclose(dotted[0].get_xydata()[[0, -1]], run.position[[0, -1], 0, :2])
-    np.testing.assert_allclose(solid[4].get_xydata()[[0, -1]], run.position_estimate[[0, -1], 4, :2])
+    np.testing.assert_allclose(ydata(dotted[0])[[0, -1]], run.position[[0, -1], 0, 1])
+    np.testing.assert_allclose(ydata(solid[4])[[0, -1]], run.position_estimate[[0, -1], 4, 1])
     assert {"SL1", "SL2", "SL3", "x [m]", "y [m]"} <= texts(figure)
 
 
@@ -205,9 +208,9 @@ def test_moving_landmark_has_a_path_and_its_own_label(run: Trajectory) -> None:
         dataclasses.replace(run, target_position=target_position, target_moving=moving)
     )
     assert "ML3" in texts(figure) and "SL3" not in texts(figure)
-    paths = [x for x in figure.axes[0].lines if x.get_color() == style.DARK_BLUE and len(x.get_xdata()) > 1]
+    paths = [x for x in figure.axes[0].lines if x.get_color() == style.DARK_BLUE and len(xdata(x)) > 1]
     assert len(paths) == 1
-    assert paths[0].get_xdata()[-1] - paths[0].get_xdata()[0] == pytest.approx(10.0)
+    assert xdata(paths[0])[-1] - xdata(paths[0])[0] == pytest.approx(10.0)
 
 
 def test_space_has_one_scale_on_all_axes(run: Trajectory) -> None:
@@ -229,9 +232,9 @@ def test_consistency_shows_the_share_of_ticks_inside_and_the_claimed_deviation(r
     figure = consistency.consistency_figure(dataclasses.replace(run, nees=nees))
     assert sum("75 % of ticks inside" in text for text in texts(figure)) == 1  # equal notes, one set member
     error, claimed = figure.axes[1].lines
-    assert error.get_ydata()[0] == pytest.approx(run.position_error[0, 0])
-    assert claimed.get_ydata()[0] == pytest.approx(np.sqrt(3) * (6 + 0.02 + 1e-3))
-    degrees = figure.axes[2].lines[1].get_ydata()[0]
+    assert ydata(error)[0] == pytest.approx(run.position_error[0, 0])
+    assert ydata(claimed)[0] == pytest.approx(np.sqrt(3) * (6 + 0.02 + 1e-3))
+    degrees = ydata(figure.axes[2].lines[1])[0]
     assert degrees == pytest.approx(np.degrees(np.sqrt(3) * (1 + np.radians(0.02) + 1e-4)))
 
 
@@ -240,7 +243,7 @@ def test_observability_figure_shows_threshold_and_verdict(run: Trajectory) -> No
     figure = observability_figure(result)
     local, _, verdict = figure.axes
     threshold = [line for line in local.lines if line.get_label() == "threshold"]
-    assert threshold[0].get_ydata()[0] == 2e-3
+    assert ydata(threshold[0])[0] == 2e-3
     drawn = sum(end - start for start, end in spans(verdict, style.GREEN))
     expected = sum(i.end - i.start for v in range(5) for i in result.intervals(v) if i.observable)
     assert drawn == pytest.approx(expected)

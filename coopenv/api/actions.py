@@ -1,0 +1,65 @@
+"""Read a dictionary of actions into one array, or say in one line what is wrong with it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from coopenv.errors import ActionError, suggest
+
+
+class ActionReader:
+    """Turns {agent: (2,)} into (1, N, 2), clipped to [-1, 1]."""
+
+    def __init__(self, possible_agents: Sequence[str]) -> None:
+        self._index = {agent: i for i, agent in enumerate(possible_agents)}
+        self._buffer = np.zeros((1, len(possible_agents), 2))
+
+    def __call__(self, actions: Mapping[str, np.ndarray], alive: Sequence[str]) -> np.ndarray:
+        """Return the actions of the living agents; those that have ended keep their last one.
+
+        Raises:
+            ActionError: an action is missing, unknown, of the wrong shape, or not finite.
+        """
+        try:
+            values = np.array([actions[agent] for agent in alive], dtype=np.float64)
+        except (KeyError, TypeError, ValueError):
+            values = np.empty(0)
+        if values.shape != (len(alive), 2) or len(actions) != len(alive) or not np.isfinite(values).all():
+            self._complain(actions, alive)
+        self._buffer[0, [self._index[agent] for agent in alive]] = np.clip(values, -1.0, 1.0)
+        return self._buffer
+
+    def _complain(self, actions: Mapping[str, np.ndarray], alive: Sequence[str]) -> None:
+        if not isinstance(actions, Mapping):
+            raise ActionError(f"actions must be a dict of agent to array, got {type(actions).__name__}")
+        for agent in actions:
+            if agent not in self._index:
+                raise ActionError(
+                    f"action for unknown agent '{agent}'{suggest(str(agent), self._index)}; "
+                    f"agents: {', '.join(alive)}"
+                )
+            if agent not in alive:
+                raise ActionError(f"action for '{agent}', which has ended; agents: {', '.join(alive)}")
+        for agent in alive:
+            if agent not in actions:
+                raise ActionError(f"no action for '{agent}'; agents: {', '.join(alive)}")
+            check_action(actions[agent], agent)
+
+
+def check_action(action: object, agent: str) -> np.ndarray:
+    """Return one action as a float array.
+
+    Raises:
+        ActionError: wrong shape, not a number, or not finite.
+    """
+    try:
+        value = np.asarray(action, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ActionError(f"action of '{agent}' is not numeric: {action!r}") from None
+    if value.shape != (2,):
+        raise ActionError(f"action of '{agent}' has shape {value.shape}, expected (2,)")
+    if not np.isfinite(value).all():
+        raise ActionError(f"action of '{agent}' is not finite: {value.tolist()}")
+    return value

@@ -1,0 +1,67 @@
+"""The info dictionaries: truth, judgements and reward terms, fresh at every step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from coopenv.api.engine import Engine
+from coopenv.api.rewards import TERMS
+from coopenv.estimation.trajectory import Sight
+from coopenv.scenario import Scenario
+
+OUTCOMES = ("under way", "arrived", "collided")
+
+
+class InfoWriter:
+    """Builds {agent: info} for world 0 of an engine."""
+
+    def __init__(self, engine: Engine, scenario: Scenario) -> None:
+        self._engine = engine
+        self._index = {agent: i for i, agent in enumerate(scenario.vehicle_names)}
+        self._targets = scenario.target_names
+        self._landmarks = len(scenario.landmarks)
+        self._tick_length = 1.0 / scenario.rates.camera
+
+    def __call__(self, agents: list[str]) -> dict[str, dict[str, Any]]:
+        """Return one info per agent, always with the same keys."""
+        view = self._engine.view
+        L = self._landmarks
+        R, position = view("rotation")[0, L:].copy(), view("position")[0, L:].copy()
+        velocity = view("velocity")[0, L:].copy()
+        angular_velocity = view("angular_velocity")[0, L:].copy()
+        R_hat, p_hat = view("estimate_rotation")[0].copy(), view("estimate_position")[0]
+        position_hat = np.matmul(R_hat, p_hat[..., None])[..., 0]
+        covariance = view("covariance")[0].copy()
+        position_error, orientation_error = view("position_error")[0].tolist(), view("orientation_error")[0].tolist()
+        nees, log_determinant = view("nees")[0].tolist(), view("log_determinant")[0].tolist()
+        smallest = view("gramian_min_eigenvalue")[0].tolist()
+        ended, terms = view("ended")[0].tolist(), view("terms")[0].tolist()
+        seen: list[list[str]] = [[] for _ in R]
+        vehicle_seen, target_seen = np.nonzero(view("sight")[0] == Sight.VISIBLE)
+        for i, target in zip(vehicle_seen.tolist(), target_seen.tolist(), strict=True):
+            seen[i].append(self._targets[target])
+        time = int(view("tick")[0]) * self._tick_length
+        infos = {}
+        for agent in agents:
+            i = self._index[agent]
+            infos[agent] = {
+                "truth": {
+                    "position": position[i],
+                    "rotation": R[i],
+                    "velocity": velocity[i],
+                    "angular_velocity": angular_velocity[i],
+                },
+                "estimate": {"position": position_hat[i], "rotation": R_hat[i], "covariance": covariance[i]},
+                "position_error": position_error[i],
+                "orientation_error": orientation_error[i],
+                "visible": tuple(seen[i]),
+                "nees": nees[i],
+                "log_determinant": log_determinant[i],
+                "gramian_min_eigenvalue": smallest[i],
+                "reward_terms": dict(zip(TERMS, terms[i], strict=True)),
+                "time": time,
+                "outcome": OUTCOMES[ended[i]],
+            }
+        return infos

@@ -1,0 +1,261 @@
+"""The PettingZoo face: one world, dictionaries keyed by agent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from pettingzoo import ParallelEnv
+
+from coopenv.api.actions import ActionReader
+from coopenv.api.engine import Engine
+from coopenv.api.infos import InfoWriter
+from coopenv.api.layout import Field, action_space, dict_space, flat_space
+from coopenv.api.state import state_space, state_vector
+from coopenv.errors import CoopenvError, suggest
+from coopenv.scenario import Scenario, load_scenario
+from coopenv.viz.topview import TopView
+
+Observations = dict[str, Any]
+Infos = dict[str, dict[str, Any]]
+
+BACKENDS = ("simulated",)
+RENDER_MODES = ("rgb_array", "human")
+
+
+class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
+    """Connected vehicles at an intersection, each estimating its own pose.
+
+    Observation (per agent): a flat float32 Box whose entries `observation_layout` names, or a one-level Dict of the
+    same fields. It holds only what the vehicle itself measures, hears and estimates.
+
+    Action (per agent): Box(-1, 1, (2,), float32): speed or acceleration, and steering (positive: left). Values beyond
+    are clipped. Vehicles with prescribed motion ignore it.
+
+    Reward: the weighted sum of the named terms in `info["reward_terms"]`.
+
+    `terminated` on collision or arrival, `truncated` at the horizon. A vehicle that has ended leaves `agents`, parks
+    where it is, and goes on observing and sending, so that its followers keep their neighbour.
+
+    Info: `truth`, `estimate`, `position_error` (m), `orientation_error` (deg), `visible` (target names), `nees`,
+    `log_determinant`, `gramian_min_eigenvalue`, `reward_terms`, `time` (s), `outcome`.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        name: str,
+        *,
+        render_mode: str | None = None,
+        observation: Literal["flat", "dict"] = "flat",
+        device: str = "cpu",
+        dtype: str = "float32",
+    ) -> None:
+        """Build the world; use `coopenv.parallel_env` to build one by name."""
+        _one_of("render_mode", render_mode, (None, *RENDER_MODES))
+        _one_of("observation", observation, ("flat", "dict"))
+        self.scenario = scenario
+        self.render_mode = render_mode
+        self.metadata = {
+            "name": f"{name}_v0",
+            "render_modes": list(RENDER_MODES),
+            "render_fps": scenario.rates.decision,
+            "is_parallelizable": True,
+        }
+        self._arguments = {
+            "scenario": scenario,
+            "name": name,
+            "render_mode": render_mode,
+            "observation": observation,
+            "device": device,
+            "dtype": dtype,
+        }
+        self.engine = Engine(scenario, 1, dtype, device)
+        self.possible_agents = list(scenario.vehicle_names)
+        self.agents: list[str] = []
+        self._index = {agent: i for i, agent in enumerate(self.possible_agents)}
+        self._flat = observation == "flat"
+        layout = self.engine.layout
+        space: spaces.Space[Any] = flat_space(layout) if self._flat else dict_space(layout)
+        self.observation_spaces = {agent: space for agent in self.possible_agents}
+        self.action_spaces = {agent: action_space() for agent in self.possible_agents}
+        self.state_space = state_space(scenario)
+        self._read_actions = ActionReader(self.possible_agents)
+        self._infos = InfoWriter(self.engine, scenario)
+        self._view: TopView | None = None
+        self._seeded = False
+
+    @property
+    def observation_layout(self) -> dict[str, Field]:
+        """Name, slice, unit and scale of every field of the flat observation."""
+        return dict(self.engine.layout)
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """Return the agent's observation space, the same object at every call."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        """Return the agent's action space, the same object at every call."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, Infos]:
+        """Start an episode.
+
+        Args:
+            seed: fixes the episode; None goes on with a new episode of the last seed (a random one at first).
+            options: not used.
+        """
+        if seed is None and not self._seeded:
+            _, seed = seeding.np_random(None)
+        self._seeded = True
+        self.engine.reset(None if seed is None else [seed])
+        self.agents = list(self.possible_agents)
+        if self.render_mode == "human":
+            self.render()
+        return self._observations(self.agents), self._infos(self.agents)
+
+    def step(
+        self, actions: Mapping[str, np.ndarray]
+    ) -> tuple[Observations, dict[str, float], dict[str, bool], dict[str, bool], Infos]:
+        """Drive for one decision period.
+
+        Raises:
+            ActionError: an action is missing, unknown, of the wrong shape, or not finite.
+            CoopenvError: `reset` has not been called.
+        """
+        if not self._seeded:
+            raise CoopenvError("step() called before reset()")
+        alive = self.agents
+        if not alive:
+            return {}, {}, {}, {}, {}
+        self.engine.step(self._read_actions(actions, alive))
+        indices = [self._index[agent] for agent in alive]
+        reward = self.engine.view("reward")[0].tolist()
+        terminated = self.engine.view("terminated")[0].tolist()
+        truncated = self.engine.view("truncated")[0].tolist()
+        result = (
+            self._observations(alive),
+            {agent: reward[i] for agent, i in zip(alive, indices, strict=True)},
+            {agent: terminated[i] for agent, i in zip(alive, indices, strict=True)},
+            {agent: truncated[i] for agent, i in zip(alive, indices, strict=True)},
+            self._infos(alive),
+        )
+        self.agents = [
+            agent
+            for agent, i in zip(alive, indices, strict=True)
+            if not (terminated[i] or truncated[i])
+        ]
+        if self.render_mode == "human":
+            self.render()
+        return result
+
+    def _observations(self, agents: list[str]) -> Observations:
+        rows = self.engine.view("observation")[0].copy()
+        if self._flat:
+            return {agent: rows[self._index[agent]] for agent in agents}
+        layout = self.engine.layout
+        return {
+            agent: {name: rows[self._index[agent], field.slice] for name, field in layout.items()}
+            for agent in agents
+        }
+
+    def state(self) -> np.ndarray:
+        """Return the truth and the estimates of all vehicles as one vector, see `coopenv.api.state`."""
+        return state_vector(self.engine)
+
+    def render(self) -> np.ndarray | None:
+        """Draw the top view: an (H, W, 3) uint8 picture for `rgb_array`, a window for `human`."""
+        if self.render_mode is None:
+            return None
+        if self._view is None:
+            self._view = TopView(self.scenario)
+        picture = self._view.draw(self.engine)
+        if self.render_mode == "human":
+            self._view.show(picture)
+            return None
+        return picture
+
+    def close(self) -> None:
+        """Close the window, if any."""
+        if self._view is not None:
+            self._view.close()
+            self._view = None
+
+    def get_state(self) -> dict[str, Any]:
+        """Return everything that the next step depends on, random streams included; see `set_state`."""
+        return {"agents": list(self.agents), "seeded": self._seeded, **self.engine.get_state()}
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go back to a state that `get_state` returned, of this or an equal environment.
+
+        Raises:
+            CoopenvError: the state belongs to another kind of environment.
+        """
+        try:
+            self.engine.set_state({k: v for k, v in state.items() if k not in ("agents", "seeded")})
+            self.agents = list(state["agents"])
+            self._seeded = bool(state["seeded"])
+        except (KeyError, ValueError) as error:
+            raise CoopenvError(f"this state does not fit {self.metadata['name']}: {error}") from None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"arguments": self._arguments, "state": self.get_state()}
+
+    def __setstate__(self, saved: dict[str, Any]) -> None:
+        self.__init__(**saved["arguments"])  # type: ignore[misc]
+        self.set_state(saved["state"])
+
+
+def _one_of(what: str, value: Any, allowed: tuple[Any, ...]) -> None:
+    if value not in allowed:
+        names = [str(a) for a in allowed]
+        raise CoopenvError(f"unknown {what} '{value}'{suggest(str(value), names)}; known: {', '.join(names)}")
+
+
+def parallel_env(
+    name_or_path: str | Path,
+    *,
+    render_mode: str | None = None,
+    observer: str | None = None,
+    backend: str | None = None,
+    observation: Literal["flat", "dict"] = "flat",
+    device: str = "cpu",
+    dtype: str = "float32",
+    overrides: Mapping[str, Any] | None = None,
+) -> CooperativeLocalisationEnv:
+    """Return an environment by name (`coopenv.list_envs()`) or from a TOML file.
+
+    Args:
+        name_or_path: for example "busy_intersection".
+        render_mode: None, "rgb_array" or "human".
+        observer: estimator that every vehicle runs; None: as the scenario says.
+        backend: where measurements come from; None: "simulated".
+        observation: "flat" Box or one-level "dict".
+        device: "cpu" or a CUDA device.
+        dtype: "float32" or "float64" (of the world; observations are float32).
+        overrides: dotted scenario keys, for example {"noise.enabled": False}.
+
+    Raises:
+        UnknownEnvironmentError: no such environment.
+        ScenarioError: the file or an override is not valid.
+        CoopenvError: another argument is not valid.
+    """
+    _one_of("backend", backend, (None, *BACKENDS))
+    merged = dict(overrides or {})
+    if observer is not None:
+        merged["observer.name"] = observer
+    scenario = load_scenario(name_or_path, merged)
+    return CooperativeLocalisationEnv(
+        scenario,
+        Path(str(name_or_path)).stem,
+        render_mode=render_mode,
+        observation=observation,
+        device=device,
+        dtype=dtype,
+    )

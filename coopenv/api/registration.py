@@ -1,0 +1,56 @@
+"""Register every shipped environment with Gymnasium and PettingZoo as `coopenv/<CamelCase>-v0`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import pettingzoo
+from pettingzoo import AECEnv, aec_registry, parallel_registry
+from pettingzoo.utils import parallel_to_aec
+
+from coopenv.api.parallel_env import CooperativeLocalisationEnv, parallel_env
+from coopenv.scenario import list_envs, load_scenario
+
+
+def environment_id(name: str) -> str:
+    """Return the registered id of an environment: busy_intersection -> coopenv/BusyIntersection-v0."""
+    return f"coopenv/{name.title().replace('_', '')}-v0"
+
+
+def make_parallel(name: str, max_cycles: int | None = None, **options: Any) -> CooperativeLocalisationEnv:
+    """Entry point of PettingZoo's parallel registry.
+
+    Args:
+        name: environment.
+        max_cycles: decision steps per episode instead of the scenario's horizon.
+        options: those of `coopenv.parallel_env`.
+    """
+    if max_cycles is not None:
+        rate = load_scenario(name, options.get("overrides")).rates.decision
+        options["overrides"] = {**(options.get("overrides") or {}), "horizon": max_cycles / rate}
+    return parallel_env(name, **options)
+
+
+def make_aec(name: str, **options: Any) -> AECEnv[str, Any, Any]:
+    """Entry point of PettingZoo's AEC registry; arguments as for `make_parallel`."""
+    return parallel_to_aec(make_parallel(name, **options))
+
+
+def register_all() -> None:
+    """Register what is not registered yet."""
+    here = __name__
+    for name in list_envs():
+        identity = environment_id(name)
+        if identity not in gymnasium.registry:
+            gymnasium.register(
+                identity,
+                entry_point="coopenv.api.single_vehicle:SingleVehicleEnv",
+                kwargs={"name_or_path": name},
+            )
+        for kind, registry, entry in (
+            ("parallel", parallel_registry, "make_parallel"),
+            ("aec", aec_registry, "make_aec"),
+        ):
+            if identity not in registry:
+                pettingzoo.register(kind, identity, entry_point=f"{here}:{entry}", kwargs={"name": name})

@@ -1,0 +1,86 @@
+"""The Gymnasium face: one vehicle is the agent, the others follow a fixed rule."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from coopenv.api.parallel_env import CooperativeLocalisationEnv, parallel_env
+from coopenv.errors import CoopenvError, suggest
+
+OtherPolicy = Callable[[str, Any], np.ndarray]
+"""Maps another vehicle's name and observation to its action."""
+
+
+def keep_going(agent: str, observation: Any) -> np.ndarray:
+    """Return the neutral action: straight on, at half of the speed range (or without acceleration)."""
+    return np.zeros(2, dtype=np.float32)
+
+
+class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
+    """One vehicle of a `CooperativeLocalisationEnv` as a single-agent environment."""
+
+    def __init__(
+        self,
+        name_or_path: str | Path,
+        *,
+        vehicle: str = "vehicle_1",
+        others: OtherPolicy = keep_going,
+        **options: Any,
+    ) -> None:
+        """Build the environment.
+
+        Args:
+            name_or_path: as for `coopenv.parallel_env`, which also takes `options`.
+            vehicle: the one that the action drives.
+            others: the rule of the other vehicles.
+
+        Raises:
+            CoopenvError: no such vehicle.
+        """
+        self.world: CooperativeLocalisationEnv = parallel_env(name_or_path, **options)
+        names = self.world.possible_agents
+        if vehicle not in names:
+            raise CoopenvError(f"unknown vehicle '{vehicle}'{suggest(vehicle, names)}; known: {', '.join(names)}")
+        self.vehicle, self._others = vehicle, others
+        self.render_mode = self.world.render_mode
+        self.metadata = dict(self.world.metadata)
+        self.observation_space = self.world.observation_space(vehicle)
+        self.action_space = self.world.action_space(vehicle)
+        self._observations: dict[str, Any] = {}
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start an episode, see `CooperativeLocalisationEnv.reset`."""
+        super().reset(seed=seed)
+        self._observations, infos = self.world.reset(seed=seed, options=options)
+        return self._observations[self.vehicle], infos[self.vehicle]
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Drive the vehicle for one decision period.
+
+        Raises:
+            ActionError: the action has the wrong shape or is not finite.
+        """
+        actions = {
+            agent: action if agent == self.vehicle else self._others(agent, self._observations[agent])
+            for agent in self.world.agents
+        }
+        self._observations, rewards, terminated, truncated, infos = self.world.step(actions)
+        v = self.vehicle
+        if v not in rewards:
+            raise CoopenvError(f"step() called although {v} has ended; call reset()")
+        return self._observations[v], rewards[v], terminated[v], truncated[v], infos[v]
+
+    def render(self) -> Any:
+        """Draw the top view."""
+        return self.world.render()
+
+    def close(self) -> None:
+        """Close the window, if any."""
+        self.world.close()
