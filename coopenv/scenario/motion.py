@@ -35,7 +35,7 @@ class TwistTable:
 def left_jacobian(w: np.ndarray) -> np.ndarray:
     """Return J_l(w) = int_0^1 Exp(s w) ds, (3, 3), for a rotation vector w in rad."""
     angle = float(np.linalg.norm(w))
-    S = np.cross(np.eye(3), w).T
+    S = np.cross(np.eye(3), w)
     if angle < 1e-4:
         return np.eye(3) + S / 2 + S @ S / 6
     return np.eye(3) + (1 - np.cos(angle)) / angle**2 * S + (angle - np.sin(angle)) / angle**3 * S @ S
