@@ -1,8 +1,8 @@
 """Cooperative localisation of connected vehicles as a standard multi-agent environment.
 
-    import coopenv
-    env = coopenv.parallel_env("busy_intersection")
-    observations, infos = env.reset(seed=0)
+import coopenv
+env = coopenv.parallel_env("busy_intersection")
+observations, infos = env.reset(seed=0)
 """
 
 from coopenv.api.parallel_env import CooperativeLocalisationEnv, parallel_env

@@ -37,8 +37,7 @@ class ActionReader:
         for agent in actions:
             if agent not in self._index:
                 raise ActionError(
-                    f"action for unknown agent '{agent}'{suggest(str(agent), self._index)}; "
-                    f"agents: {', '.join(alive)}"
+                    f"action for unknown agent '{agent}'{suggest(str(agent), self._index)}; agents: {', '.join(alive)}"
                 )
             if agent not in alive:
                 raise ActionError(f"action for '{agent}', which has ended; agents: {', '.join(alive)}")

@@ -25,9 +25,7 @@ class Engine:
     without a copy on the CPU; copy what must outlive the next step.
     """
 
-    def __init__(
-        self, scenario: Scenario, worlds: int = 1, dtype: str = "float32", device: str = "cpu"
-    ) -> None:
+    def __init__(self, scenario: Scenario, worlds: int = 1, dtype: str = "float32", device: str = "cpu") -> None:
         """Build everything.
 
         Raises:
@@ -40,7 +38,7 @@ class Engine:
             self.world.model, worlds, layout_size(self.layout), self.world.precision, self.world.device
         )
         self._plan = observation_plan(scenario, self.layout)
-        self._weights = wp.array(reward_weights(scenario), dtype=wp.float32, device=self.world.device)
+        self._weights: Any = wp.array(reward_weights(scenario), dtype=wp.float32, device=self.world.device)
         self._launch = Launcher((worlds, self.world.model.vehicles), self.world.device, dtype)
         self._state_fields = set(state_fields(self.world.precision))
         self._views: dict[str, np.ndarray] = {}

@@ -87,10 +87,7 @@ def flat_space(layout: Mapping[str, Field]) -> spaces.Box:
 def dict_space(layout: Mapping[str, Field]) -> spaces.Dict:
     """Return a one-level Dict of one-dimensional boxes, one per field."""
     return spaces.Dict(
-        {
-            name: spaces.Box(f.low, 1.0, shape=(f.stop - f.start,), dtype=np.float32)
-            for name, f in layout.items()
-        }
+        {name: spaces.Box(f.low, 1.0, shape=(f.stop - f.start,), dtype=np.float32) for name, f in layout.items()}
     )
 
 

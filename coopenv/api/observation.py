@@ -13,7 +13,6 @@ from coopenv.scenario import Scenario
 from coopenv.world.camera import VISIBLE
 from coopenv.world.v2x import fresh
 
-
 EIGENVALUE_FLOOR = wp.constant(1.0e-9)
 NEVER = wp.constant(wp.float64(1.0e9))
 LOGARITHMIC = wp.constant(LOG_SCALE)

@@ -102,9 +102,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         """Return the agent's action space, the same object at every call."""
         return self.action_spaces[agent]
 
-    def reset(
-        self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, Infos]:
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Infos]:
         """Start an episode.
 
         Args:
@@ -146,11 +144,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             {agent: truncated[i] for agent, i in zip(alive, indices, strict=True)},
             self._infos(alive),
         )
-        self.agents = [
-            agent
-            for agent, i in zip(alive, indices, strict=True)
-            if not (terminated[i] or truncated[i])
-        ]
+        self.agents = [agent for agent, i in zip(alive, indices, strict=True) if not (terminated[i] or truncated[i])]
         if self.render_mode == "human":
             self.render()
         return result
@@ -161,8 +155,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             return {agent: rows[self._index[agent]] for agent in agents}
         layout = self.engine.layout
         return {
-            agent: {name: rows[self._index[agent], field.slice] for name, field in layout.items()}
-            for agent in agents
+            agent: {name: rows[self._index[agent], field.slice] for name, field in layout.items()} for agent in agents
         }
 
     def state(self) -> np.ndarray:

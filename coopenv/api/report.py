@@ -18,7 +18,6 @@ from coopenv.estimation.so3 import rotation_angle
 from coopenv.world.collision import UNDER_WAY, goal_distance
 from coopenv.world.precision import Precision
 
-
 DEGREES = wp.constant(57.29577951308232)
 
 
@@ -59,11 +58,8 @@ def allocate_report(model: Any, worlds: int, size: int, p: Precision, device: st
     N = model.vehicles
     shapes = {"observation": (worlds, N, size), "terms": (worlds, N, len(TERMS))}
     for name, var in report_struct(p).vars.items():
-        setattr(
-            report, name, wp.zeros(shapes.get(name, (worlds, N)), dtype=var.type.dtype, device=device)
-        )
+        setattr(report, name, wp.zeros(shapes.get(name, (worlds, N)), dtype=var.type.dtype, device=device))
     return report
-
 
 
 def begin_kernel(model: Any, state: Any, report: Any, mask: wp.array(dtype=wp.int32)):
@@ -125,7 +121,6 @@ def reward(model: Any, state: Any, report: Any, weights: wp.array(dtype=wp.float
     report.last_goal_distance[world, vehicle] = distance
     report.last_ended[world, vehicle] = ended
     report.last_tick[world, vehicle] = tick
-
 
 
 def report_kernel(model: Any, state: Any, plan: Any, weights: wp.array(dtype=wp.float32), report: Any):

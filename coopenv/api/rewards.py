@@ -11,7 +11,6 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.learning import RewardWeights
 from coopenv.world.collision import ARRIVED, COLLIDED
 
-
 TERMS = tuple(RewardWeights.model_fields)
 """Names of the terms, in the order of every term axis."""
 

@@ -35,9 +35,10 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         """Build the environment.
 
         Args:
-            name_or_path: as for `coopenv.parallel_env`, which also takes `options`.
+            name_or_path: as for `coopenv.parallel_env`.
             vehicle: the one that the action drives.
             others: the rule of the other vehicles.
+            **options: the other arguments of `coopenv.parallel_env`.
 
         Raises:
             CoopenvError: no such vehicle.
@@ -53,9 +54,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         self.action_space = self.world.action_space(vehicle)
         self._observations: dict[str, Any] = {}
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode, see `CooperativeLocalisationEnv.reset`."""
         super().reset(seed=seed)
         self._observations, infos = self.world.reset(seed=seed, options=options)

@@ -97,9 +97,7 @@ def error_coordinates(
     """
     twice_lambda = 2 * quaternion_wxyz(error_rotation(rotation, rotation_estimate))[..., 1:]
     p = np.einsum("...ji,...j->...i", np.asarray(rotation, float), np.asarray(position, float))
-    p_hat = np.einsum(
-        "...ji,...j->...i", np.asarray(rotation_estimate, float), np.asarray(position_estimate, float)
-    )
+    p_hat = np.einsum("...ji,...j->...i", np.asarray(rotation_estimate, float), np.asarray(position_estimate, float))
     return np.concatenate([twice_lambda, p - p_hat], axis=-1)
 
 

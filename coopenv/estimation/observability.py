@@ -54,9 +54,7 @@ class Observability:
     threshold: float  # on `local_eigenvalue`
     min_eigenvalue: np.ndarray  # (M, N) of W as in the theorem, about the map origin; mixed units
     condition_number: np.ndarray  # (M, N) of W as in the theorem; inf where singular to rounding
-    local_eigenvalue: (
-        np.ndarray
-    )  # (M, N) smallest, about the vehicle and with lambda scaled by L: no unit, no origin
+    local_eigenvalue: np.ndarray  # (M, N) smallest, about the vehicle and with lambda scaled by L: no unit, no origin
     vehicles: np.ndarray  # (N,) names
 
     @property
@@ -71,10 +69,7 @@ class Observability:
         verdict = self.observable[:, vehicle]
         first = np.flatnonzero(np.diff(verdict, prepend=~verdict[0]))
         ends = [*self.t[first[1:]], self.t[-1] + self.window]
-        return [
-            Interval(float(self.t[k]), float(end), bool(verdict[k]))
-            for k, end in zip(first, ends, strict=True)
-        ]
+        return [Interval(float(self.t[k]), float(end), bool(verdict[k])) for k, end in zip(first, ends, strict=True)]
 
 
 def analyse_observability(
@@ -109,9 +104,7 @@ def analyse_observability(
     )
 
 
-def observability_gramian(
-    trajectory: Trajectory, window: float = DEFAULT_WINDOW
-) -> tuple[np.ndarray, np.ndarray]:
+def observability_gramian(trajectory: Trajectory, window: float = DEFAULT_WINDOW) -> tuple[np.ndarray, np.ndarray]:
     """Return the window starts (M,) in s and W(t) (M, N, 6, 6) over (2 lambda, p) in the body frame at t."""
     start, W, anchor = _windows_about_anchor(trajectory, window)
     R = trajectory.rotation[start]

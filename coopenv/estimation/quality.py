@@ -10,7 +10,6 @@ from coopenv.estimation.linalg import block3, cholesky6, inverse_lower3, join6, 
 from coopenv.estimation.so3 import quaternion_vector
 
 
-
 @wp.func
 def log_determinant(L11: Any, L22: Any):
     """Return log det P from the diagonal blocks of its Cholesky factor."""

@@ -19,7 +19,6 @@ from coopenv.estimation.linalg import cholesky6, eigen_symmetric6, inverse_lower
 from coopenv.estimation.so3 import exp_so3, identity3, left_jacobian, orthonormalise, skew
 
 
-
 @wp.func
 def accumulate_information(a: Any, b: Any, e: Any, q: Any, M11: Any, M12: Any, M22: Any, r1: Any, r2: Any):
     """Add one bearing to M = C^T Q C (blocks) and r = C^T Q (y - C_2 phat).
@@ -103,9 +102,7 @@ def gain_factor(k: Any, m: Any, h: Any):
 
 
 @wp.func
-def correction_modes(
-    M11: Any, M12: Any, M22: Any, L11: Any, L21: Any, L22: Any, zero6: Any, identity6: Any
-):
+def correction_modes(M11: Any, M12: Any, M22: Any, L11: Any, L21: Any, L22: Any, zero6: Any, identity6: Any):
     """Return (T, m): T = L U and the spectrum m (diagonal) of L^T M L = U diag(m) U^T."""
     o = M11 - M11
     L = join6(L11, o, L21, L22, zero6)

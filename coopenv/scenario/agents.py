@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -101,7 +102,7 @@ class WaypointMotion(Part):
     @model_validator(mode="after")
     def _times_increase(self) -> WaypointMotion:
         times = [w.time for w in self.waypoints]
-        if times[0] != 0.0 or any(b <= a for a, b in zip(times, times[1:], strict=False)):
+        if times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
             raise ValueError("waypoint times must start at 0 and increase")
         return self
 
@@ -114,9 +115,7 @@ class DrivenMotion(Part):
     """m/s"""
 
 
-LandmarkMotion = Annotated[
-    StaticMotion | ConstantMotion | SegmentMotion | WaypointMotion, Field(discriminator="kind")
-]
+LandmarkMotion = Annotated[StaticMotion | ConstantMotion | SegmentMotion | WaypointMotion, Field(discriminator="kind")]
 VehicleMotion = Annotated[
     StaticMotion | ConstantMotion | SegmentMotion | WaypointMotion | DrivenMotion,
     Field(discriminator="kind"),

@@ -81,8 +81,7 @@ def processing_order(scenario: Scenario) -> list[int]:
     """
     landmarks = len(scenario.landmarks)
     graph = {
-        i: {j - landmarks for j in targets if j >= landmarks}
-        for i, targets in enumerate(neighbour_sets(scenario))
+        i: {j - landmarks for j in targets if j >= landmarks} for i, targets in enumerate(neighbour_sets(scenario))
     }
     if not scenario.topology.acyclic:
         return sorted(graph)
@@ -128,18 +127,15 @@ def starts(scenario: Scenario) -> None:
     """Refuse vehicles that start inside a building or in one another's place."""
     positions = [start_position(scenario, i) for i in range(len(scenario.vehicles))]
     for i, position in enumerate(positions):
-        reach = np.array(scenario.vehicles[i].body.size).min() / 2 if scenario.vehicles[i].body else 0.0
+        body = scenario.vehicles[i].body
+        reach = min(body.size) / 2 if body else 0.0
         for obstacle in scenario.obstacles:
             local = Rotation.from_euler("z", -obstacle.yaw).apply(position - np.array(obstacle.center))
             if np.all(np.abs(local) < np.array(obstacle.size) / 2 + reach):
-                raise ValueError(
-                    f"vehicles.{i}.initial_pose: vehicle_{i + 1} starts inside obstacle '{obstacle.name}'"
-                )
+                raise ValueError(f"vehicles.{i}.initial_pose: vehicle_{i + 1} starts inside obstacle '{obstacle.name}'")
         for j in range(i):
             if np.linalg.norm(position - positions[j]) < 1e-6:
-                raise ValueError(
-                    f"vehicles.{i}.initial_pose: vehicle_{i + 1} starts in the place of vehicle_{j + 1}"
-                )
+                raise ValueError(f"vehicles.{i}.initial_pose: vehicle_{i + 1} starts in the place of vehicle_{j + 1}")
 
 
 def limits(scenario: Scenario) -> None:
@@ -152,8 +148,7 @@ def limits(scenario: Scenario) -> None:
     steering = scenario.action.steering
     if steering is not None and steering > scenario.dynamics.max_steering:
         raise ValueError(
-            f"action.steering: {steering:g} rad is above dynamics.max_steering "
-            f"({scenario.dynamics.max_steering:g} rad)"
+            f"action.steering: {steering:g} rad is above dynamics.max_steering ({scenario.dynamics.max_steering:g} rad)"
         )
 
 

@@ -155,10 +155,20 @@ def _one_line(error: ValidationError, where: str) -> str:
         name = location[-1]
         hint = suggest(name, valid) or f"; allowed: {', '.join(valid)}"
         return f"{where}: {'.'.join(location)}: unknown key{hint}{more}"
+    location = [part for part in location if part.isidentifier() or part.isdigit()]
     message = first["msg"].removeprefix("Value error, ")
+    field = ".".join(location)
+    if first["type"] == "value_error":  # our own checks: their messages start with the field that they are about
+        joint = "." if field and _starts_with_field(message) else ": "
+        return f"{where}: {field}{joint if field else ''}{message}{more}"
     got = first.get("input")
-    shown = f", got {got!r}" if isinstance(got, bool | int | float | str) and first["type"] != "value_error" else ""
-    return f"{where}: {'.'.join([*location, message]) if not location else '.'.join(location) + ': ' + message}{shown}{more}"
+    shown = f", got {got!r}" if isinstance(got, bool | int | float | str) else ""
+    return f"{where}: {field}: {message}{shown}{more}"
+
+
+def _starts_with_field(message: str) -> bool:
+    head, colon, _ = message.partition(":")
+    return bool(colon) and head.replace(".", "").isidentifier()
 
 
 def _valid_keys(location: tuple[int | str, ...]) -> list[str]:

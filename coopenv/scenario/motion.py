@@ -104,6 +104,4 @@ def _spline_table(motion: WaypointMotion, initial_rotation: np.ndarray) -> Twist
     step = rotations[:-1].inv().apply(np.diff(position, axis=0))
     linear = np.array([np.linalg.solve(left_jacobian(w), s) for w, s in zip(turn, step, strict=True)])
     rest = np.zeros((1, 3))
-    return twist_table(
-        t.tolist(), np.vstack([linear / h[:, None], rest]), np.vstack([turn / h[:, None], rest])
-    )
+    return twist_table(t.tolist(), np.vstack([linear / h[:, None], rest]), np.vstack([turn / h[:, None], rest]))

@@ -52,9 +52,7 @@ def consistency_figure(trajectory: Trajectory) -> Figure:
             "hspace": 0.16,
         },
     )
-    spread = np.sqrt(
-        np.diagonal(trajectory.covariance, axis1=-2, axis2=-1).reshape(-1, count, 2, 3).sum(axis=-1)
-    )
+    spread = np.sqrt(np.diagonal(trajectory.covariance, axis1=-2, axis2=-1).reshape(-1, count, 2, 3).sum(axis=-1))
     for vehicle, (left, middle, right) in enumerate(axes):
         _draw_nees(left, trajectory, vehicle)
         _draw_spread(middle, trajectory.t, trajectory.position_error[:, vehicle], spread[:, vehicle, 1])

@@ -50,9 +50,7 @@ def observability_figure(observability: Observability) -> Figure:
             "hspace": 0.14,
         },
     )
-    title = (
-        f"Observability Gramian, {observability.window:.3g} s windows (values below {_FLOOR:g} drawn there)"
-    )
+    title = f"Observability Gramian, {observability.window:.3g} s windows (values below {_FLOOR:g} drawn there)"
     figure.suptitle(title, x=0.11, y=1 - 0.12 / height, ha="left", va="top", fontsize=NORMAL + 1, color=INK)
     _draw_eigenvalues(local, observability, observability.local_eigenvalue)
     local.set_ylabel("smallest eigenvalue about\nthe vehicle, scaled [-]", fontsize=NORMAL)
@@ -90,9 +88,7 @@ def _draw_verdict(ax: Axes, observability: Observability) -> None:
     ax.grid(False, axis="y")
     for vehicle in range(len(observability.vehicles)):
         for observable, look in _VERDICTS.items():
-            stretches = [
-                (s, e - s) for s, e, verdict in observability.intervals(vehicle) if verdict == observable
-            ]
+            stretches = [(s, e - s) for s, e, verdict in observability.intervals(vehicle) if verdict == observable]
             if stretches:
                 ax.broken_barh(stretches, (vehicle - 0.32, 0.64), linewidth=0.4, **look)
     ax.set_yticks(range(len(observability.vehicles)), [vehicle_label(n) for n in observability.vehicles])

@@ -80,9 +80,7 @@ def moving_target_seen(trajectory: Trajectory, vehicle: int) -> np.ndarray:
 
 def shade(ax: Axes, stretches: Sequence[tuple[float, float]]) -> None:
     """Shade stretches of time over the whole height of `ax`."""
-    ax.broken_barh(
-        stretches, (0, 1), transform=ax.get_xaxis_transform(), facecolor=SHADE, edgecolor="none", zorder=0
-    )
+    ax.broken_barh(stretches, (0, 1), transform=ax.get_xaxis_transform(), facecolor=SHADE, edgecolor="none", zorder=0)
 
 
 def tidy(ax: Axes, *, x_label: str = "", y_label: str = "") -> None:

@@ -102,8 +102,6 @@ def _draw_lanes(ax: Axes, trajectory: Trajectory, vehicle: int, targets: np.ndar
     ax.set_ylim(max(1, len(targets)) - 0.5, -0.5)
     if not len(targets):
         ax.text(0.5, 0.5, "no neighbours", transform=ax.transAxes, ha="center", va="center", color=GREY)
-    ax.set_title(
-        vehicle_label(trajectory.vehicles[vehicle]), fontsize=NORMAL + 2, loc="left", pad=2.5, color=INK
-    )
+    ax.set_title(vehicle_label(trajectory.vehicles[vehicle]), fontsize=NORMAL + 2, loc="left", pad=2.5, color=INK)
     seen = trajectory.visible[:, vehicle].sum(axis=-1).mean()
     ax.set_title(f"{seen:.2f} targets in view on average", fontsize=SMALL, loc="right", pad=2.5, color=INK)

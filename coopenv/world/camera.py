@@ -11,7 +11,6 @@ import warp as wp
 
 from coopenv.world.random import BEARING, draw, gaussian_pair, signed_uniform, uniform
 
-
 NOT_A_NEIGHBOUR = wp.constant(wp.uint8(0))
 VISIBLE = wp.constant(wp.uint8(1))
 OUT_OF_VIEW = wp.constant(wp.uint8(2))

@@ -6,7 +6,6 @@ from typing import Any
 
 import warp as wp
 
-
 UNDER_WAY = wp.constant(0)
 ARRIVED = wp.constant(1)
 COLLIDED = wp.constant(2)

@@ -8,9 +8,6 @@ import warp as wp
 
 from coopenv.estimation.so3 import exp_so3, left_jacobian, orthonormalise
 
-
-PRESCRIBED = wp.constant(1)
-DRIVEN = wp.constant(2)
 LONGEST_SUBSTEP = wp.constant(wp.float64(0.0100001))
 """s; the bicycle's twist is held over no longer than this."""
 

@@ -24,7 +24,6 @@ from coopenv.estimation.so3 import exp_so3, identity3, orthonormalise, skew
 from coopenv.world.camera import VISIBLE, marker_position
 from coopenv.world.v2x import fresh
 
-
 MOST_SUBSTEPS = wp.constant(200)
 """Re-linearisations per tick; the last one takes what remains of the tick."""
 
@@ -63,9 +62,7 @@ def information(model: Any, state: Any, world: int, vehicle: int, tick: int, R: 
             b = model.camera.rotation * state.bearing[world, vehicle, target]
             a = wp.transpose(R) * known_position(model, state, world, vehicle, target)
             e = a - model.camera.position - p
-            M11, M12, M22, r1, r2 = accumulate_information(
-                a, b, e, model.observer.q[target], M11, M12, M22, r1, r2
-            )
+            M11, M12, M22, r1, r2 = accumulate_information(a, b, e, model.observer.q[target], M11, M12, M22, r1, r2)
     return M11, M12, M22, r1, r2
 
 

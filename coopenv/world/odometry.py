@@ -12,9 +12,9 @@ import warp as wp
 
 from coopenv.estimation.riccati import increment
 from coopenv.estimation.so3 import identity3
-from coopenv.world.dynamics import DRIVEN, drive, segment_at
+from coopenv.world.dynamics import drive, segment_at
+from coopenv.world.model import DRIVEN
 from coopenv.world.random import ODOMETRY_ANGULAR, ODOMETRY_LINEAR, draw, gaussian3
-
 
 
 @wp.func

@@ -11,7 +11,6 @@ from typing import Any
 
 import warp as wp
 
-
 vec4u = wp.types.vector(4, wp.uint32)
 
 MULTIPLIER_0 = wp.constant(wp.uint64(0xD2511F53))

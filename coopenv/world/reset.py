@@ -10,19 +10,18 @@ from coopenv.estimation.linalg import join6
 from coopenv.estimation.so3 import exp_so3, identity3, orthonormalise
 from coopenv.world.camera import observe
 from coopenv.world.collision import touches_anything
-from coopenv.world.dynamics import DRIVEN, PRESCRIBED, prescribe
+from coopenv.world.dynamics import prescribe
+from coopenv.world.model import DRIVEN, PRESCRIBED
 from coopenv.world.random import (
     RESET_ESTIMATE_ORIENTATION,
     RESET_ESTIMATE_POSITION,
     RESET_POSE,
     draw,
-    gaussian_pair,
     signed_uniform,
     uniform,
     unit_vector,
 )
 from coopenv.world.v2x import broadcast, deliver
-
 
 
 @wp.func
@@ -140,9 +139,7 @@ def believe(model: Any, state: Any, world: int, vehicle: int):
     state.estimate_position[world, vehicle] = wp.transpose(R) * position
     P = state.covariance[world, vehicle]
     i3 = identity3(o)
-    state.covariance[world, vehicle] = join6(
-        model.observer.p1 * i3, R - R, R - R, model.observer.p2 * i3, P - P
-    )
+    state.covariance[world, vehicle] = join6(model.observer.p1 * i3, R - R, R - R, model.observer.p2 * i3, P - P)
 
 
 @wp.func

@@ -77,9 +77,7 @@ def allocate_state(model: Any, worlds: int, p: Precision, device: str) -> Any:
         **dict.fromkeys(("bearing", "bearing_tick", "sight"), (worlds, N, A)),
         **dict.fromkeys(("outbox_rotation", "outbox_position", "outbox_tick"), (worlds, N, model.radio.slots)),
         **dict.fromkeys(("inbox_rotation", "inbox_position", "inbox_tick"), (worlds, N, N)),
-        **dict.fromkeys(
-            ("gramian_11", "gramian_12", "gramian_22", "gramian_time"), (worlds, N, model.observer.blocks)
-        ),
+        **dict.fromkeys(("gramian_11", "gramian_12", "gramian_22", "gramian_time"), (worlds, N, model.observer.blocks)),
         **dict.fromkeys(
             ("start_rotation", "start_position", "rotation", "position", "velocity", "angular_velocity"),
             (worlds, A),

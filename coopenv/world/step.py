@@ -8,39 +8,39 @@ import warp as wp
 
 from coopenv.world.camera import observe
 from coopenv.world.collision import referee
-from coopenv.world.dynamics import PRESCRIBED, prescribe
+from coopenv.world.dynamics import prescribe
+from coopenv.world.model import PRESCRIBED
 from coopenv.world.observer import estimate
 from coopenv.world.odometry import measure_motion
 from coopenv.world.reset import reset_world
 from coopenv.world.v2x import broadcast, deliver
 
 
-
 @wp.func
-def command_in_force(model: Any, before: Any, world: int, vehicle: int, action: Any, elapsed: int):
-    """Return the action that the actuators follow `elapsed` ticks after a decision, given their dead time."""
-    if elapsed < model.dynamics.latency_ticks:
+def command_in_force(model: Any, before: Any, world: int, vehicle: int, action: Any, tick: int):
+    """Return what the actuators follow during a tick: after a decision, the last command for the dead time."""
+    if (tick - 1) % model.ticks_per_decision < model.dynamics.latency_ticks:
         return before.command[world, vehicle]
     return action
 
 
 @wp.func
-def move(model: Any, before: Any, after: Any, actions: Any, world: int, tick: int, elapsed: int):
+def move(model: Any, before: Any, after: Any, actions: Any, world: int, tick: int):
     """Carry all truth of one world to the tick's end and sample odometry on the way."""
     t = wp.float64(tick) / model.camera_rate
     for agent in range(model.agents):
         if model.motion.kind[agent] == PRESCRIBED:
             prescribe(model, before, after, world, agent, t)
     for vehicle in range(model.vehicles):
-        command = command_in_force(model, before, world, vehicle, actions[world, vehicle], elapsed)
+        command = command_in_force(model, before, world, vehicle, actions[world, vehicle], tick)
         measure_motion(model, before, after, world, vehicle, command, tick)
 
 
 @wp.func
-def tick_world(model: Any, before: Any, after: Any, actions: Any, world: int, elapsed: int):
+def tick_world(model: Any, before: Any, after: Any, actions: Any, world: int):
     """Run one camera tick of one world: truth -> camera -> V2X -> observer -> V2X, leaders before followers."""
     tick = before.tick[world] + 1
-    move(model, before, after, actions, world, tick, elapsed)
+    move(model, before, after, actions, world, tick)
     for vehicle in range(model.vehicles):
         referee(model, before, after, world, vehicle)
     for place in range(model.vehicles):
@@ -49,24 +49,24 @@ def tick_world(model: Any, before: Any, after: Any, actions: Any, world: int, el
         deliver(model, before, after, world, vehicle, tick)
         estimate(model, before, after, world, vehicle, tick)
         broadcast(model, before, after, world, vehicle, tick)
+    if tick % model.ticks_per_decision == 0 or tick == model.horizon_ticks:
+        for vehicle in range(model.vehicles):
+            after.command[world, vehicle] = actions[world, vehicle]
     after.tick[world] = tick
 
 
-
 def advance_kernel(model: Any, before: Any, after: Any, actions: wp.array2d(dtype=Any), ticks: int):
-    """Advance every world by up to `ticks` camera ticks, not beyond the horizon. One thread per world."""
+    """Advance every world by up to `ticks` camera ticks, not beyond the horizon. One thread per world.
+
+    `after` may be `before`; otherwise it must start as a copy of it.
+    """
     world = wp.tid()
-    first = before.tick[world]
-    count = wp.min(ticks, model.horizon_ticks - first)
+    count = wp.min(ticks, model.horizon_ticks - before.tick[world])
     for elapsed in range(count):
         if elapsed == 0:
-            tick_world(model, before, after, actions, world, elapsed)
+            tick_world(model, before, after, actions, world)
         else:
-            tick_world(model, after, after, actions, world, elapsed)
-    if count > 0:
-        for vehicle in range(model.vehicles):
-            after.command[world, vehicle] = actions[world, vehicle]
-
+            tick_world(model, after, after, actions, world)
 
 
 def reset_kernel(model: Any, state: Any, mask: wp.array(dtype=wp.int32)):

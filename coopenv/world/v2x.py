@@ -9,7 +9,6 @@ import warp as wp
 from coopenv.world.random import RADIO, draw, uniform
 
 
-
 @wp.func
 def broadcast(model: Any, before: Any, after: Any, world: int, vehicle: int, tick: int):
     """Put this vehicle's estimate (Rhat, Rhat phat) on the air if a message is due."""

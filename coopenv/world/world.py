@@ -8,8 +8,8 @@ import numpy as np
 import warp as wp
 
 from coopenv.scenario import Scenario
+from coopenv.world.build import build_model
 from coopenv.world.launch import Launcher
-from coopenv.world.model import build_model
 from coopenv.world.precision import check_device, precision
 from coopenv.world.state import allocate_state, read_state, write_state
 from coopenv.world.step import advance_kernel, reset_kernel
@@ -22,9 +22,7 @@ class World:
     single world seeded with s + w (on the same device).
     """
 
-    def __init__(
-        self, scenario: Scenario, worlds: int = 1, dtype: str = "float32", device: str = "cpu"
-    ) -> None:
+    def __init__(self, scenario: Scenario, worlds: int = 1, dtype: str = "float32", device: str = "cpu") -> None:
         """Build the arrays; call `reset` before `advance`.
 
         Raises:
@@ -65,9 +63,7 @@ class World:
 
     def advance(self, ticks: int) -> None:
         """Run camera ticks under `self.actions`, stopping each world at its horizon."""
-        self._launch(
-            ("advance", ticks), advance_kernel, [self.model, self.state, self.state, self.actions, ticks]
-        )
+        self._launch(("advance", ticks), advance_kernel, [self.model, self.state, self.state, self.actions, ticks])
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return a copy of everything that changes, random streams included (they are seeds and counters)."""
