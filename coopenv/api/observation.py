@@ -97,8 +97,8 @@ def write_quality(
     per_decade = P.dtype(0.4342944819032518)
     for i in range(6):
         put(out, world, vehicle, plan.quality + i, wp.log(P[i, i]) * per_decade, LOGARITHMIC)
-    L11, _, L22 = cholesky_of(P, R - R)
-    put(out, world, vehicle, plan.quality + 6, log_determinant(L11, L22) / P.dtype(6.0), LOGARITHMIC)
+    I11, _, I22 = cholesky_of(P, R - R)
+    put(out, world, vehicle, plan.quality + 6, log_determinant(I11, I22) / P.dtype(6.0), LOGARITHMIC)
     smallest = gramian_smallest_eigenvalue(model, state, world, vehicle)
     decades = wp.log(wp.max(wp.float32(smallest), EIGENVALUE_FLOOR)) * 0.4342944819032518
     put(out, world, vehicle, plan.quality + 7, decades, LOGARITHMIC)

@@ -82,10 +82,10 @@ def judge(model: Any, state: Any, report: Any, world: int, vehicle: int):
     angle = rotation_angle(wp.transpose(R_hat) * R, p_hat)
     report.position_error[world, vehicle] = wp.length(position - R_hat * p_hat)
     report.orientation_error[world, vehicle] = angle * type(angle)(DEGREES)
-    L11, L21, L22 = cholesky_of(state.covariance[world, vehicle], R - R)
+    I11, L21, I22 = cholesky_of(state.covariance[world, vehicle], R - R)
     e1, e2 = observer_error(R, position, R_hat, p_hat)
-    report.nees[world, vehicle] = normalised_error_squared(L11, L21, L22, e1, e2)
-    report.log_determinant[world, vehicle] = log_determinant(L11, L22)
+    report.nees[world, vehicle] = normalised_error_squared(I11, L21, I22, e1, e2)
+    report.log_determinant[world, vehicle] = log_determinant(I11, I22)
     report.gramian_min_eigenvalue[world, vehicle] = gramian_smallest_eigenvalue(model, state, world, vehicle)
     report.targets_in_view[world, vehicle] = targets_in_view(model, state, world, vehicle)
 

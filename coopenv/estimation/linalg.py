@@ -19,39 +19,32 @@ def symmetric_part(A: Any):
 
 @wp.func
 def cholesky3(A: Any):
-    """Return the lower-triangular L with A = L L^T of a symmetric positive definite 3x3 matrix."""
+    """Return (L, L^-1), both lower triangular, with A = L L^T, A symmetric positive definite and 3x3."""
     o = A.dtype(0.0)
+    one = A.dtype(1.0)
     tiny = A.dtype(1.0e-30)
-    l00 = wp.sqrt(wp.max(A[0, 0], tiny))
-    l10 = A[1, 0] / l00
-    l20 = A[2, 0] / l00
-    l11 = wp.sqrt(wp.max(A[1, 1] - l10 * l10, tiny))
-    l21 = (A[2, 1] - l20 * l10) / l11
-    l22 = wp.sqrt(wp.max(A[2, 2] - l20 * l20 - l21 * l21, tiny))
-    return type(A)(l00, o, o, l10, l11, o, l20, l21, l22)
-
-
-@wp.func
-def inverse_lower3(L: Any):
-    """Return the inverse of a lower-triangular 3x3 matrix."""
-    o = L.dtype(0.0)
-    one = L.dtype(1.0)
-    i00 = one / L[0, 0]
-    i11 = one / L[1, 1]
-    i22 = one / L[2, 2]
-    i10 = -L[1, 0] * i00 * i11
-    i21 = -L[2, 1] * i11 * i22
-    i20 = -(L[2, 0] * i00 + L[2, 1] * i10) * i22
-    return type(L)(i00, o, o, i10, i11, o, i20, i21, i22)
+    i00 = one / wp.sqrt(wp.max(A[0, 0], tiny))
+    l10 = A[1, 0] * i00
+    l20 = A[2, 0] * i00
+    d11 = wp.max(A[1, 1] - l10 * l10, tiny)
+    i11 = one / wp.sqrt(d11)
+    l21 = (A[2, 1] - l20 * l10) * i11
+    d22 = wp.max(A[2, 2] - l20 * l20 - l21 * l21, tiny)
+    i22 = one / wp.sqrt(d22)
+    i10 = -l10 * i00 * i11
+    i21 = -l21 * i11 * i22
+    i20 = -(l20 * i00 + l21 * i10) * i22
+    L = type(A)(A[0, 0] * i00, o, o, l10, d11 * i11, o, l20, l21, d22 * i22)
+    return L, type(A)(i00, o, o, i10, i11, o, i20, i21, i22)
 
 
 @wp.func
 def cholesky6(A: Any, B: Any, D: Any):
-    """Return the blocks (L11, L21, L22) of the Cholesky factor of [[A, B], [B^T, D]]."""
-    L11 = cholesky3(A)
-    L21 = wp.transpose(inverse_lower3(L11) * B)
-    L22 = cholesky3(D - L21 * wp.transpose(L21))
-    return L11, L21, L22
+    """Return (L11, L21, L22, L11^-1, L22^-1): the Cholesky factor of [[A, B], [B^T, D]] in blocks."""
+    L11, I11 = cholesky3(A)
+    L21 = wp.transpose(I11 * B)
+    L22, I22 = cholesky3(D - L21 * wp.transpose(L21))
+    return L11, L21, L22, I11, I22
 
 
 @wp.func

@@ -6,24 +6,24 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3, cholesky6, inverse_lower3, join6, smallest_eigenvalue6
+from coopenv.estimation.linalg import block3, cholesky6, join6, smallest_eigenvalue6
 from coopenv.estimation.so3 import quaternion_vector
 
 
 @wp.func
-def log_determinant(L11: Any, L22: Any):
-    """Return log det P from the diagonal blocks of its Cholesky factor."""
-    total = L11.dtype(0.0)
+def log_determinant(I11: Any, I22: Any):
+    """Return log det P from the inverses of the diagonal blocks of its Cholesky factor."""
+    total = I11.dtype(0.0)
     for i in range(3):
-        total += wp.log(L11[i, i]) + wp.log(L22[i, i])
-    return L11.dtype(2.0) * total
+        total -= wp.log(I11[i, i]) + wp.log(I22[i, i])
+    return I11.dtype(2.0) * total
 
 
 @wp.func
-def normalised_error_squared(L11: Any, L21: Any, L22: Any, e1: Any, e2: Any):
+def normalised_error_squared(I11: Any, L21: Any, I22: Any, e1: Any, e2: Any):
     """Return e^T P^-1 e for e = (e1, e2) and P = L L^T."""
-    x1 = inverse_lower3(L11) * e1
-    x2 = inverse_lower3(L22) * (e2 - L21 * x1)
+    x1 = I11 * e1
+    x2 = I22 * (e2 - L21 * x1)
     return wp.dot(x1, x1) + wp.dot(x2, x2)
 
 
@@ -56,6 +56,6 @@ def gramian_smallest_eigenvalue(model: Any, state: Any, world: int, vehicle: int
 
 @wp.func
 def cholesky_of(P: Any, zero3: Any):
-    """Return the block Cholesky factor of a 6x6 covariance."""
-    L11, L21, L22 = cholesky6(block3(P, 0, 0, zero3), block3(P, 0, 3, zero3), block3(P, 3, 3, zero3))
-    return L11, L21, L22
+    """Return (L11^-1, L21, L22^-1) of the Cholesky factor of a 6x6 covariance."""
+    _, L21, _, I11, I22 = cholesky6(block3(P, 0, 0, zero3), block3(P, 0, 3, zero3), block3(P, 3, 3, zero3))
+    return I11, L21, I22

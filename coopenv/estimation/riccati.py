@@ -15,7 +15,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import cholesky6, eigen_symmetric6, inverse_lower3, join6, symmetric_part
+from coopenv.estimation.linalg import cholesky6, eigen_symmetric6, join6, symmetric_part
 from coopenv.estimation.so3 import exp_so3, identity3, left_jacobian, orthonormalise, skew
 
 
@@ -72,9 +72,9 @@ def correct_kalman(h: Any, M11: Any, M12: Any, M22: Any, L11: Any, L21: Any, L22
     N11 = symmetric_part(L11t * U1 + L21t * U2) * h + identity3(r1)
     N12 = wp.transpose(L22t * U2) * h
     N22 = symmetric_part(L22t * M22 * L22) * h + identity3(r1)
-    G11, G21, G22 = cholesky6(N11, N12, N22)
-    H11 = wp.transpose(inverse_lower3(G11))
-    H22 = wp.transpose(inverse_lower3(G22))
+    _, G21, _, I11, I22 = cholesky6(N11, N12, N22)
+    H11 = wp.transpose(I11)
+    H22 = wp.transpose(I22)
     H12 = -H11 * wp.transpose(G21) * H22
     X11 = L11 * H11
     X12 = L11 * H12

@@ -1,24 +1,295 @@
-"""Top view (placeholder while being built)."""
+"""The top view of an environment: who sees whom, and how good each estimate is."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_rgba_array
+from matplotlib.lines import Line2D
+from matplotlib.text import Text
+
+from coopenv.estimation.trajectory import Sight
+from coopenv.scenario import Scenario
+from coopenv.scenario.agents import Body
+from coopenv.viz.style import DARK_BLUE, INK, NORMAL, vehicle_colour
+from coopenv.viz.topview_geometry import (
+    box_shape,
+    camera_fan,
+    ellipses,
+    nose_shape,
+    outlines,
+    pointers,
+    position_covariance,
+)
+from coopenv.viz.topview_ground import (
+    DOTTED,
+    HEIGHT,
+    MOST_ROWS,
+    PANEL,
+    ROW,
+    SIGHT_LOOKS,
+    SMALLER,
+    TABLE_TOP,
+    draw_legend,
+    label_landmark,
+    new_ground,
+    pixels,
+    sees_a_part,
+    vehicle_mark,
+)
+from coopenv.viz.window import Window
+
+_ARRIVED, _COLLIDED = 1, 2  # values of the field `ended`
+_SHORTEST = 24  # px, drawn length of a vehicle
+_POINTER = 13  # px
+_LABEL = 17  # px behind a vehicle
+_REACH = 0.4  # of the picture's side, of a camera that sees farther
+_FILLED = 0.35  # of the picture's side, largest semi-axis of an ellipse that is filled
+_LARGEST = 2.0  # of the picture's side, largest semi-axis of an ellipse that is drawn
+_POINT = Body(size=(2e-3, 1e-3, 1e-3))  # stands in for a vehicle without a body, drawn at the least size
+_FIELDS = (
+    "rotation",
+    "position",
+    "estimate_rotation",
+    "estimate_position",
+    "covariance",
+    "sight",
+    "ended",
+    "position_error",
+    "orientation_error",
+)
 
 
 class TopView:
-    """Draws one world from above."""
+    """Draws one world of an engine from above.
 
-    def __init__(self, scenario: Any) -> None:
+    The picture depends on the engine's present state alone. What stands still is drawn once; the few artists that
+    move are kept and updated.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Draw the ground."""
         self.scenario = scenario
+        self._landmarks = len(scenario.landmarks)
+        self._figure, self._axes = new_ground(scenario)
+        self._canvas = FigureCanvasAgg(self._figure)
+        (x0, x1), (y0, y1) = self._axes.get_xlim(), self._axes.get_ylim()
+        self._low, self._high = np.array([x0, y0]), np.array([x1, y1])
+        self._side = x1 - x0
+        self._pixel = self._side / self._axes.get_window_extent().width  # m
+        self._prepare_shapes()
+        self._layers: list[Artist] = []
+        self._prepare_artists()
+        self._prepare_table()
+        self._canvas.draw()
+        self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+        self._window = Window(scenario.title)
 
     def draw(self, engine: Any) -> np.ndarray:
         """Return an (H, W, 3) uint8 picture of world 0."""
-        return np.zeros((8, 8, 3), dtype=np.uint8)
+        view = {name: np.asarray(engine.view(name)[0], float) for name in _FIELDS}
+        R, position = view["rotation"], view["position"]
+        R_hat, p_hat = view["estimate_rotation"], view["estimate_position"]
+        estimate = (R_hat @ p_hat[..., None])[..., 0]
+        sigma = self._place_ellipses(estimate, position_covariance(R_hat, p_hat, view["covariance"]))
+        self._place_bodies(R, position, R_hat, estimate)
+        self._place_sight(R, position, view["sight"])
+        self._place_marks(R, position, view["ended"])
+        self._write(view, sigma, float(engine.view("tick")[0]) / self.scenario.rates.camera)
+        self._canvas.restore_region(self._background)  # type: ignore[attr-defined]
+        renderer = self._canvas.get_renderer()
+        for artist in self._layers:
+            artist.draw(renderer)
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
     def show(self, picture: np.ndarray) -> None:
-        """Show a picture in a window."""
+        """Show a picture in a window, if there is a display."""
+        self._window.show(picture)
 
     def close(self) -> None:
-        """Close the window."""
+        """Close the window, if there is one."""
+        self._window.close()
+
+    def _prepare_shapes(self) -> None:
+        s = self.scenario
+        agents = [*s.landmarks, *s.vehicles]
+        shortest = _SHORTEST * self._pixel
+        bodies = [vehicle.body or _POINT for vehicle in s.vehicles]
+        self._box = np.array([box_shape(b.size, b.center, shortest) for b in bodies])
+        self._nose = np.array([nose_shape(box) for box in self._box])
+        self._others = [i for i, m in enumerate(s.landmarks) if m.body]
+        bodies = [m.body for m in s.landmarks if m.body]
+        self._other_box = np.array([box_shape(b.size, b.center, shortest) for b in bodies]).reshape(-1, 4, 2)
+        self._marker = np.array([agent.marker for agent in agents])
+        self._camera = np.array(s.camera.position)
+        limit = _REACH * self._side
+        self._ranged = s.camera.range is not None and s.camera.range <= limit
+        reach = min(s.camera.range or limit, limit)
+        self._fan = reach * camera_fan(s.camera) if sees_a_part(s) else None
+
+    def _prepare_artists(self) -> None:
+        colours = [vehicle_colour(i) for i in range(len(self.scenario.vehicles))]
+        self._rgba = to_rgba_array(colours)
+        self._wedges = self._polygons(facecolor=_faded(self._rgba, 0.10), edgecolor="none")
+        self._wedge_edges = self._lines(color=_faded(self._rgba, 0.55), linewidth=0.6)
+        self._ellipses = self._polygons(linewidth=1.0)
+        self._sight = {sight: self._lines(**look) for sight, look in SIGHT_LOOKS.items()}
+        self._still = self._points("o", DARK_BLUE, "white", 5.5)
+        self._other = self._polygons(facecolor=DARK_BLUE, edgecolor="white", linewidth=0.8)
+        self._moving = self._points("D", DARK_BLUE, "white", 5.5)
+        self._truth = self._polygons(facecolor=self._rgba, edgecolor=INK, linewidth=0.8)
+        self._truth_nose = self._polygons(facecolor="white", edgecolor="none")
+        self._links = self._lines(color=colours, linewidth=1.0, linestyle=DOTTED)
+        self._casing = self._polygons(facecolor="none", edgecolor="white", linewidth=3.2)
+        self._estimate = self._polygons(facecolor=(1, 1, 1, 0.55), edgecolor=self._rgba, linewidth=1.5)
+        self._estimate_nose = self._polygons(facecolor="none", edgecolor=self._rgba, linewidth=1.2)
+        self._pointers = self._polygons(facecolor="white", linewidth=1.3)
+        self._arrived = self._points("*", "white", INK, 12)
+        self._collided = self._points("X", INK, "white", 11)
+        self._names = [
+            self._text(vehicle_mark(i), color=c, fontsize=NORMAL, weight="bold", ha="center", va="center")
+            for i, c in enumerate(colours)
+        ]
+        self._moving_names = {
+            i: label_landmark(self._axes, m.name, np.zeros(2))
+            for i, m in enumerate(self.scenario.landmarks)
+            if m.motion.kind != "static"
+        }
+        for artist in self._moving_names.values():
+            artist.set_animated(True)
+            self._layers.append(artist)
+
+    def _prepare_table(self) -> None:
+        count = len(self.scenario.vehicles)
+        self._time = self._row(HEIGHT - 22, "", fontsize=NORMAL + 1.5, weight="bold", color=INK)
+        head = f"{'':4}{'error':>7}{'3σ':>7}{'turn':>6}{'sees':>5}\n{'':4}{'[m]':>7}{'[m]':>7}{'[deg]':>6}"
+        self._figure.text(
+            *pixels(PANEL, TABLE_TOP), head, fontsize=SMALLER, family="monospace", color=INK, va="bottom"
+        )
+        shown = min(count, MOST_ROWS)
+        self._rows = [
+            self._row(TABLE_TOP - ROW * (i + 1), "", fontsize=SMALLER, family="monospace", color=vehicle_colour(i))
+            for i in range(shown)
+        ]
+        draw_legend(self._figure, self.scenario, shown + 1)
+
+    def _place_ellipses(self, estimate: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+        """Place the 3-sigma ellipses; return their major semi-axes (N,) in m."""
+        shapes, semi = ellipses(estimate[:, :2], covariance[:, :2, :2])
+        drawn = semi <= _LARGEST * self._side
+        alpha = np.where(semi[drawn] <= _FILLED * self._side, 0.16, 0.0)
+        self._ellipses.set_verts(list(shapes[drawn]))
+        self._ellipses.set_facecolor(_faded(self._rgba[drawn], alpha))
+        self._ellipses.set_edgecolor(_faded(self._rgba[drawn], np.where(alpha > 0, 0.8, 0.35)))
+        return semi
+
+    def _place_bodies(
+        self, R: np.ndarray, position: np.ndarray, R_hat: np.ndarray, estimate: np.ndarray
+    ) -> None:
+        L = self._landmarks
+        place, guess = position[L:, :2], estimate[:, :2]
+        self._truth.set_verts(outlines(R[L:], place, self._box))
+        self._truth_nose.set_verts(outlines(R[L:], place, self._nose))
+        believed = outlines(R_hat, guess, self._box)
+        self._casing.set_verts(believed)
+        self._estimate.set_verts(believed)
+        self._estimate_nose.set_verts(outlines(R_hat, guess, self._nose))
+        self._other.set_verts(outlines(R[self._others], position[self._others, :2], self._other_box))
+        self._links.set_segments(list(np.stack([place, guess], axis=1)))
+        low, high, size = self._low, self._high, _POINTER * self._pixel
+        outside = pointers(place, guess, low, high, size)
+        which = ~np.all((guess >= low) & (guess <= high), axis=-1) & np.isfinite(guess).all(axis=-1)
+        self._pointers.set_verts(outside)
+        self._pointers.set_edgecolor(self._rgba[which])
+
+    def _place_sight(self, R: np.ndarray, position: np.ndarray, sight: np.ndarray) -> None:
+        L = self._landmarks
+        target = (position + (R @ self._marker[..., None])[..., 0])[:, :2]
+        camera = (position[L:] + R[L:] @ self._camera)[:, :2]
+        for kind, lines in self._sight.items():
+            observer, seen = np.nonzero(sight == kind)
+            lines.set_segments(list(np.stack([camera[observer], target[seen]], axis=1)))
+            if "color" not in SIGHT_LOOKS[kind]:
+                lines.set_color(_faded(self._rgba[observer], 0.9))
+        if self._fan is not None:
+            rim = camera[:, None] + (self._fan @ np.swapaxes(R[L:], 1, 2))[..., :2]
+            tip = camera[:, None]
+            self._wedges.set_verts(np.concatenate([tip, rim], axis=1))
+            edge = np.concatenate([tip, rim, tip], axis=1) if self._ranged else np.concatenate([rim[:, :1], tip, rim[:, -1:]], axis=1)
+            self._wedge_edges.set_segments(list(edge))
+        moving = np.array(list(self._moving_names), dtype=int)
+        self._still.set_data(*np.delete(target[:L], moving, axis=0).T)
+        self._moving.set_data(*target[moving].T)
+        for i, name in self._moving_names.items():
+            name.xy = tuple(target[i])
+
+    def _place_marks(self, R: np.ndarray, position: np.ndarray, ended: np.ndarray) -> None:
+        L = self._landmarks
+        place = position[L:, :2]
+        self._arrived.set_data(*place[ended == _ARRIVED].T)
+        self._collided.set_data(*place[ended == _COLLIDED].T)
+        behind = place - _LABEL * self._pixel * R[L:, :2, 0]
+        for name, (x, y) in zip(self._names, behind.tolist(), strict=True):
+            name.set_position((x, y))
+
+    def _write(self, view: dict[str, np.ndarray], sigma: np.ndarray, time: float) -> None:
+        self._time.set_text(f"t = {time:.2f} s")
+        seen = np.sum(view["sight"] == Sight.VISIBLE, axis=-1)
+        possible = np.sum(view["sight"] != Sight.NOT_A_NEIGHBOUR, axis=-1)
+        for i, row in enumerate(self._rows):
+            error, turn = view["position_error"][i], view["orientation_error"][i]
+            row.set_text(
+                f"{vehicle_mark(i):<4}{_short(error):>7}{_short(sigma[i]):>7}{turn:>6.1f}{seen[i]:>3}/{possible[i]}"
+            )
+
+    def _polygons(self, **look: Any) -> PolyCollection:
+        return self._add(PolyCollection([], **look))
+
+    def _lines(self, **look: Any) -> LineCollection:
+        return self._add(LineCollection([], **look))
+
+    def _points(self, marker: str, face: str, edge: str, size: float) -> Line2D:
+        line = Line2D(
+            [],
+            [],
+            linestyle="none",
+            marker=marker,
+            markersize=size,
+            markerfacecolor=face,
+            markeredgecolor=edge,
+            markeredgewidth=0.9,
+        )
+        self._axes.add_line(line)
+        return self._keep(line)
+
+    def _text(self, text: str, **look: Any) -> Text:
+        return self._keep(self._axes.text(0, 0, text, clip_on=True, **look))
+
+    def _row(self, y: float, text: str, **look: Any) -> Text:
+        return self._keep(self._figure.text(*pixels(PANEL, y), text, **look))
+
+    def _add(self, collection: Any) -> Any:
+        self._axes.add_collection(collection, autolim=False)
+        return self._keep(collection)
+
+    def _keep(self, artist: Any) -> Any:
+        """Leave an artist out of the background, and draw it in every frame, above those kept before."""
+        artist.set_animated(True)
+        self._layers.append(artist)
+        return artist
+
+
+def _faded(rgba: np.ndarray, alpha: np.ndarray | float) -> np.ndarray:
+    """Return colours (N, 4) with other opacities."""
+    faded = rgba.copy()
+    faded[:, 3] = alpha
+    return faded
+
+
+def _short(value: float) -> str:
+    """Return a length with three or so figures."""
+    return f"{value:.3f}" if value < 10 else f"{value:.1f}" if value < 1e4 else f"{value:.0e}"

@@ -116,7 +116,7 @@ def correct(model: Any, state: Any, world: int, vehicle: int, tick: int, duratio
     substeps = int(0)
     while remaining > duration * type(duration)(1.0e-9):
         M11, M12, M22, r1, r2 = information(model, state, world, vehicle, tick, R, p)
-        L11, L21, L22 = cholesky6(A, B, D)
+        L11, L21, L22, _, _ = cholesky6(A, B, D)
         h = remaining
         substeps += 1
         if k == one:

@@ -14,20 +14,18 @@ from coopenv.estimation.riccati import increment
 from coopenv.estimation.so3 import identity3
 from coopenv.world.dynamics import drive, segment_at
 from coopenv.world.model import DRIVEN
-from coopenv.world.random import ODOMETRY_ANGULAR, ODOMETRY_LINEAR, draw, gaussian3
+from coopenv.world.random import ODOMETRY_FIRST, ODOMETRY_SECOND, draw, gaussian_vectors
 
 
 @wp.func
 def noisy_sample(model: Any, state: Any, world: int, vehicle: int, sample: int, v: Any, w: Any):
     """Return the measured (v, omega) of one odometry sample."""
-    seed = state.seed[world]
-    episode = state.episode[world]
-    o = v - v
-    if model.noise.velocity > v.dtype(0.0):
-        v = v + model.noise.velocity * gaussian3(draw(seed, episode, sample, vehicle, ODOMETRY_LINEAR), o)
-    if model.noise.angular_velocity > v.dtype(0.0):
-        noise = gaussian3(draw(seed, episode, sample, vehicle, ODOMETRY_ANGULAR), o)
-        w = w + model.noise.angular_velocity * noise
+    if model.noise.velocity > v.dtype(0.0) or model.noise.angular_velocity > v.dtype(0.0):
+        first = draw(state.seed[world], state.episode[world], sample, vehicle, ODOMETRY_FIRST)
+        second = draw(state.seed[world], state.episode[world], sample, vehicle, ODOMETRY_SECOND)
+        linear, angular = gaussian_vectors(first, second, v)
+        v = v + model.noise.velocity * linear
+        w = w + model.noise.angular_velocity * angular
     return v, w
 
 

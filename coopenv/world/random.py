@@ -21,8 +21,8 @@ WEYL_1 = wp.constant(wp.uint32(0xBB67AE85))
 RESET_POSE = wp.constant(wp.uint32(1))
 RESET_ESTIMATE_POSITION = wp.constant(wp.uint32(2))
 RESET_ESTIMATE_ORIENTATION = wp.constant(wp.uint32(3))
-ODOMETRY_LINEAR = wp.constant(wp.uint32(4))
-ODOMETRY_ANGULAR = wp.constant(wp.uint32(5))
+ODOMETRY_FIRST = wp.constant(wp.uint32(4))
+ODOMETRY_SECOND = wp.constant(wp.uint32(5))
 BEARING = wp.constant(wp.uint32(6))
 RADIO = wp.constant(wp.uint32(7))
 
@@ -65,19 +65,29 @@ def signed_uniform(word: wp.uint32, one: Any):
 
 @wp.func
 def gaussian_pair(word0: wp.uint32, word1: wp.uint32, one: Any):
-    """Return two independent standard normal numbers (Box-Muller)."""
+    """Return two independent standard normal numbers (Box-Muller).
+
+    The angle is drawn within a quadrant, and two bits choose the quadrant: one sine per pair instead of sine and cosine.
+    """
     radius = wp.sqrt(type(one)(-2.0) * wp.log(uniform(word0, one)))
-    angle = uniform(word1, one) * type(one)(6.283185307179586)
-    return radius * wp.cos(angle), radius * wp.sin(angle)
+    angle = (type(one)(word1 >> wp.uint32(2)) + type(one)(0.5)) * type(one)(1.4629180792671596e-09)  # pi/2 / 2^30
+    sine = wp.sin(angle)
+    cosine = wp.sqrt(wp.max(one - sine * sine, one - one))
+    if (word1 & wp.uint32(1)) != wp.uint32(0):
+        sine = -sine
+    if (word1 & wp.uint32(2)) != wp.uint32(0):
+        cosine = -cosine
+    return radius * cosine, radius * sine
 
 
 @wp.func
-def gaussian3(words: vec4u, zero: Any):
-    """Return a vector of three independent standard normal numbers, in the type of `zero`."""
+def gaussian_vectors(a: vec4u, b: vec4u, zero: Any):
+    """Return two vectors of three independent standard normal numbers each, in the type of `zero`."""
     one = zero.dtype(1.0)
-    x, y = gaussian_pair(words[0], words[1], one)
-    z, _ = gaussian_pair(words[2], words[3], one)
-    return type(zero)(x, y, z)
+    x1, y1 = gaussian_pair(a[0], a[1], one)
+    z1, x2 = gaussian_pair(a[2], a[3], one)
+    y2, z2 = gaussian_pair(b[0], b[1], one)
+    return type(zero)(x1, y1, z1), type(zero)(x2, y2, z2)
 
 
 @wp.func

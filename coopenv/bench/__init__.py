@@ -1,0 +1,1 @@
+"""Measurements: steps per second, and observers compared."""

@@ -1,0 +1,181 @@
+"""The geometry behind the top view: everything in plan (x east, y north), in the map frame, m."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from coopenv.scenario import Scenario
+from coopenv.scenario.motion import TwistTable, compile_motion, left_jacobian
+from coopenv.scenario.sensing import Camera
+from coopenv.world.build import ROTATION_OF_CAMERA, agent_starts
+
+SIGMAS = 3.0
+_CIRCLE = np.linspace(0.0, 2 * np.pi, 61)
+_FAN_RAYS = 17
+_PATH_SAMPLES = 121
+_MARGIN = 0.05  # share of the scene around it
+
+
+def position_covariance(rotation: np.ndarray, position: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return the covariance (..., 3, 3) of the estimated position in the map frame, m^2, to first order.
+
+    The observer's P is over e = (2 lambda, p - phat), with R = Rhat (I + S(2 lambda)) and p = R^T pbar the position
+    in the body frame. Hence pbar = R p = Rhat (phat + (p - phat) - S(phat) 2 lambda), and the error of pbar is
+    J e with J = Rhat [-S(phat), I].
+
+    Args:
+        rotation: Rhat (..., 3, 3), body to map.
+        position: phat (..., 3), body frame, m.
+        covariance: P (..., 6, 6).
+    """
+    p = np.asarray(position, float)
+    J = np.empty((*p.shape[:-1], 3, 6))
+    J[..., :3] = np.cross(p[..., None, :], np.eye(3))  # row i: phat x e_i, which is row i of -S(phat)
+    J[..., 3:] = np.eye(3)
+    J = np.asarray(rotation, float) @ J
+    return J @ np.asarray(covariance, float) @ np.swapaxes(J, -1, -2)
+
+
+def ellipses(center: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return 3-sigma outlines (N, 61, 2) and major semi-axes (N,); NaN where a covariance is not one.
+
+    Args:
+        center: (N, 2) m.
+        covariance: (N, 2, 2) m^2.
+    """
+    finite = np.isfinite(covariance).all(axis=(-1, -2))
+    variance, axes = np.linalg.eigh(np.where(finite[:, None, None], covariance, 0.0))
+    good = finite & (variance[:, 0] >= 0.0)
+    semi = np.where(good[:, None], SIGMAS * np.sqrt(np.maximum(variance, 0.0)), np.nan)
+    circle = np.stack([np.cos(_CIRCLE), np.sin(_CIRCLE)])
+    return center[:, None] + np.swapaxes((axes * semi[:, None]) @ circle, 1, 2), semi[:, 1]
+
+
+def outlines(rotation: np.ndarray, position: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Return body-fixed outlines (N, K, 2) in plan, of rotations (N, 3, 3), places (N, 2), `shape` (N, K, 2)."""
+    turned: np.ndarray = shape @ np.swapaxes(rotation[:, :2, :2], 1, 2)
+    return position[:, None] + turned
+
+
+def box_shape(size: tuple[float, ...], center: tuple[float, ...], shortest: float) -> np.ndarray:
+    """Return a box's four corners (4, 2) in the body frame, enlarged to at least `shortest` m long."""
+    half = np.array(size[:2]) / 2
+    corners = np.array(center[:2]) + half * [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+    return corners * max(1.0, shortest / (2 * half.max()))
+
+
+def nose_shape(corners: np.ndarray) -> np.ndarray:
+    """Return the triangle (3, 2) that marks the front of a box of four corners."""
+    rear, front = corners.min(axis=0), corners.max(axis=0)
+    waist = 0.42 * rear[0] + 0.58 * front[0]
+    inset = 0.18 * (front[1] - rear[1])
+    return np.array(
+        [(waist, rear[1] + inset), (front[0] - inset, (rear[1] + front[1]) / 2), (waist, front[1] - inset)]
+    )
+
+
+def camera_fan(camera: Camera) -> np.ndarray:
+    """Return unit rays (K, 3) in the body frame over the width of the image, at the height of its centre."""
+    edges = (np.array([0.0, camera.image_size[0]]) - camera.principal_point[0]) / camera.focal_length[0]
+    x = np.linspace(*np.arctan([_undistorted(float(edge), camera) for edge in edges]), _FAN_RAYS)
+    rays = np.stack([np.sin(x), np.zeros_like(x), np.cos(x)], axis=-1)
+    return rays @ camera_rotation(camera).T
+
+
+def camera_rotation(camera: Camera) -> np.ndarray:
+    """Return the rotation (3, 3) from the camera to the body."""
+    if isinstance(camera.orientation, str):
+        return ROTATION_OF_CAMERA[camera.orientation]
+    return Rotation.from_quat(camera.orientation, scalar_first=True).as_matrix()
+
+
+def _undistorted(edge: float, camera: Camera) -> float:
+    """Return the undistorted image coordinate of a side edge (both at distance 1)."""
+    k1, k2, _, p2, k3 = camera.distortion
+    x = edge
+    for _ in range(20):
+        r2 = x * x
+        x = (edge - 3 * p2 * r2) / (1 + r2 * (k1 + r2 * (k2 + r2 * k3)))
+    return x
+
+
+def limits(scenario: Scenario, aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return opposite corners (2,) of the picture: all that is known of the episode beforehand, with a margin.
+
+    Landmarks, roads, starts, prescribed motions over the horizon, and goals; `aspect` is width over height.
+    """
+    points = np.concatenate([*_places(scenario), *_paths(scenario)])
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, size = (low + high) / 2, np.maximum(high - low, 1.0)
+    height = (1 + 2 * _MARGIN) * max(float(size[0]) / aspect, float(size[1]))
+    half = np.array([height * aspect, height]) / 2
+    return middle - half, middle + half
+
+
+def _places(scenario: Scenario) -> list[np.ndarray]:
+    origin = np.array(scenario.map.origin)[:2]
+    places = [road_corners(road.start, road.end, road.width) - origin for road in scenario.roads]
+    for vehicle in scenario.vehicles:
+        if vehicle.goal:
+            center = np.array(vehicle.goal.position)[:2] - origin
+            places.append(center + vehicle.goal.radius * np.array([(-1, -1), (1, 1)]))
+    return places
+
+
+def _paths(scenario: Scenario) -> list[np.ndarray]:
+    positions, rotations = agent_starts(scenario)
+    motions = [agent.motion for agent in (*scenario.landmarks, *scenario.vehicles)]
+    t = np.linspace(0.0, scenario.horizon, _PATH_SAMPLES)
+    paths = []
+    for motion, position, rotation in zip(motions, positions, rotations, strict=True):
+        still = motion.kind in ("static", "driven")
+        relative = _positions(compile_motion(motion, rotation), t[:1] if still else t)
+        paths.append((position + relative @ rotation.T)[:, :2])
+    return paths
+
+
+def _positions(table: TwistTable, t: np.ndarray) -> np.ndarray:
+    """Return positions (K, 3) relative to the start at times (K,) s."""
+    segment = np.searchsorted(table.start, t, side="right") - 1
+    positions = []
+    for i, h in zip(segment, t - table.start[segment], strict=True):
+        step = left_jacobian(table.angular[i] * h) @ table.linear[i] * h
+        positions.append(table.position[i] + table.rotation[i] @ step)
+    return np.array(positions)
+
+
+def road_corners(start: tuple[float, float], end: tuple[float, float], width: float) -> np.ndarray:
+    """Return the corners (4, 2) of a road."""
+    a, b = np.array(start), np.array(end)
+    along = (b - a) / max(float(np.linalg.norm(b - a)), 1e-9)
+    aside = np.array([-along[1], along[0]]) * width / 2
+    return np.array([a - aside, b - aside, b + aside, a + aside])
+
+
+def pointers(
+    origin: np.ndarray, point: np.ndarray, low: np.ndarray, high: np.ndarray, size: float
+) -> list[np.ndarray]:
+    """Return triangles (3, 2) at the border that point from `origin` to each `point` (N, 2) outside it.
+
+    Args:
+        origin: (N, 2) the points' other ends; the picture's centre stands in for those that are outside too.
+        point: (N, 2).
+        low: (2,) lower left corner.
+        high: (2,) upper right corner.
+        size: length of a triangle, m.
+    """
+    found = []
+    for start, end in zip(origin, point, strict=True):
+        if not np.isfinite(end).all() or np.all((end >= low) & (end <= high)):
+            continue
+        inside = np.all((start > low) & (start < high))
+        start = start if inside else (low + high) / 2
+        way = end - start
+        with np.errstate(divide="ignore"):
+            share = np.min(np.where(way > 0, (high - start) / way, np.where(way < 0, (low - start) / way, np.inf)))
+        ahead = way / np.linalg.norm(way)
+        tip, aside = start + share * way - 0.15 * size * ahead, np.array([-ahead[1], ahead[0]])
+        base = tip - size * ahead
+        found.append(np.array([tip, base + 0.45 * size * aside, base - 0.45 * size * aside]))
+    return found

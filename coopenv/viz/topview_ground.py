@@ -1,0 +1,170 @@
+"""What stands still under the top view: axes, roads, buildings, landmarks, goals, and the panel's legend."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle, Patch, Polygon
+from matplotlib.patheffects import withStroke
+
+from coopenv.estimation.trajectory import Sight
+from coopenv.scenario import Scenario
+from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, new_figure, vehicle_colour
+from coopenv.viz.topview_geometry import limits, road_corners
+
+WIDTH, HEIGHT = 896, 704  # px; multiples of 16, as video codecs like them
+_LEFT, _BOTTOM, _SIDE = 50, 42, 630  # px, of the square axes
+PANEL = _LEFT + _SIDE + 14  # px, left edge of the panel
+SMALLER = 6.5  # pt
+ROW = 16  # px
+TABLE_TOP = HEIGHT - 66  # px
+MOST_ROWS = 16
+
+GROUND, ASPHALT, WALL, ROOF = "#F4F2EC", "#E2E2E2", "#8A8172", "#C9C2B4"
+DASHED, DOTTED = (0, (4, 2.5)), (0, (1, 1.8))
+
+SIGHT_LOOKS: dict[Sight, dict[str, object]] = {
+    Sight.VISIBLE: {"linewidth": 1.1, "alpha": 0.9},
+    Sight.MISSED: {"linewidth": 1.1, "linestyle": DOTTED},
+    Sight.OCCLUDED_BY_BUILDING: {"linewidth": 0.9, "linestyle": DASHED, "color": GREY},
+    Sight.OCCLUDED_BY_BODY: {"linewidth": 1.1, "linestyle": DASHED, "color": INK},
+}
+"""Lines of sight; those without a colour have their observer's."""
+
+
+def vehicle_mark(index: int) -> str:
+    """Return the paper's name of a vehicle in plain text, f1 for the first."""
+    return f"f{index + 1}"
+
+
+def pixels(x: float, y: float) -> tuple[float, float]:
+    """Return figure coordinates of a pixel counted from the lower left corner."""
+    return x / WIDTH, y / HEIGHT
+
+
+def new_ground(scenario: Scenario) -> tuple[Figure, Axes]:
+    """Return a figure with everything that does not change during an episode."""
+    figure = new_figure((WIDTH + 0.1) / DPI, (HEIGHT + 0.1) / DPI)
+    ax = figure.add_axes((*pixels(_LEFT, _BOTTOM), *pixels(_SIDE, _SIDE)))
+    ax.set_facecolor(GROUND)
+    ax.set_axisbelow(True)
+    ax.grid(True, color="white", linewidth=0.8)
+    ax.tick_params(labelsize=SMALL, length=2.5, width=0.6, colors=INK)
+    ax.set_xlabel("x [m]", fontsize=NORMAL, color=INK, labelpad=1)
+    ax.set_ylabel("y [m]", fontsize=NORMAL, color=INK, labelpad=-2)
+    for spine in ax.spines.values():
+        spine.set(linewidth=0.6, color=GREY)
+    low, high = limits(scenario, 1.0)
+    ax.set_xlim(low[0], high[0])
+    ax.set_ylim(low[1], high[1])
+    ax.set_aspect("equal")
+    ax.set_autoscale_on(False)
+    figure.text(*pixels(_LEFT, HEIGHT - 22), scenario.title, fontsize=NORMAL + 1.5, color=INK)
+    _draw_scene(ax, scenario)
+    return figure, ax
+
+
+def _draw_scene(ax: Axes, scenario: Scenario) -> None:
+    origin = np.array(scenario.map.origin)[:2]
+    for road in scenario.roads:
+        ax.add_patch(Polygon(road_corners(road.start, road.end, road.width) - origin, color=ASPHALT, zorder=0.5))
+    for road in scenario.roads:
+        line = np.array([road.start, road.end]) - origin
+        ax.plot(*line.T, color="white", linewidth=1.2, linestyle=(0, (7, 6)), zorder=0.6)
+    for obstacle in scenario.obstacles:
+        half = np.array(obstacle.size)[:2] / 2
+        c, s = np.cos(obstacle.yaw), np.sin(obstacle.yaw)
+        corners = (half * [(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ np.array([[c, s], [-s, c]])
+        corners += np.array(obstacle.center)[:2] - origin
+        ax.add_patch(Polygon(corners, facecolor=ROOF, edgecolor=WALL, linewidth=1.2, hatch="//", zorder=1))
+    for i, vehicle in enumerate(scenario.vehicles):
+        if vehicle.goal:
+            center, colour = np.array(vehicle.goal.position)[:2] - origin, vehicle_colour(i)
+            ax.add_patch(Circle(center, vehicle.goal.radius, facecolor="white", edgecolor="none", alpha=0.6))
+            ax.add_patch(Circle(center, vehicle.goal.radius, fill=False, edgecolor=colour, linestyle=DOTTED, lw=1.6))
+            ax.text(*center, vehicle_mark(i), color=colour, fontsize=SMALL, ha="center", va="center", clip_on=True)
+    for landmark in scenario.landmarks:
+        if landmark.motion.kind == "static":
+            place = np.array(landmark.position)[:2] + np.array(landmark.marker)[:2] - origin
+            label_landmark(ax, landmark.name, place)
+
+
+def label_landmark(ax: Axes, name: str, place: np.ndarray) -> Artist:
+    """Write a landmark's name beside it."""
+    return ax.annotate(
+        name,
+        (float(place[0]), float(place[1])),
+        xytext=(4.5, 4.5),
+        textcoords="offset points",
+        fontsize=SMALL,
+        color=DARK_BLUE,
+        path_effects=[withStroke(linewidth=1.8, foreground="white")],
+        annotation_clip=True,
+    )
+
+
+def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
+    """Explain the marks that can occur in this scenario, under a table of `rows` rows."""
+    handles: list[Artist] = [
+        Patch(facecolor=GREY, edgecolor=INK, linewidth=0.7, label="vehicle"),
+        Patch(facecolor="white", edgecolor=GREY, linewidth=1.4, label="its estimate, nose ahead"),
+        Line2D([], [], color=GREY, linewidth=1.0, linestyle=DOTTED, label="estimate's error"),
+        Patch(facecolor="#7F7F7F30", edgecolor=GREY, linewidth=0.8, label="3σ of the position, as claimed"),
+    ]
+    if sees_a_part(scenario):
+        handles.append(Patch(facecolor="#7F7F7F24", edgecolor="none", label="field of view"))
+    handles.append(_sight(Sight.VISIBLE, "sees (its colour)"))
+    if scenario.topology.mode == "sensed":
+        if scenario.obstacles:
+            handles.append(_sight(Sight.OCCLUDED_BY_BUILDING, "hidden by a building"))
+        handles.append(_sight(Sight.OCCLUDED_BY_BODY, "hidden by a vehicle"))
+    if scenario.camera.miss_probability > 0:
+        handles.append(_sight(Sight.MISSED, "in view, but missed"))
+    handles.append(_mark("o", DARK_BLUE, DARK_BLUE, 5, "landmark"))
+    if any(landmark.motion.kind != "static" for landmark in scenario.landmarks):
+        handles.append(_mark("D", DARK_BLUE, DARK_BLUE, 4.5, "moving landmark"))
+    if any(vehicle.goal for vehicle in scenario.vehicles):
+        handles.append(_mark("o", GREY, "white", 7, "goal"))
+        if scenario.termination.arrival:
+            handles.append(_mark("*", INK, "white", 9, "arrived"))
+    if scenario.termination.collision and any(vehicle.body for vehicle in scenario.vehicles):
+        handles.append(_mark("X", "white", INK, 8, "collided"))
+    handles.append(_mark(">", GREY, "white", 6, "estimate outside the picture"))
+    figure.legend(
+        handles=handles,
+        loc="upper left",
+        bbox_to_anchor=pixels(PANEL - 4, TABLE_TOP - ROW * (rows + 1)),
+        fontsize=SMALL,
+        labelcolor=INK,
+        frameon=False,
+        borderaxespad=0.0,
+        borderpad=0.0,
+        handlelength=1.9,
+        labelspacing=0.42,
+    )
+
+
+def sees_a_part(scenario: Scenario) -> bool:
+    """Return whether cameras have a field of view that matters."""
+    return scenario.camera.model == "pinhole" and scenario.topology.mode == "sensed"
+
+
+def _sight(sight: Sight, label: str) -> Line2D:
+    return Line2D([], [], label=label, **{"color": GREY, **SIGHT_LOOKS[sight]})  # type: ignore[arg-type]
+
+
+def _mark(marker: str, edge: str, face: str, size: float, label: str) -> Line2D:
+    return Line2D(
+        [],
+        [],
+        linestyle="none",
+        marker=marker,
+        markersize=size,
+        markeredgecolor=edge,
+        markerfacecolor=face,
+        markeredgewidth=0.9,
+        label=label,
+    )
