@@ -24,7 +24,7 @@ class ActionReader:
         """
         try:
             values = np.array([actions[agent] for agent in alive], dtype=np.float64)
-        except (KeyError, TypeError, ValueError):
+        except (IndexError, KeyError, TypeError, ValueError):
             values = np.empty(0)
         if values.shape != (len(alive), 2) or len(actions) != len(alive) or not np.isfinite(values).all():
             self._complain(actions, alive)

@@ -12,12 +12,13 @@ PER_AGENT = 12
 """position (3), first two columns of R (6), linear velocity (3), all of truth"""
 PER_VEHICLE = 9
 """estimated position (3) and first two columns of Rhat (6)"""
+LIMIT = 1e6
 
 
 def state_space(scenario: Scenario) -> spaces.Box:
-    """Return the space of `state_vector`: metres and m/s, not bounded."""
+    """Return the space of `state_vector`: metres and m/s, clipped far beyond any scene."""
     size = PER_AGENT * len(scenario.target_names) + PER_VEHICLE * len(scenario.vehicles) + 1
-    return spaces.Box(-np.inf, np.inf, shape=(size,), dtype=np.float32)
+    return spaces.Box(-LIMIT, LIMIT, shape=(size,), dtype=np.float32)
 
 
 def state_vector(engine: Engine) -> np.ndarray:
@@ -28,4 +29,4 @@ def state_vector(engine: Engine) -> np.ndarray:
     truth = np.hstack([position, R[:, :, 0], R[:, :, 1], velocity])
     estimate = np.hstack([position_hat, R_hat[:, :, 0], R_hat[:, :, 1]])
     share = engine.view("tick")[:1] / engine.world.model.horizon_ticks
-    return np.concatenate([truth.ravel(), estimate.ravel(), share]).astype(np.float32)
+    return np.concatenate([truth.ravel(), estimate.ravel(), share]).astype(np.float32).clip(-LIMIT, LIMIT)

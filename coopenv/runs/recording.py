@@ -58,12 +58,18 @@ class Recording:
         self.seed = seed
         self.engine = Engine(scenario, 1, dtype, device)
         self.policy = make_policy(policy, seed) if isinstance(policy, str) else policy
+        self.policy_name = policy if isinstance(policy, str) else getattr(policy, "__name__", "custom")
         self.ticks_planned = scenario.horizon_ticks
         if steps is not None:
             self.ticks_planned = min(self.ticks_planned, steps * scenario.ticks_per_decision)
         self.wall_time = 0.0
         self._rows: dict[str, list[np.ndarray]] = {}
-        self._ticks_recorded = 0
+        self._taken = 0
+
+    @property
+    def ticks_recorded(self) -> int:
+        """Camera ticks since t = 0 that have been recorded."""
+        return max(0, self._taken - 1)
 
     def warm_up(self) -> None:
         """Load all kernels, compiling those that this machine has not compiled yet."""
@@ -78,7 +84,7 @@ class Recording:
         """
         start = perf_counter()
         self._rows = {name: [] for name in RECORDED}
-        self._ticks_recorded = 0
+        self._taken = 0
         self.wall_time = 0.0
         self.engine.reset([self.seed])
         self._take()
@@ -104,11 +110,11 @@ class Recording:
     def _take(self) -> None:
         for name, rows in self._rows.items():
             rows.append(self.engine.view(name)[0].copy())
-        self._ticks_recorded += 1
+        self._taken += 1
 
     def _recorded(self, name: str) -> np.ndarray:
         """Return (K, ...) of one view; an interrupted tick is left out."""
-        return np.stack(self._rows[name][: self._ticks_recorded])
+        return np.stack(self._rows[name][: self._taken])
 
     def trajectory(self) -> Trajectory:
         """Return what has been recorded so far; `play` must have yielded at least once."""

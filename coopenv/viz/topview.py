@@ -10,16 +10,18 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba_array
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 
 from coopenv.estimation.trajectory import Sight
 from coopenv.scenario import Scenario
-from coopenv.scenario.agents import Body
+from coopenv.scenario.agents import Body, Landmark, Vehicle
 from coopenv.viz.style import DARK_BLUE, INK, NORMAL, vehicle_colour
 from coopenv.viz.topview_geometry import (
     box_shape,
     camera_fan,
     ellipses,
+    free_lengths,
     nose_shape,
     outlines,
     pointers,
@@ -46,10 +48,11 @@ from coopenv.viz.window import Window
 _ARRIVED, _COLLIDED = 1, 2  # values of the field `ended`
 _SHORTEST = 24  # px, drawn length of a vehicle
 _POINTER = 13  # px
-_LABEL = 17  # px behind a vehicle
+_LABEL = 11  # px beside a vehicle
 _REACH = 0.4  # of the picture's side, of a camera that sees farther
-_FILLED = 0.35  # of the picture's side, largest semi-axis of an ellipse that is filled
+_FILLED = 0.3  # of the picture's side, largest semi-axis of an ellipse that is filled
 _LARGEST = 2.0  # of the picture's side, largest semi-axis of an ellipse that is drawn
+_HALO: dict[str, Any] = {"path_effects": [withStroke(linewidth=2.2, foreground="white")]}
 _POINT = Body(size=(2e-3, 1e-3, 1e-3))  # stands in for a vehicle without a body, drawn at the least size
 _FIELDS = (
     "rotation",
@@ -100,7 +103,7 @@ class TopView:
         self._place_sight(R, position, view["sight"])
         self._place_marks(R, position, view["ended"])
         self._write(view, sigma, float(engine.view("tick")[0]) / self.scenario.rates.camera)
-        self._canvas.restore_region(self._background)  # type: ignore[attr-defined]
+        self._canvas.restore_region(self._background)
         renderer = self._canvas.get_renderer()
         for artist in self._layers:
             artist.draw(renderer)
@@ -116,7 +119,7 @@ class TopView:
 
     def _prepare_shapes(self) -> None:
         s = self.scenario
-        agents = [*s.landmarks, *s.vehicles]
+        agents: list[Landmark | Vehicle] = [*s.landmarks, *s.vehicles]
         shortest = _SHORTEST * self._pixel
         bodies = [vehicle.body or _POINT for vehicle in s.vehicles]
         self._box = np.array([box_shape(b.size, b.center, shortest) for b in bodies])
@@ -125,17 +128,17 @@ class TopView:
         bodies = [m.body for m in s.landmarks if m.body]
         self._other_box = np.array([box_shape(b.size, b.center, shortest) for b in bodies]).reshape(-1, 4, 2)
         self._marker = np.array([agent.marker for agent in agents])
-        self._camera = np.array(s.camera.position)
+        self._camera, self._origin = np.array(s.camera.position), np.array(s.map.origin)
         limit = _REACH * self._side
-        self._ranged = s.camera.range is not None and s.camera.range <= limit
-        reach = min(s.camera.range or limit, limit)
-        self._fan = reach * camera_fan(s.camera) if sees_a_part(s) else None
+        self._reach = min(s.camera.range or limit, limit)
+        self._fan = camera_fan(s.camera) if sees_a_part(s) else None
+        aside = self._box[:, 2, 1] + _LABEL * self._pixel
+        self._label = np.stack([self._box[:, :, 0].mean(axis=1), aside], axis=-1)
 
     def _prepare_artists(self) -> None:
         colours = [vehicle_colour(i) for i in range(len(self.scenario.vehicles))]
         self._rgba = to_rgba_array(colours)
-        self._wedges = self._polygons(facecolor=_faded(self._rgba, 0.10), edgecolor="none")
-        self._wedge_edges = self._lines(color=_faded(self._rgba, 0.55), linewidth=0.6)
+        self._wedges = self._polygons(facecolor=_faded(self._rgba, 0.11), edgecolor="none")
         self._ellipses = self._polygons(linewidth=1.0)
         self._sight = {sight: self._lines(**look) for sight, look in SIGHT_LOOKS.items()}
         self._still = self._points("o", DARK_BLUE, "white", 5.5)
@@ -145,13 +148,15 @@ class TopView:
         self._truth_nose = self._polygons(facecolor="white", edgecolor="none")
         self._links = self._lines(color=colours, linewidth=1.0, linestyle=DOTTED)
         self._casing = self._polygons(facecolor="none", edgecolor="white", linewidth=3.2)
-        self._estimate = self._polygons(facecolor=(1, 1, 1, 0.55), edgecolor=self._rgba, linewidth=1.5)
+        self._estimate = self._polygons(facecolor="none", edgecolor=self._rgba, linewidth=1.4)
         self._estimate_nose = self._polygons(facecolor="none", edgecolor=self._rgba, linewidth=1.2)
         self._pointers = self._polygons(facecolor="white", linewidth=1.3)
         self._arrived = self._points("*", "white", INK, 12)
         self._collided = self._points("X", INK, "white", 11)
         self._names = [
-            self._text(vehicle_mark(i), color=c, fontsize=NORMAL, weight="bold", ha="center", va="center")
+            self._text(
+                vehicle_mark(i), color=c, fontsize=NORMAL, weight="bold", ha="center", va="center", **_HALO
+            )
             for i, c in enumerate(colours)
         ]
         self._moving_names = {
@@ -159,20 +164,21 @@ class TopView:
             for i, m in enumerate(self.scenario.landmarks)
             if m.motion.kind != "static"
         }
-        for artist in self._moving_names.values():
-            artist.set_animated(True)
-            self._layers.append(artist)
+        for name in self._moving_names.values():
+            self._keep(name)
 
     def _prepare_table(self) -> None:
         count = len(self.scenario.vehicles)
-        self._time = self._row(HEIGHT - 22, "", fontsize=NORMAL + 1.5, weight="bold", color=INK)
-        head = f"{'':4}{'error':>7}{'3σ':>7}{'turn':>6}{'sees':>5}\n{'':4}{'[m]':>7}{'[m]':>7}{'[deg]':>6}"
+        self._time = self._row(HEIGHT - 21, "", fontsize=NORMAL + 1.5, weight="bold", color=INK)
+        head = f"{'':4}{'error':>7}{'3σ':>7}{'turn':>6}{'sees':>6}\n{'':4}{'[m]':>7}{'[m]':>7}{'[deg]':>6}"
         self._figure.text(
             *pixels(PANEL, TABLE_TOP), head, fontsize=SMALLER, family="monospace", color=INK, va="bottom"
         )
         shown = min(count, MOST_ROWS)
         self._rows = [
-            self._row(TABLE_TOP - ROW * (i + 1), "", fontsize=SMALLER, family="monospace", color=vehicle_colour(i))
+            self._row(
+                TABLE_TOP - ROW * (i + 1), "", fontsize=SMALLER, family="monospace", color=vehicle_colour(i)
+            )
             for i in range(shown)
         ]
         draw_legend(self._figure, self.scenario, shown + 1)
@@ -181,7 +187,7 @@ class TopView:
         """Place the 3-sigma ellipses; return their major semi-axes (N,) in m."""
         shapes, semi = ellipses(estimate[:, :2], covariance[:, :2, :2])
         drawn = semi <= _LARGEST * self._side
-        alpha = np.where(semi[drawn] <= _FILLED * self._side, 0.16, 0.0)
+        alpha = np.where(semi[drawn] <= _FILLED * self._side, 0.09, 0.0)
         self._ellipses.set_verts(list(shapes[drawn]))
         self._ellipses.set_facecolor(_faded(self._rgba[drawn], alpha))
         self._ellipses.set_edgecolor(_faded(self._rgba[drawn], np.where(alpha > 0, 0.8, 0.35)))
@@ -209,31 +215,30 @@ class TopView:
     def _place_sight(self, R: np.ndarray, position: np.ndarray, sight: np.ndarray) -> None:
         L = self._landmarks
         target = (position + (R @ self._marker[..., None])[..., 0])[:, :2]
-        camera = (position[L:] + R[L:] @ self._camera)[:, :2]
+        camera = position[L:] + R[L:] @ self._camera
         for kind, lines in self._sight.items():
             observer, seen = np.nonzero(sight == kind)
-            lines.set_segments(list(np.stack([camera[observer], target[seen]], axis=1)))
+            lines.set_segments(list(np.stack([camera[observer, :2], target[seen]], axis=1)))
             if "color" not in SIGHT_LOOKS[kind]:
                 lines.set_color(_faded(self._rgba[observer], 0.9))
         if self._fan is not None:
-            rim = camera[:, None] + (self._fan @ np.swapaxes(R[L:], 1, 2))[..., :2]
-            tip = camera[:, None]
-            self._wedges.set_verts(np.concatenate([tip, rim], axis=1))
-            edge = np.concatenate([tip, rim, tip], axis=1) if self._ranged else np.concatenate([rim[:, :1], tip, rim[:, -1:]], axis=1)
-            self._wedge_edges.set_segments(list(edge))
+            rays = self._fan @ np.swapaxes(R[L:], 1, 2)
+            length = free_lengths(camera, rays, self._reach, self.scenario.obstacles, self._origin)
+            rim = camera[:, None] + length[..., None] * rays
+            self._wedges.set_verts(np.concatenate([camera[:, None], rim], axis=1)[..., :2])
         moving = np.array(list(self._moving_names), dtype=int)
         self._still.set_data(*np.delete(target[:L], moving, axis=0).T)
         self._moving.set_data(*target[moving].T)
         for i, name in self._moving_names.items():
-            name.xy = tuple(target[i])
+            name.xy = (float(target[i, 0]), float(target[i, 1]))
 
     def _place_marks(self, R: np.ndarray, position: np.ndarray, ended: np.ndarray) -> None:
         L = self._landmarks
         place = position[L:, :2]
         self._arrived.set_data(*place[ended == _ARRIVED].T)
         self._collided.set_data(*place[ended == _COLLIDED].T)
-        behind = place - _LABEL * self._pixel * R[L:, :2, 0]
-        for name, (x, y) in zip(self._names, behind.tolist(), strict=True):
+        beside = outlines(R[L:], place, self._label[:, None])[:, 0]
+        for name, (x, y) in zip(self._names, beside.tolist(), strict=True):
             name.set_position((x, y))
 
     def _write(self, view: dict[str, np.ndarray], sigma: np.ndarray, time: float) -> None:
@@ -243,13 +248,14 @@ class TopView:
         for i, row in enumerate(self._rows):
             error, turn = view["position_error"][i], view["orientation_error"][i]
             row.set_text(
-                f"{vehicle_mark(i):<4}{_short(error):>7}{_short(sigma[i]):>7}{turn:>6.1f}{seen[i]:>3}/{possible[i]}"
+                f"{vehicle_mark(i):<4}{_short(error):>7}{_short(sigma[i]):>7}{turn:>6.1f}"
+                f"{f'{seen[i]}/{possible[i]}':>6}"
             )
 
-    def _polygons(self, **look: Any) -> PolyCollection:
+    def _polygons(self, **look: Any) -> Any:
         return self._add(PolyCollection([], **look))
 
-    def _lines(self, **look: Any) -> LineCollection:
+    def _lines(self, **look: Any) -> Any:
         return self._add(LineCollection([], **look))
 
     def _points(self, marker: str, face: str, edge: str, size: float) -> Line2D:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coopenv.scenario import Scenario
+from coopenv.scenario.agents import Landmark, Obstacle, Vehicle
 from coopenv.scenario.motion import TwistTable, compile_motion, left_jacobian
 from coopenv.scenario.sensing import Camera
 from coopenv.world.build import ROTATION_OF_CAMERA, agent_starts
 
 SIGMAS = 3.0
-_CIRCLE = np.linspace(0.0, 2 * np.pi, 61)
-_FAN_RAYS = 17
+_CIRCLE = np.linspace(0.0, 2 * np.pi, 97)
+_FAN_RAYS = 65
 _PATH_SAMPLES = 121
 _MARGIN = 0.05  # share of the scene around it
 
@@ -38,7 +41,7 @@ def position_covariance(rotation: np.ndarray, position: np.ndarray, covariance: 
 
 
 def ellipses(center: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return 3-sigma outlines (N, 61, 2) and major semi-axes (N,); NaN where a covariance is not one.
+    """Return 3-sigma outlines (N, 97, 2) and major semi-axes (N,); NaN where a covariance is not one.
 
     Args:
         center: (N, 2) m.
@@ -78,7 +81,8 @@ def nose_shape(corners: np.ndarray) -> np.ndarray:
 def camera_fan(camera: Camera) -> np.ndarray:
     """Return unit rays (K, 3) in the body frame over the width of the image, at the height of its centre."""
     edges = (np.array([0.0, camera.image_size[0]]) - camera.principal_point[0]) / camera.focal_length[0]
-    x = np.linspace(*np.arctan([_undistorted(float(edge), camera) for edge in edges]), _FAN_RAYS)
+    left, right = (float(np.arctan(_undistorted(float(edge), camera))) for edge in edges)
+    x = np.linspace(left, right, _FAN_RAYS)
     rays = np.stack([np.sin(x), np.zeros_like(x), np.cos(x)], axis=-1)
     return rays @ camera_rotation(camera).T
 
@@ -88,6 +92,32 @@ def camera_rotation(camera: Camera) -> np.ndarray:
     if isinstance(camera.orientation, str):
         return ROTATION_OF_CAMERA[camera.orientation]
     return Rotation.from_quat(camera.orientation, scalar_first=True).as_matrix()
+
+
+def free_lengths(
+    origin: np.ndarray, rays: np.ndarray, reach: float, obstacles: Sequence[Obstacle], shift: np.ndarray
+) -> np.ndarray:
+    """Return how far rays (N, K, 3) from cameras (N, 3) get before a building stops them, (N, K) m, up to `reach`.
+
+    Args:
+        origin: map frame, m.
+        rays: unit vectors, map frame.
+        reach: m.
+        obstacles: buildings, in the coordinates of the scenario's file.
+        shift: (3,) the map's origin in these coordinates, m.
+    """
+    length = np.full(rays.shape[:2], reach)
+    for obstacle in obstacles:
+        Rt = Rotation.from_euler("z", -obstacle.yaw).as_matrix()
+        start = (origin - (np.array(obstacle.center) - shift)) @ Rt.T
+        way = rays @ Rt.T
+        way = np.where(np.abs(way) < 1e-9, 1e-9, way)
+        half = np.array(obstacle.size) / 2
+        sides = np.stack([(-half - start[:, None]) / way, (half - start[:, None]) / way])
+        enter, leave = sides.min(axis=0).max(axis=-1), sides.max(axis=0).min(axis=-1)
+        hit = (enter < leave) & (leave > 0)
+        length = np.where(hit, np.minimum(length, np.maximum(enter, 0.0)), length)
+    return length
 
 
 def _undistorted(edge: float, camera: Camera) -> float:
@@ -125,7 +155,8 @@ def _places(scenario: Scenario) -> list[np.ndarray]:
 
 def _paths(scenario: Scenario) -> list[np.ndarray]:
     positions, rotations = agent_starts(scenario)
-    motions = [agent.motion for agent in (*scenario.landmarks, *scenario.vehicles)]
+    agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
+    motions = [agent.motion for agent in agents]
     t = np.linspace(0.0, scenario.horizon, _PATH_SAMPLES)
     paths = []
     for motion, position, rotation in zip(motions, positions, rotations, strict=True):
@@ -173,7 +204,9 @@ def pointers(
         start = start if inside else (low + high) / 2
         way = end - start
         with np.errstate(divide="ignore"):
-            share = np.min(np.where(way > 0, (high - start) / way, np.where(way < 0, (low - start) / way, np.inf)))
+            share = np.min(
+                np.where(way > 0, (high - start) / way, np.where(way < 0, (low - start) / way, np.inf))
+            )
         ahead = way / np.linalg.norm(way)
         tip, aside = start + share * way - 0.15 * size * ahead, np.array([-ahead[1], ahead[0]])
         base = tip - size * ahead

@@ -50,10 +50,13 @@ def _matrices(p: Precision, module: wp.Module) -> dict[str, Any]:
     scalar, vec3, mat33, mat66 = p.scalar, p.vec3, p.mat33, p.mat66
 
     @wp.kernel(module=module)
-    def cholesky6(M: wp.array(dtype=mat66), out: wp.array(dtype=mat66)):
+    def cholesky6(M: wp.array(dtype=mat66), out: wp.array(dtype=mat66), inverses: wp.array(dtype=mat66)):
         i = wp.tid()
-        L11, L21, L22 = quality.cholesky_of(M[i], mat33())
-        out[i] = linalg.join6(L11, mat33(), L21, L22, mat66())
+        o = mat33()
+        A = linalg.block3(M[i], 0, 0, o)
+        L11, L21, L22, I11, I22 = linalg.cholesky6(A, linalg.block3(M[i], 0, 3, o), linalg.block3(M[i], 3, 3, o))
+        out[i] = linalg.join6(L11, o, L21, L22, mat66())
+        inverses[i] = linalg.join6(I11, o, o, I22, mat66())
 
     @wp.kernel(module=module)
     def eigen_symmetric6(M: wp.array(dtype=mat66), D: wp.array(dtype=mat66), U: wp.array(dtype=mat66)):
@@ -71,8 +74,8 @@ def _matrices(p: Precision, module: wp.Module) -> dict[str, Any]:
     @wp.kernel(module=module)
     def log_determinant(P: wp.array(dtype=mat66), out: wp.array(dtype=scalar)):
         i = wp.tid()
-        L11, _L21, L22 = quality.cholesky_of(P[i], mat33())
-        out[i] = quality.log_determinant(L11, L22)
+        I11, _L21, I22 = quality.cholesky_of(P[i], mat33())
+        out[i] = quality.log_determinant(I11, I22)
 
     @wp.kernel(module=module)
     def nees(
@@ -86,11 +89,11 @@ def _matrices(p: Precision, module: wp.Module) -> dict[str, Any]:
         out: wp.array(dtype=scalar),
     ):
         i = wp.tid()
-        L11, L21, L22 = quality.cholesky_of(P[i], mat33())
+        I11, L21, I22 = quality.cholesky_of(P[i], mat33())
         a, b = quality.observer_error(R[i], position[i], R_hat[i], p_hat[i])
         e1[i] = a
         e2[i] = b
-        out[i] = quality.normalised_error_squared(L11, L21, L22, a, b)
+        out[i] = quality.normalised_error_squared(I11, L21, I22, a, b)
 
     return locals()
 
@@ -155,7 +158,9 @@ def _observer(p: Precision, module: wp.Module) -> dict[str, Any]:
         M11 = linalg.block3(M[i], 0, 0, o)
         M12 = linalg.block3(M[i], 0, 3, o)
         M22 = linalg.block3(M[i], 3, 3, o)
-        L11, L21, L22 = quality.cholesky_of(P[i], o)
+        L11, L21, L22, _I11, _I22 = linalg.cholesky6(
+            linalg.block3(P[i], 0, 0, o), linalg.block3(P[i], 0, 3, o), linalg.block3(P[i], 3, 3, o)
+        )
         if k[i] == scalar(1.0):
             a, b, A, B, D = riccati.correct_kalman(h[i], M11, M12, M22, L11, L21, L22, r1[i], r2[i])
             dx1[i] = a
@@ -205,9 +210,11 @@ def _numbers(p: Precision, module: wp.Module) -> dict[str, Any]:
         out[i] = random.uniform(word[i], scalar(1.0))
 
     @wp.kernel(module=module)
-    def gaussian3(words: wp.array2d(dtype=wp.uint32), out: wp.array(dtype=vec3)):
+    def gaussian_pair(words: wp.array2d(dtype=wp.uint32), out: wp.array2d(dtype=scalar)):
         i = wp.tid()
-        out[i] = random.gaussian3(random.vec4u(words[i, 0], words[i, 1], words[i, 2], words[i, 3]), vec3())
+        x, y = random.gaussian_pair(words[i, 0], words[i, 1], scalar(1.0))
+        out[i, 0] = x
+        out[i, 1] = y
 
     @wp.kernel(module=module)
     def unit_vector(words: wp.array2d(dtype=wp.uint32), out: wp.array(dtype=vec3)):
@@ -277,10 +284,10 @@ def _geometry(p: Precision, module: wp.Module) -> dict[str, Any]:
 
 @cache
 def _kernels(dtype: str) -> dict[str, wp.Kernel]:
-    module = wp.get_module(f"tests.world.calls.{dtype}")
-    module.options["enable_backward"] = False
     found: dict[str, Any] = {}
     for group in (_rotations, _matrices, _observer, _numbers, _geometry):
+        module = wp.get_module(f"tests.world.calls{group.__name__}.{dtype}")
+        module.options["enable_backward"] = False
         found |= group(precision(dtype), module)
     return {name: value for name, value in found.items() if isinstance(value, wp.Kernel)}
 

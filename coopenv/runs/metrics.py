@@ -1,0 +1,121 @@
+"""What a recorded run comes to: the figures of `metrics.json`, one dict per vehicle and one for the run."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import warp
+
+from coopenv.estimation.metrics import settling_time, summarise
+from coopenv.estimation.observability import Observability
+from coopenv.estimation.trajectory import Trajectory
+from coopenv.runs.recording import Ending, Recording
+
+STEADY_SHARE = 0.7
+"""The steady state is taken to begin after this share of the horizon (35 s of 50 s)."""
+
+COARSE_POSITION_M = 0.5
+COARSE_ORIENTATION_DEG = 5.0
+"""Wider settling tolerances, which an estimate under measurement noise can meet."""
+
+
+def vehicle_metrics(
+    trajectory: Trajectory, observability: Observability, endings: list[Ending], steady_from: float
+) -> list[dict[str, Any]]:
+    """Return one dict per vehicle: outcome, errors, consistency and observability, units in the keys."""
+    coarse = settling_time(
+        trajectory.t,
+        trajectory.position_error,
+        trajectory.orientation_error,
+        COARSE_POSITION_M,
+        COARSE_ORIENTATION_DEG,
+    )
+    return [
+        {
+            **summary,
+            "coarse_settle_time_s": float(coarse[i]),
+            "outcome": endings[i].outcome,
+            "end_time_s": endings[i].time,
+            "observability": observability_metrics(observability, i),
+        }
+        for i, summary in enumerate(summarise(trajectory, steady_from))
+    ]
+
+
+def observability_metrics(observability: Observability, vehicle: int) -> dict[str, Any]:
+    """Return the verdicts on one vehicle's windows and the figures of its Gramian; NaN where there is no window."""
+    smallest = observability.min_eigenvalue[:, vehicle]
+    local = observability.local_eigenvalue[:, vehicle]
+    verdict = observability.observable[:, vehicle]
+    some = len(verdict) > 0
+    gaps = [interval for interval in observability.intervals(vehicle) if not interval.observable]
+    return {
+        "window_s": observability.window,
+        "threshold": observability.threshold,
+        "share_observable": float(verdict.mean()) if some else np.nan,
+        "not_observable_s": [[gap.start, gap.end] for gap in gaps],
+        "gramian_min_eigenvalue_min": float(smallest.min()) if some else np.nan,
+        "gramian_min_eigenvalue_median": float(np.median(smallest)) if some else np.nan,
+        "gramian_condition_number_median": (
+            float(np.median(observability.condition_number[:, vehicle])) if some else np.nan
+        ),
+        "local_eigenvalue_min": float(local.min()) if some else np.nan,
+        "local_eigenvalue_median": float(np.median(local)) if some else np.nan,
+    }
+
+
+def outcome_line(recording: Recording, interrupted: bool = False) -> str:
+    """Return how the run ended, in words."""
+    endings = recording.endings()
+    scenario = recording.scenario
+    count = {word: sum(ending.outcome == word for ending in endings) for word in ("arrived", "collided")}
+    parts = [f"{number} {word}" for word, number in count.items() if number]
+    time = recording.ticks_recorded / scenario.rates.camera
+    if interrupted:
+        end = f"interrupted at {time:g} s"
+    elif all(ending.outcome != "under way" for ending in endings):
+        end = f"all vehicles had ended by {max(ending.time for ending in endings):.4g} s"
+    elif recording.ticks_recorded >= scenario.horizon_ticks:
+        end = f"horizon reached at {time:g} s"
+    else:
+        end = f"stopped after the steps asked for, at {time:g} s"
+    return f"{end} ({', '.join(parts)})" if parts else end
+
+
+def run_metrics(
+    name: str,
+    overrides: Mapping[str, Any],
+    recording: Recording,
+    vehicles: list[dict[str, Any]],
+    steady_from: float,
+    outcome: str,
+) -> dict[str, Any]:
+    """Return the contents of `metrics.json`."""
+    from coopenv import __version__
+
+    simulated = recording.ticks_recorded / recording.scenario.rates.camera
+    engine = recording.engine
+    return {
+        "environment": name,
+        "title": recording.scenario.title,
+        "seed": recording.seed,
+        "overrides": dict(overrides),
+        "policy": recording.policy_name,
+        "dtype": engine.world.precision.name,
+        "device": engine.world.device,
+        "versions": {
+            "coopenv": __version__,
+            "warp": warp.__version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
+        "outcome": outcome,
+        "simulated_time_s": simulated,
+        "wall_time_s": recording.wall_time,
+        "real_time_factor": simulated / recording.wall_time,
+        "steady_from_s": steady_from,
+        "vehicles": vehicles,
+    }

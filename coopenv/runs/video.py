@@ -1,0 +1,92 @@
+"""Films of a run: MP4 through ffmpeg where the extra `video` is installed, otherwise an animated GIF."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from math import ceil
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from PIL import Image
+
+from coopenv.runs.output import writing
+from coopenv.scenario import Scenario
+
+MAX_FPS = 20.0
+GIF_SIZE = 480
+"""Largest width or height of a GIF, pixels: its frames are held in memory until the end."""
+
+
+class Film(Protocol):
+    """Takes pictures in order and writes them when it is closed."""
+
+    path: Path
+
+    def add(self, picture: np.ndarray) -> None:
+        """Append an (H, W, 3) uint8 picture."""
+
+    def close(self) -> None:
+        """Finish the file."""
+
+
+def frame_stride(scenario: Scenario) -> int:
+    """Return the camera ticks between pictures: one per decision, but at most `MAX_FPS` a second."""
+    return scenario.ticks_per_decision * max(1, ceil(scenario.rates.decision / MAX_FPS - 1e-9))
+
+
+def open_film(folder: Path, fps: float) -> Film:
+    """Return the film `video.mp4`, or `video.gif` without the extra."""
+    if find_spec("imageio_ffmpeg") is not None:
+        return Mp4Film(folder / "video.mp4", fps)
+    return GifFilm(folder / "video.gif", fps)
+
+
+class Mp4Film:
+    """H.264, written while the pictures come."""
+
+    def __init__(self, path: Path, fps: float) -> None:
+        self.path = path
+        self._fps = fps
+        self._writer: Any = None
+
+    def add(self, picture: np.ndarray) -> None:
+        """Append a picture, cut to even width and height as the codec asks for."""
+        height, width = picture.shape[0] // 2 * 2, picture.shape[1] // 2 * 2
+        with writing(self.path):
+            if self._writer is None:
+                import imageio_ffmpeg
+
+                self._writer = imageio_ffmpeg.write_frames(
+                    str(self.path), (width, height), fps=self._fps, macro_block_size=2, ffmpeg_log_level="error"
+                )
+                self._writer.send(None)
+            self._writer.send(np.ascontiguousarray(picture[:height, :width]))
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._writer is not None:
+            with writing(self.path):
+                self._writer.close()
+
+
+class GifFilm:
+    """An animated GIF of at most `GIF_SIZE` pixels, written at the end."""
+
+    def __init__(self, path: Path, fps: float) -> None:
+        self.path = path
+        self._duration = 1000.0 / fps
+        self._frames: list[Image.Image] = []
+
+    def add(self, picture: np.ndarray) -> None:
+        """Append a picture."""
+        image = Image.fromarray(picture)
+        image.thumbnail((GIF_SIZE, GIF_SIZE))
+        self._frames.append(image.quantize(64))
+
+    def close(self) -> None:
+        """Write the file; it plays for ever."""
+        if self._frames:
+            first, *rest = self._frames
+            with writing(self.path):
+                first.save(self.path, save_all=True, append_images=rest, duration=self._duration, loop=0)
