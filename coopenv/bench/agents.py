@@ -1,0 +1,60 @@
+"""Score a driver: what share of vehicles arrives, collides, runs out of time, and how well they know where they are."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from coopenv.api.parallel_env import CooperativeLocalisationEnv
+from coopenv.policies.base import Policy
+
+
+@dataclass(frozen=True)
+class Score:
+    """Results over episodes; shares are of all vehicles of all episodes."""
+
+    episodes: int
+    arrived: float
+    collided: float
+    under_way: float
+    mean_return: float
+    """Sum of the rewards of all vehicles, mean over episodes."""
+    std_return: float
+    median_position_error_m: float
+    p95_position_error_m: float
+
+
+def play(env: CooperativeLocalisationEnv, policy: Policy, seed: int) -> tuple[float, list[str], list[float]]:
+    """Drive one episode and return (sum of rewards, outcome per vehicle, position errors in m)."""
+    observations, infos = env.reset(seed=seed)
+    total, errors, last = 0.0, [], dict(infos)
+    while env.agents:
+        actions = {agent: policy.act(observations[agent]) for agent in env.agents}
+        observations, rewards, _, _, infos = env.step(actions)
+        total += sum(rewards.values())
+        last.update(infos)
+        errors += [info["position_error"] for info in infos.values()]
+    return total, [info["outcome"] for info in last.values()], errors
+
+
+def score(episodes: Iterator[tuple[float, list[str], list[float]]]) -> Score:
+    """Sum up episodes that `play` returned."""
+    returns, outcomes, errors = [], Counter[str](), []
+    for total, ends, seen in episodes:
+        returns.append(total)
+        outcomes.update(ends)
+        errors += seen
+    vehicles = max(1, outcomes.total())
+    return Score(
+        len(returns),
+        outcomes["arrived"] / vehicles,
+        outcomes["collided"] / vehicles,
+        outcomes["under way"] / vehicles,
+        float(np.mean(returns)),
+        float(np.std(returns)),
+        float(np.median(errors)),
+        float(np.percentile(errors, 95)),
+    )

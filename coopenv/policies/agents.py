@@ -1,0 +1,83 @@
+"""Find and load the drivers of `agents/`: one folder each, with an `agent.toml` and a card."""
+
+from __future__ import annotations
+
+import tomllib
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from coopenv.api.parallel_env import CooperativeLocalisationEnv
+from coopenv.errors import CoopenvError, suggest
+from coopenv.policies.base import Policy
+from coopenv.scenario import data_directory
+
+
+class AgentCard(BaseModel):
+    """The contents of an `agent.toml`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    title: str
+    description: str
+    entry: str
+    """`package.module:Class` within coopenv; called with the observation layout and the options."""
+    environments: tuple[str, ...]
+    """Environments that it was made for."""
+    options: dict[str, Any] = {}
+
+
+def list_agents() -> list[str]:
+    """Return the names of the drivers that ship with coopenv."""
+    return sorted(path.parent.name for path in data_directory("agents").glob("*/agent.toml"))
+
+
+def agent_path(name_or_path: str | Path) -> Path:
+    """Return the `agent.toml` of a shipped driver or of a folder.
+
+    Raises:
+        CoopenvError: there is none.
+    """
+    folder = Path(str(name_or_path))
+    if str(name_or_path) in list_agents():
+        folder = data_directory("agents") / str(name_or_path)
+    if not (folder / "agent.toml").is_file():
+        names = list_agents()
+        raise CoopenvError(f"unknown agent '{name_or_path}'{suggest(str(name_or_path), names)}; known: {', '.join(names)}")
+    return folder / "agent.toml"
+
+
+def read_card(name_or_path: str | Path) -> AgentCard:
+    """Read an `agent.toml`.
+
+    Raises:
+        CoopenvError: no such agent, or the file is not valid.
+    """
+    path = agent_path(name_or_path)
+    try:
+        return AgentCard.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except tomllib.TOMLDecodeError as error:
+        raise CoopenvError(f"{path}: not valid TOML: {error}") from None
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise CoopenvError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+
+
+def load_agent(name_or_path: str | Path, env: CooperativeLocalisationEnv) -> Policy:
+    """Return a driver for an environment.
+
+    Raises:
+        CoopenvError: no such agent, its entry lies outside coopenv, or it cannot drive this environment.
+    """
+    card = read_card(name_or_path)
+    module, _, attribute = card.entry.partition(":")
+    if not module.startswith("coopenv.") or not attribute:
+        raise CoopenvError(f"agent '{name_or_path}': entry must be 'coopenv.module:Class', got '{card.entry}'")
+    try:
+        factory = getattr(import_module(module), attribute)
+        policy: Policy = factory(env.observation_layout, **card.options)
+    except (ImportError, AttributeError, TypeError, KeyError) as error:
+        raise CoopenvError(f"agent '{name_or_path}' cannot be built: {error}") from None
+    return policy

@@ -1,0 +1,66 @@
+"""A scripted driver: towards the goal, giving way to the vehicles that it hears."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from coopenv.api.layout import Field
+
+
+class GiveWay:
+    """Pure pursuit of the goal in the vehicle's own estimated frame; stops where driving on would come too close.
+
+    In the leader-follower order a vehicle hears its leaders only, so giving way to whomever one hears cannot
+    deadlock. Written for `action.longitudinal = "speed"`.
+    """
+
+    def __init__(
+        self,
+        layout: Mapping[str, Field],
+        *,
+        max_speed: float = 1.0,
+        cruise: float = 0.6,
+        clearance: float = 0.9,
+        foresight: float = 6.0,
+        look_ahead: float = 1.2,
+        steering_gain: float = 1.5,
+    ) -> None:
+        """Choose the manner of driving.
+
+        Args:
+            layout: `env.observation_layout`; needs the groups goal and messages.
+            max_speed: speed at action 1, m/s.
+            cruise: speed when nothing is in the way, m/s; also what others are expected to drive.
+            clearance: distance to keep between reference points, m.
+            foresight: how far ahead to look, s.
+            look_ahead: distance over which the heading to the goal is closed, m.
+            steering_gain: steering share per rad of heading error.
+        """
+        self._layout = layout
+        self._full, self._cruise, self._clearance = max_speed, cruise, clearance
+        self._times = np.linspace(0.0, foresight, 31)
+        self._look_ahead, self._gain = look_ahead, steering_gain
+
+    def _read(self, observation: np.ndarray, name: str) -> np.ndarray:
+        field = self._layout[name]
+        return observation[field.slice].reshape(field.shape) * field.scale
+
+    def _closest(self, position: np.ndarray, velocity: np.ndarray, speed: float) -> float:
+        """Return the smallest distance ahead of us if we drive straight at `speed` and others keep their velocity."""
+        relative = velocity - np.array([speed, 0.0])
+        path = position[None] + self._times[:, None, None] * relative[None]
+        return float(np.linalg.norm(path, axis=-1).min(initial=np.inf))
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """Return (speed, steering)."""
+        goal = self._read(observation, "goal")
+        heading = float(np.arctan2(goal[1], max(goal[0], self._look_ahead)))
+        heard = self._read(observation, "message_mask") > 0.5
+        position = self._read(observation, "message_position")[heard, :2]
+        velocity = self._cruise * self._read(observation, "message_forward")[heard, :2]
+        going, waiting = (self._closest(position, velocity, speed) for speed in (self._cruise, 0.0))
+        go = going >= self._clearance or going > waiting
+        level = 2.0 * self._cruise / self._full - 1.0 if go else -1.0
+        return np.array([level, np.clip(self._gain * heading, -1.0, 1.0)], dtype=np.float32)
