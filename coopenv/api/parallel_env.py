@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from gymnasium import spaces
@@ -18,7 +18,9 @@ from coopenv.api.layout import Field, action_space, dict_space, flat_space
 from coopenv.api.state import state_space, state_vector
 from coopenv.errors import CoopenvError, suggest
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.viz.topview import TopView
+
+if TYPE_CHECKING:
+    from coopenv.viz.topview import TopView
 
 Observations = dict[str, Any]
 Infos = dict[str, dict[str, Any]]
@@ -167,6 +169,8 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         if self.render_mode is None:
             return None
         if self._view is None:
+            from coopenv.viz.topview import TopView  # matplotlib is loaded by those who draw
+
             self._view = TopView(self.scenario)
         picture = self._view.draw(self.engine)
         if self.render_mode == "human":
