@@ -5,13 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from matplotlib.artist import Artist
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgba_array
-from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
-from matplotlib.text import Text
 
 from coopenv.estimation.trajectory import Sight
 from coopenv.scenario import Scenario
@@ -43,16 +38,18 @@ from coopenv.viz.topview_ground import (
     sees_a_part,
     vehicle_mark,
 )
+from coopenv.viz.topview_layers import Layers
 from coopenv.viz.window import Window
 
 _ARRIVED, _COLLIDED = 1, 2  # values of the field `ended`
-_SHORTEST = 24  # px, drawn length of a vehicle
+_SHORTEST = 28  # px, drawn length of a vehicle
 _POINTER = 13  # px
 _LABEL = 11  # px beside a vehicle
 _REACH = 0.4  # of the picture's side, of a camera that sees farther
 _FILLED = 0.3  # of the picture's side, largest semi-axis of an ellipse that is filled
 _LARGEST = 2.0  # of the picture's side, largest semi-axis of an ellipse that is drawn
 _HALO: dict[str, Any] = {"path_effects": [withStroke(linewidth=2.2, foreground="white")]}
+_FARTHEST = 10.0  # pictures' sides from the middle, of an estimate as drawn
 _POINT = Body(size=(2e-3, 1e-3, 1e-3))  # stands in for a vehicle without a body, drawn at the least size
 _FIELDS = (
     "rotation",
@@ -79,17 +76,14 @@ class TopView:
         self.scenario = scenario
         self._landmarks = len(scenario.landmarks)
         self._figure, self._axes = new_ground(scenario)
-        self._canvas = FigureCanvasAgg(self._figure)
+        self._layers = Layers(self._figure, self._axes)
         (x0, x1), (y0, y1) = self._axes.get_xlim(), self._axes.get_ylim()
         self._low, self._high = np.array([x0, y0]), np.array([x1, y1])
         self._side = x1 - x0
         self._pixel = self._side / self._axes.get_window_extent().width  # m
         self._prepare_shapes()
-        self._layers: list[Artist] = []
         self._prepare_artists()
         self._prepare_table()
-        self._canvas.draw()
-        self._background = self._canvas.copy_from_bbox(self._figure.bbox)
         self._window = Window(scenario.title)
 
     def draw(self, engine: Any) -> np.ndarray:
@@ -103,11 +97,7 @@ class TopView:
         self._place_sight(R, position, view["sight"])
         self._place_marks(R, position, view["ended"])
         self._write(view, sigma, float(engine.view("tick")[0]) / self.scenario.rates.camera)
-        self._canvas.restore_region(self._background)
-        renderer = self._canvas.get_renderer()
-        for artist in self._layers:
-            artist.draw(renderer)
-        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+        return self._layers.paint()
 
     def show(self, picture: np.ndarray) -> None:
         """Show a picture in a window, if there is a display."""
@@ -136,28 +126,29 @@ class TopView:
         self._label = np.stack([self._box[:, :, 0].mean(axis=1), aside], axis=-1)
 
     def _prepare_artists(self) -> None:
+        layers = self._layers
         colours = [vehicle_colour(i) for i in range(len(self.scenario.vehicles))]
         self._rgba = to_rgba_array(colours)
-        self._wedges = self._polygons(facecolor=_faded(self._rgba, 0.11), edgecolor="none")
-        self._ellipses = self._polygons(linewidth=1.0)
-        self._sight = {sight: self._lines(**look) for sight, look in SIGHT_LOOKS.items()}
-        self._still = self._points("o", DARK_BLUE, "white", 5.5)
-        self._other = self._polygons(facecolor=DARK_BLUE, edgecolor="white", linewidth=0.8)
-        self._moving = self._points("D", DARK_BLUE, "white", 5.5)
-        self._truth = self._polygons(facecolor=self._rgba, edgecolor=INK, linewidth=0.8)
-        self._truth_nose = self._polygons(facecolor="white", edgecolor="none")
-        self._links = self._lines(color=colours, linewidth=1.0, linestyle=DOTTED)
-        self._casing = self._polygons(facecolor="none", edgecolor="white", linewidth=3.2)
-        self._estimate = self._polygons(facecolor="none", edgecolor=self._rgba, linewidth=1.4)
-        self._estimate_nose = self._polygons(facecolor="none", edgecolor=self._rgba, linewidth=1.2)
-        self._pointers = self._polygons(facecolor="white", linewidth=1.3)
-        self._arrived = self._points("*", "white", INK, 12)
-        self._collided = self._points("X", INK, "white", 11)
+        self._wedges = layers.polygons(facecolor=_faded(self._rgba, 0.11), edgecolor="none")
+        self._ellipses = layers.polygons(linewidth=1.0)
+        self._sight = {sight: layers.lines(**look) for sight, look in SIGHT_LOOKS.items()}
+        self._still = layers.points("o", DARK_BLUE, "white", 5.5)
+        self._other = layers.polygons(facecolor=DARK_BLUE, edgecolor="white", linewidth=0.8)
+        self._moving = layers.points("D", DARK_BLUE, "white", 5.5)
+        self._truth = layers.polygons(facecolor=self._rgba, edgecolor=INK, linewidth=0.8)
+        self._truth_nose = layers.polygons(facecolor="white", edgecolor="none")
+        self._links = layers.lines(color=colours, linewidth=1.0, linestyle=DOTTED)
+        self._casing = layers.polygons(facecolor="none", edgecolor="white", linewidth=2.3)
+        self._estimate = layers.polygons(facecolor="none", edgecolor=self._rgba, linewidth=1.1)
+        self._estimate_nose = layers.polygons(facecolor="none", edgecolor=self._rgba, linewidth=0.9)
+        self._pointers = layers.polygons(facecolor="white", linewidth=1.3)
+        self._strays = layers.polygons(linewidth=1.3)
+        self._arrived = layers.points("*", "white", INK, 12)
+        self._collided = layers.points("X", INK, "white", 11)
+        look = {"fontsize": NORMAL, "weight": "bold", "ha": "center", "va": "center", "clip_on": True, **_HALO}
         self._names = [
-            self._text(
-                vehicle_mark(i), color=c, fontsize=NORMAL, weight="bold", ha="center", va="center", **_HALO
-            )
-            for i, c in enumerate(colours)
+            layers.keep(self._axes.text(0, 0, vehicle_mark(i), color=colour, **look))
+            for i, colour in enumerate(colours)
         ]
         self._moving_names = {
             i: label_landmark(self._axes, m.name, np.zeros(2))
@@ -165,27 +156,27 @@ class TopView:
             if m.motion.kind != "static"
         }
         for name in self._moving_names.values():
-            self._keep(name)
+            layers.keep(name)
 
     def _prepare_table(self) -> None:
         count = len(self.scenario.vehicles)
-        self._time = self._row(HEIGHT - 21, "", fontsize=NORMAL + 1.5, weight="bold", color=INK)
-        head = f"{'':4}{'error':>7}{'3σ':>7}{'turn':>6}{'sees':>6}\n{'':4}{'[m]':>7}{'[m]':>7}{'[deg]':>6}"
-        self._figure.text(
-            *pixels(PANEL, TABLE_TOP), head, fontsize=SMALLER, family="monospace", color=INK, va="bottom"
-        )
         shown = min(count, MOST_ROWS)
+        title = self._figure.text(*pixels(PANEL, HEIGHT - 21), "", fontsize=NORMAL + 1.5, weight="bold", color=INK)
+        self._time = self._layers.keep(title)
+        look: dict[str, Any] = {"fontsize": SMALLER, "family": "monospace"}
+        head = f"{'':4}{'error':>7}{'error':>7}{'3σ':>7}{'sees':>6}\n{'':4}{'[m]':>7}{'[deg]':>7}{'[m]':>7}"
+        self._figure.text(*pixels(PANEL, TABLE_TOP), head, color=INK, va="bottom", **look)
+        places = [pixels(PANEL, TABLE_TOP - ROW * (i + 1)) for i in range(shown + 1)]
         self._rows = [
-            self._row(
-                TABLE_TOP - ROW * (i + 1), "", fontsize=SMALLER, family="monospace", color=vehicle_colour(i)
-            )
-            for i in range(shown)
+            self._layers.keep(self._figure.text(*places[i], "", color=vehicle_colour(i), **look)) for i in range(shown)
         ]
+        if count > shown:
+            self._figure.text(*places[-1], f"and {count - shown} more", color=INK, **look)
         draw_legend(self._figure, self.scenario, shown + 1)
 
     def _place_ellipses(self, estimate: np.ndarray, covariance: np.ndarray) -> np.ndarray:
         """Place the 3-sigma ellipses; return their major semi-axes (N,) in m."""
-        shapes, semi = ellipses(estimate[:, :2], covariance[:, :2, :2])
+        shapes, semi = ellipses(self._drawable(estimate[:, :2]), covariance[:, :2, :2])
         drawn = semi <= _LARGEST * self._side
         alpha = np.where(semi[drawn] <= _FILLED * self._side, 0.09, 0.0)
         self._ellipses.set_verts(list(shapes[drawn]))
@@ -193,11 +184,9 @@ class TopView:
         self._ellipses.set_edgecolor(_faded(self._rgba[drawn], np.where(alpha > 0, 0.8, 0.35)))
         return semi
 
-    def _place_bodies(
-        self, R: np.ndarray, position: np.ndarray, R_hat: np.ndarray, estimate: np.ndarray
-    ) -> None:
+    def _place_bodies(self, R: np.ndarray, position: np.ndarray, R_hat: np.ndarray, estimate: np.ndarray) -> None:
         L = self._landmarks
-        place, guess = position[L:, :2], estimate[:, :2]
+        place, guess = position[L:, :2], self._drawable(estimate[:, :2])
         self._truth.set_verts(outlines(R[L:], place, self._box))
         self._truth_nose.set_verts(outlines(R[L:], place, self._nose))
         believed = outlines(R_hat, guess, self._box)
@@ -206,11 +195,22 @@ class TopView:
         self._estimate_nose.set_verts(outlines(R_hat, guess, self._nose))
         self._other.set_verts(outlines(R[self._others], position[self._others, :2], self._other_box))
         self._links.set_segments(list(np.stack([place, guess], axis=1)))
-        low, high, size = self._low, self._high, _POINTER * self._pixel
-        outside = pointers(place, guess, low, high, size)
-        which = ~np.all((guess >= low) & (guess <= high), axis=-1) & np.isfinite(guess).all(axis=-1)
-        self._pointers.set_verts(outside)
-        self._pointers.set_edgecolor(self._rgba[which])
+        self._point_outside(self._pointers, place, guess)
+        self._point_outside(self._strays, guess, place)
+
+    def _drawable(self, points: np.ndarray) -> np.ndarray:
+        """Return points (N, 2), those too far for the renderer drawn nearer in their direction."""
+        middle = (self._low + self._high) / 2
+        away = np.linalg.norm(points - middle, axis=-1, keepdims=True)
+        return middle + (points - middle) * np.minimum(1.0, _FARTHEST * self._side / np.maximum(away, 1e-9))
+
+    def _point_outside(self, pointing: Any, origin: np.ndarray, point: np.ndarray) -> None:
+        """Point from the border to what lies outside the picture."""
+        triangles, which = pointers(origin, point, self._low, self._high, _POINTER * self._pixel)
+        pointing.set_verts(triangles)
+        pointing.set_edgecolor(self._rgba[which])
+        if pointing is self._strays:
+            pointing.set_facecolor(self._rgba[which])
 
     def _place_sight(self, R: np.ndarray, position: np.ndarray, sight: np.ndarray) -> None:
         L = self._landmarks
@@ -234,10 +234,10 @@ class TopView:
 
     def _place_marks(self, R: np.ndarray, position: np.ndarray, ended: np.ndarray) -> None:
         L = self._landmarks
-        place = position[L:, :2]
+        place = outlines(R[L:], position[L:, :2], self._box.mean(axis=1, keepdims=True))[:, 0]
         self._arrived.set_data(*place[ended == _ARRIVED].T)
         self._collided.set_data(*place[ended == _COLLIDED].T)
-        beside = outlines(R[L:], place, self._label[:, None])[:, 0]
+        beside = outlines(R[L:], position[L:, :2], self._label[:, None])[:, 0]
         for name, (x, y) in zip(self._names, beside.tolist(), strict=True):
             name.set_position((x, y))
 
@@ -246,47 +246,11 @@ class TopView:
         seen = np.sum(view["sight"] == Sight.VISIBLE, axis=-1)
         possible = np.sum(view["sight"] != Sight.NOT_A_NEIGHBOUR, axis=-1)
         for i, row in enumerate(self._rows):
-            error, turn = view["position_error"][i], view["orientation_error"][i]
+            error, angle = view["position_error"][i], view["orientation_error"][i]
             row.set_text(
-                f"{vehicle_mark(i):<4}{_short(error):>7}{_short(sigma[i]):>7}{turn:>6.1f}"
+                f"{vehicle_mark(i):<4}{_short(error):>7}{angle:>7.1f}{_short(sigma[i]):>7}"
                 f"{f'{seen[i]}/{possible[i]}':>6}"
             )
-
-    def _polygons(self, **look: Any) -> Any:
-        return self._add(PolyCollection([], **look))
-
-    def _lines(self, **look: Any) -> Any:
-        return self._add(LineCollection([], **look))
-
-    def _points(self, marker: str, face: str, edge: str, size: float) -> Line2D:
-        line = Line2D(
-            [],
-            [],
-            linestyle="none",
-            marker=marker,
-            markersize=size,
-            markerfacecolor=face,
-            markeredgecolor=edge,
-            markeredgewidth=0.9,
-        )
-        self._axes.add_line(line)
-        return self._keep(line)
-
-    def _text(self, text: str, **look: Any) -> Text:
-        return self._keep(self._axes.text(0, 0, text, clip_on=True, **look))
-
-    def _row(self, y: float, text: str, **look: Any) -> Text:
-        return self._keep(self._figure.text(*pixels(PANEL, y), text, **look))
-
-    def _add(self, collection: Any) -> Any:
-        self._axes.add_collection(collection, autolim=False)
-        return self._keep(collection)
-
-    def _keep(self, artist: Any) -> Any:
-        """Leave an artist out of the background, and draw it in every frame, above those kept before."""
-        artist.set_animated(True)
-        self._layers.append(artist)
-        return artist
 
 
 def _faded(rgba: np.ndarray, alpha: np.ndarray | float) -> np.ndarray:

@@ -73,9 +73,7 @@ def nose_shape(corners: np.ndarray) -> np.ndarray:
     rear, front = corners.min(axis=0), corners.max(axis=0)
     waist = 0.42 * rear[0] + 0.58 * front[0]
     inset = 0.18 * (front[1] - rear[1])
-    return np.array(
-        [(waist, rear[1] + inset), (front[0] - inset, (rear[1] + front[1]) / 2), (waist, front[1] - inset)]
-    )
+    return np.array([(waist, rear[1] + inset), (front[0] - inset, (rear[1] + front[1]) / 2), (waist, front[1] - inset)])
 
 
 def camera_fan(camera: Camera) -> np.ndarray:
@@ -186,29 +184,29 @@ def road_corners(start: tuple[float, float], end: tuple[float, float], width: fl
 
 def pointers(
     origin: np.ndarray, point: np.ndarray, low: np.ndarray, high: np.ndarray, size: float
-) -> list[np.ndarray]:
-    """Return triangles (3, 2) at the border that point from `origin` to each `point` (N, 2) outside it.
+) -> tuple[list[np.ndarray], list[int]]:
+    """Return triangles (3, 2) at the border, pointing to each `point` outside the picture, and the points' indices.
 
     Args:
-        origin: (N, 2) the points' other ends; the picture's centre stands in for those that are outside too.
+        origin: (N, 2) where the pointing lines come from; the picture's middle, for those outside too.
         point: (N, 2).
         low: (2,) lower left corner.
         high: (2,) upper right corner.
         size: length of a triangle, m.
     """
-    found = []
-    for start, end in zip(origin, point, strict=True):
+    triangles, which = [], []
+    for i, (start, end) in enumerate(zip(origin, point, strict=True)):
         if not np.isfinite(end).all() or np.all((end >= low) & (end <= high)):
             continue
-        inside = np.all((start > low) & (start < high))
-        start = start if inside else (low + high) / 2
+        if not np.all((start > low) & (start < high)):
+            start = (low + high) / 2
         way = end - start
-        with np.errstate(divide="ignore"):
-            share = np.min(
-                np.where(way > 0, (high - start) / way, np.where(way < 0, (low - start) / way, np.inf))
-            )
+        room = np.where(way > 0, high - start, start - low)
+        share = np.min(room / np.maximum(np.abs(way), 1e-9))
         ahead = way / np.linalg.norm(way)
-        tip, aside = start + share * way - 0.15 * size * ahead, np.array([-ahead[1], ahead[0]])
+        aside = np.array([-ahead[1], ahead[0]])
+        tip = start + share * way - 0.15 * size * ahead
         base = tip - size * ahead
-        found.append(np.array([tip, base + 0.45 * size * aside, base - 0.45 * size * aside]))
-    return found
+        triangles.append(np.array([tip, base + 0.45 * size * aside, base - 0.45 * size * aside]))
+        which.append(i)
+    return triangles, which

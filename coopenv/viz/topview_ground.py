@@ -17,7 +17,7 @@ from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, new_figu
 from coopenv.viz.topview_geometry import limits, road_corners
 
 WIDTH, HEIGHT = 896, 672  # px; multiples of 16, as video codecs like them
-_LEFT, _BOTTOM, _SIDE = 54, 40, 600  # px, of the square axes
+_LEFT, _BOTTOM, _SIDE = 54, 46, 592  # px, of the square axes
 PANEL = _LEFT + _SIDE + 12  # px, left edge of the panel
 SMALLER = 6.5  # pt
 ROW = 16  # px
@@ -71,9 +71,7 @@ def new_ground(scenario: Scenario) -> tuple[Figure, Axes]:
 def _draw_scene(ax: Axes, scenario: Scenario) -> None:
     origin = np.array(scenario.map.origin)[:2]
     for road in scenario.roads:
-        ax.add_patch(
-            Polygon(road_corners(road.start, road.end, road.width) - origin, color=ASPHALT, zorder=0.5)
-        )
+        ax.add_patch(Polygon(road_corners(road.start, road.end, road.width) - origin, color=ASPHALT, zorder=0.5))
     for road in scenario.roads:
         line = np.array([road.start, road.end]) - origin
         ax.plot(*line.T, color="white", linewidth=1.2, linestyle=(0, (7, 6)), zorder=0.6)
@@ -87,13 +85,9 @@ def _draw_scene(ax: Axes, scenario: Scenario) -> None:
         if vehicle.goal:
             center, colour = np.array(vehicle.goal.position)[:2] - origin, vehicle_colour(i)
             ax.add_patch(Circle(center, vehicle.goal.radius, facecolor="white", edgecolor="none", alpha=0.6))
-            ax.add_patch(
-                Circle(center, vehicle.goal.radius, fill=False, edgecolor=colour, linestyle=DOTTED, lw=1.6)
-            )
+            ax.add_patch(Circle(center, vehicle.goal.radius, fill=False, edgecolor=colour, linestyle=DOTTED, lw=1.6))
             x, y = center.tolist()
-            ax.text(
-                x, y, vehicle_mark(i), color=colour, fontsize=SMALL, ha="center", va="center", clip_on=True
-            )
+            ax.text(x, y, vehicle_mark(i), color=colour, fontsize=SMALL, ha="center", va="center", clip_on=True)
     for landmark in scenario.landmarks:
         if landmark.motion.kind == "static":
             place = np.array(landmark.position)[:2] + np.array(landmark.marker)[:2] - origin
@@ -117,10 +111,10 @@ def label_landmark(ax: Axes, name: str, place: np.ndarray) -> Annotation:
 def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
     """Explain the marks that can occur in this scenario, under a table of `rows` rows."""
     handles: list[Artist] = [
-        Patch(facecolor=GREY, edgecolor=INK, linewidth=0.7, label="vehicle"),
-        Patch(facecolor="white", edgecolor=GREY, linewidth=1.4, label="its estimate of itself"),
+        Patch(facecolor=GREY, edgecolor=INK, linewidth=0.7, label="vehicle, true"),
+        Patch(facecolor="white", edgecolor=GREY, linewidth=1.4, label="its estimate"),
         Line2D([], [], color=GREY, linewidth=1.0, linestyle=DOTTED, label="error of the estimate"),
-        Patch(facecolor="#7F7F7F30", edgecolor=GREY, linewidth=0.8, label="3σ that it claims"),
+        Patch(facecolor="#7F7F7F30", edgecolor=GREY, linewidth=0.8, label="3σ of the estimate"),
     ]
     if sees_a_part(scenario):
         handles.append(Patch(facecolor="#7F7F7F24", edgecolor="none", label="field of view"))
@@ -140,7 +134,7 @@ def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
             handles.append(_mark("*", INK, "white", 9, "arrived"))
     if scenario.termination.collision and any(vehicle.body for vehicle in scenario.vehicles):
         handles.append(_mark("X", "white", INK, 8, "collided"))
-    handles.append(_mark(">", GREY, "white", 6, "estimate out there"))
+    handles.append(_mark(">", GREY, "white", 6, "estimate outside"))
     figure.legend(
         handles=handles,
         loc="upper left",

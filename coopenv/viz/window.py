@@ -53,7 +53,7 @@ class Window:
             dpi = 100
             size = (picture.shape[1] / dpi, picture.shape[0] / dpi)
             self._figure = plt.figure(num=None, figsize=size, dpi=dpi)
-        except (ImportError, RuntimeError):  # the backend asked for is not installed, or finds no display
+        except Exception:  # each toolkit has its own way to say that it is not installed or finds no display
             return False
         ax = self._figure.add_axes((0, 0, 1, 1))
         ax.set_axis_off()

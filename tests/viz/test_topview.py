@@ -1,0 +1,318 @@
+"""The top view: its picture is read back pixel by pixel, its geometry against independent formulas."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib import pyplot as plt
+from matplotlib.backends import backend_registry
+from matplotlib.colors import to_rgb
+from scipy.spatial.transform import Rotation
+
+import coopenv
+from coopenv.api.engine import Engine
+from coopenv.estimation.metrics import error_coordinates
+from coopenv.estimation.trajectory import Sight
+from coopenv.scenario import load_scenario
+from coopenv.scenario.agents import Obstacle
+from coopenv.scenario.sensing import Camera
+from coopenv.viz.style import ORANGE, vehicle_colour
+from coopenv.viz.topview import TopView
+from coopenv.viz.topview_geometry import (
+    camera_fan,
+    ellipses,
+    free_lengths,
+    limits,
+    pointers,
+    position_covariance,
+)
+from coopenv.viz.topview_ground import HEIGHT, PANEL, ROW, TABLE_TOP, WIDTH
+
+
+@pytest.fixture(autouse=True)
+def no_warnings() -> Iterator[None]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+@pytest.fixture(scope="module")
+def busy() -> Any:
+    env = coopenv.parallel_env("busy_intersection", render_mode="rgb_array")
+    env.reset(seed=1)
+    env.render()
+    return env
+
+
+@pytest.fixture
+def start(busy: Any) -> Any:
+    busy.reset(seed=1)
+    return busy
+
+
+def drive(env: Any, steps: int, seed: int = 0) -> None:
+    rng = np.random.default_rng(seed)
+    for _ in range(steps):
+        env.step({agent: rng.uniform(-1, 1, 2).astype(np.float32) for agent in env.agents})
+
+
+def at(picture: np.ndarray, view: TopView, x: float, y: float) -> np.ndarray:
+    """Return the colour of the picture at a point in m."""
+    column, row = view._axes.transData.transform((x, y))
+    return picture[HEIGHT - 1 - int(row), int(column)]
+
+
+def assert_colour(rgb: np.ndarray, name: str) -> None:
+    np.testing.assert_allclose(rgb, np.array(to_rgb(name)) * 255, atol=8)
+
+
+@pytest.mark.parametrize("name", coopenv.list_envs())
+def test_draws_every_environment_and_leaves_its_state_alone(name: str) -> None:
+    env = coopenv.parallel_env(name, render_mode="rgb_array")
+    env.reset(seed=0)
+    drive(env, 10)
+    before = env.engine.get_state()
+    picture = env.render()
+    after = env.engine.get_state()
+    assert picture.shape == (HEIGHT, WIDTH, 3) and picture.dtype == np.uint8
+    assert picture.flags.owndata and picture.std() > 10
+    assert before.keys() == after.keys()
+    for key, value in before.items():
+        np.testing.assert_array_equal(value, after[key], err_msg=key)
+
+
+def test_vehicles_move_over_a_ground_that_stays(start: Any) -> None:
+    first = start.render()
+    drive(start, 50)
+    second = start.render()
+    changed = np.any(first != second, axis=-1)
+    assert 0.005 < changed.mean() < 0.5
+    below_the_table = HEIGHT - int(TABLE_TOP) + ROW * 6
+    assert not changed[below_the_table:, int(PANEL) :].any()
+    axes = start._view._axes.get_window_extent()
+    assert not changed[:, : int(axes.x0) - 1].any()
+    assert not changed[HEIGHT - int(axes.y0) + 1 :].any()
+    x, y = start.engine.view("position")[0, 3 + 4, :2].tolist()
+    assert_colour(at(second, start._view, x - 0.4, y + 0.3), ORANGE)
+    assert x == pytest.approx(-27.0, abs=1e-3)
+    assert_colour(at(first, start._view, x - 3.4, y + 0.3), ORANGE)
+
+
+def test_equal_states_give_equal_pictures_whatever_was_drawn_before(start: Any) -> None:
+    drive(start, 5)
+    state, picture = start.get_state(), start.render()
+    drive(start, 20)
+    assert np.any(start.render() != picture)
+    start.set_state(state)
+    np.testing.assert_array_equal(start.render(), picture)
+    np.testing.assert_array_equal(TopView(start.scenario).draw(start.engine), picture)
+
+
+def test_lines_of_sight_say_who_sees_whom_and_what_is_hidden() -> None:
+    engine = Engine(load_scenario("overtaking"))
+    engine.reset([0])
+    engine.step(ticks=30 * 60)
+    view = TopView(engine.world.scenario)
+    view.draw(engine)
+    sight = engine.view("sight")[0]
+    for kind, lines in view._sight.items():
+        assert len(lines.get_segments()) == np.sum(sight == kind)
+    hidden = view._sight[Sight.OCCLUDED_BY_BODY]
+    assert len(hidden.get_segments()) == 2 and len(view._sight[Sight.VISIBLE].get_segments()) == 7
+    _, dashes = hidden.get_linestyle()[0]
+    assert dashes and view._sight[Sight.VISIBLE].get_linestyle()[0][1] is None
+    start, end = hidden.get_segments()[0]
+    np.testing.assert_allclose(start, engine.view("position")[0, 5, :2] + [0.0, 0.3218], atol=1e-6)
+    np.testing.assert_allclose(end, engine.view("position")[0, np.flatnonzero(sight[1] == 4)[0], :2], atol=1e-6)
+
+
+def test_ended_vehicles_are_marked() -> None:
+    engine = Engine(load_scenario("urban_crossing"))
+    engine.reset([0])
+    view = TopView(engine.world.scenario)
+    plain = view.draw(engine)
+    state = engine.get_state()
+    state["ended"][0] = [1, 0, 2, 0]
+    engine.set_state(state)
+    marked = view.draw(engine)
+    for marks, vehicle in ((view._arrived, 0), (view._collided, 2)):
+        place = np.array(marks.get_data())[:, 0]
+        assert np.linalg.norm(place - engine.view("position")[0, 12 + vehicle, :2]) < 0.3
+    assert 100 < np.any(plain != marked, axis=-1).sum() < 2000
+
+
+def test_world_0_of_a_batch_is_drawn() -> None:
+    scenario = load_scenario("urban_crossing")
+    one, two = Engine(scenario), Engine(scenario, worlds=2)
+    one.reset([5])
+    two.reset([5, 6])
+    view = TopView(scenario)
+    np.testing.assert_array_equal(view.draw(one), view.draw(two))
+
+
+def test_position_covariance_agrees_with_monte_carlo() -> None:
+    rng = np.random.default_rng(0)
+    R_hat = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
+    p_hat = np.array([9.0, -4.0, 2.0])
+    spread = np.diag([0.01, 0.01, 0.01, 0.05, 0.05, 0.05])
+    root = spread @ np.linalg.cholesky(0.3 * np.eye(6) + 0.7 * np.ones((6, 6)))
+    P = root @ root.T
+    e = rng.standard_normal((200_000, 6)) @ root.T
+    half = e[:, :3] / 2
+    scalar = np.sqrt(1 - np.sum(half**2, axis=1))
+    R = R_hat @ Rotation.from_quat(np.column_stack([scalar, half]), scalar_first=True).as_matrix()
+    position = np.einsum("kij,kj->ki", R, p_hat + e[:, 3:])
+
+    p_bar = np.broadcast_to(R_hat @ p_hat, position.shape)
+    again = error_coordinates(position, R, p_bar, np.broadcast_to(R_hat, R.shape))
+    np.testing.assert_allclose(again, e, atol=1e-9)  # these are the coordinates of P
+
+    sampled = np.cov(position.T)
+    scale = np.linalg.norm(sampled)
+    assert np.linalg.norm(position_covariance(R_hat, p_hat, P) - sampled) < 0.02 * scale
+    other_sign = np.diag([-1.0, -1, -1, 1, 1, 1])
+    assert np.linalg.norm(position_covariance(R_hat, p_hat, other_sign @ P @ other_sign) - sampled) > 0.2 * scale
+
+
+def test_position_covariance_takes_leading_axes() -> None:
+    rng = np.random.default_rng(1)
+    R = Rotation.random(4, rng).as_matrix()
+    p, root = rng.standard_normal((4, 3)), rng.standard_normal((4, 6, 6))
+    P = root @ np.swapaxes(root, 1, 2)
+    each = [position_covariance(R[i], p[i], P[i]) for i in range(4)]
+    np.testing.assert_allclose(position_covariance(R, p, P), each)
+
+
+def test_ellipse_is_the_3_sigma_contour() -> None:
+    covariance = np.array([[[4.0, 1.0], [1.0, 2.0]], [[1.0, 0.0], [0.0, -1.0]], [[np.nan] * 2] * 2])
+    center = np.array([[1.0, -2.0], [0.0, 0.0], [0.0, 0.0]])
+    shape, semi = ellipses(center, covariance)
+    off = shape[0] - center[0]
+    squared = np.einsum("ki,ij,kj->k", off, np.linalg.inv(covariance[0]), off)
+    np.testing.assert_allclose(squared, 9.0)
+    assert semi[0] == pytest.approx(3 * np.sqrt(np.linalg.eigvalsh(covariance[0])[1]))
+    assert np.isnan(semi[1:]).all() and np.isnan(shape[1:]).all()
+
+
+def test_estimates_outside_change_no_limits_and_are_pointed_at(start: Any) -> None:
+    inside = start.render()
+    axes = start._view._axes
+    before = (*axes.get_xlim(), *axes.get_ylim())
+    state = start.engine.get_state()
+    state["estimate_rotation"][0, 0] = np.eye(3)
+    for far in (60.0, 1e12, np.nan):
+        state["estimate_position"][0, 0] = [far, -16.0, 2.5]
+        state["covariance"][0] *= 1e6
+        start.engine.set_state(state)
+        picture = start.render()
+        assert (*axes.get_xlim(), *axes.get_ylim()) == before
+        edge = picture[:, int(axes.get_window_extent().x1) - 16 : int(axes.get_window_extent().x1) - 2]
+        blue = np.all(np.abs(edge - 255 * np.array(to_rgb(vehicle_colour(0)))) < 8, axis=-1).sum()
+        assert (blue > 15) == (far > 0), far
+    assert np.any(inside != picture)
+
+
+def test_pointer_sits_at_the_border_and_points_outwards() -> None:
+    low, high = np.zeros(2), np.array([10.0, 10.0])
+    origin = np.array([[5.0, 5.0], [5.0, 5.0], [20.0, 5.0]])
+    point = np.array([[5.0, 50.0], [6.0, 6.0], [-20.0, 5.0]])
+    triangles, which = pointers(origin, point, low, high, size=1.0)
+    assert which == [0, 2]
+    np.testing.assert_allclose(triangles[0][0], [5.0, 9.85])
+    np.testing.assert_allclose(triangles[1][0], [0.15, 5.0])
+    assert all(np.all((t >= low) & (t <= high)) for t in triangles)
+
+
+@pytest.mark.parametrize("name", coopenv.list_envs())
+def test_limits_hold_the_whole_prescribed_episode(name: str) -> None:
+    scenario = load_scenario(name)
+    low, high = limits(scenario, 1.0)
+    engine = Engine(scenario)
+    engine.reset([0])
+    prescribed = [a.motion.kind != "driven" for a in (*scenario.landmarks, *scenario.vehicles)]
+    for _ in range(int(scenario.horizon)):
+        position = engine.view("position")[0, prescribed, :2]
+        assert np.all((position > low) & (position < high))
+        engine.step(ticks=round(scenario.rates.camera))
+    assert high[0] - low[0] == pytest.approx(high[1] - low[1])
+
+
+def test_limits_follow_the_map_origin() -> None:
+    low, high = limits(load_scenario("urban_crossing"), 1.0)
+    moved = limits(load_scenario("urban_crossing", {"map.origin": [3.0, -2.0, 0.5]}), 1.0)
+    np.testing.assert_allclose(moved, np.array([low, high]) - [3.0, -2.0])
+
+
+def test_field_of_view_is_that_of_the_calibration() -> None:
+    fan = camera_fan(Camera(model="pinhole"))
+    angles = np.degrees(np.arctan2(fan[:, 1], fan[:, 0]))
+    assert angles[0] == pytest.approx(np.degrees(np.arctan(154.841998 / 213.161906)))
+    assert angles[-1] == pytest.approx(-np.degrees(np.arctan((316 - 154.841998) / 213.161906)))
+    np.testing.assert_allclose(np.linalg.norm(fan, axis=1), 1.0)
+    np.testing.assert_allclose(fan[:, 2], 0.0, atol=1e-12)
+
+
+def test_field_of_view_ends_at_walls() -> None:
+    wall = Obstacle(name="wall", center=(6.0, 1.0, 1.0), size=(2.0, 4.0, 2.0))
+    low_wall = Obstacle(name="low", center=(0.0, 3.0, 0.1), size=(9.0, 1.0, 0.2))
+    rays = np.array([[[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [np.cos(1.2), np.sin(1.2), 0]]])
+    shift = np.array([1.0, 1.0, 0.0])
+    length = free_lengths(np.array([[0.0, 0.0, 0.5]]), rays, 8.0, [wall, low_wall], shift)
+    np.testing.assert_allclose(length, [[4.0, 8.0, 8.0, 8.0]])
+
+
+@pytest.mark.parametrize("backend", [None, "agg", "tkagg", "module://no_such_backend"])
+def test_show_without_a_display_is_silent(backend: str | None) -> None:
+    script = (
+        "import sys, matplotlib as mpl, numpy as np\n"
+        "settings = lambda: {k: mpl.rcParams[k] for k in mpl.rcParams if k != 'backend'}\n"
+        "before = settings()\n"
+        "import coopenv\n"
+        "from coopenv.viz.topview import TopView\n"
+        "view = TopView(coopenv.load_scenario('crossing_path'))\n"
+        "assert 'matplotlib.pyplot' not in sys.modules and settings() == before\n"
+        "view.show(np.zeros((4, 6, 3), np.uint8)); view.show(np.zeros((4, 6, 3), np.uint8)); view.close()\n"
+    )
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY", "MPLBACKEND")}
+    if backend:
+        environment["MPLBACKEND"] = backend
+    done = subprocess.run(
+        [sys.executable, "-W", "error::UserWarning", "-c", script],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "matplotlib" not in done.stderr.lower()
+
+
+def test_window_is_reused_and_stays_away_once_closed_by_the_user(monkeypatch: pytest.MonkeyPatch, start: Any) -> None:
+    monkeypatch.setattr(backend_registry, "list_builtin", lambda which: [mpl.get_backend().lower()])
+    plt.switch_backend("agg")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    already = set(plt.get_fignums())
+    view = TopView(start.scenario)
+    picture = view.draw(start.engine)
+    view.show(picture)
+    (number,) = set(plt.get_fignums()) - already
+    view.show(255 - picture)
+    assert set(plt.get_fignums()) == {*already, number}
+    np.testing.assert_array_equal(plt.figure(number).axes[0].images[0].get_array(), 255 - picture)
+    plt.close(number)
+    view.show(picture)
+    assert set(plt.get_fignums()) == already
+    view.close()
+    view.show(picture)
+    assert len(plt.get_fignums()) == len(already) + 1
+    view.close()
+    assert set(plt.get_fignums()) == already
