@@ -5,7 +5,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.api.observation import targets_in_view, write_observation
+from coopenv.api.observation import write_observation
 from coopenv.api.rewards import TERMS, weigh, write_terms
 from coopenv.estimation.quality import (
     cholesky_of,
@@ -13,6 +13,7 @@ from coopenv.estimation.quality import (
     log_determinant,
     normalised_error_squared,
     observer_error,
+    targets_in_view,
 )
 from coopenv.estimation.so3 import rotation_angle
 from coopenv.world.collision import UNDER_WAY, goal_distance
@@ -128,4 +129,14 @@ def report_kernel(model: Any, state: Any, plan: Any, weights: wp.array(dtype=wp.
     world, vehicle = wp.tid()
     judge(model, state, report, world, vehicle)
     reward(model, state, report, weights, world, vehicle)
-    write_observation(model, plan, state, report.observation, world, vehicle)
+    write_observation(
+        model,
+        plan,
+        state,
+        report.observation,
+        world,
+        vehicle,
+        report.log_determinant[world, vehicle],
+        report.gramian_min_eigenvalue[world, vehicle],
+        report.targets_in_view[world, vehicle],
+    )

@@ -33,15 +33,6 @@ def reward_weights(scenario: Scenario) -> np.ndarray:
 
 
 @wp.func
-def possible_targets(model: Any, vehicle: int) -> int:
-    """Return how many targets a vehicle could measure at best."""
-    count = int(0)
-    for target in range(model.agents):
-        count += model.neighbour[vehicle, target]
-    return count
-
-
-@wp.func
 def write_terms(
     model: Any,
     state: Any,
@@ -68,8 +59,8 @@ def write_terms(
     terms[world, vehicle, ORIENTATION_ERROR] = -orientation_error
     terms[world, vehicle, UNCERTAINTY] = -log_determinant / 6.0
     terms[world, vehicle, OBSERVABILITY] = wp.log(wp.max(smallest_eigenvalue, 1.0e-9)) * 0.4342944819032518
-    best = wp.max(possible_targets(model, vehicle), 1)
-    terms[world, vehicle, VISIBILITY] = wp.float32(in_view) / wp.float32(best)
+    possible = wp.max(model.target_count[vehicle], 1)
+    terms[world, vehicle, VISIBILITY] = wp.float32(in_view) / wp.float32(possible)
 
 
 @wp.func

@@ -8,6 +8,9 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, cholesky6, join6, smallest_eigenvalue6
 from coopenv.estimation.so3 import quaternion_vector
+from coopenv.estimation.trajectory import Sight
+
+VISIBLE = wp.constant(wp.uint8(Sight.VISIBLE))
 
 
 @wp.func
@@ -59,3 +62,13 @@ def cholesky_of(P: Any, zero3: Any):
     """Return (L11^-1, L21, L22^-1) of the Cholesky factor of a 6x6 covariance."""
     _, L21, _, I11, I22 = cholesky6(block3(P, 0, 0, zero3), block3(P, 0, 3, zero3), block3(P, 3, 3, zero3))
     return I11, L21, I22
+
+
+@wp.func
+def targets_in_view(model: Any, state: Any, world: int, vehicle: int) -> int:
+    """Return how many targets the vehicle measures in this frame."""
+    count = int(0)
+    for n in range(model.target_count[vehicle]):
+        if state.sight[world, vehicle, model.targets[vehicle, n]] == VISIBLE:
+            count += 1
+    return count

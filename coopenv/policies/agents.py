@@ -44,8 +44,8 @@ def agent_path(name_or_path: str | Path) -> Path:
     if str(name_or_path) in list_agents():
         folder = data_directory("agents") / str(name_or_path)
     if not (folder / "agent.toml").is_file():
-        names = list_agents()
-        raise CoopenvError(f"unknown agent '{name_or_path}'{suggest(str(name_or_path), names)}; known: {', '.join(names)}")
+        name, names = str(name_or_path), list_agents()
+        raise CoopenvError(f"unknown agent '{name}'{suggest(name, names)}; known: {', '.join(names)}")
     return folder / "agent.toml"
 
 

@@ -67,11 +67,13 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
 
 
 def _fill_topology(model: Any, scenario: Scenario, fill: _Filler) -> None:
-    neighbour = np.zeros((model.vehicles, model.agents), dtype=np.int32)
-    for i, targets in enumerate(checks.neighbour_sets(scenario)):
-        neighbour[i, targets] = 1
+    sets = checks.neighbour_sets(scenario)
+    table = np.full((model.vehicles, model.agents), -1, dtype=np.int32)
+    for i, targets in enumerate(sets):
+        table[i, : len(targets)] = targets
     order = checks.processing_order(scenario)
-    model.neighbour = wp.array(neighbour, dtype=wp.int32, ndim=2, device=fill.device)
+    model.targets = wp.array(table, dtype=wp.int32, ndim=2, device=fill.device)
+    model.target_count = fill.array([len(targets) for targets in sets], wp.int32)
     model.order = fill.array(order, wp.int32)
     model.rank = fill.array(np.argsort(order), wp.int32)
 

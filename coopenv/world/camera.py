@@ -9,14 +9,15 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.estimation.trajectory import Sight
 from coopenv.world.random import BEARING, draw, gaussian_pair, signed_uniform, uniform
 
-NOT_A_NEIGHBOUR = wp.constant(wp.uint8(0))
-VISIBLE = wp.constant(wp.uint8(1))
-OUT_OF_VIEW = wp.constant(wp.uint8(2))
-OCCLUDED_BY_BUILDING = wp.constant(wp.uint8(3))
-OCCLUDED_BY_BODY = wp.constant(wp.uint8(4))
-MISSED = wp.constant(wp.uint8(5))
+NOT_A_NEIGHBOUR = wp.constant(wp.uint8(Sight.NOT_A_NEIGHBOUR))
+VISIBLE = wp.constant(wp.uint8(Sight.VISIBLE))
+OUT_OF_VIEW = wp.constant(wp.uint8(Sight.OUT_OF_VIEW))
+OCCLUDED_BY_BUILDING = wp.constant(wp.uint8(Sight.OCCLUDED_BY_BUILDING))
+OCCLUDED_BY_BODY = wp.constant(wp.uint8(Sight.OCCLUDED_BY_BODY))
+MISSED = wp.constant(wp.uint8(Sight.MISSED))
 
 
 @wp.func
@@ -179,21 +180,20 @@ def observe(model: Any, before: Any, after: Any, world: int, vehicle: int, tick:
     to_camera = wp.transpose(R * model.camera.rotation)
     zero = origin.dtype(0.0)
     random = model.camera.miss > zero or model.noise.bearing > zero
-    for target in range(model.agents):
-        sight = NOT_A_NEIGHBOUR
-        if model.neighbour[vehicle, target] == 1:
-            line = marker_position(model, after, world, target) - origin
-            b = wp.normalize(to_camera * line)
-            sight = sight_of(model, after, world, vehicle, target, origin, line, b)
-            if sight == VISIBLE and random:
-                words = draw(before.seed[world], before.episode[world], tick, vehicle * 65536 + target, BEARING)
-                if uniform(words[2], zero) < model.camera.miss:
-                    sight = MISSED
-                if model.noise.bearing > zero:
-                    b = noisy_bearing(model.noise, b, words)
-            if sight == VISIBLE:
-                if model.camera.pinhole == 1 and model.sensed == 1:
-                    b = through_pixels(model.camera, b)
-                after.bearing[world, vehicle, target] = b
-                after.bearing_tick[world, vehicle, target] = tick
+    for n in range(model.target_count[vehicle]):
+        target = model.targets[vehicle, n]
+        line = marker_position(model, after, world, target) - origin
+        b = wp.normalize(to_camera * line)
+        sight = sight_of(model, after, world, vehicle, target, origin, line, b)
+        if sight == VISIBLE and random:
+            words = draw(before.seed[world], before.episode[world], tick, vehicle * 65536 + target, BEARING)
+            if uniform(words[2], zero) < model.camera.miss:
+                sight = MISSED
+            if model.noise.bearing > zero:
+                b = noisy_bearing(model.noise, b, words)
+        if sight == VISIBLE:
+            if model.camera.pinhole == 1 and model.sensed == 1:
+                b = through_pixels(model.camera, b)
+            after.bearing[world, vehicle, target] = b
+            after.bearing_tick[world, vehicle, target] = tick
         after.sight[world, vehicle, target] = sight

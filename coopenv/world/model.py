@@ -151,7 +151,8 @@ def model_struct(p: Precision) -> Any:
         odometry_rate: wp.float64  # Hz
         ticks_per_decision: wp.int32
         horizon_ticks: wp.int32
-        neighbour: wp.array2d(dtype=wp.int32)  # (N, A) 1: may be measured and heard
+        targets: wp.array2d(dtype=wp.int32)  # (N, A) agents that may be measured and heard, ascending, then -1
+        target_count: wp.array(dtype=wp.int32)  # (N,)
         order: wp.array(dtype=wp.int32)  # (N,) leaders first
         rank: wp.array(dtype=wp.int32)  # (N,) place in the order
         start: Start

@@ -57,7 +57,8 @@ def information(model: Any, state: Any, world: int, vehicle: int, tick: int, R: 
     M22 = R - R
     r1 = o
     r2 = o
-    for target in range(model.agents):
+    for n in range(model.target_count[vehicle]):
+        target = model.targets[vehicle, n]
         if usable(model, state, world, vehicle, target, tick):
             b = model.camera.rotation * state.bearing[world, vehicle, target]
             a = wp.transpose(R) * known_position(model, state, world, vehicle, target)
@@ -169,7 +170,8 @@ def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: i
         G22 = state.gramian_22[world, vehicle, block]
         time = state.gramian_time[world, vehicle, block]
     i3 = identity3(p)
-    for target in range(model.agents):
+    for n in range(model.target_count[vehicle]):
+        target = model.targets[vehicle, n]
         if usable(model, state, world, vehicle, target, tick):
             b = R * (model.camera.rotation * state.bearing[world, vehicle, target])
             z = known_position(model, state, world, vehicle, target)

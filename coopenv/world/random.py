@@ -67,7 +67,7 @@ def signed_uniform(word: wp.uint32, one: Any):
 def gaussian_pair(word0: wp.uint32, word1: wp.uint32, one: Any):
     """Return two independent standard normal numbers (Box-Muller).
 
-    The angle is drawn within a quadrant, and two bits choose the quadrant: one sine per pair instead of sine and cosine.
+    The angle is drawn within a quadrant and two bits choose the quadrant: one sine per pair, no cosine.
     """
     radius = wp.sqrt(type(one)(-2.0) * wp.log(uniform(word0, one)))
     angle = (type(one)(word1 >> wp.uint32(2)) + type(one)(0.5)) * type(one)(1.4629180792671596e-09)  # pi/2 / 2^30

@@ -8,7 +8,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import join6
 from coopenv.estimation.so3 import exp_so3, identity3, orthonormalise
-from coopenv.world.camera import observe
+from coopenv.world.camera import NOT_A_NEIGHBOUR, observe
 from coopenv.world.collision import touches_anything
 from coopenv.world.dynamics import prescribe
 from coopenv.world.model import DRIVEN, PRESCRIBED
@@ -79,6 +79,7 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
     for target in range(model.agents):
         state.bearing[world, vehicle, target] = o
         state.bearing_tick[world, vehicle, target] = -1
+        state.sight[world, vehicle, target] = NOT_A_NEIGHBOUR
     for slot in range(model.radio.slots):
         state.outbox_tick[world, vehicle, slot] = -1
     for sender in range(model.vehicles):

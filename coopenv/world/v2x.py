@@ -30,8 +30,9 @@ def deliver(model: Any, before: Any, after: Any, world: int, receiver: int, tick
     its receiver (possible only without the acyclic restriction) is heard one tick late.
     """
     here = after.position[world, model.landmarks + receiver]
-    for sender in range(model.vehicles):
-        if model.neighbour[receiver, model.landmarks + sender] == 1:
+    for n in range(model.target_count[receiver]):
+        sender = model.targets[receiver, n] - model.landmarks
+        if sender >= 0:
             lag = model.radio.delay
             if lag == 0 and model.rank[sender] > model.rank[receiver]:
                 lag = int(1)
