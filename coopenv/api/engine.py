@@ -10,10 +10,10 @@ import warp as wp
 
 from coopenv.api.layout import layout_size, observation_layout
 from coopenv.api.observation import observation_plan
-from coopenv.api.report import MEMORY, allocate_report, begin_kernel, report_kernel
+from coopenv.api.report import MEMORY, allocate_report, report_kernel
 from coopenv.api.rewards import reward_weights
 from coopenv.scenario import Scenario
-from coopenv.world.launch import Launcher
+from coopenv.world.launch import PerWorld
 from coopenv.world.state import state_fields
 from coopenv.world.world import World
 
@@ -25,29 +25,30 @@ class Engine:
     without a copy on the CPU; copy what must outlive the next step.
     """
 
-    def __init__(self, scenario: Scenario, worlds: int = 1, dtype: str = "float32", device: str = "cpu") -> None:
-        """Build everything.
-
-        Raises:
-            DeviceError: unknown precision or device.
-            ValueError: no worlds.
-        """
-        self.world = World(scenario, worlds, dtype, device)
+    def __init__(
+        self,
+        scenario: Scenario,
+        worlds: int = 1,
+        dtype: str = "float32",
+        device: str = "cpu",
+        threads: int | None = None,
+    ) -> None:
+        """Build everything; arguments and errors as for `World`."""
+        self.world = World(scenario, worlds, dtype, device, threads)
         self.layout = observation_layout(scenario)
-        self.report = allocate_report(
-            self.world.model, worlds, layout_size(self.layout), self.world.precision, self.world.device
-        )
+        device = self.world.device
+        self.report = allocate_report(self.world.model, worlds, layout_size(self.layout), self.world.precision, device)
         self._plan = observation_plan(scenario, self.layout)
-        self._weights: Any = wp.array(reward_weights(scenario), dtype=wp.float32, device=self.world.device)
-        self._launch = Launcher((worlds, self.world.model.vehicles), self.world.device, dtype)
+        self._weights: Any = wp.array(reward_weights(scenario), dtype=wp.float32, device=device)
+        self._everywhere: Any = wp.ones(worlds, dtype=wp.int32, device=device)
         self._state_fields = set(state_fields(self.world.precision))
         self._views: dict[str, np.ndarray] = {}
 
     def reset(self, seeds: Sequence[int] | np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
-        """Start new episodes, see `World.reset`."""
+        """Start new episodes, see `World.reset`; reports of the other worlds stay."""
         self.world.reset(seeds, mask)
-        self._launch("begin", begin_kernel, [self.world.model, self.world.state, self.report, self.world.mask])
-        self.refresh()
+        self._report("report reset", self.world.mask)
+        self.world.mask.zero_()
 
     def step(self, actions: np.ndarray | None = None, ticks: int | None = None) -> None:
         """Advance by one decision (or `ticks` camera ticks) under actions (W, N, 2) in [-1, 1]."""
@@ -55,6 +56,20 @@ class Engine:
             self.set_actions(actions)
         self.world.advance(self.world.model.ticks_per_decision if ticks is None else ticks)
         self.refresh()
+
+    def step_or_restart(self) -> None:
+        """Restart the worlds that are over, advance the others by one decision; nothing leaves the device."""
+        wp.copy(self.world.mask, self.report.over)
+        self.world.advance(self.world.model.ticks_per_decision)
+        self.world.restart()
+        self.refresh()
+
+    def restart_finished(self) -> None:
+        """Restart the worlds that are over and report them anew; nothing leaves the device."""
+        wp.copy(self.world.mask, self.report.over)
+        self.world.restart()
+        self._report("report reset", self.world.mask)
+        self.world.mask.zero_()
 
     def set_actions(self, actions: np.ndarray) -> None:
         """Copy host actions, (W, N, 2), to the device."""
@@ -64,12 +79,20 @@ class Engine:
             self.world.actions.assign(np.ascontiguousarray(actions, dtype=self.world.precision.numpy))
 
     def refresh(self) -> None:
-        """Recompute the report from the present state."""
-        self._launch(
-            "report",
-            report_kernel,
-            [self.world.model, self.world.state, self._plan, self._weights, self.report],
-        )
+        """Recompute the report of every world from the present state."""
+        self._report("report", self._everywhere)
+
+    def _report(self, key: str, chosen: Any) -> None:
+        arguments = [
+            self.world.model,
+            PerWorld(self.world.state),
+            self._plan,
+            self._weights,
+            PerWorld(self.report),
+            PerWorld(self.world.mask),
+            PerWorld(chosen),
+        ]
+        self.world.launch(key, report_kernel, arguments, inner=(self.world.model.vehicles,))
 
     def view(self, name: str) -> np.ndarray:
         """Return a field of the report, the state or the actions on the host."""

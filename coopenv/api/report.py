@@ -33,9 +33,11 @@ def report_struct(p: Precision) -> Any:
 
         observation: wp.array3d(dtype=wp.float32)  # (W, N, D)
         terms: wp.array3d(dtype=wp.float32)  # (W, N, K)
-        reward: wp.array2d(dtype=wp.float32)  # (W, N)
-        terminated: wp.array2d(dtype=wp.bool)  # (W, N) arrived or collided
-        truncated: wp.array2d(dtype=wp.bool)  # (W, N) horizon reached without having ended before
+        reward: wp.array2d(dtype=wp.float32)  # (W, N) 0 for vehicles that had ended before, and right after a reset
+        alive: wp.array2d(dtype=wp.bool)  # (W, N) had not ended before this step
+        terminated: wp.array2d(dtype=wp.bool)  # (W, N) arrived or collided in this step
+        truncated: wp.array2d(dtype=wp.bool)  # (W, N) the world is over and this vehicle has not just terminated
+        over: wp.array(dtype=wp.int32)  # (W,) 1: at the horizon, or every vehicle has ended
         position_error: wp.array2d(dtype=scalar)  # (W, N) m
         orientation_error: wp.array2d(dtype=scalar)  # (W, N) deg
         nees: wp.array2d(dtype=scalar)  # (W, N)
@@ -49,7 +51,7 @@ def report_struct(p: Precision) -> Any:
     return Report
 
 
-MEMORY = ("last_goal_distance", "last_ended", "last_tick")
+MEMORY = ("last_goal_distance", "last_ended", "last_tick", "over")
 """Fields that carry over from one report to the next."""
 
 
@@ -57,19 +59,18 @@ def allocate_report(model: Any, worlds: int, size: int, p: Precision, device: st
     """Return a zeroed report for observations of `size` entries."""
     report = report_struct(p)()
     N = model.vehicles
-    shapes = {"observation": (worlds, N, size), "terms": (worlds, N, len(TERMS))}
+    shapes = {"observation": (worlds, N, size), "terms": (worlds, N, len(TERMS)), "over": (worlds,)}
     for name, var in report_struct(p).vars.items():
         setattr(report, name, wp.zeros(shapes.get(name, (worlds, N)), dtype=var.type.dtype, device=device))
     return report
 
 
-def begin_kernel(model: Any, state: Any, report: Any, mask: wp.array(dtype=wp.int32)):
-    """Forget the last episode's memory in the worlds that have been reset."""
-    world, vehicle = wp.tid()
-    if mask[world] != 0:
-        report.last_goal_distance[world, vehicle] = goal_distance(model, state, world, vehicle)
-        report.last_ended[world, vehicle] = UNDER_WAY
-        report.last_tick[world, vehicle] = 0
+@wp.func
+def forget(model: Any, state: Any, report: Any, world: int, vehicle: int):
+    """Start the memory of a new episode."""
+    report.last_goal_distance[world, vehicle] = goal_distance(model, state, world, vehicle)
+    report.last_ended[world, vehicle] = UNDER_WAY
+    report.last_tick[world, vehicle] = 0
 
 
 @wp.func
@@ -92,11 +93,24 @@ def judge(model: Any, state: Any, report: Any, world: int, vehicle: int):
 
 
 @wp.func
-def reward(model: Any, state: Any, report: Any, weights: wp.array(dtype=wp.float32), world: int, vehicle: int):
+def is_over(model: Any, state: Any, world: int) -> bool:
+    """Return whether a world is at its horizon or has no vehicle under way."""
+    if state.tick[world] >= model.horizon_ticks:
+        return True
+    for vehicle in range(model.vehicles):
+        if state.ended[world, vehicle] == UNDER_WAY:
+            return False
+    return True
+
+
+@wp.func
+def reward(
+    model: Any, state: Any, report: Any, weights: wp.array(dtype=wp.float32), world: int, vehicle: int, fresh: int
+):
     """Write the reward terms since the last report, and the flags that end an episode."""
     tick = state.tick[world]
     ended = state.ended[world, vehicle]
-    before = report.last_ended[world, vehicle]
+    alive = report.last_ended[world, vehicle] == UNDER_WAY
     distance = goal_distance(model, state, world, vehicle)
     has_goal = model.scene.goal_radius[vehicle] > distance - distance
     progress = wp.where(has_goal, report.last_goal_distance[world, vehicle] - distance, distance - distance)
@@ -109,26 +123,46 @@ def reward(model: Any, state: Any, report: Any, weights: wp.array(dtype=wp.float
         vehicle,
         wp.float32(progress),
         wp.float32(elapsed),
-        wp.where(before == UNDER_WAY, ended, UNDER_WAY),
+        wp.where(alive, ended, UNDER_WAY),
         wp.float32(report.position_error[world, vehicle]),
         wp.float32(report.orientation_error[world, vehicle]) / wp.float32(DEGREES),
         wp.float32(report.log_determinant[world, vehicle]),
         wp.float32(report.gramian_min_eigenvalue[world, vehicle]),
         report.targets_in_view[world, vehicle],
     )
-    report.reward[world, vehicle] = weigh(report.terms, weights, world, vehicle)
-    report.terminated[world, vehicle] = ended != UNDER_WAY
-    report.truncated[world, vehicle] = ended == UNDER_WAY and tick >= model.horizon_ticks
+    total = weigh(report.terms, weights, world, vehicle)
+    report.reward[world, vehicle] = wp.where(alive and fresh == 0, total, 0.0)
+    over = is_over(model, state, world)
+    report.alive[world, vehicle] = alive
+    report.terminated[world, vehicle] = alive and ended != UNDER_WAY
+    report.truncated[world, vehicle] = over and not (alive and ended != UNDER_WAY)
+    if vehicle == 0:
+        report.over[world] = wp.where(over, 1, 0)
     report.last_goal_distance[world, vehicle] = distance
     report.last_ended[world, vehicle] = ended
     report.last_tick[world, vehicle] = tick
 
 
-def report_kernel(model: Any, state: Any, plan: Any, weights: wp.array(dtype=wp.float32), report: Any):
-    """Fill the report of every vehicle of every world. One thread per (world, vehicle)."""
+def report_kernel(
+    model: Any,
+    state: Any,
+    plan: Any,
+    weights: wp.array(dtype=wp.float32),
+    report: Any,
+    fresh: wp.array(dtype=wp.int32),
+    chosen: wp.array(dtype=wp.int32),
+):
+    """Fill the report of every vehicle of the chosen worlds. One thread per (world, vehicle).
+
+    `fresh` marks worlds that have just been reset: they forget the last episode and earn no reward.
+    """
     world, vehicle = wp.tid()
+    if chosen[world] == 0:
+        return
+    if fresh[world] != 0:
+        forget(model, state, report, world, vehicle)
     judge(model, state, report, world, vehicle)
-    reward(model, state, report, weights, world, vehicle)
+    reward(model, state, report, weights, world, vehicle, fresh[world])
     write_observation(
         model,
         plan,

@@ -12,7 +12,7 @@ import warp
 from coopenv.estimation.metrics import settling_time, summarise
 from coopenv.estimation.observability import Observability
 from coopenv.estimation.trajectory import Trajectory
-from coopenv.runs.recording import Ending, Recording
+from coopenv.runs.recording import ARRIVED, COLLIDED, UNDER_WAY, Ending, Recording
 
 STEADY_SHARE = 0.7
 """The steady state is taken to begin after this share of the horizon (35 s of 50 s)."""
@@ -71,12 +71,12 @@ def outcome_line(recording: Recording, interrupted: bool = False) -> str:
     """Return how the run ended, in words."""
     endings = recording.endings()
     scenario = recording.scenario
-    count = {word: sum(ending.outcome == word for ending in endings) for word in ("arrived", "collided")}
+    count = {word: sum(ending.outcome == word for ending in endings) for word in (ARRIVED, COLLIDED)}
     parts = [f"{number} {word}" for word, number in count.items() if number]
     time = recording.ticks_recorded / scenario.rates.camera
     if interrupted:
         end = f"interrupted at {time:g} s"
-    elif all(ending.outcome != "under way" for ending in endings):
+    elif all(ending.outcome != UNDER_WAY for ending in endings):
         end = f"all vehicles had ended by {max(ending.time for ending in endings):.4g} s"
     elif recording.ticks_recorded >= scenario.horizon_ticks:
         end = f"horizon reached at {time:g} s"

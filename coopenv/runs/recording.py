@@ -31,6 +31,8 @@ RECORDED = (
 )
 """Views of the engine that are kept of every camera tick."""
 
+UNDER_WAY, ARRIVED, COLLIDED = OUTCOMES
+
 
 class Ending(NamedTuple):
     """How a vehicle's run ended: a value of `OUTCOMES`, and when, s (`under way`: the end of the record)."""

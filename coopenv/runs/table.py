@@ -11,6 +11,7 @@ from rich.table import Table
 
 from coopenv.estimation.metrics import SETTLED_ORIENTATION_DEG, SETTLED_POSITION_M
 from coopenv.runs.metrics import COARSE_ORIENTATION_DEG, COARSE_POSITION_M
+from coopenv.runs.recording import UNDER_WAY
 
 
 def metrics_table(vehicles: list[dict[str, Any]], noisy: bool) -> Table:
@@ -59,7 +60,10 @@ def _cells(vehicle: dict[str, Any], noisy: bool) -> list[str]:
 
 
 def remarks(vehicles: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield the lines below the table: gaps in observability, and mirrored estimates."""
+    """Yield the lines below the table: early ends, gaps in observability, mirrored estimates."""
+    for vehicle in vehicles:
+        if vehicle["outcome"] != UNDER_WAY:
+            yield f"{vehicle['vehicle']}: {vehicle['outcome']} at {vehicle['end_time_s']:.2f} s"
     for vehicle in vehicles:
         gaps = vehicle["observability"]["not_observable_s"]
         if gaps:

@@ -75,7 +75,7 @@ class GifFilm:
 
     def __init__(self, path: Path, fps: float) -> None:
         self.path = path
-        self._duration = 1000.0 / fps
+        self._fps = fps
         self._frames: list[Image.Image] = []
 
     def add(self, picture: np.ndarray) -> None:
@@ -88,5 +88,7 @@ class GifFilm:
         """Write the file; it plays for ever."""
         if self._frames:
             first, *rest = self._frames
+            ends = np.round(np.arange(len(self._frames) + 1) * 100.0 / self._fps) * 10.0
+            duration = np.diff(ends).astype(int).tolist()  # ms; the format counts in hundredths of a second
             with writing(self.path):
-                first.save(self.path, save_all=True, append_images=rest, duration=self._duration, loop=0)
+                first.save(self.path, save_all=True, append_images=rest, duration=duration, loop=0)

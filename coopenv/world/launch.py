@@ -1,4 +1,4 @@
-"""Compile kernels once per precision, and replay their launches.
+"""Compile kernels once per precision, replay their launches, and split a batch over threads.
 
 Each kernel gets a Warp module of its own and of its precision, so that it is compiled once and then found in the cache
 whatever else a program uses; a generic kernel in a shared module would be rebuilt for every new combination.
@@ -6,13 +6,21 @@ whatever else a program uses; a generic kernel in a shared module would be rebui
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Hashable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 wp.config.log_level = wp.LOG_ERROR
+
+WORLDS_PER_THREAD = 32
+"""Smaller shares are not worth the handing over between threads."""
 
 
 @cache
@@ -23,26 +31,65 @@ def kernel(function: Callable[..., None], precision_name: str) -> wp.Kernel:
     return wp.Kernel(func=function, key=function.__name__, module=module)
 
 
-class Launcher:
-    """Launches kernels of one grid on one device; the first launch is recorded, later ones take a microsecond.
+def default_threads(worlds: int, device: str) -> int:
+    """Return how many threads to split a batch over: all cores (or COOPENV_THREADS) on the CPU, if it is large."""
+    if device != "cpu":
+        return 1
+    limit = int(os.environ.get("COOPENV_THREADS", 0)) or len(os.sched_getaffinity(0))
+    return max(1, min(limit, worlds // WORLDS_PER_THREAD))
 
-    A recorded launch keeps its arguments, so a key must always come with the same ones.
+
+@dataclass(frozen=True)
+class PerWorld:
+    """Marks a kernel argument whose arrays have the world as leading axis."""
+
+    value: Any
+
+    def part(self, start: int, stop: int) -> Any:
+        """Return the argument for worlds start..stop-1, sharing memory."""
+        if isinstance(self.value, wp.array):
+            return self.value[start:stop]
+        part = type(self.value)()
+        for name in self.value._cls.vars:
+            setattr(part, name, getattr(self.value, name)[start:stop])
+        return part
+
+
+class Launcher:
+    """Launches kernels whose grid is (worlds, ...) on one device.
+
+    The first launch under a key is recorded and later ones replay it in about a microsecond, so a key must always come
+    with the same arguments. On the CPU the batch may be split over threads: worlds do not talk to one another, so the
+    result does not depend on the split. Launches release the interpreter lock.
     """
 
-    def __init__(self, dim: int | tuple[int, ...], device: str, precision_name: str) -> None:
-        self._dim, self._device, self._precision = dim, device, precision_name
-        self._recorded: dict[Hashable, Any] = {}
+    def __init__(self, worlds: int, device: str, precision_name: str, threads: int = 1) -> None:
+        self._device, self._precision = device, precision_name
+        bounds = np.linspace(0, worlds, threads + 1).round().astype(int).tolist()
+        self._shares = [(a, b) for a, b in pairwise(bounds) if b > a]
+        self._recorded: dict[Hashable, list[Any]] = {}
+        self._pool = ThreadPoolExecutor(len(self._shares) - 1) if len(self._shares) > 1 else None
 
-    def __call__(self, key: Hashable, function: Callable[..., None], arguments: list[Any]) -> None:
-        """Run a kernel over the grid."""
-        command = self._recorded.get(key)
-        if command is None:
-            command = wp.launch(
-                kernel(function, self._precision),
-                dim=self._dim,
-                inputs=arguments,
-                device=self._device,
-                record_cmd=True,
-            )
-            self._recorded[key] = command
-        command.launch()
+    def __call__(
+        self, key: Hashable, function: Callable[..., None], arguments: list[Any], inner: tuple[int, ...] = ()
+    ) -> None:
+        """Run a kernel over the grid (worlds, *inner)."""
+        commands = self._recorded.get(key)
+        if commands is None:
+            commands = self._recorded[key] = [
+                wp.launch(
+                    kernel(function, self._precision),
+                    dim=(stop - start, *inner),
+                    inputs=[a.part(start, stop) if isinstance(a, PerWorld) else a for a in arguments],
+                    device=self._device,
+                    record_cmd=True,
+                )
+                for start, stop in self._shares
+            ]
+        if self._pool is None:
+            commands[0].launch()
+            return
+        others = [self._pool.submit(command.launch) for command in commands[1:]]
+        commands[0].launch()
+        for other in others:
+            other.result()

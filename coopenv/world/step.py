@@ -55,13 +55,15 @@ def tick_world(model: Any, before: Any, after: Any, actions: Any, world: int):
     after.tick[world] = tick
 
 
-def advance_kernel(model: Any, before: Any, after: Any, actions: wp.array2d(dtype=Any), ticks: int):
+def advance_kernel(
+    model: Any, before: Any, after: Any, actions: wp.array2d(dtype=Any), hold: wp.array(dtype=wp.int32), ticks: int
+):
     """Advance every world by up to `ticks` camera ticks, not beyond the horizon. One thread per world.
 
-    `after` may be `before`; otherwise it must start as a copy of it.
+    Worlds marked in `hold` stay as they are. `after` may be `before`; otherwise it must start as a copy of it.
     """
     world = wp.tid()
-    count = wp.min(ticks, model.horizon_ticks - before.tick[world])
+    count = wp.where(hold[world] == 0, wp.min(ticks, model.horizon_ticks - before.tick[world]), 0)
     for elapsed in range(count):
         if elapsed == 0:
             tick_world(model, before, after, actions, world)
@@ -70,7 +72,8 @@ def advance_kernel(model: Any, before: Any, after: Any, actions: wp.array2d(dtyp
 
 
 def reset_kernel(model: Any, state: Any, mask: wp.array(dtype=wp.int32)):
-    """Start a new episode in every world whose mask is set. One thread per world."""
+    """Start the next episode in every world whose mask is set. One thread per world."""
     world = wp.tid()
     if mask[world] != 0:
+        state.episode[world] = state.episode[world] + wp.uint32(1)
         reset_world(model, state, world)

@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
+from coopenv.errors import CoopenvError
 from coopenv.scenario import Scenario
 from coopenv.world.build import build_model
-from coopenv.world.launch import Launcher
+from coopenv.world.launch import Launcher, PerWorld, default_threads
 from coopenv.world.precision import check_device, precision
 from coopenv.world.state import allocate_state, read_state, write_state
 from coopenv.world.step import advance_kernel, reset_kernel
@@ -22,48 +23,68 @@ class World:
     single world seeded with s + w (on the same device).
     """
 
-    def __init__(self, scenario: Scenario, worlds: int = 1, dtype: str = "float32", device: str = "cpu") -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        worlds: int = 1,
+        dtype: str = "float32",
+        device: str = "cpu",
+        threads: int | None = None,
+    ) -> None:
         """Build the arrays; call `reset` before `advance`.
+
+        Args:
+            scenario: what to build.
+            worlds: how many.
+            dtype: "float32" or "float64".
+            device: "cpu", "cuda", "cuda:0", ...
+            threads: shares into which the batch is split on the CPU; None: by its size and the cores. Results do not
+                depend on it.
 
         Raises:
             DeviceError: unknown precision or device.
-            ValueError: no worlds.
+            CoopenvError: no worlds or no threads.
         """
         if worlds < 1:
-            raise ValueError(f"num_worlds must be at least 1, got {worlds}")
+            raise CoopenvError(f"num_worlds must be at least 1, got {worlds}")
+        if threads is not None and threads < 1:
+            raise CoopenvError(f"threads must be at least 1, got {threads}")
         self.scenario = scenario
         self.worlds = worlds
         self.precision = precision(dtype)
         self.device = check_device(device)
+        self.threads = default_threads(worlds, self.device) if threads is None else min(threads, worlds)
         self.model = build_model(scenario, self.precision, self.device)
         self.state = allocate_state(self.model, worlds, self.precision, self.device)
-        N = self.model.vehicles
-        self.actions = wp.zeros((worlds, N), dtype=self.precision.vec2, device=self.device)
+        self.actions = wp.zeros((worlds, self.model.vehicles), dtype=self.precision.vec2, device=self.device)
         self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
-        self._launch = Launcher(worlds, self.device, dtype)
+        """(W,) worlds that `restart` resets and that `advance` leaves alone; zero outside of a reset."""
+        self.launch = Launcher(worlds, self.device, dtype, self.threads)
 
     def reset(self, seeds: Sequence[int] | np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
-        """Start a new episode in the worlds of `mask` (all by default).
+        """Start a new episode in the worlds of `mask` (all by default), which stays set in `self.mask`.
 
         Args:
             seeds: one per world, reduced modulo 2^64; None keeps each world's seed and draws a new episode from it.
             mask: (W,) bool.
         """
         chosen = np.ones(self.worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
-        seed, episode = self.state.seed.numpy(), self.state.episode.numpy()
-        if seeds is None:
-            episode = np.where(chosen, episode + np.uint32(1), episode)
-        else:
+        if seeds is not None:
             wanted = np.array([int(s) % 2**64 for s in seeds], dtype=np.uint64)
-            seed, episode = np.where(chosen, wanted, seed), np.where(chosen, np.uint32(0), episode)
-        self.state.seed.assign(seed.astype(np.uint64))
-        self.state.episode.assign(episode.astype(np.uint32))
+            self.state.seed.assign(np.where(chosen, wanted, self.state.seed.numpy()))
+            # restart() raises the episode's number by one: the first one of a seed is 0
+            self.state.episode.assign(np.where(chosen, np.uint32(2**32 - 1), self.state.episode.numpy()))
         self.mask.assign(chosen.astype(np.int32))
-        self._launch("reset", reset_kernel, [self.model, self.state, self.mask])
+        self.restart()
+
+    def restart(self) -> None:
+        """Start the next episode in the worlds of `self.mask`, on the device."""
+        self.launch("restart", reset_kernel, [self.model, PerWorld(self.state), PerWorld(self.mask)])
 
     def advance(self, ticks: int) -> None:
         """Run camera ticks under `self.actions`, stopping each world at its horizon."""
-        self._launch(("advance", ticks), advance_kernel, [self.model, self.state, self.state, self.actions, ticks])
+        state, actions, mask = PerWorld(self.state), PerWorld(self.actions), PerWorld(self.mask)
+        self.launch(("advance", ticks), advance_kernel, [self.model, state, state, actions, mask, ticks])
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return a copy of everything that changes, random streams included (they are seeds and counters)."""

@@ -1,0 +1,188 @@
+"""The command line: `coopenv list | describe | schema | run`."""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from coopenv.errors import CoopenvError
+
+UsageError: Any = typer.BadParameter.__base__
+"""What typer raises for every mistake in the options; it has no public name."""
+
+INTERRUPTED = 130
+
+app = typer.Typer(
+    name="coopenv",
+    help="Cooperative localisation of connected vehicles.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Environment = Annotated[str, typer.Argument(metavar="ENV", help="Name (see `coopenv list`) or path of a TOML file.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Override a dotted key of the scenario, e.g. noise.enabled=false; the value is TOML, or else a string. "
+        "Repeatable.",
+    ),
+]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit status: 0, 2 after a mistake in the input, 130 after Ctrl-C."""
+    try:
+        status = app(args=arguments, standalone_mode=False)
+    except (CoopenvError, UsageError) as error:
+        message = error.format_message() if isinstance(error, UsageError) else str(error)
+        print(f"error: {' '.join(message.split())}", file=sys.stderr)
+        return 2
+    except (KeyboardInterrupt, typer.Abort):
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+    return status if isinstance(status, int) else 0
+
+
+@app.callback(invoke_without_command=True)
+def root(
+    context: typer.Context,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+) -> None:
+    """Cooperative localisation of connected vehicles."""
+    if version:
+        from coopenv import __version__
+
+        print(f"coopenv {__version__}")
+    elif context.invoked_subcommand is None:
+        print(context.get_help())
+
+
+@app.command("list")
+def list_command() -> None:
+    """List the environments that ship with coopenv."""
+    from coopenv.scenario import list_envs
+    from coopenv.scenario.describe import environment_table
+
+    out = console()
+    out.print(environment_table({name: load(name, {}) for name in list_envs()}))
+
+
+@app.command()
+def describe(environment: Environment, overrides: Overrides = None) -> None:
+    """Print a scenario for people: who is in it, how they sense and estimate, and what an observation holds."""
+    from coopenv.scenario.describe import describe_scenario
+
+    out = console()
+    for part in describe_scenario(load(environment, parse_overrides(overrides))):
+        out.print(part)
+
+
+@app.command()
+def schema(
+    out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None,
+) -> None:
+    """Write the JSON schema of scenario files, for editors and other tools."""
+    from coopenv.runs.output import writing
+    from coopenv.scenario.json_schema import schema_text
+
+    if out is None:
+        print(schema_text(), end="")
+        return
+    with writing(out):
+        out.write_text(schema_text(), encoding="utf-8")
+
+
+@app.command()
+def run(
+    environment: Environment,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")] = 0,
+    overrides: Overrides = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Decisions to run (default: up to the horizon).")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the results (default: out/ENV).")] = None,
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, ...")] = "cpu",
+    dtype: Annotated[str, typer.Option(help="float32 or float64.")] = "float64",
+    policy: Annotated[str, typer.Option(help="Of driven vehicles: zero or random.")] = "zero",
+    steady_from: Annotated[
+        float | None,
+        typer.Option(help="Start of the steady state in s (default: 70 % of the horizon).", show_default=False),
+    ] = None,
+    video: Annotated[bool, typer.Option("--video", help="Also film the top view.")] = False,
+) -> None:
+    """Run an environment and write metrics, record and figures."""
+    parsed = parse_overrides(overrides)
+    scenario = load(environment, parsed)
+    from coopenv.runs.command import RunRequest, execute
+
+    name = Path(environment).stem
+    request = RunRequest(
+        name=name,
+        scenario=scenario,
+        folder=out if out is not None else Path("out") / name,
+        overrides=parsed,
+        seed=seed,
+        steps=steps,
+        device=device,
+        dtype=dtype,
+        policy=policy,
+        steady_from=steady_from,
+        video=video,
+    )
+    if not execute(request, console(), console(stderr=True)):
+        raise typer.Exit(INTERRUPTED)
+
+
+def console(stderr: bool = False) -> Console:
+    """Return a console that prints scenario texts as they are."""
+    return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
+
+
+def load(environment: str, overrides: dict[str, Any]) -> Any:
+    """Return a scenario, its warnings printed as one line each."""
+    from coopenv.scenario import ScenarioWarning, load_scenario
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", ScenarioWarning)
+        scenario = load_scenario(environment, overrides)
+    for warning in (w for w in caught if issubclass(w.category, ScenarioWarning)):
+        print(f"warning: {warning.message}", file=sys.stderr)
+    return scenario
+
+
+def parse_overrides(assignments: Sequence[str] | None) -> dict[str, Any]:
+    """Return `key=value` texts as a dict; a value that is not TOML is a string.
+
+    Raises:
+        CoopenvError: no `=`, or nothing before it.
+    """
+    overrides = {}
+    for assignment in assignments or ():
+        key, equals, text = assignment.partition("=")
+        key, text = key.strip(), text.strip()
+        if not equals or not key:
+            raise CoopenvError(f"--set {assignment}: expected KEY=VALUE, e.g. --set noise.enabled=false")
+        overrides[key] = parse_value(text)
+    return overrides
+
+
+def parse_value(text: str) -> Any:
+    """Return a TOML value, or the text itself when it is none."""
+    try:
+        document = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return text
+    return document["value"] if len(document) == 1 else text
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,192 @@
+"""`coopenv run`: simulate with progress shown, write the results, print the table."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+from rich.console import Console
+from rich.padding import Padding
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+
+from coopenv.errors import CoopenvError
+from coopenv.estimation.observability import Observability, analyse_observability
+from coopenv.estimation.trajectory import Trajectory
+from coopenv.runs.metrics import STEADY_SHARE, outcome_line, run_metrics, vehicle_metrics
+from coopenv.runs.output import prepare_folder, write_results
+from coopenv.runs.recording import Recording
+from coopenv.runs.table import metrics_table, remarks
+from coopenv.runs.video import Film, GifFilm, frame_stride, open_film
+from coopenv.scenario import Scenario
+
+COMPILE_NOTICE_AFTER = 1.5
+"""s; kernels in the cache load well within it, compiling takes longer."""
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """What `coopenv run` was asked for; see its help."""
+
+    name: str
+    scenario: Scenario
+    folder: Path
+    overrides: dict[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    steps: int | None = None
+    device: str = "cpu"
+    dtype: str = "float64"
+    policy: str = "zero"
+    steady_from: float | None = None
+    video: bool = False
+
+
+def execute(request: RunRequest, out: Console, log: Console) -> bool:
+    """Run, write and print; return False when the user interrupted the run, of which what exists is written.
+
+    Raises:
+        CoopenvError: an argument is not valid, or the results cannot be written.
+    """
+    with without_driver_notice():
+        wp.init()
+    scenario = request.scenario
+    recording = Recording(scenario, request.seed, request.steps, request.dtype, request.device, request.policy)
+    if request.policy != "zero" and not scenario.driven:
+        log.print("note: all motion here is prescribed, the policy has no effect", soft_wrap=True)
+    steady_from = _steady_from(request, recording)
+    prepare_folder(request.folder)
+    with compile_notice(log):
+        recording.warm_up()
+    film = open_film(request.folder, _fps(scenario)) if request.video else None
+    finished = _simulate(recording, film, log)
+    trajectory = recording.trajectory()
+    observability = analyse_observability(trajectory)
+    vehicles = vehicle_metrics(trajectory, observability, recording.endings(), steady_from)
+    outcome = outcome_line(recording, interrupted=not finished)
+    metrics = run_metrics(request.name, request.overrides, recording, vehicles, steady_from, outcome)
+    paths = write_results(request.folder, trajectory, metrics)
+    if finished:
+        paths += _draw(request.folder, trajectory, observability, log)
+    if film is not None:
+        paths.append(_finish(film, log))
+    report(request, metrics, paths, out)
+    return finished
+
+
+def _steady_from(request: RunRequest, recording: Recording) -> float:
+    if request.steady_from is None:
+        return STEADY_SHARE * request.scenario.horizon
+    end = recording.ticks_planned / request.scenario.rates.camera
+    if not 0.0 <= request.steady_from < end:
+        raise CoopenvError(f"--steady-from: {request.steady_from:g} s is not within the run of {end:g} s")
+    return request.steady_from
+
+
+def _fps(scenario: Scenario) -> float:
+    return scenario.rates.camera / frame_stride(scenario)
+
+
+def _simulate(recording: Recording, film: Film | None, log: Console) -> bool:
+    """Play the recording to its end; return False if the user interrupted it after it had begun."""
+    view = None
+    if film is not None:
+        from coopenv.viz.topview import TopView
+
+        view = TopView(recording.scenario)
+    stride = frame_stride(recording.scenario)
+    try:
+        with progress(log) as bar:
+            task = bar.add_task("simulating", total=recording.ticks_planned)
+            for tick in recording.play():
+                if tick % stride == 0:
+                    if film is not None and view is not None:
+                        film.add(view.draw(recording.engine))
+                    bar.update(task, completed=tick)
+    except KeyboardInterrupt:
+        if recording.ticks_recorded < 1:
+            raise
+        return False
+    return True
+
+
+def _draw(folder: Path, trajectory: Trajectory, observability: Observability, log: Console) -> list[Path]:
+    with progress(log) as bar:
+        bar.add_task("drawing figures", total=None)
+        from coopenv.viz.figures import save_figures
+
+        return save_figures(trajectory, folder, observability)
+
+
+def _finish(film: Film, log: Console) -> Path:
+    with progress(log) as bar:
+        bar.add_task(f"finishing {film.path.name}", total=None)
+        film.close()
+    if isinstance(film, GifFilm):
+        log.print("video: written as GIF; for MP4: pip install 'coopenv[video]'", soft_wrap=True)
+    return film.path
+
+
+def report(request: RunRequest, metrics: dict[str, Any], paths: list[Path], out: Console) -> None:
+    """Print the result for people."""
+    noise = "on" if request.scenario.noise.enabled else "off"
+    out.print(
+        f"{request.scenario.title}: seed {request.seed}, noise {noise}, {metrics['dtype']} on {metrics['device']}",
+        soft_wrap=True,
+    )
+    out.print()
+    out.print(metrics_table(metrics["vehicles"], request.scenario.noise.enabled))
+    out.print()
+    steady_from, end = metrics["steady_from_s"], metrics["simulated_time_s"]
+    if steady_from < end:
+        out.print(f"Steady RMSE and NEES: after {steady_from:g} s. NEES of a consistent estimate: 6.")
+    else:
+        out.print(f"No steady state: it would begin at {steady_from:g} s (see --steady-from).")
+    for line in remarks(metrics["vehicles"]):
+        out.print(line)
+    factor = metrics["real_time_factor"]
+    out.print(f"Outcome: {metrics['outcome']}. Simulated at {factor:.3g} times real time.")
+    out.print(f"Files in {request.folder}:", soft_wrap=True)
+    out.print(Padding(", ".join(path.name for path in paths), (0, 0, 0, 2)))
+
+
+def progress(log: Console) -> Progress:
+    """Return a progress display that vanishes when done, and is silent where nobody looks."""
+    return Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TimeRemainingColumn(),
+        console=log,
+        transient=True,
+        disable=not log.is_terminal,
+    )
+
+
+@contextmanager
+def compile_notice(log: Console) -> Iterator[None]:
+    """Say what takes so long when kernels are not found in Warp's cache."""
+    timer = threading.Timer(COMPILE_NOTICE_AFTER, lambda: log.print("compiling kernels (once per machine) ..."))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+@contextmanager
+def without_driver_notice() -> Iterator[None]:
+    """Mute the native standard error: Warp's library writes to it on every machine without a GPU driver."""
+    saved = os.dup(2)
+    with Path(os.devnull).open("wb") as nothing:
+        os.dup2(nothing.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)

@@ -1,0 +1,94 @@
+"""Judgements in Warp against the NumPy measures: log-determinant, error coordinates and NEES."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from coopenv.estimation import metrics
+from tests.world.calls import DTYPES, call
+
+COUNT = 300
+
+
+def covariances(rng: np.random.Generator) -> np.ndarray:
+    A = rng.normal(size=(COUNT, 6, 6))
+    scale = 10.0 ** rng.uniform(-2, 1, (COUNT, 6, 1))
+    P = (A @ np.swapaxes(A, 1, 2) + 0.3 * np.eye(6)) * scale * np.swapaxes(scale, 1, 2)
+    return (P + np.swapaxes(P, 1, 2)) / 2
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-11), ("float32", 2e-3)])
+def test_log_determinant(dtype: str, tolerance: float) -> None:
+    P = covariances(np.random.default_rng(0))
+    sign, expected = np.linalg.slogdet(P)
+    assert (sign > 0).all()
+    assert_allclose(call("log_determinant", dtype, P), expected, atol=tolerance)
+
+
+def test_log_determinant_in_ten_decades() -> None:
+    P = np.diag(np.logspace(-8, 2, 6))[None]
+    assert_allclose(call("log_determinant", "float64", P), np.log(np.logspace(-8, 2, 6)).sum(), rtol=1e-13)
+
+
+def draws(seed: int, angle: float | None) -> tuple[np.ndarray, ...]:
+    """Return truth and estimate: R, pbar, Rhat, phat, the error turned by `angle` (None: any) about random axes."""
+    rng = np.random.default_rng(seed)
+    R = Rotation.random(COUNT, rng=rng).as_matrix()
+    axis = rng.normal(size=(COUNT, 3))
+    axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+    size = rng.uniform(0, np.pi - 1e-3, (COUNT, 1)) if angle is None else angle
+    R_hat = R @ Rotation.from_rotvec(-size * axis).as_matrix()  # Rtilde = Rhat^T R = Rot(size axis)
+    position = rng.uniform(-20, 20, (COUNT, 3))
+    estimate = position + rng.normal(size=(COUNT, 3))
+    return R, position, R_hat, np.einsum("nji,nj->ni", R_hat, estimate)
+
+
+@pytest.mark.parametrize("angle", [None, 1e-9, 1e-3, np.pi - 1e-6])
+def test_error_coordinates_and_nees(angle: float | None) -> None:
+    R, position, R_hat, p_hat = draws(1, angle)
+    P = covariances(np.random.default_rng(2))
+    e1, e2, value = call("nees", "float64", P, R, position, R_hat, p_hat)
+    estimate = np.einsum("nij,nj->ni", R_hat, p_hat)
+    expected = metrics.error_coordinates(position, R, estimate, R_hat)
+    assert_allclose(np.concatenate([e1, e2], axis=1), expected, atol=1e-13)
+    assert_allclose(value, metrics.nees(expected, P), rtol=1e-8)
+
+
+def test_nees_by_hand() -> None:
+    """10 degrees too far about z at the origin, and 0.3 m off in y."""
+    turn = Rotation.from_euler("z", np.radians(10)).as_matrix()
+    P = np.diag([1.0, 1.0, 0.01, 1.0, 0.09, 1.0])
+    e1, e2, value = call("nees", "float64", P[None], np.eye(3)[None], np.zeros((1, 3)), turn[None], [[0.0, -0.3, 0.0]])
+    lam = -2 * np.sin(np.radians(5))
+    assert_allclose(e1[0], [0, 0, lam], atol=1e-15)
+    assert_allclose(e2[0], [0, 0.3, 0], atol=1e-15)
+    assert_allclose(value[0], lam**2 / 0.01 + 1.0, rtol=1e-13)
+
+
+def test_nees_of_consistent_draws_has_mean_six() -> None:
+    P = covariances(np.random.default_rng(3))
+    P[:, :3] *= 1e-2
+    P[:, :, :3] *= 1e-2  # small turns, so that 2 lambda is the rotation vector
+    rng = np.random.default_rng(4)
+    e = np.einsum("nij,nj->ni", np.linalg.cholesky(P), rng.normal(size=(COUNT, 6)))
+    small = np.linalg.norm(e[:, :3], axis=1) < 0.3
+    R_hat = Rotation.from_rotvec(-e[:, :3]).as_matrix()
+    zero = np.zeros((COUNT, 3))
+    value = call("nees", "float64", P, np.broadcast_to(np.eye(3), (COUNT, 3, 3)), zero, R_hat, -e[:, 3:])[2][small]
+    assert small.sum() > 250
+    assert abs(value.mean() - 6.0) < 4 * np.sqrt(12.0 / len(value)) + 0.05
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_nothing_is_wrong_with_a_perfect_estimate(dtype: str) -> None:
+    R, position, _, _ = draws(5, None)
+    R = R.astype(dtype).astype(float)
+    p = np.einsum("nji,nj->ni", R, position)
+    e1, e2, value = call("nees", dtype, covariances(np.random.default_rng(6)), R, position, R, p)
+    tolerance = 1e-13 if dtype == "float64" else 2e-5
+    assert np.abs(e1).max() < tolerance
+    assert np.abs(e2).max() < tolerance
+    assert (value >= 0.0).all()

@@ -1,0 +1,168 @@
+"""What `describe`, the words and the JSON schema say about scenarios."""
+
+from __future__ import annotations
+
+import copy
+import io
+import json
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import jsonschema
+import pytest
+from rich.console import Console
+
+import coopenv
+from coopenv.api.layout import observation_layout
+from coopenv.cli import main
+from coopenv.scenario import words
+from coopenv.scenario.agents import ConstantMotion, InitialEstimate, TwistSegment, WaypointMotion
+from coopenv.scenario.describe import describe_scenario, settings
+from coopenv.scenario.files import apply_vehicle_defaults, data_directory, parse_scenario
+from coopenv.scenario.json_schema import schema_text
+
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "scenario.schema.json"
+
+
+def described(name: str, width: int, **overrides: Any) -> str:
+    stream = io.StringIO()
+    console = Console(file=stream, width=width, markup=False, highlight=False, emoji=False)
+    for part in describe_scenario(coopenv.load_scenario(name, overrides)):
+        console.print(part)
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("width", [80, 100])
+@pytest.mark.parametrize("name", coopenv.list_envs())
+def test_everything_fits_and_nothing_is_cut_off(name: str, width: int) -> None:
+    text = described(name, width)
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= width
+    assert "…" not in text
+    tokens = set(text.split())
+    scenario = coopenv.load_scenario(name)
+    for section in (scenario.camera, scenario.noise, scenario.v2x, scenario.observer, scenario.observation):
+        for key, _, meaning, _ in settings(section):
+            assert key in tokens
+            assert set(meaning.split()) <= tokens, key
+    for field, layout in observation_layout(scenario).items():
+        assert field in tokens
+        assert f"{layout.start}:{layout.stop}" in tokens
+        assert set(layout.meaning.split()) <= tokens
+    assert set(scenario.target_names) <= {token.strip(",") for token in tokens}
+
+
+def test_the_sections_of_the_busy_intersection() -> None:
+    lines = [line.split() for line in described("busy_intersection", 100).splitlines()]
+    assert ["landmark", "position", "motion", "body"] in lines
+    assert ["SL1", "(-4,", "5,", "3)", "stands", "still", "none"] in lines
+    assert next(line for line in lines if line[:1] == ["bearing.scale"])[:3] == ["bearing.scale", "*", "0.005"]
+    assert next(line for line in lines if line[:1] == ["loss"])[:2] == ["loss", "0"]
+    text = described("busy_intersection", 140)
+    assert "keeps 0.6 m/s to the left" in text
+    assert "off by 90 deg about z" in text
+    assert "Horizon: 50 s, 500 decisions of 6 camera ticks each." in text
+    assert "wheelbase" not in text
+    assert "wheelbase" in described("urban_crossing", 100)
+
+
+def test_overrides_are_described(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["describe", "busy_intersection", "--set", "v2x.loss=0.25"]) == 0
+    assert any(line.split()[:3] == ["loss", "*", "0.25"] for line in capsys.readouterr().out.splitlines())
+
+
+def test_scenario_texts_are_not_read_as_markup() -> None:
+    assert "[bold]loud[/bold]" in described("busy_intersection", 80, title="[bold]loud[/bold]")
+
+
+def test_starts_and_estimates_in_words() -> None:
+    half = 0.7071067811865476
+    belief = InitialEstimate(position_radius=0.3, orientation_angle="uniform")
+    assert words.estimate(belief).splitlines() == [
+        "true position",
+        "within 0.3 m",
+        "true orientation",
+        "turned at random, over SO(3)",
+    ]
+    belief = InitialEstimate(position=(1.0, 2.0, -0.0), orientation_offset_wxyz=(half, 0.0, -half, 0.0))
+    assert words.estimate(belief).splitlines() == ["(1, 2, 0)", "true orientation", "off by -90 deg about y"]
+    assert words.turn((half, 0.5, 0.5, 0.0)) == "90 deg about (0.707, 0.707, 0)"
+    assert words.turn((1.0, 0.0, 0.0, 0.0)) == "0 deg"
+    assert words.orientation(None, (half, half, 0.0, 0.0)) == "turned 90 deg about x"
+
+
+def test_motions_in_words() -> None:
+    assert words.motion(ConstantMotion(linear=(-1.0, 0.0, 0.0))) == "keeps 1 m/s backward"
+    turning = ConstantMotion(linear=(1.0, 2.0, 0.0), angular=(0.0, 0.0, 0.5))
+    assert words.motion(turning) == "keeps (1, 2, 0) m/s, turning at (0, 0, 0.5) rad/s"
+    assert words.motion(ConstantMotion(linear=(0.0, 0.0, 0.0))) == "keeps 0 m/s"
+    assert TwistSegment(duration=1.0).linear == (0.0, 0.0, 0.0)
+    waypoints = [{"time": 0.0, "position": (0, 0, 0)}, {"time": 8.0, "position": (4, 0, 0)}]
+    motion = WaypointMotion.model_validate({"kind": "waypoints", "waypoints": waypoints})
+    assert words.motion(motion) == "spline through 2 waypoints over 8 s"
+
+
+def test_the_published_schema_is_up_to_date() -> None:
+    assert DOCUMENT.read_text() == schema_text(), "run: coopenv schema --out docs/scenario.schema.json"
+
+
+def test_schema_to_standard_output_and_to_a_file(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["schema"]) == 0
+    assert capsys.readouterr().out == schema_text()
+    assert main(["schema", "--out", str(tmp_path / "schema.json")]) == 0
+    assert (tmp_path / "schema.json").read_text() == schema_text()
+
+
+@pytest.fixture(scope="module")
+def validator() -> Any:
+    schema = json.loads(schema_text())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    return jsonschema.Draft202012Validator(schema)
+
+
+def raw(name: str) -> dict[str, Any]:
+    return tomllib.loads((data_directory("envs") / f"{name}.toml").read_text())
+
+
+@pytest.mark.parametrize("name", coopenv.list_envs())
+def test_every_environment_satisfies_the_schema(name: str, validator: Any) -> None:
+    assert [error.message for error in validator.iter_errors(raw(name))] == []
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        (),
+        ("camera",),
+        ("noise", "bearing"),
+        ("vehicle_defaults",),
+        ("vehicle_defaults", "body"),
+        ("vehicle_defaults", "initial_pose"),
+        ("vehicles", 0),
+        ("vehicles", 0, "initial_pose"),
+        ("vehicles", 0, "goal"),
+        ("landmarks", 0),
+        ("obstacles", 0),
+        ("reward", "weights"),
+    ],
+)
+def test_the_schema_refuses_unknown_keys_as_the_loader_does(path: tuple[Any, ...], validator: Any) -> None:
+    document = raw("urban_crossing")
+    node: Any = document
+    for part in path:
+        node = node[part]
+    node["misspelt"] = 1
+    assert not validator.is_valid(document)
+    with pytest.raises(coopenv.ScenarioError, match="misspelt"):
+        parse_scenario(apply_vehicle_defaults(copy.deepcopy(document)), "urban_crossing")
+
+
+def test_vehicles_may_leave_out_what_the_defaults_say(validator: Any) -> None:
+    document = raw("urban_crossing")
+    document["vehicle_defaults"]["goal"] = {"position": [5.0, 5.0, 0.0]}
+    for vehicle in document["vehicles"]:
+        vehicle["goal"] = {"radius": 1.0}
+    parse_scenario(apply_vehicle_defaults(copy.deepcopy(document)), "urban_crossing")
+    assert validator.is_valid(document)
+    del document["horizon"]
+    assert not validator.is_valid(document)

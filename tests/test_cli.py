@@ -1,0 +1,195 @@
+"""The command line: what it prints, writes, and refuses."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import coopenv
+from coopenv.cli import main, parse_value
+from coopenv.estimation.trajectory import Trajectory
+
+FIGURES = {
+    "errors.png",
+    "trajectories_2d.png",
+    "trajectories_3d.png",
+    "topology.png",
+    "consistency.png",
+    "observability.png",
+}
+
+
+@pytest.fixture(autouse=True)
+def terminal(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    """A folder with a plain file and a scenario that is no TOML."""
+    (tmp_path / "occupied").write_text("")
+    (tmp_path / "broken.toml").write_text("title = ")
+    return tmp_path
+
+
+def test_list_names_every_environment(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list"]) == 0
+    out = capsys.readouterr().out
+    for name in coopenv.list_envs():
+        assert any(line.startswith(f"{name} ") for line in out.splitlines())
+        assert coopenv.load_scenario(name).title in out
+    assert "coopenv/BusyIntersection-v0" in out
+    assert max(len(line) for line in out.splitlines()) <= 80
+    row = next(line.split() for line in out.splitlines() if line.startswith("busy_intersection "))
+    assert row == ["busy_intersection", "5", "3", "prescribed", "50", "s"]
+
+
+def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    usage = capsys.readouterr().out
+    assert all(command in usage for command in ("list", "describe", "schema", "run"))
+    assert main(["run", "--help"]) == 0
+    assert "--steady-from" in capsys.readouterr().out
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"coopenv {coopenv.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("run busy_intersecton", "did you mean 'busy_intersection'"),
+        ("run nowhere.toml", "no such scenario file: nowhere.toml"),
+        ("run broken.toml", "not valid TOML"),
+        ("run busy_intersection --steps 0", "--steps"),
+        ("run busy_intersection --seed x", "--seed"),
+        ("run busy_intersection --seed -1", "--seed"),
+        ("run busy_intersection --set foo", "expected KEY=VALUE"),
+        ("run busy_intersection --set =3", "expected KEY=VALUE"),
+        ("run busy_intersection --set noise.enabld=false", "did you mean 'enabled'"),
+        ("run busy_intersection --set horizon=nan", "horizon"),
+        ("run busy_intersection --set vehicles.9.goal=1", "no entry '9'"),
+        ("run busy_intersection --dtype float16", "float16"),
+        ("run busy_intersection --device tpu", "tpu"),
+        ("run urban_crossing --policy rando", "did you mean 'random'"),
+        ("run busy_intersection --steady-from 50", "--steady-from"),
+        ("run busy_intersection --out occupied", "it is not a folder"),
+        ("run busy_intersection --out occupied/below", "cannot write to"),
+        ("schema --out missing/schema.json", "cannot write to"),
+        ("describe", "ENV"),
+        ("run busy_intersection --bogus", "--bogus"),
+        ("frobnicate", "frobnicate"),
+    ],
+)
+def test_mistakes_end_with_one_line_and_status_2(
+    line: str, message: str, files: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert main(line.split()) == 2
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("error: ")
+    assert captured.err.count("\n") == 1
+    assert message in captured.err
+    assert {path.name for path in files.iterdir()} <= {"occupied", "broken.toml", "out"}
+
+
+def test_run_writes_its_files_and_prints_its_table(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["run", "busy_intersection", "--seed", "4", "--steps", "120", "--set", "noise.enabled=false"]) == 0
+    out = capsys.readouterr().out
+    folder = tmp_path / "out" / "busy_intersection"
+    assert {path.name for path in folder.iterdir()} == FIGURES | {"metrics.json", "trajectory.npz"}
+    assert all((folder / name).stat().st_size > 10_000 for name in FIGURES)
+    assert len(Trajectory.load(folder / "trajectory.npz").t) == 721
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert (metrics["seed"], metrics["dtype"], metrics["device"]) == (4, "float64", "cpu")
+    assert metrics["overrides"] == {"noise.enabled": False}
+    assert metrics["steady_from_s"] == 35.0
+    rows = {line.split()[0]: line.split() for line in out.splitlines() if line.startswith("vehicle_")}
+    assert rows["vehicle_1"][1:5] == ["11.5", "90", "2.93", "s"]
+    assert "vehicle_5: not observable at 0-" in out
+    assert "No steady state: it would begin at 35 s" in out
+    assert "stopped after the steps asked for, at 12 s" in out
+    assert "Files in out/busy_intersection:" in out
+    assert max(len(line) for line in out.splitlines()) <= 80
+
+
+def test_noise_adds_the_wider_tolerance(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "busy_intersection", "--steps", "60", "--steady-from", "2", "--out", "here"]) == 0
+    out = capsys.readouterr().out
+    assert "5 deg" in out
+    assert "Steady RMSE and NEES: after 2 s" in out
+    assert max(len(line) for line in out.splitlines()) <= 80
+
+
+def test_video_without_the_extra_is_a_gif(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("coopenv.runs.video.find_spec", lambda name: None)
+    assert main(["run", "urban_crossing", "--steps", "3", "--video", "--policy", "random", "--out", "film"]) == 0
+    assert Path("film/video.gif").read_bytes()[:3] == b"GIF"
+    assert "pip install 'coopenv[video]'" in capsys.readouterr().err
+
+
+def test_scenarios_from_a_path_and_their_warnings(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("mine.toml").write_text(
+        'title = "Mine"\nhorizon = 2.0\n[[landmarks]]\nname = "A"\nposition = [1.0, 0.0, 2.0]\n'
+        "[[vehicles]]\ninitial_pose.position = [0.0, 0.0, 0.0]\n"
+    )
+    assert main(["run", "mine.toml", "--policy", "random"]) == 0
+    captured = capsys.readouterr()
+    first, second = captured.err.splitlines()
+    assert first.startswith("warning: only 1 landmark")
+    assert second.startswith("note: all motion here is prescribed")
+    assert "Mine: seed 0" in captured.out
+    assert Path("out/mine/metrics.json").is_file()
+
+
+def test_an_interrupt_keeps_the_record_and_exits_with_130(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from coopenv.runs.recording import Recording
+
+    take = Recording._take
+
+    def interrupted(self: Recording) -> None:
+        if self.ticks_recorded == 30:
+            raise KeyboardInterrupt
+        take(self)
+
+    monkeypatch.setattr(Recording, "_take", interrupted)
+    assert main(["run", "busy_intersection", "--out", "cut"]) == 130
+    assert "interrupted at 0.5 s" in capsys.readouterr().out
+    assert len(Trajectory.load(Path("cut/trajectory.npz")).t) == 31
+    assert {path.name for path in Path("cut").iterdir()} == {"metrics.json", "trajectory.npz"}
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("true", True),
+        ("3", 3),
+        ("0.5", 0.5),
+        ("[1, 2]", [1, 2]),
+        ('"x"', "x"),
+        ("sensed", "sensed"),
+        ("", ""),
+        ("{a = 1}", {"a": 1}),
+        ("1\nother = 2", "1\nother = 2"),
+    ],
+)
+def test_values_are_toml_or_else_strings(text: str, value: object) -> None:
+    assert parse_value(text) == value
+
+
+def test_the_installed_module_runs_in_a_process_of_its_own(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "coopenv.cli"]
+    good = subprocess.run([*command, "run", "overtaking", "--steps", "5"], capture_output=True, text=True)
+    assert good.returncode == 0
+    assert good.stderr == ""
+    assert "Overtaking: seed 0" in good.stdout
+    bad = subprocess.run([*command, "run", "overtaking", "--dtype", "half"], capture_output=True, text=True)
+    assert bad.returncode == 2
+    assert bad.stderr.startswith("error: unknown dtype 'half'")
+    assert bad.stderr.count("\n") == 1

@@ -1,0 +1,219 @@
+"""Recording a run: the same world as the environment's, tick by tick, and the figures it comes to."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import coopenv
+from coopenv.errors import CoopenvError, DeviceError, OutputError
+from coopenv.estimation.metrics import settling_time
+from coopenv.estimation.observability import analyse_observability
+from coopenv.estimation.trajectory import Sight, Trajectory
+from coopenv.runs import Recording, record
+from coopenv.runs.metrics import outcome_line, run_metrics, vehicle_metrics
+from coopenv.runs.output import prepare_folder, write_results
+from coopenv.runs.table import figure, percent, seconds
+from coopenv.runs.video import GIF_SIZE, GifFilm, frame_stride
+
+CASES: list[tuple[str, dict[str, Any]]] = [
+    *((name, {}) for name in coopenv.list_envs()),
+    *(("urban_crossing", {"dynamics.latency": ticks / 60.0}) for ticks in (0, 1, 3, 6)),
+    ("urban_crossing", {"action.longitudinal": "acceleration", "rates.decision": 5.0}),
+    ("busy_intersection", {"v2x.delay": 7, "v2x.period": 4, "v2x.loss": 0.3, "rates.observer": 25.0}),
+]
+
+
+@pytest.mark.parametrize(("name", "overrides"), CASES)
+def test_recorded_ticks_equal_the_environment_stepped_by_decisions(name: str, overrides: dict[str, Any]) -> None:
+    overrides = {**overrides, "horizon": 7.35}  # not a whole number of decisions
+    scenario = coopenv.load_scenario(name, overrides)
+    actions = np.random.default_rng(5).uniform(-1.0, 1.0, (100, len(scenario.vehicles), 2))
+    given = iter(actions)
+    run = record(scenario, seed=7, policy=lambda observations: next(given))
+    env = coopenv.parallel_env(name, dtype="float64", overrides=overrides)
+    env.reset(seed=7)
+    tick = 0
+    for action in actions:
+        if not env.agents:
+            break
+        *_, infos = env.step({agent: action[env.possible_agents.index(agent)] for agent in env.agents})
+        tick = min(tick + scenario.ticks_per_decision, scenario.horizon_ticks)
+        for agent, info in infos.items():
+            i = env.possible_agents.index(agent)
+            assert np.array_equal(info["truth"]["position"], run.position[tick, i])
+            assert np.array_equal(info["truth"]["rotation"], run.rotation[tick, i])
+            assert np.array_equal(info["estimate"]["position"], run.position_estimate[tick, i])
+            assert np.array_equal(info["estimate"]["rotation"], run.rotation_estimate[tick, i])
+            assert np.array_equal(info["estimate"]["covariance"], run.covariance[tick, i])
+            assert info["position_error"] == run.position_error[tick, i]
+            assert info["nees"] == run.nees[tick, i]
+            assert info["visible"] == tuple(run.targets[run.visible[tick, i]])
+    assert tick == len(run.t) - 1
+
+
+def test_noise_free_busy_intersection_settles_as_measured() -> None:
+    run = record(coopenv.load_scenario("busy_intersection", {"noise.enabled": False}))
+    assert len(run.t) == 3001
+    assert run.t[-1] == 50.0
+    assert run.position_error[-1].max() < 1e-6
+    settled = settling_time(run.t, run.position_error, run.orientation_error)
+    assert settled == pytest.approx([2.93, 7.83, 10.38, 11.47, 30.1], abs=0.01)
+
+
+def test_the_record_has_the_documented_arrays() -> None:
+    scenario = coopenv.load_scenario("crossing_path", {"horizon": 1.0})
+    run = record(scenario, seed=1)
+    K, N, T = 61, 1, 6
+    assert run.t == pytest.approx(np.arange(K) / 60.0)
+    assert run.position.shape == run.velocity.shape == run.position_estimate.shape == (K, N, 3)
+    assert run.rotation.shape == run.rotation_estimate.shape == (K, N, 3, 3)
+    assert run.covariance.shape == (K, N, 6, 6)
+    assert run.position_error.shape == run.orientation_error.shape == run.nees.shape == (K, N)
+    assert run.sight.shape == run.visible.shape == (K, N, T)
+    assert run.target_position.shape == (K, T, 3)
+    assert run.targets.tolist() == scenario.target_names
+    assert run.target_moving.tolist() == [False, False, False, False, True, True]
+    assert np.array_equal(run.target_position[:, 5], run.position[:, 0])
+    assert run.target_position[0, 0].tolist() == list(scenario.landmarks[0].position)
+    assert np.array_equal(run.visible, run.sight == Sight.VISIBLE)
+    error = np.linalg.norm(run.position - run.position_estimate, axis=-1)
+    assert run.position_error == pytest.approx(error, abs=1e-12)
+
+
+def test_steps_are_decisions_and_end_at_the_horizon() -> None:
+    scenario = coopenv.load_scenario("busy_intersection", {"horizon": 2.0})
+    assert len(record(scenario, steps=3).t) == 1 + 3 * 6
+    assert len(record(scenario, steps=1000).t) == 1 + 120
+
+
+def test_policies_are_seeded_and_reach_the_vehicles() -> None:
+    scenario = coopenv.load_scenario("urban_crossing")
+    first, again = (record(scenario, seed=4, steps=20, policy="random") for _ in range(2))
+    assert np.array_equal(first.position, again.position)
+    assert not np.array_equal(first.position, record(scenario, seed=5, steps=20, policy="random").position)
+    straight = record(scenario, seed=4, steps=20)
+    assert not np.array_equal(first.position, straight.position)
+    assert np.array_equal(first.position[0], straight.position[0])
+    clipped = record(scenario, seed=4, steps=20, policy=lambda o: np.full((4, 2), 9.0))
+    full = record(scenario, seed=4, steps=20, policy=lambda o: np.ones((4, 2)))
+    assert np.array_equal(clipped.position, full.position)
+
+
+def test_the_run_ends_with_the_last_vehicle() -> None:
+    scenario = coopenv.load_scenario("urban_crossing", {"vehicles.*.goal.radius": 30.0})
+    recording = Recording(scenario)
+    ticks = list(recording.play())
+    assert ticks == list(range(scenario.ticks_per_decision + 1))
+    assert {ending.outcome for ending in recording.endings()} == {"arrived"}
+    assert outcome_line(recording) == "all vehicles had ended by 0.01667 s (4 arrived)"
+
+
+def test_on_tick_sees_every_tick() -> None:
+    seen: list[tuple[int, int]] = []
+    scenario = coopenv.load_scenario("busy_intersection")
+    record(scenario, steps=2, on_tick=lambda engine, tick: seen.append((tick, int(engine.view("tick")[0]))))
+    assert seen == [(k, k) for k in range(13)]
+
+
+def test_float32_is_recorded_in_float32() -> None:
+    assert record(coopenv.load_scenario("busy_intersection"), steps=1, dtype="float32").covariance.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"steps": 0}, CoopenvError, "steps"),
+        ({"dtype": "float16"}, DeviceError, "float16"),
+        ({"device": "tpu"}, DeviceError, "tpu"),
+        ({"policy": "zeros"}, CoopenvError, "did you mean 'zero'"),
+        ({"policy": lambda observations: np.zeros(2)}, CoopenvError, "shape"),
+    ],
+)
+def test_bad_arguments_are_named(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        record(coopenv.load_scenario("busy_intersection"), **arguments)
+
+
+def test_an_interrupted_run_keeps_what_was_recorded(tmp_path: Path) -> None:
+    recording = Recording(coopenv.load_scenario("busy_intersection"), seed=2)
+    for tick in recording.play():
+        if tick == 100:
+            break
+    trajectory = recording.trajectory()
+    assert len(trajectory.t) == 101
+    assert outcome_line(recording, interrupted=True) == "interrupted at 1.66667 s"
+    trajectory.save(tmp_path / "run.npz")
+    assert np.array_equal(Trajectory.load(tmp_path / "run.npz").position, trajectory.position)
+
+
+def test_metrics_file_is_strict_json_with_figures_of_every_vehicle(tmp_path: Path) -> None:
+    recording = Recording(coopenv.load_scenario("busy_intersection"), seed=3, steps=60)
+    for _ in recording.play():
+        pass
+    trajectory = recording.trajectory()
+    vehicles = vehicle_metrics(trajectory, analyse_observability(trajectory), recording.endings(), 35.0)
+    metrics = run_metrics("busy_intersection", {"a.b": [1]}, recording, vehicles, 35.0, "stopped")
+    write_results(tmp_path, trajectory, metrics)
+    text = (tmp_path / "metrics.json").read_text()
+    assert "NaN" not in text
+    read = json.loads(text)
+    assert read["seed"] == 3
+    assert read["overrides"] == {"a.b": [1]}
+    assert read["versions"]["coopenv"] == coopenv.__version__
+    assert read["simulated_time_s"] == 6.0
+    assert read["real_time_factor"] > 1.0
+    assert [vehicle["vehicle"] for vehicle in read["vehicles"]] == [f"vehicle_{i}" for i in range(1, 6)]
+    first, last = read["vehicles"][0], read["vehicles"][4]
+    assert first["steady_position_rmse_m"] is None  # the run ends before
+    assert first["observability"]["share_observable"] == 1.0
+    assert 0.0 < last["observability"]["share_observable"] < 1.0
+    assert last["observability"]["not_observable_s"][0][0] == 0.0
+    assert first["coarse_settle_time_s"] <= first["settle_time_s"]
+
+
+def test_a_record_shorter_than_any_window_still_has_metrics() -> None:
+    recording = Recording(coopenv.load_scenario("busy_intersection"))
+    next(recording.play())
+    trajectory = recording.trajectory()
+    vehicles = vehicle_metrics(trajectory, analyse_observability(trajectory), recording.endings(), 0.0)
+    assert math.isnan(vehicles[0]["observability"]["share_observable"])
+
+
+def test_folders_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "run" / "metrics.json").mkdir(parents=True)
+    for folder in ("file", "file/below", "run"):
+        with pytest.raises(OutputError, match="cannot write to"):
+            prepare_folder(tmp_path / folder)
+    prepare_folder(tmp_path / "new" / "folder")
+    assert list((tmp_path / "new" / "folder").iterdir()) == []
+
+
+def test_films_play_in_real_time(tmp_path: Path) -> None:
+    scenario = coopenv.load_scenario("busy_intersection")
+    assert frame_stride(scenario) == 6
+    assert frame_stride(coopenv.load_scenario("busy_intersection", {"rates.decision": 60.0})) == 3
+    film = GifFilm(tmp_path / "video.gif", fps=15.0)
+    for shade in range(15):
+        film.add(np.full((300, 960, 3), 10 * shade, dtype=np.uint8))
+    film.close()
+    with Image.open(film.path) as image:
+        assert image.size == (GIF_SIZE, 150)
+        duration = 0
+        for frame in range(image.n_frames):
+            image.seek(frame)
+            duration += image.info["duration"]
+    assert duration == 1000
+
+
+def test_figures_of_the_table() -> None:
+    assert [figure(x) for x in (math.nan, 0.0, 12.34, 3e-5, 0.5)] == ["-", "0", "12.3", "3.0e-05", "0.5"]
+    assert [seconds(x) for x in (math.nan, 2.9333)] == ["never", "2.93 s"]
+    assert [percent(x) for x in (math.nan, 1.0, 0.99999, 0.00001, 0.0)] == ["-", "100", "99.9", "0.1", "0"]

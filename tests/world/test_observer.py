@@ -1,0 +1,214 @@
+"""The observer inside the world against the splitting oracle tick by tick, and against the continuous solution."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from coopenv.scenario import load_scenario
+from coopenv.world.world import World
+from tests.oracles import continuous, splitting
+from tests.world.builders import (
+    constant,
+    errors,
+    estimated_position,
+    from_oracle,
+    run,
+    same_bits,
+    scenario,
+    start,
+    vehicle,
+)
+
+LEVER = (0.3, -0.1, 0.2)
+
+
+def case(k: float, angle: float = 0.3) -> continuous.Scenario:
+    """Return three turning vehicles with a camera off their origin and a landmark that moves."""
+    made = continuous.small_error_case(k, 10.0, lever_arm=LEVER, angle=angle, offset=0.5)
+    velocity = np.zeros((4, 3))
+    velocity[2] = [-0.2, 0.1, 0.05]
+    return replace(made, landmark_velocity=velocity)
+
+
+def assert_follows_oracle(described: continuous.Scenario, ticks: int, rate: float, tolerance: float) -> None:
+    world = start(from_oracle(described, rate))
+    reference = splitting.run(described, ticks / rate, rate)
+    for s, state in enumerate(run(world, ticks)):
+        assert_allclose(state["estimate_rotation"][0], reference.R_hat[s], atol=tolerance, err_msg=f"tick {s}")
+        assert_allclose(state["estimate_position"][0], reference.p_hat[s], atol=tolerance, err_msg=f"tick {s}")
+        assert_allclose(state["covariance"][0], reference.P[s], atol=tolerance, err_msg=f"tick {s}")
+
+
+@pytest.mark.parametrize("k", [0.6, 1.0, 5.0, 80.0])
+def test_two_hundred_ticks_equal_the_splitting_oracle(k: float) -> None:
+    assert_follows_oracle(case(k), 200, 60.0, 1e-9)
+
+
+@pytest.mark.parametrize("k", [1.0, 80.0])
+@pytest.mark.parametrize("rate", [10.0, 100.0])
+def test_other_rates_equal_the_splitting_oracle(k: float, rate: float) -> None:
+    assert_follows_oracle(case(k), 30, rate, 1e-9)
+
+
+def test_large_turns_are_relinearised_as_in_the_oracle() -> None:
+    """The paper's start: the first ticks take many sub-steps each."""
+    assert_follows_oracle(continuous.busy_intersection(), 40, 60.0, 1e-7)
+    assert_follows_oracle(replace(continuous.busy_intersection(), k=5.0), 15, 60.0, 1e-7)
+
+
+def test_gains_per_vehicle_and_per_target() -> None:
+    """One vehicle per gain equals the vehicles one by one; weights as in the oracle's information."""
+    described = case(1.0)
+    settings = from_oracle(described, 60.0)
+    mixed = settings.model_copy(update={"observer": settings.observer.model_copy(update={"k": (0.7, 1.0, 6.0)})})
+    weights = {"L1": 3.0, "L3": 40.0, "vehicle_1": 2.5}
+    weighted = mixed.model_copy(update={"observer": mixed.observer.model_copy(update={"q": weights})})
+    world = start(weighted)
+    state = run(world, 1)[1]
+    q = np.array([3.0, 10.0, 40.0, 10.0, 2.5, 10.0, 10.0])
+    positions = []
+    for i, targets in enumerate(described.neighbours):
+        x = splitting.initial_estimate(described.R_hat[i], described.position_hat[i], described.P0)
+        known = np.concatenate([described.landmark_positions(1 / 60), *(p[None] for p in positions)])
+        x, _ = splitting.tick(
+            x,
+            described.angular_velocity[i],
+            described.velocity[i],
+            described.bearings(1 / 60, i),
+            known[list(targets)],
+            1 / 60,
+            (0.7, 1.0, 6.0)[i],
+            q[list(targets)],
+            described.V,
+            LEVER,
+        )
+        positions.append(x.position)
+        assert_allclose(state["covariance"][0, i], x.P, atol=1e-9)
+        assert_allclose(estimated_position(state)[0, i], x.position, atol=1e-9)
+
+
+@pytest.mark.parametrize(("k", "q"), [(1.0, 10.0), (5.0, 10.0), (80.0, 25.0)])
+def test_error_against_the_continuous_observer_falls_with_the_step(k: float, q: float) -> None:
+    described = continuous.small_error_case(k, q, lever_arm=LEVER, angle=0.02, offset=0.05)
+    reference = continuous.solve(described, 2.0, method="LSODA", sample=0.5)
+    found = []
+    for rate in (30, 120, 480):
+        states = run(start(from_oracle(described, rate)), 2 * rate)[:: rate // 2]
+        truth = [described.pose(t)[1] for t in reference.t]
+        position = [p - estimated_position(s)[0] for p, s in zip(truth, states, strict=True)]
+        attitude = [s["estimate_rotation"][0] for s in states]
+        covariance = [s["covariance"][0] for s in states]
+        found.append(
+            [
+                np.abs(np.array(position) - reference.position_error).max(),
+                np.abs(np.array(attitude) - reference.R_hat).max(),
+                np.abs(np.array(covariance) - reference.P).max(),
+            ]
+        )
+    coarse, middle, fine = np.array(found)
+    assert (fine < [3e-4, 3e-4, 3e-3]).all()
+    for rough, smooth in ((coarse, middle), (middle, fine)):
+        assert ((smooth < 0.6 * rough) | (smooth < 1e-7)).all()
+
+
+@cache
+def busy_reference() -> continuous.Result:
+    return continuous.solve(continuous.busy_intersection(), 50.0)
+
+
+@pytest.mark.parametrize("rate", [30.0, 60.0, 100.0])
+def test_busy_intersection_settles_like_the_continuous_observer(rate: float) -> None:
+    overrides = {"noise.enabled": False, "rates.camera": rate}
+    world = start(load_scenario("busy_intersection", overrides))
+    ticks = round(50.0 * rate)
+    states = run(world, ticks)
+    position, angle = (np.array(x)[:, 0] for x in zip(*(errors(world, s) for s in states), strict=True))
+    settled = continuous.settle_times(np.arange(ticks + 1) / rate, np.eye(3)[0] * position[..., None], angle)
+    expected = busy_reference().settle_times()
+    assert (np.abs(settled - expected) <= np.maximum(0.1 * expected, 0.5)).all(), (settled, expected)
+    assert position[-1].max() < 1e-6
+    assert angle[-1].max() < 1e-5
+
+
+def test_mirrored_start_ends_in_the_mirror() -> None:
+    world = start(load_scenario("busy_intersection_mirror", {"noise.enabled": False}))
+    world.advance(3000)
+    assert world.get_state()["tick"][0] == 3000
+    assert errors(world, world.get_state())[1].min() > 150.0
+
+
+def test_float32_settles_too() -> None:
+    world = start(load_scenario("busy_intersection", {"noise.enabled": False}), dtype="float32")
+    world.advance(3000)
+    position, angle = errors(world, world.get_state())
+    assert position.max() < 1e-3
+    assert angle.max() < 1e-2
+
+
+def test_truth_is_an_equilibrium() -> None:
+    described = replace(case(5.0), position_hat=case(5.0).position, R_hat=case(5.0).R)
+    world = start(from_oracle(described, 60.0))
+    world.advance(600)
+    position, angle = errors(world, world.get_state())
+    assert position.max() < 1e-10
+    assert angle.max() < 1e-8
+
+
+def standing(**sections: object) -> World:
+    estimate = {"position_offset": [0.4, -0.3, 0.2], "orientation_offset_wxyz": [0.98, 0.0, 0.0, 0.198997487]}
+    return start(scenario([vehicle(initial_estimate=estimate)], **sections))
+
+
+def test_slow_observer_corrects_at_its_own_rate_for_as_long() -> None:
+    """At 20 Hz over 60 Hz frames: two ticks of prediction, then one correction over three ticks."""
+    world = standing(rates={"observer": 20.0})
+    states = run(world, 6)
+    P0 = states[0]["covariance"][0, 0]
+    V = np.diag([0.1] * 3 + [1.0] * 3)
+    assert_allclose(states[2]["covariance"][0, 0], P0 + 2 / 60 * V, rtol=1e-13)
+    assert [int(s["corrected_tick"][0, 0]) for s in states] == [0, 0, 0, 3, 3, 3, 6]
+    position = states[0]["position"][0, -1]
+    x = splitting.initial_estimate(
+        states[0]["estimate_rotation"][0, 0], estimated_position(states[0])[0, 0], P0 + 3 / 60 * V
+    )
+    landmarks = states[0]["position"][0, :4]
+    bearings = (landmarks - position) / np.linalg.norm(landmarks - position, axis=1, keepdims=True)
+    x, _ = splitting.correct(x, bearings, landmarks, 10.0, 1.0, 3 / 60)
+    assert_allclose(states[3]["covariance"][0, 0], x.P, atol=1e-9)
+    assert_allclose(states[3]["estimate_rotation"][0, 0], x.R, atol=1e-9)
+
+
+def test_dead_reckoning_only_predicts() -> None:
+    world = start(
+        scenario(
+            [vehicle(motion=constant([0.5, 0, 0], [0, 0, 0.3]), initial_estimate={"position_offset": [0.4, 0, 0]})],
+            observer={"name": "dead_reckoning"},
+        )
+    )
+    world.advance(600)
+    state = world.get_state()
+    position, angle = errors(world, state)
+    assert_allclose(position, 0.4, atol=1e-10)
+    assert angle.max() < 1e-10
+    assert_allclose(state["covariance"][0, 0], np.diag([1.0 + 1.0] * 3 + [100.0 + 10.0] * 3), atol=1e-10)
+
+
+def test_prediction_does_not_look_at_the_truth() -> None:
+    """With nothing in range, a vehicle that is carried away unnoticed goes on as before."""
+    world = standing(topology={"mode": "sensed"}, camera={"range": 1e-3})
+    world.advance(3)
+    saved = world.get_state()
+    found = []
+    for shift in (0.0, 5.0):
+        moved = {**saved, "position": saved["position"] + shift * np.eye(5)[-1][:, None]}
+        world.set_state(moved)
+        world.advance(5)
+        assert_allclose(world.get_state()["position"], moved["position"])
+        found.append(world.get_state())
+    for name in ("estimate_rotation", "estimate_position", "covariance"):
+        assert same_bits(found[0][name], found[1][name])

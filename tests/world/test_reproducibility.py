@@ -1,0 +1,184 @@
+"""Same seed, same world: whatever the batch, the neighbours in it, and where a run was interrupted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coopenv.errors import DeviceError
+from coopenv.scenario import Scenario
+from coopenv.world.world import World
+from tests.world.builders import command, constant, same_bits, scenario, start, vehicle
+from tests.world.calls import DTYPES
+
+State = dict[str, np.ndarray]
+
+
+def noisy() -> Scenario:
+    """Return a world that uses every stream: spreads, noise, misses, losses, driven and prescribed vehicles."""
+    pose = {"yaw": 0.3, "position_spread": [0.5, 0.3, 0.1], "yaw_spread": 0.2}
+    estimate = {"position_radius": 1.0, "orientation_angle": "uniform"}
+    driven = {"initial_estimate": estimate, "motion": {"kind": "driven", "initial_speed": 0.5}}
+    return scenario(
+        [
+            {"initial_pose": {"position": [0.0, 0.0, 0.5], **pose}, **driven},
+            {"initial_pose": {"position": [-3.0, -2.0, 0.2], **pose}, **driven},
+            vehicle((2.0, -4.0, 0.5), initial_estimate=estimate, motion=constant([0.3, 0, 0], [0, 0, 0.2])),
+        ],
+        horizon=5.0,
+        noise={"velocity": 0.1, "angular_velocity": 0.05, "bearing": {"scale": 0.01}},
+        camera={"miss_probability": 0.2, "position": [0.2, 0.0, 0.1]},
+        v2x={"delay": 2, "loss": 0.3},
+    )
+
+
+def assert_same(a: State, b: State, rows_a: object = slice(None), rows_b: object = slice(None)) -> None:
+    assert a.keys() == b.keys()
+    for name in a:
+        assert same_bits(a[name][rows_a], b[name][rows_b]), name
+
+
+def played(world: World, ticks: int = 300) -> State:
+    """Drive by actions that differ between vehicles and decisions, not between worlds."""
+    for decision in range(ticks // 6):
+        command(world, np.array([[0.2, 0.4], [-0.3, -0.5], [0, 0]]) * np.cos(decision))
+        world.advance(6)
+    return world.get_state()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_world_does_not_know_its_batch(dtype: str) -> None:
+    alone = played(start(noisy(), [123 + 17], dtype))
+    many = played(start(noisy(), range(123, 123 + 64), dtype))
+    assert_same(alone, many, slice(0, 1), slice(17, 18))
+    assert alone["tick"][0] == 300
+    for name in ("position", "estimate_position", "odometry_velocity", "bearing"):
+        assert len(np.unique(many[name].reshape(64, -1), axis=0)) == 64, name
+
+
+def test_the_same_run_twice_in_one_world() -> None:
+    world = start(noisy(), [3, 4])
+    first = played(world)
+    world.reset([3, 4])
+    assert_same(first, played(world))
+
+
+def test_reset_leaves_nothing_of_the_last_episode() -> None:
+    world = start(noisy(), [3, 4])
+    fresh = world.get_state()
+    played(world)
+    world.reset([3, 4])
+    again = world.get_state()
+    again["actions"] = fresh["actions"]
+    assert_same(fresh, again)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2**31, 2**32 + 1, 2**63, 2**64 - 1])
+def test_seeds_of_every_size(seed: int) -> None:
+    assert_same(played(start(noisy(), [seed]), 30), played(start(noisy(), [seed]), 30))
+    assert start(noisy(), [seed]).get_state()["seed"][0] == seed
+
+
+def test_large_seeds_differ_in_their_upper_half() -> None:
+    low, high = start(noisy(), [5]).get_state(), start(noisy(), [5 + 2**32]).get_state()
+    assert not np.allclose(low["position"], high["position"])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_reset_by_mask_touches_the_masked_only(dtype: str) -> None:
+    world = start(noisy(), range(8), dtype)
+    before = played(world, 60)
+    mask = np.array([True, False, True, False, False, True, False, False])
+    world.reset(mask=mask)
+    after = world.get_state()
+    assert_same(before, after, ~mask, ~mask)
+    assert (after["tick"] == np.where(mask, 0, 60)).all()
+    assert (after["episode"] == mask).all()
+    straight = start(noisy(), range(8), dtype)
+    played(straight, 60)
+    assert_same(played(world, 60), played(straight, 60), ~mask, ~mask)
+
+
+def test_reset_by_mask_with_seeds() -> None:
+    world = start(noisy(), range(4))
+    played(world, 30)
+    world.reset([100, 101, 102, 103], mask=np.array([False, True, False, False]))
+    assert world.get_state()["seed"].tolist() == [0, 101, 2, 3]
+    fresh = start(noisy(), [101])
+    command(fresh, world.get_state()["actions"][1:2])
+    assert_same(world.get_state(), fresh.get_state(), slice(1, 2))
+
+
+def test_the_next_episode_differs_and_is_reproducible() -> None:
+    world, twin = start(noisy(), [9]), start(noisy(), [9])
+    first = world.get_state()
+    world.reset()
+    second = world.get_state()
+    assert second["episode"][0] == 1
+    assert second["seed"][0] == 9
+    assert not np.allclose(first["start_position"][0, 4:6], second["start_position"][0, 4:6])
+    assert not np.allclose(first["estimate_rotation"], second["estimate_rotation"])
+    assert not np.allclose(played(start(noisy(), [9]), 6)["odometry_velocity"], played(world, 6)["odometry_velocity"])
+    played(twin, 120)  # where an episode ends does not change the next one
+    twin.reset()
+    assert same_bits(twin.get_state()["start_position"], second["start_position"])
+    assert same_bits(twin.get_state()["estimate_position"], second["estimate_position"])
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_saved_state_continues_as_if_nothing_happened(dtype: str) -> None:
+    world = start(noisy(), [1, 2], dtype)
+    played(world, 90)
+    saved = world.get_state()
+    straight = played(world, 60)
+    other = start(noisy(), [77, 78], dtype)
+    played(other, 42)
+    other.set_state(saved)
+    assert_same(saved, other.get_state())
+    assert_same(straight, played(other, 60))
+
+
+def test_saved_state_is_a_copy() -> None:
+    world = start(noisy(), [1])
+    saved = world.get_state()
+    kept = {name: value.copy() for name, value in saved.items()}
+    played(world, 30)
+    assert_same(saved, kept)
+
+
+def test_set_state_names_what_is_wrong() -> None:
+    world = start(noisy(), [1])
+    saved = world.get_state()
+    for name in saved:
+        with pytest.raises(ValueError, match=name):
+            world.set_state({k: v for k, v in saved.items() if k != name})
+        with pytest.raises(ValueError, match=name):
+            world.set_state({**saved, name: np.concatenate([saved[name], saved[name]])})
+
+
+def test_worlds_stop_at_their_horizon() -> None:
+    world = start(noisy(), [1, 2])
+    world.advance(200)
+    world.reset(mask=np.array([False, True]))
+    world.advance(200)
+    assert world.get_state()["tick"].tolist() == [300, 200]
+    ended = world.get_state()
+    world.advance(60)
+    assert_same(ended, world.get_state(), slice(0, 1), slice(0, 1))
+
+
+def test_ticks_may_be_advanced_one_by_one_or_together() -> None:
+    together, single = start(noisy(), [6]), start(noisy(), [6])
+    together.advance(60)
+    for _ in range(60):
+        single.advance(1)
+    assert_same(together.get_state(), single.get_state())
+
+
+def test_what_cannot_be_built() -> None:
+    with pytest.raises(ValueError, match="num_worlds must be at least 1, got 0"):
+        World(noisy(), 0)
+    with pytest.raises(DeviceError, match="did you mean 'float32'"):
+        World(noisy(), 1, "float23")
+    with pytest.raises(DeviceError, match="unknown device 'gpu'"):
+        World(noisy(), 1, "float32", "gpu")

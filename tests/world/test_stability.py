@@ -1,0 +1,137 @@
+"""P stays finite, symmetric and positive definite, and the estimate finite, whatever is seen and however stiff."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coopenv.scenario import Scenario
+from coopenv.world.world import World
+from tests.world.builders import LANDMARKS, constant, landmark, scenario, start, vehicle
+
+NOISE = {
+    "velocity": 0.05,
+    "angular_velocity": 0.02,
+    "bearing": {"model": "isotropic", "scale": 0.01},
+}
+MIXED_ERRORS = (
+    {"position_radius": 0.5, "orientation_angle": 0.2},
+    {"position_radius": 10.0, "orientation_angle": "uniform"},
+    {"position_offset": [30.0, -20.0, 10.0], "orientation_offset_wxyz": [0.0, 0.0, 0.0, 1.0]},
+)
+
+
+def circling(miss: float = 0.5, **observer: object) -> Scenario:
+    """Return three vehicles on circles that lose detections and messages at random."""
+    vehicles = [
+        vehicle(
+            (1.5 * i, -1.0 * i, 0.5),
+            yaw=0.7 * i,
+            motion=constant([0.4, 0.0, 0.0], [0.0, 0.0, 0.2 + 0.1 * i]),
+            initial_estimate=error,
+        )
+        for i, error in enumerate(MIXED_ERRORS)
+    ]
+    return scenario(
+        vehicles,
+        noise=NOISE,
+        camera={"orientation": "body", "miss_probability": miss, "position": [0.3, 0.0, 0.2]},
+        v2x={"delay": 1, "loss": 0.3},
+        observer={"q": 25.0, **observer},
+    )
+
+
+def assert_healthy(world: World) -> None:
+    state = world.get_state()
+    P, R, p = state["covariance"], state["estimate_rotation"], state["estimate_position"]
+    assert np.isfinite(P).all()
+    assert (np.swapaxes(P, -1, -2) == P).all()
+    P = P.astype(float)
+    diagonal = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
+    assert np.isfinite(diagonal).all()
+    assert (diagonal > 0.0).all()
+    correlation = P / (diagonal[..., :, None] * diagonal[..., None, :])
+    assert np.linalg.eigvalsh(correlation).min() > 0.0
+    assert np.isfinite(p).all()
+    R = R.astype(float)
+    slack = 1e-12 if world.precision.name == "float64" else 3e-6
+    assert np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max() < slack
+    assert np.linalg.det(R).min() > 0.5
+
+
+def watch(world: World, ticks: int, every: int) -> None:
+    for _ in range(ticks // every):
+        world.advance(every)
+        assert_healthy(world)
+    assert (world.get_state()["tick"] == ticks // every * every).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_stiff_gain_over_ten_minutes_of_random_visibility(dtype: str) -> None:
+    watch(start(circling(k=80.0), range(3), dtype), 36000, 60)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("k", [0.6, 1.0, 80.0, 1000.0])
+def test_any_gain_over_a_minute_tick_by_tick(k: float, dtype: str) -> None:
+    world = start(circling(k=k), range(4), dtype)
+    watch(world, 600, 1)
+    for _ in range(50):
+        world.advance(60)
+        assert_healthy(world)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("k", [1.0, 80.0])
+def test_almost_never_a_target_in_view(k: float, dtype: str) -> None:
+    watch(start(circling(miss=0.999, k=k), range(4), dtype), 12000, 30)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("k", [1.0, 80.0])
+def test_nothing_in_view_then_everything(k: float, dtype: str) -> None:
+    """Ten minutes blind, then every target at once."""
+    world = start(circling(miss=1.0, k=k), range(4), dtype)
+    watch(world, 36000, 6000)
+    growth = 600.0 * np.array([0.1] * 3 + [1.0] * 3)
+    P = world.get_state()["covariance"]
+    np.testing.assert_allclose(
+        np.diagonal(P, axis1=-2, axis2=-1), np.broadcast_to([1.0] * 3 + [100.0] * 3 + growth, (4, 3, 6)), rtol=2e-3
+    )
+    seeing = start(circling(miss=0.0, k=k), range(4), dtype)
+    seeing.set_state(world.get_state())
+    for _ in range(300):
+        seeing.advance(1)
+        assert_healthy(seeing)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("k", [1.0, 80.0])
+def test_one_landmark_only(k: float, dtype: str) -> None:
+    """Unobservable for ever: P grows along what one bearing cannot tell."""
+    made = scenario(
+        [vehicle(motion=constant([0.2, 0, 0]), initial_estimate=MIXED_ERRORS[0])],
+        landmarks=[landmark("only", LANDMARKS[0])],
+        noise=NOISE,
+        observer={"k": k, "q": 25.0},
+    )
+    watch(start(made, range(4), dtype), 6000, 20)
+
+
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_tiny_and_huge_initial_covariances(dtype: str) -> None:
+    for p0 in ([1e-6, 1e-6], [1e3, 1e5], [1e-6, 1e4]):
+        watch(start(circling(k=80.0, P0=p0), range(4), dtype), 300, 1)
+
+
+def test_far_origin_in_float32() -> None:
+    """1 km from the map's origin, where M's condition number passes 1e12."""
+    far = np.array([1000.0, -500.0, 0.0])
+    made = scenario(
+        [vehicle(far, motion=constant([0.4, 0.0, 0.0], [0.0, 0.0, 0.3]), initial_estimate=MIXED_ERRORS[0])],
+        landmarks=[landmark(f"L{i}", (far + p).tolist()) for i, p in enumerate(LANDMARKS)],
+        noise=NOISE,
+        observer={"k": 80.0, "q": 25.0},
+    )
+    watch(start(made, range(4), "float32"), 3600, 10)
