@@ -1,4 +1,4 @@
-"""The command line: `coopenv list | describe | schema | run`."""
+"""The command line: `coopenv list | describe | schema | run | bench`."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def run(
     out: Annotated[Path | None, typer.Option(help="Folder of the results (default: out/ENV).")] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, ...")] = "cpu",
     dtype: Annotated[str, typer.Option(help="float32 or float64.")] = "float64",
-    policy: Annotated[str, typer.Option(help="Of driven vehicles: zero or random.")] = "zero",
+    policy: Annotated[str, typer.Option(help="Of driven vehicles: zero, random, or the name of an agent.")] = "zero",
     steady_from: Annotated[
         float | None,
         typer.Option(help="Start of the steady state in s (default: 70 % of the horizon).", show_default=False),
@@ -140,6 +140,53 @@ def run(
     )
     if not execute(request, console(), console(stderr=True)):
         raise typer.Exit(INTERRUPTED)
+
+
+bench = typer.Typer(help="Measure: steps per second, drivers.", no_args_is_help=True)
+app.add_typer(bench, name="bench")
+
+
+@bench.command("speed")
+def bench_speed(
+    environment: Annotated[str, typer.Argument(metavar="ENV", help="Environment to step.")] = "busy_intersection",
+    seconds: Annotated[float, typer.Option(min=0.01, help="Time per case and round.")] = 1.0,
+    repeats: Annotated[int, typer.Option(min=1, help="Rounds, of which the median counts.")] = 5,
+) -> None:
+    """Measure steps per second, alternating between cases in one process."""
+    load(environment, {})
+    from coopenv.bench.speed import measure, own_cases
+    from coopenv.bench.tables import speed_table
+    from coopenv.runs.command import progress
+
+    with progress(console(stderr=True)) as bar:
+        task = bar.add_task("compiling and measuring", total=None)
+        results = measure(
+            own_cases(environment), seconds, repeats, lambda share: bar.update(task, total=1, completed=share)
+        )
+    console().print(speed_table(results))
+
+
+@bench.command("agents")
+def bench_agents(
+    agents: Annotated[list[str] | None, typer.Argument(metavar="[AGENT]...", help="Default: all.")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Episodes, seeds 0, 1, ...")] = 20,
+) -> None:
+    """Let drivers cross their environments: who arrives, who collides, who knows where it is."""
+    from coopenv.api.parallel_env import parallel_env
+    from coopenv.bench.agents import play, score
+    from coopenv.bench.tables import score_table
+    from coopenv.policies import list_agents, load_agent, read_card
+    from coopenv.runs.command import progress
+
+    rows = []
+    for agent in agents or list_agents():
+        for name in read_card(agent).environments:
+            env = parallel_env(name)
+            policy = load_agent(agent, env.observation_layout)
+            with progress(console(stderr=True)) as bar:
+                episodes = bar.track(range(seeds), description=f"{agent} in {name}")
+                rows.append((agent, name, score(play(env, policy, seed) for seed in episodes)))
+    console().print(score_table(rows))
 
 
 def console(stderr: bool = False) -> Console:

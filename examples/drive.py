@@ -7,7 +7,7 @@ import coopenv
 from coopenv.policies import load_agent
 
 env = coopenv.parallel_env("urban_crossing")
-driver = load_agent("give_way", env)
+driver = load_agent("give_way", env.observation_layout)
 observations, infos = env.reset(seed=1)
 total = dict.fromkeys(env.possible_agents, 0.0)
 while env.agents:

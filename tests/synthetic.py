@@ -19,9 +19,7 @@ RATE = np.array([1.2, 0.7, 0.5, 0.4, 0.2])  # 1/s
 NEIGHBOURS = ((0, 1, 2), (1, 2, 3), (1, 2, 4), (2, 4, 5), (3, 4, 6))
 
 
-def make_trajectory(
-    ticks: int = 3001, dt: float = 1 / 60, noise: float = 0.0, yaw_rate: float = 0.0
-) -> Trajectory:
+def make_trajectory(ticks: int = 3001, dt: float = 1 / 60, noise: float = 0.0, yaw_rate: float = 0.0) -> Trajectory:
     """Return five vehicles at constant velocity that estimate their poses ever better.
 
     Args:

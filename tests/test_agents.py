@@ -28,7 +28,7 @@ def test_agent_has_a_card_with_results(agent: str) -> None:
 @pytest.mark.parametrize(("agent", "name"), PAIRS)
 def test_agent_drives(agent: str, name: str) -> None:
     env = coopenv.parallel_env(name)
-    policy = load_agent(agent, env)
+    policy = load_agent(agent, env.observation_layout)
     observations, _ = env.reset(seed=1000)
     for _ in range(60):
         actions = {a: policy.act(observations[a]) for a in env.agents}
@@ -38,7 +38,7 @@ def test_agent_drives(agent: str, name: str) -> None:
 
 def test_give_way_arrives_without_touching() -> None:
     env = coopenv.parallel_env("urban_crossing")
-    policy = load_agent("give_way", env)
+    policy = load_agent("give_way", env.observation_layout)
     result = score(play(env, policy, seed) for seed in range(500, 520))
     assert result.collided == 0.0
     assert result.arrived >= 0.95
@@ -54,14 +54,14 @@ class Still:
 def test_bad_agents(tmp_path: Path) -> None:
     env = coopenv.parallel_env("urban_crossing")
     with pytest.raises(coopenv.CoopenvError, match=r"unknown agent 'giveway' \(did you mean 'give_way'\?\)"):
-        load_agent("giveway", env)
+        load_agent("giveway", env.observation_layout)
     (tmp_path / "agent.toml").write_text('title = "x"')
     with pytest.raises(coopenv.CoopenvError, match=r"agent\.toml: description: Field required"):
-        load_agent(str(tmp_path), env)
+        load_agent(str(tmp_path), env.observation_layout)
     card = 'title = "x"\ndescription = "y"\nenvironments = []\nentry = "{}"\n'
     (tmp_path / "agent.toml").write_text(card.format("os:system"))
     with pytest.raises(coopenv.CoopenvError, match=r"entry must be 'coopenv\.module:Class'"):
-        load_agent(str(tmp_path), env)
+        load_agent(str(tmp_path), env.observation_layout)
     (tmp_path / "agent.toml").write_text(card.format("coopenv.policies.give_way:GiveWay") + "[options]\nspeeed = 1\n")
     with pytest.raises(coopenv.CoopenvError, match="speeed"):
-        load_agent(str(tmp_path), env)
+        load_agent(str(tmp_path), env.observation_layout)

@@ -127,7 +127,9 @@ def test_rollout_equality_and_spaces(name: str, observation: Any) -> None:
 
 
 def _flatten(step: Any) -> list[np.ndarray]:
-    return [np.asarray(v) for agent in step[0].values() for v in (agent.values() if isinstance(agent, dict) else [agent])]
+    return [
+        np.asarray(v) for agent in step[0].values() for v in (agent.values() if isinstance(agent, dict) else [agent])
+    ]
 
 
 def test_flat_and_dict_hold_the_same(name: str) -> None:

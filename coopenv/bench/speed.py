@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import median
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ class Case:
     name: str
     worlds: int
     vehicles: int
+    threads: int
     ticks_per_step: int
     dtype: str
     step: Callable[[], None]
@@ -28,7 +30,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Speed:
-    """Median rates of one case on one CPU core."""
+    """Median rates of one case."""
 
     case: Case
     env_steps_per_s: float
@@ -41,9 +43,7 @@ def parallel_env_case(name: str, dtype: str = "float32") -> Case:
     env = parallel_env(name, dtype=dtype)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
-    actions = [
-        {a: rng.uniform(-1, 1, 2).astype(np.float32) for a in env.possible_agents} for _ in range(64)
-    ]
+    actions = [{a: rng.uniform(-1, 1, 2).astype(np.float32) for a in env.possible_agents} for _ in range(64)]
     turn = iter(range(1 << 62))
 
     def step() -> None:
@@ -52,15 +52,15 @@ def parallel_env_case(name: str, dtype: str = "float32") -> Case:
         action = actions[next(turn) % len(actions)]
         env.step({agent: action[agent] for agent in env.agents})
 
-    return Case(
-        f"ParallelEnv {name}", 1, len(env.possible_agents), env.scenario.ticks_per_decision, dtype, step
-    )
+    return Case(f"ParallelEnv {name}", 1, len(env.possible_agents), 1, env.scenario.ticks_per_decision, dtype, step)
 
 
-def engine_case(name: str, worlds: int, dtype: str = "float32", **overrides: object) -> Case:
+def engine_case(
+    name: str, worlds: int, dtype: str = "float32", threads: int | None = None, **overrides: object
+) -> Case:
     """Return the batched core: random actions, observations, rewards, judgements; resets at the horizon."""
     scenario = load_scenario(name, overrides)
-    engine = Engine(scenario, worlds, dtype)
+    engine = Engine(scenario, worlds, dtype, threads=threads)
     engine.reset(range(worlds))
     actions = np.random.default_rng(0).uniform(-1, 1, (worlds, len(scenario.vehicles), 2))
 
@@ -69,10 +69,16 @@ def engine_case(name: str, worlds: int, dtype: str = "float32", **overrides: obj
         if engine.view("truncated")[0, 0]:
             engine.reset()
 
-    return Case(f"batch {name}", worlds, len(scenario.vehicles), scenario.ticks_per_decision, dtype, step)
+    label = f"batch {name}{', sensed' if overrides.get('topology.mode') == 'sensed' else ''}"
+    return Case(label, worlds, len(scenario.vehicles), engine.world.threads, scenario.ticks_per_decision, dtype, step)
 
 
-def measure(cases: list[Case], seconds: float = 1.0, repeats: int = 5) -> list[Speed]:
+def measure(
+    cases: list[Case],
+    seconds: float = 1.0,
+    repeats: int = 5,
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> list[Speed]:
     """Time every case for about `seconds` in each of `repeats` rounds and return median rates."""
     counts = []
     for case in cases:
@@ -84,8 +90,9 @@ def measure(cases: list[Case], seconds: float = 1.0, repeats: int = 5) -> list[S
             runs += 1
         counts.append(max(1, round(runs * seconds / (time.perf_counter() - start))))
     rates: list[list[float]] = [[] for _ in cases]
-    for _ in range(repeats):
+    for round_number in range(repeats):
         for i, case in enumerate(cases):
+            on_progress((round_number + i / len(cases)) / repeats)
             start = time.perf_counter()
             for _ in range(counts[i]):
                 case.step()
@@ -98,11 +105,13 @@ def measure(cases: list[Case], seconds: float = 1.0, repeats: int = 5) -> list[S
 
 def own_cases(name: str = "busy_intersection") -> list[Case]:
     """Return the cases that coopenv's own figures are stated for."""
+    sensed: dict[str, Any] = {"topology.mode": "sensed"}
     return [
         parallel_env_case(name),
-        engine_case(name, 1024),
-        engine_case(name, 1024, **{"topology.mode": "sensed"}),
-        engine_case(name, 1024, "float64"),
+        engine_case(name, 1024, threads=1),
+        engine_case(name, 1024, threads=1, **sensed),
+        engine_case(name, 1024, "float64", threads=1),
+        engine_case(name, 1024, **sensed),
         parallel_env_case("urban_crossing"),
         engine_case("urban_crossing", 1024),
     ]

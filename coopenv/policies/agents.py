@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from coopenv.api.parallel_env import CooperativeLocalisationEnv
+from coopenv.api.layout import Field
 from coopenv.errors import CoopenvError, suggest
 from coopenv.policies.base import Policy
 from coopenv.scenario import data_directory
@@ -65,8 +66,8 @@ def read_card(name_or_path: str | Path) -> AgentCard:
         raise CoopenvError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
-def load_agent(name_or_path: str | Path, env: CooperativeLocalisationEnv) -> Policy:
-    """Return a driver for an environment.
+def load_agent(name_or_path: str | Path, layout: Mapping[str, Field]) -> Policy:
+    """Return a driver that reads observations of a layout (`env.observation_layout`).
 
     Raises:
         CoopenvError: no such agent, its entry lies outside coopenv, or it cannot drive this environment.
@@ -77,7 +78,7 @@ def load_agent(name_or_path: str | Path, env: CooperativeLocalisationEnv) -> Pol
         raise CoopenvError(f"agent '{name_or_path}': entry must be 'coopenv.module:Class', got '{card.entry}'")
     try:
         factory = getattr(import_module(module), attribute)
-        policy: Policy = factory(env.observation_layout, **card.options)
+        policy: Policy = factory(layout, **card.options)
     except (ImportError, AttributeError, TypeError, KeyError) as error:
         raise CoopenvError(f"agent '{name_or_path}' cannot be built: {error}") from None
     return policy

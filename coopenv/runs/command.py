@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import warp as wp
 from rich.console import Console
 from rich.padding import Padding
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
@@ -52,8 +50,6 @@ def execute(request: RunRequest, out: Console, log: Console) -> bool:
     Raises:
         CoopenvError: an argument is not valid, or the results cannot be written.
     """
-    with without_driver_notice():
-        wp.init()
     scenario = request.scenario
     recording = Recording(scenario, request.seed, request.steps, request.dtype, request.device, request.policy)
     if request.policy != "zero" and not scenario.driven:
@@ -177,16 +173,3 @@ def compile_notice(log: Console) -> Iterator[None]:
         yield
     finally:
         timer.cancel()
-
-
-@contextmanager
-def without_driver_notice() -> Iterator[None]:
-    """Mute the native standard error: Warp's library writes to it on every machine without a GPU driver."""
-    saved = os.dup(2)
-    with Path(os.devnull).open("wb") as nothing:
-        os.dup2(nothing.fileno(), 2)
-    try:
-        yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)

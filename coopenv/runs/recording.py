@@ -59,7 +59,7 @@ class Recording:
         self.scenario = scenario
         self.seed = seed
         self.engine = Engine(scenario, 1, dtype, device)
-        self.policy = make_policy(policy, seed) if isinstance(policy, str) else policy
+        self.policy = make_policy(policy, seed, self.engine.layout) if isinstance(policy, str) else policy
         self.policy_name = policy if isinstance(policy, str) else getattr(policy, "__name__", "custom")
         self.ticks_planned = scenario.horizon_ticks
         if steps is not None:
@@ -175,8 +175,8 @@ def record(
         steps: decisions (None: up to the horizon, where a run ends in any case).
         dtype: "float32" or "float64".
         device: "cpu" or a CUDA device.
-        policy: "zero", "random", or a function of the observations (N, D) that returns actions (N, 2); vehicles with
-            prescribed motion ignore their actions.
+        policy: "zero", "random", an agent's name, or a function of the observations (N, D) that returns actions
+            (N, 2); vehicles with prescribed motion ignore their actions.
         on_tick: called with the engine and the tick's number after every tick, 0 included.
 
     Raises:

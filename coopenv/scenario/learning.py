@@ -113,4 +113,6 @@ class Termination(Part):
     """What ends an agent's episode before the horizon."""
 
     collision: bool = True
+    """Touching a building or another body ends the vehicle's episode."""
     arrival: bool = True
+    """Reaching its goal ends the vehicle's episode."""

@@ -51,7 +51,9 @@ class Rates(Part):
     """Rates in Hz; the sensors are asynchronous."""
 
     camera: Positive = 60.0
+    """Frames per second; one frame is one tick."""
     odometry: Positive = 100.0
+    """Samples of the body twist per second, each held until the next."""
     observer: Positive | None = None
     """Rate of the observer's corrections (none: at every camera frame)."""
     decision: Positive = 10.0
@@ -92,6 +94,7 @@ class Noise(Part):
     """Measurement noise."""
 
     enabled: bool = True
+    """False switches off all noise of odometry and bearings."""
     velocity: NonNegative = 0.0
     """Standard deviation of each component of a linear velocity sample, m/s."""
     angular_velocity: NonNegative = 0.0

@@ -12,15 +12,32 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-wp.config.log_level = wp.LOG_ERROR
-
 WORLDS_PER_THREAD = 32
 """Smaller shares are not worth the handing over between threads."""
+
+
+@cache
+def start_warp() -> None:
+    """Initialise Warp without its banner, and without the notice that its library prints where no GPU driver is."""
+    wp.config.log_level = wp.LOG_ERROR
+    try:
+        saved = os.dup(2)
+    except OSError:  # no standard error: nothing to mute
+        wp.init()
+        return
+    with Path(os.devnull).open("wb") as nothing:
+        os.dup2(nothing.fileno(), 2)
+    try:
+        wp.init()
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
 
 
 @cache

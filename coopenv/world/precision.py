@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.errors import DeviceError, suggest
+from coopenv.world.launch import start_warp
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ def check_device(device: str) -> str:
     Raises:
         DeviceError: Warp knows no such device here.
     """
+    start_warp()
     if not isinstance(device, str) or device.split(":")[0] not in ("cpu", "cuda"):
         raise DeviceError(f"unknown device '{device}'; known: cpu, cuda, cuda:0, ...")
     if device.startswith("cuda") and not wp.is_cuda_available():

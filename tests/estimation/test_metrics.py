@@ -92,14 +92,10 @@ def test_error_coordinates_to_first_order() -> None:
 
 def test_synthetic_errors_and_nees_are_recovered() -> None:
     run = make_trajectory(ticks=200, noise=0.02, yaw_rate=0.4)
-    assert_allclose(
-        metrics.position_error(run.position, run.position_estimate), run.position_error, rtol=1e-10
-    )
+    assert_allclose(metrics.position_error(run.position, run.position_estimate), run.position_error, rtol=1e-10)
     angle = metrics.orientation_error_deg(run.rotation, run.rotation_estimate)
     assert_allclose(angle, run.orientation_error, rtol=1e-9)
-    error = metrics.error_coordinates(
-        run.position, run.rotation, run.position_estimate, run.rotation_estimate
-    )
+    error = metrics.error_coordinates(run.position, run.rotation, run.position_estimate, run.rotation_estimate)
     assert_allclose(metrics.nees(error, run.covariance), run.nees, rtol=1e-8)
 
 
@@ -195,14 +191,10 @@ def test_summary_of_the_synthetic_run() -> None:
         assert row["rate_per_s"] == pytest.approx(rate, rel=1e-6)
         mean_square = initial**2 * (math.exp(-80 * rate) - math.exp(-100 * rate)) / (2 * rate * 10)
         assert row["steady_position_rmse_m"] == pytest.approx(math.sqrt(mean_square), rel=0.02)
-        assert row["steady_orientation_rmse_deg"] == pytest.approx(
-            90 / initial * math.sqrt(mean_square), rel=0.02
-        )
+        assert row["steady_orientation_rmse_deg"] == pytest.approx(90 / initial * math.sqrt(mean_square), rel=0.02)
         assert row["final_position_error_m"] == pytest.approx(initial * math.exp(-50 * rate))
         assert row["mirrored"] is False
-    assert rows[3]["mean_targets_in_view"] == pytest.approx(
-        3 - np.mean(np.sin(3 * np.arange(3001) / 60) > 0.97)
-    )
+    assert rows[3]["mean_targets_in_view"] == pytest.approx(3 - np.mean(np.sin(3 * np.arange(3001) / 60) > 0.97))
 
 
 def test_mirror_is_told_by_the_end_of_the_run() -> None:
@@ -222,7 +214,5 @@ def test_json_ready_survives_a_strict_encoder() -> None:
     encoded = json.dumps(metrics.json_ready(value), allow_nan=False)
     assert json.loads(encoded) == {"a": None, "b": [None, 3, [1.0, None]], "c": [True, "x", None]}
     assert all(
-        isinstance(v, str | float | bool)
-        for row in metrics.summarise(make_trajectory(60), 9.0)
-        for v in row.values()
+        isinstance(v, str | float | bool) for row in metrics.summarise(make_trajectory(60), 9.0) for v in row.values()
     )

@@ -46,9 +46,7 @@ def scene(position: np.ndarray, targets: np.ndarray, ticks: int = 61) -> Traject
 
 
 def shifted(run: Trajectory, offset: np.ndarray) -> Trajectory:
-    return dataclasses.replace(
-        run, position=run.position + offset, target_position=run.target_position + offset
-    )
+    return dataclasses.replace(run, position=run.position + offset, target_position=run.target_position + offset)
 
 
 def local_eigenvalue(position: np.ndarray, targets: np.ndarray) -> float:
@@ -128,9 +126,7 @@ def test_degenerate_targets_are_not_observable_even_in_motion(targets: np.ndarra
 
 @given(st.floats(0, 2 * np.pi), st.floats(-8, 8), st.floats(2, 12))
 @settings(max_examples=30, deadline=None)
-def test_danger_cylinder_is_singular_at_rest_and_not_off_it(
-    angle: float, height: float, radius: float
-) -> None:
+def test_danger_cylinder_is_singular_at_rest_and_not_off_it(angle: float, height: float, radius: float) -> None:
     """Three targets on a circle: singular exactly on the cylinder through it, not inside of it."""
     targets = radius * np.array([[np.cos(a), np.sin(a), 0] for a in (0.0, 2.1, 4.2)])
     on = np.array([radius * np.cos(angle), radius * np.sin(angle), height])

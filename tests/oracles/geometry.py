@@ -33,18 +33,14 @@ def point_in_camera(
     return (in_body - np.asarray(lever_arm, float)) @ np.asarray(optical_to_body, float)
 
 
-def bearing(
-    target: ArrayLike, R: ArrayLike, position: ArrayLike, lever_arm: ArrayLike = (0.0, 0.0, 0.0)
-) -> Array:
+def bearing(target: ArrayLike, R: ArrayLike, position: ArrayLike, lever_arm: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
     """Return the body-frame unit vectors from the camera to inertial points (..., 3)."""
     d = (np.asarray(target, float) - np.asarray(position, float)) @ np.asarray(R, float)
     d = d - np.asarray(lever_arm, float)
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
-def project(
-    point: ArrayLike, fx: float, fy: float, cx: float, cy: float, distortion: ArrayLike = ()
-) -> Array:
+def project(point: ArrayLike, fx: float, fy: float, cx: float, cy: float, distortion: ArrayLike = ()) -> Array:
     """Return the pixels (..., 2) of optical-frame points (..., 3); NaN for points that are not in front."""
     point = np.asarray(point, float)
     with np.errstate(divide="ignore", invalid="ignore"):

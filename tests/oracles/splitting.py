@@ -52,9 +52,7 @@ def predict(x: Estimate, omega: ArrayLike, v: ArrayLike, V: ArrayLike, dt: float
     return Estimate(x.R @ exponential(omega * dt), p, F @ x.P @ F.T + np.asarray(V, float) * dt)
 
 
-def information(
-    x: Estimate, bearings: Array, positions: Array, q: Array, lever_arm: Array
-) -> tuple[Array, Array]:
+def information(x: Estimate, bearings: Array, positions: Array, q: Array, lever_arm: Array) -> tuple[Array, Array]:
     """Return M = sum q C^T C (6, 6) and r = sum q C^T (y - C_2 p_hat) (6,) over the visible targets."""
     M, r = np.zeros((6, 6)), np.zeros(6)
     for b, z, weight in zip(bearings, positions, q, strict=True):
@@ -171,9 +169,7 @@ def run(
         landmarks = scenario.landmark_positions(s * dt)
         sent = x if message_delay == 0 else history[max(0, s - message_delay)]
         for i, neighbours in enumerate(scenario.neighbours):
-            positions = [
-                landmarks[j] if j < len(landmarks) else sent[j - len(landmarks)].position for j in neighbours
-            ]
+            positions = [landmarks[j] if j < len(landmarks) else sent[j - len(landmarks)].position for j in neighbours]
             x[i], substeps = tick(
                 x[i],
                 scenario.angular_velocity[i],

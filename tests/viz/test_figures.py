@@ -204,9 +204,7 @@ def test_moving_landmark_has_a_path_and_its_own_label(run: Trajectory) -> None:
     target_position, moving = run.target_position.copy(), run.target_moving.copy()
     target_position[:, 2, 0] += 0.2 * run.t
     moving[2] = True
-    figure = trajectory_figure_2d(
-        dataclasses.replace(run, target_position=target_position, target_moving=moving)
-    )
+    figure = trajectory_figure_2d(dataclasses.replace(run, target_position=target_position, target_moving=moving))
     assert "ML3" in texts(figure) and "SL3" not in texts(figure)
     paths = [x for x in figure.axes[0].lines if x.get_color() == style.DARK_BLUE and len(xdata(x)) > 1]
     assert len(paths) == 1

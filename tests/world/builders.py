@@ -14,7 +14,6 @@ from coopenv.world.world import World
 from tests.oracles import continuous
 
 LANDMARKS = ((3.0, 3.0, 2.0), (-3.0, 2.5, 1.0), (0.5, 4.0, 3.0), (4.0, -2.0, 1.5))
-FIELDS_OF_TIME = ("tick", "episode")
 
 
 def landmark(name: str, position: Sequence[float], **more: Any) -> dict[str, Any]:
@@ -51,8 +50,14 @@ def start(description: Scenario, seeds: Sequence[int] | int = 0, dtype: str = "f
     """Return a world per seed, reset."""
     seeds = [seeds] if isinstance(seeds, int) else list(seeds)
     world = World(description, len(seeds), dtype)
-    world.reset(seeds)
+    reset(world, seeds)
     return world
+
+
+def reset(world: World, seeds: Sequence[int] | None = None, mask: np.ndarray | None = None) -> None:
+    """Start new episodes and let all worlds run on."""
+    world.reset(seeds, mask)
+    world.mask.zero_()
 
 
 def run(world: World, ticks: int) -> list[dict[str, np.ndarray]]:

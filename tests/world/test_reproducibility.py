@@ -8,7 +8,7 @@ import pytest
 from coopenv.errors import DeviceError
 from coopenv.scenario import Scenario
 from coopenv.world.world import World
-from tests.world.builders import command, constant, same_bits, scenario, start, vehicle
+from tests.world.builders import command, constant, reset, same_bits, scenario, start, vehicle
 from tests.world.calls import DTYPES
 
 State = dict[str, np.ndarray]
@@ -59,7 +59,7 @@ def test_a_world_does_not_know_its_batch(dtype: str) -> None:
 def test_the_same_run_twice_in_one_world() -> None:
     world = start(noisy(), [3, 4])
     first = played(world)
-    world.reset([3, 4])
+    reset(world, [3, 4])
     assert_same(first, played(world))
 
 
@@ -67,7 +67,7 @@ def test_reset_leaves_nothing_of_the_last_episode() -> None:
     world = start(noisy(), [3, 4])
     fresh = world.get_state()
     played(world)
-    world.reset([3, 4])
+    reset(world, [3, 4])
     again = world.get_state()
     again["actions"] = fresh["actions"]
     assert_same(fresh, again)
@@ -89,7 +89,7 @@ def test_reset_by_mask_touches_the_masked_only(dtype: str) -> None:
     world = start(noisy(), range(8), dtype)
     before = played(world, 60)
     mask = np.array([True, False, True, False, False, True, False, False])
-    world.reset(mask=mask)
+    reset(world, mask=mask)
     after = world.get_state()
     assert_same(before, after, ~mask, ~mask)
     assert (after["tick"] == np.where(mask, 0, 60)).all()
@@ -102,7 +102,7 @@ def test_reset_by_mask_touches_the_masked_only(dtype: str) -> None:
 def test_reset_by_mask_with_seeds() -> None:
     world = start(noisy(), range(4))
     played(world, 30)
-    world.reset([100, 101, 102, 103], mask=np.array([False, True, False, False]))
+    reset(world, [100, 101, 102, 103], mask=np.array([False, True, False, False]))
     assert world.get_state()["seed"].tolist() == [0, 101, 2, 3]
     fresh = start(noisy(), [101])
     command(fresh, world.get_state()["actions"][1:2])
@@ -112,7 +112,7 @@ def test_reset_by_mask_with_seeds() -> None:
 def test_the_next_episode_differs_and_is_reproducible() -> None:
     world, twin = start(noisy(), [9]), start(noisy(), [9])
     first = world.get_state()
-    world.reset()
+    reset(world)
     second = world.get_state()
     assert second["episode"][0] == 1
     assert second["seed"][0] == 9
@@ -120,7 +120,7 @@ def test_the_next_episode_differs_and_is_reproducible() -> None:
     assert not np.allclose(first["estimate_rotation"], second["estimate_rotation"])
     assert not np.allclose(played(start(noisy(), [9]), 6)["odometry_velocity"], played(world, 6)["odometry_velocity"])
     played(twin, 120)  # where an episode ends does not change the next one
-    twin.reset()
+    reset(twin)
     assert same_bits(twin.get_state()["start_position"], second["start_position"])
     assert same_bits(twin.get_state()["estimate_position"], second["estimate_position"])
 
@@ -159,7 +159,7 @@ def test_set_state_names_what_is_wrong() -> None:
 def test_worlds_stop_at_their_horizon() -> None:
     world = start(noisy(), [1, 2])
     world.advance(200)
-    world.reset(mask=np.array([False, True]))
+    reset(world, mask=np.array([False, True]))
     world.advance(200)
     assert world.get_state()["tick"].tolist() == [300, 200]
     ended = world.get_state()
@@ -182,3 +182,21 @@ def test_what_cannot_be_built() -> None:
         World(noisy(), 1, "float23")
     with pytest.raises(DeviceError, match="unknown device 'gpu'"):
         World(noisy(), 1, "float32", "gpu")
+
+
+def test_a_world_that_was_reset_advances() -> None:
+    world = World(noisy(), 2, "float64")
+    world.reset([1, 2])
+    world.advance(3)
+    assert world.get_state()["tick"].tolist() == [3, 3]
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_threads_change_nothing(dtype: str) -> None:
+    found = []
+    for threads in (1, 2, 5):
+        world = World(noisy(), 11, dtype, threads=threads)
+        reset(world, range(11))
+        found.append(played(world, 60))
+    assert_same(found[0], found[1])
+    assert_same(found[0], found[2])
