@@ -52,7 +52,7 @@ def parallel_env_case(name: str, dtype: str = "float32") -> Case:
         action = actions[next(turn) % len(actions)]
         env.step({agent: action[agent] for agent in env.agents})
 
-    return Case(f"ParallelEnv {name}", 1, len(env.possible_agents), 1, env.scenario.ticks_per_decision, dtype, step)
+    return Case(f"single {name}", 1, len(env.possible_agents), 1, env.scenario.ticks_per_decision, dtype, step)
 
 
 def engine_case(

@@ -29,8 +29,8 @@ def speed_table(results: list[Speed]) -> Table:
     table = _table(
         ("case", "left"),
         ("worlds", ""),
-        ("threads", ""),
-        ("dtype", ""),
+        ("cores", ""),
+        ("type", ""),
         ("env\nsteps/s", ""),
         ("agent\nsteps/s", ""),
         ("vehicle\nticks/s", ""),
@@ -48,13 +48,13 @@ def score_table(rows: list[tuple[str, str, Score]]) -> Table:
     table = _table(
         ("agent", "left"),
         ("environment", "left"),
-        ("episodes", ""),
+        ("runs", ""),
         ("arrived", ""),
         ("collided", ""),
         ("out of\ntime", ""),
         ("return", ""),
-        ("median\nerror", ""),
-        ("95 %\nerror", ""),
+        ("median\nerr [m]", ""),
+        ("95 %\nerr [m]", ""),
     )
     for agent, name, s in rows:
         table.add_row(
@@ -62,8 +62,8 @@ def score_table(rows: list[tuple[str, str, Score]]) -> Table:
             name,
             str(s.episodes),
             *(f"{100 * share:.0f} %" for share in (s.arrived, s.collided, s.under_way)),
-            f"{s.mean_return:.1f} ± {s.std_return:.1f}",
-            f"{s.median_position_error_m:.3f} m",
-            f"{s.p95_position_error_m:.3f} m",
+            f"{s.mean_return:.1f}±{s.std_return:.1f}",
+            f"{s.median_position_error_m:.3f}",
+            f"{s.p95_position_error_m:.3f}",
         )
     return table

@@ -36,7 +36,7 @@ def integrated(motion: list[dict[str, Any]], R0: np.ndarray, p0: np.ndarray, tim
 
         def rate(_: float, y: np.ndarray, v: np.ndarray = v, w: np.ndarray = w) -> np.ndarray:
             A = y[:9].reshape(3, 3)
-            return np.concatenate([np.cross(A, -w).ravel(), A @ v])  # rows of R S(w)
+            return np.concatenate([np.cross(A, w).ravel(), A @ v])  # rows of R S(w)
 
         inside = times[(times >= now) & (times < end)]
         last = min(end, max(times[-1], now) + 1e-9)
