@@ -7,6 +7,7 @@ observations, infos = env.reset(seed=0)
 
 from coopenv.api.parallel_env import CooperativeLocalisationEnv, parallel_env
 from coopenv.api.registration import register_all
+from coopenv.api.vector_env import CooperativeVectorEnv, make_vec
 from coopenv.errors import (
     ActionError,
     CoopenvError,
@@ -24,6 +25,7 @@ __all__ = [
     "ActionError",
     "CoopenvError",
     "CooperativeLocalisationEnv",
+    "CooperativeVectorEnv",
     "DataError",
     "DeviceError",
     "OutputError",
@@ -32,6 +34,7 @@ __all__ = [
     "UnknownEnvironmentError",
     "list_envs",
     "load_scenario",
+    "make_vec",
     "parallel_env",
 ]
 

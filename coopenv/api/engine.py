@@ -98,12 +98,13 @@ class Engine:
         """Return a field of the report, the state or the actions on the host."""
         view = self._views.get(name)
         if view is None:
-            view = self._array(name).numpy()
+            view = self.array(name).numpy()
             if self.world.device == "cpu":
                 self._views[name] = view
         return view
 
-    def _array(self, name: str) -> Any:
+    def array(self, name: str) -> Any:
+        """Return the Warp array of a field of the report or the state, or the actions."""
         if name == "actions":
             return self.world.actions
         return getattr(self.world.state if name in self._state_fields else self.report, name)

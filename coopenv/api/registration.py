@@ -46,6 +46,7 @@ def register_all() -> None:
             gymnasium.register(
                 identity,
                 entry_point="coopenv.api.single_vehicle:SingleVehicleEnv",
+                vector_entry_point="coopenv.api.vector_env:make_rows",
                 kwargs={"name_or_path": name},
             )
         for kind, registry, entry in (

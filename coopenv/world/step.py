@@ -17,6 +17,19 @@ from coopenv.world.v2x import broadcast, deliver
 
 
 @wp.func
+def sound(action: Any):
+    """Return an action clipped to [-1, 1], zero where it is not finite."""
+    one = action.dtype(1.0)
+    result = action - action
+    for axis in range(2):
+        if wp.isfinite(action[axis]):
+            result[axis] = wp.clamp(action[axis], -one, one)
+        else:
+            result[axis] = one - one
+    return result
+
+
+@wp.func
 def command_in_force(model: Any, before: Any, world: int, vehicle: int, action: Any, tick: int):
     """Return what the actuators follow during a tick: after a decision, the last command for the dead time."""
     if (tick - 1) % model.ticks_per_decision < model.dynamics.latency_ticks:
@@ -32,7 +45,8 @@ def move(model: Any, before: Any, after: Any, actions: Any, world: int, tick: in
         if model.motion.kind[agent] == PRESCRIBED:
             prescribe(model, before, after, world, agent, t)
     for vehicle in range(model.vehicles):
-        command = command_in_force(model, before, world, vehicle, actions[world, vehicle], tick)
+        action = sound(actions[world, vehicle])
+        command = command_in_force(model, before, world, vehicle, action, tick)
         measure_motion(model, before, after, world, vehicle, command, tick)
 
 
@@ -51,7 +65,7 @@ def tick_world(model: Any, before: Any, after: Any, actions: Any, world: int):
         broadcast(model, before, after, world, vehicle, tick)
     if tick % model.ticks_per_decision == 0 or tick == model.horizon_ticks:
         for vehicle in range(model.vehicles):
-            after.command[world, vehicle] = actions[world, vehicle]
+            after.command[world, vehicle] = sound(actions[world, vehicle])
     after.tick[world] = tick
 
 

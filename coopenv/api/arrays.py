@@ -1,0 +1,94 @@
+"""Hand arrays of a batch in and out: NumPy copies on the host, or torch tensors that share memory."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import Any, Literal
+
+import numpy as np
+import warp as wp
+
+from coopenv.api.engine import Engine
+from coopenv.errors import ActionError, CoopenvError
+
+ArrayKind = Literal["numpy", "torch"]
+
+
+class Exchange:
+    """Gives fields of an engine as rows (W N, ...) and takes actions as rows."""
+
+    def __init__(self, engine: Engine, kind: ArrayKind | None) -> None:
+        """Choose what arrays look like.
+
+        Args:
+            engine: the batch.
+            kind: "numpy": fresh host arrays; "torch": tensors on the engine's device that share its memory and are
+                overwritten by the next step. None: "numpy" on the CPU, "torch" on CUDA.
+
+        Raises:
+            CoopenvError: another kind, or torch is not installed.
+        """
+        self._engine = engine
+        self._on_cpu = engine.world.device == "cpu"
+        self.kind: ArrayKind = kind if kind is not None else ("numpy" if self._on_cpu else "torch")
+        if self.kind not in ("numpy", "torch"):
+            raise CoopenvError(f"unknown arrays '{kind}'; known: numpy, torch")
+        if self.kind == "torch" and find_spec("torch") is None:
+            raise CoopenvError("arrays='torch' needs torch: pip install 'coopenv[train]'")
+        worlds, vehicles = engine.world.worlds, engine.world.model.vehicles
+        self._rows = worlds * vehicles
+        self._shape = (worlds, vehicles, 2)
+        self._tensors: dict[str, Any] = {}
+
+    def rows(self, name: str) -> Any:
+        """Return a field: a copy on the host, or a tensor that shares memory."""
+        if self.kind == "numpy":
+            view = self._engine.view(name)
+            return view.reshape(self._rows, *view.shape[2:]).copy()
+        tensor = self._tensors.get(name)
+        if tensor is None:
+            whole = wp.to_torch(self._engine.array(name))
+            tensor = self._tensors[name] = whole.reshape(self._rows, *whole.shape[2:])
+        return tensor
+
+    def kept(self, name: str) -> Any:
+        """Return a field as an array that the next step does not touch."""
+        return self.owned(self.rows(name))
+
+    def owned(self, rows: Any) -> Any:
+        """Return rows that `rows()` gave as an array that the next step does not touch."""
+        return rows if self.kind == "numpy" else rows.clone()
+
+    def set_actions(self, actions: Any) -> None:
+        """Take actions (W N, 2), or (W, N, 2), clipped to [-1, 1] by the actuators.
+
+        A tensor that is on the device already is copied there; whether it is finite is not checked, as that would
+        wait for the device: an action that is not finite counts as zero.
+
+        Raises:
+            ActionError: wrong shape or dtype; a host array that is not finite.
+        """
+        shape = tuple(getattr(actions, "shape", np.shape(actions)))
+        if shape not in ((self._rows, 2), self._shape):
+            raise ActionError(f"actions have shape {shape}, expected ({self._rows}, 2)")
+        if self.kind == "torch" and hasattr(actions, "__dlpack__") and not isinstance(actions, np.ndarray):
+            self._set_tensor(actions)
+            return
+        self._engine.set_actions(self._host_actions(actions))
+
+    def _set_tensor(self, actions: Any) -> None:
+        import torch
+
+        if not torch.is_floating_point(actions):
+            raise ActionError(f"actions have dtype {actions.dtype}, expected a float")
+        target = wp.to_torch(self._engine.array("actions"))
+        target.copy_(actions.detach().reshape(self._shape))
+
+    def _host_actions(self, actions: Any) -> np.ndarray:
+        values = np.asarray(actions)
+        if values.dtype.kind not in "fiu":
+            raise ActionError(f"actions have dtype {values.dtype}, expected a float")
+        if not np.isfinite(values).all():
+            row = int(np.flatnonzero(~np.isfinite(values.reshape(self._rows, 2)).all(axis=1))[0])
+            raise ActionError(f"action of row {row} is not finite: {values.reshape(self._rows, 2)[row].tolist()}")
+        return values.reshape(self._shape)

@@ -1,0 +1,288 @@
+"""The batched Gymnasium face: rows are (world, vehicle), for policies that all vehicles share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from coopenv.api.arrays import ArrayKind, Exchange
+from coopenv.api.engine import Engine
+from coopenv.api.layout import Field, action_space, flat_space
+from coopenv.errors import CoopenvError, suggest
+from coopenv.scenario import Scenario, load_scenario
+
+INFO_FIELDS = ("alive", "position_error", "orientation_error", "nees")
+"""Arrays (num_envs,) in every info: m, deg; `alive` is false for a vehicle that had ended before this step."""
+
+
+class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
+    """`num_worlds` worlds; row r is vehicle r % vehicles of world r // vehicles.
+
+    A vehicle that ends (collision, arrival) reports `terminated` once; it stays in its world, parked, with reward 0 and
+    `infos["alive"]` false, until the world is over: at the horizon, or when all its vehicles have ended. Then every row
+    that has not just terminated reports `truncated`, and the world is reset as the autoreset mode says:
+
+    - NEXT_STEP: the following step ignores the actions of these rows and returns the new episode's first observation,
+      reward 0, no flags.
+    - SAME_STEP: the observation returned is already the new episode's; the last one stands in `infos["final_obs"]`
+      with mask `infos["_final_obs"]`.
+    - DISABLED: nothing happens before `reset(options={"reset_mask": mask})`, which takes whole worlds.
+
+    Every reset draws anew. On the CPU results are fresh NumPy arrays; on CUDA they are torch tensors that share the
+    environment's memory, valid until the next step, and `step` does not synchronise with the host.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        name: str,
+        *,
+        num_worlds: int,
+        device: str = "cpu",
+        dtype: str = "float32",
+        autoreset: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        arrays: ArrayKind | None = None,
+        threads: int | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """Build the worlds; use `coopenv.make_vec` to build them by name."""
+        if render_mode not in (None, "rgb_array"):
+            raise CoopenvError(f"unknown render_mode '{render_mode}'; known: None, rgb_array")
+        self.scenario = scenario
+        self.engine = Engine(scenario, num_worlds, dtype, device, threads)
+        self.num_worlds, self.vehicles = num_worlds, len(scenario.vehicles)
+        self.num_envs = num_worlds * self.vehicles
+        self.autoreset = autoreset_mode(autoreset)
+        self.render_mode = render_mode
+        self.metadata = {
+            "name": f"{name}_v0",
+            "autoreset_mode": self.autoreset,
+            "render_modes": ["rgb_array"],
+            "render_fps": scenario.rates.decision,
+        }
+        self.single_observation_space = flat_space(self.engine.layout)
+        self.single_action_space = action_space()
+        self._exchange = Exchange(self.engine, arrays)
+        self._seeded = False
+        self._view: Any = None
+
+    @cached_property
+    def observation_space(self) -> spaces.Space[Any]:  # type: ignore[override]
+        """The batch of `single_observation_space`, built when first asked for (it is as large as the batch)."""
+        return batch_space(self.single_observation_space, self.num_envs)
+
+    @cached_property
+    def action_space(self) -> spaces.Space[Any]:  # type: ignore[override]
+        """The batch of `single_action_space`."""
+        return batch_space(self.single_action_space, self.num_envs)
+
+    @property
+    def observation_layout(self) -> dict[str, Field]:
+        """Name, slice, unit and scale of every field of an observation row."""
+        return dict(self.engine.layout)
+
+    def world_major(self, rows: Any) -> Any:
+        """Return rows (num_envs, ...) as (num_worlds, vehicles, ...), without a copy."""
+        return rows.reshape(self.num_worlds, self.vehicles, *rows.shape[1:])
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Start new episodes.
+
+        Args:
+            seed: world w gets seed + w, or the w-th of a sequence of one per world; None goes on from the last seeds.
+            options: `{"reset_mask": bool array}` of one per row or per world restricts the reset to whole worlds.
+
+        Raises:
+            CoopenvError: a mask that splits a world, or a sequence of the wrong length.
+        """
+        mask = self._world_mask((options or {}).get("reset_mask"))
+        if seed is None and not self._seeded:
+            _, seed = seeding.np_random(None)
+        self._seeded = True
+        self.engine.reset(self._world_seeds(seed), mask)
+        return self._exchange.rows("observation"), self._infos()
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Drive all worlds for one decision period.
+
+        Args:
+            actions: (num_envs, 2) in [-1, 1]; values beyond are clipped.
+
+        Raises:
+            ActionError: wrong shape or dtype, or (host arrays) not finite.
+            CoopenvError: `reset` has not been called.
+        """
+        if not self._seeded:
+            raise CoopenvError("step() called before reset()")
+        self._exchange.set_actions(actions)
+        if self.autoreset == AutoresetMode.NEXT_STEP:
+            self.engine.step_or_restart()
+        else:
+            self.engine.step()
+        flags = [self._exchange.rows(name) for name in ("reward", "terminated", "truncated")]
+        infos = self._infos()
+        if self.autoreset == AutoresetMode.SAME_STEP:
+            self._restart_at_once(infos, flags)
+        return self._exchange.rows("observation"), flags[0], flags[1], flags[2], infos
+
+    def _restart_at_once(self, infos: dict[str, Any], flags: list[Any]) -> None:
+        """Reset what is over, keeping the last observations and the flags of the step."""
+        final = self._exchange.kept("observation")
+        kept = [self._exchange.owned(flag) for flag in flags]
+        infos.update({name: self._exchange.owned(value) for name, value in infos.items()})
+        flags[:] = kept
+        ended = kept[1] | kept[2]
+        infos.update(final_obs=final, _final_obs=ended)
+        infos["final_info"] = {name: infos[name] for name in INFO_FIELDS}
+        infos["_final_info"] = ended
+        self.engine.restart_finished()
+
+    def _infos(self) -> dict[str, Any]:
+        return {name: self._exchange.rows(name) for name in INFO_FIELDS}
+
+    def _world_mask(self, mask: Any) -> np.ndarray | None:
+        if mask is None:
+            return None
+        chosen = np.asarray(mask, dtype=bool)
+        if chosen.shape == (self.num_envs,):
+            by_world = self.world_major(chosen)
+            if (by_world.any(axis=1) != by_world.all(axis=1)).any():
+                world = int(np.flatnonzero(by_world.any(axis=1) != by_world.all(axis=1))[0])
+                raise CoopenvError(f"reset_mask splits world {world}: its {self.vehicles} rows are reset together")
+            chosen = by_world[:, 0]
+        if chosen.shape != (self.num_worlds,):
+            raise CoopenvError(
+                f"reset_mask has shape {chosen.shape}, expected ({self.num_envs},) rows or ({self.num_worlds},) worlds"
+            )
+        return chosen
+
+    def _world_seeds(self, seed: int | Sequence[int] | None) -> list[int] | None:
+        if seed is None:
+            return None
+        if isinstance(seed, int | np.integer):
+            return [int(seed) + world for world in range(self.num_worlds)]
+        seeds = [int(s) for s in seed]
+        if len(seeds) == self.num_envs:
+            seeds = seeds[:: self.vehicles]
+        if len(seeds) != self.num_worlds:
+            raise CoopenvError(f"{len(seeds)} seeds for {self.num_worlds} worlds")
+        return seeds
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Return the top view of world 0, as a tuple of one (H, W, 3) uint8 picture."""
+        if self.render_mode is None:
+            return None
+        if self._view is None:
+            from coopenv.viz.topview import TopView  # matplotlib is loaded by those who draw
+
+            self._view = TopView(self.scenario)
+        return (self._view.draw(self.engine),)
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Return everything that the next step depends on, random streams included."""
+        return self.engine.get_state()
+
+    def set_state(self, state: dict[str, np.ndarray]) -> None:
+        """Go back to what `get_state` returned.
+
+        Raises:
+            CoopenvError: the state belongs to another kind of environment.
+        """
+        try:
+            self.engine.set_state(state)
+        except (KeyError, ValueError) as error:
+            raise CoopenvError(f"this state does not fit {self.metadata['name']}: {error}") from None
+        self._seeded = True
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the renderer."""
+        if self._view is not None:
+            self._view.close()
+            self._view = None
+
+
+def autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    """Return a member of Gymnasium's enumeration for it, its name or its value.
+
+    Raises:
+        CoopenvError: no such mode.
+    """
+    if isinstance(mode, AutoresetMode):
+        return mode
+    known = {m.name.lower(): m for m in AutoresetMode}
+    word = str(mode).lower().replace("-", "_").replace("nextstep", "next_step").replace("samestep", "same_step")
+    if word not in known:
+        raise CoopenvError(f"unknown autoreset '{mode}'{suggest(word, known)}; known: {', '.join(known)}")
+    return known[word]
+
+
+def make_vec(
+    name_or_path: str | Path,
+    *,
+    num_worlds: int,
+    device: str = "cpu",
+    dtype: str = "float32",
+    autoreset: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    overrides: Mapping[str, Any] | None = None,
+    arrays: ArrayKind | None = None,
+    threads: int | None = None,
+    render_mode: str | None = None,
+) -> CooperativeVectorEnv:
+    """Return a batch of worlds as a Gymnasium `VectorEnv` with num_worlds x vehicles rows.
+
+    Args:
+        name_or_path: environment or TOML file.
+        num_worlds: how many worlds.
+        device: "cpu" or a CUDA device.
+        dtype: precision of the worlds; observations and rewards are float32.
+        autoreset: "next_step", "same_step" or "disabled".
+        overrides: dotted scenario keys.
+        arrays: "numpy" (default on the CPU) or "torch" (default on CUDA).
+        threads: shares of the batch on the CPU; None: by size and cores.
+        render_mode: None or "rgb_array".
+
+    Raises:
+        CoopenvError: any argument is not valid.
+    """
+    return CooperativeVectorEnv(
+        load_scenario(name_or_path, overrides),
+        Path(str(name_or_path)).stem,
+        num_worlds=num_worlds,
+        device=device,
+        dtype=dtype,
+        autoreset=autoreset,
+        arrays=arrays,
+        threads=threads,
+        render_mode=render_mode,
+    )
+
+
+def make_rows(
+    name_or_path: str,
+    num_envs: int = 1,
+    vectorization_mode: Literal["vector_entry_point"] | None = None,
+    **options: Any,
+) -> CooperativeVectorEnv:
+    """Entry point of `gymnasium.make_vec("coopenv/...", num_envs=rows)`.
+
+    Raises:
+        CoopenvError: `num_envs` is not a multiple of the vehicles.
+    """
+    vehicles = len(load_scenario(name_or_path, options.get("overrides")).vehicles)
+    if num_envs < 1 or num_envs % vehicles:
+        raise CoopenvError(
+            f"num_envs counts rows (world, vehicle): {num_envs} is not a positive multiple of the {vehicles} vehicles "
+            f"of {name_or_path}"
+        )
+    return make_vec(name_or_path, num_worlds=num_envs // vehicles, **options)

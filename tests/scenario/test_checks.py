@@ -1,0 +1,199 @@
+"""Checks across sections: topology, starts, limits, and warnings where the theory's conditions fail."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from coopenv.errors import ScenarioError
+from coopenv.scenario import Scenario, ScenarioWarning, checks, parse_scenario
+from tests.world import builders
+from tests.world.builders import errors, landmark, run, start, vehicle
+
+
+def fleet(*neighbours: list[str] | None, **sections: Any) -> Scenario:
+    """Parse one vehicle per list of neighbours (None: the default), with warnings as errors off."""
+    vehicles = []
+    for i, names in enumerate(neighbours):
+        vehicles.append(vehicle((2.0 * i, 0, 0)))
+        if names is not None:
+            vehicles[-1]["neighbours"] = names
+    return builders.scenario(vehicles, **sections)
+
+
+def test_default_neighbours_are_all_landmarks_and_leaders() -> None:
+    assert checks.neighbour_sets(fleet(None, None, None)) == [[0, 1, 2, 3], [0, 1, 2, 3, 4], [0, 1, 2, 3, 4, 5]]
+    everyone = checks.neighbour_sets(fleet(None, None, topology={"acyclic": False}))
+    assert everyone == [[0, 1, 2, 3, 5], [0, 1, 2, 3, 4]]
+
+
+@pytest.mark.parametrize(
+    ("neighbours", "order"),
+    [
+        ([["L1"], ["vehicle_1"], ["vehicle_2"]], [0, 1, 2]),
+        ([["vehicle_2"], ["vehicle_3"], ["L1"]], [2, 1, 0]),
+        ([["vehicle_3"], ["L1"], ["L1"]], [1, 2, 0]),
+        ([["vehicle_4"], ["vehicle_1"], ["L1"], ["vehicle_3"]], [2, 3, 0, 1]),
+        ([["L1"], ["L1"], ["L1"]], [0, 1, 2]),
+    ],
+)
+def test_leaders_come_first(neighbours: list[list[str]], order: list[int]) -> None:
+    assert checks.processing_order(fleet(*neighbours)) == order
+
+
+@pytest.mark.parametrize(
+    "neighbours",
+    [
+        [["vehicle_2"], ["vehicle_1"]],
+        [["L1", "vehicle_3"], ["vehicle_1"], ["vehicle_2"]],
+        [["L1"], ["vehicle_3"], ["vehicle_4"], ["L1", "vehicle_2"]],
+    ],
+)
+def test_cycles_are_refused_and_named(neighbours: list[list[str]]) -> None:
+    with pytest.raises(ScenarioError, match=r"topology: the neighbours form a cycle \(vehicle_\d -> .*Assumption 1"):
+        fleet(*neighbours)
+    assert checks.processing_order(fleet(*neighbours, topology={"acyclic": False})) == list(range(len(neighbours)))
+
+
+def test_unknown_neighbours_and_oneself() -> None:
+    with pytest.raises(
+        ScenarioError, match=r"vehicles.1.neighbours: unknown target 'vehicle_11' \(did you mean 'vehicle_1'"
+    ):
+        fleet(None, ["L1", "vehicle_11"])
+    with pytest.raises(ScenarioError, match=r"vehicles.1.neighbours: a vehicle cannot be its own neighbour"):
+        fleet(None, ["L1", "vehicle_2"])
+
+
+def test_gains_must_fit_the_vehicles_and_targets() -> None:
+    with pytest.raises(ScenarioError, match=r"observer.k: 3 values for 2 vehicles"):
+        fleet(None, None, observer={"k": [1.0, 2.0, 3.0]})
+    with pytest.raises(ScenarioError, match=r"observer.q: unknown target 'L9'"):
+        fleet(None, observer={"q": {"L9": 1.0}})
+    assert fleet(None, None, observer={"k": [1.0, 2.0]}).observer.k == (1.0, 2.0)
+
+
+WALL = {"name": "house", "center": [0.0, 0.0, 1.0], "size": [4.0, 2.0, 2.0], "yaw": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("place", "inside"),
+    [((0, 0, 1), True), ((1.6, 0.9, 1), True), ((1.6, -0.9, 1), False), ((0, 0, 2.5), False), ((2.5, 0, 1), False)],
+)
+def test_starts_inside_buildings_are_refused(place: tuple[float, float, float], inside: bool) -> None:
+    data = builders.raw([vehicle((9, 9, 0)), vehicle(place)], obstacles=[WALL])
+    if inside:
+        with pytest.raises(ScenarioError, match=r"vehicles.1.initial_pose: vehicle_2 starts inside obstacle 'house'"):
+            parse_scenario(data, "here")
+    else:
+        parse_scenario(data, "here")
+
+
+def test_the_map_origin_does_not_move_buildings_against_starts() -> None:
+    with pytest.raises(ScenarioError, match="starts inside obstacle"):
+        parse_scenario(builders.raw([vehicle((0, 0, 1))], obstacles=[WALL], map={"origin": [3, 0, 0]}), "here")
+
+
+def test_waypoint_starts_are_checked_too() -> None:
+    points = [{"time": 0, "position": [0, 0, 1]}, {"time": 1, "position": [5, 0, 1]}]
+    with pytest.raises(ScenarioError, match="vehicle_1 starts inside obstacle 'house'"):
+        parse_scenario(builders.raw([{"motion": {"kind": "waypoints", "waypoints": points}}], obstacles=[WALL]), "here")
+
+
+def test_two_vehicles_in_one_place() -> None:
+    with pytest.raises(ScenarioError, match="vehicle_2 starts in the place of vehicle_1"):
+        parse_scenario(builders.raw([vehicle((1, 1, 1)), vehicle((1, 1, 1))]), "here")
+
+
+def test_limits_between_sections() -> None:
+    with pytest.raises(ScenarioError, match=r"dynamics.latency: 0.2 s is longer than one decision \(0.1 s\)"):
+        fleet(None, dynamics={"latency": 0.2})
+    with pytest.raises(ScenarioError, match=r"action.steering: 1 rad is above dynamics.max_steering"):
+        fleet(None, action={"steering": 1.0})
+    fleet(None, dynamics={"latency": 0.1})
+
+
+@pytest.mark.parametrize(
+    ("count", "words"), [(0, "only 0 landmarks"), (1, "only 1 landmark:"), (2, "only 2 landmarks")]
+)
+def test_fewer_than_three_landmarks_warn(count: int, words: str) -> None:
+    landmarks = [landmark(f"L{i}", (i, 2 * i, 1)) for i in range(count)]
+    with pytest.warns(ScenarioWarning, match=words):
+        parse_scenario(builders.raw(landmarks=landmarks), "here")
+
+
+def test_fewer_than_three_neighbours_warn() -> None:
+    data = builders.raw([vehicle(), vehicle((3, 3, 0), neighbours=["L1", "vehicle_1"])])
+    with pytest.warns(ScenarioWarning, match="vehicle_2 has fewer than three neighbours"):
+        parse_scenario(data, "here")
+
+
+def test_a_sound_scenario_does_not_warn() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        parse_scenario(builders.raw(), "here")
+
+
+def shifted(origin: tuple[float, float, float], **sections: Any) -> dict[str, Any]:
+    """Return a noisy scene whose every position is given in the same file coordinates, whatever the map's origin."""
+    estimate = {"position_offset": [0.4, -0.3, 0.2], "orientation_offset_wxyz": [0.98, 0.0, 0.0, 0.198997487]}
+    absolute = {"position": [2.3, -1.2, 0.4], "yaw": 0.2}
+    return builders.raw(
+        [
+            vehicle(initial_estimate=estimate, motion=builders.constant([0.3, 0, 0], [0, 0, 0.2])),
+            vehicle(
+                (2, -1, 0.5), initial_estimate=absolute, body={"size": [0.5, 0.3, 0.3]}, goal={"position": [2, 2, 0]}
+            ),
+        ],
+        obstacles=[{"name": "B", "center": [1.5, 1.5, 1], "size": [0.5, 0.5, 2.0]}],
+        topology={"mode": "sensed"},
+        noise={"velocity": 0.05, "angular_velocity": 0.01, "bearing": {"scale": 0.002}},
+        map={"origin": list(origin)},
+        **sections,
+    )
+
+
+def test_the_origin_moves_the_map_and_nothing_else() -> None:
+    """The truth, sight and bearings are the same scene; the map's coordinates are less the origin."""
+    origin = (1.0, -2.0, 0.5)
+    here, there = (run(start(parse_scenario(shifted(o), "t"), 3), 30) for o in ((0.0, 0.0, 0.0), origin))
+    for a, b in zip(here, there, strict=True):
+        assert_allclose(b["position"], a["position"] - np.array(origin), atol=1e-12)
+        np.testing.assert_array_equal(b["sight"], a["sight"])
+        np.testing.assert_array_equal(b["ended"], a["ended"])
+        assert_allclose(b["bearing"], a["bearing"], atol=1e-12)
+        assert_allclose(b["increment_translation"], a["increment_translation"], atol=1e-14)
+
+
+def test_an_accurate_estimate_does_not_feel_a_small_shift() -> None:
+    """The observer is not invariant to the origin, but its equilibrium is: from the truth nothing moves."""
+    for origin in ((0.0, 0.0, 0.0), (0.5, -0.5, 0.2), (20.0, 10.0, 0.0)):
+        data = shifted(origin, observer={"k": 1.0})
+        data["noise"]["enabled"] = False
+        for v in data["vehicles"]:
+            v["initial_estimate"] = {}
+        world = start(parse_scenario(data, "t"))
+        world.advance(300)
+        position, angle = errors(world, world.get_state())
+        assert position.max() < 1e-11
+        assert angle.max() < 1e-9
+
+
+def test_initial_errors_do_not_depend_on_the_origin() -> None:
+    found = []
+    for origin in ((0.0, 0.0, 0.0), (7.0, -3.0, 1.0)):
+        world = start(parse_scenario(shifted(origin), "t"))
+        found.append(errors(world, world.get_state()))
+    assert_allclose(found[1][0], found[0][0], atol=1e-13)
+    assert_allclose(found[1][1], found[0][1], atol=1e-6)
+
+
+def test_a_far_origin_warns() -> None:
+    with pytest.warns(ScenarioWarning, match=r"landmark 'L1' lies \d+ m from the map origin.*set map.origin"):
+        parse_scenario(builders.raw(map={"origin": [60.0, 0, 0]}), "here")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        parse_scenario(builders.raw(map={"origin": [40.0, 0, 0]}), "here")

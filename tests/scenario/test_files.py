@@ -1,0 +1,169 @@
+"""Finding, reading and overriding scenario files."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from coopenv.errors import ScenarioError, UnknownEnvironmentError
+from coopenv.scenario import ScenarioWarning, list_envs, load_scenario, scenario_path
+
+MINIMAL = """
+title = "t"
+horizon = 5.0
+landmarks = [
+    { name = "A", position = [3.0, 0.0, 1.0] },
+    { name = "B", position = [0.0, 3.0, 1.0] },
+    { name = "C", position = [-3.0, 0.0, 1.0] },
+]
+[vehicle_defaults]
+body.size = [1.0, 0.5, 0.5]
+initial_estimate = { position_radius = 0.3, orientation_angle = 0.1 }
+motion = { kind = "driven" }
+goal.position = [9.0, 0.0, 0.0]
+[[vehicles]]
+initial_pose.position = [0.0, 0.0, 0.0]
+[[vehicles]]
+initial_pose.position = [0.0, -2.0, 0.0]
+initial_estimate.position_radius = 2.0
+body = { size = [2.0, 2.0, 2.0], center = [1.0, 0.0, 0.0] }
+goal.radius = 0.7
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "mine.toml"
+    path.write_text(MINIMAL)
+    return path
+
+
+def test_shipped_environments_load_under_their_names() -> None:
+    names = list_envs()
+    assert {"busy_intersection", "busy_intersection_mirror", "crossing_path", "overtaking"} <= set(names)
+    for name in names:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ScenarioWarning)
+            assert load_scenario(name).title
+        assert scenario_path(name).stem == name
+
+
+def test_unknown_names_and_files(tmp_path: Path) -> None:
+    with pytest.raises(UnknownEnvironmentError, match=r"unknown environment 'busy'.*known: busy_intersection"):
+        load_scenario("busy")
+    with pytest.raises(UnknownEnvironmentError, match=r"did you mean 'busy_intersection'"):
+        load_scenario("busy_intersecton")
+    with pytest.raises(UnknownEnvironmentError, match=r"no such scenario file: .*gone.toml"):
+        load_scenario(tmp_path / "gone.toml")
+    with pytest.raises(UnknownEnvironmentError, match="no such scenario file"):
+        load_scenario(str(tmp_path) + "/")
+
+
+@pytest.mark.parametrize(("content", "words"), [(b"a = ", "not valid TOML"), (b"\xff\xfe = 1", "cannot be read")])
+def test_broken_files(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "broken.toml"
+    path.write_bytes(content)
+    with pytest.raises(ScenarioError, match=f"broken.toml: {words}"):
+        load_scenario(path)
+
+
+def test_vehicle_defaults_merge_below_each_vehicle(file: Path) -> None:
+    first, second = load_scenario(file).vehicles
+    assert first.body is not None
+    assert second.body is not None
+    assert (first.body.size, second.body.size) == ((1.0, 0.5, 0.5), (2.0, 2.0, 2.0))
+    assert second.body.center == (1.0, 0.0, 0.0)
+    assert (first.initial_estimate.position_radius, second.initial_estimate.position_radius) == (0.3, 2.0)
+    assert second.initial_estimate.orientation_angle == 0.1
+    assert first.motion.kind == second.motion.kind == "driven"
+    assert first.goal is not None
+    assert second.goal is not None
+    assert (first.goal.radius, second.goal.radius) == (0.5, 0.7)
+    assert second.goal.position == (9.0, 0.0, 0.0)
+
+
+def test_unknown_keys_in_the_defaults_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_text(MINIMAL.replace("body.size", "bodi.size"))
+    with pytest.raises(ScenarioError, match=r"bad.toml: vehicles.0.bodi: unknown key \(did you mean 'body'"):
+        load_scenario(path)
+
+
+def get(value: Any, path: str) -> Any:
+    for part in path.split("."):
+        value = value[int(part)] if part.isdigit() else getattr(value, part)
+    return value
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "where", "expected"),
+    [
+        ("noise.enabled", False, "noise.enabled", False),
+        ("noise.bearing.scale", 0.01, "noise.bearing.scale", 0.01),
+        ("observer.k", 5, "observer.k", 5.0),
+        ("observer.k", [1, 2], "observer.k", (1.0, 2.0)),
+        ("observer.q", {"A": 3}, "observer.q", {"A": 3.0}),
+        ("horizon", 3, "horizon", 3.0),
+        ("vehicles.0.goal.radius", 0.9, "vehicles.0.goal.radius", 0.9),
+        ("vehicles.1.goal.radius", 0.9, "vehicles.0.goal.radius", 0.5),
+        ("vehicles.vehicle_2.goal.radius", 0.9, "vehicles.1.goal.radius", 0.9),
+        ("vehicles.vehicle_2.goal.radius", 0.9, "vehicles.0.goal.radius", 0.5),
+        ("landmarks.B.position", [0, 4, 1], "landmarks.1.position", (0.0, 4.0, 1.0)),
+        ("landmarks.2.position", [0, -4, 1], "landmarks.2.position", (0.0, -4.0, 1.0)),
+        ("vehicles.0.initial_pose.yaw", 1.5, "vehicles.0.initial_pose.yaw", 1.5),
+        ("v2x.delay", 3, "v2x.delay", 3),
+        ("vehicles.0", {"initial_pose": {"position": [5, 5, 5]}}, "vehicles.0.initial_pose.position", (5.0, 5.0, 5.0)),
+    ],
+)
+def test_overrides(file: Path, key: str, value: Any, where: str, expected: Any) -> None:
+    assert get(load_scenario(file, {key: value}), where) == expected
+
+
+def test_star_means_every_entry(file: Path) -> None:
+    made = load_scenario(file, {"vehicles.*.goal.radius": 0.9, "vehicles.*.initial_estimate.position_radius": 0.0})
+    assert [v.goal.radius for v in made.vehicles if v.goal] == [0.9, 0.9]
+    assert [v.initial_estimate.position_radius for v in made.vehicles] == [0.0, 0.0]
+    assert [v.body.size[0] for v in made.vehicles if v.body] == [1.0, 2.0]
+
+
+def test_later_overrides_win(file: Path) -> None:
+    made = load_scenario(file, {"vehicles.*.goal.radius": 0.9, "vehicles.1.goal.radius": 1.1})
+    assert [v.goal.radius for v in made.vehicles if v.goal] == [0.9, 1.1]
+
+
+def test_overrides_do_not_leak_into_the_next_load(file: Path) -> None:
+    before = load_scenario(file)
+    load_scenario(file, {"vehicles.*.goal.radius": 0.9, "noise.enabled": False, "landmarks.A.position": [1, 1, 1]})
+    assert load_scenario(file) == before
+    shared = load_scenario(file, {"vehicles.0.body.size": [3, 3, 3]})
+    assert shared.vehicles[1].body is not None
+    assert shared.vehicles[1].body.size == (2.0, 2.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        ("noise.enabld", r"noise.enabld: unknown key \(did you mean 'enabled'"),
+        ("nois.enabled", r"nois: unknown key \(did you mean 'noise'"),
+        ("vehicles.7.goal.radius", r"override 'vehicles.7.goal.radius': no entry '7' \(there are 2; 0..1 or \*\)"),
+        ("vehicles.vehicle_3.goal.radius", r"no entry 'vehicle_3'"),
+        ("vehicles.vehicle_0.goal.radius", r"no entry 'vehicle_0'"),
+        ("vehicles.-1.goal.radius", r"no entry '-1'"),
+        ("landmarks.D.position", r"no entry 'D'"),
+        ("landmarks.vehicle_1.position", r"no entry 'vehicle_1'"),
+        ("horizon.length", r"override 'horizon.length': 'length' lies below a plain value"),
+    ],
+)
+def test_wrong_overrides(file: Path, key: str, words: str) -> None:
+    with pytest.raises(ScenarioError, match=words):
+        load_scenario(file, {key: 1.0})
+
+
+def test_override_values_are_checked(file: Path) -> None:
+    with pytest.raises(ScenarioError, match=r"mine.toml: rates.camera: Input should be greater than 0, got -5"):
+        load_scenario(file, {"rates.camera": -5})
+    with pytest.raises(ScenarioError, match="whole multiple of the decision rate"):
+        load_scenario(file, {"rates.camera": 61})

@@ -1,0 +1,110 @@
+"""Motion tables: held twists whose poses chain without gaps, from segments and from splines."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from coopenv.scenario.agents import ConstantMotion, SegmentMotion, StaticMotion, TwistSegment, Waypoint, WaypointMotion
+from coopenv.scenario.motion import TwistTable, compile_motion, left_jacobian, path_heading
+from tests.oracles import continuous
+
+POINTS = [(0.0, (1.0, 2.0, 0.0)), (1.3, (2.5, 2.0, 0.3)), (2.0, (3.0, 3.5, 0.5)), (4.1, (1.0, 5.0, 0.0))]
+
+
+def assert_chained(table: TwistTable, tolerance: float = 1e-12) -> None:
+    """Each segment ends where the next begins."""
+    assert_allclose(table.rotation[0], np.eye(3))
+    assert_allclose(table.position[0], 0.0)
+    for i in range(len(table.start) - 1):
+        h = table.start[i + 1] - table.start[i]
+        w, v = table.angular[i], table.linear[i]
+        R = table.rotation[i] @ Rotation.from_rotvec(w * h).as_matrix()
+        p = table.position[i] + table.rotation[i] @ continuous.left_jacobian(w * h) @ v * h
+        assert_allclose(table.rotation[i + 1], R, atol=tolerance)
+        assert_allclose(table.position[i + 1], p, atol=tolerance)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-6, 0.99e-4, 1.01e-4, 1e-3, 0.1, 3.0])
+def test_left_jacobian(size: float) -> None:
+    w = size * np.array([0.36, -0.48, 0.8])
+    assert_allclose(left_jacobian(w), continuous.left_jacobian(w), atol=2e-9)
+
+
+def test_static_and_constant() -> None:
+    still = compile_motion(StaticMotion(), np.eye(3))
+    assert not still.linear.any()
+    assert not still.angular.any()
+    table = compile_motion(ConstantMotion(linear=(1, 2, 3), angular=(4, 5, 6)), np.eye(3))
+    assert table.linear.tolist() == [[1, 2, 3]]
+    assert table.angular.tolist() == [[4, 5, 6]]
+
+
+def test_segments_chain_and_end_at_rest() -> None:
+    segments = (
+        TwistSegment(duration=0.5, linear=(1, 0, 0)),
+        TwistSegment(duration=1.5, linear=(0.5, 0.1, 0), angular=(0.1, -0.2, 1.0)),
+        TwistSegment(duration=0.25, angular=(0, 0, -3.0)),
+    )
+    table = compile_motion(SegmentMotion(segments=segments), np.eye(3))
+    assert table.start.tolist() == [0.0, 0.5, 2.0, 2.25]
+    assert not table.linear[-1].any()
+    assert not table.angular[-1].any()
+    assert_chained(table)
+
+
+def spline(heading: str = "path", points: list[tuple[float, tuple[float, float, float]]] = POINTS) -> WaypointMotion:
+    return WaypointMotion(waypoints=tuple(Waypoint(time=t, position=p) for t, p in points), heading=heading)
+
+
+@pytest.mark.parametrize("heading", ["path", "fixed"])
+def test_splines_pass_their_waypoints(heading: str) -> None:
+    motion = spline(heading)
+    R0 = Rotation.from_euler("z", path_heading(motion)).as_matrix()
+    table = compile_motion(motion, R0)
+    assert_chained(table, 1e-11)
+    times, places = (np.array(x) for x in zip(*POINTS, strict=True))
+    curve = CubicSpline(times, places, bc_type="natural")
+    in_map = places[0] + table.position @ R0.T
+    assert_allclose(in_map, curve(table.start), atol=1e-10)
+    assert table.start[-1] == pytest.approx(4.1)
+    assert np.diff(table.start).max() < 0.0201
+    assert not table.linear[-1].any()
+    facing = R0 @ table.rotation
+    if heading == "fixed":
+        assert_allclose(facing, np.broadcast_to(R0, facing.shape), atol=1e-12)
+    else:
+        velocity = curve(table.start, 1)[:, :2]
+        assert_allclose(facing[:, :2, 0], velocity / np.linalg.norm(velocity, axis=1, keepdims=True), atol=1e-9)
+
+
+def test_straight_waypoints_drive_straight() -> None:
+    motion = spline(points=[(0.0, (0.0, 0.0, 0.0)), (1.0, (0.0, 1.0, 0.0)), (3.0, (0.0, 3.0, 0.0))])
+    assert path_heading(motion) == pytest.approx(np.pi / 2)
+    table = compile_motion(motion, Rotation.from_euler("z", np.pi / 2).as_matrix())
+    assert_allclose(table.linear[:-1], np.broadcast_to([1.0, 0.0, 0.0], (len(table.start) - 1, 3)), atol=1e-9)
+    assert_allclose(table.angular, 0.0, atol=1e-9)
+
+
+def test_waiting_keeps_the_heading() -> None:
+    """Two equal waypoints in a row: the spline swings a little, but a stop never turns the body about."""
+    points = [(0.0, (0.0, 0.0, 0.0)), (1.0, (1.0, 0.0, 0.0)), (2.0, (2.0, 0.0, 0.0)), (3.0, (3.0, 0.0, 0.0))]
+    table = compile_motion(spline(points=points), np.eye(3))
+    assert_allclose(table.rotation, np.broadcast_to(np.eye(3), table.rotation.shape), atol=1e-12)
+
+
+def test_never_moving_waypoints_stand() -> None:
+    still = [(0.0, (1.0, 1.0, 0.0)), (1.0, (1.0, 1.0, 0.0))]
+    table = compile_motion(spline(points=still), np.eye(3))
+    assert path_heading(spline(points=still)) == 0.0
+    assert_allclose(table.position, 0.0, atol=1e-15)
+
+
+def test_rising_straight_up_has_no_heading() -> None:
+    """Only the horizontal velocity turns the body."""
+    table = compile_motion(spline(points=[(0.0, (0, 0, 0)), (1.0, (0, 0, 2))]), np.eye(3))
+    assert_allclose(table.rotation, np.broadcast_to(np.eye(3), table.rotation.shape), atol=1e-12)
+    assert_allclose(table.position[-1], [0, 0, 2], atol=1e-12)
