@@ -14,7 +14,7 @@ from coopenv.api.report import MEMORY, allocate_report, report_kernel
 from coopenv.api.rewards import reward_weights
 from coopenv.scenario import Scenario
 from coopenv.world.launch import PerWorld
-from coopenv.world.state import state_fields
+from coopenv.world.state import overwrite, state_fields
 from coopenv.world.world import World
 
 
@@ -41,14 +41,17 @@ class Engine:
         self._plan = observation_plan(scenario, self.layout)
         self._weights: Any = wp.array(reward_weights(scenario), dtype=wp.float32, device=device)
         self._everywhere: Any = wp.ones(worlds, dtype=wp.int32, device=device)
+        self._nowhere: Any = wp.zeros(worlds, dtype=wp.int32, device=device)
+        self._fresh: Any = wp.zeros(worlds, dtype=wp.int32, device=device)
         self._state_fields = set(state_fields(self.world.precision))
         self._views: dict[str, np.ndarray] = {}
 
     def reset(self, seeds: Sequence[int] | np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
         """Start new episodes, see `World.reset`; reports of the other worlds stay."""
         self.world.reset(seeds, mask)
-        self._report("report reset", self.world.mask)
-        self.world.mask.zero_()
+        chosen = np.ones(self.world.worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
+        self._fresh.assign(chosen.astype(np.int32))
+        self._report("report fresh", self._fresh, self._fresh)
 
     def step(self, actions: np.ndarray | None = None, ticks: int | None = None) -> None:
         """Advance by one decision (or `ticks` camera ticks) under actions (W, N, 2) in [-1, 1]."""
@@ -62,14 +65,16 @@ class Engine:
         wp.copy(self.world.mask, self.report.over)
         self.world.advance(self.world.model.ticks_per_decision)
         self.world.restart()
-        self.refresh()
+        self._report("report some fresh", self.world.mask, self._everywhere)
+        self.world.mask.zero_()
 
     def restart_finished(self) -> None:
         """Restart the worlds that are over and report them anew; nothing leaves the device."""
         wp.copy(self.world.mask, self.report.over)
+        wp.copy(self._fresh, self.report.over)
         self.world.restart()
-        self._report("report reset", self.world.mask)
         self.world.mask.zero_()
+        self._report("report fresh", self._fresh, self._fresh)
 
     def set_actions(self, actions: np.ndarray) -> None:
         """Copy host actions, (W, N, 2), to the device."""
@@ -80,16 +85,16 @@ class Engine:
 
     def refresh(self) -> None:
         """Recompute the report of every world from the present state."""
-        self._report("report", self._everywhere)
+        self._report("report", self._nowhere, self._everywhere)
 
-    def _report(self, key: str, chosen: Any) -> None:
+    def _report(self, key: str, fresh: Any, chosen: Any) -> None:
         arguments = [
             self.world.model,
             PerWorld(self.world.state),
             self._plan,
             self._weights,
             PerWorld(self.report),
-            PerWorld(self.world.mask),
+            PerWorld(fresh),
             PerWorld(chosen),
         ]
         self.world.launch(key, report_kernel, arguments, inner=(self.world.model.vehicles,))
@@ -122,5 +127,4 @@ class Engine:
         """
         self.world.set_state(values)
         self.refresh()
-        for name in MEMORY:
-            getattr(self.report, name).assign(values[name])
+        overwrite({name: getattr(self.report, name) for name in MEMORY}, values)

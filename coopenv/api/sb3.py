@@ -32,7 +32,9 @@ class CooperativeSB3VecEnv(VecEnv):
     truncated when the world is over. `info["alive"]` is False in those rows at every done.
     """
 
-    def __init__(self, scenario: Scenario, *, num_worlds: int, dtype: str = "float32", threads: int | None = None) -> None:
+    def __init__(
+        self, scenario: Scenario, *, num_worlds: int, dtype: str = "float32", threads: int | None = None
+    ) -> None:
         """Build the worlds; use `make_sb3_vec_env` to build them by name."""
         self.scenario = scenario
         self.engine = Engine(scenario, num_worlds, dtype, "cpu", threads)
@@ -170,7 +172,9 @@ def make_sb3_vec_env(
     Raises:
         CoopenvError: any argument is not valid.
     """
-    env = CooperativeSB3VecEnv(load_scenario(name_or_path, overrides), num_worlds=num_worlds, dtype=dtype, threads=threads)
+    env = CooperativeSB3VecEnv(
+        load_scenario(name_or_path, overrides), num_worlds=num_worlds, dtype=dtype, threads=threads
+    )
     if seed is not None:
         env.seed(seed)
     return env

@@ -112,10 +112,10 @@ def override(raw: Any, key: str, value: Any) -> None:
     _descend(raw, key.split("."), value, key)
 
 
-def _descend(node: Any, path: list[str], value: Any, key: str) -> None:
+def _descend(node: Any, path: list[str], value: Any, key: str, parent: str = "") -> None:
     head, rest = path[0], path[1:]
     if isinstance(node, list):
-        for index in _indices(node, head, key):
+        for index in _indices(node, head, key, parent):
             if rest:
                 node[index] = dict(node[index]) if isinstance(node[index], dict) else node[index]
                 _descend(node[index], rest, value, key)
@@ -125,20 +125,20 @@ def _descend(node: Any, path: list[str], value: Any, key: str) -> None:
         if rest:
             below = node.get(head, {})
             node[head] = dict(below) if isinstance(below, dict) else below
-            _descend(node[head], rest, value, key)
+            _descend(node[head], rest, value, key, head)
         else:
             node[head] = value
     else:
         raise ScenarioError(f"override '{key}': '{head}' lies below a plain value")
 
 
-def _indices(node: list[Any], head: str, key: str) -> range | list[int]:
+def _indices(node: list[Any], head: str, key: str, parent: str) -> range | list[int]:
     if head == "*":
         return range(len(node))
     names = [entry.get("name") if isinstance(entry, dict) else None for entry in node]
     if head in names:
         return [names.index(head)]
-    number = head.removeprefix("vehicle_")
+    number = head.removeprefix("vehicle_") if parent == "vehicles" else head
     index = int(number) - (1 if head != number else 0) if number.isdigit() else -1
     if not 0 <= index < len(node):
         raise ScenarioError(f"override '{key}': no entry '{head}' (there are {len(node)}; 0..{len(node) - 1} or *)")

@@ -96,7 +96,7 @@ def _sample_spline(motion: WaypointMotion) -> tuple[np.ndarray, np.ndarray, np.n
 def _spline_table(motion: WaypointMotion, initial_rotation: np.ndarray) -> TwistTable:
     t, position, heading = _sample_spline(motion)
     if motion.heading == "path":
-        rotations = Rotation.from_euler("z", heading)
+        rotations = Rotation.from_rotvec(np.outer(heading, [0.0, 0.0, 1.0]))
     else:
         rotations = Rotation.from_matrix(np.tile(initial_rotation, (len(t), 1, 1)))
     h = np.diff(t)

@@ -103,20 +103,28 @@ def undistort(camera: Any, xd: Any, yd: Any):
 
 @wp.func
 def project(camera: Any, bearing: Any):
-    """Return (pixel u, pixel v, 1 if inside the image) of a bearing in the optical frame."""
-    o = bearing.dtype(0.0)
-    if bearing[2] <= bearing.dtype(1.0e-6):
-        return o, o, 0
-    x = bearing[0] / bearing[2]
-    y = bearing[1] / bearing[2]
-    if x * x + y * y > camera.max_radius * camera.max_radius:
-        return o, o, 0
+    """Return (pixel u, pixel v, 1 if inside the image) of a bearing in the optical frame.
+
+    A ray beyond the lens's largest radius has the pixel of the nearest ray that the lens can image.
+    """
+    inside = int(1)
+    depth = bearing[2]
+    if depth <= bearing.dtype(1.0e-6):
+        inside = int(0)
+        depth = bearing.dtype(1.0e-6)
+    x = bearing[0] / depth
+    y = bearing[1] / depth
+    radius = wp.sqrt(x * x + y * y)
+    if radius > camera.max_radius:
+        inside = int(0)
+        x = x * camera.max_radius / radius
+        y = y * camera.max_radius / radius
     xd, yd = distort(camera, x, y)
     u = camera.focal_length[0] * xd + camera.principal_point[0]
     v = camera.focal_length[1] * yd + camera.principal_point[1]
-    inside = int(0)
-    if u >= o and v >= o and u < camera.image_size[0] and v < camera.image_size[1]:
-        inside = int(1)
+    o = bearing.dtype(0.0)
+    if u < o or v < o or u >= camera.image_size[0] or v >= camera.image_size[1]:
+        inside = int(0)
     return u, v, inside
 
 

@@ -54,7 +54,8 @@ def draw(seed: wp.uint64, episode: wp.uint32, index: int, subject: int, stream: 
 @wp.func
 def uniform(word: wp.uint32, one: Any):
     """Return a number in (0, 1), in the precision of `one`."""
-    return (type(one)(word) + type(one)(0.5)) * type(one)(2.3283064365386963e-10)
+    u = (type(one)(word) + type(one)(0.5)) * type(one)(2.3283064365386963e-10)
+    return wp.min(u, type(one)(0.99999994))  # the largest float32 below 1, to which the largest words would round
 
 
 @wp.func

@@ -82,6 +82,8 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
         state.sight[world, vehicle, target] = NOT_A_NEIGHBOUR
     for slot in range(model.radio.slots):
         state.outbox_tick[world, vehicle, slot] = -1
+        state.outbox_position[world, vehicle, slot] = o
+        state.outbox_rotation[world, vehicle, slot] = identity3(o)
     for sender in range(model.vehicles):
         state.inbox_tick[world, vehicle, sender] = -1
         state.inbox_position[world, vehicle, sender] = o

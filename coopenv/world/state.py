@@ -3,6 +3,7 @@
 W worlds, A agents (landmarks first), N vehicles, S slots of the radio's outbox, B blocks of the sliding Gramian.
 """
 
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -99,18 +100,17 @@ def read_state(state: Any, p: Precision) -> dict[str, np.ndarray]:
     return {name: getattr(state, name).numpy().copy() for name in state_fields(p)}
 
 
-def write_state(state: Any, values: dict[str, np.ndarray], p: Precision) -> None:
-    """Overwrite every field.
+def overwrite(arrays: dict[str, Any], values: Mapping[str, np.ndarray]) -> None:
+    """Overwrite device arrays by name, all or none.
 
     Raises:
         ValueError: a field is missing, or has another shape.
     """
-    for name in state_fields(p):
+    for name, target in arrays.items():
         if name not in values:
             raise ValueError(f"state: field '{name}' is missing")
-        target = getattr(state, name)
-        current = target.numpy()
-        value = np.asarray(values[name])
-        if value.shape != current.shape:
-            raise ValueError(f"state: field '{name}' has shape {value.shape}, expected {current.shape}")
-        target.assign(np.ascontiguousarray(value, dtype=current.dtype))
+        expected, got = target.numpy().shape, np.shape(values[name])
+        if got != expected:
+            raise ValueError(f"state: field '{name}' has shape {got}, expected {expected}")
+    for name, target in arrays.items():
+        target.assign(np.ascontiguousarray(values[name], dtype=target.numpy().dtype))

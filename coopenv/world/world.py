@@ -12,7 +12,7 @@ from coopenv.scenario import Scenario
 from coopenv.world.build import build_model
 from coopenv.world.launch import Launcher, PerWorld, default_threads
 from coopenv.world.precision import check_device, precision
-from coopenv.world.state import allocate_state, read_state, write_state
+from coopenv.world.state import allocate_state, overwrite, read_state, state_fields
 from coopenv.world.step import advance_kernel, reset_kernel
 
 
@@ -58,11 +58,11 @@ class World:
         self.state = allocate_state(self.model, worlds, self.precision, self.device)
         self.actions = wp.zeros((worlds, self.model.vehicles), dtype=self.precision.vec2, device=self.device)
         self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
-        """(W,) worlds that `restart` resets and that `advance` leaves alone; zero outside of a reset."""
+        """(W,) worlds that `restart` resets and that `advance` leaves alone; zero between calls."""
         self.launch = Launcher(worlds, self.device, dtype, self.threads)
 
     def reset(self, seeds: Sequence[int] | np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
-        """Start a new episode in the worlds of `mask` (all by default), which stays set in `self.mask`.
+        """Start a new episode in the worlds of `mask` (all by default).
 
         Args:
             seeds: one per world, reduced modulo 2^64; None keeps each world's seed and draws a new episode from it.
@@ -76,6 +76,7 @@ class World:
             self.state.episode.assign(np.where(chosen, np.uint32(2**32 - 1), self.state.episode.numpy()))
         self.mask.assign(chosen.astype(np.int32))
         self.restart()
+        self.mask.zero_()
 
     def restart(self) -> None:
         """Start the next episode in the worlds of `self.mask`, on the device."""
@@ -96,5 +97,5 @@ class World:
         Raises:
             ValueError: a field is missing or has another shape.
         """
-        write_state(self.state, values, self.precision)
-        self.actions.assign(values["actions"])
+        fields = {name: getattr(self.state, name) for name in state_fields(self.precision)}
+        overwrite({**fields, "actions": self.actions}, values)

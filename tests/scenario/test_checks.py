@@ -92,6 +92,18 @@ def test_starts_inside_buildings_are_refused(place: tuple[float, float, float], 
         parse_scenario(data, "here")
 
 
+def test_a_body_may_not_reach_into_a_building() -> None:
+    for gap, inside in ((0.2, True), (0.3, False)):
+        start_at = np.array([np.cos(0.5), np.sin(0.5), 0.0]) * (2.0 + gap) + [0, 0, 1]
+        car = vehicle(start_at.tolist(), body={"size": [2.0, 0.5, 0.5]})
+        data = builders.raw([car], obstacles=[WALL])
+        if inside:
+            with pytest.raises(ScenarioError, match="vehicle_1 starts inside obstacle"):
+                parse_scenario(data, "here")
+        else:
+            parse_scenario(data, "here")
+
+
 def test_the_map_origin_does_not_move_buildings_against_starts() -> None:
     with pytest.raises(ScenarioError, match="starts inside obstacle"):
         parse_scenario(builders.raw([vehicle((0, 0, 1))], obstacles=[WALL], map={"origin": [3, 0, 0]}), "here")

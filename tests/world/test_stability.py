@@ -66,7 +66,6 @@ def watch(world: World, ticks: int, every: int) -> None:
     assert (world.get_state()["tick"] == ticks // every * every).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_stiff_gain_over_ten_minutes_of_random_visibility(dtype: str) -> None:
     watch(start(circling(k=80.0), range(3), dtype), 36000, 60)
