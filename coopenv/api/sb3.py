@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ class CooperativeSB3VecEnv(VecEnv):
         self.engine = Engine(scenario, num_worlds, dtype, "cpu", threads)
         self.vehicles = len(scenario.vehicles)
         self.render_mode = "rgb_array"
-        self.metadata = {"render_modes": ["rgb_array"], "render_fps": scenario.rates.decision}
+        self.metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": scenario.rates.decision}
         self._actions = np.zeros((num_worlds, self.vehicles, 2), dtype=np.float32)
         self._view: Any = None
         self._seeded = False
@@ -65,7 +65,7 @@ class CooperativeSB3VecEnv(VecEnv):
         self.engine.reset(seeds)
         self._reset_seeds()
         self._reset_options()
-        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         return self._rows("observation")
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -142,7 +142,7 @@ class CooperativeSB3VecEnv(VecEnv):
         """Return False per row: the batch has no wrappers inside."""
         return [False] * len(self._chosen(indices))
 
-    def _chosen(self, indices: VecEnvIndices) -> Iterable[int] | Any:
+    def _chosen(self, indices: VecEnvIndices) -> list[int]:
         return list(self._get_indices(indices))
 
     def _all(self, indices: VecEnvIndices, what: str) -> None:

@@ -59,7 +59,7 @@ def test_terminal_observations_and_flags() -> None:
         assert done.all() == (step % 5 == 0)
         if done.all():
             assert all(info["TimeLimit.truncated"] for info in infos)
-            assert all(np.array_equal(info["terminal_observation"], row) for info, row in zip(infos, expected[0], strict=True))
+            assert np.array_equal([info["terminal_observation"] for info in infos], expected[0])
             assert np.array_equal(observation, twin.reset()[0])
         else:
             assert np.array_equal(observation, expected[0])
