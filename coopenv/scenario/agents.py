@@ -92,7 +92,10 @@ class Waypoint(Part):
 
 
 class WaypointMotion(Part):
-    """Follows a cubic spline in time through waypoints, heading along the path, then stands still."""
+    """Follows a smooth curve (modified Akima spline in time) through waypoints, heading along the path, then stands still.
+
+    Equal waypoints in a row mean waiting.
+    """
 
     kind: Literal["waypoints"] = "waypoints"
     waypoints: tuple[Waypoint, ...] = Field(min_length=2)

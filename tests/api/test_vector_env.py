@@ -1,0 +1,289 @@
+"""The batch: rows, autoreset modes, masks, equality with the single world, independence of threads."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+import coopenv
+from coopenv.api.layout import layout_size
+
+ENVS = coopenv.list_envs()
+CRASH = {"urban_crossing": np.array([1.0, 1.0])}
+"""Actions under which vehicles soon end: full speed, full lock."""
+
+
+def actions_for(env: coopenv.CooperativeVectorEnv, rng: np.random.Generator) -> np.ndarray:
+    return rng.uniform(-1.0, 1.0, (env.num_envs, 2)).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", ENVS)
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_single_world_is_world_0_bit_for_bit(name: str, dtype: str) -> None:
+    """And world 2 of the batch is the single world of seed + 2."""
+    batch = coopenv.make_vec(name, num_worlds=3, dtype=dtype, autoreset="disabled")
+    rng = np.random.default_rng(0)
+    observations, _ = batch.reset(seed=40)
+    singles = [coopenv.parallel_env(name, dtype=dtype) for _ in range(3)]
+    for world, single in enumerate(singles):
+        first, _ = single.reset(seed=40 + world)
+        assert np.array_equal(batch.world_major(observations)[world], np.stack(list(first.values())))
+    for _ in range(60):
+        actions = batch.world_major(actions_for(batch, rng))
+        observations, rewards, terminated, truncated, infos = batch.step(actions.reshape(-1, 2))
+        for world, single in enumerate(singles):
+            alive = list(single.agents)
+            results = single.step({agent: actions[world, single.possible_agents.index(agent)] for agent in alive})
+            for agent in alive:
+                row = world * batch.vehicles + single.possible_agents.index(agent)
+                assert np.array_equal(observations[row], results[0][agent])
+                assert rewards[row] == np.float32(results[1][agent])
+                assert (terminated[row], truncated[row]) == (results[2][agent], results[3][agent])
+                assert infos["position_error"][row] == results[4][agent]["position_error"]
+                assert infos["alive"][row]
+
+
+@pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
+def test_threads_do_not_matter(autoreset: str) -> None:
+    runs = []
+    for threads in (1, 2, 5):
+        env = coopenv.make_vec(
+            "urban_crossing", num_worlds=7, threads=threads, autoreset=autoreset, overrides={"horizon": 2.0}
+        )
+        assert env.engine.world.threads == threads
+        rng = np.random.default_rng(1)
+        record = [env.reset(seed=3)[0]]
+        for _ in range(50):
+            record += env.step(actions_for(env, rng))[:4]
+        runs.append(record)
+    for other in runs[1:]:
+        assert all(np.array_equal(a, b) for a, b in zip(runs[0], other, strict=True))
+
+
+def test_next_step_mode() -> None:
+    env = coopenv.make_vec("busy_intersection", num_worlds=2, overrides={"horizon": 0.5})
+    assert env.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    first, _ = env.reset(seed=1)
+    zero = np.zeros((env.num_envs, 2), dtype=np.float32)
+    for _ in range(4):
+        _, _, terminated, truncated, _ = env.step(zero)
+        assert not (terminated | truncated).any()
+    last, reward, terminated, truncated, _ = env.step(zero)
+    assert truncated.all() and not terminated.any()
+    again, reward, terminated, truncated, infos = env.step(zero)
+    assert not (terminated | truncated).any() and (reward == 0).all() and infos["alive"].all()
+    assert env.engine.view("tick").tolist() == [0, 0]
+    assert not np.array_equal(again, last) and not np.array_equal(again, first)  # drawn anew
+
+
+def test_same_step_mode() -> None:
+    env = coopenv.make_vec("busy_intersection", num_worlds=2, overrides={"horizon": 0.5}, autoreset="same_step")
+    twin = coopenv.make_vec("busy_intersection", num_worlds=2, overrides={"horizon": 0.5}, autoreset="disabled")
+    env.reset(seed=1)
+    twin.reset(seed=1)
+    zero = np.zeros((env.num_envs, 2), dtype=np.float32)
+    for step in range(1, 11):
+        observation, reward, _, truncated, infos = env.step(zero)
+        expected = twin.step(zero)
+        assert np.array_equal(reward, expected[1]) and np.array_equal(truncated, expected[3])
+        assert truncated.all() == (step % 5 == 0)
+        assert np.array_equal(infos["final_obs"], expected[0])
+        assert np.array_equal(infos["_final_obs"], truncated)
+        if truncated.all():
+            assert np.array_equal(infos["final_info"]["position_error"], expected[4]["position_error"])
+            assert np.array_equal(observation, twin.reset()[0])
+
+
+def test_disabled_mode_resets_by_mask() -> None:
+    env = coopenv.make_vec("busy_intersection", num_worlds=3, autoreset="disabled")
+    env.reset(seed=1)
+    zero = np.zeros((env.num_envs, 2), dtype=np.float32)
+    for _ in range(3):
+        before, *_ = env.step(zero)
+    mask = np.zeros(env.num_envs, dtype=bool)
+    mask[5:10] = True  # the rows of world 1
+    after, _ = env.reset(options={"reset_mask": mask})
+    assert np.array_equal(after[:5], before[:5]) and np.array_equal(after[10:], before[10:])
+    assert not np.array_equal(after[5:10], before[5:10])
+    assert env.engine.view("tick").tolist() == [18, 0, 18]
+    by_world, _ = env.reset(options={"reset_mask": np.array([True, False, False])})
+    assert env.engine.view("tick").tolist() == [0, 0, 18]
+    assert np.array_equal(by_world[10:], before[10:])
+
+
+def test_over_worlds_wait_in_disabled_mode() -> None:
+    env = coopenv.make_vec("busy_intersection", num_worlds=1, overrides={"horizon": 0.2}, autoreset="disabled")
+    env.reset(seed=1)
+    zero = np.zeros((5, 2), dtype=np.float32)
+    env.step(zero)
+    at_end, _, _, truncated, _ = env.step(zero)
+    still, _, _, truncated_again, _ = env.step(zero)
+    assert truncated.all() and truncated_again.all() and np.array_equal(at_end, still)
+
+
+@pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
+def test_dead_rows(autoreset: str) -> None:
+    """A vehicle terminates once, earns nothing afterwards, and its row is truncated when the world is over."""
+    env = coopenv.make_vec("urban_crossing", num_worlds=16, autoreset=autoreset)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    dead = np.zeros(env.num_envs, dtype=bool)
+    deaths = ends = 0
+    for _ in range(600):
+        ticks = env.engine.view("tick").copy()
+        _, reward, terminated, truncated, infos = env.step(np.abs(actions_for(env, rng)))
+        assert np.array_equal(infos["alive"], ~dead)
+        assert (reward[dead] == 0).all() and not terminated[dead].any()
+        over = env.world_major(truncated).any(axis=1) | env.world_major(dead | terminated).all(axis=1)
+        assert np.array_equal(over, env.world_major(truncated | terminated).all(axis=1) | over)
+        assert env.world_major(truncated | terminated)[over].all()
+        deaths, ends = deaths + int(terminated.sum()), ends + int(over.sum())
+        dead |= terminated
+        dead[np.repeat(over, env.vehicles)] = False
+        assert (env.engine.view("tick")[~over] >= ticks[~over]).all() or autoreset == "next_step"
+    assert deaths > 10 and ends > 5
+
+
+def test_every_reset_draws_anew() -> None:
+    env = coopenv.make_vec("urban_crossing", num_worlds=4, overrides={"horizon": 0.1}, autoreset="same_step")
+    seen = [env.reset(seed=0)[0]]
+    zero = np.zeros((env.num_envs, 2), dtype=np.float32)
+    seen += [env.step(zero)[0] for _ in range(5)]
+    rows = np.concatenate(seen)
+    assert len(np.unique(rows, axis=0)) == len(rows)
+
+
+def test_results_are_fresh_arrays() -> None:
+    env = coopenv.make_vec("busy_intersection", num_worlds=2)
+    env.reset(seed=0)
+    zero = np.zeros((env.num_envs, 2), dtype=np.float32)
+    first, second = env.step(zero), env.step(zero)
+    for a, b in zip(first[:4], second[:4], strict=True):
+        assert not np.shares_memory(a, b) and not np.shares_memory(a, env.engine.view("observation"))
+    for name, value in first[4].items():
+        assert not np.shares_memory(value, second[4][name])
+
+
+def test_gymnasium_make_vec_and_wrappers() -> None:
+    env = gymnasium.make_vec("coopenv/UrbanCrossing-v0", num_envs=12, overrides={"horizon": 1.0})
+    assert env.num_envs == 12 and env.unwrapped.num_worlds == 3
+    assert env.observation_space.shape == (12, *env.single_observation_space.shape)
+    wrapped = gymnasium.wrappers.vector.NormalizeObservation(gymnasium.wrappers.vector.RecordEpisodeStatistics(env))
+    wrapped.reset(seed=0)
+    finished = 0
+    for _ in range(40):
+        observation, *_, infos = wrapped.step(wrapped.action_space.sample())
+        assert np.isfinite(observation).all()
+        finished += int(infos.get("_episode", np.zeros(12, dtype=bool)).sum())
+    assert finished >= 24
+
+
+@pytest.mark.parametrize("name", ENVS)
+def test_observations_are_in_their_space(name: str) -> None:
+    env = coopenv.make_vec(name, num_worlds=3)
+    observation, _ = env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    assert observation.shape == (env.num_envs, layout_size(env.observation_layout))
+    for _ in range(50):
+        assert env.observation_space.contains(observation)
+        observation, reward, terminated, truncated, _ = env.step(actions_for(env, rng))
+        assert observation.dtype == np.float32 and reward.dtype == np.float32
+        assert terminated.dtype == truncated.dtype == bool
+
+
+def test_saved_state() -> None:
+    env = coopenv.make_vec("urban_crossing", num_worlds=3, overrides={"horizon": 1.5})
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    actions = [actions_for(env, rng) for _ in range(40)]
+    for action in actions[:13]:
+        env.step(action)
+    saved = env.get_state()
+    first = [env.step(action) for action in actions[13:]]
+    env.reset(seed=9)
+    env.set_state(saved)
+    for expected, action in zip(first, actions[13:], strict=True):
+        assert all(np.array_equal(a, b) for a, b in zip(env.step(action)[:4], expected[:4], strict=True))
+
+
+def test_rendering() -> None:
+    env = coopenv.make_vec("overtaking", num_worlds=2, render_mode="rgb_array")
+    env.reset(seed=0)
+    (picture,) = env.render()
+    assert picture.dtype == np.uint8 and picture.ndim == 3
+    env.close()
+
+
+def bad(value: Any, dtype: Any = np.float32) -> np.ndarray:
+    actions = np.zeros((10, 2), dtype=dtype)
+    actions[7, 1] = value
+    return actions
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [
+        (np.zeros((9, 2)), r"shape \(9, 2\), expected \(10, 2\)"),
+        (np.zeros(20), r"shape \(20,\)"),
+        (bad(np.nan), "action of row 7 is not finite"),
+        (bad(np.inf), "action of row 7 is not finite"),
+        (np.full((10, 2), "left"), "expected a float"),
+        (np.zeros((10, 2), dtype=complex), "expected a float"),
+    ],
+)
+def test_wrong_actions(actions: np.ndarray, message: str) -> None:
+    env = coopenv.make_vec("busy_intersection", num_worlds=2)
+    env.reset(seed=0)
+    with pytest.raises(coopenv.ActionError, match=message):
+        env.step(actions)
+
+
+def test_nan_on_the_device_harms_nobody_else() -> None:
+    """Where actions cannot be checked without waiting for the device, one that is not finite counts as zero."""
+    env = coopenv.make_vec("urban_crossing", num_worlds=2, autoreset="disabled")
+    twin = coopenv.make_vec("urban_crossing", num_worlds=2, autoreset="disabled")
+    env.reset(seed=0)
+    twin.reset(seed=0)
+    for batch, value in ((env, np.nan), (twin, 0.0)):
+        actions = np.full((2, 4, 2), 0.5)
+        actions[1, 2] = value
+        batch.engine.set_actions(actions)
+        batch.engine.step()
+    assert np.array_equal(env.engine.view("observation"), twin.engine.view("observation"))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"num_worlds": 0}, "num_worlds must be at least 1"),
+        ({"num_worlds": 1, "device": "gpu"}, "unknown device 'gpu'"),
+        ({"num_worlds": 1, "device": "cuda:0"}, "no CUDA device is available"),
+        ({"num_worlds": 1, "dtype": "float16"}, r"unknown dtype 'float16' \(did you mean"),
+        ({"num_worlds": 1, "autoreset": "nextstep!"}, "unknown autoreset"),
+        ({"num_worlds": 1, "arrays": "jax"}, "unknown arrays 'jax'"),
+        ({"num_worlds": 1, "threads": 0}, "threads must be at least 1"),
+        ({"num_worlds": 1, "render_mode": "human"}, "unknown render_mode"),
+    ],
+)
+def test_wrong_options(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(coopenv.CoopenvError, match=message):
+        coopenv.make_vec("busy_intersection", **options)
+
+
+def test_wrong_resets() -> None:
+    env = coopenv.make_vec("busy_intersection", num_worlds=2)
+    with pytest.raises(coopenv.CoopenvError, match="before reset"):
+        env.step(np.zeros((10, 2)))
+    env.reset(seed=0)
+    with pytest.raises(coopenv.CoopenvError, match="splits world 0"):
+        env.reset(options={"reset_mask": np.arange(10) == 3})
+    with pytest.raises(coopenv.CoopenvError, match=r"reset_mask has shape \(3,\)"):
+        env.reset(options={"reset_mask": np.ones(3, dtype=bool)})
+    with pytest.raises(coopenv.CoopenvError, match="3 seeds for 2 worlds"):
+        env.reset(seed=[1, 2, 3])
+    with pytest.raises(coopenv.CoopenvError, match="not a positive multiple of the 5 vehicles"):
+        gymnasium.make_vec("coopenv/BusyIntersection-v0", num_envs=7)
