@@ -92,7 +92,7 @@ class Waypoint(Part):
 
 
 class WaypointMotion(Part):
-    """Follows a smooth curve (modified Akima spline in time) through waypoints, heading along the path, then stands still.
+    """Follows a monotone cubic (PCHIP) in time through waypoints, heading along the path, then stands still.
 
     Equal waypoints in a row mean waiting.
     """

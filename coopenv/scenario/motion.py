@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import Akima1DInterpolator
+from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from coopenv.scenario.agents import ConstantMotion, SegmentMotion, WaypointMotion
@@ -82,8 +82,8 @@ def path_heading(motion: WaypointMotion) -> float:
 def _sample_spline(motion: WaypointMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times (S,), positions (S, 3) and continuous headings (S,) along the spline."""
     times = np.array([w.time for w in motion.waypoints])
-    # Local: between two equal waypoints the agent stands still instead of swinging.
-    spline = Akima1DInterpolator(times, np.array([w.position for w in motion.waypoints]), method="makima")
+    # Shape preserving: between two equal waypoints the agent stands still instead of swinging.
+    spline = PchipInterpolator(times, np.array([w.position for w in motion.waypoints]))
     t = np.linspace(0.0, times[-1], max(2, round(times[-1] / SPLINE_STEP) + 1))
     velocity = spline(t, 1)[:, :2]
     moving = np.linalg.norm(velocity, axis=1) > STANDING

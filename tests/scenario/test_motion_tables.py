@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from scipy.interpolate import Akima1DInterpolator
+from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from coopenv.scenario.agents import ConstantMotion, SegmentMotion, StaticMotion, TwistSegment, Waypoint, WaypointMotion
@@ -67,7 +67,7 @@ def test_splines_pass_their_waypoints(heading: str) -> None:
     table = compile_motion(motion, R0)
     assert_chained(table, 1e-11)
     times, places = (np.array(x) for x in zip(*POINTS, strict=True))
-    curve = Akima1DInterpolator(times, places, method="makima")
+    curve = PchipInterpolator(times, places)
     in_map = places[0] + table.position @ R0.T
     assert_allclose(in_map, curve(table.start), atol=1e-10)
     assert table.start[-1] == pytest.approx(4.1)
