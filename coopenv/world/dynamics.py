@@ -56,7 +56,6 @@ def approach(value: Any, target: Any, dt: Any, lag: Any, rate: Any):
 def actuate(model: Any, speed: Any, steering: Any, command: Any, dt: Any):
     """Return (speed, steering) after dt under a command in [-1, 1]^2."""
     d = model.dynamics
-    zero = type(speed)(0.0)
     one = type(speed)(1.0)
     if d.acceleration_mode == 1:
         new_speed = speed + command[0] * d.max_acceleration * dt
@@ -66,37 +65,47 @@ def actuate(model: Any, speed: Any, steering: Any, command: Any, dt: Any):
         new_speed = approach(speed, target, dt, d.speed_lag, d.max_acceleration)
     angle = wp.clamp(command[1] * d.action_steering, -d.max_steering, d.max_steering)
     new_steering = approach(steering, angle, dt, d.steering_lag, d.max_steering_rate)
-    return wp.clamp(new_speed, d.min_speed, d.max_speed) + zero, new_steering
+    return wp.clamp(new_speed, d.min_speed, d.max_speed), new_steering
+
+
+@wp.func
+def bicycle_step(model: Any, R: Any, position: Any, speed: Any, steering: Any, command: Any, dt: Any, parked: int):
+    """Return (R, position, speed, steering) after dt: rear-axle bicycle, its twist held at the mid-point."""
+    new_speed, new_steering = actuate(model, speed, steering, command, dt)
+    if parked != 0:
+        new_speed = speed - speed
+    half = type(speed)(0.5)
+    mid_speed = wp.where(parked != 0, new_speed, (speed + new_speed) * half)
+    turn = mid_speed * dt * wp.tan((steering + new_steering) * half) / model.dynamics.wheelbase
+    o = position - position
+    step = type(position)(o[0], o[1], turn)
+    new_position = position + R * (left_jacobian(step) * type(position)(mid_speed * dt, o[1], o[2]))
+    return R * exp_so3(step), new_position, new_speed, new_steering
 
 
 @wp.func
 def drive(model: Any, before: Any, after: Any, world: int, vehicle: int, command: Any, duration: wp.float64):
-    """Advance a driven vehicle: rear-axle bicycle, its twist held at the mid-point over short steps."""
+    """Advance a driven vehicle in short steps; one that has ended stands still."""
     agent = model.landmarks + vehicle
     R = before.rotation[world, agent]
     position = before.position[world, agent]
     speed = before.speed[world, vehicle]
     steering = before.steering[world, vehicle]
-    v = before.velocity[world, agent]
-    zero = speed - speed
+    parked = before.ended[world, vehicle]
     steps = int(wp.ceil(duration / LONGEST_SUBSTEP))
     dt = type(speed)(duration / wp.float64(wp.max(steps, 1)))
-    half = type(speed)(0.5)
     for _ in range(steps):
-        new_speed, new_steering = actuate(model, speed, steering, command, dt)
-        if before.ended[world, vehicle] != 0:
-            new_speed = zero
-            speed = zero
-        mid_speed = (speed + new_speed) * half
-        rate = mid_speed * wp.tan((steering + new_steering) * half) / model.dynamics.wheelbase
-        step = type(v)(zero, zero, rate * dt)
-        position = position + R * (left_jacobian(step) * type(v)(mid_speed * dt, zero, zero))
-        R = R * exp_so3(step)
-        speed = new_speed
-        steering = new_steering
+        R, position, speed, steering = bicycle_step(model, R, position, speed, steering, command, dt, parked)
+    o = position - position
     after.rotation[world, agent] = orthonormalise(R)
     after.position[world, agent] = position
     after.speed[world, vehicle] = speed
     after.steering[world, vehicle] = steering
-    after.velocity[world, agent] = type(v)(speed, zero, zero)
-    after.angular_velocity[world, agent] = type(v)(zero, zero, speed * wp.tan(steering) / model.dynamics.wheelbase)
+    after.velocity[world, agent] = type(o)(speed, o[1], o[2])
+    after.angular_velocity[world, agent] = type(o)(o[0], o[1], yaw_rate(model, speed, steering))
+
+
+@wp.func
+def yaw_rate(model: Any, speed: Any, steering: Any):
+    """Return the bicycle's yaw rate, rad/s."""
+    return speed * wp.tan(steering) / model.dynamics.wheelbase

@@ -41,10 +41,11 @@ def start_warp() -> None:
 
 
 @cache
-def kernel(function: Callable[..., None], precision_name: str) -> wp.Kernel:
+def kernel(function: Callable[..., None], precision_name: str, differentiable: bool = False) -> wp.Kernel:
     """Return a plain Python function as a Warp kernel whose module serves one precision only."""
-    module = wp.get_module(f"{function.__module__}.{function.__name__}.{precision_name}")
-    module.options["enable_backward"] = False
+    kind = ".differentiable" if differentiable else ""
+    module = wp.get_module(f"{function.__module__}.{function.__name__}.{precision_name}{kind}")
+    module.options["enable_backward"] = differentiable
     return wp.Kernel(func=function, key=function.__name__, module=module)
 
 
