@@ -16,7 +16,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import cholesky6, eigen_symmetric6, join6, symmetric_part
-from coopenv.estimation.so3 import exp_so3, identity3, left_jacobian, orthonormalise, skew
+from coopenv.estimation.so3 import SIXTH, exp_so3, identity3, left_jacobian, skew
 
 
 @wp.func
@@ -48,7 +48,7 @@ def predict_covariance(E: Any, A: Any, B: Any, D: Any, v1: Any, v2: Any):
 @wp.func
 def predict_pose(R: Any, p: Any, rotation: Any, translation: Any):
     """Return (R, p) after the odometry increment: R <- R dR, p <- dR^T (p + dp) (paper, eq. dot_estmate)."""
-    return orthonormalise(R * rotation), wp.transpose(rotation) * (p + translation)
+    return R * rotation, wp.transpose(rotation) * (p + translation)
 
 
 @wp.func
@@ -95,7 +95,7 @@ def gain_factor(k: Any, m: Any, h: Any):
     x = k * growth
     decayed = type(m)(1.0) - wp.exp(-x)
     if x < type(m)(1.0e-3):
-        decayed = x * (type(m)(1.0) - x * (type(m)(0.5) - x * (type(m)(1.0 / 6.0) - x / type(m)(24.0))))
+        decayed = x * (type(m)(1.0) - x * (type(m)(0.5) - x * (type(m)(SIXTH) - x / type(m)(24.0))))
     if m * h < type(m)(1.0e-30):
         return k * h
     return decayed / m

@@ -180,21 +180,21 @@ def sight_of(model: Any, state: Any, world: int, vehicle: int, target: int, orig
 
 
 @wp.func
-def observe(model: Any, before: Any, after: Any, world: int, vehicle: int, tick: int):
-    """Take one camera frame of one vehicle; `after` already holds the truth of this tick."""
+def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
+    """Take one camera frame of one vehicle; the truth of this tick is already in place."""
     agent = model.landmarks + vehicle
-    R = after.rotation[world, agent]
-    origin = after.position[world, agent] + R * model.camera.position
+    R = state.rotation[world, agent]
+    origin = state.position[world, agent] + R * model.camera.position
     to_camera = wp.transpose(R * model.camera.rotation)
     zero = origin.dtype(0.0)
     random = model.camera.miss > zero or model.noise.bearing > zero
     for n in range(model.target_count[vehicle]):
         target = model.targets[vehicle, n]
-        line = marker_position(model, after, world, target) - origin
+        line = marker_position(model, state, world, target) - origin
         b = wp.normalize(to_camera * line)
-        sight = sight_of(model, after, world, vehicle, target, origin, line, b)
+        sight = sight_of(model, state, world, vehicle, target, origin, line, b)
         if sight == VISIBLE and random:
-            words = draw(before.seed[world], before.episode[world], tick, vehicle * 65536 + target, BEARING)
+            words = draw(state.seed[world], state.episode[world], tick, vehicle * 65536 + target, BEARING)
             if uniform(words[2], zero) < model.camera.miss:
                 sight = MISSED
             if model.noise.bearing > zero:
@@ -202,6 +202,6 @@ def observe(model: Any, before: Any, after: Any, world: int, vehicle: int, tick:
         if sight == VISIBLE:
             if model.camera.pinhole == 1 and model.sensed == 1:
                 b = through_pixels(model.camera, b)
-            after.bearing[world, vehicle, target] = b
-            after.bearing_tick[world, vehicle, target] = tick
-        after.sight[world, vehicle, target] = sight
+            state.bearing[world, vehicle, target] = b
+            state.bearing_tick[world, vehicle, target] = tick
+        state.sight[world, vehicle, target] = sight

@@ -75,16 +75,16 @@ def goal_distance(model: Any, state: Any, world: int, vehicle: int):
 
 
 @wp.func
-def referee(model: Any, before: Any, after: Any, world: int, vehicle: int):
+def referee(model: Any, state: Any, world: int, vehicle: int):
     """Mark contact, and end the vehicle's episode on a collision or an arrival that counts."""
-    touching = touches_anything(model, after, world, vehicle)
-    ended = before.ended[world, vehicle]
+    touching = touches_anything(model, state, world, vehicle)
+    ended = state.ended[world, vehicle]
     if ended == UNDER_WAY:
         radius = model.scene.goal_radius[vehicle]
         if touching == 1 and model.scene.end_on_collision == 1:
             ended = COLLIDED
         elif model.scene.end_on_arrival == 1 and radius > radius - radius:
-            if goal_distance(model, after, world, vehicle) < radius:
+            if goal_distance(model, state, world, vehicle) < radius:
                 ended = ARRIVED
-    after.collided[world, vehicle] = touching
-    after.ended[world, vehicle] = ended
+    state.collided[world, vehicle] = touching
+    state.ended[world, vehicle] = ended

@@ -27,20 +27,25 @@ def segment_at(model: Any, agent: int, t: wp.float64) -> int:
 
 
 @wp.func
-def prescribe(model: Any, before: Any, after: Any, world: int, agent: int, t: wp.float64):
+def prescribe(model: Any, state: Any, world: int, agent: int, t: wp.float64):
     """Set an agent's pose and twist to its prescribed motion at time t."""
     segment = segment_at(model, agent, t)
     v = model.motion.linear[segment]
     w = model.motion.angular[segment]
     h = v.dtype(t - model.motion.start[segment])
-    step = w * h
-    relative_R = model.motion.rotation[segment]
-    relative_p = model.motion.position[segment] + relative_R * (left_jacobian(step) * (v * h))
-    R0 = before.start_rotation[world, agent]
-    after.rotation[world, agent] = R0 * (relative_R * exp_so3(step))
-    after.position[world, agent] = before.start_position[world, agent] + R0 * relative_p
-    after.velocity[world, agent] = v
-    after.angular_velocity[world, agent] = w
+    R0 = state.start_rotation[world, agent]
+    R = R0 * model.motion.rotation[segment]
+    travelled = v * h
+    if wp.dot(w, w) > v.dtype(0.0):
+        travelled = left_jacobian(w * h) * travelled
+        state.rotation[world, agent] = R * exp_so3(w * h)
+    else:
+        state.rotation[world, agent] = R
+    state.position[world, agent] = (
+        state.start_position[world, agent] + R0 * model.motion.position[segment] + R * travelled
+    )
+    state.velocity[world, agent] = v
+    state.angular_velocity[world, agent] = w
 
 
 @wp.func
@@ -84,25 +89,25 @@ def bicycle_step(model: Any, R: Any, position: Any, speed: Any, steering: Any, c
 
 
 @wp.func
-def drive(model: Any, before: Any, after: Any, world: int, vehicle: int, command: Any, duration: wp.float64):
+def drive(model: Any, state: Any, world: int, vehicle: int, command: Any, duration: wp.float64):
     """Advance a driven vehicle in short steps; one that has ended stands still."""
     agent = model.landmarks + vehicle
-    R = before.rotation[world, agent]
-    position = before.position[world, agent]
-    speed = before.speed[world, vehicle]
-    steering = before.steering[world, vehicle]
-    parked = before.ended[world, vehicle]
+    R = state.rotation[world, agent]
+    position = state.position[world, agent]
+    speed = state.speed[world, vehicle]
+    steering = state.steering[world, vehicle]
+    parked = state.ended[world, vehicle]
     steps = int(wp.ceil(duration / LONGEST_SUBSTEP))
     dt = type(speed)(duration / wp.float64(wp.max(steps, 1)))
     for _ in range(steps):
         R, position, speed, steering = bicycle_step(model, R, position, speed, steering, command, dt, parked)
     o = position - position
-    after.rotation[world, agent] = orthonormalise(R)
-    after.position[world, agent] = position
-    after.speed[world, vehicle] = speed
-    after.steering[world, vehicle] = steering
-    after.velocity[world, agent] = type(o)(speed, o[1], o[2])
-    after.angular_velocity[world, agent] = type(o)(o[0], o[1], yaw_rate(model, speed, steering))
+    state.rotation[world, agent] = orthonormalise(R)
+    state.position[world, agent] = position
+    state.speed[world, vehicle] = speed
+    state.steering[world, vehicle] = steering
+    state.velocity[world, agent] = type(o)(speed, o[1], o[2])
+    state.angular_velocity[world, agent] = type(o)(o[0], o[1], yaw_rate(model, speed, steering))
 
 
 @wp.func

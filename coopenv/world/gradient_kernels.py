@@ -199,4 +199,4 @@ def show_kernel(model: Any, truth: Any, state: Any, t: wp.float64):
         state.rotation[world, agent] = truth.rotation[world, agent - model.landmarks]
         state.position[world, agent] = truth.position[world, agent - model.landmarks]
     elif model.motion.kind[agent] == PRESCRIBED:
-        prescribe(model, state, state, world, agent, t)
+        prescribe(model, state, world, agent, t)

@@ -68,16 +68,16 @@ def information(model: Any, state: Any, world: int, vehicle: int, tick: int, R: 
 
 
 @wp.func
-def predict(model: Any, before: Any, after: Any, world: int, vehicle: int, dt: Any):
+def predict(model: Any, state: Any, world: int, vehicle: int, dt: Any):
     """Carry the estimate and P through one tick of odometry."""
-    rotation = after.increment_rotation[world, vehicle]
+    rotation = state.increment_rotation[world, vehicle]
     R, p = predict_pose(
-        before.estimate_rotation[world, vehicle],
-        before.estimate_position[world, vehicle],
+        state.estimate_rotation[world, vehicle],
+        state.estimate_position[world, vehicle],
         rotation,
-        after.increment_translation[world, vehicle],
+        state.increment_translation[world, vehicle],
     )
-    P = before.covariance[world, vehicle]
+    P = state.covariance[world, vehicle]
     E = wp.transpose(rotation)
     o = R - R
     A, B, D = predict_covariance(
@@ -88,9 +88,9 @@ def predict(model: Any, before: Any, after: Any, world: int, vehicle: int, dt: A
         model.observer.v1 * dt,
         model.observer.v2 * dt,
     )
-    after.estimate_rotation[world, vehicle] = R
-    after.estimate_position[world, vehicle] = p
-    after.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D, P - P)
+    state.estimate_rotation[world, vehicle] = R
+    state.estimate_position[world, vehicle] = p
+    state.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D, P - P)
 
 
 @wp.func
@@ -139,7 +139,7 @@ def correct(model: Any, state: Any, world: int, vehicle: int, tick: int, duratio
             A1 = block3(P1, 0, 0, R - R)
             B1 = block3(P1, 0, 3, R - R)
             D1 = block3(P1, 3, 3, R - R)
-        R = orthonormalise(R * exp_so3(dx1))
+        R = R * exp_so3(dx1)
         p = p + dx2
         A = A1
         B = B1
@@ -186,16 +186,18 @@ def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: i
 
 
 @wp.func
-def estimate(model: Any, before: Any, after: Any, world: int, vehicle: int, tick: int):
+def estimate(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Run one tick of the observer of one vehicle: predict, and correct when its rate says so."""
     dt = type(model.observer.max_turn)(wp.float64(1.0) / model.camera_rate)
-    predict(model, before, after, world, vehicle, dt)
+    predict(model, state, world, vehicle, dt)
     due_before = wp.floor(wp.float64(tick - 1) * model.observer.rate / model.camera_rate + wp.float64(1.0e-9))
     due_now = wp.floor(wp.float64(tick) * model.observer.rate / model.camera_rate + wp.float64(1.0e-9))
-    last = before.corrected_tick[world, vehicle]
+    last = state.corrected_tick[world, vehicle]
     if due_now > due_before:
         if model.observer.corrects == 1:
-            correct(model, after, world, vehicle, tick, dt * type(dt)(tick - last))
+            correct(model, state, world, vehicle, tick, dt * type(dt)(tick - last))
         last = tick
-    after.corrected_tick[world, vehicle] = last
-    accumulate_gramian(model, after, world, vehicle, tick, dt)
+    state.corrected_tick[world, vehicle] = last
+    # Products of rotations drift by rounding; once per tick is enough to keep Rhat a rotation.
+    state.estimate_rotation[world, vehicle] = orthonormalise(state.estimate_rotation[world, vehicle])
+    accumulate_gramian(model, state, world, vehicle, tick, dt)

@@ -30,7 +30,7 @@ def noisy_sample(model: Any, state: Any, world: int, vehicle: int, sample: int, 
 
 
 @wp.func
-def measure_motion(model: Any, before: Any, after: Any, world: int, vehicle: int, command: Any, tick: int):
+def measure_motion(model: Any, state: Any, world: int, vehicle: int, command: Any, tick: int):
     """Move a driven vehicle through one camera tick and take the odometry samples that fall into it.
 
     Sample m is taken at m / odometry_rate; those in (t_{tick-1}, t_tick] belong to this tick.
@@ -39,42 +39,33 @@ def measure_motion(model: Any, before: Any, after: Any, world: int, vehicle: int
     driven = model.motion.kind[agent] == DRIVEN
     tick_end = wp.float64(tick) / model.camera_rate
     now = wp.float64(tick - 1) / model.camera_rate
-    v = before.odometry_velocity[world, vehicle]
-    w = before.odometry_angular_velocity[world, vehicle]
-    sample = before.odometry_samples[world, vehicle]
+    v = state.odometry_velocity[world, vehicle]
+    w = state.odometry_angular_velocity[world, vehicle]
+    sample = state.odometry_samples[world, vehicle]
     rotation = identity3(v)
     translation = v - v
-    moved = int(0)
     due = wp.float64(sample) / model.odometry_rate
     while due <= tick_end + wp.float64(1.0e-9):
         duration = wp.max(due - now, wp.float64(0.0))
         if driven:
-            if moved == 0:
-                drive(model, before, after, world, vehicle, command, duration)
-            else:
-                drive(model, after, after, world, vehicle, command, duration)
-            moved = 1
+            drive(model, state, world, vehicle, command, duration)
         rotation, translation = increment(rotation, translation, v, w, v.dtype(duration))
-        if driven:
-            true_v = after.velocity[world, agent]
-            true_w = after.angular_velocity[world, agent]
-        else:
+        true_v = state.velocity[world, agent]
+        true_w = state.angular_velocity[world, agent]
+        if not driven:
             segment = segment_at(model, agent, due)
             true_v = model.motion.linear[segment]
             true_w = model.motion.angular[segment]
-        v, w = noisy_sample(model, before, world, vehicle, sample, true_v, true_w)
+        v, w = noisy_sample(model, state, world, vehicle, sample, true_v, true_w)
         now = due
         sample += 1
         due = wp.float64(sample) / model.odometry_rate
     duration = wp.max(tick_end - now, wp.float64(0.0))
     if driven:
-        if moved == 0:
-            drive(model, before, after, world, vehicle, command, duration)
-        else:
-            drive(model, after, after, world, vehicle, command, duration)
+        drive(model, state, world, vehicle, command, duration)
     rotation, translation = increment(rotation, translation, v, w, v.dtype(duration))
-    after.odometry_velocity[world, vehicle] = v
-    after.odometry_angular_velocity[world, vehicle] = w
-    after.odometry_samples[world, vehicle] = sample
-    after.increment_rotation[world, vehicle] = rotation
-    after.increment_translation[world, vehicle] = translation
+    state.odometry_velocity[world, vehicle] = v
+    state.odometry_angular_velocity[world, vehicle] = w
+    state.odometry_samples[world, vehicle] = sample
+    state.increment_rotation[world, vehicle] = rotation
+    state.increment_translation[world, vehicle] = translation

@@ -49,7 +49,7 @@ def place_agent(model: Any, state: Any, world: int, agent: int):
     state.velocity[world, agent] = o
     state.angular_velocity[world, agent] = o
     if model.motion.kind[agent] == PRESCRIBED:
-        prescribe(model, state, state, world, agent, wp.float64(0.0))
+        prescribe(model, state, world, agent, wp.float64(0.0))
 
 
 @wp.func
@@ -129,7 +129,7 @@ def believe(model: Any, state: Any, world: int, vehicle: int):
     if model.start.estimate_fixed[vehicle] == 0:
         position = position + state.position[world, agent]
     words = draw(seed, episode, 0, vehicle, RESET_ESTIMATE_POSITION)
-    third = o.dtype(1.0 / 3.0)
+    third = o.dtype(1.0) / o.dtype(3.0)
     radius = model.start.estimate_radius[vehicle] * wp.pow(uniform(words[2], third), third)
     position = position + unit_vector(words[0], words[1], o) * radius
     R = model.start.estimate_rotation[vehicle]
@@ -158,6 +158,6 @@ def reset_world(model: Any, state: Any, world: int):
         state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
     for place in range(model.vehicles):
         vehicle = model.order[place]
-        observe(model, state, state, world, vehicle, 0)
-        deliver(model, state, state, world, vehicle, 0)
-        broadcast(model, state, state, world, vehicle, 0)
+        observe(model, state, world, vehicle, 0)
+        deliver(model, state, world, vehicle, 0)
+        broadcast(model, state, world, vehicle, 0)

@@ -30,59 +30,54 @@ def sound(action: Any):
 
 
 @wp.func
-def command_in_force(model: Any, before: Any, world: int, vehicle: int, action: Any, tick: int):
+def command_in_force(model: Any, state: Any, world: int, vehicle: int, action: Any, tick: int):
     """Return what the actuators follow during a tick: after a decision, the last command for the dead time."""
     if (tick - 1) % model.ticks_per_decision < model.dynamics.latency_ticks:
-        return before.command[world, vehicle]
+        return state.command[world, vehicle]
     return action
 
 
 @wp.func
-def move(model: Any, before: Any, after: Any, actions: Any, world: int, tick: int):
+def move(model: Any, state: Any, actions: Any, world: int, tick: int):
     """Carry all truth of one world to the tick's end and sample odometry on the way."""
     t = wp.float64(tick) / model.camera_rate
     for agent in range(model.agents):
         if model.motion.kind[agent] == PRESCRIBED:
-            prescribe(model, before, after, world, agent, t)
+            prescribe(model, state, world, agent, t)
     for vehicle in range(model.vehicles):
         action = sound(actions[world, vehicle])
-        command = command_in_force(model, before, world, vehicle, action, tick)
-        measure_motion(model, before, after, world, vehicle, command, tick)
+        command = command_in_force(model, state, world, vehicle, action, tick)
+        measure_motion(model, state, world, vehicle, command, tick)
 
 
 @wp.func
-def tick_world(model: Any, before: Any, after: Any, actions: Any, world: int):
+def tick_world(model: Any, state: Any, actions: Any, world: int):
     """Run one camera tick of one world: truth -> camera -> V2X -> observer -> V2X, leaders before followers."""
-    tick = before.tick[world] + 1
-    move(model, before, after, actions, world, tick)
+    tick = state.tick[world] + 1
+    move(model, state, actions, world, tick)
     for vehicle in range(model.vehicles):
-        referee(model, before, after, world, vehicle)
+        referee(model, state, world, vehicle)
     for place in range(model.vehicles):
         vehicle = model.order[place]
-        observe(model, before, after, world, vehicle, tick)
-        deliver(model, before, after, world, vehicle, tick)
-        estimate(model, before, after, world, vehicle, tick)
-        broadcast(model, before, after, world, vehicle, tick)
+        observe(model, state, world, vehicle, tick)
+        deliver(model, state, world, vehicle, tick)
+        estimate(model, state, world, vehicle, tick)
+        broadcast(model, state, world, vehicle, tick)
     if tick % model.ticks_per_decision == 0 or tick == model.horizon_ticks:
         for vehicle in range(model.vehicles):
-            after.command[world, vehicle] = sound(actions[world, vehicle])
-    after.tick[world] = tick
+            state.command[world, vehicle] = sound(actions[world, vehicle])
+    state.tick[world] = tick
 
 
-def advance_kernel(
-    model: Any, before: Any, after: Any, actions: wp.array2d(dtype=Any), hold: wp.array(dtype=wp.int32), ticks: int
-):
+def advance_kernel(model: Any, state: Any, actions: wp.array2d(dtype=Any), hold: wp.array(dtype=wp.int32), ticks: int):
     """Advance every world by up to `ticks` camera ticks, not beyond the horizon. One thread per world.
 
-    Worlds marked in `hold` stay as they are. `after` may be `before`; otherwise it must start as a copy of it.
+    Worlds marked in `hold` stay as they are.
     """
     world = wp.tid()
-    count = wp.where(hold[world] == 0, wp.min(ticks, model.horizon_ticks - before.tick[world]), 0)
-    for elapsed in range(count):
-        if elapsed == 0:
-            tick_world(model, before, after, actions, world)
-        else:
-            tick_world(model, after, after, actions, world)
+    count = wp.where(hold[world] == 0, wp.min(ticks, model.horizon_ticks - state.tick[world]), 0)
+    for _ in range(count):
+        tick_world(model, state, actions, world)
 
 
 def reset_kernel(model: Any, state: Any, mask: wp.array(dtype=wp.int32)):

@@ -10,26 +10,26 @@ from coopenv.world.random import RADIO, draw, uniform
 
 
 @wp.func
-def broadcast(model: Any, before: Any, after: Any, world: int, vehicle: int, tick: int):
+def broadcast(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Put this vehicle's estimate (Rhat, Rhat phat) on the air if a message is due."""
     slot = tick % model.radio.slots
     sent = int(-1)
     if tick % model.radio.period == 0:
         sent = tick
-        R = after.estimate_rotation[world, vehicle]
-        after.outbox_rotation[world, vehicle, slot] = R
-        after.outbox_position[world, vehicle, slot] = R * after.estimate_position[world, vehicle]
-    after.outbox_tick[world, vehicle, slot] = sent
+        R = state.estimate_rotation[world, vehicle]
+        state.outbox_rotation[world, vehicle, slot] = R
+        state.outbox_position[world, vehicle, slot] = R * state.estimate_position[world, vehicle]
+    state.outbox_tick[world, vehicle, slot] = sent
 
 
 @wp.func
-def deliver(model: Any, before: Any, after: Any, world: int, receiver: int, tick: int):
+def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
     """Receive what arrives at this tick from the neighbours that may be heard.
 
     With delay 0 a follower hears its leaders' estimates of this very tick; a sender later in the order than
     its receiver (possible only without the acyclic restriction) is heard one tick late.
     """
-    here = after.position[world, model.landmarks + receiver]
+    here = state.position[world, model.landmarks + receiver]
     for n in range(model.target_count[receiver]):
         sender = model.targets[receiver, n] - model.landmarks
         if sender >= 0:
@@ -38,20 +38,20 @@ def deliver(model: Any, before: Any, after: Any, world: int, receiver: int, tick
                 lag = int(1)
             due = tick - lag
             slot = wp.max(due, 0) % model.radio.slots
-            if due >= 0 and after.outbox_tick[world, sender, slot] == due:
+            if due >= 0 and state.outbox_tick[world, sender, slot] == due:
                 heard = int(1)
-                there = after.position[world, model.landmarks + sender]
+                there = state.position[world, model.landmarks + sender]
                 if wp.length(there - here) > model.radio.range:
                     heard = int(0)
                 if model.radio.loss > model.radio.loss - model.radio.loss:
                     subject = receiver * 65536 + sender
-                    words = draw(before.seed[world], before.episode[world], tick, subject, RADIO)
+                    words = draw(state.seed[world], state.episode[world], tick, subject, RADIO)
                     if uniform(words[0], model.radio.loss) < model.radio.loss:
                         heard = int(0)
                 if heard == 1:
-                    after.inbox_rotation[world, receiver, sender] = after.outbox_rotation[world, sender, slot]
-                    after.inbox_position[world, receiver, sender] = after.outbox_position[world, sender, slot]
-                    after.inbox_tick[world, receiver, sender] = due
+                    state.inbox_rotation[world, receiver, sender] = state.outbox_rotation[world, sender, slot]
+                    state.inbox_position[world, receiver, sender] = state.outbox_position[world, sender, slot]
+                    state.inbox_tick[world, receiver, sender] = due
 
 
 @wp.func

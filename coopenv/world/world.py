@@ -85,7 +85,7 @@ class World:
     def advance(self, ticks: int) -> None:
         """Run camera ticks under `self.actions`, stopping each world at its horizon."""
         state, actions, mask = PerWorld(self.state), PerWorld(self.actions), PerWorld(self.mask)
-        self.launch(("advance", ticks), advance_kernel, [self.model, state, state, actions, mask, ticks])
+        self.launch(("advance", ticks), advance_kernel, [self.model, state, actions, mask, ticks])
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return a copy of everything that changes, random streams included (they are seeds and counters)."""
