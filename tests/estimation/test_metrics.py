@@ -32,7 +32,7 @@ def test_quaternion_is_axis_sine_of_half_the_angle(axis: tuple[float, ...], angl
     expected = np.array([math.cos(half), *(math.sin(half) * np.array(axis) / np.linalg.norm(axis))])
     if angle > 180 - 1e-6:  # q and -q are one rotation, and which one rounding decides
         expected *= np.sign(expected @ q)
-    assert_allclose(q, expected, atol=4e-16)
+    assert_allclose(q, expected, atol=2e-15)
     assert q[0] >= 0
 
 
