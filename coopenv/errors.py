@@ -34,6 +34,20 @@ class DataError(CoopenvError):
     """A recorded file is not what it claims to be."""
 
 
+def checked_seed(seed: object) -> int:
+    """Return a seed as an int.
+
+    Raises:
+        CoopenvError: it is not a whole number, or negative.
+    """
+    if isinstance(seed, bool) or not hasattr(seed, "__index__"):
+        raise CoopenvError(f"seed must be a whole number, got {seed!r}")
+    number = seed.__index__()
+    if number < 0:
+        raise CoopenvError(f"seed must not be negative, got {number}")
+    return int(number)
+
+
 def suggest(word: str, valid: Iterable[str]) -> str:
     """Return ` (did you mean 'x'?)` for the nearest valid word, else the empty string."""
     near = get_close_matches(word, list(valid), n=1, cutoff=0.5)

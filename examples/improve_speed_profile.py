@@ -12,7 +12,7 @@ from coopenv.world.gradient import DifferentiableWorld
 overrides = {
     "noise.enabled": False,
     "camera.miss_probability": 0.0,
-    "v2x": {},
+    "v2x": {"delay": 0, "loss": 0.0, "staleness": None},
     "vehicles.*.initial_estimate.position_radius": 0.01,
     "vehicles.*.initial_estimate.orientation_angle": 0.005,
 }

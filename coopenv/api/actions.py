@@ -6,15 +6,16 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from coopenv.api.engine import Engine
 from coopenv.errors import ActionError, suggest
 
 
 class ActionReader:
     """Turns {agent: (2,)} into (1, N, 2), clipped to [-1, 1]."""
 
-    def __init__(self, possible_agents: Sequence[str]) -> None:
+    def __init__(self, possible_agents: Sequence[str], engine: Engine) -> None:
         self._index = {agent: i for i, agent in enumerate(possible_agents)}
-        self._buffer = np.zeros((1, len(possible_agents), 2))
+        self._engine = engine
 
     def __call__(self, actions: Mapping[str, np.ndarray], alive: Sequence[str]) -> np.ndarray:
         """Return the actions of the living agents; those that have ended keep their last one.
@@ -23,13 +24,15 @@ class ActionReader:
             ActionError: an action is missing, unknown, of the wrong shape, or not finite.
         """
         try:
-            values = np.array([actions[agent] for agent in alive], dtype=np.float64)
+            values = np.array([actions[agent] for agent in alive])
         except (IndexError, KeyError, TypeError, ValueError):
             values = np.empty(0)
-        if values.shape != (len(alive), 2) or len(actions) != len(alive) or not np.isfinite(values).all():
+        numeric = values.dtype.kind in "fiu" and values.shape == (len(alive), 2)
+        if not numeric or len(actions) != len(alive) or not np.isfinite(values).all():
             self._complain(actions, alive)
-        self._buffer[0, [self._index[agent] for agent in alive]] = np.clip(values, -1.0, 1.0)
-        return self._buffer
+        whole = self._engine.view("actions").copy()
+        whole[0, [self._index[agent] for agent in alive]] = np.clip(values, -1.0, 1.0)
+        return whole
 
     def _complain(self, actions: Mapping[str, np.ndarray], alive: Sequence[str]) -> None:
         if not isinstance(actions, Mapping):
@@ -54,9 +57,11 @@ def check_action(action: object, agent: str) -> np.ndarray:
         ActionError: wrong shape, not a number, or not finite.
     """
     try:
-        value = np.asarray(action, dtype=np.float64)
+        value = np.asarray(action)
     except (TypeError, ValueError):
-        raise ActionError(f"action of '{agent}' is not numeric: {action!r}") from None
+        value = np.array("?")
+    if value.dtype.kind not in "fiu":
+        raise ActionError(f"action of '{agent}' is not numeric: {action!r}")
     if value.shape != (2,):
         raise ActionError(f"action of '{agent}' has shape {value.shape}, expected (2,)")
     if not np.isfinite(value).all():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from coopenv.api.report import MEMORY, allocate_report, report_kernel
 from coopenv.api.rewards import reward_weights
 from coopenv.scenario import Scenario
 from coopenv.world.launch import PerWorld
-from coopenv.world.state import overwrite, state_fields
+from coopenv.world.state import check_fit, overwrite, state_fields
 from coopenv.world.world import World
 
 
@@ -119,12 +119,14 @@ class Engine:
         memory = {name: getattr(self.report, name).numpy().copy() for name in MEMORY}
         return {**self.world.get_state(), **memory}
 
-    def set_state(self, values: dict[str, np.ndarray]) -> None:
+    def set_state(self, values: Mapping[str, np.ndarray]) -> None:
         """Restore what `get_state` returned.
 
         Raises:
             ValueError: a field is missing or has another shape.
         """
+        memory = {name: getattr(self.report, name) for name in MEMORY}
+        check_fit({**memory, **self.world.state_arrays()}, values)
         self.world.set_state(values)
         self.refresh()
-        overwrite({name: getattr(self.report, name) for name in MEMORY}, values)
+        overwrite(memory, values)

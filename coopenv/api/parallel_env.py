@@ -16,7 +16,7 @@ from coopenv.api.engine import Engine
 from coopenv.api.infos import InfoWriter
 from coopenv.api.layout import Field, action_space, dict_space, flat_space
 from coopenv.api.state import state_space, state_vector
-from coopenv.errors import CoopenvError, suggest
+from coopenv.errors import CoopenvError, checked_seed, suggest
 from coopenv.scenario import Scenario, load_scenario
 
 if TYPE_CHECKING:
@@ -40,8 +40,9 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
 
     Reward: the weighted sum of the named terms in `info["reward_terms"]`.
 
-    `terminated` on collision or arrival, `truncated` at the horizon. A vehicle that has ended leaves `agents`, parks
-    where it is, and goes on observing and sending, so that its followers keep their neighbour.
+    `terminated` on collision or arrival, `truncated` at the horizon. A vehicle that has ended leaves `agents` and goes
+    on observing and sending, so that its followers keep their neighbour; a driven one parks where it is, a prescribed
+    motion goes on.
 
     Info: `truth`, `estimate`, `position_error` (m), `orientation_error` (deg), `visible` (target names), `nees`,
     `log_determinant`, `gramian_min_eigenvalue`, `reward_terms`, `time` (s), `outcome`.
@@ -86,7 +87,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         self.observation_spaces = {agent: space for agent in self.possible_agents}
         self.action_spaces = {agent: action_space() for agent in self.possible_agents}
         self.state_space = state_space(scenario)
-        self._read_actions = ActionReader(self.possible_agents)
+        self._read_actions = ActionReader(self.possible_agents, self.engine)
         self._infos = InfoWriter(self.engine, scenario)
         self._view: TopView | None = None
         self._seeded = False
@@ -113,8 +114,8 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         """
         if seed is None and not self._seeded:
             _, seed = seeding.np_random(None)
+        self.engine.reset(None if seed is None else [checked_seed(seed)])
         self._seeded = True
-        self.engine.reset(None if seed is None else [seed])
         self.agents = list(self.possible_agents)
         if self.render_mode == "human":
             self.render()
@@ -186,7 +187,8 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
 
     def get_state(self) -> dict[str, Any]:
         """Return everything that the next step depends on, random streams included; see `set_state`."""
-        return {"agents": list(self.agents), "seeded": self._seeded, **self.engine.get_state()}
+        own = {"agents": list(self.agents), "seeded": self._seeded, "scenario": self.scenario}
+        return {**own, **self.engine.get_state()}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Go back to a state that `get_state` returned, of this or an equal environment.
@@ -194,12 +196,19 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         Raises:
             CoopenvError: the state belongs to another kind of environment.
         """
+        where = f"this state does not fit {self.metadata['name']}"
+        if not isinstance(state, Mapping):
+            raise CoopenvError(f"{where}: not a mapping, but {type(state).__name__}")
+        if state.get("scenario") != self.scenario:
+            raise CoopenvError(f"{where}: it is of another scenario")
+        agents = list(state.get("agents", ["none"]))
+        if not set(agents) <= set(self.possible_agents):
+            raise CoopenvError(f"{where}: its agents are {', '.join(agents)}")
         try:
-            self.engine.set_state({k: v for k, v in state.items() if k not in ("agents", "seeded")})
-            self.agents = list(state["agents"])
-            self._seeded = bool(state["seeded"])
-        except (KeyError, ValueError) as error:
-            raise CoopenvError(f"this state does not fit {self.metadata['name']}: {error}") from None
+            self.engine.set_state(state)
+        except ValueError as error:
+            raise CoopenvError(f"{where}: {error}") from None
+        self.agents, self._seeded = agents, bool(state.get("seeded"))
 
     def __getstate__(self) -> dict[str, Any]:
         return {"arguments": self._arguments, "state": self.get_state()}

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from coopenv.api.parallel_env import CooperativeLocalisationEnv, parallel_env
+from coopenv.api.parallel_env import RENDER_MODES, CooperativeLocalisationEnv, parallel_env
 from coopenv.errors import CoopenvError, suggest
 
 OtherPolicy = Callable[[str, Any], np.ndarray]
@@ -23,6 +23,8 @@ def keep_going(agent: str, observation: Any) -> np.ndarray:
 
 class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
     """One vehicle of a `CooperativeLocalisationEnv` as a single-agent environment."""
+
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012  (Gymnasium's convention)
 
     def __init__(
         self,

@@ -17,7 +17,7 @@ from gymnasium.vector.utils import batch_space
 from coopenv.api.arrays import ArrayKind, Exchange
 from coopenv.api.engine import Engine
 from coopenv.api.layout import Field, action_space, flat_space
-from coopenv.errors import CoopenvError, suggest
+from coopenv.errors import CoopenvError, checked_seed, suggest
 from coopenv.scenario import Scenario, load_scenario
 
 INFO_FIELDS = ("alive", "position_error", "orientation_error", "nees")
@@ -101,16 +101,18 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
         Args:
             seed: world w gets seed + w, or the w-th of a sequence of one per world; None goes on from the last seeds.
-            options: `{"reset_mask": bool array}` of one per row or per world restricts the reset to whole worlds.
+            options: `{"reset_mask": bool array}` of one per row or per world restricts the reset to whole worlds (not
+                the first one).
 
         Raises:
             CoopenvError: a mask that splits a world, or a sequence of the wrong length.
         """
         mask = self._world_mask((options or {}).get("reset_mask"))
-        if seed is None and not self._seeded:
-            _, seed = seeding.np_random(None)
-        self._seeded = True
+        if not self._seeded:
+            mask = None  # nothing has begun yet: the first reset is of all worlds
+            seed = seeding.np_random(None)[1] if seed is None else seed
         self.engine.reset(self._world_seeds(seed), mask)
+        self._seeded = True
         return self._exchange.rows("observation"), self._infos()
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -170,9 +172,9 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     def _world_seeds(self, seed: int | Sequence[int] | None) -> list[int] | None:
         if seed is None:
             return None
-        if isinstance(seed, int | np.integer):
-            return [int(seed) + world for world in range(self.num_worlds)]
-        seeds = [int(s) for s in seed]
+        if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):
+            return [checked_seed(seed) + world for world in range(self.num_worlds)]
+        seeds = [checked_seed(s) for s in seed]
         if len(seeds) == self.num_envs:
             seeds = seeds[:: self.vehicles]
         if len(seeds) != self.num_worlds:

@@ -19,10 +19,16 @@ def symmetric_part(A: Any):
 
 @wp.func
 def cholesky3(A: Any):
-    """Return (L, L^-1), both lower triangular, with A = L L^T, A symmetric positive definite and 3x3."""
+    """Return (L, L^-1), both lower triangular, with A = L L^T, A symmetric positive definite and 3x3.
+
+    Pivots that are lost in the rounding of A count as rounding, so that nothing is divided by zero.
+    """
     o = A.dtype(0.0)
     one = A.dtype(1.0)
-    tiny = A.dtype(1.0e-30)
+    rounding = A.dtype(1.0e-18)
+    if one + A.dtype(1.0e-9) == one:
+        rounding = A.dtype(1.0e-9)
+    tiny = wp.max(rounding * wp.trace(A), A.dtype(1.0e-30))
     i00 = one / wp.sqrt(wp.max(A[0, 0], tiny))
     l10 = A[1, 0] * i00
     l20 = A[2, 0] * i00

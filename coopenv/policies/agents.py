@@ -79,6 +79,6 @@ def load_agent(name_or_path: str | Path, layout: Mapping[str, Field]) -> Policy:
     try:
         factory = getattr(import_module(module), attribute)
         policy: Policy = factory(layout, **card.options)
-    except (ImportError, AttributeError, TypeError, KeyError) as error:
+    except (ImportError, AttributeError, TypeError, ValueError, KeyError) as error:
         raise CoopenvError(f"agent '{name_or_path}' cannot be built: {error}") from None
     return policy

@@ -38,6 +38,10 @@ class GiveWay:
             look_ahead: distance over which the heading to the goal is closed, m.
             steering_gain: steering share per rad of heading error.
         """
+        needed = ("goal", "message_position", "message_forward", "message_mask")
+        missing = [name for name in needed if name not in layout]
+        if missing:
+            raise ValueError(f"the observation lacks {', '.join(missing)}")
         self._layout = layout
         self._full, self._cruise, self._clearance = max_speed, cruise, clearance
         self._times = np.linspace(0.0, foresight, 31)

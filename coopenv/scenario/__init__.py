@@ -1,8 +1,8 @@
 """What a world is: typed, validated, read from `envs/*.toml`."""
 
-from coopenv.scenario.checks import ScenarioWarning
 from coopenv.scenario.files import data_directory, list_envs, load_scenario, parse_scenario, scenario_path
 from coopenv.scenario.schema import Scenario
+from coopenv.scenario.warning import ScenarioWarning
 
 __all__ = [
     "Scenario",

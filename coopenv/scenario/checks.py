@@ -9,19 +9,19 @@ from graphlib import CycleError, TopologicalSorter
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from coopenv.errors import suggest
+from coopenv.scenario.starts import check_room
+from coopenv.scenario.warning import ScenarioWarning
 
 if TYPE_CHECKING:
     from coopenv.scenario.schema import Scenario
 
+MOST_TICKS = 1e8
+"""Camera frames or odometry samples of one episode; counters are 32 bits wide."""
+
 FAR_FROM_ORIGIN = 50.0
 """m; beyond it the paper's observer loses accuracy, because it is not invariant to the map origin."""
-
-
-class ScenarioWarning(UserWarning):
-    """The scenario is possible but the theory's conditions may not hold."""
 
 
 def landmark_names(names: Sequence[str]) -> None:
@@ -42,7 +42,7 @@ def everything(scenario: Scenario) -> None:
     neighbour_sets(scenario)
     processing_order(scenario)
     gains(scenario)
-    starts(scenario)
+    check_room(scenario)
     limits(scenario)
     observability(scenario)
 
@@ -114,32 +114,19 @@ def gains(scenario: Scenario) -> None:
                 raise ValueError(f"observer.q: unknown target '{name}'{suggest(name, targets)}")
 
 
-def start_position(scenario: Scenario, vehicle: int) -> np.ndarray:
-    """Return the nominal start of a vehicle in the file's coordinates, (3,) m."""
-    description = scenario.vehicles[vehicle]
-    if description.motion.kind == "waypoints":
-        return np.array(description.motion.waypoints[0].position)
-    assert description.initial_pose is not None
-    return np.array(description.initial_pose.position)
-
-
-def starts(scenario: Scenario) -> None:
-    """Refuse vehicles that start inside a building or in one another's place."""
-    positions = [start_position(scenario, i) for i in range(len(scenario.vehicles))]
-    for i, position in enumerate(positions):
-        body = scenario.vehicles[i].body
-        reach = min(body.size) / 2 if body else 0.0
-        for obstacle in scenario.obstacles:
-            local = Rotation.from_euler("z", -obstacle.yaw).apply(position - np.array(obstacle.center))
-            if np.all(np.abs(local) < np.array(obstacle.size) / 2 + reach):
-                raise ValueError(f"vehicles.{i}.initial_pose: vehicle_{i + 1} starts inside obstacle '{obstacle.name}'")
-        for j in range(i):
-            if np.linalg.norm(position - positions[j]) < 1e-6:
-                raise ValueError(f"vehicles.{i}.initial_pose: vehicle_{i + 1} starts in the place of vehicle_{j + 1}")
-
-
 def limits(scenario: Scenario) -> None:
     """Check quantities of one section against those of another."""
+    for name, rate in (("camera", scenario.rates.camera), ("odometry", scenario.rates.odometry)):
+        if scenario.horizon * rate > MOST_TICKS:
+            raise ValueError(
+                f"horizon: {scenario.horizon:g} s at rates.{name} = {rate:g} Hz are over {MOST_TICKS:.0e} samples"
+            )
+    for i, vehicle in enumerate(scenario.vehicles):
+        motion, top = vehicle.motion, scenario.dynamics.max_speed
+        if motion.kind == "driven" and not (-top if scenario.dynamics.reverse else 0.0) <= motion.initial_speed <= top:
+            raise ValueError(
+                f"vehicles.{i}.motion.initial_speed: {motion.initial_speed:g} m/s is beyond what [dynamics] permits"
+            )
     decision = 1.0 / scenario.rates.decision
     if scenario.dynamics.latency > decision:
         raise ValueError(

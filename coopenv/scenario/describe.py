@@ -14,12 +14,16 @@ from coopenv.api.layout import layout_size, observation_layout
 from coopenv.api.registration import environment_id
 from coopenv.scenario import words
 from coopenv.scenario.schema import Scenario
+from coopenv.scenario.sensing import Camera
 
 SECTIONS = ("camera", "rates", "noise", "topology", "v2x", "observer", "observation", "reward", "termination")
 DRIVEN_SECTIONS = ("dynamics", "action")
 """Sections that matter only where actions drive a vehicle."""
 
 VALUE_WIDTH = 17
+
+IMAGE_FIELDS = ("image_size", "focal_length", "principal_point", "distortion", "undistort", "quantise")
+"""Settings of a camera that matter only where it has an image, as a pinhole camera does."""
 
 
 def environment_table(scenarios: Mapping[str, Scenario]) -> Table:
@@ -52,6 +56,9 @@ def describe_scenario(scenario: Scenario) -> Iterator[RenderableType]:
     yield from _spaced(vehicle_table(scenario))
     if scenario.landmarks:
         yield from _spaced(landmark_table(scenario))
+    timed = motion_table(scenario)
+    if timed.row_count:
+        yield from _spaced(timed)
     if scenario.obstacles:
         yield from _spaced(obstacle_table(scenario))
     yield Text("Settings (* differs from the default)\n", "bold")
@@ -92,6 +99,17 @@ def landmark_table(scenario: Scenario) -> Table:
     return table
 
 
+def motion_table(scenario: Scenario) -> Table:
+    """Return one row per stage of every motion that is prescribed stage by stage."""
+    table = _table("who", "time", "prescribed motion", title="Motions (s, m, rad; velocities forward, left, up)")
+    table.columns[0].no_wrap = table.columns[1].no_wrap = True
+    agents = [*zip(scenario.vehicle_names, scenario.vehicles, strict=True), *((m.name, m) for m in scenario.landmarks)]
+    for name, agent in agents:
+        for i, (time, stage) in enumerate(words.stages(agent.motion)):
+            table.add_row("" if i else name, time, stage)
+    return table
+
+
 def obstacle_table(scenario: Scenario) -> Table:
     """Return one row per building."""
     table = _table("building", "centre", "size", "yaw", title="Buildings (m)")
@@ -103,8 +121,11 @@ def obstacle_table(scenario: Scenario) -> Table:
 
 
 def settings(part: BaseModel, prefix: str = "") -> Iterator[tuple[str, str, str, bool]]:
-    """Yield (dotted key, value, meaning, whether it differs from the default) of a section's fields."""
+    """Yield (dotted key, value, meaning, whether it differs from the default) of a section's fields that matter."""
+    unused = IMAGE_FIELDS if isinstance(part, Camera) and part.model != "pinhole" else ()
     for name, info in type(part).model_fields.items():
+        if name in unused:
+            continue
         value = getattr(part, name)
         if isinstance(value, BaseModel):
             yield from settings(value, f"{prefix}{name}.")

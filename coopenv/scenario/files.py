@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import BaseModel, ValidationError
 
 from coopenv.errors import ScenarioError, UnknownEnvironmentError, suggest
@@ -61,16 +63,17 @@ def load_scenario(name_or_path: str | Path, overrides: Mapping[str, Any] | None 
         ScenarioError: the file or an override does not describe a possible world.
     """
     path = scenario_path(name_or_path)
+    if overrides is not None and not isinstance(overrides, Mapping):
+        raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError(f"{path.name}: cannot be read ({error})") from None
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"{path.name}: not valid TOML: {error}") from None
-    raw = apply_vehicle_defaults(raw)
     for key, value in (overrides or {}).items():
         override(raw, str(key), value)
-    return parse_scenario(raw, path.name)
+    return parse_scenario(apply_vehicle_defaults(raw, path.name), path.name)
 
 
 def parse_scenario(raw: Mapping[str, Any], where: str) -> Scenario:
@@ -80,31 +83,55 @@ def parse_scenario(raw: Mapping[str, Any], where: str) -> Scenario:
         ScenarioError: one line that names the field and, for unknown keys, the nearest valid one.
     """
     try:
-        return Scenario.model_validate(raw)
+        # Through JSON, where the strict mode refuses "5" and true for a number but takes lists for tuples.
+        return Scenario.model_validate_json(json.dumps(raw, default=_plain), strict=True)
     except ValidationError as error:
         raise ScenarioError(_one_line(error, where)) from None
 
 
-def apply_vehicle_defaults(raw: dict[str, Any]) -> dict[str, Any]:
-    """Merge the table `vehicle_defaults` under every entry of `vehicles`."""
-    raw = dict(raw)
-    defaults = raw.pop(DEFAULTS_KEY, None)
-    vehicles = raw.get("vehicles")
-    if isinstance(defaults, dict) and isinstance(vehicles, list):
-        raw["vehicles"] = [_merged(defaults, v) if isinstance(v, dict) else v for v in vehicles]
-    return raw
+def _plain(value: Any) -> Any:
+    """Return NumPy scalars and arrays as plain data, and anything else as text."""
+    return value.tolist() if isinstance(value, np.generic | np.ndarray) else str(value)
+
+
+def apply_vehicle_defaults(raw: Mapping[str, Any], where: str = "scenario") -> dict[str, Any]:
+    """Merge the table `vehicle_defaults` under every entry of `vehicles`.
+
+    Raises:
+        ScenarioError: it is not a table.
+    """
+    merged = dict(raw)
+    defaults = merged.pop(DEFAULTS_KEY, {})
+    if not isinstance(defaults, dict):
+        raise ScenarioError(f"{where}: {DEFAULTS_KEY}: must be a table, got {defaults!r}")
+    vehicles = merged.get("vehicles")
+    if isinstance(vehicles, list):
+        merged["vehicles"] = [_with_defaults(defaults, v) if isinstance(v, dict) else v for v in vehicles]
+    return merged
+
+
+def _with_defaults(defaults: Mapping[str, Any], vehicle: Mapping[str, Any]) -> dict[str, Any]:
+    result = _merged(defaults, vehicle)
+    motion = result.get("motion")
+    if isinstance(motion, dict) and motion.get("kind") == "waypoints" and "initial_pose" not in vehicle:
+        result.pop("initial_pose", None)  # such a motion starts at its first waypoint
+    return result
 
 
 def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `over` on top of `under`; tables are merged unless they are of different kinds."""
     result = dict(under)
     for key, value in over.items():
         below = result.get(key)
-        result[key] = _merged(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+        if isinstance(below, dict) and isinstance(value, dict):
+            kind = below.get("kind")
+            value = _merged(below, value) if value.get("kind", kind) == kind else value
+        result[key] = value
     return result
 
 
 def override(raw: Any, key: str, value: Any) -> None:
-    """Set one dotted key in nested plain data, in place.
+    """Set one dotted key in nested plain data, in place; a table is merged into the one that is there.
 
     Raises:
         ScenarioError: a list index does not exist, or the path runs through a plain value.
@@ -127,7 +154,7 @@ def _descend(node: Any, path: list[str], value: Any, key: str, parent: str = "")
             node[head] = dict(below) if isinstance(below, dict) else below
             _descend(node[head], rest, value, key, head)
         else:
-            node[head] = value
+            node[head] = _merged({head: node.get(head)}, {head: value})[head]
     else:
         raise ScenarioError(f"override '{key}': '{head}' lies below a plain value")
 
@@ -147,23 +174,37 @@ def _indices(node: list[Any], head: str, key: str, parent: str) -> range | list[
 
 def _one_line(error: ValidationError, where: str) -> str:
     details = error.errors(include_url=False)
-    first = details[0]
-    location = [str(part) for part in first["loc"] if not str(part).startswith("function-")]
+    # A misspelt key often also leaves a required one missing: the misspelling is what helps.
+    first = min(details, key=lambda d: d["type"] != "extra_forbidden")
+    keys = [part for part in first["loc"] if isinstance(part, int) or part.isidentifier()]
+    field = ".".join(str(part) for part in keys)
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
     if first["type"] == "extra_forbidden":
         valid = _valid_keys(first["loc"][:-1])
-        name = location[-1]
-        hint = suggest(name, valid) or f"; allowed: {', '.join(valid)}"
-        return f"{where}: {'.'.join(location)}: unknown key{hint}{more}"
-    location = [part for part in location if part.isidentifier() or part.isdigit()]
-    message = first["msg"].removeprefix("Value error, ")
-    field = ".".join(location)
+        hint = suggest(str(keys[-1]), valid) or f"; allowed: {', '.join(valid)}"
+        return f"{where}: {field}: unknown key{hint}{more}"
+    if first["type"] in ("union_tag_not_found", "union_tag_invalid"):
+        return f"{where}: {field}.kind: {_kind_message(first)}{more}"
+    message = first["msg"].removeprefix("Value error, ").replace("valid tuple", "list")
+    if first["type"] == "missing" and isinstance(keys[-1], int):
+        return f"{where}: {field.rpartition('.')[0]}: too few entries, number {keys[-1] + 1} is missing{more}"
     if first["type"] == "value_error":  # our own checks: their messages start with the field that they are about
         joint = "." if field and _starts_with_field(message) else ": "
         return f"{where}: {field}{joint if field else ''}{message}{more}"
     got = first.get("input")
     shown = f", got {got!r}" if isinstance(got, bool | int | float | str) else ""
     return f"{where}: {field}: {message}{shown}{more}"
+
+
+def _kind_message(detail: Any) -> str:
+    """Say which kinds exist, for a table whose `kind` is missing, misspelt or unknown."""
+    context, given = detail.get("ctx", {}), detail.get("input")
+    if "expected_tags" not in context:
+        near = suggest("kind", [str(k) for k in given]) if isinstance(given, dict) else ""
+        return f"Field required{near}"
+    kinds = [tag.strip().strip("'") for tag in context["expected_tags"].split(",")]
+    tag = str(context.get("tag", ""))
+    return f"unknown kind '{tag}'{suggest(tag, kinds)}; known: {', '.join(kinds)}"
 
 
 def _starts_with_field(message: str) -> bool:

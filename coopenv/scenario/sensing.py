@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, PositiveInt, model_validator
+from pydantic import Field, model_validator
 
 from coopenv.scenario.base import (
     Loss,
@@ -14,22 +14,26 @@ from coopenv.scenario.base import (
     PositiveVector2,
     Probability,
     QuaternionWxyz,
+    Rate,
     Sample,
     Vector2,
     Vector3,
 )
+
+Pixels = Annotated[int, Field(ge=1, le=65_535)]
 
 
 class Camera(Part):
     """The camera that every vehicle carries; optical frame: x right, y down, z forward."""
 
     model: Literal["pinhole", "omnidirectional"] = "omnidirectional"
-    """`omnidirectional` sees in every direction; `pinhole` is bounded by its image."""
+    """`omnidirectional` sees in every direction; `pinhole` is bounded by its image. Like range, distortion and
+    quantisation it counts in the topology `sensed` only; in `fixed` every neighbour is measured at every tick."""
     position: Vector3 = (0.0, 0.0, 0.0)
     """Optical centre in the body frame, m."""
     orientation: Literal["forward", "body"] | QuaternionWxyz = "forward"
     """Camera to body: `forward` looks along the body's x axis, `body` has the body's own axes."""
-    image_size: tuple[PositiveInt, PositiveInt] = (316, 208)
+    image_size: tuple[Pixels, Pixels] = (316, 208)
     """Width and height, pixels."""
     focal_length: PositiveVector2 = (213.161906, 213.521038)
     """fx and fy, pixels."""
@@ -50,13 +54,13 @@ class Camera(Part):
 class Rates(Part):
     """Rates in Hz; the sensors are asynchronous."""
 
-    camera: Positive = 60.0
+    camera: Rate = 60.0
     """Frames per second; one frame is one tick."""
-    odometry: Positive = 100.0
+    odometry: Rate = 100.0
     """Samples of the body twist per second, each held until the next."""
-    observer: Positive | None = None
+    observer: Rate | None = None
     """Rate of the observer's corrections (none: at every camera frame)."""
-    decision: Positive = 10.0
+    decision: Rate = 10.0
     """Rate of the policy's actions; the camera rate must be a multiple."""
 
     @model_validator(mode="after")
@@ -118,7 +122,7 @@ class V2x(Part):
 
     delay: int = Field(default=0, ge=0, le=600)
     """Camera ticks from sending to receiving; 0: a leader's estimate of the same tick."""
-    period: PositiveInt = 1
+    period: int = Field(default=1, ge=1, le=100_000)
     """Camera ticks between messages."""
     loss: Loss = 0.0
     """Chance that one receiver loses one message."""
@@ -143,7 +147,7 @@ class Observer(Part):
     """P(0) = diag(P0[0] I3, P0[1] I3)."""
     max_turn: Positive = 0.05
     """The correction is re-linearised whenever the attitude has turned by this much within a tick, rad."""
-    gramian_window: Positive = 1.0
+    gramian_window: float = Field(default=1.0, gt=0.0, le=3600.0)
     """Length of the sliding window of the observability Gramian, s."""
 
     @model_validator(mode="after")

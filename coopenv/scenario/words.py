@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -105,8 +105,7 @@ def estimate(belief: InitialEstimate) -> str:
 def motion(moves: Any) -> str:
     """Return a motion in words."""
     if isinstance(moves, ConstantMotion):
-        turning = f", turning at {vector(moves.angular)} rad/s" if any(moves.angular) else ""
-        return f"keeps {velocity(moves.linear)}{turning}"
+        return f"keeps {twist(moves.linear, moves.angular)}"
     if isinstance(moves, SegmentMotion):
         time = sum(segment.duration for segment in moves.segments)
         speed = max(math.hypot(*segment.linear) for segment in moves.segments)
@@ -116,6 +115,27 @@ def motion(moves: Any) -> str:
     if isinstance(moves, DrivenMotion):
         return f"driven by actions, starts at {number(moves.initial_speed)} m/s"
     return "stands still"
+
+
+def stages(moves: Any) -> Iterator[tuple[str, str]]:
+    """Yield (time, what happens) of a motion by segments or waypoints, in order; nothing for other motions."""
+    if isinstance(moves, SegmentMotion):
+        begin = 0.0
+        for segment in moves.segments:
+            end = begin + segment.duration
+            rests = not any((*segment.linear, *segment.angular))
+            yield f"{number(begin)}-{number(end)}", "rests" if rests else twist(segment.linear, segment.angular)
+            begin = end
+        yield f"{number(begin)}-", "rests"
+    elif isinstance(moves, WaypointMotion):
+        for waypoint in moves.waypoints:
+            yield number(waypoint.time), f"at {vector(waypoint.position)}"
+
+
+def twist(linear: Sequence[float], angular: Sequence[float]) -> str:
+    """Return a body twist in words."""
+    turning = f", turning at {vector(angular)} rad/s" if any(angular) else ""
+    return f"{velocity(linear)}{turning}"
 
 
 def velocity(linear: Sequence[float]) -> str:

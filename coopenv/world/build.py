@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.scenario import Scenario, checks
 from coopenv.scenario.agents import Body, Landmark, Vehicle
-from coopenv.scenario.motion import TwistTable, compile_motion, path_heading
+from coopenv.scenario.motion import TwistTable, compile_motion
+from coopenv.scenario.starts import agent_starts, rotation_of
 from coopenv.world.model import DRIVEN, PRESCRIBED, STATIC, model_struct
 from coopenv.world.precision import Precision
 
@@ -78,34 +79,6 @@ def _fill_topology(model: Any, scenario: Scenario, fill: _Filler) -> None:
     model.rank = fill.array(np.argsort(order), wp.int32)
 
 
-def _start_rotation(vehicle: Vehicle) -> np.ndarray:
-    if vehicle.motion.kind == "waypoints":
-        return Rotation.from_euler("z", path_heading(vehicle.motion)).as_matrix()
-    assert vehicle.initial_pose is not None
-    return _rotation(vehicle.initial_pose.yaw, vehicle.initial_pose.quaternion_wxyz)
-
-
-def _rotation(yaw: float | None, quaternion_wxyz: Any) -> np.ndarray:
-    if quaternion_wxyz is not None:
-        return Rotation.from_quat(quaternion_wxyz, scalar_first=True).as_matrix()
-    return Rotation.from_euler("z", yaw or 0.0).as_matrix()
-
-
-def agent_starts(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
-    """Return nominal start positions (A, 3) in the map frame and rotations (A, 3, 3)."""
-    origin = np.array(scenario.map.origin)
-    positions = [np.array(landmark.position) for landmark in scenario.landmarks]
-    rotations = [Rotation.from_euler("z", landmark.yaw).as_matrix() for landmark in scenario.landmarks]
-    for i, landmark in enumerate(scenario.landmarks):
-        if landmark.motion.kind == "waypoints":
-            positions[i] = np.array(landmark.motion.waypoints[0].position)
-            rotations[i] = Rotation.from_euler("z", path_heading(landmark.motion)).as_matrix()
-    for i, vehicle in enumerate(scenario.vehicles):
-        positions.append(checks.start_position(scenario, i))
-        rotations.append(_start_rotation(vehicle))
-    return np.array(positions) - origin, np.array(rotations)
-
-
 def _fill_start(start: Any, scenario: Scenario, fill: _Filler) -> None:
     p = fill.p
     landmarks = len(scenario.landmarks)
@@ -135,7 +108,7 @@ def _fill_start(start: Any, scenario: Scenario, fill: _Filler) -> None:
     offset = [Rotation.from_quat(e.orientation_offset_wxyz, scalar_first=True).as_matrix() for e in estimates]
     start.estimate_rotation = fill.array(
         [
-            (_rotation(e.yaw, e.quaternion_wxyz) if f else np.eye(3)) @ o
+            (rotation_of(e.yaw, e.quaternion_wxyz) if f else np.eye(3)) @ o
             for e, f, o in zip(estimates, fixed, offset, strict=True)
         ],
         p.mat33,
@@ -211,7 +184,7 @@ def _fill_camera(camera: Any, scenario: Scenario, p: Precision) -> None:
     if isinstance(c.orientation, str):
         rotation = ROTATION_OF_CAMERA[c.orientation]
     else:
-        rotation = _rotation(None, c.orientation)
+        rotation = rotation_of(None, c.orientation)
     camera.rotation = p.mat33(*rotation.ravel().tolist())
     camera.position = p.vec3(*c.position)
     camera.pinhole = int(c.model == "pinhole")

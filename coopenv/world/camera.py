@@ -150,7 +150,7 @@ def noisy_bearing(noise: Any, bearing: Any, words: Any):
         g = wp.transpose(noise.axis) * bearing
         depth = g[2]
         tiny = bearing.dtype(1.0e-6)
-        if wp.abs(depth) < tiny:  # the formula divides by it; see F7 of the method page
+        if wp.abs(depth) < tiny:  # the formula divides by it: docs/method.md, Limits
             depth = wp.where(depth < bearing.dtype(0.0), -tiny, tiny)
         x = g[0] / depth + noise.bearing * signed_uniform(words[0], one)
         y = g[1] / depth + noise.bearing * signed_uniform(words[1], one)

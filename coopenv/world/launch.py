@@ -18,6 +18,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from coopenv.errors import CoopenvError
+
 WORLDS_PER_THREAD = 32
 """Smaller shares are not worth the handing over between threads."""
 
@@ -50,11 +52,18 @@ def kernel(function: Callable[..., None], precision_name: str, differentiable: b
 
 
 def default_threads(worlds: int, device: str) -> int:
-    """Return how many threads to split a batch over: all cores (or COOPENV_THREADS) on the CPU, if it is large."""
+    """Return how many threads to split a batch over: all cores (or COOPENV_THREADS) on the CPU, if it is large.
+
+    Raises:
+        CoopenvError: COOPENV_THREADS is not a positive number.
+    """
     if device != "cpu":
         return 1
-    limit = int(os.environ.get("COOPENV_THREADS", 0)) or len(os.sched_getaffinity(0))
-    return max(1, min(limit, worlds // WORLDS_PER_THREAD))
+    wanted = os.environ.get("COOPENV_THREADS", "")
+    if wanted and not (wanted.isdigit() and int(wanted) > 0):
+        raise CoopenvError(f"COOPENV_THREADS must be a positive whole number, got '{wanted}'")
+    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, min(int(wanted or available), worlds // WORLDS_PER_THREAD))
 
 
 @dataclass(frozen=True)

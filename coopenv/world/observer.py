@@ -145,9 +145,11 @@ def correct(model: Any, state: Any, world: int, vehicle: int, tick: int, duratio
         B = B1
         D = D1
         remaining = remaining - h
-    state.estimate_rotation[world, vehicle] = R
-    state.estimate_position[world, vehicle] = p
-    state.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D, zero6)
+    # A correction that overflows the precision (float32 far from the origin, absurd gains) is left out.
+    if wp.isfinite(wp.dot(p, p) + wp.trace(A) + wp.trace(D) + wp.trace(R)):
+        state.estimate_rotation[world, vehicle] = R
+        state.estimate_position[world, vehicle] = p
+        state.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D, zero6)
 
 
 @wp.func

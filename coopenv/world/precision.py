@@ -26,17 +26,23 @@ class Precision:
     mat66: Any
 
 
-@cache
+SCALARS = {"float32": (wp.float32, np.float32), "float64": (wp.float64, np.float64)}
+
+
 def precision(dtype: str) -> Precision:
     """Return the types for `float32` or `float64`.
 
     Raises:
         DeviceError: another name.
     """
-    scalars = {"float32": (wp.float32, np.float32), "float64": (wp.float64, np.float64)}
-    if dtype not in scalars:
-        raise DeviceError(f"unknown dtype '{dtype}'{suggest(str(dtype), scalars)}; known: float32, float64")
-    scalar, numpy_type = scalars[dtype]
+    if not isinstance(dtype, str) or dtype not in SCALARS:
+        raise DeviceError(f"unknown dtype '{dtype}'{suggest(str(dtype), SCALARS)}; known: float32, float64")
+    return _precision(dtype)
+
+
+@cache
+def _precision(dtype: str) -> Precision:
+    scalar, numpy_type = SCALARS[dtype]
     return Precision(
         name=dtype,
         scalar=scalar,

@@ -100,8 +100,8 @@ def read_state(state: Any, p: Precision) -> dict[str, np.ndarray]:
     return {name: getattr(state, name).numpy().copy() for name in state_fields(p)}
 
 
-def overwrite(arrays: dict[str, Any], values: Mapping[str, np.ndarray]) -> None:
-    """Overwrite device arrays by name, all or none.
+def check_fit(arrays: Mapping[str, Any], values: Mapping[str, np.ndarray]) -> None:
+    """Check that values can overwrite device arrays by name.
 
     Raises:
         ValueError: a field is missing, or has another shape.
@@ -112,5 +112,9 @@ def overwrite(arrays: dict[str, Any], values: Mapping[str, np.ndarray]) -> None:
         expected, got = target.numpy().shape, np.shape(values[name])
         if got != expected:
             raise ValueError(f"state: field '{name}' has shape {got}, expected {expected}")
+
+
+def overwrite(arrays: Mapping[str, Any], values: Mapping[str, np.ndarray]) -> None:
+    """Overwrite device arrays by name."""
     for name, target in arrays.items():
         target.assign(np.ascontiguousarray(values[name], dtype=target.numpy().dtype))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -12,7 +13,7 @@ from coopenv.scenario import Scenario
 from coopenv.world.build import build_model
 from coopenv.world.launch import Launcher, PerWorld, default_threads
 from coopenv.world.precision import check_device, precision
-from coopenv.world.state import allocate_state, overwrite, read_state, state_fields
+from coopenv.world.state import allocate_state, check_fit, overwrite, read_state, state_fields
 from coopenv.world.step import advance_kernel, reset_kernel
 
 
@@ -45,10 +46,9 @@ class World:
             DeviceError: unknown precision or device.
             CoopenvError: no worlds or no threads.
         """
-        if worlds < 1:
-            raise CoopenvError(f"num_worlds must be at least 1, got {worlds}")
-        if threads is not None and threads < 1:
-            raise CoopenvError(f"threads must be at least 1, got {threads}")
+        for name, count in (("num_worlds", worlds), ("threads", 1 if threads is None else threads)):
+            if not isinstance(count, int | np.integer) or count < 1:
+                raise CoopenvError(f"{name} must be at least 1 and whole, got {count!r}")
         self.scenario = scenario
         self.worlds = worlds
         self.precision = precision(dtype)
@@ -91,11 +91,16 @@ class World:
         """Return a copy of everything that changes, random streams included (they are seeds and counters)."""
         return {**read_state(self.state, self.precision), "actions": self.actions.numpy().copy()}
 
-    def set_state(self, values: dict[str, np.ndarray]) -> None:
+    def set_state(self, values: Mapping[str, np.ndarray]) -> None:
         """Restore what `get_state` returned.
 
         Raises:
             ValueError: a field is missing or has another shape.
         """
+        check_fit(self.state_arrays(), values)
+        overwrite(self.state_arrays(), values)
+
+    def state_arrays(self) -> dict[str, Any]:
+        """Return every array that `set_state` writes, by name."""
         fields = {name: getattr(self.state, name) for name in state_fields(self.precision)}
-        overwrite({**fields, "actions": self.actions}, values)
+        return {**fields, "actions": self.actions}

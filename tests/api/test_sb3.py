@@ -12,6 +12,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import coopenv
+from coopenv.api.rewards import TERMS
 from coopenv.api.sb3 import make_sb3_vec_env
 
 pytestmark = pytest.mark.train
@@ -31,7 +32,7 @@ def test_time_limit_is_not_learnt_as_a_death() -> None:
     """Reward 1 per step for ever, cut off after 10 steps: the value is that of going on, 1 / (1 - gamma) = 20."""
     overrides = {
         "horizon": 1.0,
-        "reward.weights": {"time": -10.0},
+        "reward.weights": {**dict.fromkeys(TERMS, 0.0), "time": -10.0},
         "reward.privileged": False,
         "observation.include": ["odometry"],  # nothing that tells the time left
         "termination": {"collision": False, "arrival": False},

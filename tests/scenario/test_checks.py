@@ -93,7 +93,7 @@ def test_starts_inside_buildings_are_refused(place: tuple[float, float, float], 
 
 
 def test_a_body_may_not_reach_into_a_building() -> None:
-    for gap, inside in ((0.2, True), (0.3, False)):
+    for gap, inside in ((0.9, True), (1.1, False)):  # half the car's length is 1 m, along the wall's normal
         start_at = np.array([np.cos(0.5), np.sin(0.5), 0.0]) * (2.0 + gap) + [0, 0, 1]
         car = vehicle(start_at.tolist(), body={"size": [2.0, 0.5, 0.5]})
         data = builders.raw([car], obstacles=[WALL])

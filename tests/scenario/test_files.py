@@ -138,7 +138,7 @@ def test_overrides_do_not_leak_into_the_next_load(file: Path) -> None:
     before = load_scenario(file)
     load_scenario(file, {"vehicles.*.goal.radius": 0.9, "noise.enabled": False, "landmarks.A.position": [1, 1, 1]})
     assert load_scenario(file) == before
-    shared = load_scenario(file, {"vehicles.0.body.size": [3, 3, 3]})
+    shared = load_scenario(file, {"vehicles.0.body.size": [2.5, 2, 2]})
     assert shared.vehicles[1].body is not None
     assert shared.vehicles[1].body.size == (2.0, 2.0, 2.0)
 

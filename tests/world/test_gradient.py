@@ -15,7 +15,7 @@ from coopenv.world.world import World
 SMOOTH: dict[str, Any] = {
     "noise.enabled": False,
     "camera.miss_probability": 0.0,
-    "v2x": {},
+    "v2x": {"delay": 0, "loss": 0.0, "staleness": None},
     "vehicles.*.initial_estimate.position_radius": 0.01,
     "vehicles.*.initial_estimate.orientation_angle": 0.005,
 }

@@ -1,0 +1,42 @@
+"""A world for trainers that put infos into arrays: numbers only, no truth, and no complaint about the dead."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from pettingzoo.utils import BaseParallelWrapper
+
+from coopenv.api.parallel_env import CooperativeLocalisationEnv
+
+NUMBERS = ("position_error", "orientation_error", "nees", "arrived", "collided")
+"""Keys of every info: m, deg, squared normalised error, and 1.0 in the step of that event."""
+
+
+class PlainInfos(BaseParallelWrapper[str, Any, np.ndarray]):
+    """Keeps what is a number of each info, and drops the actions of vehicles that have ended.
+
+    TorchRL makes a tensor of every entry of an info, and sends actions for all agents, the dead ones included. RLlib
+    keeps infos for whole episodes. Truth is left out, so that no policy can be built on it by accident.
+    """
+
+    def __init__(self, env: CooperativeLocalisationEnv) -> None:
+        super().__init__(env)
+        self.state_space = env.state_space
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Start an episode."""
+        observations, infos = self.env.reset(seed=seed, options=options)
+        return observations, {agent: plain(info) for agent, info in infos.items()}
+
+    def step(self, actions: dict[str, np.ndarray]) -> Any:
+        """Drive for one decision period."""
+        living = {agent: actions[agent] for agent in self.env.agents if agent in actions}
+        *results, infos = self.env.step(living)
+        return *results, {agent: plain(info) for agent, info in infos.items()}
+
+
+def plain(info: dict[str, Any]) -> dict[str, float]:
+    """Return the numbers of an info."""
+    events = {"arrived": float(info["outcome"] == "arrived"), "collided": float(info["outcome"] == "collided")}
+    return {name: events[name] if name in events else float(info[name]) for name in NUMBERS}

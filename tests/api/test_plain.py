@@ -1,0 +1,53 @@
+"""The world for trainers that put infos into arrays."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pettingzoo.test import parallel_api_test
+
+import coopenv
+from coopenv.api.plain import NUMBERS, PlainInfos
+
+
+def test_infos_are_numbers_and_hold_no_truth() -> None:
+    env, full = PlainInfos(coopenv.parallel_env("urban_crossing")), coopenv.parallel_env("urban_crossing")
+    observations, infos = env.reset(seed=3)
+    expected, complete = full.reset(seed=3)
+    for _ in range(20):
+        assert set(infos) == set(env.agents)
+        for agent, info in infos.items():
+            assert tuple(info) == NUMBERS
+            assert all(type(value) is float for value in info.values())
+            assert info["nees"] == complete[agent]["nees"]
+            assert np.array_equal(observations[agent], expected[agent])
+        actions = {agent: np.full(2, 0.1, dtype=np.float32) for agent in env.agents}
+        observations, _, _, _, infos = env.step(actions)
+        expected, _, _, _, complete = full.step(actions)
+
+
+def test_events_show_once_and_actions_of_the_dead_are_dropped() -> None:
+    env = PlainInfos(coopenv.parallel_env("urban_crossing"))
+    env.reset(seed=0)
+    turns = {agent: np.array([1.0, 0.2 + 0.1 * i], dtype=np.float32) for i, agent in enumerate(env.possible_agents)}
+    collided = dict.fromkeys(env.possible_agents, 0.0)
+    while env.agents:
+        _, _, terminated, _, infos = env.step(turns)  # for all, the dead included
+        for agent, info in infos.items():
+            assert (info["arrived"] + info["collided"] == 1.0) == terminated[agent]
+            collided[agent] += info["collided"]
+    assert set(collided.values()) == {1.0}
+
+
+def test_missing_action_is_still_an_error() -> None:
+    env = PlainInfos(coopenv.parallel_env("urban_crossing"))
+    env.reset(seed=0)
+    with pytest.raises(coopenv.ActionError, match="no action for 'vehicle_1'"):
+        env.step({})
+
+
+def test_conforms() -> None:
+    env = PlainInfos(coopenv.parallel_env("urban_crossing"))
+    parallel_api_test(env, num_cycles=100)
+    env.reset(seed=0)
+    assert env.state_space.contains(env.state())

@@ -1,0 +1,203 @@
+"""The wrappers and checks that users bring along work unchanged on every face."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pettingzoo
+import pytest
+from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import RecordVideo
+from gymnasium.wrappers import vector as wrappers
+from pettingzoo.test import api_test, seed_test
+from pettingzoo.utils.wrappers import RecordVideoParallel
+
+import coopenv
+
+CROSSING = "coopenv/UrbanCrossing-v0"
+SHORT = {"horizon": 3.0}
+GYMNASIUM = tuple(int(part) for part in gymnasium.__version__.split(".")[:2])
+
+
+def batch(**options: Any) -> coopenv.CooperativeVectorEnv:
+    return coopenv.make_vec("urban_crossing", num_worlds=3, **options)
+
+
+def wide_turns(env: gymnasium.vector.VectorEnv) -> np.ndarray:
+    """Return actions under which vehicles hit walls, each at a time of its own."""
+    return np.column_stack([np.ones(env.num_envs), np.linspace(0.2, 0.5, env.num_envs)]).astype(np.float32)
+
+
+# Gymnasium, one vehicle
+
+
+@pytest.mark.parametrize("name", coopenv.list_envs())
+def test_check_env_on_the_single_vehicle_view(name: str) -> None:
+    identity = f"coopenv/{name.title().replace('_', '')}-v0"
+    check_env(gymnasium.make(identity).unwrapped, skip_render_check=True)
+
+
+def test_time_limit_and_statistics_of_one_vehicle() -> None:
+    env = gymnasium.wrappers.RecordEpisodeStatistics(gymnasium.make(CROSSING, max_episode_steps=7))
+    env.reset(seed=0)
+    total, done = 0.0, False
+    while not done:
+        _, reward, terminated, truncated, info = env.step(np.zeros(2, dtype=np.float32))
+        total, done = total + reward, terminated or truncated
+    assert truncated
+    assert info["episode"]["l"] == 7
+    assert info["episode"]["r"] == pytest.approx(total)
+
+
+@pytest.mark.filterwarnings("ignore:.*Overwriting existing videos")
+def test_record_video_of_one_vehicle(tmp_path: Path) -> None:
+    pytest.importorskip("moviepy", reason="RecordVideo needs moviepy")
+    env = RecordVideo(gymnasium.make(CROSSING, render_mode="rgb_array"), str(tmp_path), video_length=4)
+    env.reset(seed=0)
+    for _ in range(5):
+        env.step(env.action_space.sample())
+    env.close()
+    assert [path.suffix for path in tmp_path.iterdir()] == [".mp4"]
+
+
+# PettingZoo
+
+
+@pytest.mark.filterwarnings("ignore:.*Overwriting existing videos")
+def test_record_video_of_all_vehicles(tmp_path: Path) -> None:
+    pytest.importorskip("moviepy", reason="RecordVideoParallel needs moviepy")
+    env = RecordVideoParallel(
+        coopenv.parallel_env("urban_crossing", render_mode="rgb_array", overrides={"horizon": 0.5}), str(tmp_path)
+    )
+    env.reset(seed=0)
+    while env.agents:
+        env.step({agent: np.zeros(2, dtype=np.float32) for agent in env.agents})
+    env.close()
+    (video,) = tmp_path.iterdir()
+    assert video.name == "rl-video-episode-0.mp4"
+    assert video.stat().st_size > 1000
+
+
+def test_aec_by_name() -> None:
+    env = pettingzoo.make("aec", CROSSING, max_cycles=20)
+    api_test(env, num_cycles=50)
+    seed_test(lambda: pettingzoo.make("aec", CROSSING, max_cycles=20), num_cycles=10)
+
+
+def test_aec_goes_through_the_same_states_as_the_parallel_face() -> None:
+    turns, together = pettingzoo.make("aec", CROSSING), pettingzoo.make("parallel", CROSSING)
+    turns.reset(seed=5)
+    observations, _ = together.reset(seed=5)
+    for _ in range(3):
+        for agent in list(turns.agents):
+            observation, *_ = turns.last()
+            assert turns.agent_selection == agent
+            assert np.array_equal(observation, observations[agent])
+            turns.step(np.full(2, 0.1, dtype=np.float32))
+        observations, *_ = together.step({agent: np.full(2, 0.1, dtype=np.float32) for agent in together.agents})
+    assert np.array_equal(turns.state(), together.state())
+
+
+# Gymnasium, all vehicles of a batch
+
+
+def test_make_vec_by_name() -> None:
+    env = gymnasium.make_vec(CROSSING, num_envs=8)
+    assert env.num_envs == 8
+    with pytest.raises(coopenv.CoopenvError, match="not a positive multiple of the 4 vehicles"):
+        gymnasium.make_vec(CROSSING, num_envs=9)
+
+
+@pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
+def test_record_episode_statistics(autoreset: str) -> None:
+    """One entry per vehicle and episode, and one without reward for the time that a vehicle stood parked."""
+    if autoreset == "same_step" and GYMNASIUM < (1, 4):
+        pytest.skip("the wrapper of older Gymnasium loses the first reward after a reset in this mode")
+    env = wrappers.RecordEpisodeStatistics(batch(autoreset=autoreset, overrides={"horizon": 12.0}))
+    env.reset(seed=0)
+    actions, returns, lengths = wide_turns(env), np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=int)
+    over = np.zeros(env.num_envs, dtype=bool)
+    seen = parked = 0
+    for _ in range(150):
+        _, reward, terminated, truncated, infos = env.step(actions)
+        acted = infos["alive"] if autoreset == "same_step" else infos["alive"] & ~over
+        returns += reward * acted
+        lengths += acted
+        over = terminated | truncated
+        for row in np.flatnonzero(over):
+            if acted[row]:
+                seen += 1
+                assert infos["episode"]["r"][row] == pytest.approx(returns[row], abs=1e-4)
+                assert infos["episode"]["l"][row] == lengths[row]
+                returns[row] = lengths[row] = 0
+            else:
+                parked += 1
+                assert infos["episode"]["r"][row] == 0.0
+    assert seen > env.num_envs and parked > 0
+    assert env.episode_count == seen + parked
+
+
+def test_normalize_observation() -> None:
+    env = wrappers.NormalizeObservation(batch())
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    observations = np.stack([env.step(env.action_space.sample())[0] for _ in range(60)])
+    assert observations.dtype == np.float32
+    assert np.isfinite(observations).all()
+    assert abs(observations[20:].mean()) < 0.5
+    for mode in ("same_step", "disabled"):  # Gymnasium's wrapper allows next_step alone
+        with pytest.raises((ValueError, AssertionError)):
+            wrappers.NormalizeObservation(batch(autoreset=mode))
+
+
+@pytest.mark.parametrize("autoreset", ["next_step", "same_step", "disabled"])
+def test_reward_wrappers(autoreset: str) -> None:
+    plain = batch(autoreset=autoreset, overrides=SHORT)
+    clipped = wrappers.ClipReward(batch(autoreset=autoreset, overrides=SHORT), -0.05, 0.05)
+    normalised = wrappers.NormalizeReward(batch(autoreset=autoreset, overrides=SHORT))
+    for env in (plain, clipped, normalised):
+        env.reset(seed=2)
+    for _ in range(70):
+        rewards = [env.step(wide_turns(env))[1] for env in (plain, clipped, normalised)]
+        assert np.array_equal(rewards[1], np.clip(rewards[0], -0.05, 0.05))
+        assert np.isfinite(rewards[2]).all()
+        assert ((rewards[2] > 0) == (rewards[0] > 0)).all()
+
+
+@pytest.mark.parametrize("autoreset", ["next_step", "same_step", "disabled"])
+def test_action_and_observation_wrappers(autoreset: str) -> None:
+    env = wrappers.RescaleAction(batch(autoreset=autoreset), np.float32(0.0), np.float32(1.0))
+    twin: gymnasium.vector.VectorEnv = wrappers.ClipAction(batch(autoreset=autoreset))
+    if autoreset != "same_step":  # Gymnasium's observation wrappers do not touch final_obs, and so refuse this mode
+        twin = wrappers.FlattenObservation(twin)
+    assert np.array_equal(env.reset(seed=1)[0], twin.reset(seed=1)[0])
+    actions = wide_turns(env)
+    for _ in range(5):
+        first, second = env.step((actions + 1.0) / 2.0), twin.step(actions)
+        assert np.allclose(first[0], second[0], atol=1e-5)
+        assert np.allclose(first[1], second[1], atol=1e-5)
+
+
+def test_partial_reset_under_statistics() -> None:
+    env = wrappers.RecordEpisodeStatistics(batch(autoreset="disabled", overrides={"horizon": 0.5}))
+    env.reset(seed=0)
+    for _ in range(5):
+        _, _, terminated, truncated, _ = env.step(np.zeros((env.num_envs, 2), dtype=np.float32))
+    assert (terminated | truncated).all()
+    mask = np.repeat([True, False, True], 4)
+    env.reset(options={"reset_mask": mask})
+    assert (env.episode_lengths == np.where(mask, 0, 5)).all()
+
+
+@pytest.mark.xfail(strict=True, reason="render() gives one picture of world 0, the wrapper wants one per row")
+def test_record_video_of_a_batch(tmp_path: Path) -> None:
+    pytest.importorskip("moviepy", reason="RecordVideo needs moviepy")
+    env = wrappers.RecordVideo(batch(render_mode="rgb_array"), str(tmp_path), video_length=3)
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step(np.zeros((env.num_envs, 2), dtype=np.float32))
+    env.close()
+    assert [path.suffix for path in tmp_path.iterdir()] == [".mp4"]
