@@ -18,7 +18,7 @@ class ActionReader:
         self._engine = engine
 
     def __call__(self, actions: Mapping[str, np.ndarray], alive: Sequence[str]) -> np.ndarray:
-        """Return the actions of the living agents; those that have ended keep their last one.
+        """Return the actions of the living agents; those that have ended keep their last one, whatever is given.
 
         Raises:
             ActionError: an action is missing, unknown, of the wrong shape, or not finite.
@@ -28,7 +28,8 @@ class ActionReader:
         except (IndexError, KeyError, TypeError, ValueError):
             values = np.empty(0)
         numeric = values.dtype.kind in "fiu" and values.shape == (len(alive), 2)
-        if not numeric or len(actions) != len(alive) or not np.isfinite(values).all():
+        unknown = len(actions) != len(alive) and not set(actions) <= set(self._index)
+        if not numeric or unknown or not np.isfinite(values).all():
             self._complain(actions, alive)
         whole = self._engine.view("actions").copy()
         whole[0, [self._index[agent] for agent in alive]] = np.clip(values, -1.0, 1.0)
@@ -42,8 +43,6 @@ class ActionReader:
                 raise ActionError(
                     f"action for unknown agent '{agent}'{suggest(str(agent), self._index)}; agents: {', '.join(alive)}"
                 )
-            if agent not in alive:
-                raise ActionError(f"action for '{agent}', which has ended; agents: {', '.join(alive)}")
         for agent in alive:
             if agent not in actions:
                 raise ActionError(f"no action for '{agent}'; agents: {', '.join(alive)}")

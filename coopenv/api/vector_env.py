@@ -20,8 +20,20 @@ from coopenv.api.layout import Field, action_space, flat_space
 from coopenv.errors import CoopenvError, checked_seed, suggest
 from coopenv.scenario import Scenario, load_scenario
 
-INFO_FIELDS = ("alive", "position_error", "orientation_error", "nees")
-"""Arrays (num_envs,) in every info: m, deg; `alive` is false for a vehicle that had ended before this step."""
+INFO_FIELDS = ("alive", "ended", "position_error", "orientation_error", "nees")
+"""Arrays (num_envs,) in every info: `alive` is false for a vehicle that had ended before this step; `ended` is 0 under way,
+1 arrived, 2 collided; errors in m and deg."""
+
+
+class OneWorld:
+    """An engine's views as if one of its worlds were the only one, for what draws world 0."""
+
+    def __init__(self, engine: Engine, world: int) -> None:
+        self._engine, self._world = engine, world
+
+    def view(self, name: str) -> np.ndarray:
+        """Return a field with a leading axis of one world."""
+        return self._engine.view(name)[self._world : self._world + 1]
 
 
 class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
@@ -40,6 +52,8 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     Every reset draws anew. On the CPU results are fresh NumPy arrays; on CUDA they are torch tensors that share the
     environment's memory, valid until the next step, and `step` does not synchronise with the host.
     """
+
+    _view: Any = None
 
     def __init__(
         self,
@@ -73,7 +87,6 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.single_action_space = action_space()
         self._exchange = Exchange(self.engine, arrays)
         self._seeded = False
-        self._view: Any = None
 
     @cached_property
     def observation_space(self) -> spaces.Space[Any]:  # type: ignore[override]
@@ -182,14 +195,15 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return seeds
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """Return the top view of world 0, as a tuple of one (H, W, 3) uint8 picture."""
+        """Return one (H, W, 3) uint8 picture per row; the rows of a world share the top view of their world."""
         if self.render_mode is None:
             return None
         if self._view is None:
             from coopenv.viz.topview import TopView  # matplotlib is loaded by those who draw
 
             self._view = TopView(self.scenario)
-        return (self._view.draw(self.engine),)
+        pictures = [self._view.draw(OneWorld(self.engine, world)) for world in range(self.num_worlds)]
+        return tuple(picture for picture in pictures for _ in range(self.vehicles))
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return everything that the next step depends on, random streams included."""

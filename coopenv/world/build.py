@@ -24,6 +24,9 @@ ROTATION_OF_CAMERA = {
 
 NUMPY_OF = {wp.int32: np.int32, wp.float64: np.float64}
 
+GRAMIAN_RATE = 20.0
+"""Hz at which the sliding Gramian is sampled: it says how the scene is seen over a second, not within a frame."""
+
 GRAMIAN_BLOCKS = 10
 """Blocks of the sliding window of the observability Gramian; it moves on by one block."""
 
@@ -53,6 +56,8 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     model.sensed = int(scenario.topology.mode == "sensed")
     model.camera_rate = scenario.rates.camera
     model.odometry_rate = scenario.rates.odometry
+    model.camera_period = 1.0 / scenario.rates.camera
+    model.odometry_period = 1.0 / scenario.rates.odometry
     model.ticks_per_decision = scenario.ticks_per_decision
     model.horizon_ticks = scenario.horizon_ticks
     _fill_topology(model, scenario, fill)
@@ -242,5 +247,7 @@ def _fill_observer(observer: Any, scenario: Scenario, fill: _Filler) -> None:
     observer.p1, observer.p2 = o.P0
     observer.max_turn = o.max_turn
     observer.rate = min(scenario.rates.observer or scenario.rates.camera, scenario.rates.camera)
-    observer.block_ticks = max(1, round(o.gramian_window * scenario.rates.camera / GRAMIAN_BLOCKS))
+    stride = max(1, round(scenario.rates.camera / GRAMIAN_RATE))
+    observer.gramian_stride = stride
+    observer.block_ticks = stride * max(1, round(o.gramian_window * scenario.rates.camera / GRAMIAN_BLOCKS / stride))
     observer.blocks = GRAMIAN_BLOCKS

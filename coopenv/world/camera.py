@@ -27,20 +27,19 @@ def marker_position(model: Any, state: Any, world: int, agent: int):
 
 
 @wp.func
-def segment_hits_box(origin: Any, direction: Any, R: Any, center: Any, half: Any) -> bool:
-    """Return whether the segment origin + s direction, 0 < s < 1, passes through an oriented box (slab test)."""
+def segment_hits_box(origin: Any, direction: Any, inverse_square: Any, R: Any, center: Any, half: Any) -> bool:
+    """Return whether the segment origin + s direction, 0 < s < 1, passes through an oriented box (slab test).
+
+    `inverse_square` is 1 / |direction|^2; most boxes are told apart by their bounding spheres.
+    """
     reach = origin.dtype(1.0e-12)
-    Rt = wp.transpose(R)
     to_center = center - origin
-    along = wp.clamp(
-        wp.dot(to_center, direction) / wp.max(wp.dot(direction, direction), reach),
-        origin.dtype(0.0),
-        origin.dtype(1.0),
-    )
+    along = wp.clamp(wp.dot(to_center, direction) * inverse_square, origin.dtype(0.0), origin.dtype(1.0))
     miss = to_center - along * direction
     if wp.dot(miss, miss) > wp.dot(half, half):
         return False
-    o = Rt * (origin - center)
+    Rt = wp.transpose(R)
+    o = -(Rt * to_center)
     d = Rt * direction
     enter = origin.dtype(0.0)
     leave = origin.dtype(1.0)
@@ -59,10 +58,12 @@ def segment_hits_box(origin: Any, direction: Any, R: Any, center: Any, half: Any
 @wp.func
 def occlusion(model: Any, state: Any, world: int, observer: int, target: int, origin: Any, direction: Any):
     """Return VISIBLE, or what blocks the line of sight; neither end's own body does."""
+    inverse_square = direction.dtype(1.0) / wp.max(wp.dot(direction, direction), direction.dtype(1.0e-12))
     for k in range(model.obstacles):
         if segment_hits_box(
             origin,
             direction,
+            inverse_square,
             model.scene.obstacle_rotation[k],
             model.scene.obstacle_center[k],
             model.scene.obstacle_half[k],
@@ -73,7 +74,7 @@ def occlusion(model: Any, state: Any, world: int, observer: int, target: int, or
         if agent != observer and agent != target and half[0] > half.dtype(0.0):
             R = state.rotation[world, agent]
             center = state.position[world, agent] + R * model.scene.body_center[agent]
-            if segment_hits_box(origin, direction, R, center, half):
+            if segment_hits_box(origin, direction, inverse_square, R, center, half):
                 return OCCLUDED_BY_BODY
     return VISIBLE
 
@@ -103,7 +104,7 @@ def undistort(camera: Any, xd: Any, yd: Any):
 
 @wp.func
 def project(camera: Any, bearing: Any):
-    """Return (pixel u, pixel v, 1 if inside the image) of a bearing in the optical frame.
+    """Return (pixel u, pixel v, 1 if inside the image) of a direction of any length in the optical frame.
 
     A ray beyond the lens's largest radius has the pixel of the nearest ray that the lens can image.
     """
@@ -114,11 +115,12 @@ def project(camera: Any, bearing: Any):
         depth = bearing.dtype(1.0e-6)
     x = bearing[0] / depth
     y = bearing[1] / depth
-    radius = wp.sqrt(x * x + y * y)
-    if radius > camera.max_radius:
+    square = x * x + y * y
+    if square > camera.max_radius * camera.max_radius:
         inside = int(0)
-        x = x * camera.max_radius / radius
-        y = y * camera.max_radius / radius
+        shrink = camera.max_radius / wp.sqrt(square)
+        x = x * shrink
+        y = y * shrink
     xd, yd = distort(camera, x, y)
     u = camera.focal_length[0] * xd + camera.principal_point[0]
     v = camera.focal_length[1] * yd + camera.principal_point[1]
@@ -165,14 +167,15 @@ def noisy_bearing(noise: Any, bearing: Any, words: Any):
 
 
 @wp.func
-def sight_of(model: Any, state: Any, world: int, vehicle: int, target: int, origin: Any, line: Any, b: Any):
-    """Return whether a neighbour is in view now, and if not, why."""
-    distance = wp.length(line)
+def sight_of(model: Any, state: Any, world: int, vehicle: int, target: int, origin: Any, line: Any, ray: Any):
+    """Return whether a neighbour is in view now, and if not, why; `ray` is `line` in the optical frame."""
     if model.sensed == 1:
-        if distance > model.camera.range:
+        if wp.dot(line, line) > model.camera.range * model.camera.range:
             return OUT_OF_VIEW
         if model.camera.pinhole == 1:
-            _, _, inside = project(model.camera, b)
+            if ray[2] <= ray.dtype(0.0):
+                return OUT_OF_VIEW
+            _, _, inside = project(model.camera, ray)
             if inside == 0:
                 return OUT_OF_VIEW
         return occlusion(model, state, world, model.landmarks + vehicle, target, origin, line)
@@ -191,8 +194,11 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
     for n in range(model.target_count[vehicle]):
         target = model.targets[vehicle, n]
         line = marker_position(model, state, world, target) - origin
-        b = wp.normalize(to_camera * line)
-        sight = sight_of(model, state, world, vehicle, target, origin, line, b)
+        ray = to_camera * line
+        sight = sight_of(model, state, world, vehicle, target, origin, line, ray)
+        b = ray
+        if sight == VISIBLE:
+            b = wp.normalize(ray)
         if sight == VISIBLE and random:
             words = draw(state.seed[world], state.episode[world], tick, vehicle * 65536 + target, BEARING)
             if uniform(words[2], zero) < model.camera.miss:

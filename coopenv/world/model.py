@@ -135,7 +135,8 @@ def model_struct(p: Precision) -> Any:
         p2: scalar
         max_turn: scalar  # rad
         rate: wp.float64  # Hz
-        block_ticks: wp.int32  # ticks per block of the sliding Gramian
+        gramian_stride: wp.int32  # ticks between the samples of the sliding Gramian
+        block_ticks: wp.int32  # ticks per block of it, a multiple of the stride
         blocks: wp.int32
 
     @wp.struct
@@ -149,6 +150,8 @@ def model_struct(p: Precision) -> Any:
         sensed: wp.int32
         camera_rate: wp.float64  # Hz
         odometry_rate: wp.float64  # Hz
+        camera_period: wp.float64  # s
+        odometry_period: wp.float64  # s
         ticks_per_decision: wp.int32
         horizon_ticks: wp.int32
         targets: wp.array2d(dtype=wp.int32)  # (N, A) agents that may be measured and heard, ascending, then -1

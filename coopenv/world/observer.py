@@ -109,7 +109,6 @@ def correct(model: Any, state: Any, world: int, vehicle: int, tick: int, duratio
     limit = model.observer.max_turn
     one = type(duration)(1.0)
     zero6 = P - P
-    identity6 = join6(identity3(p), R - R, R - R, identity3(p), zero6)
     A = block3(P, 0, 0, R - R)
     B = block3(P, 0, 3, R - R)
     D = block3(P, 3, 3, R - R)
@@ -128,6 +127,7 @@ def correct(model: Any, state: Any, world: int, vehicle: int, tick: int, duratio
                 dx1, dx2, A1, B1, D1 = correct_kalman(h, M11, M12, M22, L11, L21, L22, r1, r2)
                 turn = wp.length(dx1)
         else:
+            identity6 = join6(identity3(p), R - R, R - R, identity3(p), zero6)
             T, spectrum = correction_modes(M11, M12, M22, L11, L21, L22, zero6, identity6)
             dx1, dx2 = correct_modes(k, h, T, spectrum, r1, r2)
             turn = wp.length(dx1)
@@ -154,7 +154,7 @@ def correct(model: Any, state: Any, world: int, vehicle: int, tick: int, duratio
 
 @wp.func
 def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: int, dt: Any):
-    """Add this tick's C^T C dt to the current block of the sliding observability Gramian.
+    """Add C^T C dt, dt being the time since the last sample, to the current block of the sliding Gramian.
 
     In map axes the transition matrix of A_i is the identity, so that blocks simply add up; the spectrum is the same
     as in the body frame of the window's start. C is taken at the estimate, as the observer itself knows it.
@@ -190,10 +190,11 @@ def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: i
 @wp.func
 def estimate(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Run one tick of the observer of one vehicle: predict, and correct when its rate says so."""
-    dt = type(model.observer.max_turn)(wp.float64(1.0) / model.camera_rate)
+    dt = type(model.observer.max_turn)(model.camera_period)
     predict(model, state, world, vehicle, dt)
-    due_before = wp.floor(wp.float64(tick - 1) * model.observer.rate / model.camera_rate + wp.float64(1.0e-9))
-    due_now = wp.floor(wp.float64(tick) * model.observer.rate / model.camera_rate + wp.float64(1.0e-9))
+    ratio = model.observer.rate * model.camera_period
+    due_before = wp.floor(wp.float64(tick - 1) * ratio + wp.float64(1.0e-9))
+    due_now = wp.floor(wp.float64(tick) * ratio + wp.float64(1.0e-9))
     last = state.corrected_tick[world, vehicle]
     if due_now > due_before:
         if model.observer.corrects == 1:
@@ -202,4 +203,6 @@ def estimate(model: Any, state: Any, world: int, vehicle: int, tick: int):
     state.corrected_tick[world, vehicle] = last
     # Products of rotations drift by rounding; once per tick is enough to keep Rhat a rotation.
     state.estimate_rotation[world, vehicle] = orthonormalise(state.estimate_rotation[world, vehicle])
-    accumulate_gramian(model, state, world, vehicle, tick, dt)
+    if tick % model.observer.gramian_stride == 0:
+        span = dt * type(dt)(model.observer.gramian_stride)
+        accumulate_gramian(model, state, world, vehicle, tick, span)

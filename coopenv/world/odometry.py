@@ -37,14 +37,14 @@ def measure_motion(model: Any, state: Any, world: int, vehicle: int, command: An
     """
     agent = model.landmarks + vehicle
     driven = model.motion.kind[agent] == DRIVEN
-    tick_end = wp.float64(tick) / model.camera_rate
-    now = wp.float64(tick - 1) / model.camera_rate
+    tick_end = wp.float64(tick) * model.camera_period
+    now = wp.float64(tick - 1) * model.camera_period
     v = state.odometry_velocity[world, vehicle]
     w = state.odometry_angular_velocity[world, vehicle]
     sample = state.odometry_samples[world, vehicle]
     rotation = identity3(v)
     translation = v - v
-    due = wp.float64(sample) / model.odometry_rate
+    due = wp.float64(sample) * model.odometry_period
     while due <= tick_end + wp.float64(1.0e-9):
         duration = wp.max(due - now, wp.float64(0.0))
         if driven:
@@ -59,7 +59,7 @@ def measure_motion(model: Any, state: Any, world: int, vehicle: int, command: An
         v, w = noisy_sample(model, state, world, vehicle, sample, true_v, true_w)
         now = due
         sample += 1
-        due = wp.float64(sample) / model.odometry_rate
+        due = wp.float64(sample) * model.odometry_period
     duration = wp.max(tick_end - now, wp.float64(0.0))
     if driven:
         drive(model, state, world, vehicle, command, duration)

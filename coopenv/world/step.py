@@ -40,7 +40,7 @@ def command_in_force(model: Any, state: Any, world: int, vehicle: int, action: A
 @wp.func
 def move(model: Any, state: Any, actions: Any, world: int, tick: int):
     """Carry all truth of one world to the tick's end and sample odometry on the way."""
-    t = wp.float64(tick) / model.camera_rate
+    t = wp.float64(tick) * model.camera_period
     for agent in range(model.agents):
         if model.motion.kind[agent] == PRESCRIBED:
             prescribe(model, state, world, agent, t)

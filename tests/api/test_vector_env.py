@@ -213,8 +213,12 @@ def test_saved_state() -> None:
 def test_rendering() -> None:
     env = coopenv.make_vec("overtaking", num_worlds=2, render_mode="rgb_array")
     env.reset(seed=0)
-    (picture,) = env.render()
-    assert picture.dtype == np.uint8 and picture.ndim == 3
+    for _ in range(3):
+        env.step(np.zeros((env.num_envs, 2)))
+    pictures = env.render()
+    assert len(pictures) == env.num_envs
+    assert all(picture.dtype == np.uint8 and picture.ndim == 3 for picture in pictures)
+    assert pictures[0] is pictures[1] and not np.array_equal(pictures[0], pictures[2])
     env.close()
 
 

@@ -192,7 +192,6 @@ def test_partial_reset_under_statistics() -> None:
     assert (env.episode_lengths == np.where(mask, 0, 5)).all()
 
 
-@pytest.mark.xfail(strict=True, reason="render() gives one picture of world 0, the wrapper wants one per row")
 def test_record_video_of_a_batch(tmp_path: Path) -> None:
     pytest.importorskip("moviepy", reason="RecordVideo needs moviepy")
     env = wrappers.RecordVideo(batch(render_mode="rgb_array"), str(tmp_path), video_length=3)

@@ -264,7 +264,8 @@ def _geometry(p: Precision, module: wp.Module) -> dict[str, Any]:
         out: wp.array(dtype=wp.int32),
     ):
         i = wp.tid()
-        out[i] = int(camera.segment_hits_box(start[i], end[i] - start[i], R[i], center[i], half[i]))
+        d = end[i] - start[i]
+        out[i] = int(camera.segment_hits_box(start[i], d, d.dtype(1.0) / wp.dot(d, d), R[i], center[i], half[i]))
 
     @wp.kernel(module=module)
     def boxes_touch(

@@ -1,0 +1,138 @@
+"""How the cost of a step grows with vehicles, landmarks and worlds."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+import warnings
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from coopenv.bench.cases import COOPENV, Case
+from coopenv.bench.measure import Result
+from coopenv.scenario import Scenario, ScenarioWarning, parse_scenario, scenario_path
+from coopenv.scenario.files import apply_vehicle_defaults
+
+BASE = "busy_intersection"
+VEHICLES, LANDMARKS = 5, 3
+"""Held while something else grows."""
+GAP = 3.0
+"""m between vehicles that follow one another."""
+WORLDS = 64
+"""Worlds while vehicles or landmarks grow: enough for the arithmetic to outweigh the call."""
+SIZES: dict[str, tuple[int, ...]] = {
+    "vehicles": (2, 4, 8, 16, 32, 64),
+    "landmarks": (3, 6, 12, 24, 48, 64),
+    "worlds": (1, 4, 16, 64, 256, 1024, 4096, 16384, 65536),
+}
+QUICK_SIZES: dict[str, tuple[int, ...]] = {"vehicles": (2, 8, 32), "landmarks": (3, 12, 48), "worlds": (1, 64, 4096)}
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """One quantity that grows, all else held."""
+
+    quantity: str
+    """vehicles, landmarks or worlds."""
+    sensed: bool
+    """Everyone looks for everyone before it; or else each measures three fixed neighbours."""
+    sizes: tuple[int, ...]
+
+    @property
+    def label(self) -> str:
+        """Name for people."""
+        return f"{self.quantity}, {'sensed' if self.sensed else 'three neighbours'}"
+
+    def cases(self) -> list[Case]:
+        """Return one case per size, on one thread."""
+        cases = []
+        for size in self.sizes:
+            shape = {"vehicles": VEHICLES, "landmarks": LANDMARKS, "worlds": WORLDS, self.quantity: size}
+            worlds = shape.pop("worlds")
+            options = {"growth": {**shape, "sensed": self.sensed}}
+            cases.append(Case(self.label, COOPENV.name, worlds, shape["vehicles"], options=options))
+        return cases
+
+
+def sweeps(quick: bool = False) -> list[Sweep]:
+    """Return what is measured."""
+    sizes = QUICK_SIZES if quick else SIZES
+    return [
+        Sweep("vehicles", True, sizes["vehicles"]),
+        Sweep("vehicles", False, sizes["vehicles"]),
+        Sweep("landmarks", True, sizes["landmarks"]),
+        Sweep("worlds", True, sizes["worlds"]),
+    ]
+
+
+def growth_scenario(vehicles: int, landmarks: int, sensed: bool) -> Scenario:
+    """Return the busy intersection with other numbers of vehicles (two columns) and landmarks (on a circle)."""
+    raw = apply_vehicle_defaults(tomllib.loads(scenario_path(BASE).read_text(encoding="utf-8")))
+    names = [f"L{i}" for i in range(1, landmarks + 1)]
+    angles = [2 * math.pi * i / landmarks for i in range(landmarks)]
+    raw["landmarks"] = [
+        {"name": name, "position": [6 * math.cos(a), 6 * math.sin(a), 3.0 + i % 3]}
+        for i, (name, a) in enumerate(zip(names, angles, strict=True))
+    ]
+    raw["topology"] = {"mode": "sensed" if sensed else "fixed"}
+    template = raw["vehicles"][0]
+    raw["vehicles"] = []
+    for i in range(vehicles):
+        back = 16.0 + GAP * (i // 2)
+        position, direction = ([-2.0, -back, 2.5], [0.0, 0.5, 0.0]) if i % 2 == 0 else ([-back, 2.0, 3.0], [0.5, 0, 0])
+        vehicle = {
+            **template,
+            "initial_pose": {"position": position},
+            "initial_estimate": {**template["initial_estimate"], "position": [x + 2.0 for x in position]},
+            "motion": {"kind": "constant", "linear": direction},
+        }
+        del vehicle["neighbours"]
+        if not sensed:
+            vehicle["neighbours"] = names[:3] if i == 0 else [*names[:2], f"vehicle_{i}"]
+        raw["vehicles"].append(vehicle)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ScenarioWarning)
+        return parse_scenario(raw, f"{BASE} with {vehicles} vehicles and {landmarks} landmarks")
+
+
+@dataclass(frozen=True)
+class PowerLaw:
+    """cost = factor * size ** exponent."""
+
+    exponent: float
+    factor: float
+
+
+@dataclass(frozen=True)
+class Growth:
+    """The cost of a step of all worlds (s) over the sizes that were measured."""
+
+    sweep: Sweep
+    sizes: list[int]
+    costs: list[float]
+    overall: PowerLaw
+    large: PowerLaw
+    """Fitted to the larger half of the sizes, where constant costs no longer count."""
+
+    def row(self) -> dict[str, object]:
+        """Return the figures as plain data."""
+        return {"label": self.sweep.label, "unit": "s per step of all worlds", **asdict(self)}
+
+
+def fit_power_law(sizes: list[int], costs: list[float]) -> PowerLaw:
+    """Return the least-squares line through the logarithms."""
+    slope, offset = np.polyfit(np.log(sizes), np.log(costs), 1)
+    return PowerLaw(float(slope), float(np.exp(offset)))
+
+
+def summarise(sweep: Sweep, results: list[Result]) -> Growth | None:
+    """Return a sweep's costs and fits; None when fewer than two sizes could be measured."""
+    pairs = [
+        (size, result.seconds_per_step) for size, result in zip(sweep.sizes, results, strict=True) if not result.problem
+    ]
+    if len(pairs) < 2:
+        return None
+    sizes, costs = [size for size, _ in pairs], [cost for _, cost in pairs]
+    half = min(len(sizes) // 2, len(sizes) - 2)
+    return Growth(sweep, sizes, costs, fit_power_law(sizes, costs), fit_power_law(sizes[half:], costs[half:]))

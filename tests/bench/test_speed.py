@@ -1,0 +1,137 @@
+"""`coopenv bench speed` as a whole."""
+
+from __future__ import annotations
+
+import json
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from jsonschema import validate
+from rich.console import Console
+
+import coopenv
+from coopenv.bench import peers, speed
+from coopenv.bench.speed import SpeedRequest
+from coopenv.cli import main
+from tests.bench.fake_peer import FAKE, fake_case
+
+NUMBER = {"type": "number", "exclusiveMinimum": 0}
+COUNT = {"type": "integer", "minimum": 1}
+ROW = {
+    "type": "object",
+    "properties": {
+        "name": {"type": "string"},
+        "worlds": COUNT,
+        "vehicles": COUNT,
+        "threads": COUNT,
+        "dtype": {"enum": ["float32", "float64"]},
+        "infos": {"type": "boolean"},
+        "env_steps_per_s": NUMBER,
+        "agent_steps_per_s": NUMBER,
+        "vehicle_ticks_per_s": NUMBER,
+        "counted_as_vehicle_ticks": {"type": "string"},
+        "array_bytes_per_world": {"type": ["number", "null"]},
+        "rss_bytes_per_world": {"type": ["number", "null"]},
+    },
+}
+ROW["required"] = list(ROW["properties"])  # type: ignore[call-overload]
+DOCUMENT = {
+    "type": "object",
+    "properties": {
+        "command": {"type": "string", "pattern": "^coopenv bench speed "},
+        "rows": {"type": "array", "items": ROW, "minItems": 1},
+        "machine": {"type": "object", "required": ["processor", "cores_available", "memory_bytes", "system"]},
+        "versions": {"type": "object", "required": ["python", "coopenv", "warp-lang", "numpy"]},
+        "without_figures": {"type": "array", "items": {"required": ["name", "worlds", "reason"]}},
+        "ratios": {"type": "array", "items": {"required": ["peer", "worlds", "threads", "agent_steps"]}},
+        "startup_s": {"type": "object", "required": ["imports", "compiling", "cached"]},
+        "growth": {"type": "array", "items": {"required": ["sizes", "costs", "overall", "large", "label"]}},
+    },
+}
+DOCUMENT["required"] = list(DOCUMENT["properties"])  # type: ignore[call-overload]
+
+
+@pytest.fixture(autouse=True)
+def terminal(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("busy_intersecton", "did you mean 'busy_intersection'"),
+        ("--repeats 0", "--repeats"),
+        ("--seconds 0", "--seconds"),
+        ("--seconds nan", "--seconds"),
+        ("--out occupied", "it is not a folder"),
+        ("--out occupied/below", "cannot write to"),
+        ("--out taken", "speed.json: it is a folder"),
+        ("--set noise.enabld=false", "did you mean 'enabled'"),
+    ],
+)
+def test_mistakes_end_with_one_line_and_status_2(line: str, message: str, capfd: pytest.CaptureFixture[str]) -> None:
+    Path("occupied").write_text("")
+    Path("taken/speed.json").mkdir(parents=True)
+    assert main(["bench", "speed", *line.split()]) == 2
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("error: ")
+    assert captured.err.count("\n") == 1
+    assert message in captured.err
+
+
+def test_a_peer_that_is_not_installed_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(peers, "find_spec", lambda name: None)
+    assert not any(peers.installed(peer) for peer in peers.PEERS)
+    assert peers.install_hint(peers.MPE2) == "not installed: pip install mpe2"
+
+
+def test_the_command_is_written_as_it_can_be_typed() -> None:
+    request = SpeedRequest("urban_crossing", None, {"horizon": 20.0}, seconds=1.5, growth=True, peers=False)  # type: ignore[arg-type]
+    assert request.command == (
+        "coopenv bench speed urban_crossing --seconds 1.5 --repeats 5 --set horizon=20.0 --growth --no-peers"
+    )
+
+
+def test_a_run_with_a_fake_peer(monkeypatch: pytest.MonkeyPatch) -> None:
+    absent = peers.peer_cases(quick=True)[0]
+    monkeypatch.setattr(speed, "PEERS", (FAKE, peers.HIGHWAY))
+    monkeypatch.setattr(speed, "installed", lambda library: library is FAKE)
+    monkeypatch.setattr(speed, "peer_cases", lambda quick: [fake_case(), absent])
+    monkeypatch.setattr(speed, "own_cases", lambda *_: [fake_case("make_vec", worlds=32)])
+    scenario = coopenv.load_scenario("busy_intersection")
+    out = StringIO()
+    request = SpeedRequest("busy_intersection", scenario, seconds=0.01, repeats=1, quick=True, out=Path("here"))
+    report = speed.execute(request, Console(file=out, width=80), Console(file=StringIO()))
+    document = json.loads(Path("here/speed.json").read_text())
+    validate(document, DOCUMENT)
+    assert [row["name"] for row in document["rows"]] == ["make_vec", "fake"]
+    assert document["without_figures"][0]["reason"] == "not installed: pip install highway-env"
+    assert set(report.startup.imports) == {"coopenv", "fake"}
+    assert "install highway-env" in out.getvalue()
+    assert "Cores used: 0.0" in out.getvalue()
+    assert "figures are too low" in " ".join(out.getvalue().split())
+    assert "For fake: scans." in out.getvalue()
+    assert "Files in here: speed.json, speed.png" in out.getvalue()
+
+
+@pytest.mark.slow
+def test_quick_from_end_to_end(capsys: pytest.CaptureFixture[str]) -> None:
+    line = "bench speed --quick --growth --seconds 0.02 --repeats 1 --out here"
+    assert main(line.split()) == 0
+    out = capsys.readouterr().out
+    document = json.loads(Path("here/speed.json").read_text())
+    validate(document, DOCUMENT)
+    assert max(len(line) for line in out.splitlines()) <= 80
+    assert "…" not in out
+    assert {path.name for path in Path("here").iterdir()} == {"speed.json", "speed.png", "growth.png"}
+    shown = {row["name"] for row in document["rows"]} | {row["name"] for row in document["without_figures"]}
+    assert {case.name for case in peers.peer_cases()} <= shown
+    own = {(row["worlds"], row["infos"]) for row in document["rows"] if row["name"] == "make_vec"}
+    assert own == {(worlds, infos) for worlds in (1, 32, 1024) for infos in (True, False)}
+    assert all(row["array_bytes_per_world"] > 1000 for row in document["rows"] if row["library"] == "coopenv")
+    assert len(document["growth"]) == 4
+    assert all(growth["costs"] for growth in document["growth"])
+    assert "coopenv" in document["startup_s"]["imports"]

@@ -1,0 +1,23 @@
+"""Without its extra, a trainer's face says in one line what to install."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import pytest
+
+
+@pytest.mark.parametrize(
+    ("module", "needed", "extra"),
+    [
+        ("coopenv.api.sb3", "stable_baselines3.common.vec_env", "train"),
+        ("coopenv.api.rllib", "ray.rllib.env.multi_agent_env", "rllib"),
+        ("coopenv.api.benchmarl", "benchmarl.environments.common", "benchmarl"),
+    ],
+)
+def test_missing_extra(module: str, needed: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, needed, None)
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    with pytest.raises(ImportError, match=rf"^{module} needs .+: pip install 'coopenv\[{extra}\]'$"):
+        importlib.import_module(module)
