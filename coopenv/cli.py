@@ -149,21 +149,25 @@ app.add_typer(bench, name="bench")
 @bench.command("speed")
 def bench_speed(
     environment: Annotated[str, typer.Argument(metavar="ENV", help="Environment to step.")] = "busy_intersection",
-    seconds: Annotated[float, typer.Option(min=0.01, help="Time per case and round.")] = 1.0,
-    repeats: Annotated[int, typer.Option(min=1, help="Rounds, of which the median counts.")] = 5,
+    overrides: Overrides = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.01, help="Time per case and round (default: 0.5).", show_default=False)
+    ] = None,
+    repeats: Annotated[
+        int | None, typer.Option(min=1, help="Rounds, of which the median counts (default: 5).", show_default=False)
+    ] = None,
+    growth: Annotated[bool, typer.Option("--growth", help="Also grow vehicles, landmarks and worlds.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer cases and shorter rounds: under a minute.")] = False,
+    peers: Annotated[bool, typer.Option(help="Also measure other projects' environments.")] = True,
+    out: Annotated[Path | None, typer.Option(help="Folder for speed.json and pictures (default: none).")] = None,
 ) -> None:
-    """Measure steps per second, alternating between cases in one process."""
-    load(environment, {})
-    from coopenv.bench.speed import measure, own_cases
-    from coopenv.bench.tables import speed_table
-    from coopenv.runs.command import progress
+    """Measure steps per second of coopenv and, where installed, of its peers, alternating in one run."""
+    parsed = parse_overrides(overrides)
+    scenario = load(environment, parsed)
+    from coopenv.bench.speed import SpeedRequest, execute
 
-    with progress(console(stderr=True)) as bar:
-        task = bar.add_task("compiling and measuring", total=None)
-        results = measure(
-            own_cases(environment), seconds, repeats, lambda share: bar.update(task, total=1, completed=share)
-        )
-    console().print(speed_table(results))
+    request = SpeedRequest(environment, scenario, parsed, seconds, repeats, out, growth, quick, peers)
+    execute(request, console(), console(stderr=True))
 
 
 @bench.command("agents")
@@ -187,6 +191,37 @@ def bench_agents(
                 episodes = bar.track(range(seeds), description=f"{agent} in {name}")
                 rows.append((agent, name, score(play(env, policy, seed) for seed in episodes)))
     console().print(score_table(rows))
+
+
+@bench.command("seeds")
+def bench_seeds(
+    environment: Environment,
+    seeds: Annotated[int, typer.Option(min=1, help="How many.")] = 20,
+    first: Annotated[int, typer.Option(min=0, help="The first one.")] = 0,
+    overrides: Overrides = None,
+    steady_from: Annotated[
+        float | None,
+        typer.Option(help="Start of the steady state in s (default: 70 % of the horizon).", show_default=False),
+    ] = None,
+) -> None:
+    """Run an environment over many seeds at once: who settles, and the steady errors with their spread."""
+    scenario = load(environment, parse_overrides(overrides))
+    from coopenv.bench.seed_table import seed_table
+    from coopenv.bench.seeds import study_seeds
+    from coopenv.estimation.metrics import STEADY_SHARE
+    from coopenv.runs.command import progress
+
+    start = STEADY_SHARE * scenario.horizon if steady_from is None else steady_from
+    if not 0.0 <= start < scenario.horizon:
+        raise CoopenvError(f"--steady-from {start:g} is not within the horizon of {scenario.horizon:g} s")
+    with progress(console(stderr=True)) as bar:
+        task = bar.add_task(f"{seeds} seeds", total=1.0)
+        study = study_seeds(
+            scenario, range(first, first + seeds), start, on_progress=lambda share: bar.update(task, completed=share)
+        )
+    out = console()
+    out.print(seed_table(study))
+    out.print(f"Steady: after {start:g} s. Settled: below 0.5 m and 5 deg until the end.")
 
 
 def console(stderr: bool = False) -> Console:

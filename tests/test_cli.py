@@ -117,6 +117,33 @@ def test_run_writes_its_files_and_prints_its_table(capsys: pytest.CaptureFixture
     assert max(len(line) for line in out.splitlines()) <= 80
 
 
+@pytest.mark.parametrize("name", ["metrics.json", "trajectory.npz", *sorted(FIGURES), "video.gif"])
+def test_results_that_cannot_be_written_are_found_before_the_run(
+    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("coopenv.runs.video.find_spec", lambda name: None)
+    monkeypatch.setattr("coopenv.runs.recording.Recording.play", lambda self: pytest.fail("simulated"))
+    (Path("there") / name).mkdir(parents=True)
+    assert main(["run", "overtaking", "--out", "there", "--video"]) == 2
+    assert capsys.readouterr().err == f"error: cannot write to there/{name}: it is a folder\n"
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["urban_crossing", "--set", "observer.name=dead_reckoning", "--policy", "give_way"],
+        ["busy_intersection", "--set", "observer.q=1e30", "--dtype", "float32"],
+    ],
+)
+def test_lost_observers_have_tables_and_figures(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", *options, "--out", "lost"]) == 0
+    out = capsys.readouterr().out
+    assert "no rate to fit" in out
+    assert {path.name for path in Path("lost").iterdir()} == FIGURES | {"metrics.json", "trajectory.npz"}
+    assert "NaN" not in Path("lost/metrics.json").read_text()
+
+
 def test_noise_adds_the_wider_tolerance(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "busy_intersection", "--steps", "60", "--steady-from", "2", "--out", "here"]) == 0
     out = capsys.readouterr().out

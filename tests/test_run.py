@@ -19,7 +19,7 @@ from coopenv.estimation.trajectory import Sight, Trajectory
 from coopenv.runs import Recording, record
 from coopenv.runs.metrics import outcome_line, run_metrics, vehicle_metrics
 from coopenv.runs.output import prepare_folder, write_results
-from coopenv.runs.table import figure, percent, seconds
+from coopenv.runs.table import figure, metrics_table, percent, remarks, seconds
 from coopenv.runs.video import GIF_SIZE, GifFilm, frame_stride
 
 CASES: list[tuple[str, dict[str, Any]]] = [
@@ -192,6 +192,10 @@ def test_folders_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
     for folder in ("file", "file/below", "run"):
         with pytest.raises(OutputError, match="cannot write to"):
             prepare_folder(tmp_path / folder)
+    prepare_folder(tmp_path / "run", ["trajectory.npz"])
+    (tmp_path / "run" / "trajectory.npz").write_text("kept")
+    prepare_folder(tmp_path / "run", ["trajectory.npz"])
+    assert (tmp_path / "run" / "trajectory.npz").read_text() == "kept"
     prepare_folder(tmp_path / "new" / "folder")
     assert list((tmp_path / "new" / "folder").iterdir()) == []
 
@@ -211,6 +215,65 @@ def test_films_play_in_real_time(tmp_path: Path) -> None:
             image.seek(frame)
             duration += image.info["duration"]
     assert duration == 1000
+
+
+def test_a_file_that_may_not_be_replaced_is_found_beforehand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "errors.png").write_text("")
+    open_file = Path.open
+
+    def guarded(self: Path, mode: str = "r", *arguments: Any, **options: Any) -> Any:
+        if self.name == "errors.png":
+            raise PermissionError(13, "Permission denied")
+        return open_file(self, mode, *arguments, **options)
+
+    monkeypatch.setattr(Path, "open", guarded)
+    with pytest.raises(OutputError, match=r"errors\.png: Permission denied"):
+        prepare_folder(tmp_path, ["errors.png"])
+
+
+def vehicles_of(name: str, policy: str = "zero", **overrides: Any) -> tuple[Recording, list[dict[str, Any]]]:
+    recording = Recording(coopenv.load_scenario(name, overrides), seed=1, policy=policy)
+    for _ in recording.play():
+        pass
+    run = recording.trajectory()
+    return recording, vehicle_metrics(run, analyse_observability(run), recording.endings(), 5.0)
+
+
+def test_figures_of_a_vehicle_end_with_it() -> None:
+    recording, vehicles = vehicles_of("urban_crossing", "give_way")
+    run, endings = recording.trajectory(), recording.endings()
+    assert min(ending.time for ending in endings) < run.t[-1] - 1.0
+    for i, (vehicle, ending) in enumerate(zip(vehicles, endings, strict=True)):
+        part = run.t <= ending.time + 1e-6
+        assert vehicle["ended_at_s"] == ending.time
+        assert vehicle["mean_targets_in_view"] == pytest.approx(run.visible[part, i].sum(axis=-1).mean())
+        assert vehicle["final_position_error_m"] == run.position_error[part, i][-1]
+        steady = part & (run.t > 5.0)
+        assert vehicle["mean_nees"] == pytest.approx(run.nees[steady, i].mean())
+        rmse = np.sqrt(np.mean(run.position_error[steady, i] ** 2))
+        assert vehicle["steady_position_rmse_m"] == pytest.approx(rmse)
+        gaps = vehicle["observability"]["not_observable_s"]
+        assert all(end <= ending.time + 1e-6 for _, end in gaps)
+    assert "arrived at" in next(remarks(vehicles))
+
+
+def test_small_scenes_have_no_wider_tolerance_and_say_why_there_is_no_rate() -> None:
+    _, vehicles = vehicles_of("crossing_path", horizon=20.0)
+    assert math.isnan(vehicles[0]["ended_at_s"])
+    assert vehicles[0]["rate_remark"] == "error fell below half within 1 tick, no rate to fit"
+    assert list(remarks(vehicles)) == [f"vehicle_1: {vehicles[0]['rate_remark']}"]
+    assert not any("0.5 m" in str(column.header) for column in metrics_table(vehicles, True).columns)
+    vehicles[0]["initial_position_error_m"] = 9.0
+    assert any("0.5 m" in str(column.header) for column in metrics_table(vehicles, True).columns)
+    assert not any("0.5 m" in str(column.header) for column in metrics_table(vehicles, False).columns)
+
+
+def test_a_mirrored_estimate_did_not_converge() -> None:
+    _, vehicles = vehicles_of("busy_intersection_mirror", horizon=30.0)
+    assert vehicles[0]["mirrored"]
+    assert vehicles[0]["rate_remark"] == "did not converge, no rate to fit"
+    lines = [line for line in remarks(vehicles) if line.startswith("vehicle_1: ")]
+    assert len(lines) == 1 and "mirrored solution" in lines[0]
 
 
 def test_figures_of_the_table() -> None:

@@ -21,8 +21,8 @@ from coopenv.errors import CoopenvError, checked_seed, suggest
 from coopenv.scenario import Scenario, load_scenario
 
 INFO_FIELDS = ("alive", "ended", "position_error", "orientation_error", "nees")
-"""Arrays (num_envs,) in every info: `alive` is false for a vehicle that had ended before this step; `ended` is 0 under way,
-1 arrived, 2 collided; errors in m and deg."""
+"""Arrays (num_envs,) in every info: `alive` is false for a vehicle that had ended before this step; `ended` is 0 under
+way, 1 arrived, 2 collided; errors in m and deg."""
 
 
 class OneWorld:

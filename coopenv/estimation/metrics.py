@@ -9,12 +9,19 @@ fall into.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.ndimage import median_filter
 from scipy.stats import theilslopes
 
+from coopenv.estimation.observability import Observability
 from coopenv.estimation.trajectory import Trajectory
+
+STEADY_SHARE = 0.7
+"""The steady state is taken to begin after this share of the horizon (35 s of 50 s)."""
 
 MIRROR_ANGLE_DEG = 150.0
 """An orientation error above this at the end of a run is the mirrored solution, not a slow one."""
@@ -22,8 +29,10 @@ MIRROR_ANGLE_DEG = 150.0
 SETTLED_POSITION_M = 0.1
 SETTLED_ORIENTATION_DEG = 1.0
 
+_NOT_CONVERGED = "did not converge, no rate to fit"
 _FIT_SAMPLES = 400  # Theil-Sen looks at every pair: 80 000 slopes
-_FIT_SAMPLES_MIN = 10
+_FIT_SAMPLES_MIN = 3
+_FLICKER = 31  # ticks of a running median, which tells an error that is above half from one that flickers above it
 
 
 class RateFit(NamedTuple):
@@ -33,6 +42,21 @@ class RateFit(NamedTuple):
     low: float
     high: float
     samples: int
+    remark: str = ""  # why there is no rate
+
+
+def live_ticks(t: np.ndarray, vehicles: int, ends: Sequence[float] | None = None) -> np.ndarray:
+    """Return (N,) the number of ticks up to each vehicle's end, the tick of its end included.
+
+    Args:
+        t: (K,) s.
+        vehicles: N.
+        ends: s, when each vehicle arrived or collided and was parked; NaN or beyond the record for one that was
+            not (None: no vehicle was).
+    """
+    if ends is None:
+        return np.full(vehicles, len(t))
+    return np.maximum(1, np.searchsorted(t, np.asarray(ends, float) + 1e-6, side="right"))
 
 
 def position_error(position: np.ndarray, position_estimate: np.ndarray) -> np.ndarray:
@@ -141,13 +165,41 @@ def settling_time(
     return np.where(settled[-1], np.asarray(t, float)[np.argmax(settled, axis=0)], np.nan)
 
 
+def settling_times(
+    trajectory: Trajectory,
+    ends: Sequence[float] | None = None,
+    position_tolerance: float = SETTLED_POSITION_M,
+    orientation_tolerance: float = SETTLED_ORIENTATION_DEG,
+) -> np.ndarray:
+    """Return the settling time (N,) s of every vehicle, judged up to its end; see `settling_time`, `live_ticks`."""
+    count = len(trajectory.vehicles)
+    tolerances = position_tolerance, orientation_tolerance
+    return np.array(
+        [
+            settling_time(
+                trajectory.t[:ticks],
+                trajectory.position_error[:ticks, vehicle],
+                trajectory.orientation_error[:ticks, vehicle],
+                *tolerances,
+            )
+            for vehicle, ticks in enumerate(live_ticks(trajectory.t, count, ends))
+        ]
+    )
+
+
+def steady_mean(t: np.ndarray, values: np.ndarray, steady_from: float) -> np.ndarray:
+    """Return the mean of values (K, ...) over the ticks with t > steady_from; NaN if there are none."""
+    return _mean(values[t > steady_from])
+
+
 def steady_rmse(t: np.ndarray, error: np.ndarray, steady_from: float) -> np.ndarray:
     """Return the root mean square of errors (K, ...) over the ticks with t > steady_from; NaN if none."""
-    return np.sqrt(_mean(np.square(error[t > steady_from])))
+    with np.errstate(over="ignore"):  # of an observer that has diverged
+        return np.sqrt(steady_mean(t, np.square(np.asarray(error, float)), steady_from))
 
 
 def mean_targets_in_view(visible: np.ndarray) -> np.ndarray:
-    """Return (N,) targets measured per tick, on average, of `visible` (K, N, T)."""
+    """Return (...) targets measured per tick, on average, of `visible` (K, ..., T)."""
     return _mean(np.sum(visible, axis=-1))
 
 
@@ -159,10 +211,10 @@ def mirrored(orientation_error: np.ndarray) -> np.ndarray:
 def fit_exponential_rate(t: np.ndarray, error: np.ndarray, noise_floor: float | None = None) -> RateFit:
     """Fit error ~ exp(-rate t) to the final descent of one error (K,), robustly (Theil-Sen).
 
-    The fit takes the ticks after the error was last above half of its initial value, up to the first within
-    three times the noise floor: before, the transient is not exponential (P falls as 1/t); after, there is
-    only noise. The bounds assume independent residuals, which neighbouring ticks are not: they are a lower
-    limit of the uncertainty.
+    The fit takes the ticks after the error (its running median) was last above half of its initial value, up to
+    the first within three times the noise floor: before, the transient is not exponential (P falls as 1/t);
+    after, there is only noise. The bounds assume independent residuals, which neighbouring ticks are not: they
+    are a lower limit of the uncertainty.
 
     Args:
         t: (K,) s.
@@ -170,44 +222,88 @@ def fit_exponential_rate(t: np.ndarray, error: np.ndarray, noise_floor: float | 
         noise_floor: in the unit of `error`; by default the median over the last fifth of the record.
 
     Returns:
-        The rate, or NaN with the number of samples found when there are fewer than ten.
+        The rate, or NaN and a remark when there is no descent of at least three samples that stands out
+        of the scatter.
     """
     t, error = np.asarray(t, float), np.asarray(error, float)
+    if not np.isfinite(error).all():
+        return _no_rate("error is not finite")
+    half = 0.5 * error[0]
+    if half < np.finfo(float).tiny:
+        return _no_rate("no initial error")
     floor = float(np.median(error[-max(1, len(error) // 5) :])) if noise_floor is None else noise_floor
-    high = np.flatnonzero(~(error <= 0.5 * error[0]))
-    start = high[-1] + 1 if high.size else 0
+    start = int(np.flatnonzero(median_filter(error, _FLICKER, mode="nearest") > half)[-1]) + 1
+    if start == len(error) or 3 * floor >= half:
+        return _no_rate(f"error ends at {100 * floor / error[0]:.0f} % of its initial value")
     low = np.flatnonzero(error[start:] <= max(3 * floor, np.finfo(float).tiny))
     index = np.arange(start, start + low[0] if low.size else len(error))
     if len(index) < _FIT_SAMPLES_MIN:
-        return RateFit(math.nan, math.nan, math.nan, len(index))
+        if start <= _FIT_SAMPLES_MIN:
+            return _no_rate(f"error fell below half {_within(start)}", len(index))
+        return _no_rate(f"error fell from half to the noise floor {_within(len(index) + 1)}", len(index))
     index = index[:: math.ceil(len(index) / _FIT_SAMPLES)]
     slope, _, slope_low, slope_high = theilslopes(np.log(error[index]), t[index], alpha=0.95)
+    fall = np.log(half / error[index].min())
+    if slope_high >= 0 or -slope * (t[index[-1]] - t[index[0]]) < 0.5 * fall:
+        return _no_rate("error falls no faster than it scatters", len(index))
     return RateFit(float(-slope), float(-slope_high), float(-slope_low), len(index))
 
 
-def summarise(trajectory: Trajectory, steady_from: float) -> list[dict[str, Any]]:
-    """Return one dict of plain Python values per vehicle, units in the keys; what does not exist is NaN.
+def _within(ticks: int) -> str:
+    return f"within {ticks} tick{'s' if ticks > 1 else ''}"
+
+
+def _no_rate(reason: str, samples: int = 0) -> RateFit:
+    return RateFit(math.nan, math.nan, math.nan, samples, f"{reason}, no rate to fit")
+
+
+def observability_of(observability: Observability, vehicle: int, end: float = math.inf) -> Observability:
+    """Return the figures of one vehicle alone, without the windows that reach beyond its end (s; NaN: none)."""
+    late = observability.t + observability.window > end + 1e-6
+    columns = ("min_eigenvalue", "condition_number", "local_eigenvalue")
+    return replace(
+        observability,
+        t=observability.t[~late],
+        vehicles=observability.vehicles[[vehicle]],
+        **{name: getattr(observability, name)[~late][:, [vehicle]] for name in columns},
+    )
+
+
+def summarise(trajectory: Trajectory, steady_from: float, ends: Sequence[float] | None = None) -> list[dict[str, Any]]:
+    """Return one dict of plain Python values per vehicle, units in the keys; what does not exist is NaN or None.
 
     Args:
         trajectory: the record of a run.
         steady_from: s; steady RMSE and mean NEES are over the ticks after it.
+        ends: s, when each vehicle was parked, after which nothing counts; see `live_ticks`.
     """
-    t, position, orientation = trajectory.t, trajectory.position_error, trajectory.orientation_error
-    columns = {
-        "initial_position_error_m": position[0],
-        "initial_orientation_error_deg": orientation[0],
-        "settle_time_s": settling_time(t, position, orientation),
-        "steady_position_rmse_m": steady_rmse(t, position, steady_from),
-        "steady_orientation_rmse_deg": steady_rmse(t, orientation, steady_from),
-        "mean_targets_in_view": mean_targets_in_view(trajectory.visible),
-        "mean_nees": _mean(trajectory.nees[t > steady_from]),
-        "final_position_error_m": position[-1],
-        "final_orientation_error_deg": orientation[-1],
-        "rate_per_s": np.array([fit_exponential_rate(t, error).rate for error in position.T]),
-        "mirrored": mirrored(orientation),
-    }
-    names = [str(name) for name in trajectory.vehicles]
-    return [{"vehicle": n, **{k: v[i].item() for k, v in columns.items()}} for i, n in enumerate(names)]
+    settled = settling_times(trajectory, ends)
+    rows = []
+    for vehicle, ticks in enumerate(live_ticks(trajectory.t, len(trajectory.vehicles), ends)):
+        t = trajectory.t[:ticks]
+        position, orientation = (
+            trajectory.position_error[:ticks, vehicle],
+            trajectory.orientation_error[:ticks, vehicle],
+        )
+        fit, mirror = fit_exponential_rate(t, position), bool(mirrored(orientation))
+        rows.append(
+            {
+                "vehicle": str(trajectory.vehicles[vehicle]),
+                "initial_position_error_m": float(position[0]),
+                "initial_orientation_error_deg": float(orientation[0]),
+                "settle_time_s": float(settled[vehicle]),
+                "steady_position_rmse_m": float(steady_rmse(t, position, steady_from)),
+                "steady_orientation_rmse_deg": float(steady_rmse(t, orientation, steady_from)),
+                "mean_targets_in_view": float(mean_targets_in_view(trajectory.visible[:ticks, vehicle])),
+                "mean_nees": float(steady_mean(t, trajectory.nees[:ticks, vehicle], steady_from)),
+                "final_position_error_m": float(position[-1]),
+                "final_orientation_error_deg": float(orientation[-1]),
+                "rate_per_s": fit.rate,
+                "rate_remark": (_NOT_CONVERGED if fit.remark and mirror else fit.remark) or None,
+                "mirrored": mirror,
+            }
+        )
+    return rows
 
 
 def json_ready(value: Any) -> Any:

@@ -14,13 +14,13 @@ from rich.padding import Padding
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from coopenv.errors import CoopenvError
+from coopenv.estimation.metrics import STEADY_SHARE
 from coopenv.estimation.observability import Observability, analyse_observability
-from coopenv.estimation.trajectory import Trajectory
-from coopenv.runs.metrics import STEADY_SHARE, outcome_line, run_metrics, vehicle_metrics
-from coopenv.runs.output import prepare_folder, write_results
+from coopenv.runs.metrics import outcome_line, run_metrics, vehicle_metrics
+from coopenv.runs.output import METRICS_FILE, TRAJECTORY_FILE, prepare_folder, write_results
 from coopenv.runs.recording import Recording
 from coopenv.runs.table import metrics_table, remarks
-from coopenv.runs.video import Film, GifFilm, frame_stride, open_film
+from coopenv.runs.video import Film, GifFilm, film_name, frame_stride, open_film
 from coopenv.scenario import Scenario
 
 COMPILE_NOTICE_AFTER = 1.5
@@ -55,7 +55,7 @@ def execute(request: RunRequest, out: Console, log: Console) -> bool:
     if request.policy != "zero" and not scenario.driven:
         log.print("note: all motion here is prescribed, the policy has no effect", soft_wrap=True)
     steady_from = _steady_from(request, recording)
-    prepare_folder(request.folder)
+    prepare_folder(request.folder, _files(request))
     with compile_notice(log):
         recording.warm_up()
     film = open_film(request.folder, _fps(scenario)) if request.video else None
@@ -67,7 +67,7 @@ def execute(request: RunRequest, out: Console, log: Console) -> bool:
     metrics = run_metrics(request.name, request.overrides, recording, vehicles, steady_from, outcome)
     paths = write_results(request.folder, trajectory, metrics)
     if finished:
-        paths += _draw(request.folder, trajectory, observability, log)
+        paths += _draw(request.folder, recording, observability, steady_from, log)
     if film is not None:
         paths.append(_finish(film, log))
     report(request, metrics, paths, out)
@@ -81,6 +81,12 @@ def _steady_from(request: RunRequest, recording: Recording) -> float:
     if not 0.0 <= request.steady_from < end:
         raise CoopenvError(f"--steady-from: {request.steady_from:g} s is not within the run of {end:g} s")
     return request.steady_from
+
+
+def _files(request: RunRequest) -> list[str]:
+    from coopenv.viz.figures import FIGURE_NAMES
+
+    return [METRICS_FILE, TRAJECTORY_FILE, *FIGURE_NAMES, *([film_name()] if request.video else [])]
 
 
 def _fps(scenario: Scenario) -> float:
@@ -110,12 +116,21 @@ def _simulate(recording: Recording, film: Film | None, log: Console) -> bool:
     return True
 
 
-def _draw(folder: Path, trajectory: Trajectory, observability: Observability, log: Console) -> list[Path]:
+def _draw(
+    folder: Path, recording: Recording, observability: Observability, steady_from: float, log: Console
+) -> list[Path]:
     with progress(log) as bar:
         bar.add_task("drawing figures", total=None)
         from coopenv.viz.figures import save_figures
 
-        return save_figures(trajectory, folder, observability)
+        return save_figures(
+            recording.trajectory(),
+            folder,
+            observability,
+            scenario=recording.scenario,
+            ends=[ending.time for ending in recording.endings()],
+            steady_from=steady_from,
+        )
 
 
 def _finish(film: Film, log: Console) -> Path:

@@ -9,13 +9,10 @@ from typing import Any
 import numpy as np
 import warp
 
-from coopenv.estimation.metrics import settling_time, summarise
+from coopenv.estimation.metrics import observability_of, settling_times, summarise
 from coopenv.estimation.observability import Observability
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.recording import ARRIVED, COLLIDED, UNDER_WAY, Ending, Recording
-
-STEADY_SHARE = 0.7
-"""The steady state is taken to begin after this share of the horizon (35 s of 50 s)."""
 
 COARSE_POSITION_M = 0.5
 COARSE_ORIENTATION_DEG = 5.0
@@ -25,33 +22,32 @@ COARSE_ORIENTATION_DEG = 5.0
 def vehicle_metrics(
     trajectory: Trajectory, observability: Observability, endings: list[Ending], steady_from: float
 ) -> list[dict[str, Any]]:
-    """Return one dict per vehicle: outcome, errors, consistency and observability, units in the keys."""
-    coarse = settling_time(
-        trajectory.t,
-        trajectory.position_error,
-        trajectory.orientation_error,
-        COARSE_POSITION_M,
-        COARSE_ORIENTATION_DEG,
-    )
+    """Return one dict per vehicle: outcome, errors, consistency and observability, units in the keys.
+
+    What a vehicle did after it had arrived or collided, parked, does not count.
+    """
+    ends = [ending.time for ending in endings]
+    coarse = settling_times(trajectory, ends, COARSE_POSITION_M, COARSE_ORIENTATION_DEG)
     return [
         {
             **summary,
             "coarse_settle_time_s": float(coarse[i]),
             "outcome": endings[i].outcome,
-            "end_time_s": endings[i].time,
-            "observability": observability_metrics(observability, i),
+            "ended_at_s": np.nan if endings[i].outcome == UNDER_WAY else endings[i].time,
+            "observability": observability_metrics(observability_of(observability, i, ends[i])),
         }
-        for i, summary in enumerate(summarise(trajectory, steady_from))
+        for i, summary in enumerate(summarise(trajectory, steady_from, ends))
     ]
 
 
-def observability_metrics(observability: Observability, vehicle: int) -> dict[str, Any]:
-    """Return the verdicts on one vehicle's windows and the figures of its Gramian; NaN where there is no window."""
-    smallest = observability.min_eigenvalue[:, vehicle]
-    local = observability.local_eigenvalue[:, vehicle]
-    verdict = observability.observable[:, vehicle]
+def observability_metrics(observability: Observability) -> dict[str, Any]:
+    """Return the verdicts on the windows of one vehicle (see `observability_of`) and the figures of its Gramian.
+
+    NaN where there is no window.
+    """
+    smallest, local, verdict = observability.min_eigenvalue, observability.local_eigenvalue, observability.observable
     some = len(verdict) > 0
-    gaps = [interval for interval in observability.intervals(vehicle) if not interval.observable]
+    gaps = [interval for interval in observability.intervals(0) if not interval.observable]
     return {
         "window_s": observability.window,
         "threshold": observability.threshold,
@@ -59,9 +55,7 @@ def observability_metrics(observability: Observability, vehicle: int) -> dict[st
         "not_observable_s": [[gap.start, gap.end] for gap in gaps],
         "gramian_min_eigenvalue_min": float(smallest.min()) if some else np.nan,
         "gramian_min_eigenvalue_median": float(np.median(smallest)) if some else np.nan,
-        "gramian_condition_number_median": (
-            float(np.median(observability.condition_number[:, vehicle])) if some else np.nan
-        ),
+        "gramian_condition_number_median": (float(np.median(observability.condition_number)) if some else np.nan),
         "local_eigenvalue_min": float(local.min()) if some else np.nan,
         "local_eigenvalue_median": float(np.median(local)) if some else np.nan,
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,11 @@ def writing(path: Path) -> Iterator[None]:
         raise OutputError(f"cannot write to {path}: {error.strerror or error}") from None
 
 
-def prepare_folder(folder: Path) -> None:
-    """Make the folder, and make sure that files can be written into it.
+def prepare_folder(folder: Path, names: Iterable[str] = (METRICS_FILE, TRAJECTORY_FILE)) -> None:
+    """Make the folder, and make sure that files of these names can be written into it.
 
     Raises:
-        OutputError: it cannot be made or written to.
+        OutputError: it cannot be made or written to, or what has one of the names cannot be replaced.
     """
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"cannot write to {folder}: it is not a folder")
@@ -38,9 +38,12 @@ def prepare_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-    for name in (METRICS_FILE, TRAJECTORY_FILE):
-        if (folder / name).is_dir():
-            raise OutputError(f"cannot write to {folder / name}: it is a folder")
+    for path in (folder / name for name in names):
+        if path.is_dir():
+            raise OutputError(f"cannot write to {path}: it is a folder")
+        if path.is_file():
+            with writing(path), path.open("ab"):
+                pass
 
 
 def write_results(folder: Path, trajectory: Trajectory, metrics: dict[str, Any]) -> list[Path]:

@@ -11,23 +11,27 @@ from rich.table import Table
 
 from coopenv.estimation.metrics import SETTLED_ORIENTATION_DEG, SETTLED_POSITION_M
 from coopenv.runs.metrics import COARSE_ORIENTATION_DEG, COARSE_POSITION_M
-from coopenv.runs.recording import UNDER_WAY
 
 
 def metrics_table(vehicles: list[dict[str, Any]], noisy: bool) -> Table:
-    """Return one row per vehicle; with noise also the time to settle within the wider tolerances."""
+    """Return one row per vehicle.
+
+    With noise, which may keep an estimate from the settling tolerances, also the time to settle within wider ones;
+    not in a small scene, where all estimates start about as near.
+    """
+    coarse = noisy and any(v["initial_position_error_m"] > 2 * COARSE_POSITION_M for v in vehicles)
     table = Table(box=box.SIMPLE_HEAD, padding=0, show_edge=False)
     table.add_column("\n\nvehicle", no_wrap=True)
-    for header in _headers(noisy):
+    for header in _headers(coarse):
         table.add_column(header, justify="right", no_wrap=True)
     for vehicle in vehicles:
-        table.add_row(*_cells(vehicle, noisy))
+        table.add_row(*_cells(vehicle, coarse))
     return table
 
 
-def _headers(noisy: bool) -> list[str]:
+def _headers(with_coarse: bool) -> list[str]:
     fine = f"below\n{SETTLED_POSITION_M:g} m\n{SETTLED_ORIENTATION_DEG:g} deg"
-    coarse = [f"below\n{COARSE_POSITION_M:g} m\n{COARSE_ORIENTATION_DEG:g} deg"] if noisy else []
+    coarse = [f"below\n{COARSE_POSITION_M:g} m\n{COARSE_ORIENTATION_DEG:g} deg"] if with_coarse else []
     return [
         "start\nerror\nm",
         "\n\ndeg",
@@ -42,8 +46,8 @@ def _headers(noisy: bool) -> list[str]:
     ]
 
 
-def _cells(vehicle: dict[str, Any], noisy: bool) -> list[str]:
-    coarse = [seconds(vehicle["coarse_settle_time_s"])] if noisy else []
+def _cells(vehicle: dict[str, Any], with_coarse: bool) -> list[str]:
+    coarse = [seconds(vehicle["coarse_settle_time_s"])] if with_coarse else []
     return [
         vehicle["vehicle"],
         figure(vehicle["initial_position_error_m"]),
@@ -60,15 +64,18 @@ def _cells(vehicle: dict[str, Any], noisy: bool) -> list[str]:
 
 
 def remarks(vehicles: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield the lines below the table: early ends, gaps in observability, mirrored estimates."""
+    """Yield the lines below the table: early ends, gaps in observability, missing rates, mirrored estimates."""
     for vehicle in vehicles:
-        if vehicle["outcome"] != UNDER_WAY:
-            yield f"{vehicle['vehicle']}: {vehicle['outcome']} at {vehicle['end_time_s']:.2f} s"
+        if not math.isnan(vehicle["ended_at_s"]):
+            yield f"{vehicle['vehicle']}: {vehicle['outcome']} at {vehicle['ended_at_s']:.2f} s, where its figures end"
     for vehicle in vehicles:
         gaps = vehicle["observability"]["not_observable_s"]
         if gaps:
             times = ", ".join(f"{start:.4g}-{end:.4g}" for start, end in gaps)
             yield f"{vehicle['vehicle']}: not observable at {times} s"
+    for vehicle in vehicles:
+        if vehicle["rate_remark"] and not vehicle["mirrored"]:
+            yield f"{vehicle['vehicle']}: {vehicle['rate_remark']}"
     for vehicle in vehicles:
         if vehicle["mirrored"]:
             yield (

@@ -35,11 +35,15 @@ def frame_stride(scenario: Scenario) -> int:
     return scenario.ticks_per_decision * max(1, ceil(scenario.rates.decision / MAX_FPS - 1e-9))
 
 
+def film_name() -> str:
+    """Return `video.mp4`, or `video.gif` without the extra."""
+    return "video.mp4" if find_spec("imageio_ffmpeg") is not None else "video.gif"
+
+
 def open_film(folder: Path, fps: float) -> Film:
-    """Return the film `video.mp4`, or `video.gif` without the extra."""
-    if find_spec("imageio_ffmpeg") is not None:
-        return Mp4Film(folder / "video.mp4", fps)
-    return GifFilm(folder / "video.gif", fps)
+    """Return the film of that name in `folder`."""
+    path = folder / film_name()
+    return Mp4Film(path, fps) if path.suffix == ".mp4" else GifFilm(path, fps)
 
 
 class Mp4Film:

@@ -101,11 +101,12 @@ def landmark_table(scenario: Scenario) -> Table:
 
 def motion_table(scenario: Scenario) -> Table:
     """Return one row per stage of every motion that is prescribed stage by stage."""
-    table = _table("who", "time", "prescribed motion", title="Motions (s, m, rad; velocities forward, left, up)")
+    table = _table("who", "time", "motion", title="Stages of motion (s)")
     table.columns[0].no_wrap = table.columns[1].no_wrap = True
-    agents = [*zip(scenario.vehicle_names, scenario.vehicles, strict=True), *((m.name, m) for m in scenario.landmarks)]
-    for name, agent in agents:
-        for i, (time, stage) in enumerate(words.stages(agent.motion)):
+    motions = [*(v.motion for v in scenario.vehicles), *(m.motion for m in scenario.landmarks)]
+    names = [*scenario.vehicle_names, *(m.name for m in scenario.landmarks)]
+    for name, motion in zip(names, motions, strict=True):
+        for i, (time, stage) in enumerate(words.stages(motion)):
             table.add_row("" if i else name, time, stage)
     return table
 

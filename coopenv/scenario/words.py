@@ -123,8 +123,8 @@ def stages(moves: Any) -> Iterator[tuple[str, str]]:
         begin = 0.0
         for segment in moves.segments:
             end = begin + segment.duration
-            rests = not any((*segment.linear, *segment.angular))
-            yield f"{number(begin)}-{number(end)}", "rests" if rests else twist(segment.linear, segment.angular)
+            moving = any((*segment.linear, *segment.angular))
+            yield f"{number(begin)}-{number(end)}", twist(segment.linear, segment.angular) if moving else "rests"
             begin = end
         yield f"{number(begin)}-", "rests"
     elif isinstance(moves, WaypointMotion):

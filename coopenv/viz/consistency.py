@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
 from scipy.stats import chi2
 
+from coopenv.estimation.metrics import STEADY_SHARE, live_ticks, steady_mean
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.viz.style import (
+    ENDED,
     GREY,
     INK,
     NORMAL,
     SHADE,
     SMALL,
     VERMILION,
+    drawable,
     new_figure,
+    shade_ended,
+    show_decades,
     thinned,
     tidy,
     time_axis,
@@ -28,14 +38,29 @@ NEES_BOUNDS = (float(chi2.ppf(0.025, DEGREES_OF_FREEDOM)), float(chi2.ppf(0.975,
 """95 % of the NEES of a consistent observer lie between these, at one instant over many runs."""
 
 _ROW, _HEAD, _FOOT = 1.45, 0.6, 0.5  # inches
+_NOTE: dict[str, Any] = {
+    "fontsize": SMALL,
+    "color": INK,
+    "path_effects": [withStroke(linewidth=2.0, foreground="white")],
+}
 
 
-def consistency_figure(trajectory: Trajectory) -> Figure:
+def consistency_figure(
+    trajectory: Trajectory, ends: Sequence[float] | None = None, steady_from: float | None = None
+) -> Figure:
     """Draw, per vehicle, NEES, and both errors beside the standard deviations that the observer claims.
 
     The bounds hold at each instant over many runs; the ticks of one run are correlated, so the share of ticks
     inside is a hint, not a test.
+
+    Args:
+        trajectory: the record of a run.
+        ends: s, when each vehicle was parked, after which nothing counts.
+        steady_from: s; the mean NEES and the share inside are over the ticks after it (None: `STEADY_SHARE` of
+            the record).
     """
+    if steady_from is None:
+        steady_from = STEADY_SHARE * float(trajectory.t[-1])
     count = len(trajectory.vehicles)
     height = _HEAD + _FOOT + _ROW * count
     figure = new_figure(10.5, height)
@@ -52,56 +77,69 @@ def consistency_figure(trajectory: Trajectory) -> Figure:
             "hspace": 0.16,
         },
     )
-    spread = np.sqrt(np.diagonal(trajectory.covariance, axis1=-2, axis2=-1).reshape(-1, count, 2, 3).sum(axis=-1))
+    variance = np.diagonal(np.asarray(trajectory.covariance, float), axis1=-2, axis2=-1)
+    with np.errstate(invalid="ignore"):  # of an observer that has diverged
+        spread = np.sqrt(variance.reshape(-1, count, 2, 3).sum(axis=-1))
+    live = live_ticks(trajectory.t, count, ends)
     for vehicle, (left, middle, right) in enumerate(axes):
-        _draw_nees(left, trajectory, vehicle)
-        _draw_spread(middle, trajectory.t, trajectory.position_error[:, vehicle], spread[:, vehicle, 1])
-        degrees = np.degrees(spread[:, vehicle, 0])
-        _draw_spread(right, trajectory.t, trajectory.orientation_error[:, vehicle], degrees)
+        ticks = live[vehicle]
+        t, part = trajectory.t[:ticks], (slice(ticks), vehicle)
+        _draw_nees(left, t, trajectory.nees[part], vehicle, steady_from)
+        _draw_spread(middle, t, trajectory.position_error[part], spread[part][:, 1])
+        _draw_spread(right, t, trajectory.orientation_error[part], np.degrees(spread[part][:, 0]))
         name = vehicle_label(trajectory.vehicles[vehicle])
         left.set_ylabel(name, fontsize=13, rotation=0, labelpad=14, va="center")
         for ax in (left, middle, right):
+            shade_ended(ax, trajectory.t, ticks)
             time_axis(ax, trajectory.t, labelled=vehicle == count - 1)
     for ax, title in zip(axes[0], ("NEES (6 dof)", "position [m]", "orientation [deg]"), strict=True):
         ax.set_title(title, fontsize=NORMAL + 1, color=INK, pad=20)
-    axes[0, 1].legend(
-        loc="lower center",
-        bbox_to_anchor=(0.5, 0.98),
-        ncols=2,
-        fontsize=SMALL,
-        frameon=False,
-        handlelength=2.2,
-    )
-    axes[0, 0].legend(loc="lower center", bbox_to_anchor=(0.5, 0.98), ncols=3, fontsize=SMALL, frameon=False)
+    for column in (0, 1):
+        handles = axes[0, column].get_legend_handles_labels()[0]
+        if column == 1 and live.min() < len(trajectory.t):
+            handles.append(Patch(facecolor=ENDED, label="ended, parked"))
+        axes[0, column].legend(
+            handles=handles,
+            loc="lower center",
+            bbox_to_anchor=(0.5, 0.98),
+            ncols=3,
+            fontsize=SMALL,
+            frameon=False,
+            handlelength=2.0,
+            columnspacing=1.2,
+        )
     return figure
 
 
-def _draw_nees(ax: Axes, trajectory: Trajectory, vehicle: int) -> None:
+def _draw_nees(ax: Axes, t: np.ndarray, nees: np.ndarray, vehicle: int, steady_from: float) -> None:
     tidy(ax)
     ax.axhspan(*NEES_BOUNDS, color=SHADE, zorder=0, label="95 % of $\\chi^2_6$")
     ax.axhline(DEGREES_OF_FREEDOM, color=GREY, linewidth=0.8, linestyle=(0, (4, 2)), label="expected")
-    nees = trajectory.nees[:, vehicle]
     ax.set_yscale("log")
-    if not np.any(nees > 0):
+    shown = drawable(nees, positive=True)
+    if np.isnan(shown).all():
         ax.set_ylim(0.1, 100.0)
-        ax.text(
-            0.5,
-            0.5,
-            "no covariance declared",
-            transform=ax.transAxes,
-            ha="center",
-            fontsize=SMALL,
-            color=GREY,
-        )
+        reason = "no covariance declared" if np.isnan(nees).all() else "none to draw"
+        ax.text(0.5, 0.5, reason, transform=ax.transAxes, ha="center", fontsize=SMALL, color=GREY)
         return
-    keep = thinned(len(nees))
-    positive = np.where(nees[keep] > 0, nees[keep], np.nan)
-    ax.plot(trajectory.t[keep], positive, color=vehicle_colour(vehicle), linewidth=0.7)
+    keep = thinned(len(t))
+    ax.plot(t[keep], shown[keep], color=vehicle_colour(vehicle), linewidth=0.7)
+    show_decades(ax)
     bottom, top = ax.get_ylim()
     ax.set_ylim(bottom, top * (top / bottom) ** 0.25)  # room for the note
-    inside = np.mean((nees >= NEES_BOUNDS[0]) & (nees <= NEES_BOUNDS[1]))
-    note = f"mean {np.nanmean(nees):.3g}, {100 * inside:.0f} % of ticks inside"
-    ax.text(0.985, 0.95, note, transform=ax.transAxes, ha="right", va="top", fontsize=SMALL, color=INK)
+    ax.text(0.985, 0.95, _note(t, nees, steady_from), transform=ax.transAxes, ha="right", va="top", **_NOTE)
+    if t[0] < steady_from < t[-1]:
+        ax.axvline(steady_from, ymax=0.83, color=INK, linewidth=0.7, linestyle=(0, (1, 1.5)), label="steady state")
+
+
+def _note(t: np.ndarray, nees: np.ndarray, steady_from: float) -> str:
+    """Return the mean NEES that the table of the run has, too."""
+    steady = nees[t > steady_from]
+    if not len(steady):
+        return f"ended before the steady state ({steady_from:.4g} s)"
+    inside = np.mean((steady >= NEES_BOUNDS[0]) & (steady <= NEES_BOUNDS[1]))
+    mean = float(steady_mean(t, nees, steady_from))
+    return f"after {steady_from:.4g} s: mean {mean:.3g}, {100 * inside:.0f} % of ticks inside"
 
 
 def _draw_spread(ax: Axes, t: np.ndarray, error: np.ndarray, spread: np.ndarray) -> None:
@@ -110,8 +148,9 @@ def _draw_spread(ax: Axes, t: np.ndarray, error: np.ndarray, spread: np.ndarray)
     ax.set_yscale("log")
     for values, colour, style, width, name in (
         (error, INK, "-", 0.8, "error"),
-        (spread, VERMILION, (0, (4, 1.5)), 1.4, "claimed standard deviation"),
+        (spread, VERMILION, (0, (4, 1.5)), 1.4, "claimed std. deviation"),
     ):
-        if np.any(values > 0):
-            positive = np.where(values[keep] > 0, values[keep], np.nan)
-            ax.plot(t[keep], positive, color=colour, linestyle=style, linewidth=width, label=name)
+        shown = drawable(values, positive=True)
+        if not np.isnan(shown).all():
+            ax.plot(t[keep], shown[keep], color=colour, linestyle=style, linewidth=width, label=name)
+    show_decades(ax)

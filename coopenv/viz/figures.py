@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
-
-from matplotlib.figure import Figure
 
 from coopenv.errors import OutputError
 from coopenv.estimation.observability import Observability, analyse_observability
 from coopenv.estimation.trajectory import Trajectory
+from coopenv.scenario import Scenario
 from coopenv.viz.consistency import consistency_figure
 from coopenv.viz.errors import error_figure
 from coopenv.viz.observability import observability_figure
@@ -17,24 +16,34 @@ from coopenv.viz.style import save
 from coopenv.viz.topology import topology_figure
 from coopenv.viz.trajectories import trajectory_figure_2d, trajectory_figure_3d
 
-FIGURES: dict[str, Callable[[Trajectory], Figure]] = {
-    "errors.png": error_figure,
-    "trajectories_2d.png": trajectory_figure_2d,
-    "trajectories_3d.png": trajectory_figure_3d,
-    "topology.png": topology_figure,
-    "consistency.png": consistency_figure,
-}
+FIGURE_NAMES = (
+    "errors.png",
+    "trajectories_2d.png",
+    "trajectories_3d.png",
+    "topology.png",
+    "consistency.png",
+    "observability.png",
+)
 
 
 def save_figures(
-    trajectory: Trajectory, directory: str | Path, observability: Observability | None = None
+    trajectory: Trajectory,
+    directory: str | Path,
+    observability: Observability | None = None,
+    *,
+    scenario: Scenario | None = None,
+    ends: Sequence[float] | None = None,
+    steady_from: float | None = None,
 ) -> list[Path]:
-    """Write the figures of `FIGURES` and `observability.png` into `directory`, which is made if need be.
+    """Write the figures of `FIGURE_NAMES` into `directory`, which is made if need be.
 
     Args:
         trajectory: the record of a run.
         directory: where the files go; files of the same names are replaced.
         observability: evaluated here with the default window and threshold unless given.
+        scenario: of the run, for the roads and buildings under its paths.
+        ends: s, when each vehicle arrived or collided and was parked, where its lines stop (None: no vehicle was).
+        steady_from: s, start of the steady state that mean NEES are over (None: at 70 % of the record).
 
     Returns:
         The paths written.
@@ -45,10 +54,17 @@ def save_figures(
     directory = Path(directory)
     if observability is None:
         observability = analyse_observability(trajectory)
+    seen = observability
+    draw = {
+        "errors.png": lambda: error_figure(trajectory, ends),
+        "trajectories_2d.png": lambda: trajectory_figure_2d(trajectory, ends, scenario),
+        "trajectories_3d.png": lambda: trajectory_figure_3d(trajectory, ends),
+        "topology.png": lambda: topology_figure(trajectory, ends),
+        "consistency.png": lambda: consistency_figure(trajectory, ends, steady_from),
+        "observability.png": lambda: observability_figure(seen, ends),
+    }
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        paths = [save(draw(trajectory), directory / name) for name, draw in FIGURES.items()]
-        paths.append(save(observability_figure(observability), directory / "observability.png"))
+        return [save(draw[name](), directory / name) for name in FIGURE_NAMES]
     except OSError as error:
         raise OutputError(f"{directory}: cannot write figures ({error.strerror or error})") from None
-    return paths

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from coopenv.estimation.metrics import observability_of
 from coopenv.estimation.observability import Observability
 from coopenv.viz.style import (
     GREEN,
@@ -18,6 +20,7 @@ from coopenv.viz.style import (
     SMALL,
     VERMILION,
     new_figure,
+    show_decades,
     thinned,
     tidy,
     time_axis,
@@ -32,9 +35,13 @@ _VERDICTS: dict[bool, dict[str, Any]] = {
 _FLOOR = 1e-8  # smaller eigenvalues are drawn here: they are zero but for rounding
 
 
-def observability_figure(observability: Observability) -> Figure:
-    """Draw the eigenvalue that the verdict rests on, the theorem's own, and the verdict of every vehicle."""
+def observability_figure(observability: Observability, ends: Sequence[float] | None = None) -> Figure:
+    """Draw the eigenvalue that the verdict rests on, the theorem's own, and the verdict of every vehicle.
+
+    Windows that reach beyond a vehicle's end (s) are left out.
+    """
     count = len(observability.vehicles)
+    cut = [observability_of(observability, i, np.nan if ends is None else ends[i]) for i in range(count)]
     strip = 0.3 + 0.24 * count
     height = 5.6 + strip
     figure = new_figure(9.0, height)
@@ -52,13 +59,15 @@ def observability_figure(observability: Observability) -> Figure:
     )
     title = f"Observability Gramian, {observability.window:.3g} s windows (values below {_FLOOR:g} drawn there)"
     figure.suptitle(title, x=0.11, y=1 - 0.12 / height, ha="left", va="top", fontsize=NORMAL + 1, color=INK)
-    _draw_eigenvalues(local, observability, observability.local_eigenvalue)
+    _draw_eigenvalues(local, [(part.t, part.local_eigenvalue[:, 0]) for part in cut], observability.vehicles)
     local.set_ylabel("smallest eigenvalue about\nthe vehicle, scaled [-]", fontsize=NORMAL)
     local.axhline(observability.threshold, color=INK, linewidth=0.9, linestyle=(0, (4, 2)), label="threshold")
     local.legend(loc="upper left", bbox_to_anchor=(1.005, 1.0), fontsize=NORMAL, frameon=False)
-    _draw_eigenvalues(theorem, observability, observability.min_eigenvalue)
+    _draw_eigenvalues(theorem, [(part.t, part.min_eigenvalue[:, 0]) for part in cut], observability.vehicles)
     theorem.set_ylabel("smallest eigenvalue\nabout the map origin", fontsize=NORMAL)
-    _draw_verdict(verdict, observability)
+    _draw_verdict(verdict, cut)
+    for ax in (local, theorem):
+        show_decades(ax)
     for ax in (local, theorem, verdict):
         if len(observability.t):
             span = np.array([observability.t[0], observability.t[-1] + observability.window])
@@ -66,35 +75,31 @@ def observability_figure(observability: Observability) -> Figure:
     return figure
 
 
-def _draw_eigenvalues(ax: Axes, observability: Observability, values: np.ndarray) -> None:
+def _draw_eigenvalues(ax: Axes, curves: list[tuple[np.ndarray, np.ndarray]], vehicles: np.ndarray) -> None:
     tidy(ax)
     ax.set_yscale("log")
-    if not len(values):
-        return
-    keep = thinned(len(values))
-    for vehicle, name in enumerate(observability.vehicles):
-        drawn = np.maximum(values[keep, vehicle], _FLOOR)
-        ax.plot(
-            observability.t[keep],
-            drawn,
-            color=vehicle_colour(vehicle),
-            linewidth=LINE,
-            label=vehicle_label(name),
-        )
+    for vehicle, (t, values) in enumerate(curves):
+        if len(t):
+            keep = thinned(len(t))
+            drawn = np.maximum(values[keep], _FLOOR)
+            look: dict[str, Any] = {"color": vehicle_colour(vehicle), "label": vehicle_label(vehicles[vehicle])}
+            ax.plot(t[keep], drawn, linewidth=LINE, **look)
 
 
-def _draw_verdict(ax: Axes, observability: Observability) -> None:
+def _draw_verdict(ax: Axes, cut: list[Observability]) -> None:
     tidy(ax)
     ax.grid(False, axis="y")
-    for vehicle in range(len(observability.vehicles)):
+    occurring = set()
+    for vehicle, part in enumerate(cut):
         for observable, look in _VERDICTS.items():
-            stretches = [(s, e - s) for s, e, verdict in observability.intervals(vehicle) if verdict == observable]
+            stretches = [(s, e - s) for s, e, verdict in part.intervals(0) if verdict == observable]
             if stretches:
+                occurring.add(observable)
                 ax.broken_barh(stretches, (vehicle - 0.32, 0.64), linewidth=0.4, **look)
-    ax.set_yticks(range(len(observability.vehicles)), [vehicle_label(n) for n in observability.vehicles])
-    ax.set_ylim(len(observability.vehicles) - 0.5, -0.5)
+    ax.set_yticks(range(len(cut)), [vehicle_label(part.vehicles[0]) for part in cut])
+    ax.set_ylim(len(cut) - 0.5, -0.5)
     ax.legend(
-        handles=[Patch(**look) for look in _VERDICTS.values()],
+        handles=[Patch(**look) for observable, look in _VERDICTS.items() if observable in occurring],
         loc="upper left",
         bbox_to_anchor=(1.005, 1.0),
         fontsize=SMALL,

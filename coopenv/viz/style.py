@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from coopenv.estimation.trajectory import Trajectory
 
@@ -17,6 +18,7 @@ from coopenv.estimation.trajectory import Trajectory
 BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
 INK, GREY, RULE = "#222222", "#7F7F7F", "#D9D9D9"
 SHADE = "#DCEAF6"  # a moving target is in view
+ENDED = "#EBEBEB"  # a vehicle has ended and is parked
 DARK_BLUE = "#00264D"  # landmarks, as in the paper
 AXES_COLOURS = (VERMILION, GREEN, BLUE)  # x, y, z and roll, pitch, yaw
 VEHICLE_COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, INK, GREY)
@@ -25,6 +27,9 @@ DPI = 130
 LINE = 1.2  # pt
 SMALL, NORMAL = 7.5, 9.0  # pt
 MAX_POINTS = 1500  # of a line: more than the pixels it crosses
+MERGED_GAP = 0.2  # s, longest gap in a shade that is not drawn: a frame or two without a detection
+_LEAST_DECADES = 1.05  # on a logarithmic axis
+_LARGEST = 1e100  # of a value that is drawn
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -65,11 +70,23 @@ def thinned(count: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, MAX_POINTS)).round().astype(int))
 
 
-def runs(t: np.ndarray, mask: np.ndarray) -> list[tuple[float, float]]:
-    """Return (start, duration) in s of the stretches where `mask` (K,) holds, a tick lasting to the next."""
+def drawable(values: np.ndarray, *, positive: bool = False) -> np.ndarray:
+    """Return values with NaN in place of what an axis cannot show: infinite, huge, on a logarithmic one zero."""
+    values = np.asarray(values, float)
+    with np.errstate(invalid="ignore"):
+        return np.where((np.abs(values) < _LARGEST) & ((values > 1 / _LARGEST) | (not positive)), values, np.nan)
+
+
+def runs(t: np.ndarray, mask: np.ndarray, gap: float = 0.0) -> list[tuple[float, float]]:
+    """Return (start, duration) in s of the stretches where `mask` (K,) holds, a tick lasting to the next.
+
+    Stretches not more than `gap` (s) apart are one.
+    """
     edges = np.append(t, t[-1] + (np.median(np.diff(t)) if len(t) > 1 else 0.0))
     change = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0))
     starts, ends = edges[change[::2]], edges[change[1::2]]
+    apart = starts[1:] - ends[:-1] > gap
+    starts, ends = starts[np.append(True, apart)[: len(starts)]], ends[np.append(apart, True)[: len(ends)]]
     return list(zip(starts.tolist(), (ends - starts).tolist(), strict=True))
 
 
@@ -78,9 +95,15 @@ def moving_target_seen(trajectory: Trajectory, vehicle: int) -> np.ndarray:
     return np.any(trajectory.visible[:, vehicle] & trajectory.target_moving, axis=-1)
 
 
-def shade(ax: Axes, stretches: Sequence[tuple[float, float]]) -> None:
+def shade(ax: Axes, stretches: Sequence[tuple[float, float]], colour: str = SHADE) -> None:
     """Shade stretches of time over the whole height of `ax`."""
-    ax.broken_barh(stretches, (0, 1), transform=ax.get_xaxis_transform(), facecolor=SHADE, edgecolor="none", zorder=0)
+    ax.broken_barh(stretches, (0, 1), transform=ax.get_xaxis_transform(), facecolor=colour, edgecolor="none", zorder=0)
+
+
+def shade_ended(ax: Axes, t: np.ndarray, ticks: int) -> None:
+    """Shade the time after a vehicle's last tick that counts."""
+    if ticks < len(t):
+        shade(ax, [(float(t[ticks - 1]), float(t[-1] - t[ticks - 1]))], ENDED)
 
 
 def tidy(ax: Axes, *, x_label: str = "", y_label: str = "") -> None:
@@ -97,10 +120,25 @@ def tidy(ax: Axes, *, x_label: str = "", y_label: str = "") -> None:
     ax.set_ylabel(y_label, fontsize=NORMAL, color=INK)
 
 
+def show_decades(ax: Axes) -> None:
+    """Label a logarithmic ordinate, on which everything has been drawn, at decades only, one at least in sight."""
+    ax.yaxis.set_minor_formatter(NullFormatter())
+    low, high = ax.dataLim.intervaly
+    if 0 < low <= high < np.inf:
+        ax.set_autoscaley_on(False)  # it would complain about a single value
+        low, high = np.log10((low, high))
+        room = max(0.05 * (high - low), (_LEAST_DECADES - (high - low)) / 2)
+        ax.set_ylim(10 ** (low - room), 10 ** (high + room))
+
+
 def time_axis(ax: Axes, t: np.ndarray, *, labelled: bool) -> None:
     """Span the record in time, with labels only where asked for."""
-    end = float(t[-1]) if t[-1] > t[0] else float(t[0]) + 1.0
-    ax.set_xlim(float(t[0]), end)
+    ax.set_xlim(*time_span(t))
     ax.tick_params(labelbottom=labelled)
     if labelled:
         ax.set_xlabel("time [s]", fontsize=NORMAL, color=INK)
+
+
+def time_span(t: np.ndarray) -> tuple[float, float]:
+    """Return the ends of a time axis, s."""
+    return float(t[0]), float(t[-1]) if t[-1] > t[0] else float(t[0]) + 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,11 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from coopenv.estimation.metrics import live_ticks, mean_targets_in_view
 from coopenv.estimation.trajectory import Sight, Trajectory
 from coopenv.viz.style import (
     BLUE,
+    ENDED,
     GREY,
     INK,
+    MERGED_GAP,
     NORMAL,
     ORANGE,
     SHADE,
@@ -23,6 +27,7 @@ from coopenv.viz.style import (
     new_figure,
     runs,
     shade,
+    shade_ended,
     target_labels,
     tidy,
     time_axis,
@@ -50,30 +55,35 @@ _BAR = {Sight.VISIBLE: 0.62, Sight.OUT_OF_VIEW: 0.14}  # share of a row; 0.62 fo
 _LANE, _PANEL_GAP, _HEAD, _FOOT = 0.19, 0.36, 0.55, 0.5  # inches
 
 
-def topology_figure(trajectory: Trajectory) -> Figure:
+def topology_figure(trajectory: Trajectory, ends: Sequence[float] | None = None) -> Figure:
     """Draw, per vehicle, one lane per target against time, the bar telling what became of the sight line.
 
     Targets that are never a vehicle's neighbours have no lane. Blue shading: a moving target is detected, or
-    a moving body hides a target.
+    a moving body hides a target. Grey: the vehicle has ended (at `ends`, s) and is parked; others may see it.
     """
     lanes = [_neighbours(trajectory, vehicle) for vehicle in range(len(trajectory.vehicles))]
     rows = [max(1, len(targets)) * _LANE for targets in lanes]
     height = _HEAD + _FOOT + sum(rows) + _PANEL_GAP * (len(rows) - 1)
     figure = new_figure(9.0, height)
     top = height - _HEAD
+    live = live_ticks(trajectory.t, len(lanes), ends)
+    shaded = False
     for vehicle, targets in enumerate(lanes):
         bottom = top - rows[vehicle]
         ax = figure.add_axes((0.105, bottom / height, 0.875, rows[vehicle] / height))
-        _draw_lanes(ax, trajectory, vehicle, targets)
+        shaded |= _draw_lanes(ax, trajectory, vehicle, targets, live[vehicle])
         time_axis(ax, trajectory.t, labelled=vehicle == len(lanes) - 1)
         top = bottom - _PANEL_GAP
+    occurring = {kind for vehicle, ticks in enumerate(live) for kind in np.unique(trajectory.sight[:ticks, vehicle])}
+    handles = [Patch(**look) for kind, look in _LOOKS.items() if kind in occurring]
+    if shaded:
+        handles.append(Patch(facecolor=SHADE, label="moving target involved"))
+    if live.min() < len(trajectory.t):
+        handles.append(Patch(facecolor=ENDED, label="ended, parked"))
     figure.legend(
-        handles=[
-            *(Patch(**look) for look in _LOOKS.values()),
-            Patch(facecolor=SHADE, label="moving target involved"),
-        ],
+        handles=handles,
         loc="upper center",
-        ncols=6,
+        ncols=7,
         fontsize=SMALL,
         frameon=False,
         handlelength=1.8,
@@ -86,12 +96,15 @@ def _neighbours(trajectory: Trajectory, vehicle: int) -> np.ndarray:
     return np.flatnonzero(np.any(trajectory.sight[:, vehicle] != Sight.NOT_A_NEIGHBOUR, axis=0))
 
 
-def _draw_lanes(ax: Axes, trajectory: Trajectory, vehicle: int, targets: np.ndarray) -> None:
-    sight, names = trajectory.sight[:, vehicle], target_labels(trajectory)
+def _draw_lanes(ax: Axes, trajectory: Trajectory, vehicle: int, targets: np.ndarray, ticks: int) -> bool:
+    """Draw one vehicle's lanes; return whether a moving target is ever involved."""
+    names, live = target_labels(trajectory), np.arange(len(trajectory.t)) < ticks
+    sight = np.where(live[:, None], trajectory.sight[:, vehicle], Sight.NOT_A_NEIGHBOUR)
     tidy(ax)
     ax.grid(False, axis="y")
-    involved = moving_target_seen(trajectory, vehicle) | np.any(sight == Sight.OCCLUDED_BY_BODY, axis=-1)
-    shade(ax, runs(trajectory.t, involved))
+    involved = (moving_target_seen(trajectory, vehicle) & live) | np.any(sight == Sight.OCCLUDED_BY_BODY, axis=-1)
+    shade(ax, runs(trajectory.t, involved, MERGED_GAP))
+    shade_ended(ax, trajectory.t, ticks)
     for lane, target in enumerate(targets):
         for kind, look in _LOOKS.items():
             stretches = runs(trajectory.t, sight[:, target] == kind)
@@ -103,5 +116,6 @@ def _draw_lanes(ax: Axes, trajectory: Trajectory, vehicle: int, targets: np.ndar
     if not len(targets):
         ax.text(0.5, 0.5, "no neighbours", transform=ax.transAxes, ha="center", va="center", color=GREY)
     ax.set_title(vehicle_label(trajectory.vehicles[vehicle]), fontsize=NORMAL + 2, loc="left", pad=2.5, color=INK)
-    seen = trajectory.visible[:, vehicle].sum(axis=-1).mean()
+    seen = mean_targets_in_view(trajectory.visible[:ticks, vehicle])
     ax.set_title(f"{seen:.2f} targets in view on average", fontsize=SMALL, loc="right", pad=2.5, color=INK)
+    return bool(involved.any())

@@ -64,11 +64,13 @@ def new_ground(scenario: Scenario) -> tuple[Figure, Axes]:
     ax.set_aspect("equal")
     ax.set_autoscale_on(False)
     figure.text(*pixels(_LEFT, HEIGHT - 21), scenario.title, fontsize=NORMAL + 1.5, color=INK)
-    _draw_scene(ax, scenario)
+    draw_site(ax, scenario)
+    _draw_goals(ax, scenario)
     return figure, ax
 
 
-def _draw_scene(ax: Axes, scenario: Scenario) -> None:
+def draw_site(ax: Axes, scenario: Scenario) -> None:
+    """Draw roads and buildings in plan."""
     origin = np.array(scenario.map.origin)[:2]
     for road in scenario.roads:
         ax.add_patch(Polygon(road_corners(road.start, road.end, road.width) - origin, color=ASPHALT, zorder=0.5))
@@ -81,6 +83,11 @@ def _draw_scene(ax: Axes, scenario: Scenario) -> None:
         corners = (half * [(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ np.array([[c, s], [-s, c]])
         corners += np.array(obstacle.center)[:2] - origin
         ax.add_patch(Polygon(corners, facecolor=ROOF, edgecolor=WALL, linewidth=1.2, hatch="//", zorder=1))
+
+
+def _draw_goals(ax: Axes, scenario: Scenario) -> None:
+    """Draw goals and the names of static landmarks."""
+    origin = np.array(scenario.map.origin)[:2]
     for i, vehicle in enumerate(scenario.vehicles):
         if vehicle.goal:
             center, colour = np.array(vehicle.goal.position)[:2] - origin, vehicle_colour(i)
@@ -122,7 +129,7 @@ def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
     if scenario.topology.mode == "sensed":
         if scenario.obstacles:
             handles.append(_sight(Sight.OCCLUDED_BY_BUILDING, "hidden by a building"))
-        handles.append(_sight(Sight.OCCLUDED_BY_BODY, "hidden by a vehicle"))
+        handles.append(_sight(Sight.OCCLUDED_BY_BODY, "hidden by a body"))
     if scenario.camera.miss_probability > 0:
         handles.append(_sight(Sight.MISSED, "in view, but missed"))
     handles.append(_mark("o", DARK_BLUE, DARK_BLUE, 5, "landmark"))

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
+from mpl_toolkits.mplot3d import proj3d
 
+from coopenv.estimation.metrics import live_ticks
 from coopenv.estimation.trajectory import Trajectory
+from coopenv.scenario import Scenario
+from coopenv.viz.clipping import clipped
+from coopenv.viz.labels import place_names
 from coopenv.viz.style import (
     DARK_BLUE,
     INK,
@@ -22,45 +29,117 @@ from coopenv.viz.style import (
     vehicle_colour,
     vehicle_label,
 )
+from coopenv.viz.topview_ground import ASPHALT, ROOF, WALL, draw_site
 
 _DOTTED = (0, (1, 1.6))
-_MARGIN_M, _MARGIN_SHARE = 1.5, 0.06  # around the truth
-_LEGEND = 1.75  # inches
+_DASHED = (0, (5, 1.5, 1, 1.5))
+_MARGIN_M, _MARGIN_SHARE = 0.5, 0.08  # around the truth
+_DEPTH_SHARE = 0.25  # of the scene's extent: farther above or below, the frame does not follow an estimate
+_TRANSIENT_SHARE = 0.1  # of the record, in which estimates come from anywhere
+_LEGEND = 1.85  # inches
+_NAME = NORMAL + 1  # pt
 
 
-def trajectory_figure_2d(trajectory: Trajectory) -> Figure:
-    """Draw the paths in plan, axes equal, in metres.
+class _Drawing:
+    """Axes with what has been drawn on them, names to be placed at the end."""
+
+    def __init__(self, ax: Any, low: np.ndarray, high: np.ndarray, dimensions: int) -> None:
+        self.ax, self.low, self.high, self.dimensions = ax, low, high, dimensions
+        self.outside = False  # an estimate starts outside the box
+        self._marks: list[np.ndarray] = []
+        self._lines: list[np.ndarray] = []
+        self._names: list[tuple[str, np.ndarray, str]] = []
+
+    def line(self, path: np.ndarray, **look: Any) -> None:
+        """Draw what lies in the box of a path (K, 3)."""
+        high, low = self.high[: self.dimensions], self.low[: self.dimensions]
+        shown = clipped(path[:, : self.dimensions], low, high)
+        self.ax.plot(*shown.T, **look)
+        self._lines.append(shown)
+
+    def mark(self, point: np.ndarray, marker: str, *, edge: str, face: str) -> None:
+        """Mark a point (3,)."""
+        point = point[: self.dimensions]
+        self.ax.plot(*([value] for value in point), clip_on=False, zorder=4, **_marker(marker, edge, face))
+        self._marks.append(point)
+
+    def name(self, point: np.ndarray, text: str, colour: str) -> None:
+        """Name a point (3,)."""
+        self._names.append((text, point[: self.dimensions], colour))
+
+    def write_names(self) -> None:
+        """Write the names; the limits of the axes must be final."""
+        self.ax.apply_aspect()
+        if not self._names:
+            return
+        texts, points, colours = zip(*self._names, strict=True)
+        anchors = self._plane(np.array(points))
+        marks, lines = self._plane(np.array(self._marks)), self._plane(np.concatenate(self._lines or [points]))
+        pixels = self.ax.transData.transform
+        offsets = place_names(texts, pixels(anchors), pixels(marks), pixels(lines), _NAME)
+        for text, anchor, offset, colour in zip(texts, anchors, offsets, colours, strict=True):
+            self.ax.annotate(
+                text,
+                tuple(anchor),
+                xytext=tuple(offset),
+                textcoords="offset points",
+                fontsize=_NAME,
+                color=colour,
+                zorder=5,
+                path_effects=[withStroke(linewidth=2.0, foreground="white")],
+            )
+
+    def _plane(self, points: np.ndarray) -> np.ndarray:
+        """Return points (K, D) in the coordinates of the plane that is drawn."""
+        if self.dimensions == 2:
+            return points
+        x, y, _ = proj3d.proj_transform(*points.T, self.ax.get_proj())
+        return np.stack([x, y], axis=-1)
+
+
+def trajectory_figure_2d(
+    trajectory: Trajectory, ends: Sequence[float] | None = None, scenario: Scenario | None = None
+) -> Figure:
+    """Draw the paths in plan, axes equal, in metres, over the roads and buildings of a scenario.
 
     The frame follows the truth. An estimate that starts outside enters from the edge, where an open triangle
-    marks it.
+    marks it. The paths of a vehicle stop at its end (s).
     """
     low, high = _scene(trajectory)
     width, depth = high[:2] - low[:2]
     scale = min(6.6 / width, 6.6 / depth)  # inches per metre
     drawn = np.maximum((width * scale, depth * scale), 2.4)
+    middle, half = (low[:2] + high[:2]) / 2, drawn / scale / 2
+    low[:2], high[:2] = middle - half, middle + half
     figure = new_figure(float(drawn[0]) + 0.75 + _LEGEND, float(drawn[1]) + 0.75)
     w, h = figure.get_size_inches()
     ax = figure.add_axes((0.65 / w, 0.55 / h, drawn[0] / w, drawn[1] / h))
     tidy(ax, x_label="x [m]", y_label="y [m]")
-    outside = _draw_paths(ax, trajectory, low, high, dimensions=2)
+    if scenario is not None:
+        draw_site(ax, scenario)
+    drawing = _Drawing(ax, low, high, dimensions=2)
+    _draw_paths(drawing, trajectory, ends)
     ax.set_xlim(low[0], high[0])
     ax.set_ylim(low[1], high[1])
     ax.set_aspect("equal", adjustable="datalim")
-    _legend(figure, trajectory, x=1 - (_LEGEND - 0.05) / w, y=1 - 0.2 / h, outside=outside)
+    drawing.write_names()
+    _legend(figure, trajectory, x=1 - (_LEGEND - 0.1) / w, y=1 - 0.2 / h, outside=drawing.outside, scenario=scenario)
     return figure
 
 
-def trajectory_figure_3d(trajectory: Trajectory) -> Figure:
-    """Draw the paths in space, one scale on all axes, in metres; the frame follows the truth, as in plan."""
+def trajectory_figure_3d(trajectory: Trajectory, ends: Sequence[float] | None = None) -> Figure:
+    """Draw the paths in space, one scale on all axes, in metres; frame and ends as in plan."""
     low, high = _scene(trajectory)
     figure = new_figure(9.5, 5.8)
     ax: Any = figure.add_axes((-0.01, -0.12, 0.85, 1.24), projection="3d")
     ax.view_init(elev=32, azim=-58)
-    outside = _draw_paths(ax, trajectory, low, high, dimensions=3)
+    drawing = _Drawing(ax, low, high, dimensions=3)
+    _draw_paths(drawing, trajectory, ends)
     ax.set_xlim(low[0], high[0])
     ax.set_ylim(low[1], high[1])
     ax.set_zlim(low[2], high[2])
-    ax.set_box_aspect(high - low, zoom=1.0)
+    steep = float((high - low)[2] / np.max((high - low)[:2]))
+    ax.set_box_aspect(high - low, zoom=float(np.clip(1.2 - 0.5 * steep, 0.7, 1.0)))
     ax.tick_params(labelsize=SMALL, pad=0)
     ax.locator_params(axis="z", nbins=4)
     ax.set_xlabel("x [m]", fontsize=NORMAL)
@@ -68,65 +147,80 @@ def trajectory_figure_3d(trajectory: Trajectory) -> Figure:
     ax.set_zlabel("z [m]", fontsize=NORMAL, labelpad=-2)
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
         axis.pane.set_facecolor("#F7F7F7")
-    _legend(figure, trajectory, x=0.86, y=0.93, outside=outside)
+    drawing.write_names()
+    _legend(figure, trajectory, x=0.84, y=0.93, outside=drawing.outside)
     return figure
 
 
 def _scene(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
-    """Return opposite corners (3,) in m of a box around everything true, with a margin."""
+    """Return opposite corners (3,) in m of a box around everything true, with a margin.
+
+    The box reaches below the ground, and as high, as estimates go once they have come near.
+    """
     points = np.concatenate([trajectory.position.reshape(-1, 3), trajectory.target_position.reshape(-1, 3)])
     points = points[np.isfinite(points).all(axis=-1)]
-    low, high = points.min(axis=0), points.max(axis=0)
-    margin = max(_MARGIN_M, _MARGIN_SHARE * float(np.max(high - low)))
-    low, high = low - margin, high + margin
-    if low[2] < 0 <= points[:, 2].min():
+    if not len(points):
+        return np.full(3, -1.0), np.full(3, 1.0)
+    least, most = points.min(axis=0), points.max(axis=0)
+    extent = float(np.max(most - least))
+    margin = max(_MARGIN_M, _MARGIN_SHARE * extent)
+    low, high = least - margin, most + margin
+    if low[2] < 0 <= least[2]:
         low[2] = 0.0
+    later = int(_TRANSIENT_SHARE * len(trajectory.t))
+    z = trajectory.position_estimate[later:, :, 2]
+    reach = margin + _DEPTH_SHARE * extent
+    z = z[(z > least[2] - reach) & (z < most[2] + reach)]
+    if len(z):
+        pad = 0.2 * margin
+        low[2] = min(low[2], float(z.min()) - pad) if z.min() < low[2] else low[2]
+        high[2] = max(high[2], float(z.max()) + pad)
     return low, high
 
 
-def _draw_paths(ax: Any, trajectory: Trajectory, low: np.ndarray, high: np.ndarray, dimensions: int) -> bool:
-    """Draw landmarks, estimates, and the truth on top; return whether an estimate starts outside the box."""
-    outside = False
-    keep = thinned(len(trajectory.t))
-    _draw_landmarks(ax, trajectory, keep, dimensions)
-    for vehicle in range(len(trajectory.vehicles)):
+def _draw_paths(drawing: _Drawing, trajectory: Trajectory, ends: Sequence[float] | None) -> None:
+    """Draw landmarks, estimates, and the truth on top."""
+    low, high = drawing.low, drawing.high
+    used = slice(drawing.dimensions)
+    _draw_landmarks(drawing, trajectory)
+    for vehicle, ticks in enumerate(live_ticks(trajectory.t, len(trajectory.vehicles), ends)):
+        keep = thinned(ticks)
         colour = vehicle_colour(vehicle)
-        estimate = trajectory.position_estimate[keep, vehicle]
-        within = (estimate >= low) & (estimate <= high)
-        inside = np.all(within[:, :dimensions], axis=-1, keepdims=True)
-        outside |= not inside[0, 0]
-        shown = estimate if dimensions == 2 else np.where(inside, estimate, np.nan)  # 3-D axes do not clip
-        ax.plot(*shown.T[:dimensions], color=colour, linewidth=1.6, alpha=0.8)
-        face = colour if inside[0] else "white"
-        _mark(ax, np.clip(estimate[0], low, high)[:dimensions], "^", edge=colour, face=face)
+        estimate = np.asarray(trajectory.position_estimate[keep, vehicle], float)
+        inside = np.all((estimate >= low)[:, used] & (estimate <= high)[:, used], axis=-1)
+        drawing.line(estimate, color=colour, linewidth=1.6, alpha=0.8)
+        if np.isfinite(estimate[0]).all():
+            drawing.outside |= not inside[0]
+            start = np.clip(estimate[0], low, high)
+            drawing.mark(start, "^", edge=colour, face=colour if inside[0] else "white")
         if inside[-1]:
-            _mark(ax, estimate[-1, :dimensions], "x", edge=colour, face=colour)
-        truth = trajectory.position[keep, vehicle, :dimensions]
-        ax.plot(*truth.T, color=INK, linewidth=1.1, linestyle=_DOTTED)
-        _mark(ax, truth[0], "^", edge=INK, face=colour)
-        _mark(ax, truth[-1], "x", edge=INK, face=INK)
-        _label(ax, truth[0], vehicle_label(trajectory.vehicles[vehicle]), INK)
-    return outside
+            drawing.mark(estimate[-1], "x", edge=colour, face=colour)
+        truth = trajectory.position[keep, vehicle]
+        drawing.line(truth, color=INK, linewidth=1.1, linestyle=_DOTTED)
+        drawing.mark(truth[0], "^", edge=INK, face=colour)
+        drawing.mark(truth[-1], "x", edge=INK, face=INK)
+        drawing.name(truth[0], vehicle_label(trajectory.vehicles[vehicle]), INK)
 
 
-def _draw_landmarks(ax: Any, trajectory: Trajectory, keep: np.ndarray, dimensions: int) -> None:
-    vehicles = set(trajectory.vehicles.tolist())
+def _draw_landmarks(drawing: _Drawing, trajectory: Trajectory) -> None:
+    keep = thinned(len(trajectory.t))
     labels = target_labels(trajectory)
-    for target, name in enumerate(trajectory.targets.tolist()):
-        if name in vehicles:
-            continue
-        path = trajectory.target_position[keep, target, :dimensions]
-        if trajectory.target_moving[target]:
-            ax.plot(*path.T, color=DARK_BLUE, linewidth=1.1, linestyle=(0, (5, 1.5, 1, 1.5)))
-            _mark(ax, path[0], "^", edge=DARK_BLUE, face=DARK_BLUE)
-            _mark(ax, path[-1], "x", edge=DARK_BLUE, face=DARK_BLUE)
+    for target, moving in _landmarks(trajectory):
+        path = trajectory.target_position[keep, target]
+        if moving:
+            drawing.line(path, color=DARK_BLUE, linewidth=1.1, linestyle=_DASHED)
+            drawing.mark(path[0], "^", edge=DARK_BLUE, face=DARK_BLUE)
+            drawing.mark(path[-1], "x", edge=DARK_BLUE, face=DARK_BLUE)
         else:
-            _mark(ax, path[0], "o", edge=DARK_BLUE, face=DARK_BLUE)
-        _label(ax, path[0], labels[target], DARK_BLUE)
+            drawing.mark(path[0], "o", edge=DARK_BLUE, face=DARK_BLUE)
+        drawing.name(path[0], labels[target], DARK_BLUE)
 
 
-def _mark(ax: Any, point: np.ndarray, marker: str, *, edge: str, face: str) -> None:
-    ax.plot(*([value] for value in point), clip_on=False, zorder=4, **_marker(marker, edge, face))
+def _landmarks(trajectory: Trajectory) -> list[tuple[int, bool]]:
+    """Return (index among the targets, whether it moves) of every landmark."""
+    vehicles = set(trajectory.vehicles.tolist())
+    names, moving = trajectory.targets.tolist(), trajectory.target_moving.tolist()
+    return [(i, moves) for i, (name, moves) in enumerate(zip(names, moving, strict=True)) if name not in vehicles]
 
 
 def _marker(marker: str, edge: str, face: str) -> dict[str, Any]:
@@ -140,21 +234,10 @@ def _marker(marker: str, edge: str, face: str) -> dict[str, Any]:
     }
 
 
-def _label(ax: Any, point: np.ndarray, text: str, colour: str) -> None:
-    look = {
-        "fontsize": NORMAL + 1,
-        "color": colour,
-        "zorder": 5,
-        "path_effects": [withStroke(linewidth=2.0, foreground="white")],
-    }
-    if len(point) == 2:
-        ax.annotate(text, point, xytext=(6, 5), textcoords="offset points", **look)
-    else:
-        ax.text(*point, f"  {text}", **look)
-
-
-def _legend(figure: Figure, trajectory: Trajectory, x: float, y: float, *, outside: bool) -> None:
-    handles = [
+def _legend(
+    figure: Figure, trajectory: Trajectory, x: float, y: float, *, outside: bool, scenario: Scenario | None = None
+) -> None:
+    handles: list[Line2D | Patch] = [
         Line2D([], [], color=vehicle_colour(i), linewidth=1.6, label=vehicle_label(name))
         for i, name in enumerate(trajectory.vehicles)
     ]
@@ -163,10 +246,18 @@ def _legend(figure: Figure, trajectory: Trajectory, x: float, y: float, *, outsi
         Line2D([], [], color=INK, linewidth=1.6, alpha=0.8, label="estimate"),
         Line2D([], [], label="start", **_marker("^", INK, INK)),
         Line2D([], [], label="end", **_marker("x", INK, INK)),
-        Line2D([], [], label="landmark", **_marker("o", DARK_BLUE, DARK_BLUE)),
     ]
+    motions = {moving for _, moving in _landmarks(trajectory)}
+    if False in motions:
+        handles.append(Line2D([], [], label="landmark", **_marker("o", DARK_BLUE, DARK_BLUE)))
+    if True in motions:
+        handles.append(Line2D([], [], label="moving landmark", color=DARK_BLUE, linewidth=1.1, linestyle=_DASHED))
     if outside:
         handles.append(Line2D([], [], label="starts outside", **_marker("^", INK, "white")))
+    if scenario is not None and scenario.roads:
+        handles.append(Patch(facecolor=ASPHALT, edgecolor="none", label="road"))
+    if scenario is not None and scenario.obstacles:
+        handles.append(Patch(facecolor=ROOF, edgecolor=WALL, hatch="//", label="building"))
     figure.legend(
         handles=handles,
         loc="upper left",

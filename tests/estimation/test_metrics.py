@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import metrics
+from coopenv.estimation.observability import analyse_observability
+from coopenv.estimation.trajectory import Trajectory
 from tests.synthetic import INITIAL_ERROR, RATE, make_trajectory
 
 unit_vectors = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-2)
@@ -182,6 +185,87 @@ def test_rate_fit_without_a_descent_is_nan(error: np.ndarray) -> None:
     assert fit.samples < 10
 
 
+@pytest.mark.parametrize(
+    ("error", "remark"),
+    [
+        (np.append(9.0, np.full(99, 0.01)), "error fell below half within 1 tick"),
+        (
+            np.concatenate([np.full(40, 9.0), np.full(60, 0.01)]),
+            "error fell from half to the noise floor within 1 tick",
+        ),
+        (np.full(100, 4.0), "error ends at 100 % of its initial value"),
+        (np.append(9.0, np.full(99, 3.0)), "error ends at 33 % of its initial value"),
+        (np.append(9.0, np.full(99, np.inf)), "error is not finite"),
+        (np.full(100, np.nan), "error is not finite"),
+        (np.zeros(100), "no initial error"),
+    ],
+)
+def test_a_missing_rate_is_explained(error: np.ndarray, remark: str) -> None:
+    fit = metrics.fit_exponential_rate(np.arange(100.0), error)
+    assert math.isnan(fit.rate)
+    assert fit.remark == f"{remark}, no rate to fit"
+
+
+def test_three_samples_are_enough_for_a_rate() -> None:
+    error = np.concatenate([8.0 * np.exp(-1.0 * np.arange(5)), np.full(95, 0.02)])
+    fit = metrics.fit_exponential_rate(np.arange(100.0), error)
+    assert (fit.samples, fit.remark) == (4, "")
+    assert fit.rate == pytest.approx(1.0)
+    error = np.concatenate([[8.0, 3.0, 1.0, 0.3], np.full(96, 0.01)])
+    assert metrics.fit_exponential_rate(np.arange(100.0), error).samples == 3
+
+
+def test_noise_that_flickers_above_half_is_no_descent() -> None:
+    rng = np.random.default_rng(2)
+    t = np.arange(2400) / 60.0
+    error = np.where(t < 25, 0.1, 0.01) * np.abs(1 + 0.6 * rng.standard_normal(len(t)))
+    error[0] = 0.4
+    assert np.flatnonzero(error > 0.2)[-1] > 600
+    assert "no rate to fit" in metrics.fit_exponential_rate(t, error).remark
+
+
+def parked_run() -> tuple[Trajectory, list[float]]:
+    """Return the synthetic run with nonsense recorded of vehicle_2 after it ended at 20 s, and all ends."""
+    run = make_trajectory()
+    after = run.t > 20.0 + 1e-9
+    error, angle, nees, visible = (
+        run.position_error.copy(),
+        run.orientation_error.copy(),
+        run.nees.copy(),
+        run.visible.copy(),
+    )
+    error[after, 1], angle[after, 1], nees[after, 1], visible[after, 1] = 1e6, 179.0, np.nan, False
+    ends = [50.0, 20.0, math.nan, 50.0, 50.0]
+    return replace(run, position_error=error, orientation_error=angle, nees=nees, visible=visible), ends
+
+
+def test_nothing_counts_after_a_vehicle_has_ended() -> None:
+    run, ends = parked_run()
+    assert metrics.live_ticks(run.t, 5, ends).tolist() == [3001, 1201, 3001, 3001, 3001]
+    assert metrics.live_ticks(run.t, 2).tolist() == [3001, 3001]
+    ticks = 1201
+    clean = make_trajectory()
+    expected = metrics.summarise(make_trajectory(ticks), steady_from=10.0)[1]
+    rows = metrics.summarise(run, 10.0, ends)
+    assert rows[1] == pytest.approx(expected)
+    assert rows[1]["mean_targets_in_view"] == pytest.approx(clean.visible[:ticks, 1].sum() / ticks)
+    assert not rows[1]["mirrored"]
+    assert rows[0] == metrics.summarise(clean, 10.0)[0]
+    assert math.isnan(metrics.summarise(run, 30.0, ends)[1]["steady_position_rmse_m"])
+
+
+def test_windows_beyond_the_end_do_not_count() -> None:
+    run, ends = parked_run()
+    whole = analyse_observability(run)
+    cut = metrics.observability_of(whole, 1, ends[1])
+    assert cut.vehicles.tolist() == ["vehicle_2"]
+    assert cut.t[-1] + cut.window == pytest.approx(20.0)
+    assert_allclose(cut.condition_number[:, 0], whole.condition_number[: len(cut.t), 1])
+    assert_allclose(cut.local_eigenvalue[:, 0], whole.local_eigenvalue[: len(cut.t), 1])
+    assert len(metrics.observability_of(whole, 0, math.nan).t) == len(whole.t)
+    assert len(metrics.observability_of(whole, 0, 0.5).t) == 0
+
+
 def test_summary_of_the_synthetic_run() -> None:
     rows = metrics.summarise(make_trajectory(), steady_from=40.0)
     assert [row["vehicle"] for row in rows] == [f"vehicle_{i}" for i in range(1, 6)]
@@ -214,5 +298,7 @@ def test_json_ready_survives_a_strict_encoder() -> None:
     encoded = json.dumps(metrics.json_ready(value), allow_nan=False)
     assert json.loads(encoded) == {"a": None, "b": [None, 3, [1.0, None]], "c": [True, "x", None]}
     assert all(
-        isinstance(v, str | float | bool) for row in metrics.summarise(make_trajectory(60), 9.0) for v in row.values()
+        isinstance(v, str | float | bool | None)
+        for row in metrics.summarise(make_trajectory(60), 9.0)
+        for v in row.values()
     )

@@ -17,7 +17,7 @@ import coopenv
 from coopenv.api.layout import observation_layout
 from coopenv.cli import main
 from coopenv.scenario import words
-from coopenv.scenario.agents import ConstantMotion, InitialEstimate, TwistSegment, WaypointMotion
+from coopenv.scenario.agents import ConstantMotion, InitialEstimate, SegmentMotion, TwistSegment, WaypointMotion
 from coopenv.scenario.describe import describe_scenario, settings
 from coopenv.scenario.files import apply_vehicle_defaults, data_directory, parse_scenario
 from coopenv.scenario.json_schema import schema_text
@@ -64,6 +64,38 @@ def test_the_sections_of_the_busy_intersection() -> None:
     assert "Horizon: 50 s, 500 decisions of 6 camera ticks each." in text
     assert "wheelbase" not in text
     assert "wheelbase" in described("urban_crossing", 100)
+
+
+def test_settings_of_the_image_are_left_out_where_there_is_none() -> None:
+    fields = ("image_size", "focal_length", "principal_point", "distortion", "undistort", "quantise")
+    keys = {name: [key for key, *_ in settings(coopenv.load_scenario(name).camera)] for name in coopenv.list_envs()}
+    assert coopenv.load_scenario("busy_intersection").camera.model == "omnidirectional"
+    assert not set(fields) & set(keys["busy_intersection"])
+    assert {"model", "position", "orientation", "miss_probability"} <= set(keys["busy_intersection"])
+    assert set(fields) <= set(keys["crossing_path"])
+    assert "principal_point" not in described("busy_intersection", 100)
+
+
+def test_stages_of_prescribed_motions_are_shown() -> None:
+    lines = [line.split() for line in described("crossing_path", 80).splitlines()]
+    first = lines.index(["vehicle_1", "0-20", "rests"])
+    assert lines[first + 1 : first + 5] == [
+        ["20-22.1", "0.26", "m/s", "forward"],
+        ["22.1-28.5", "rests"],
+        ["28.5-30", "0.26", "m/s", "forward"],
+        ["30-", "rests"],
+    ]
+    assert ["ML", "0-15.6", "rests"] in lines
+    assert "Stages of motion" not in described("busy_intersection", 80)
+    turning = {"duration": 2.5, "linear": (0.26, 0, 0), "angular": (0, 0, -0.5)}
+    segments = SegmentMotion.model_validate({"kind": "segments", "segments": [turning]})
+    assert list(words.stages(segments)) == [
+        ("0-2.5", "0.26 m/s forward, turning at (0, 0, -0.5) rad/s"),
+        ("2.5-", "rests"),
+    ]
+    waypoints = [{"time": 0.0, "position": (0, 0, 0)}, {"time": 8.0, "position": (4, 0, 1.5)}]
+    spline = WaypointMotion.model_validate({"kind": "waypoints", "waypoints": waypoints})
+    assert list(words.stages(spline)) == [("0", "at (0, 0, 0)"), ("8", "at (4, 0, 1.5)")]
 
 
 def test_overrides_are_described(capsys: pytest.CaptureFixture[str]) -> None:

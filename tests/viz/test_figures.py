@@ -9,6 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -18,27 +19,25 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.lines import Line2D
+from mpl_toolkits.mplot3d import proj3d
 from scipy.stats import chi2
 
+import coopenv
 from coopenv.errors import OutputError
+from coopenv.estimation.metrics import summarise
 from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.trajectory import Sight, Trajectory
 from coopenv.viz import consistency, style
+from coopenv.viz.clipping import clipped
 from coopenv.viz.errors import error_figure
-from coopenv.viz.figures import save_figures
+from coopenv.viz.figures import FIGURE_NAMES, save_figures
+from coopenv.viz.labels import place_names
 from coopenv.viz.observability import observability_figure
 from coopenv.viz.topology import topology_figure
 from coopenv.viz.trajectories import trajectory_figure_2d, trajectory_figure_3d
 from tests.synthetic import make_trajectory
 
-NAMES = [
-    "errors.png",
-    "trajectories_2d.png",
-    "trajectories_3d.png",
-    "topology.png",
-    "consistency.png",
-    "observability.png",
-]
+NAMES = list(FIGURE_NAMES)
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +105,15 @@ def test_lost_observer_without_covariance_is_drawn(tmp_path: Path) -> None:
     assert "no covariance declared" in texts(consistency.consistency_figure(run))
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
+def test_an_observer_that_is_lost_from_the_start_is_drawn(value: float, tmp_path: Path) -> None:
+    run = make_trajectory(ticks=90)
+    fields = ("position_estimate", "rotation_estimate", "position_error", "orientation_error", "covariance", "nees")
+    run = dataclasses.replace(run, **{name: np.full_like(getattr(run, name), value) for name in fields})
+    assert len(save_figures(run, tmp_path, ends=[0.0, 0.5, np.nan, 1.0, 1.5])) == len(NAMES)
+    assert "no rate to fit" in summarise(run, 0.5)[0]["rate_remark"]
+
+
 def test_a_place_that_cannot_be_written_is_one_clear_error(run: Trajectory, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write figures"):
@@ -131,15 +139,18 @@ def test_error_figure_shows_the_errors_and_marks_settling_and_moving_targets(run
     assert len(figure.axes) == 20  # five vehicles, two columns, linear and logarithmic
     linear, log = figure.axes[0], figure.axes[1]
     assert log.get_yscale() == "log"
-    lines = [line for line in linear.lines if line.get_color() in style.AXES_COLOURS]
+    lines = [x for x in linear.lines if x.get_color() in style.AXES_COLOURS and len(xdata(x)) > 1]
     error = run.position[:, 0] - run.position_estimate[:, 0]
     for line, component in zip(lines, error.T, strict=True):
         np.testing.assert_allclose(ydata(line), np.interp(xdata(line), run.t, component), atol=1e-12)
         assert xdata(line)[0] == run.t[0] and xdata(line)[-1] == run.t[-1]
+    dots = [x for x in linear.lines if x.get_color() in style.AXES_COLOURS and len(xdata(x)) == 1]
+    assert [ydata(dot)[0] for dot in dots] == pytest.approx(error[0].tolist())
+    assert {dot.get_marker() for dot in dots} == {"o"}
     yaw = next(line for line in figure.axes[2].lines if line.get_color() == style.AXES_COLOURS[2])
     assert ydata(yaw)[0] == pytest.approx(90, abs=0.1)  # the synthetic start is a quarter turn about z
     assert spans(linear, style.SHADE) == [pytest.approx((21, 25), abs=0.05)]  # f1 sees f2
-    settled = [x[0] for x in (xdata(line) for line in log.lines) if x[0] == x[1]]  # upright
+    settled = [x[0] for x in (xdata(line) for line in log.lines) if len(x) > 1 and x[0] == x[1]]  # upright
     assert settled == [pytest.approx(np.log(90) / 1.2, abs=0.5)]
     assert {"position error\n[m]", "orientation error\n[deg]", "time [s]", "$f_{5}$"} <= texts(figure)
 
@@ -227,7 +238,7 @@ def test_nees_bounds_are_the_central_95_percent_of_six_dof() -> None:
 def test_consistency_shows_the_share_of_ticks_inside_and_the_claimed_deviation(run: Trajectory) -> None:
     nees = np.full_like(run.nees, 6.0)
     nees[: len(nees) // 4] = 100.0
-    figure = consistency.consistency_figure(dataclasses.replace(run, nees=nees))
+    figure = consistency.consistency_figure(dataclasses.replace(run, nees=nees), steady_from=0.0)
     assert sum("75 % of ticks inside" in text for text in texts(figure)) == 1  # equal notes, one set member
     error, claimed = figure.axes[1].lines
     assert ydata(error)[0] == pytest.approx(run.position_error[0, 0])
@@ -236,12 +247,209 @@ def test_consistency_shows_the_share_of_ticks_inside_and_the_claimed_deviation(r
     assert degrees == pytest.approx(np.degrees(np.sqrt(3) * (1 + np.radians(0.02) + 1e-4)))
 
 
+def test_mean_nees_is_the_one_of_the_table(run: Trajectory) -> None:
+    shown = texts(consistency.consistency_figure(run, steady_from=30.0))
+    for row in summarise(run, 30.0):
+        assert any(text.startswith(f"after 30 s: mean {row['mean_nees']:.3g}, ") for text in shown)
+    assert any(text.startswith("after 35 s: mean ") for text in texts(consistency.consistency_figure(run)))
+    late = consistency.consistency_figure(run, ends=[50.0, 20.0, 50.0, 50.0, 50.0], steady_from=30.0)
+    assert "ended before the steady state (30 s)" in texts(late)
+
+
+ENDS = [50.0, 20.0, 50.0, 50.0, 50.0]
+
+
+def test_lines_stop_where_a_vehicle_ends(run: Trajectory) -> None:
+    errors = error_figure(run, ENDS)
+    for panel in errors.axes[4:8]:
+        assert max(xdata(x)[-1] for x in panel.lines if len(xdata(x)) > 2) == pytest.approx(20.0)
+        assert spans(panel, style.ENDED) == [pytest.approx((20.0, 50.0))]
+    assert all(spans(panel, style.ENDED) == [] for panel in errors.axes[:4])
+    topology = topology_figure(run, ENDS)
+    bars = [x for c in topology.axes[1].collections[2:] for p in c.get_paths() for x in np.asarray(p.vertices)[:, 0]]
+    assert max(bars) == pytest.approx(20.0, abs=0.02)
+    assert spans(topology.axes[1], style.ENDED) == [pytest.approx((20.0, 50.0))]
+    seen = run.visible[run.t <= 20.0, 1].sum() / 1201
+    assert f"{seen:.2f} targets in view on average" in texts(topology)
+    nees = consistency.consistency_figure(run, ENDS).axes[3]
+    assert max(xdata(x)[-1] for x in nees.lines if len(xdata(x)) > 2) == pytest.approx(20.0)
+    local, _, verdict = observability_figure(analyse_observability(run), ENDS).axes
+    assert xdata(local.lines[1])[-1] == pytest.approx(19.0)
+    assert max(p.vertices[:, 0].max() for c in verdict.collections for p in c.get_paths()) == pytest.approx(50.0)
+    plan = trajectory_figure_2d(run, ENDS).axes[0]
+    dotted = [x for x in plan.lines if x.get_color() == style.INK and len(xdata(x)) > 1]
+    assert ydata(dotted[1])[-1] == pytest.approx(run.position[1200, 1, 1])
+    for figure in (errors, topology, consistency.consistency_figure(run, ENDS)):
+        assert "ended, parked" in texts(figure)
+    for draw in (error_figure, topology_figure, consistency.consistency_figure):
+        assert "ended, parked" not in texts(draw(run))
+
+
+def fallen_at_once(run: Trajectory) -> Trajectory:
+    """Return the run with errors of the size of its noise from the first correction on."""
+    rng = np.random.default_rng(5)
+    estimate = run.position + 0.01 * rng.standard_normal(run.position.shape)
+    estimate[0] = run.position_estimate[0]
+    error = np.linalg.norm(run.position - estimate, axis=-1)
+    return dataclasses.replace(run, position_estimate=estimate, position_error=error)
+
+
+def test_a_fall_within_a_tick_does_not_fix_the_axis_but_is_marked(run: Trajectory) -> None:
+    figure = error_figure(fallen_at_once(run))
+    linear, log = figure.axes[0], figure.axes[1]
+    low, high = linear.get_ylim()
+    assert -0.1 < low < 0 < high < 0.1
+    starts = [x for x in linear.lines if len(xdata(x)) == 1]
+    assert [x.get_marker() for x in starts] == ["v", "v", "v"]  # -2, -11 and -2.5 m
+    assert {ydata(x)[0] for x in starts} == {low}
+    x, y, z = (run.position - run.position_estimate)[0, 0]
+    assert f"starts at {x:.3g}, {y:.3g}, {z:.3g} m" in texts(figure)
+    start = [x for x in log.lines if len(xdata(x)) == 1]
+    assert ydata(start[0])[0] == pytest.approx(run.position_error[0, 0])
+    assert not any(text.startswith("starts at") for text in texts(error_figure(run)))
+
+
+def test_the_settling_time_is_not_written_across_its_line(run: Trajectory) -> None:
+    wide = run.position_error + np.where(run.t < 45.0, 0.2, 0.0)[:, None]
+    figure = error_figure(dataclasses.replace(run, position_error=wide))
+    figure.canvas.draw()
+    for ax in figure.axes:
+        notes = [text for text in ax.texts if text.get_text().startswith("settled at 45.0")]
+        for note in notes:
+            line = ax.transData.transform((45.0, 1.0))[0]
+            box = note.get_window_extent()
+            assert not box.x0 <= line <= box.x1
+    assert any(text.startswith("settled at 45.0") for text in texts(figure))
+
+
+def test_space_shows_estimates_below_the_ground(run: Trajectory) -> None:
+    height = np.array([0.0, 0.0, 2.0])
+    ground = dataclasses.replace(
+        run,
+        position=run.position * [1, 1, 0],
+        target_position=run.target_position * [1, 1, 0] + height,
+        position_estimate=run.position * [1, 1, 0] + [0, 0, -0.4],
+    )
+    ax: Any = trajectory_figure_3d(ground).axes[0]
+    assert -1.5 < ax.get_zlim()[0] < -0.4
+    solid = [x.get_data_3d() for x in ax.lines if x.get_linestyle() == "-" and len(x.get_data_3d()[0]) > 1]
+    assert len(solid) == 5
+    assert all(np.isfinite(path).all() and path[2].min() == pytest.approx(-0.4) for path in map(np.array, solid))
+    above = dataclasses.replace(ground, position_estimate=ground.position + height / 5)
+    assert trajectory_figure_3d(above).axes[0].get_zlim()[0] == 0.0  # type: ignore[attr-defined]
+
+
+def test_lines_are_cut_at_the_sides_of_a_box() -> None:
+    path = np.array([(0.5, 0.5), (0.5, 2.5), (0.8, 2.5), (0.8, 0.5), (0.2, 0.5), (np.nan, 0.5), (0.1, 0.1), (0.1, 0.2)])
+    expected = [
+        (0.5, 0.5),
+        (0.5, 1),
+        (np.nan,) * 2,
+        (0.8, 1),
+        (0.8, 0.5),
+        (0.2, 0.5),
+        (np.nan,) * 2,
+        (0.1, 0.1),
+        (0.1, 0.2),
+    ]
+    np.testing.assert_allclose(clipped(path, np.zeros(2), np.ones(2)), expected)
+    through = clipped(np.array([(-1.0, 0.5), (1e30, 0.5)]), np.zeros(2), np.ones(2))
+    np.testing.assert_allclose(through[:, 0], [0, 1], atol=1e-9)
+    assert len(clipped(np.array([(5.0, 5.0), (6.0, 6.0)]), np.zeros(2), np.ones(2))) == 0
+    assert len(clipped(np.array([(0.5, 0.5)]), np.zeros(2), np.ones(2))) == 1
+
+
+def test_names_keep_off_marks_and_each_other() -> None:
+    point = style.DPI / 72.0
+    anchors = np.array([(100.0, 100.0), (104.0, 100.0)])
+    marks = np.vstack([anchors, [(115.0, 110.0)]])
+    offsets = place_names(["SL1", "$f_{2}$"], anchors, marks, np.empty((0, 2)), 10.0)
+    low = anchors / point + offsets
+    extent = np.array([(0.62 * 3, 0.95), (0.62 * 2, 0.95)]) * 10.0
+    for corner, size in zip(low, extent, strict=True):
+        assert not np.any(np.all((marks / point > corner) & (marks / point < corner + size), axis=-1))
+    assert np.any((low[0] >= low[1] + extent[1]) | (low[1] >= low[0] + extent[0]))
+    assert place_names(["A"], anchors[:1], anchors[:1], np.empty((0, 2)), 10.0).tolist() == [[5.0, 5.0]]
+
+
+@pytest.mark.parametrize("draw", [trajectory_figure_2d, trajectory_figure_3d])
+def test_no_name_covers_the_end_of_a_vehicle(draw: Callable[[Trajectory], Figure], run: Trajectory) -> None:
+    figure = draw(run)  # SL1 at (-4, 5), the end of f2 at (-2, 6)
+    figure.canvas.draw()
+    ax = figure.axes[0]
+    ends = [x for x in ax.lines if x.get_marker() == "x"]
+    assert len(ends) == 10
+    names = [text for text in ax.texts if text.get_text() in ("SL1", "SL2", "SL3", *(f"$f_{{{i}}}$" for i in range(6)))]
+    assert len(names) == 8
+    for end in ends:
+        if draw is trajectory_figure_3d:
+            x, y, _ = proj3d.proj_transform(*(v[0] for v in end.get_data_3d()), ax.get_proj())  # type: ignore[attr-defined]
+        else:
+            x, y = xdata(end)[0], ydata(end)[0]
+        place = ax.transData.transform((x, y))
+        assert not any(name.get_window_extent().contains(*place) for name in names)
+
+
+def test_plan_shows_roads_and_buildings_of_a_scenario(run: Trajectory) -> None:
+    scenario = coopenv.load_scenario("urban_crossing")
+    figure = trajectory_figure_2d(run, scenario=scenario)
+    assert len(figure.axes[0].patches) == len(scenario.roads) + len(scenario.obstacles)
+    assert {"road", "building"} <= texts(figure)
+    assert not {"road", "building"} & texts(trajectory_figure_2d(run))
+
+
+def test_legends_list_only_what_occurs(run: Trajectory) -> None:
+    assert {"missed", "occluded by a building", "out of view", "moving target involved"} <= texts(topology_figure(run))
+    sight = np.where(run.sight == Sight.NOT_A_NEIGHBOUR, Sight.NOT_A_NEIGHBOUR, Sight.OUT_OF_VIEW)
+    blind = dataclasses.replace(run, sight=sight, visible=np.zeros_like(run.visible))
+    shown = texts(topology_figure(blind))
+    assert "out of view" in shown
+    assert not {"visible", "missed", "occluded by a building", "moving target involved"} & shown
+    assert "moving target detected" not in texts(error_figure(blind))
+    assert "not\nobservable" not in texts(observability_figure(analyse_observability(run, threshold=0.0)))
+    without = trajectory_figure_2d(dataclasses.replace(run, target_moving=np.ones(8, bool)))
+    assert "landmark" not in texts(without) and "moving landmark" in texts(without)
+
+
+def test_a_missed_frame_leaves_no_line_in_the_shade(run: Trajectory) -> None:
+    visible = run.visible.copy()
+    visible[:, 0] = False
+    visible[600:900, 0, 4] = True
+    visible[700:703, 0, 4] = visible[800:803, 0, 4] = False
+    sight = np.where(visible, Sight.VISIBLE, np.where(run.sight == Sight.VISIBLE, Sight.MISSED, run.sight))
+    sight[:, 0][sight[:, 0] == Sight.OCCLUDED_BY_BODY] = Sight.MISSED
+    missing = dataclasses.replace(run, visible=visible, sight=sight)
+    for figure in (error_figure(missing), topology_figure(missing)):
+        assert spans(figure.axes[0], style.SHADE) == [pytest.approx((10, 15), abs=1e-6)]
+
+
+def test_axes_show_a_decade_and_no_labels_between() -> None:
+    figure = style.new_figure(3, 2)
+    ax = figure.add_subplot()
+    ax.set_yscale("log")
+    ax.plot([0, 1], [120.0, 180.0])
+    style.show_decades(ax)
+    figure.canvas.draw()
+    low, high = ax.get_ylim()
+    assert any(low <= 10.0**k <= high for k in range(5))
+    assert all(not text.get_text() for text in ax.get_yticklabels(minor=True))
+
+
+def test_what_an_axis_cannot_show_is_left_out() -> None:
+    values = np.array([1.0, -1.0, 0.0, np.nan, np.inf, 1e200])
+    np.testing.assert_array_equal(style.drawable(values), [1, -1, 0, np.nan, np.nan, np.nan])
+    np.testing.assert_array_equal(style.drawable(values, positive=True), [1] + [np.nan] * 5)
+
+
 def test_observability_figure_shows_threshold_and_verdict(run: Trajectory) -> None:
     result = analyse_observability(run, threshold=2e-3)
     figure = observability_figure(result)
     local, _, verdict = figure.axes
     threshold = [line for line in local.lines if line.get_label() == "threshold"]
     assert ydata(threshold[0])[0] == 2e-3
+    assert local.get_ylim()[0] < 2e-3 < local.get_ylim()[1]
+    low = observability_figure(analyse_observability(run, threshold=1e-7)).axes[0].get_ylim()[0]
+    assert low < 1e-7
     drawn = sum(end - start for start, end in spans(verdict, style.GREEN))
     expected = sum(i.end - i.start for v in range(5) for i in result.intervals(v) if i.observable)
     assert drawn == pytest.approx(expected)
@@ -252,6 +460,9 @@ def test_runs_cover_each_tick_until_the_next() -> None:
     t = np.array([0.0, 1.0, 3.0, 4.0])
     assert style.runs(t, np.array([True, True, False, True])) == [(0.0, 3.0), (4.0, 1.0)]
     assert style.runs(t, np.zeros(4, bool)) == []
+    assert style.runs(t, np.zeros(4, bool), 1.0) == []
+    assert style.runs(t, np.array([True, False, True, False]), 2.0) == [(0.0, 4.0)]
+    assert style.runs(t, np.array([True, False, True, False]), 1.9) == [(0.0, 1.0), (3.0, 1.0)]
 
 
 def test_thinning_keeps_both_ends_and_short_records_whole() -> None:

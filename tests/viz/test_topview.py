@@ -116,6 +116,12 @@ def test_equal_states_give_equal_pictures_whatever_was_drawn_before(start: Any) 
     np.testing.assert_array_equal(TopView(start.scenario).draw(start.engine), picture)
 
 
+def test_the_legend_speaks_of_bodies_since_landmarks_have_them_too() -> None:
+    view = TopView(load_scenario("crossing_path"))
+    shown = {text.get_text() for legend in view._figure.legends for text in legend.get_texts()}
+    assert "hidden by a body" in shown and "hidden by a building" not in shown
+
+
 def test_lines_of_sight_say_who_sees_whom_and_what_is_hidden() -> None:
     engine = Engine(load_scenario("overtaking"))
     engine.reset([0])
