@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-all lint format bench schema clean
+.PHONY: help demo test test-train test-all lint format bench schema clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -31,7 +31,15 @@ demo: $(VENV)/.base ## run the paper's busy intersection; table here, figures in
 test: lint ## lint, type check and all tests but the slow ones
 	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
 
-test-all: lint ## every test
+$(VENV)/.train: $(VENV)/.dev
+	@echo "Installing torch and Stable-Baselines3 into $(VENV) (once) ..."
+	@$(PIP) --editable '.[train]'
+	@touch $@
+
+test-train: $(VENV)/.train ## the tests that train policies (installs torch)
+	@$(BIN)/python -m pytest -m train
+
+test-all: lint ## every test whose tools are installed
 	@$(BIN)/python -m pytest -n 2 --dist loadfile
 
 lint: $(VENV)/.dev ## ruff and mypy

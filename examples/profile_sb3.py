@@ -28,9 +28,9 @@ class TimedEnv(CooperativeSB3VecEnv):
 
 
 env = TimedEnv(load_scenario("urban_crossing"), num_worlds=64)
-model = PPO("MlpPolicy", env, n_steps=64, batch_size=2048, seed=0, device="cpu")
+model = PPO("MlpPolicy", env, n_steps=64, seed=0, device="cpu")
 model.learn(2 * 64 * env.num_envs)  # compile and warm up
 env.seconds, start = 0.0, perf_counter()
-model.learn(20 * 64 * env.num_envs, reset_num_timesteps=False)
+model.learn(3 * 64 * env.num_envs, reset_num_timesteps=False)
 wall = perf_counter() - start
 print(f"{env.num_envs} rows: environment {env.seconds:.2f} s of {wall:.2f} s = {100 * env.seconds / wall:.1f} %")

@@ -40,6 +40,16 @@ class Exchange:
         self._shape = (worlds, vehicles, 2)
         self._tensors: dict[str, Any] = {}
 
+    def follow_torch(self) -> None:
+        """Queue this engine's kernels on torch's current CUDA stream, so that neither overtakes the other."""
+        if self._on_cpu or self.kind != "torch":
+            return
+        import torch
+
+        device = self._engine.world.device
+        current = torch.cuda.current_stream(wp.device_to_torch(device))
+        wp.set_stream(wp.stream_from_torch(current), device)
+
     def rows(self, name: str) -> Any:
         """Return a field: a copy on the host, or a tensor that shares memory."""
         if self.kind == "numpy":

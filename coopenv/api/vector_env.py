@@ -124,6 +124,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if not self._seeded:
             mask = None  # nothing has begun yet: the first reset is of all worlds
             seed = seeding.np_random(None)[1] if seed is None else seed
+        self._exchange.follow_torch()
         self.engine.reset(self._world_seeds(seed), mask)
         self._seeded = True
         return self._exchange.rows("observation"), self._infos()
@@ -140,6 +141,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         """
         if not self._seeded:
             raise CoopenvError("step() called before reset()")
+        self._exchange.follow_torch()
         self._exchange.set_actions(actions)
         if self.autoreset == AutoresetMode.NEXT_STEP:
             self.engine.step_or_restart()
