@@ -23,9 +23,11 @@ class ActionReader:
         Raises:
             ActionError: an action is missing, unknown, of the wrong shape, or not finite.
         """
+        if not isinstance(actions, Mapping):
+            raise ActionError(f"actions must be a dict of agent to array, got {type(actions).__name__}")
         try:
             values = np.array([actions[agent] for agent in alive])
-        except (IndexError, KeyError, TypeError, ValueError):
+        except (IndexError, KeyError, TypeError, ValueError, RuntimeError):
             values = np.empty(0)
         numeric = values.dtype.kind in "fiu" and values.shape == (len(alive), 2)
         unknown = len(actions) != len(alive) and not set(actions) <= set(self._index)
@@ -36,8 +38,6 @@ class ActionReader:
         return whole
 
     def _complain(self, actions: Mapping[str, np.ndarray], alive: Sequence[str]) -> None:
-        if not isinstance(actions, Mapping):
-            raise ActionError(f"actions must be a dict of agent to array, got {type(actions).__name__}")
         for agent in actions:
             if agent not in self._index:
                 raise ActionError(

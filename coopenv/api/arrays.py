@@ -39,6 +39,7 @@ class Exchange:
         self._rows = worlds * vehicles
         self._shape = (worlds, vehicles, 2)
         self._tensors: dict[str, Any] = {}
+        self._stream: Any = None
 
     def follow_torch(self) -> None:
         """Queue this engine's kernels on torch's current CUDA stream, so that neither overtakes the other."""
@@ -48,7 +49,10 @@ class Exchange:
 
         device = self._engine.world.device
         current = torch.cuda.current_stream(wp.device_to_torch(device))
-        wp.set_stream(wp.stream_from_torch(current), device)
+        if self._stream is None or self._stream.cuda_stream != current.cuda_stream:
+            self._stream = wp.stream_from_torch(current)
+        # The first time, wait for what was queued on the stream so far, such as the building of the world.
+        wp.set_stream(self._stream, device, sync=wp.get_stream(device) != self._stream)
 
     def rows(self, name: str) -> Any:
         """Return a field: a copy on the host, or a tensor that shares memory."""
@@ -78,27 +82,44 @@ class Exchange:
         Raises:
             ActionError: wrong shape or dtype; a host array that is not finite.
         """
-        shape = tuple(getattr(actions, "shape", np.shape(actions)))
-        if shape not in ((self._rows, 2), self._shape):
-            raise ActionError(f"actions have shape {shape}, expected ({self._rows}, 2)")
-        if self.kind == "torch" and hasattr(actions, "__dlpack__") and not isinstance(actions, np.ndarray):
+        if self.kind == "torch" and type(actions).__module__.split(".")[0] == "torch":
             self._set_tensor(actions)
-            return
-        self._engine.set_actions(self._host_actions(actions))
+        else:
+            self._engine.set_actions(host_actions(actions, self._shape))
 
     def _set_tensor(self, actions: Any) -> None:
         import torch
 
-        if not torch.is_floating_point(actions):
-            raise ActionError(f"actions have dtype {actions.dtype}, expected a float")
+        if tuple(actions.shape) not in ((self._rows, 2), self._shape):
+            raise ActionError(f"actions have shape {tuple(actions.shape)}, expected ({self._rows}, 2)")
+        if not torch.is_floating_point(actions) or actions.device.type == "meta":
+            raise ActionError(f"actions have dtype {actions.dtype} on {actions.device}, expected a float with data")
+        if actions.device.type == "cpu" and not torch.isfinite(actions).all():
+            host_actions(actions.detach().numpy(), self._shape)  # says which row
         target = wp.to_torch(self._engine.array("actions"))
         target.copy_(actions.detach().reshape(self._shape))
 
-    def _host_actions(self, actions: Any) -> np.ndarray:
+
+def host_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return host actions as an array (W, N, 2).
+
+    Args:
+        actions: (W N, 2) or (W, N, 2).
+        shape: (W, N, 2).
+
+    Raises:
+        ActionError: wrong shape or dtype, or not finite.
+    """
+    rows = shape[0] * shape[1]
+    try:
         values = np.asarray(actions)
-        if values.dtype.kind not in "fiu":
-            raise ActionError(f"actions have dtype {values.dtype}, expected a float")
-        if not np.isfinite(values).all():
-            row = int(np.flatnonzero(~np.isfinite(values.reshape(self._rows, 2)).all(axis=1))[0])
-            raise ActionError(f"action of row {row} is not finite: {values.reshape(self._rows, 2)[row].tolist()}")
-        return values.reshape(self._shape)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ActionError(f"actions cannot be read as an array of shape ({rows}, 2): {error}") from None
+    if values.shape not in ((rows, 2), shape):
+        raise ActionError(f"actions have shape {values.shape}, expected ({rows}, 2)")
+    if values.dtype.kind not in "fiu":
+        raise ActionError(f"actions have dtype {values.dtype}, expected a float")
+    if not np.isfinite(values).all():
+        row = int(np.flatnonzero(~np.isfinite(values.reshape(rows, 2)).all(axis=1))[0])
+        raise ActionError(f"action of row {row} is not finite: {values.reshape(rows, 2)[row].tolist()}")
+    return values.reshape(shape)

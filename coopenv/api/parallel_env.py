@@ -16,7 +16,7 @@ from coopenv.api.engine import Engine
 from coopenv.api.infos import InfoWriter
 from coopenv.api.layout import Field, action_space, dict_space, flat_space
 from coopenv.api.state import state_space, state_vector
-from coopenv.errors import CoopenvError, checked_seed, suggest
+from coopenv.errors import CoopenvError, ScenarioError, checked_seed, suggest
 from coopenv.scenario import Scenario, load_scenario
 
 if TYPE_CHECKING:
@@ -201,14 +201,14 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             raise CoopenvError(f"{where}: not a mapping, but {type(state).__name__}")
         if state.get("scenario") != self.scenario:
             raise CoopenvError(f"{where}: it is of another scenario")
-        agents = list(state.get("agents", ["none"]))
-        if not set(agents) <= set(self.possible_agents):
-            raise CoopenvError(f"{where}: its agents are {', '.join(agents)}")
+        agents = state.get("agents")
+        if not isinstance(agents, list) or not set(agents) <= set(self.possible_agents):
+            raise CoopenvError(f"{where}: its agents are {agents!r}")
         try:
             self.engine.set_state(state)
         except ValueError as error:
             raise CoopenvError(f"{where}: {error}") from None
-        self.agents, self._seeded = agents, bool(state.get("seeded"))
+        self.agents, self._seeded = list(agents), bool(state.get("seeded"))
 
     def __getstate__(self) -> dict[str, Any]:
         return {"arguments": self._arguments, "state": self.get_state()}
@@ -253,6 +253,8 @@ def parallel_env(
         CoopenvError: another argument is not valid.
     """
     _one_of("backend", backend, (None, *BACKENDS))
+    if overrides is not None and not isinstance(overrides, Mapping):
+        raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
     merged = dict(overrides or {})
     if observer is not None:
         merged["observer.name"] = observer

@@ -110,7 +110,9 @@ def reward(
     """Write the reward terms since the last report, and the flags that end an episode."""
     tick = state.tick[world]
     ended = state.ended[world, vehicle]
-    alive = report.last_ended[world, vehicle] == UNDER_WAY
+    # Over since the last report: nothing more is earned before a reset (each vehicle reads its own memory only).
+    waiting = report.last_tick[world, vehicle] >= model.horizon_ticks
+    alive = report.last_ended[world, vehicle] == UNDER_WAY and not waiting
     distance = goal_distance(model, state, world, vehicle)
     has_goal = model.scene.goal_radius[vehicle] > distance - distance
     progress = wp.where(has_goal, report.last_goal_distance[world, vehicle] - distance, distance - distance)

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from coopenv.api.arrays import host_actions
 from coopenv.api.engine import Engine
 from coopenv.api.layout import Field, action_space, flat_space
-from coopenv.errors import ActionError, CoopenvError
+from coopenv.errors import CoopenvError, checked_seed
 from coopenv.scenario import Scenario, load_scenario
 
 try:
@@ -28,8 +29,8 @@ class CooperativeSB3VecEnv(VecEnv):
     A world that is over is reset in the same step, as SB3 expects: `infos[row]["terminal_observation"]` holds the
     last observation, and `infos[row]["TimeLimit.truncated"]` says that the value beyond it counts.
 
-    A vehicle that ended before its world stays parked with reward 0; its row starts a new "episode" there, which is
-    truncated when the world is over. `info["alive"]` is False in those rows at every done.
+    A vehicle that ended before its world stays parked with reward 0; its row starts a new "episode" there, which ends,
+    worth nothing, when the world is over. `info["alive"]` is False in those rows at every done.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class CooperativeSB3VecEnv(VecEnv):
         first = self._seeds[0]
         if first is None and not self._seeded:
             _, first = seeding.np_random(None)
-        seeds = None if first is None else [int(first) + world for world in range(self.engine.world.worlds)]
+        seeds = None if first is None else [checked_seed(first) + w for w in range(self.engine.world.worlds)]
         self._seeded = True
         self.engine.reset(seeds)
         self._reset_seeds()
@@ -74,13 +75,9 @@ class CooperativeSB3VecEnv(VecEnv):
         Raises:
             ActionError: wrong shape, or not finite.
         """
-        values = np.asarray(actions, dtype=np.float32)
-        if values.shape != (self.num_envs, 2):
-            raise ActionError(f"actions have shape {values.shape}, expected ({self.num_envs}, 2)")
-        if not np.isfinite(values).all():
-            row = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
-            raise ActionError(f"action of row {row} is not finite: {values[row].tolist()}")
-        self._actions[...] = values.reshape(self._actions.shape)
+        if not self._seeded:
+            raise CoopenvError("step() called before reset()")
+        self._actions[...] = host_actions(actions, self._actions.shape)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Drive for one decision period and reset the worlds that are over."""
@@ -93,20 +90,29 @@ class CooperativeSB3VecEnv(VecEnv):
             for row in np.flatnonzero(dones).tolist():
                 infos[row] = {
                     "terminal_observation": final[row].copy(),
-                    "TimeLimit.truncated": bool(truncated[row]),
+                    "TimeLimit.truncated": bool(truncated[row] and alive[row]),
                     "alive": bool(alive[row]),
                 }
             self.engine.restart_finished()
         return self._rows("observation"), rewards, dones, infos
 
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Set the seed of the next reset: world w gets seed + w.
+
+        Raises:
+            CoopenvError: not a whole number, or negative.
+        """
+        return super().seed(None if seed is None else checked_seed(seed))
+
     def close(self) -> None:
-        """Close the renderer."""
+        """Close the renderer and end the threads."""
+        self.engine.world.launch.close()
         if self._view is not None:
             self._view.close()
             self._view = None
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Return the top view of world 0 as the picture of its first row, None for the other rows."""
+        """Return one picture, the top view of world 0."""
         if self._view is None:
             from coopenv.viz.topview import TopView  # matplotlib is loaded by those who draw
 

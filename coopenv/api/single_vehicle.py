@@ -48,7 +48,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         self.world: CooperativeLocalisationEnv = parallel_env(name_or_path, **options)
         names = self.world.possible_agents
         if vehicle not in names:
-            raise CoopenvError(f"unknown vehicle '{vehicle}'{suggest(vehicle, names)}; known: {', '.join(names)}")
+            raise CoopenvError(f"unknown vehicle '{vehicle}'{suggest(str(vehicle), names)}; known: {', '.join(names)}")
         self.vehicle, self._others = vehicle, others
         self.render_mode = self.world.render_mode
         self.metadata = dict(self.world.metadata)

@@ -45,8 +45,8 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     - NEXT_STEP: the following step ignores the actions of these rows and returns the new episode's first observation,
       reward 0, no flags.
-    - SAME_STEP: the observation returned is already the new episode's; the last one stands in `infos["final_obs"]`
-      with mask `infos["_final_obs"]`.
+    - SAME_STEP: observation and infos returned are already the new episode's; those of the step stand in
+      `infos["final_obs"]` and `infos["final_info"]`, with masks `infos["_final_obs"]` and `infos["_final_info"]`.
     - DISABLED: nothing happens before `reset(options={"reset_mask": mask})`, which takes whole worlds.
 
     Every reset draws anew. On the CPU results are fresh NumPy arrays; on CUDA they are torch tensors that share the
@@ -113,19 +113,23 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Start new episodes.
 
         Args:
-            seed: world w gets seed + w, or the w-th of a sequence of one per world; None goes on from the last seeds.
+            seed: world w gets seed + w, or the w-th of a sequence of one per world (one per row: that of the world's
+                first row counts); None goes on from the last seeds.
             options: `{"reset_mask": bool array}` of one per row or per world restricts the reset to whole worlds (not
                 the first one).
 
         Raises:
             CoopenvError: a mask that splits a world, or a sequence of the wrong length.
         """
-        mask = self._world_mask((options or {}).get("reset_mask"))
+        mask = self._world_mask(self._reset_mask(options))
         if not self._seeded:
             mask = None  # nothing has begun yet: the first reset is of all worlds
             seed = seeding.np_random(None)[1] if seed is None else seed
         self._exchange.follow_torch()
-        self.engine.reset(self._world_seeds(seed), mask)
+        seeds = self._world_seeds(seed)
+        if seeds is not None:
+            self._np_random, self._np_random_seed = seeding.np_random(seeds[0])
+        self.engine.reset(seeds, mask)
         self._seeded = True
         return self._exchange.rows("observation"), self._infos()
 
@@ -150,28 +154,46 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         flags = [self._exchange.rows(name) for name in ("reward", "terminated", "truncated")]
         infos = self._infos()
         if self.autoreset == AutoresetMode.SAME_STEP:
-            self._restart_at_once(infos, flags)
+            flags, infos = self._restart_at_once(flags, infos)
         return self._exchange.rows("observation"), flags[0], flags[1], flags[2], infos
 
-    def _restart_at_once(self, infos: dict[str, Any], flags: list[Any]) -> None:
-        """Reset what is over, keeping the last observations and the flags of the step."""
-        final = self._exchange.kept("observation")
-        kept = [self._exchange.owned(flag) for flag in flags]
-        infos.update({name: self._exchange.owned(value) for name, value in infos.items()})
-        flags[:] = kept
-        ended = kept[1] | kept[2]
-        infos.update(final_obs=final, _final_obs=ended)
-        infos["final_info"] = {name: infos[name] for name in INFO_FIELDS}
-        infos["_final_info"] = ended
+    def _restart_at_once(self, flags: list[Any], infos: dict[str, Any]) -> tuple[list[Any], dict[str, Any]]:
+        """Reset what is over; return the flags of the step, and the infos after it with those of the step inside.
+
+        `final_obs` and `final_info` are there when a row has ended; for tensors always, as looking would mean waiting.
+        """
+        flags = [self._exchange.owned(flag) for flag in flags]
+        ended = flags[1] | flags[2]
+        if self._exchange.kind == "numpy" and not ended.any():
+            return flags, infos
+        final = {"final_obs": self._exchange.kept("observation"), "_final_obs": ended}
+        final["final_info"] = {name: self._exchange.owned(value) for name, value in infos.items()}
+        final["_final_info"] = ended
         self.engine.restart_finished()
+        return flags, {**self._infos(), **final}
 
     def _infos(self) -> dict[str, Any]:
         return {name: self._exchange.rows(name) for name in INFO_FIELDS}
 
+    def _reset_mask(self, options: Any) -> Any:
+        if options is None:
+            return None
+        if not isinstance(options, Mapping):
+            raise CoopenvError(f"options must be a dict, got {type(options).__name__}")
+        for key in options:
+            if key != "reset_mask":
+                raise CoopenvError(f"unknown option '{key}'{suggest(str(key), ['reset_mask'])}; known: reset_mask")
+        return options.get("reset_mask")
+
     def _world_mask(self, mask: Any) -> np.ndarray | None:
         if mask is None:
             return None
-        chosen = np.asarray(mask, dtype=bool)
+        try:
+            chosen = np.asarray(mask)
+        except (TypeError, ValueError, RuntimeError):
+            chosen = np.empty(0)
+        if chosen.dtype != bool or not chosen.any():
+            raise CoopenvError("reset_mask must be an array of bool with at least one True")
         if chosen.shape == (self.num_envs,):
             by_world = self.world_major(chosen)
             if (by_world.any(axis=1) != by_world.all(axis=1)).any():
@@ -187,7 +209,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     def _world_seeds(self, seed: int | Sequence[int] | None) -> list[int] | None:
         if seed is None:
             return None
-        if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str):
+        if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str) or np.ndim(seed) == 0:
             return [checked_seed(seed) + world for world in range(self.num_worlds)]
         seeds = [checked_seed(s) for s in seed]
         if len(seeds) == self.num_envs:
@@ -207,24 +229,29 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         pictures = [self._view.draw(OneWorld(self.engine, world)) for world in range(self.num_worlds)]
         return tuple(picture for picture in pictures for _ in range(self.vehicles))
 
-    def get_state(self) -> dict[str, np.ndarray]:
+    def get_state(self) -> dict[str, Any]:
         """Return everything that the next step depends on, random streams included."""
-        return self.engine.get_state()
+        return {"scenario": self.scenario, **self.engine.get_state()}
 
-    def set_state(self, state: dict[str, np.ndarray]) -> None:
+    def set_state(self, state: Mapping[str, Any]) -> None:
         """Go back to what `get_state` returned.
 
         Raises:
             CoopenvError: the state belongs to another kind of environment.
         """
+        where = f"this state does not fit {self.metadata['name']}"
+        if not isinstance(state, Mapping) or state.get("scenario") != self.scenario:
+            raise CoopenvError(f"{where}: it is of another scenario")
         try:
             self.engine.set_state(state)
-        except (KeyError, ValueError) as error:
-            raise CoopenvError(f"this state does not fit {self.metadata['name']}: {error}") from None
+        except ValueError as error:
+            raise CoopenvError(f"{where}: {error}") from None
         self._seeded = True
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close the renderer."""
+        """Close the renderer and end the threads."""
+        if hasattr(self, "engine"):
+            self.engine.world.launch.close()
         if self._view is not None:
             self._view.close()
             self._view = None
@@ -297,8 +324,10 @@ def make_rows(
     Raises:
         CoopenvError: `num_envs` is not a multiple of the vehicles.
     """
+    if "num_worlds" in options:
+        raise CoopenvError("give num_envs, which counts rows (world, vehicle), instead of num_worlds")
     vehicles = len(load_scenario(name_or_path, options.get("overrides")).vehicles)
-    if num_envs < 1 or num_envs % vehicles:
+    if not isinstance(num_envs, int) or num_envs < 1 or num_envs % vehicles:
         raise CoopenvError(
             f"num_envs counts rows (world, vehicle): {num_envs} is not a positive multiple of the {vehicles} vehicles "
             f"of {name_or_path}"

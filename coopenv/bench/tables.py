@@ -181,12 +181,12 @@ def score_table(rows: list[tuple[str, str, Score]]) -> Table:
         ("agent", "left"),
         ("environment", "left"),
         ("runs", ""),
-        ("arrived", ""),
-        ("collided", ""),
+        ("arri-\nved", ""),
+        ("colli-\nded", ""),
         ("out of\ntime", ""),
         ("return", ""),
-        ("median\nerr [m]", ""),
-        ("95 %\nerr [m]", ""),
+        ("median\nerror", ""),
+        ("95 %\nerror", ""),
     )
     for agent, name, s in rows:
         table.add_row(

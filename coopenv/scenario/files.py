@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Mapping
+from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -176,15 +177,22 @@ def _one_line(error: ValidationError, where: str) -> str:
     details = error.errors(include_url=False)
     # A misspelt key often also leaves a required one missing: the misspelling is what helps.
     first = min(details, key=lambda d: d["type"] != "extra_forbidden")
-    keys = [part for part in first["loc"] if isinstance(part, int) or part.isidentifier()]
+    # Pydantic puts its own tags of unions into the location; keys of the file are identifiers or stand last.
+    last = len(first["loc"]) - 1
+    unknown = first["type"] == "extra_forbidden"
+    keys = [
+        part
+        for i, part in enumerate(first["loc"])
+        if isinstance(part, int) or part.isidentifier() or (unknown and i == last)
+    ]
     field = ".".join(str(part) for part in keys)
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
-    if first["type"] == "extra_forbidden":
+    if unknown:
         valid = _valid_keys(first["loc"][:-1])
         hint = suggest(str(keys[-1]), valid) or f"; allowed: {', '.join(valid)}"
         return f"{where}: {field}: unknown key{hint}{more}"
     if first["type"] in ("union_tag_not_found", "union_tag_invalid"):
-        return f"{where}: {field}.kind: {_kind_message(first)}{more}"
+        return f"{where}: {field}.{_kind_message(first)}{more}"
     message = first["msg"].removeprefix("Value error, ").replace("valid tuple", "list")
     if first["type"] == "missing" and isinstance(keys[-1], int):
         return f"{where}: {field.rpartition('.')[0]}: too few entries, number {keys[-1] + 1} is missing{more}"
@@ -200,11 +208,11 @@ def _kind_message(detail: Any) -> str:
     """Say which kinds exist, for a table whose `kind` is missing, misspelt or unknown."""
     context, given = detail.get("ctx", {}), detail.get("input")
     if "expected_tags" not in context:
-        near = suggest("kind", [str(k) for k in given]) if isinstance(given, dict) else ""
-        return f"Field required{near}"
+        near = get_close_matches("kind", [str(k) for k in given], n=1) if isinstance(given, dict) else []
+        return f"{near[0]}: unknown key (did you mean 'kind'?)" if near else "kind: Field required"
     kinds = [tag.strip().strip("'") for tag in context["expected_tags"].split(",")]
     tag = str(context.get("tag", ""))
-    return f"unknown kind '{tag}'{suggest(tag, kinds)}; known: {', '.join(kinds)}"
+    return f"kind: unknown kind '{tag}'{suggest(tag, kinds)}; known: {', '.join(kinds)}"
 
 
 def _starts_with_field(message: str) -> bool:

@@ -84,7 +84,7 @@ class BearingNoise(Part):
     """`paper`: largest deviation (image plane at distance 1); `isotropic`: standard deviation per axis, rad."""
     axis: Vector3 = (0.0, 0.0, 1.0)
     """Optical axis of the paper's formula, in the camera frame."""
-    rate: Positive | Sample = "sample"
+    rate: Rate | Sample = "sample"
     """Camera rate in Hz at which the scale holds (other rates keep its density), or `sample`: at any rate."""
 
     @model_validator(mode="after")
@@ -103,7 +103,7 @@ class Noise(Part):
     """Standard deviation of each component of a linear velocity sample, m/s."""
     angular_velocity: NonNegative = 0.0
     """Standard deviation of each component of an angular velocity sample, rad/s."""
-    odometry_rate: Positive | Sample = "sample"
+    odometry_rate: Rate | Sample = "sample"
     """Odometry rate in Hz at which these hold (other rates keep their density), or `sample`: at any rate."""
     bearing: BearingNoise = BearingNoise()
 

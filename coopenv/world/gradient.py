@@ -1,7 +1,8 @@
 """A differentiable rollout: from commands to the uncertainty of every vehicle, through Warp's tape.
 
 It covers what has a derivative: noise off, no losses and no delay, k = 1, and ticks in which one linearisation
-suffices. Whether a target is in view is taken as it falls out on the way forward.
+suffices. Whether a target is in view is taken as it falls out on the way forward. Contact and arrival end nothing here:
+vehicles drive on through one another.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.errors import ActionError, ScenarioError
+from coopenv.errors import ActionError, ScenarioError, checked_seed
 from coopenv.scenario import Scenario, ScenarioWarning
 from coopenv.scenario.checks import processing_order
 from coopenv.world.dynamics import LONGEST_SUBSTEP
@@ -74,9 +75,15 @@ class DifferentiableWorld:
         """
         world = self._world
         expected = (world.worlds, world.model.vehicles, 2)
-        if commands.ndim != 4 or commands.shape[1:] != expected:
+        commands = np.asarray(commands)
+        numeric = commands.dtype.kind in "fiu"
+        if not numeric or commands.ndim != 4 or len(commands) == 0 or commands.shape[1:] != expected:
             raise ActionError(f"commands have shape {commands.shape}, expected (decisions, W, N, 2) = (T, *{expected})")
-        world.reset([seed + w for w in range(world.worlds)])
+        if not np.isfinite(commands).all():
+            raise ActionError("commands are not finite")
+        if len(commands) * self.scenario.ticks_per_decision > self.scenario.horizon_ticks:
+            raise ActionError(f"{len(commands)} decisions reach beyond the horizon of {self.scenario.horizon:g} s")
+        world.reset([checked_seed(seed) + w for w in range(world.worlds)])
         decisions = [self._array(c, vec2) for c in commands]
         total, turn = self._array(np.zeros(1), scalar), wp.zeros(1, dtype=scalar, device=world.device)
         truth, held, belief = self._start()

@@ -60,7 +60,7 @@ def default_threads(worlds: int, device: str) -> int:
     if device != "cpu":
         return 1
     wanted = os.environ.get("COOPENV_THREADS", "")
-    if wanted and not (wanted.isdigit() and int(wanted) > 0):
+    if wanted and not (wanted.isascii() and wanted.isdecimal() and int(wanted) > 0):
         raise CoopenvError(f"COOPENV_THREADS must be a positive whole number, got '{wanted}'")
     available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, min(int(wanted or available), worlds // WORLDS_PER_THREAD))
@@ -95,7 +95,8 @@ class Launcher:
         bounds = np.linspace(0, worlds, threads + 1).round().astype(int).tolist()
         self._shares = [(a, b) for a, b in pairwise(bounds) if b > a]
         self._recorded: dict[Hashable, list[Any]] = {}
-        self._pool = ThreadPoolExecutor(len(self._shares) - 1) if len(self._shares) > 1 else None
+        self._pool: ThreadPoolExecutor | None = None
+        self._pool_owner = 0
 
     def __call__(
         self, key: Hashable, function: Callable[..., None], arguments: list[Any], inner: tuple[int, ...] = ()
@@ -113,10 +114,23 @@ class Launcher:
                 )
                 for start, stop in self._shares
             ]
-        if self._pool is None:
+        if len(commands) == 1:
             commands[0].launch()
             return
-        others = [self._pool.submit(command.launch) for command in commands[1:]]
+        pool = self._workers()
+        others = [pool.submit(command.launch) for command in commands[1:]]
         commands[0].launch()
         for other in others:
             other.result()
+
+    def _workers(self) -> ThreadPoolExecutor:
+        """Return this process's threads: those of a parent process do not exist after a fork."""
+        if self._pool is None or self._pool_owner != os.getpid():
+            self._pool, self._pool_owner = ThreadPoolExecutor(len(self._shares) - 1), os.getpid()
+        return self._pool
+
+    def close(self) -> None:
+        """End the threads; a later launch starts new ones."""
+        if self._pool is not None and self._pool_owner == os.getpid():
+            self._pool.shutdown(wait=False)
+        self._pool = None

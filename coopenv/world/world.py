@@ -47,13 +47,15 @@ class World:
             CoopenvError: no worlds or no threads.
         """
         for name, count in (("num_worlds", worlds), ("threads", 1 if threads is None else threads)):
-            if not isinstance(count, int | np.integer) or count < 1:
-                raise CoopenvError(f"{name} must be at least 1 and whole, got {count!r}")
+            if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 1 <= count < 2**31:
+                raise CoopenvError(f"{name} must be at least 1, whole and below 2^31, got {count!r}")
         self.scenario = scenario
         self.worlds = worlds
         self.precision = precision(dtype)
         self.device = check_device(device)
         self.threads = default_threads(worlds, self.device) if threads is None else min(threads, worlds)
+        if self.device != "cpu":
+            self.threads = 1
         self.model = build_model(scenario, self.precision, self.device)
         self.state = allocate_state(self.model, worlds, self.precision, self.device)
         self.actions = wp.zeros((worlds, self.model.vehicles), dtype=self.precision.vec2, device=self.device)

@@ -88,6 +88,24 @@ def test_methods_reach_the_batch() -> None:
         env.env_method("reset", indices=[0])
 
 
+def test_parked_vehicles_are_not_bootstrapped() -> None:
+    env = make_sb3_vec_env("urban_crossing", num_worlds=16, seed=0)
+    env.reset()
+    rng = np.random.default_rng(0)
+    ends = {True: 0, False: 0}
+    for _ in range(600):
+        _, _, dones, infos = env.step(rng.uniform(0, 1, (env.num_envs, 2)))
+        for row in np.flatnonzero(dones):
+            ends[infos[row]["alive"]] += 1
+            assert infos[row]["alive"] or not infos[row]["TimeLimit.truncated"]
+    assert min(ends.values()) > 10
+
+
+def test_step_before_reset() -> None:
+    with pytest.raises(coopenv.CoopenvError, match="before reset"):
+        make_sb3_vec_env("urban_crossing", num_worlds=2).step(np.zeros((8, 2)))
+
+
 @pytest.mark.parametrize(
     ("actions", "message"),
     [(np.zeros((3, 2)), r"shape \(3, 2\), expected \(10, 2\)"), (np.full((10, 2), np.nan), "row 0 is not finite")],

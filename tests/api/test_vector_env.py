@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import warnings
 from typing import Any
 
 import gymnasium
@@ -91,11 +93,14 @@ def test_same_step_mode() -> None:
         expected = twin.step(zero)
         assert np.array_equal(reward, expected[1]) and np.array_equal(truncated, expected[3])
         assert truncated.all() == (step % 5 == 0)
-        assert np.array_equal(infos["final_obs"], expected[0])
-        assert np.array_equal(infos["_final_obs"], truncated)
+        assert ("final_obs" in infos) == truncated.any()
         if truncated.all():
+            assert np.array_equal(infos["final_obs"], expected[0])
+            assert np.array_equal(infos["_final_obs"], truncated)
             assert np.array_equal(infos["final_info"]["position_error"], expected[4]["position_error"])
-            assert np.array_equal(observation, twin.reset()[0])
+            again, fresh = twin.reset()
+            assert np.array_equal(observation, again)
+            assert np.array_equal(infos["position_error"], fresh["position_error"])  # of the new episode
 
 
 def test_disabled_mode_resets_by_mask() -> None:
@@ -121,8 +126,9 @@ def test_over_worlds_wait_in_disabled_mode() -> None:
     zero = np.zeros((5, 2), dtype=np.float32)
     env.step(zero)
     at_end, _, _, truncated, _ = env.step(zero)
-    still, _, _, truncated_again, _ = env.step(zero)
+    still, reward, _, truncated_again, infos = env.step(zero)
     assert truncated.all() and truncated_again.all() and np.array_equal(at_end, still)
+    assert (reward == 0).all() and not infos["alive"].any()
 
 
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
@@ -136,7 +142,7 @@ def test_dead_rows(autoreset: str) -> None:
     for _ in range(600):
         ticks = env.engine.view("tick").copy()
         _, reward, terminated, truncated, infos = env.step(np.abs(actions_for(env, rng)))
-        assert np.array_equal(infos["alive"], ~dead)
+        assert np.array_equal(infos.get("final_info", infos)["alive"], ~dead)
         assert (reward[dead] == 0).all() and not terminated[dead].any()
         over = env.world_major(truncated).any(axis=1) | env.world_major(dead | terminated).all(axis=1)
         assert np.array_equal(over, env.world_major(truncated | terminated).all(axis=1) | over)
@@ -276,6 +282,57 @@ def test_nan_on_the_device_harms_nobody_else() -> None:
 def test_wrong_options(options: dict[str, Any], message: str) -> None:
     with pytest.raises(coopenv.CoopenvError, match=message):
         coopenv.make_vec("busy_intersection", **options)
+
+
+def test_batch_goes_on_after_a_fork() -> None:
+    env = coopenv.make_vec("busy_intersection", num_worlds=64, threads=2)
+    env.reset(seed=0)
+    zero = np.zeros((env.num_envs, 2), dtype=np.float32)
+    env.step(zero)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Python warns of forking a process that has threads
+        with multiprocessing.get_context("fork").Pool(1) as pool:
+            there = pool.apply_async(_reward_of_a_step, (env.get_state(),)).get(timeout=60)
+    assert np.array_equal(there, env.step(zero)[1])
+
+
+def _reward_of_a_step(state: dict[str, Any]) -> np.ndarray:
+    env = coopenv.make_vec("busy_intersection", num_worlds=64, threads=2)
+    env.set_state(state)
+    return env.step(np.zeros((env.num_envs, 2), dtype=np.float32))[1]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"reset_maks": np.ones(2, dtype=bool)}, r"unknown option 'reset_maks' \(did you mean 'reset_mask'"),
+        ({"reset_mask": np.zeros(2, dtype=bool)}, "at least one True"),
+        ({"reset_mask": [0, 1]}, "array of bool"),
+        ([1], "options must be a dict"),
+    ],
+)
+def test_wrong_reset_options(options: Any, message: str) -> None:
+    env = coopenv.make_vec("busy_intersection", num_worlds=2)
+    env.reset(seed=0)
+    with pytest.raises(coopenv.CoopenvError, match=message):
+        env.reset(options=options)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "a", [1, -2], True])
+def test_wrong_seeds(seed: Any) -> None:
+    with pytest.raises(coopenv.CoopenvError, match="seed"):
+        coopenv.make_vec("busy_intersection", num_worlds=2).reset(seed=seed)
+    with pytest.raises(coopenv.CoopenvError, match="seed"):
+        coopenv.parallel_env("busy_intersection").reset(seed=seed)
+
+
+def test_states_of_other_scenarios_do_not_fit() -> None:
+    env = coopenv.make_vec("busy_intersection", num_worlds=2)
+    other = coopenv.make_vec("busy_intersection_mirror", num_worlds=2)
+    other.reset(seed=0)
+    for state in (other.get_state(), None, 5, {}):
+        with pytest.raises(coopenv.CoopenvError, match="another scenario"):
+            env.set_state(state)
 
 
 def test_wrong_resets() -> None:

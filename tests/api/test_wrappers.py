@@ -123,7 +123,8 @@ def test_record_episode_statistics(autoreset: str) -> None:
     seen = parked = 0
     for _ in range(150):
         _, reward, terminated, truncated, infos = env.step(actions)
-        acted = infos["alive"] if autoreset == "same_step" else infos["alive"] & ~over
+        alive = infos.get("final_info", infos)["alive"]  # of the step, not of what has been reset since
+        acted = alive if autoreset == "same_step" else alive & ~over
         returns += reward * acted
         lengths += acted
         over = terminated | truncated

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from coopenv.errors import ScenarioError
-from coopenv.scenario import Scenario, parse_scenario
+from coopenv.scenario import Scenario, load_scenario, parse_scenario
 from tests.world import builders
 
 
@@ -187,7 +187,7 @@ def test_impossible_values_are_refused_at_their_field(path: str, value: Any) -> 
 @pytest.mark.parametrize(
     ("path", "value", "text"),
     [
-        ("rates.camera", -60, "rates.camera: Input should be greater than 0, got -60"),
+        ("rates.camera", -60, "rates.camera: Input should be greater than or equal to 0.001, got -60"),
         (
             "rates.decision",
             7,
@@ -245,3 +245,24 @@ def test_derived_counts_and_names() -> None:
     assert made.driven
     with pytest.raises(ValueError, match="unknown target 'L5'"):
         made.target_index("L5")
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("noise-enabled", False, "noise-enabled: unknown key"),
+        ("", 1, "unknown key"),
+        ("noise.foo-bar", 1, "noise.foo-bar: unknown key"),
+        ("vehicles.0.motion", {"kind": None, "knd": "constant"}, r"motion.kind"),
+        ("rates.decision", 1e-9, "rates.decision"),
+        ("horizon", "5", "horizon: Input should be a valid number"),
+        ("observer.k", True, "observer.k"),
+        ("v2x.period", 2**32, "v2x.period"),
+        ("horizon", 1e308, "horizon"),
+        ("rates.camera", 1e300, "rates.camera"),
+    ],
+)
+def test_one_line_for_what_a_stranger_tried(key: str, value: object, message: str) -> None:
+    with pytest.raises(ScenarioError, match=message) as caught:
+        load_scenario("busy_intersection", {key: value})
+    assert "\n" not in str(caught.value)
