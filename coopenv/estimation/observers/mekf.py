@@ -1,0 +1,123 @@
+"""Error-state (multiplicative) Kalman filter with body-frame errors; neighbours are taken as exact.
+
+Source: Lefferts, Markley and Shuster, Kalman filtering for spacecraft attitude estimation, 1982 (multiplicative
+error); the bearing as a residual in its tangent plane. Errors: R = Rhat Exp(theta), p = phat + Rhat rho.
+
+Over a tick of odometry (dR, dp), with E = dR^T:  F = [E, 0; -E S(dp), E].
+With a = Rhat^T (z - phat), d = a - c the line from the camera c, and B a tangent basis at d / |d|:
+H = B [S(a), -I] / |d|,  residual B b.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from coopenv.estimation.observers.base import Array, Coordinates, Estimate, Message, Setup, Tick
+from coopenv.estimation.observers.rotations import exp_so3, orthonormalise, skew, tangent_basis
+
+
+def innovation(R: Array, p: Array, lever_arm: Array, bearings: Array, positions: Array) -> tuple[Array, Array]:
+    """Return (residual (m, 2), J (m, 2, 3)): tangent residuals and their derivative by the line d in the body frame."""
+    d = (positions - p) @ R - lever_arm
+    distance = np.maximum(np.linalg.norm(d, axis=1), 1e-9)[:, None]
+    B = tangent_basis(d / distance)
+    return (B @ bearings[..., None])[..., 0], B / distance[..., None]
+
+
+@dataclass(frozen=True)
+class LeftError:
+    """A pose with a covariance over its left error."""
+
+    R: Array
+    p: Array  # map frame
+    P: Array
+
+    @classmethod
+    def start(cls, R: Array, p: Array, P: Array) -> LeftError:
+        """Return the state of a pose with a covariance in LEFT coordinates."""
+        return cls(R, p, P)
+
+    def predicted(self, tick: Tick) -> LeftError:
+        """Return the state after the tick's odometry."""
+        F = transition(tick.rotation, tick.translation)
+        P = F @ self.P @ F.T + np.diag(tick.noise.odometry(tick.dt))
+        return LeftError(orthonormalise(self.R @ tick.rotation), self.p + self.R @ tick.translation, P)
+
+    def jacobian(self, positions: Array) -> Array:
+        """Return (m, 3, 6) the derivative of the lines to map positions (m, 3)."""
+        a = (positions - self.p) @ self.R
+        return np.concatenate([skew(a), np.broadcast_to(-np.eye(3), (len(a), 3, 3))], axis=2)
+
+    def moved(self, dx: Array, P: Array) -> LeftError:
+        """Return the state moved by an error dx."""
+        return LeftError(self.R @ exp_so3(dx[:3]), self.p + self.R @ dx[3:], P)
+
+    def point_covariance(self, marker: Array) -> Array:
+        """Return the covariance (3, 3) in map axes of a point of the body."""
+        J = self.R @ np.hstack([-skew(marker), np.eye(3)])
+        return J @ self.P @ J.T
+
+    def estimate(self) -> Estimate:
+        """Return the pose with its covariance."""
+        return Estimate(self.R, self.p, self.P, Coordinates.LEFT)
+
+
+def transition(rotation: Array, translation: Array) -> Array:
+    """Return F of the left error over an odometry increment (dR, dp)."""
+    F = np.zeros((6, 6))
+    F[:3, :3] = F[3:, 3:] = rotation.T
+    F[3:, :3] = -rotation.T @ skew(translation)
+    return F
+
+
+def kalman(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array]:
+    """Return (dx, P+) of a Kalman update with measurement covariance N, in Joseph's form."""
+    PHt = P @ H.T
+    K = np.linalg.solve(H @ PHt + N, PHt.T).T
+    A = np.eye(len(P)) - K @ H
+    P = A @ P @ A.T + K @ N @ K.T
+    return K @ residual, (P + P.T) / 2
+
+
+class Mekf:
+    """Error-state filter; sends its position and trusts the positions that it hears."""
+
+    belief: ClassVar[type[LeftError]] = LeftError
+    sends_covariance = False
+
+    def __init__(self, setup: Setup) -> None:
+        """Remember the marker, which is what others measure."""
+        self.marker = setup.marker
+
+    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
+        """Start at a pose."""
+        R, p = initial_pose
+        self.state = self.belief.start(np.array(R, float), np.array(p, float), np.array(initial_covariance, float))
+
+    def update(self, tick: Tick) -> Estimate:
+        """Predict, then correct by every usable bearing."""
+        self.state = self.state.predicted(tick)
+        seen = tick.usable() if tick.due else []
+        if seen:
+            b, z = np.array([s[1] for s in seen]), np.array([s[2] for s in seen])
+            self.correct(tick, b, z, [s[3] for s in seen])
+        return self.state.estimate()
+
+    def correct(self, tick: Tick, b: Array, z: Array, messages: list[Message | None]) -> None:
+        """Correct by bearings b (m, 3) to positions z (m, 3)."""
+        residual, J = innovation(self.state.R, self.state.p, tick.lever_arm, b, z)
+        H = (J @ self.state.jacobian(z)).reshape(-1, 6)
+        N = tick.noise.bearing_std**2 * np.eye(len(H))
+        for n, message in enumerate(messages):
+            if self.sends_covariance and message is not None and message.covariance is not None:
+                G = J[n] @ self.state.R.T
+                N[2 * n : 2 * n + 2, 2 * n : 2 * n + 2] += G @ message.covariance @ G.T
+        self.state = self.state.moved(*kalman(self.state.P, H, N, residual.ravel()))
+
+    def message(self) -> Message:
+        """Return the marker's position, and its covariance if this filter sends it."""
+        covariance = self.state.point_covariance(self.marker) if self.sends_covariance else None
+        return Message(position=self.state.p + self.state.R @ self.marker, covariance=covariance)

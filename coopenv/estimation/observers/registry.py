@@ -1,0 +1,74 @@
+"""Observers by name: the zoo, those registered in the program, and those of installed packages.
+
+A package offers its own under the entry point group `coopenv.observers`.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+
+from coopenv.errors import CoopenvError, suggest
+from coopenv.estimation.observers.base import Factory
+
+GROUP = "coopenv.observers"
+
+ZOO = {
+    "dead_reckoning": "dead_reckoning:DeadReckoning",
+    "riccati": "riccati:Riccati",
+    "hamel_samson": "hamel_samson:HamelSamson",
+    "mekf": "mekf:Mekf",
+    "mekf_covariance": "mekf_covariance:MekfCovariance",
+    "covariance_intersection": "covariance_intersection:CovarianceIntersection",
+    "right_invariant": "right_invariant:RightInvariant",
+    "centralised": "centralised:Centralised",
+}
+"""Name to module and class in this package."""
+
+_registered: dict[str, Factory] = {}
+
+
+def register(name: str, factory: Factory) -> None:
+    """Make an observer known by name in this program.
+
+    Raises:
+        CoopenvError: the name is taken by another observer.
+    """
+    if name in ZOO or _registered.get(name, factory) is not factory:
+        raise CoopenvError(f"an observer named '{name}' exists already")
+    _registered[name] = factory
+
+
+def _installed() -> dict[str, EntryPoint]:
+    return {point.name: point for point in entry_points(group=GROUP)}
+
+
+def observer_names() -> list[str]:
+    """Return every known name."""
+    return sorted({*ZOO, *_registered, *_installed()})
+
+
+def find(name: str) -> Factory:
+    """Return the factory of a name.
+
+    Raises:
+        CoopenvError: unknown name, or a package's observer cannot be loaded.
+    """
+    if name in ZOO:
+        module, attribute = ZOO[name].split(":")
+        return getattr(import_module(f"{__package__}.{module}"), attribute)
+    if name in _registered:
+        return _registered[name]
+    point = _installed().get(name)
+    if point is None:
+        names = observer_names()
+        raise CoopenvError(f"unknown observer '{name}'{suggest(name, names)}; known: {', '.join(names)}")
+    try:
+        return point.load()
+    except Exception as error:
+        raise CoopenvError(f"observer '{name}' ({point.value}) cannot be loaded: {error}") from error
+
+
+def is_joint(factory: Factory) -> bool:
+    """Return whether a factory builds one observer for all vehicles."""
+    return bool(getattr(factory, "joint", False))

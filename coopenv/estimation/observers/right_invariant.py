@@ -1,0 +1,72 @@
+"""Right-invariant extended Kalman filter, with the neighbours' covariance as measurement noise.
+
+Source: Barrau and Bonnabel, The invariant extended Kalman filter as a stable observer, IEEE Transactions on Automatic
+Control 62(4), 2017. Errors: R = Exp(theta) Rhat, p = Exp(theta) phat + rho. F = I;
+G = [Rhat, 0; S(phat) Rhat, Rhat];  H = B Rhat^T [S(z), -I] / |d|, which depends on the map's origin through z.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from coopenv.estimation.observers.base import Array, Coordinates, Estimate, Tick
+from coopenv.estimation.observers.mekf import LeftError, Mekf
+from coopenv.estimation.observers.rotations import exp_so3, orthonormalise, skew
+
+
+def from_left(R: Array, p: Array) -> Array:
+    """Return G, which turns left errors (theta, rho) at a pose into right ones."""
+    G = np.zeros((6, 6))
+    G[:3, :3] = G[3:, 3:] = R
+    G[3:, :3] = skew(p) @ R
+    return G
+
+
+@dataclass(frozen=True)
+class RightError(LeftError):
+    """A pose with a covariance over its right error."""
+
+    R: Array
+    p: Array  # map frame
+    P: Array
+
+    @classmethod
+    def start(cls, R: Array, p: Array, P: Array) -> RightError:
+        """Return the state of a pose with a covariance in LEFT coordinates."""
+        G = from_left(R, p)
+        return cls(R, p, G @ P @ G.T)
+
+    def predicted(self, tick: Tick) -> RightError:
+        """Return the state after the tick's odometry."""
+        R, p = orthonormalise(self.R @ tick.rotation), self.p + self.R @ tick.translation
+        G = from_left(R, p)
+        return RightError(R, p, self.P + (G * tick.noise.odometry(tick.dt)) @ G.T)
+
+    def jacobian(self, positions: Array) -> Array:
+        """Return (m, 3, 6) the derivative of the lines to map positions (m, 3)."""
+        minus = np.broadcast_to(-np.eye(3), (len(positions), 3, 3))
+        return self.R.T @ np.concatenate([skew(positions), minus], axis=2)
+
+    def moved(self, dx: Array, P: Array) -> RightError:
+        """Return the state moved by an error dx."""
+        turn = exp_so3(dx[:3])
+        return RightError(turn @ self.R, turn @ self.p + dx[3:], P)
+
+    def point_covariance(self, marker: Array) -> Array:
+        """Return the covariance (3, 3) in map axes of a point of the body."""
+        J = np.hstack([-skew(self.p + self.R @ marker), np.eye(3)])
+        return J @ self.P @ J.T
+
+    def estimate(self) -> Estimate:
+        """Return the pose with its covariance."""
+        return Estimate(self.R, self.p, self.P, Coordinates.RIGHT)
+
+
+class RightInvariant(Mekf):
+    """Invariant filter; sends position and covariance."""
+
+    belief: ClassVar[type[LeftError]] = RightError
+    sends_covariance = True

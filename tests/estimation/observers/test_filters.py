@@ -1,0 +1,273 @@
+"""The zoo's filters against numerical derivatives, a batch least squares and textbook forms of the Kalman update."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from coopenv.estimation.observers import Coordinates, Recording, SensorNoise, Tick, record, run
+from coopenv.estimation.observers.covariance_intersection import CovarianceIntersection, best_weight
+from coopenv.estimation.observers.mekf import LeftError, innovation, kalman, transition
+from coopenv.estimation.observers.right_invariant import RightError, from_left
+from coopenv.scenario import load_scenario
+from tests.estimation.observers.batch import small_record, solve
+
+STATES = {Coordinates.LEFT: LeftError, Coordinates.RIGHT: RightError}
+
+
+def spd(rng: np.random.Generator, n: int) -> np.ndarray:
+    A = rng.normal(size=(n, n))
+    return A @ A.T + 0.3 * np.eye(n)
+
+
+def pose(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return Rotation.random(random_state=seed).as_matrix(), rng.uniform(-5, 5, 3)
+
+
+def tick(seed: int, noise: SensorNoise) -> Tick:
+    rng = np.random.default_rng(seed)
+    return Tick(
+        index=1,
+        time=0.1,
+        dt=0.1,
+        rotation=Rotation.from_rotvec(rng.normal(size=3)).as_matrix(),
+        translation=rng.normal(size=3),
+        velocity=np.zeros(3),
+        angular_velocity=np.zeros(3),
+        targets=np.arange(0),
+        bearings=np.zeros((0, 3)),
+        valid=np.zeros(0, bool),
+        landmarks=np.zeros((0, 3)),
+        messages={},
+        lever_arm=np.zeros(3),
+        noise=noise,
+    )
+
+
+QUIET = SensorNoise(0.0, 0.0, 0.1, 0.0)
+
+
+def derivative(f, n: int = 6, h: float = 1e-6) -> np.ndarray:
+    return np.stack([(f(h * e) - f(-h * e)) / (2 * h) for e in np.eye(n)], axis=-1)
+
+
+@pytest.mark.parametrize("coordinates", STATES)
+def test_moving_by_an_error_makes_that_error(coordinates: Coordinates) -> None:
+    state = STATES[coordinates](*pose(0), np.eye(6))
+    e = np.array([0.3, -0.2, 0.5, 1.0, 2.0, -3.0])
+    moved = state.moved(e, state.P)
+    assert_allclose(coordinates.error(moved.R, moved.p, state.R, state.p), e, atol=1e-12)
+
+
+@pytest.mark.parametrize("coordinates", STATES)
+def test_bearing_jacobian_is_the_derivative_of_the_predicted_bearing(coordinates: Coordinates) -> None:
+    """The residual falls by H dx when the estimate moves by dx, to first order at a noise-free bearing."""
+    state, c = STATES[coordinates](*pose(1), np.eye(6)), np.array([0.2, 0.1, -0.3])
+    z = np.random.default_rng(2).uniform(-8, 8, (4, 3))
+    d = (z - state.p) @ state.R - c
+    bearings = d / np.linalg.norm(d, axis=1, keepdims=True)
+    _, J = innovation(state.R, state.p, c, bearings, z)
+    H = J @ state.jacobian(z)
+    numeric = -derivative(
+        lambda dx: innovation(*(lambda s: (s.R, s.p))(state.moved(dx, state.P)), c, bearings, z)[0], h=1e-6
+    )
+    # the tangent basis turns with the estimate, which a zero residual does not feel
+    assert_allclose(H, numeric, atol=1e-7)
+
+
+@pytest.mark.parametrize("coordinates", STATES)
+def test_prediction_carries_the_covariance_by_numerical_derivatives(coordinates: Coordinates) -> None:
+    P, t = spd(np.random.default_rng(3), 6), tick(4, QUIET)
+    state = STATES[coordinates](*pose(5), P)
+    after = state.predicted(t)
+
+    def error(dx: np.ndarray) -> np.ndarray:
+        truth = state.moved(dx, P).predicted(t)
+        return coordinates.error(truth.R, truth.p, after.R, after.p)
+
+    F = derivative(error)
+    assert_allclose(after.P, F @ P @ F.T, atol=1e-6)
+    assert np.abs(after.P - P).max() > 0.1 or coordinates is Coordinates.RIGHT
+
+
+def test_odometry_noise_is_the_same_in_both_coordinates() -> None:
+    """From P = 0, the right covariance is the left one carried over by the numerical derivative between the errors."""
+    t = tick(6, SensorNoise(0.3, 0.2, 0.1, 0.0))
+    left = LeftError(*pose(7), np.zeros((6, 6))).predicted(t)
+    right = RightError(*pose(7), np.zeros((6, 6))).predicted(t)
+
+    def convert(dx: np.ndarray) -> np.ndarray:
+        moved = left.moved(dx, left.P)
+        return Coordinates.RIGHT.error(moved.R, moved.p, left.R, left.p)
+
+    T = derivative(convert)
+    assert_allclose(np.diag(left.P), np.repeat([(0.2 * 0.1) ** 2, (0.3 * 0.1) ** 2], 3), rtol=1e-12)
+    assert_allclose(right.P, T @ left.P @ T.T, atol=1e-9)
+    started = RightError.start(left.R, left.p, spd(np.random.default_rng(0), 6))
+    assert_allclose(started.P, T @ spd(np.random.default_rng(0), 6) @ T.T, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("coordinates", STATES)
+def test_covariance_of_the_marker(coordinates: Coordinates) -> None:
+    P, m = spd(np.random.default_rng(8), 6), np.array([0.3, -0.4, 0.8])
+    state = STATES[coordinates](*pose(9), P)
+    J = derivative(lambda dx: (lambda s: s.p + s.R @ m)(state.moved(dx, P)))
+    assert_allclose(state.point_covariance(m), J @ P @ J.T, atol=1e-7)
+
+
+def test_joseph_update_is_the_information_form() -> None:
+    rng = np.random.default_rng(0)
+    P, N, H, r = spd(rng, 6), spd(rng, 4), rng.normal(size=(4, 6)), rng.normal(size=4)
+    dx, updated = kalman(P, H, N, r)
+    information = np.linalg.inv(P) + H.T @ np.linalg.inv(N) @ H
+    assert_allclose(updated, np.linalg.inv(information), atol=1e-12)
+    assert_allclose(dx, np.linalg.solve(information, H.T @ np.linalg.solve(N, r)), atol=1e-12)
+
+
+def test_filter_of_a_vehicle_on_a_line_is_the_scalar_kalman_filter() -> None:
+    """Known orientation, motion along x, one bearing at right angles: x measured with std |d| sigma."""
+    sigma, sv, dt, distance = 0.01, 0.3, 0.1, 5.0
+    noise = SensorNoise(sv, 0.0, dt, sigma)
+    R, P = np.eye(3), np.diag([1e-18] * 3 + [0.04, 1e-18, 1e-18])
+    state = LeftError(R, np.zeros(3), P)
+    x, variance = 0.0, 0.04
+    for measured in (0.0, 0.0, 0.0):
+        state = state.predicted(
+            Tick(**{**vars(tick(0, noise)), "rotation": np.eye(3), "translation": np.zeros(3), "dt": dt})
+        )
+        state = LeftError(state.R, state.p, np.diag([1e-18] * 3 + [state.P[3, 3], 1e-18, 1e-18]))
+        b, z = np.array([[measured, 1.0, 0.0]]), np.array([[0.0, distance, 0.0]])
+        residual, J = innovation(state.R, state.p, np.zeros(3), b, z)
+        state = state.moved(*kalman(state.P, (J @ state.jacobian(z))[0], sigma**2 * np.eye(2), residual[0]))
+        variance += (sv * dt) ** 2
+        gain = variance / (variance + (distance * sigma) ** 2)
+        x, variance = x + gain * (measured - x), (1 - gain) * variance
+        assert_allclose(state.P[3, 3], variance, rtol=1e-9)
+        assert_allclose(state.p[0], x, atol=1e-12)
+
+
+@cache
+def short() -> Recording:
+    return small_record()
+
+
+@pytest.mark.parametrize("name", ["mekf", "mekf_covariance", "right_invariant", "covariance_intersection"])
+def test_leader_is_at_the_most_probable_trajectory(name: str) -> None:
+    R, p, covariance = solve(short(), [0])
+    result = run(name, short())
+    assert not result.failure
+    std = np.sqrt(covariance[0, range(6), range(6)])
+    e = Coordinates.LEFT.error(R[0], p[0], result.rotation[-1, 0], result.position[-1, 0])
+    assert np.abs(e / std).max() < 0.01
+    moved = np.abs(Coordinates.LEFT.error(R[0], p[0], short().start_rotation[0], short().start_position[0]) / std)
+    assert moved.max() > 0.1  # the measurements did something
+    P = result.covariance[-1, 0]
+    if result.coordinates is Coordinates.RIGHT:
+        G = np.linalg.inv(from_left(result.rotation[-1, 0], result.position[-1, 0]))
+        P = G @ P @ G.T
+    assert_allclose(P / np.outer(std, std), covariance[0] / np.outer(std, std), atol=2e-3)
+
+
+def test_centralised_filter_is_at_the_most_probable_trajectory_of_all() -> None:
+    R, p, covariance = solve(short(), range(5))
+    result = run("centralised", short())
+    for i in range(5):
+        std = np.sqrt(covariance[i, range(6), range(6)])
+        e = Coordinates.LEFT.error(R[i], p[i], result.rotation[-1, i], result.position[-1, i])
+        assert np.abs(e / std).max() < 0.01
+        assert_allclose(result.covariance[-1, i] / np.outer(std, std), covariance[i] / np.outer(std, std), atol=2e-3)
+
+
+def test_transition_of_a_standstill_is_the_identity() -> None:
+    assert_allclose(transition(np.eye(3), np.zeros(3)), np.eye(6))
+
+
+def test_covariance_intersection_covers_every_correlation() -> None:
+    """Whatever joint covariance own and neighbour's errors have, the claimed covariance is not below the true one."""
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        joint = spd(rng, 9)
+        scale = np.diag(10.0 ** rng.uniform(-1, 1, 9))
+        joint = scale @ joint @ scale
+        P, C, X = joint[:6, :6], joint[6:, 6:], joint[:6, 6:]
+        H, G, own = rng.normal(size=(2, 6)), rng.normal(size=(2, 3)), spd(rng, 2)
+        w = best_weight(H @ P @ H.T, own, G @ C @ G.T)
+        if w == 1.0:
+            continue
+        N = own + G @ C @ G.T / (1 - w)
+        K = np.stack([kalman(P / w, H, N, e)[0] for e in np.eye(2)], axis=1)
+        claimed = kalman(P / w, H, N, np.zeros(2))[1]
+        A, B = np.eye(6) - K @ H, K @ G
+        true = A @ P @ A.T + B @ C @ B.T - A @ X @ B.T - B @ X.T @ A.T + K @ own @ K.T
+        assert np.linalg.eigvalsh(claimed - true).min() > -1e-9 * np.trace(claimed)
+
+
+def test_the_weight_minimises_the_determinant() -> None:
+    rng = np.random.default_rng(1)
+    P, H, own, theirs = spd(rng, 6), rng.normal(size=(2, 6)), 0.01 * spd(rng, 2), 0.05 * spd(rng, 2)
+
+    def log_determinant(w: float) -> float:
+        N = own + theirs / (1 - w)
+        return -np.linalg.slogdet(w * np.linalg.inv(P) + H.T @ np.linalg.inv(N) @ H)[1]
+
+    grid = np.linspace(0.001, 0.999, 999)
+    best = best_weight(H @ P @ H.T, own, theirs)
+    assert log_determinant(best) < min(log_determinant(w) for w in grid) + 0.02
+    assert log_determinant(best) < log_determinant(0.999999)
+
+
+def test_a_useless_neighbour_is_left_out() -> None:
+    assert best_weight(0.01 * np.eye(2), np.eye(2), 1e6 * np.eye(2)) == 1.0
+
+
+@pytest.mark.parametrize("name", ["mekf_covariance", "right_invariant"])
+def test_a_leader_s_covariance_counts_as_it_should_while_nothing_is_correlated(name: str) -> None:
+    """After one tick, a follower knows what the joint solution of leader and follower says of it."""
+    made = small_record(1)
+    _, _, covariance = solve(made, [0, 1])
+    result = run(name, made)
+    P = result.covariance[-1, 1]
+    if result.coordinates is Coordinates.RIGHT:
+        G = np.linalg.inv(from_left(result.rotation[-1, 1], result.position[-1, 1]))
+        P = G @ P @ G.T
+    std = np.sqrt(np.diag(covariance[1]))
+    assert_allclose(P / np.outer(std, std), covariance[1] / np.outer(std, std), atol=2e-3)
+    naive = run("mekf", made).covariance[-1, 1]
+    assert np.trace(naive) < 0.999 * np.trace(covariance[1])
+
+
+def test_covariance_intersection_of_one_bearing_is_the_best_of_all_weights() -> None:
+    made = small_record(1)
+    P, C = 1e-2 * spd(np.random.default_rng(2), 6), 1e-2 * np.eye(3)
+    fused = CovarianceIntersection(made.setups[1])
+    fused.reset(pose(3), P)
+    z, noise = np.array([[4.0, 3.0, 2.0]]), replace(made.setups[1].noise, bearing=0.01)
+    heard = replace(made.tick(1, 1, {}), noise=noise)
+    d = (z - fused.state.p) @ fused.state.R - heard.lever_arm
+    b = d / np.linalg.norm(d)
+    _, J = innovation(fused.state.R, fused.state.p, heard.lever_arm, b, z)
+    H, G = (J @ fused.state.jacobian(z))[0], J[0] @ fused.state.R.T
+
+    def log_determinant(w: float) -> float:
+        N = 1e-4 * np.eye(2) + G @ C @ G.T / (1 - w)
+        return -np.linalg.slogdet(w * np.linalg.inv(P) + H.T @ np.linalg.inv(N) @ H)[1]
+
+    fused.intersect(heard, b, z, C)
+    best = min(log_determinant(w) for w in np.linspace(0.001, 0.999, 999))
+    assert_allclose(np.linalg.slogdet(fused.state.P)[1], best, atol=0.02)
+    assert best < np.linalg.slogdet(P)[1] - 0.05
+
+
+def test_odometry_s_variance_is_that_of_what_is_recorded() -> None:
+    """Samples at 100 Hz, ticks at 60 Hz: the density counts."""
+    noise = {"noise.odometry_rate": "sample", "noise.velocity": 0.1, "noise.angular_velocity": 0.0}
+    made = record(load_scenario("busy_intersection", {"horizon": 20.0, "rates.odometry": 100.0, **noise}), 0)
+    error = made.translation[61:1201] - np.diff(made.truth.position[60:1201], axis=0)  # R(t) = I
+    sums = error.reshape(38, 30, 5, 3).sum(axis=1)
+    assert_allclose(sums.var(), 30 * made.setups[0].noise.odometry(made.dt)[3], rtol=0.2)

@@ -1,0 +1,261 @@
+"""What an observer is given, when, and what becomes of what it returns."""
+
+from __future__ import annotations
+
+import runpy
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import coopenv.estimation.observers.registry as registry
+from coopenv import CoopenvError
+from coopenv.estimation.observers import (
+    Coordinates,
+    Estimate,
+    Message,
+    Observer,
+    Recording,
+    Setup,
+    Tick,
+    find,
+    observer_names,
+    record,
+    register,
+    run,
+)
+from coopenv.scenario import load_scenario
+from tests.estimation.observers.batch import small_errors
+
+
+@cache
+def recording(seed: int = 0, **overrides: Any) -> Recording:
+    return record(
+        load_scenario("busy_intersection", {"horizon": 1.0, **{k.replace("__", "."): v for k, v in overrides.items()}}),
+        seed,
+    )
+
+
+class Probe:
+    """Stands still and notes what it is given; its message says when it was made."""
+
+    seen: ClassVar[list[tuple[str, Tick]]] = []
+
+    def __init_subclass__(cls) -> None:
+        cls.seen = []
+
+    def __init__(self, setup: Setup) -> None:
+        self.setup, self.index = setup, 0
+
+    def reset(self, initial_pose: tuple[np.ndarray, np.ndarray], initial_covariance: np.ndarray) -> None:
+        self.R, self.p = initial_pose
+
+    def update(self, tick: Tick) -> Estimate:
+        self.index = tick.index
+        type(self).seen.append((self.setup.name, tick))
+        return Estimate(self.R, self.p)
+
+    def message(self) -> Message:
+        return Message(position=self.p, extra={"index": np.array([float(self.index)])})
+
+
+def probe(record_: Recording) -> list[tuple[str, Tick]]:
+    class Mine(Probe):
+        pass
+
+    assert isinstance(Mine(record_.setups[0]), Observer)
+    assert not run(Mine, record_).failure
+    return Mine.seen
+
+
+def test_without_delay_a_leader_is_heard_in_the_same_tick() -> None:
+    seen = probe(recording())
+    assert len(seen) == 60 * 5
+    for _, tick in seen:
+        vehicles = [int(t) for t in tick.targets if t >= 3]
+        assert sorted(tick.messages) == vehicles
+        assert all(m.age == 0.0 and m.message.extra["index"][0] == tick.index for m in tick.messages.values())
+        assert_allclose(np.linalg.norm(tick.bearings[tick.valid], axis=1), 1.0)
+    assert {name for name, _ in seen} == {f"vehicle_{i}" for i in range(1, 6)}
+
+
+def test_delay_period_loss_and_staleness_are_the_worlds() -> None:
+    made = recording(v2x__delay=4, v2x__period=3, v2x__loss=0.5, v2x__staleness=0.15)
+    ages, missing = [], 0
+    for name, tick in probe(made):
+        receiver = int(name[-1]) - 1
+        for target in tick.targets[tick.targets >= 3]:
+            sent = int(made.inbox_tick[tick.index, receiver, target - 3])
+            heard = tick.messages.get(int(target))
+            if sent < 0 or (tick.index - sent) / 60.0 > 0.15:
+                missing += 1
+                assert heard is None
+            else:
+                assert heard is not None
+                assert heard.message.extra["index"][0] == sent
+                assert_allclose(heard.age, (tick.index - sent) / 60.0, atol=1e-12)
+                ages.append(tick.index - sent)
+    assert min(ages) == 4 and max(ages) <= 9 and missing > 10
+
+
+def test_bearings_are_in_the_body_frame_and_point_to_the_target() -> None:
+    scenario = load_scenario(
+        "busy_intersection", {"horizon": 0.1, "noise.enabled": False, "camera.orientation": "forward"}
+    )
+    made = record(scenario, 0)
+    for name, tick in probe(made):
+        R, p = made.truth.rotation[tick.index, int(name[-1]) - 1], made.truth.position[tick.index, int(name[-1]) - 1]
+        for n, target in enumerate(tick.targets):
+            z = tick.landmarks[target] if target < 3 else made.truth.position[tick.index, target - 3]
+            line = R.T @ (z - p)
+            assert_allclose(tick.bearings[n], line / np.linalg.norm(line), atol=1e-12)
+
+
+def test_odometry_without_noise_is_the_true_motion() -> None:
+    scenario = small_errors({"horizon": 0.5, "noise.enabled": False})
+    made = record(scenario, 0)
+    result = run(
+        "dead_reckoning", replace(made, start_rotation=made.truth.rotation[0], start_position=made.truth.position[0])
+    )
+    assert result.position_error.max() < 1e-10
+    assert result.orientation_error.max() < 1e-8
+
+
+@pytest.mark.parametrize("name", sorted(registry.ZOO))
+def test_truth_does_not_leak(name: str) -> None:
+    made = recording(horizon=0.2)
+    lie = replace(made.truth, rotation=made.truth.rotation[:, ::-1], position=made.truth.position + 100.0)
+    honest, lied = run(name, made), run(name, replace(made, truth=lie))
+    assert not honest.failure
+    assert (honest.position == lied.position).all() and (honest.rotation == lied.rotation).all()
+    assert (honest.position_error[1:] != lied.position_error[1:]).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "each"), [("riccati", 24), ("mekf", 24), ("mekf_covariance", 72), ("hamel_samson", 0)]
+)
+def test_bytes_are_counted(name: str, each: int) -> None:
+    assert_allclose(run(name, recording(horizon=0.2)).bytes_per_second, each * 60.0)
+    assert_allclose(run(name, recording(horizon=0.2, v2x__period=2)).bytes_per_second, each * 30.0)
+
+
+def test_size_of_messages() -> None:
+    pose = {"position": np.zeros(3), "rotation": np.eye(3)}
+    assert Message().size_bytes == 0
+    assert Message(**pose).size_bytes == 56
+    assert Message(**pose, covariance=np.eye(6)).size_bytes == 56 + 168
+    assert Message(extra={"a": np.zeros((2, 5))}).size_bytes == 80
+
+
+def test_failures_end_in_a_word_not_in_a_crash() -> None:
+    class Breaks(Probe):
+        def update(self, tick: Tick) -> Estimate:
+            if tick.index == 6 and self.setup.name == "vehicle_3":
+                raise ZeroDivisionError("no gain")
+            return super().update(tick)
+
+    class Nan(Probe):
+        def update(self, tick: Tick) -> Estimate:
+            return Estimate(self.R, self.p * np.nan)
+
+    result = run(Breaks, recording())
+    assert result.failure == "of vehicle_3 at 0.100 s: ZeroDivisionError: no gain"
+    assert np.isfinite(result.position_error[6, :2]).all()
+    assert np.isnan(result.position_error[6:, 2:]).all() and np.isnan(result.position_error[7:]).all()
+    assert "of vehicle_1 at 0.017 s" in run(Nan, recording()).failure and "finite" in run(Nan, recording()).failure
+
+
+def test_a_sent_message_does_not_change_any_more() -> None:
+    class Careless(Probe):
+        def __init__(self, setup: Setup) -> None:
+            super().__init__(setup)
+            self.buffer = np.zeros(3)
+
+        def message(self) -> Message:
+            self.buffer[:] = self.index
+            return Message(position=self.buffer)
+
+    run(Careless, recording(v2x__delay=3))
+    late = [tick for name, tick in Careless.seen if name == "vehicle_2" and tick.index == 20]
+    assert late[0].messages[3].message.position is not None
+    assert late[0].messages[3].message.position[0] == 17.0
+
+
+def test_what_is_recorded_cannot_be_written_to() -> None:
+    class Vandal(Probe):
+        def update(self, tick: Tick) -> Estimate:
+            tick.translation[:] = 0.0
+            return super().update(tick)
+
+    assert "read-only" in run(Vandal, recording()).failure
+
+
+def test_errors_in_every_coordinates_are_about_the_same_thing() -> None:
+    """NEES of a far estimate by the definitions, and a wrong choice of coordinates shows."""
+    made = recording()
+    result = run("mekf", made)
+    k, i = 30, 2
+    R, p = made.truth.rotation[k, i], made.truth.position[k, i]
+    e = Coordinates.LEFT.error(R, p, result.rotation[k, i], result.position[k, i])
+    assert_allclose(result.nees[k, i], e @ np.linalg.inv(result.covariance[k, i]) @ e, rtol=1e-6)
+    assert result.coordinates is Coordinates.LEFT and run("right_invariant", made).coordinates is Coordinates.RIGHT
+
+
+def test_honest_filters_are_consistent() -> None:
+    """The centralised filter's NEES is that of its dimension: 4 seeds, 5 vehicles, correlated in time."""
+    scenario = small_errors(
+        {"horizon": 2.0, "noise.bearing.scale": 0.003, "rates.odometry": 60.0}, size=0.1, turning=False
+    )
+    mean = np.mean([run("centralised", record(scenario, seed)).anees(0.5) for seed in range(4)])
+    assert 0.7 < mean < 1.4
+
+
+def test_drawn_starts_have_the_stated_covariance() -> None:
+    scenario = small_errors({"horizon": 1 / 60}, size=0.4, turning=False)
+    errors = []
+    for seed in range(60):
+        made = record(scenario, seed)
+        R, p = made.truth.rotation[0], made.truth.position[0]
+        errors.append(Coordinates.LEFT.error(R, p, made.start_rotation, made.start_position))
+    measured = np.mean(np.concatenate(errors) ** 2, axis=0)
+    assert_allclose(measured, np.diag(made.start_covariance[0]), rtol=0.25)
+
+
+def test_registry(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(CoopenvError, match="did you mean 'riccati'"):
+        find("ricati")
+    monkeypatch.setattr(registry, "_registered", {})
+    register("mine", Probe)
+    assert find("mine") is Probe and "mine" in observer_names()
+    register("mine", Probe)
+    for name in ("mine", "riccati"):
+        with pytest.raises(CoopenvError, match="exists already"):
+            register(name, Message)
+
+
+def test_observers_of_installed_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    from importlib.metadata import EntryPoint
+
+    points = [
+        EntryPoint("theirs", f"{__name__}:Probe", "coopenv.observers"),
+        EntryPoint("broken", "no_such_module:Thing", "coopenv.observers"),
+    ]
+    monkeypatch.setattr(registry, "entry_points", lambda group: points if group == "coopenv.observers" else [])
+    assert find("theirs") is Probe
+    with pytest.raises(CoopenvError, match=r"'broken'.*cannot be loaded.*no_such_module"):
+        find("broken")
+
+
+def test_the_example_is_better_than_odometry(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(registry, "_registered", {})
+    runpy.run_path(str(Path(__file__).parents[3] / "examples" / "own_observer.py"))
+    rows = {line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines()[1:]}
+    own, odometry = (np.array(rows[name][:5], float) for name in ("complementary", "dead_reckoning"))
+    assert (own < odometry).all() and own[0] < 0.5
+    assert float(rows["complementary"][5]) == 24 * 60
