@@ -1,0 +1,1 @@
+"""Sources of ticks other than the simulator: recorded robots."""

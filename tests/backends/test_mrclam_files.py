@@ -1,0 +1,128 @@
+"""Files of the MR.CLAM format are read as they are, and what is wrong is named by file and line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coopenv.backends.mrclam.files import find_folder, read_recording
+from coopenv.errors import DataError
+from tests.backends.mrclam_files import BARCODES, LANDMARKS, ORIGIN, command, pose, write
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return write(tmp_path, seconds=4.0)
+
+
+def change(path: Path, line: int, text: str) -> None:
+    lines = path.read_text().splitlines(keepends=True)
+    lines[line - 1] = text
+    path.write_text("".join(lines))
+
+
+def message(folder: Path) -> str:
+    with pytest.raises(DataError) as caught:
+        read_recording("mrclam_6", folder)
+    text = str(caught.value)
+    assert "\n" not in text
+    return text
+
+
+def test_round_trip(folder):
+    recording = read_recording("mrclam_6", folder)
+    assert recording.barcodes == {barcode: subject for subject, barcode in BARCODES.items()}
+    assert {m.subject: (m.x, m.y) for m in recording.landmarks} == LANDMARKS
+    assert recording.landmarks[0].y_std == 0.00027395
+    for robot in recording.robots:
+        t = robot.truth[:, 0] - ORIGIN
+        np.testing.assert_allclose(robot.truth[:, 1:], pose(robot.subject, t), atol=1e-6)
+        np.testing.assert_allclose(robot.odometry[:, 1:], np.broadcast_to(command(robot.subject), (170, 2)), atol=1e-8)
+        assert set(robot.detection_subject.tolist()) <= {*LANDMARKS, 1, 2, 3, 4, 5} - {robot.subject}
+        assert robot.skipped == 0
+
+
+def test_folder_its_parent_or_the_environment(folder, monkeypatch):
+    assert find_folder("mrclam_6", folder) == folder
+    assert find_folder("mrclam_6", str(folder.parent)) == folder
+    monkeypatch.setenv("COOPENV_DATA", str(folder.parent))
+    assert find_folder("mrclam_6") == folder
+    renamed = folder.rename(folder.parent / "mine")
+    assert find_folder("mrclam_6", renamed) == renamed
+
+
+def test_folders_that_are_not_there(folder, monkeypatch):
+    monkeypatch.delenv("COOPENV_DATA", raising=False)
+    for name, data, words in (
+        ("mrclam_6", None, "COOPENV_DATA"),
+        ("mrclam_66", folder, "did you mean 'mrclam_6'"),
+        ("mrclam_6", folder / "no", "does not exist"),
+        ("mrclam_7", folder, "another sub-dataset"),
+        ("mrclam_7", folder.parent, "MRCLAM_Dataset7"),
+    ):
+        with pytest.raises(DataError, match=words):
+            find_folder(name, data)
+
+
+def test_missing_file(folder):
+    (folder / "Robot3_Odometry.dat").unlink()
+    assert "Robot3_Odometry.dat: no such file" in message(folder)
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "text", "words"),
+    [
+        ("Robot1_Odometry.dat", 9, f"{ORIGIN + 0.18} 0.1\n", "2 columns, expected 3"),
+        ("Robot2_Groundtruth.dat", 7, f"{ORIGIN} 1 2 3 4\n", "5 columns, expected 4"),
+        ("Robot2_Groundtruth.dat", 7, f"{ORIGIN} 1 2 x\n", "'x' is not a number"),
+        ("Robot4_Measurement.dat", 6, f"{ORIGIN + 1.04} 118 nan 0.1\n", "not finite"),
+        ("Robot4_Measurement.dat", 6, f"{ORIGIN + 1.04} 118 -1 0.1\n", "negative range"),
+        ("Robot4_Measurement.dat", 6, f"{ORIGIN + 1.04} 118.5 1 0.1\n", "whole"),
+        ("Robot5_Odometry.dat", 8, f"{ORIGIN - 5} 0.1 0.1\n", "time runs backwards"),
+        ("Barcodes.dat", 6, "1 7\n", "occurs twice"),
+        ("Barcodes.dat", 6, "21 7\n", "not in 1..20"),
+        ("Landmark_Groundtruth.dat", 5, "5 0 0 0 0\n", "not in 6..20"),
+        ("Landmark_Groundtruth.dat", 6, "6 0 0 0 0\n", "occurs twice"),
+    ],
+)
+def test_bad_line_is_named(folder, file, line, text, words):
+    change(folder / file, line, text)
+    said = message(folder)
+    assert f"{file}:{line}: " in said
+    assert words in said
+
+
+@pytest.mark.parametrize("cut", [3, 25])
+def test_truncated_file(folder, cut):
+    path = folder / "Robot5_Groundtruth.dat"
+    text = path.read_text().rstrip("\n")
+    path.write_text(text[:-cut])
+    assert f"Robot5_Groundtruth.dat:{len(text.splitlines())}: " in message(folder)
+
+
+def test_last_line_end_may_miss(folder):
+    path = folder / "Robot5_Groundtruth.dat"
+    path.write_text(path.read_text().rstrip("\n"))
+    read_recording("mrclam_6", folder)
+
+
+def test_empty_files(folder):
+    (folder / "Robot1_Measurement.dat").write_text("# nothing seen\n")
+    assert read_recording("mrclam_6", folder).robots[0].detection_time.size == 0
+    (folder / "Robot1_Odometry.dat").write_text("# nothing\n")
+    assert "Robot1_Odometry.dat:1: 0 rows" in message(folder)
+
+
+def test_binary_file(folder):
+    (folder / "Robot1_Odometry.dat").write_bytes(bytes(range(256)))
+    assert "Robot1_Odometry.dat:" in message(folder)
+
+
+def test_unknown_barcodes_are_counted_and_left_out(folder):
+    before = read_recording("mrclam_6", folder).robots[3]
+    change(folder / "Robot4_Measurement.dat", 5, f"{ORIGIN + 1.04} 999 2.0 0.1\n")
+    after = read_recording("mrclam_6", folder).robots[3]
+    assert after.skipped == 1
+    assert after.detection_time.size == before.detection_time.size - 1
