@@ -224,6 +224,49 @@ def bench_seeds(
     out.print(f"Steady: after {start:g} s. Settled: below 0.5 m and 5 deg until the end.")
 
 
+@bench.command("observers")
+def bench_observers(
+    environment: Environment,
+    observers: Annotated[str | None, typer.Option(help="Names with commas between (default: all).")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Seeds 0, 1, ...")] = 5,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that share the seeds.")] = 1,
+    overrides: Overrides = None,
+    steady_from: Annotated[
+        float | None,
+        typer.Option(help="Start of the steady state in s (default: 70 % of the horizon).", show_default=False),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for leaderboard.json and leaderboard.csv.")] = None,
+) -> None:
+    """Compare observers on the same simulated ticks, against the truth and the Cramér-Rao bound."""
+    scenario = load(environment, parse_overrides(overrides))
+    from coopenv.bench.observer_table import error_table, failures, quality_table
+    from coopenv.bench.observers import compare, write_leaderboard
+    from coopenv.estimation.metrics import STEADY_SHARE
+    from coopenv.estimation.observers.registry import observer_names
+    from coopenv.runs.command import progress
+
+    start = STEADY_SHARE * scenario.horizon if steady_from is None else steady_from
+    if not 0.0 <= start < scenario.horizon:
+        raise CoopenvError(f"--steady-from {start:g} is not within the horizon of {scenario.horizon:g} s")
+    names = [name.strip() for name in observers.split(",")] if observers else observer_names()
+    with progress(console(stderr=True)) as bar:
+        task = bar.add_task(f"{len(names)} observers, {seeds} seeds", total=1.0)
+        rows = compare(
+            scenario, Path(environment).stem, names, seeds, start, jobs, lambda share: bar.update(task, completed=share)
+        )
+    printed = console()
+    printed.print(error_table(rows))
+    printed.print()
+    printed.print(quality_table(rows))
+    for line in failures(rows):
+        printed.print(line, soft_wrap=True)
+    if out is not None:
+        command = f"coopenv bench observers {environment} --observers {','.join(names)} --seeds {seeds}"
+        settings = "".join(f" --set {override}" for override in overrides or [])
+        paths = write_leaderboard(rows, out, command + settings)
+        printed.print(f"Files in {out}: {', '.join(path.name for path in paths)}", soft_wrap=True)
+
+
 def console(stderr: bool = False) -> Console:
     """Return a console that prints scenario texts as they are."""
     return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
