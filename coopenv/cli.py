@@ -38,6 +38,10 @@ Overrides = Annotated[
         "Repeatable.",
     ),
 ]
+SteadyFrom = Annotated[
+    float | None,
+    typer.Option(help="Start of the steady state in s (default: 70 % of the horizon).", show_default=False),
+]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -113,10 +117,7 @@ def run(
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, ...")] = "cpu",
     dtype: Annotated[str, typer.Option(help="float32 or float64.")] = "float64",
     policy: Annotated[str, typer.Option(help="Of driven vehicles: zero, random, or the name of an agent.")] = "zero",
-    steady_from: Annotated[
-        float | None,
-        typer.Option(help="Start of the steady state in s (default: 70 % of the horizon).", show_default=False),
-    ] = None,
+    steady_from: SteadyFrom = None,
     video: Annotated[bool, typer.Option("--video", help="Also film the top view.")] = False,
 ) -> None:
     """Run an environment and write metrics, record and figures."""
@@ -199,21 +200,16 @@ def bench_seeds(
     seeds: Annotated[int, typer.Option(min=1, help="How many.")] = 20,
     first: Annotated[int, typer.Option(min=0, help="The first one.")] = 0,
     overrides: Overrides = None,
-    steady_from: Annotated[
-        float | None,
-        typer.Option(help="Start of the steady state in s (default: 70 % of the horizon).", show_default=False),
-    ] = None,
+    steady_from: SteadyFrom = None,
 ) -> None:
     """Run an environment over many seeds at once: who settles, and the steady errors with their spread."""
     scenario = load(environment, parse_overrides(overrides))
     from coopenv.bench.seed_table import seed_table
     from coopenv.bench.seeds import study_seeds
-    from coopenv.estimation.metrics import STEADY_SHARE
+    from coopenv.estimation.metrics import steady_start
     from coopenv.runs.command import progress
 
-    start = STEADY_SHARE * scenario.horizon if steady_from is None else steady_from
-    if not 0.0 <= start < scenario.horizon:
-        raise CoopenvError(f"--steady-from {start:g} is not within the horizon of {scenario.horizon:g} s")
+    start = steady_start(steady_from, scenario.horizon)
     with progress(console(stderr=True)) as bar:
         task = bar.add_task(f"{seeds} seeds", total=1.0)
         study = study_seeds(
@@ -231,24 +227,22 @@ def bench_observers(
     seeds: Annotated[int, typer.Option(min=1, help="Seeds 0, 1, ...")] = 5,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that share the seeds.")] = 1,
     overrides: Overrides = None,
-    steady_from: Annotated[
-        float | None,
-        typer.Option(help="Start of the steady state in s (default: 70 % of the horizon).", show_default=False),
-    ] = None,
+    steady_from: SteadyFrom = None,
     out: Annotated[Path | None, typer.Option(help="Folder for leaderboard.json and leaderboard.csv.")] = None,
 ) -> None:
     """Compare observers on the same simulated ticks, against the truth and the Cramér-Rao bound."""
     scenario = load(environment, parse_overrides(overrides))
     from coopenv.bench.observer_table import error_table, failures, quality_table
-    from coopenv.bench.observers import compare, write_leaderboard
-    from coopenv.estimation.metrics import STEADY_SHARE
+    from coopenv.bench.observers import LEADERBOARD_FILES, compare, write_leaderboard
+    from coopenv.estimation.metrics import steady_start
     from coopenv.estimation.observers.registry import observer_names
     from coopenv.runs.command import progress
+    from coopenv.runs.output import prepare_folder
 
-    start = STEADY_SHARE * scenario.horizon if steady_from is None else steady_from
-    if not 0.0 <= start < scenario.horizon:
-        raise CoopenvError(f"--steady-from {start:g} is not within the horizon of {scenario.horizon:g} s")
+    start = steady_start(steady_from, scenario.horizon)
     names = [name.strip() for name in observers.split(",")] if observers else observer_names()
+    if out is not None:
+        prepare_folder(out, LEADERBOARD_FILES)  # before the work, not after it
     with progress(console(stderr=True)) as bar:
         task = bar.add_task(f"{len(names)} observers, {seeds} seeds", total=1.0)
         rows = compare(
@@ -262,8 +256,8 @@ def bench_observers(
         printed.print(line, soft_wrap=True)
     if out is not None:
         command = f"coopenv bench observers {environment} --observers {','.join(names)} --seeds {seeds}"
-        settings = "".join(f" --set {override}" for override in overrides or [])
-        paths = write_leaderboard(rows, out, command + settings)
+        command += f" --steady-from {start:g}" + "".join(f" --set {override}" for override in overrides or [])
+        paths = write_leaderboard(rows, out, command)
         printed.print(f"Files in {out}: {', '.join(path.name for path in paths)}", soft_wrap=True)
 
 

@@ -37,4 +37,4 @@ def test_command(capsys: pytest.CaptureFixture[str]) -> None:
     printed = capsys.readouterr().out
     assert "vehicle_2" in printed and "2/2" in printed
     assert main(["bench", "seeds", "overtaking", "--steady-from", "99"]) == 2
-    assert "--steady-from 99 is not within the horizon" in capsys.readouterr().err
+    assert "--steady-from 99 is not within the run of 45 s" in capsys.readouterr().err

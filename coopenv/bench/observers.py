@@ -12,13 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from coopenv.errors import CoopenvError
 from coopenv.estimation.bound import cramer_rao
 from coopenv.estimation.metrics import json_ready, settling_time
 from coopenv.estimation.observers.registry import find
 from coopenv.estimation.observers.runner import record, run
 from coopenv.runs.output import writing
 from coopenv.scenario import Scenario
+
+LEADERBOARD_FILES = ("leaderboard.json", "leaderboard.csv")
 
 SETTLED_POSITION, SETTLED_ORIENTATION = 0.5, 5.0
 """m and deg below which a vehicle counts as settled under noise."""
@@ -148,15 +149,13 @@ def row_of(environment: str, observer: str, vehicle: str, i: int, samples: Seque
 
 
 def write_leaderboard(rows: Sequence[Row], folder: Path, command: str) -> list[Path]:
-    """Write `leaderboard.json` (with the command) and `leaderboard.csv`.
+    """Write `leaderboard.json` (with the command) and `leaderboard.csv`; there is at least one row.
 
     Raises:
         OutputError: the folder cannot be written.
     """
-    if not rows:
-        raise CoopenvError("no observers to write about")
     plain = [json_ready(asdict(row)) for row in rows]
-    as_json, as_csv = folder / "leaderboard.json", folder / "leaderboard.csv"
+    as_json, as_csv = (folder / name for name in LEADERBOARD_FILES)
     with writing(as_json):
         folder.mkdir(parents=True, exist_ok=True)
         as_json.write_text(json.dumps({"command": command, "rows": plain}, indent=1) + "\n", encoding="utf-8")

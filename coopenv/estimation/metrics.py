@@ -17,6 +17,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.stats import theilslopes
 
+from coopenv.errors import CoopenvError
 from coopenv.estimation.observability import Observability
 from coopenv.estimation.trajectory import Trajectory
 
@@ -43,6 +44,25 @@ class RateFit(NamedTuple):
     high: float
     samples: int
     remark: str = ""  # why there is no rate
+
+
+def steady_start(given: float | None, horizon: float, end: float | None = None) -> float:
+    """Return when the steady state starts, s: as given, or after `STEADY_SHARE` of the horizon.
+
+    Args:
+        given: what the user asked for, s.
+        horizon: of the scenario, s.
+        end: of the run, s, where it is cut short of the horizon.
+
+    Raises:
+        CoopenvError: what was asked for does not lie within the run.
+    """
+    if given is None:
+        return STEADY_SHARE * horizon
+    last = horizon if end is None else end
+    if not 0.0 <= given < last:
+        raise CoopenvError(f"--steady-from {given:g} is not within the run of {last:g} s")
+    return given
 
 
 def live_ticks(t: np.ndarray, vehicles: int, ends: Sequence[float] | None = None) -> np.ndarray:

@@ -13,8 +13,7 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
-from coopenv.errors import CoopenvError
-from coopenv.estimation.metrics import STEADY_SHARE
+from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import Observability, analyse_observability
 from coopenv.runs.metrics import outcome_line, run_metrics, vehicle_metrics
 from coopenv.runs.output import METRICS_FILE, TRAJECTORY_FILE, prepare_folder, write_results
@@ -54,7 +53,8 @@ def execute(request: RunRequest, out: Console, log: Console) -> bool:
     recording = Recording(scenario, request.seed, request.steps, request.dtype, request.device, request.policy)
     if request.policy != "zero" and not scenario.driven:
         log.print("note: all motion here is prescribed, the policy has no effect", soft_wrap=True)
-    steady_from = _steady_from(request, recording)
+    end = recording.ticks_planned / scenario.rates.camera
+    steady_from = steady_start(request.steady_from, scenario.horizon, end)
     prepare_folder(request.folder, _files(request))
     with compile_notice(log):
         recording.warm_up()
@@ -72,15 +72,6 @@ def execute(request: RunRequest, out: Console, log: Console) -> bool:
         paths.append(_finish(film, log))
     report(request, metrics, paths, out)
     return finished
-
-
-def _steady_from(request: RunRequest, recording: Recording) -> float:
-    if request.steady_from is None:
-        return STEADY_SHARE * request.scenario.horizon
-    end = recording.ticks_planned / request.scenario.rates.camera
-    if not 0.0 <= request.steady_from < end:
-        raise CoopenvError(f"--steady-from: {request.steady_from:g} s is not within the run of {end:g} s")
-    return request.steady_from
 
 
 def _files(request: RunRequest) -> list[str]:

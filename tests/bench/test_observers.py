@@ -72,3 +72,6 @@ def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert len((tmp_path / "board" / "leaderboard.csv").read_text().splitlines()) == 5
     assert main(["bench", "observers", "overtaking", "--observers", "ricati"]) == 2
     assert "did you mean 'riccati'" in capsys.readouterr().err
+    (tmp_path / "file").write_text("")
+    assert main([*arguments, "--out", str(tmp_path / "file")]) == 2
+    assert "file" in capsys.readouterr().err
