@@ -106,6 +106,9 @@ class Setup:
     """(3,) the point of this vehicle that others' cameras measure, in its body, m."""
     noise: SensorNoise
     gains: Gains
+    planar: bool = False
+    """Whether the vehicle moves on a plane (z = 0, yaw only) and its odometry is the commands it was given, which
+    need calibration; so it is for recorded robots."""
 
 
 @dataclass(frozen=True)
@@ -123,13 +126,16 @@ class Message:
 
     @property
     def size_bytes(self) -> int:
-        """Payload: 8 bytes a number; a rotation travels as a quaternion, a covariance as its triangle."""
+        """Payload: 8 bytes a number; a rotation travels as a quaternion, a covariance as its triangle.
+
+        Arrays in `extra` count what they hold, so that a sender may save bytes with a narrower dtype.
+        """
         numbers = 0 if self.position is None else 3
         numbers += 0 if self.rotation is None else 4
         if self.covariance is not None:
             n = len(self.covariance)
             numbers += n * (n + 1) // 2
-        return BYTES_PER_NUMBER * (numbers + sum(int(np.size(a)) for a in self.extra.values()))
+        return BYTES_PER_NUMBER * numbers + sum(np.asarray(a).nbytes for a in self.extra.values())
 
 
 @dataclass(frozen=True)
