@@ -1,11 +1,12 @@
-"""The command line: `coopenv list | describe | schema | run | bench`."""
+"""The command line: `coopenv list | describe | schema | run | record | bench`."""
 
 from __future__ import annotations
 
 import sys
 import tomllib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -143,6 +144,36 @@ def run(
         raise typer.Exit(INTERRUPTED)
 
 
+@app.command("record")
+def record_command(
+    environment: Annotated[
+        str, typer.Argument(metavar="ENV|DATASET", help="Environment, TOML file, or a data set such as mrclam_6.")
+    ],
+    out: Annotated[Path, typer.Option(help="MCAP file to write.")],
+    seed: Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")] = 0,
+    policy: Annotated[str, typer.Option(help="Of driven vehicles: zero, random, or the name of an agent.")] = "zero",
+    overrides: Overrides = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of data sets (default: COOPENV_DATA).")] = None,
+    variant: Annotated[str | None, typer.Option(help="Of a data set: landmarks, landmarks+robots, blind.")] = None,
+) -> None:
+    """Write what vehicles sense, tick by tick, to an MCAP file, which Foxglove opens and coopenv replays."""
+    from coopenv.backends.mcap import check_target, write_recording
+    from coopenv.backends.replay import is_recorded
+    from coopenv.runs.log import read_recorded, simulate
+
+    check_target(out)
+    parsed = parse_overrides(overrides)
+    if is_recorded(environment):
+        asked = {"--set": parsed, "--seed": seed, "--policy": policy if policy != "zero" else None}
+        recording = read_recorded(environment, data, variant, {name: value for name, value in asked.items() if value})
+    else:
+        recording = simulate(load(environment, parsed), seed, policy)
+    write_recording(recording, out)
+    console().print(
+        f"{out}: {len(recording.setups)} vehicles, {recording.ticks} ticks, {recording.t[-1]:g} s", soft_wrap=True
+    )
+
+
 bench = typer.Typer(help="Measure: steps per second, drivers.", no_args_is_help=True)
 app.add_typer(bench, name="bench")
 
@@ -222,43 +253,40 @@ def bench_seeds(
 
 @bench.command("observers")
 def bench_observers(
-    environment: Environment,
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="ENV|DATASET|FILE.mcap",
+            help="Environment (name or TOML file), recorded robots (mrclam_1 .. mrclam_9) or a log file.",
+        ),
+    ],
     observers: Annotated[str | None, typer.Option(help="Names with commas between (default: all).")] = None,
+    variants: Annotated[
+        str | None,
+        typer.Option(help="Names with commas between, or `all`: faults of an environment, what recorded robots see."),
+    ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Seeds 0, 1, ...")] = 5,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes that share the seeds.")] = 1,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes (default: one per core).")] = None,
+    engine: Annotated[str, typer.Option(help="`local`, or `ray`: an existing Ray cluster.")] = "local",
+    address: Annotated[str | None, typer.Option(help="Of the Ray cluster: HOST:PORT (default: auto).")] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder with the data of recorded robots (default: COOPENV_DATA).")
+    ] = None,
+    basin: Annotated[int, typer.Option(min=0, help="Random initial estimates for maps of the basins.")] = 0,
     overrides: Overrides = None,
     steady_from: SteadyFrom = None,
-    out: Annotated[Path | None, typer.Option(help="Folder for leaderboard.json and leaderboard.csv.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the leaderboard and the report.")] = None,
 ) -> None:
-    """Compare observers on the same simulated ticks, against the truth and the Cramér-Rao bound."""
-    scenario = load(environment, parse_overrides(overrides))
-    from coopenv.bench.observer_table import error_table, failures, quality_table
-    from coopenv.bench.observers import LEADERBOARD_FILES, compare, write_leaderboard
-    from coopenv.estimation.metrics import steady_start
-    from coopenv.estimation.observers.registry import observer_names
-    from coopenv.runs.command import progress
-    from coopenv.runs.output import prepare_folder
+    """Compare observers on the same ticks, against the truth and the Cramér-Rao bound."""
+    from coopenv.bench.leaderboard.command import perform, request_of
+    from coopenv.bench.leaderboard.engines import find_engine
 
-    start = steady_start(steady_from, scenario.horizon)
-    names = [name.strip() for name in observers.split(",")] if observers else observer_names()
-    if out is not None:
-        prepare_folder(out, LEADERBOARD_FILES)  # before the work, not after it
-    with progress(console(stderr=True)) as bar:
-        task = bar.add_task(f"{len(names)} observers, {seeds} seeds", total=1.0)
-        rows = compare(
-            scenario, Path(environment).stem, names, seeds, start, jobs, lambda share: bar.update(task, completed=share)
+    printed, log = console(), console(stderr=True)
+    with warned():
+        request = request_of(
+            source, observers, variants, seeds, steady_from, basin, data, parse_overrides(overrides), overrides or ()
         )
-    printed = console()
-    printed.print(error_table(rows))
-    printed.print()
-    printed.print(quality_table(rows))
-    for line in failures(rows):
-        printed.print(line, soft_wrap=True)
-    if out is not None:
-        command = f"coopenv bench observers {environment} --observers {','.join(names)} --seeds {seeds}"
-        command += f" --steady-from {start:g}" + "".join(f" --set {override}" for override in overrides or [])
-        paths = write_leaderboard(rows, out, command)
-        printed.print(f"Files in {out}: {', '.join(path.name for path in paths)}", soft_wrap=True)
+    perform(request, find_engine(engine, jobs, address), out, printed, log)
 
 
 def console(stderr: bool = False) -> Console:
@@ -268,14 +296,22 @@ def console(stderr: bool = False) -> Console:
 
 def load(environment: str, overrides: dict[str, Any]) -> Any:
     """Return a scenario, its warnings printed as one line each."""
-    from coopenv.scenario import ScenarioWarning, load_scenario
+    from coopenv.scenario import load_scenario
+
+    with warned():
+        return load_scenario(environment, overrides)
+
+
+@contextmanager
+def warned() -> Iterator[None]:
+    """Print the warnings of scenarios that are loaded meanwhile as one line each."""
+    from coopenv.scenario import ScenarioWarning
 
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ScenarioWarning)
-        scenario = load_scenario(environment, overrides)
+        yield
     for warning in (w for w in caught if issubclass(w.category, ScenarioWarning)):
         print(f"warning: {warning.message}", file=sys.stderr)
-    return scenario
 
 
 def parse_overrides(assignments: Sequence[str] | None) -> dict[str, Any]:

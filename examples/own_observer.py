@@ -1,11 +1,11 @@
-"""Write an observer of one's own, send it through the benchmark, and compare it with others.
+"""Write an observer of one's own, compare it with others on the same ticks, and let it drive an environment.
 
 Run: python examples/own_observer.py
 """
 
 import numpy as np
 
-from coopenv import load_scenario
+from coopenv import load_scenario, parallel_env
 from coopenv.estimation.observers import Estimate, Message, Setup, Tick, record, register, run
 
 
@@ -46,3 +46,9 @@ for name in ("complementary", "riccati", "dead_reckoning"):
     result = run(name, recording)
     errors = "  ".join(f"{e:8.3f}" for e in result.position_error[-1])
     print(f"{name:16} {errors}   {result.bytes_per_second[0]:8.0f}   {result.failure}")
+
+env = parallel_env("busy_intersection", observer="complementary")  # the same class in the environment
+_, infos = env.reset(seed=0)
+while env.agents:
+    _, _, _, _, infos = env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+print(f"{'in the environment':18}", *(f"{info['position_error']:8.3f}" for info in infos.values()))

@@ -10,12 +10,15 @@ import warp as wp
 
 from coopenv.api.layout import layout_size, observation_layout
 from coopenv.api.observation import observation_plan
+from coopenv.api.plugins import PlugIns
 from coopenv.api.report import MEMORY, allocate_report, report_kernel
 from coopenv.api.rewards import reward_weights
+from coopenv.backends.base import Backend
+from coopenv.backends.simulated import Simulated
 from coopenv.scenario import Scenario
+from coopenv.world.build import EMBEDDED
 from coopenv.world.launch import PerWorld
 from coopenv.world.state import check_fit, overwrite, state_fields
-from coopenv.world.world import World
 
 
 class Engine:
@@ -32,9 +35,23 @@ class Engine:
         dtype: str = "float32",
         device: str = "cpu",
         threads: int | None = None,
+        backend: Backend | None = None,
     ) -> None:
-        """Build everything; arguments and errors as for `World`."""
-        self.world = World(scenario, worlds, dtype, device, threads)
+        """Build everything; arguments and errors as for `World`.
+
+        Args:
+            scenario: what to build.
+            worlds: how many.
+            dtype: "float32" or "float64".
+            device: "cpu" or a CUDA device.
+            threads: shares of the batch on the CPU.
+            backend: where ticks come from (None: computed).
+        """
+        backend = backend or Simulated(scenario)
+        self.world = backend.world(worlds, dtype, device, threads)
+        name = scenario.observer.name
+        self.plugins = None if name in EMBEDDED else PlugIns(name, self.world, backend.senses(self.world))
+        """The observers that run on the host; None where the embedded one estimates."""
         self.layout = observation_layout(scenario)
         device = self.world.device
         self.report = allocate_report(self.world.model, worlds, layout_size(self.layout), self.world.precision, device)
@@ -50,14 +67,22 @@ class Engine:
         """Start new episodes, see `World.reset`; reports of the other worlds stay."""
         self.world.reset(seeds, mask)
         chosen = np.ones(self.world.worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
+        self._start_plugins(chosen)
         self._fresh.assign(chosen.astype(np.int32))
         self._report("report fresh", self._fresh, self._fresh)
+
+    def _start_plugins(self, chosen: np.ndarray) -> None:
+        if self.plugins is not None:
+            self.plugins.start(np.flatnonzero(chosen))
+
+    def _advance(self, ticks: int) -> None:
+        (self.plugins or self.world).advance(ticks)
 
     def step(self, actions: np.ndarray | None = None, ticks: int | None = None) -> None:
         """Advance by one decision (or `ticks` camera ticks) under actions (W, N, 2) in [-1, 1]."""
         if actions is not None:
             self.set_actions(actions)
-        self.world.advance(self.world.model.ticks_per_decision if ticks is None else ticks)
+        self._advance(self.world.model.ticks_per_decision if ticks is None else ticks)
         self.refresh()
 
     def step_or_restart(self) -> None:
@@ -66,8 +91,8 @@ class Engine:
             self.step()
             return
         wp.copy(self.world.mask, self.report.over)
-        self.world.advance(self.world.model.ticks_per_decision)
-        self.world.restart()
+        self._advance(self.world.model.ticks_per_decision)
+        self._restart()
         self._report("report some fresh", self.world.mask, self._everywhere)
         self.world.mask.zero_()
 
@@ -75,9 +100,14 @@ class Engine:
         """Restart the worlds that are over and report them anew; nothing leaves the device."""
         wp.copy(self.world.mask, self.report.over)
         wp.copy(self._fresh, self.report.over)
-        self.world.restart()
+        self._restart()
         self.world.mask.zero_()
         self._report("report fresh", self._fresh, self._fresh)
+
+    def _restart(self) -> None:
+        self.world.restart()
+        if self.plugins is not None:
+            self.plugins.start(np.flatnonzero(self.world.mask.numpy()))
 
     def set_actions(self, actions: np.ndarray) -> None:
         """Copy host actions, (W, N, 2), to the device."""
@@ -117,12 +147,17 @@ class Engine:
             return self.world.actions
         return getattr(self.world.state if name in self._state_fields else self.report, name)
 
-    def get_state(self) -> dict[str, np.ndarray]:
-        """Return a copy of everything that the next step depends on."""
-        memory = {name: getattr(self.report, name).numpy().copy() for name in MEMORY}
-        return {**self.world.get_state(), **memory}
+    def get_state(self) -> dict[str, Any]:
+        """Return a copy of everything that the next step depends on.
 
-    def set_state(self, values: Mapping[str, np.ndarray]) -> None:
+        Raises:
+            CoopenvError: a plug-in observer cannot be copied.
+        """
+        memory = {name: getattr(self.report, name).numpy().copy() for name in MEMORY}
+        own = {} if self.plugins is None else {"observers": self.plugins.get_state()}
+        return {**self.world.get_state(), **memory, **own}
+
+    def set_state(self, values: Mapping[str, Any]) -> None:
         """Restore what `get_state` returned.
 
         Raises:
@@ -130,6 +165,8 @@ class Engine:
         """
         memory = {name: getattr(self.report, name) for name in MEMORY}
         check_fit({**memory, **self.world.state_arrays()}, values)
+        if self.plugins is not None:
+            self.plugins.set_state(values.get("observers"))
         self.world.set_state(values)
         self.refresh()
         overwrite(memory, values)

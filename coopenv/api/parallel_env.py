@@ -16,8 +16,11 @@ from coopenv.api.engine import Engine
 from coopenv.api.infos import InfoWriter
 from coopenv.api.layout import Field, action_space, dict_space, flat_space
 from coopenv.api.state import state_space, state_vector
+from coopenv.backends.base import Backend
+from coopenv.backends.select import open_backend
+from coopenv.backends.simulated import Simulated
 from coopenv.errors import CoopenvError, ScenarioError, checked_seed, suggest
-from coopenv.scenario import Scenario, load_scenario
+from coopenv.scenario import Scenario
 
 if TYPE_CHECKING:
     from coopenv.viz.topview import TopView
@@ -25,7 +28,6 @@ if TYPE_CHECKING:
 Observations = dict[str, Any]
 Infos = dict[str, dict[str, Any]]
 
-BACKENDS = ("simulated",)
 RENDER_MODES = ("rgb_array", "human")
 
 
@@ -50,7 +52,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
 
     def __init__(
         self,
-        scenario: Scenario,
+        source: Scenario | Backend,
         name: str,
         *,
         render_mode: str | None = None,
@@ -61,7 +63,8 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         """Build the world; use `coopenv.parallel_env` to build one by name."""
         _one_of("render_mode", render_mode, (None, *RENDER_MODES))
         _one_of("observation", observation, ("flat", "dict"))
-        self.scenario = scenario
+        backend = Simulated(source) if isinstance(source, Scenario) else source
+        self.scenario = scenario = backend.scenario
         self.render_mode = render_mode
         self.metadata = {
             "name": f"{name}_v0",
@@ -70,14 +73,14 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             "is_parallelizable": True,
         }
         self._arguments = {
-            "scenario": scenario,
+            "source": source,
             "name": name,
             "render_mode": render_mode,
             "observation": observation,
             "device": device,
             "dtype": dtype,
         }
-        self.engine = Engine(scenario, 1, dtype, device)
+        self.engine = Engine(scenario, 1, dtype, device, backend=backend)
         self.possible_agents = list(scenario.vehicle_names)
         self.agents: list[str] = []
         self._index = {agent: i for i, agent in enumerate(self.possible_agents)}
@@ -234,33 +237,38 @@ def parallel_env(
     device: str = "cpu",
     dtype: str = "float32",
     overrides: Mapping[str, Any] | None = None,
+    data: str | Path | None = None,
+    variant: str | None = None,
 ) -> CooperativeLocalisationEnv:
-    """Return an environment by name (`coopenv.list_envs()`) or from a TOML file.
+    """Return an environment by name (`coopenv.list_envs()`), from a TOML file, or from a recording.
+
+    A recording goes by as it was, whatever the actions; see docs/replay.md.
 
     Args:
-        name_or_path: for example "busy_intersection".
+        name_or_path: for example "busy_intersection"; "mrclam_6" or "drive.mcap" replay what was recorded.
         render_mode: None, "rgb_array" or "human".
-        observer: estimator that every vehicle runs; None: as the scenario says.
-        backend: where measurements come from; None: "simulated".
+        observer: estimator that every vehicle runs, embedded or a plug-in (`coopenv.estimation.observers.register`);
+            None: as the scenario says.
+        backend: where measurements come from, "simulated" or "replay"; None: as the name says.
         observation: "flat" Box or one-level "dict".
         device: "cpu" or a CUDA device.
         dtype: "float32" or "float64" (of the world; observations are float32).
         overrides: dotted scenario keys, for example {"noise.enabled": False}.
+        data: folder of recorded data sets; None: what COOPENV_DATA says.
+        variant: of a recorded data set: "landmarks", "landmarks+robots" (the default) or "blind".
 
     Raises:
         UnknownEnvironmentError: no such environment.
         ScenarioError: the file or an override is not valid.
         CoopenvError: another argument is not valid.
     """
-    _one_of("backend", backend, (None, *BACKENDS))
     if overrides is not None and not isinstance(overrides, Mapping):
         raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
     merged = dict(overrides or {})
     if observer is not None:
         merged["observer.name"] = observer
-    scenario = load_scenario(name_or_path, merged)
     return CooperativeLocalisationEnv(
-        scenario,
+        open_backend(name_or_path, backend, merged, data, variant),
         Path(str(name_or_path)).stem,
         render_mode=render_mode,
         observation=observation,

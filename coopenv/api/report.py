@@ -104,6 +104,12 @@ def is_over(model: Any, state: Any, world: int) -> bool:
 
 
 @wp.func
+def known(value: Any) -> wp.float32:
+    """Return a quantity of truth, 0 where a recording does not know it."""
+    return wp.where(wp.isfinite(value), wp.float32(value), 0.0)
+
+
+@wp.func
 def reward(
     model: Any, state: Any, report: Any, weights: wp.array(dtype=wp.float32), world: int, vehicle: int, fresh: int
 ):
@@ -123,11 +129,11 @@ def reward(
         report.terms,
         world,
         vehicle,
-        wp.float32(progress),
+        known(progress),
         wp.float32(elapsed),
         wp.where(alive, ended, UNDER_WAY),
-        wp.float32(report.position_error[world, vehicle]),
-        wp.float32(report.orientation_error[world, vehicle]) / wp.float32(DEGREES),
+        known(report.position_error[world, vehicle]),
+        known(report.orientation_error[world, vehicle]) / wp.float32(DEGREES),
         wp.float32(report.log_determinant[world, vehicle]),
         wp.float32(report.gramian_min_eigenvalue[world, vehicle]),
         report.targets_in_view[world, vehicle],

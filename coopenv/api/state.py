@@ -22,11 +22,15 @@ def state_space(scenario: Scenario) -> spaces.Box:
 
 
 def state_vector(engine: Engine) -> np.ndarray:
-    """Return the state of world 0: every agent's truth (landmarks first), every vehicle's estimate, episode share."""
+    """Return the state of world 0: every agent's truth (landmarks first), every vehicle's estimate, episode share.
+
+    Truth that a recording does not know reads 0.
+    """
     R, position, velocity = (engine.view(name)[0] for name in ("rotation", "position", "velocity"))
     R_hat, p_hat = engine.view("estimate_rotation")[0], engine.view("estimate_position")[0]
     position_hat = np.einsum("nij,nj->ni", R_hat, p_hat)
     truth = np.hstack([position, R[:, :, 0], R[:, :, 1], velocity])
     estimate = np.hstack([position_hat, R_hat[:, :, 0], R_hat[:, :, 1]])
     share = engine.view("tick")[:1] / engine.world.model.horizon_ticks
-    return np.concatenate([truth.ravel(), estimate.ravel(), share]).astype(np.float32).clip(-LIMIT, LIMIT)
+    whole = np.concatenate([truth.ravel(), estimate.ravel(), share]).astype(np.float32)
+    return np.nan_to_num(whole.clip(-LIMIT, LIMIT), nan=0.0)

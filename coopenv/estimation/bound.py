@@ -13,9 +13,11 @@ everybody has all data, whatever was delivered.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from coopenv.estimation.observers.base import Array
 from coopenv.estimation.observers.rotations import skew
@@ -44,26 +46,70 @@ def cramer_rao(recording: Recording, joint: bool = True) -> Bound:
         joint: over all vehicles, whose poses are all unknown; False: each vehicle alone, as if its neighbours' poses
             were known exactly.
     """
-    K, N = recording.ticks, len(recording.setups)
-    M = information(recording, joint)
+    N = len(recording.setups)
+    M, F = information(recording, joint), transitions(recording)
+    groups = [range(N)] if joint else [[i] for i in range(N)]
+    return _bound(recording, _covariances(recording, F, M, groups).reshape(recording.ticks, N, 6, 6))
+
+
+def cramer_rao_ancestors(recording: Recording) -> Bound:
+    """Return, for each vehicle, the joint bound over it and its ancestors: all whose messages can reach it.
+
+    It counts what these vehicles measure and nothing else. A decentralised observer whose messages follow the graph
+    knows no more, whereas the bound over all vehicles also counts what followers could tell their leaders.
+    """
+    N = len(recording.setups)
     F = transitions(recording)
-    noise = np.concatenate([setup.noise.odometry(recording.dt) for setup in recording.setups])
-    P = np.zeros((6 * N, 6 * N))
-    for i, covariance in enumerate(recording.start_covariance):
-        P[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = covariance
-    blocks = np.empty((K, N, 6, 6))
-    own = np.arange(6 * N).reshape(N, 6)
+    blocks = np.empty((recording.ticks, N, 6, 6))
+    families = [ancestors(recording, i) for i in range(N)]
+    for family in set(families):
+        P = _covariances(recording, F, information(recording, observers=family), [family])[:, 0]
+        for i in (i for i in range(N) if families[i] == family):
+            blocks[:, i] = P[:, family.index(i)]
+    return _bound(recording, blocks)
+
+
+def ancestors(recording: Recording, vehicle: int) -> tuple[int, ...]:
+    """Return a vehicle, its neighbours, theirs, and so on, sorted."""
+    found, waiting = set(), {vehicle}
+    while waiting:
+        i = waiting.pop()
+        found.add(i)
+        targets = recording.setups[i].targets - recording.setups[i].landmarks
+        waiting |= {int(j) for j in targets if j >= 0} - found
+    return tuple(sorted(found))
+
+
+def _covariances(recording: Recording, F: Array, M: Array, groups: Sequence[Sequence[int]]) -> Array:
+    """Return (K, g, n, 6, 6) the bounds of g groups of n vehicles, those of a group estimated together.
+
+    Args:
+        recording: for the start, the odometry's noise, and when corrections are due.
+        F: (K, 6N, 6N) of all.
+        M: (K, 6N, 6N) information of all.
+        groups: vehicles, equally many in each.
+    """
+    part = (6 * np.asarray(groups)[..., None] + np.arange(6)).reshape(len(groups), -1)
+    F, M = (A[:, part[:, :, None], part[:, None, :]] for A in (F, M))
+    F_T = np.swapaxes(F, -1, -2)
+    noise = [np.diag(np.concatenate([recording.setups[i].noise.odometry(recording.dt) for i in g])) for g in groups]
+    P = np.array([block_diag(*(recording.start_covariance[i] for i in group)) for group in groups])
+    own = np.arange(part.shape[1]).reshape(-1, 6)
     rows, columns = own[:, :, None], own[:, None, :]
-    blocks[0] = P[rows, columns]
-    identity = np.eye(6 * N)
-    for k in range(1, K):
-        P = F[k] @ P @ F[k].T
-        P[np.diag_indices(6 * N)] += noise
+    blocks = np.empty((recording.ticks, len(groups), len(own), 6, 6))
+    blocks[0] = P[:, rows, columns]
+    identity = np.eye(part.shape[1])
+    for k in range(1, recording.ticks):
+        P = F[k] @ P @ F_T[k] + noise
         if recording.due[k]:
             # (P^-1 + M)^-1 without the inverse of P, which may be ill-conditioned: P (I + M P)^-1
             P = np.linalg.solve(identity + P @ M[k], P)
-            P = (P + P.T) / 2
-        blocks[k] = P[rows, columns]
+            P = (P + np.swapaxes(P, -1, -2)) / 2
+        blocks[k] = P[:, rows, columns]
+    return blocks
+
+
+def _bound(recording: Recording, blocks: Array) -> Bound:
     trace = np.trace(blocks[..., 3:, 3:], axis1=-2, axis2=-1)
     angle = np.trace(blocks[..., :3, :3], axis1=-2, axis2=-1)
     return Bound(recording.t, np.sqrt(trace), np.degrees(np.sqrt(angle)), blocks)
@@ -83,14 +129,22 @@ def transitions(recording: Recording) -> Array:
     return F
 
 
-def information(recording: Recording, joint: bool = True) -> Array:
-    """Return sum of H^T H / sigma^2 (K, 6N, 6N) over the visible edges at each tick, linearised at the truth."""
+def information(recording: Recording, joint: bool = True, observers: Collection[int] | None = None) -> Array:
+    """Return sum of H^T H / sigma^2 (K, 6N, 6N) over the visible edges at each tick, linearised at the truth.
+
+    Args:
+        recording: with the truth and the visible edges.
+        joint: whether a neighbour's pose is unknown, too.
+        observers: whose measurements count; None: everybody's.
+    """
     R, p = recording.truth.rotation, recording.truth.position
     K, N = R.shape[:2]
     L = recording.landmarks.shape[1]
     M = np.zeros((K, 6 * N, 6 * N))
     minus = np.broadcast_to(-np.eye(3), (K, 3, 3))
     for i, setup in enumerate(recording.setups):
+        if observers is not None and i not in observers:
+            continue
         own = slice(6 * i, 6 * i + 6)
         Rt = np.swapaxes(R[:, i], -1, -2)
         for target in setup.targets:

@@ -19,11 +19,9 @@ own position, in a unit of length that the geometry brings along (`Observability
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
-
-from coopenv.estimation.trajectory import Trajectory
 
 DEFAULT_WINDOW = 1.0
 DEFAULT_THRESHOLD = 1e-4
@@ -35,6 +33,40 @@ class Interval(NamedTuple):
     start: float
     end: float
     observable: bool
+
+
+class Scene(Protocol):
+    """What of a record matters here; a `Trajectory` has it. Shapes and units as there."""
+
+    @property
+    def t(self) -> np.ndarray:
+        """(K,) s."""
+        ...
+
+    @property
+    def position(self) -> np.ndarray:
+        """(K, N, 3) m, map frame."""
+        ...
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """(K, N, 3, 3) body to map."""
+        ...
+
+    @property
+    def target_position(self) -> np.ndarray:
+        """(K, T, 3) m, map frame."""
+        ...
+
+    @property
+    def visible(self) -> np.ndarray:
+        """(K, N, T) bool."""
+        ...
+
+    @property
+    def vehicles(self) -> np.ndarray:
+        """(N,) names."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -73,7 +105,7 @@ class Observability:
 
 
 def analyse_observability(
-    trajectory: Trajectory, window: float = DEFAULT_WINDOW, threshold: float = DEFAULT_THRESHOLD
+    scene: Scene, window: float = DEFAULT_WINDOW, threshold: float = DEFAULT_THRESHOLD
 ) -> Observability:
     """Evaluate W(t) for every camera tick at which a whole window begins.
 
@@ -82,44 +114,44 @@ def analyse_observability(
     the graph.
 
     Args:
-        trajectory: the record of a run.
+        scene: the record of a run.
         window: s.
         threshold: verdict on the local eigenvalue, see `Observability`.
     """
-    window = min(window, float(trajectory.t[-1] - trajectory.t[0]))
-    start, W, anchor = _windows_about_anchor(trajectory, window)
+    window = min(window, float(scene.t[-1] - scene.t[0]))
+    start, W, anchor = _windows_about_anchor(scene, window)
     eigenvalues = np.linalg.eigvalsh(_move_origin(W, -anchor))
     smallest, largest = eigenvalues[..., 0], eigenvalues[..., -1]
     regular = smallest > np.finfo(float).eps * largest
     condition = np.where(regular, largest / np.where(regular, smallest, 1.0), np.inf)
-    local = _scaled(_move_origin(W, trajectory.position[start] - anchor))
+    local = _scaled(_move_origin(W, scene.position[start] - anchor))
     return Observability(
-        t=trajectory.t[start],
+        t=scene.t[start],
         window=window,
         threshold=threshold,
         min_eigenvalue=np.maximum(smallest, 0.0),
         condition_number=condition,
         local_eigenvalue=np.maximum(np.linalg.eigvalsh(local)[..., 0], 0.0),
-        vehicles=trajectory.vehicles,
+        vehicles=scene.vehicles,
     )
 
 
-def observability_gramian(trajectory: Trajectory, window: float = DEFAULT_WINDOW) -> tuple[np.ndarray, np.ndarray]:
+def observability_gramian(scene: Scene, window: float = DEFAULT_WINDOW) -> tuple[np.ndarray, np.ndarray]:
     """Return the window starts (M,) in s and W(t) (M, N, 6, 6) over (2 lambda, p) in the body frame at t."""
-    start, W, anchor = _windows_about_anchor(trajectory, window)
-    R = trajectory.rotation[start]
+    start, W, anchor = _windows_about_anchor(scene, window)
+    R = scene.rotation[start]
     blocks = np.zeros((*R.shape[:-2], 6, 6))
     blocks[..., :3, :3] = blocks[..., 3:, 3:] = R
-    return trajectory.t[start], np.swapaxes(blocks, -1, -2) @ _move_origin(W, -anchor) @ blocks
+    return scene.t[start], np.swapaxes(blocks, -1, -2) @ _move_origin(W, -anchor) @ blocks
 
 
-def _windows_about_anchor(trajectory: Trajectory, window: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _windows_about_anchor(scene: Scene, window: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return start ticks (M,), W in map axes (M, N, 6, 6), and the points (N, 3) in m that it is taken about.
 
     A point amid the vehicle's path keeps the running sums, and so the rounding of their differences, small.
     """
-    anchor = trajectory.position.mean(axis=0)
-    t, rate = trajectory.t, _information_rate(trajectory, anchor)
+    anchor = scene.position.mean(axis=0)
+    t, rate = scene.t, _information_rate(scene, anchor)
     step = np.diff(t)[:, None, None, None]
     total = np.concatenate([np.zeros_like(rate[:1]), np.cumsum(0.5 * step * (rate[1:] + rate[:-1]), axis=0)])
     slack = 1e-6 * max(window, np.finfo(float).tiny)
@@ -129,16 +161,16 @@ def _windows_about_anchor(trajectory: Trajectory, window: float) -> tuple[np.nda
     return start, (total[end] - total[start]) / length, anchor
 
 
-def _information_rate(trajectory: Trajectory, anchor: np.ndarray) -> np.ndarray:
+def _information_rate(scene: Scene, anchor: np.ndarray) -> np.ndarray:
     """Return C*^T C* (K, N, 6, 6) in map axes, about one point (N, 3) per vehicle."""
-    offset = trajectory.target_position[:, None] - trajectory.position[:, :, None]  # (K, N, T, 3)
+    offset = scene.target_position[:, None] - scene.position[:, :, None]  # (K, N, T, 3)
     distance = np.linalg.norm(offset, axis=-1, keepdims=True)
     bearing = offset / np.where(distance > 0, distance, 1.0)
-    seen = trajectory.visible & (distance[..., 0] > 0)
+    seen = scene.visible & (distance[..., 0] > 0)
     projection = (np.eye(3) - bearing[..., :, None] * bearing[..., None, :]) * seen[..., None, None]
-    lever = _skew(trajectory.target_position[:, None] - anchor[:, None])  # (K, N, T, 3, 3)
+    lever = _skew(scene.target_position[:, None] - anchor[:, None])  # (K, N, T, 3, 3)
     cross = lever @ projection  # = (-Pi S)^T Pi
-    rate = np.empty((*trajectory.position.shape[:2], 6, 6))
+    rate = np.empty((*scene.position.shape[:2], 6, 6))
     rate[..., :3, :3] = -(cross @ lever).sum(axis=2)
     rate[..., :3, 3:] = cross.sum(axis=2)
     rate[..., 3:, :3] = np.swapaxes(rate[..., :3, 3:], -1, -2)

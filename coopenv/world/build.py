@@ -22,6 +22,9 @@ ROTATION_OF_CAMERA = {
 """Camera to body: columns are the optical frame's x (right), y (down), z (forward)."""
 
 
+EMBEDDED = ("riccati", "dead_reckoning")
+"""Values of `observer.name` that run in the kernels; any other is a plug-in's (coopenv/api/plugins.py)."""
+
 NUMPY_OF = {wp.int32: np.int32, wp.float64: np.float64}
 
 GRAMIAN_RATE = 20.0

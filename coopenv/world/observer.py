@@ -188,6 +188,14 @@ def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: i
 
 
 @wp.func
+def sample_gramian(model: Any, state: Any, world: int, vehicle: int, tick: int):
+    """Add this tick to the sliding Gramian when a sample is due."""
+    if tick % model.observer.gramian_stride == 0:
+        dt = type(model.observer.max_turn)(model.camera_period)
+        accumulate_gramian(model, state, world, vehicle, tick, dt * type(dt)(model.observer.gramian_stride))
+
+
+@wp.func
 def estimate(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Run one tick of the observer of one vehicle: predict, and correct when its rate says so."""
     dt = type(model.observer.max_turn)(model.camera_period)
@@ -203,6 +211,4 @@ def estimate(model: Any, state: Any, world: int, vehicle: int, tick: int):
     state.corrected_tick[world, vehicle] = last
     # Products of rotations drift by rounding; once per tick is enough to keep Rhat a rotation.
     state.estimate_rotation[world, vehicle] = orthonormalise(state.estimate_rotation[world, vehicle])
-    if tick % model.observer.gramian_stride == 0:
-        span = dt * type(dt)(model.observer.gramian_stride)
-        accumulate_gramian(model, state, world, vehicle, tick, span)
+    sample_gramian(model, state, world, vehicle, tick)

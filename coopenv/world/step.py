@@ -51,22 +51,35 @@ def move(model: Any, state: Any, actions: Any, world: int, tick: int):
 
 
 @wp.func
-def tick_world(model: Any, state: Any, actions: Any, world: int):
-    """Run one camera tick of one world: truth -> camera -> V2X -> observer -> V2X, leaders before followers."""
-    tick = state.tick[world] + 1
+def sense(model: Any, state: Any, actions: Any, world: int, tick: int):
+    """Move the truth of one world to a tick and measure it: everything that does not depend on any estimate."""
     move(model, state, actions, world, tick)
     for vehicle in range(model.vehicles):
         referee(model, state, world, vehicle)
-    for place in range(model.vehicles):
-        vehicle = model.order[place]
+    for vehicle in range(model.vehicles):
         observe(model, state, world, vehicle, tick)
-        deliver(model, state, world, vehicle, tick)
-        estimate(model, state, world, vehicle, tick)
-        broadcast(model, state, world, vehicle, tick)
+
+
+@wp.func
+def finish(model: Any, state: Any, actions: Any, world: int, tick: int):
+    """Put a decision that is over on record, and count the tick."""
     if tick % model.ticks_per_decision == 0 or tick == model.horizon_ticks:
         for vehicle in range(model.vehicles):
             state.command[world, vehicle] = sound(actions[world, vehicle])
     state.tick[world] = tick
+
+
+@wp.func
+def tick_world(model: Any, state: Any, actions: Any, world: int):
+    """Run one camera tick of one world: truth -> camera -> V2X -> observer -> V2X, leaders before followers."""
+    tick = state.tick[world] + 1
+    sense(model, state, actions, world, tick)
+    for place in range(model.vehicles):
+        vehicle = model.order[place]
+        deliver(model, state, world, vehicle, tick)
+        estimate(model, state, world, vehicle, tick)
+        broadcast(model, state, world, vehicle, tick)
+    finish(model, state, actions, world, tick)
 
 
 def advance_kernel(model: Any, state: Any, actions: wp.array2d(dtype=Any), hold: wp.array(dtype=wp.int32), ticks: int):

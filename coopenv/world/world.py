@@ -13,6 +13,7 @@ from coopenv.scenario import Scenario
 from coopenv.world.build import build_model
 from coopenv.world.launch import Launcher, PerWorld, default_threads
 from coopenv.world.precision import check_device, precision
+from coopenv.world.stages import broadcast_kernel, deliver_kernel, finish_kernel, sense_kernel
 from coopenv.world.state import allocate_state, check_fit, overwrite, read_state, state_fields
 from coopenv.world.step import advance_kernel, reset_kernel
 
@@ -56,12 +57,16 @@ class World:
         self.threads = default_threads(worlds, self.device) if threads is None else min(threads, worlds)
         if self.device != "cpu":
             self.threads = 1
-        self.model = build_model(scenario, self.precision, self.device)
+        self.model = self._build_model()
         self.state = allocate_state(self.model, worlds, self.precision, self.device)
         self.actions = wp.zeros((worlds, self.model.vehicles), dtype=self.precision.vec2, device=self.device)
         self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         """(W,) worlds that `restart` resets and that `advance` leaves alone; zero between calls."""
         self.launch = Launcher(worlds, self.device, dtype, self.threads)
+        self._views: dict[str, np.ndarray] = {}
+
+    def _build_model(self) -> Any:
+        return build_model(self.scenario, self.precision, self.device)
 
     def reset(self, seeds: Sequence[int] | np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
         """Start a new episode in the worlds of `mask` (all by default).
@@ -88,6 +93,36 @@ class World:
         """Run camera ticks under `self.actions`, stopping each world at its horizon."""
         state, actions, mask = PerWorld(self.state), PerWorld(self.actions), PerWorld(self.mask)
         self.launch(("advance", ticks), advance_kernel, [self.model, state, actions, mask, ticks])
+
+    # One tick in stages, for estimators on the host: sense, then per vehicle deliver and broadcast, then finish.
+
+    def sense(self, active: Any) -> None:
+        """Move the truth of the active worlds (W,) to the next tick and measure it."""
+        self.launch("sense", sense_kernel, [self.model, *self._arguments(active), PerWorld(self.actions)])
+
+    def deliver(self, active: Any, vehicle: int) -> None:
+        """Let a vehicle of the active worlds receive what arrives at this tick."""
+        self.launch(("deliver", vehicle), deliver_kernel, [self.model, *self._arguments(active), vehicle])
+
+    def broadcast(self, active: Any, vehicle: int) -> None:
+        """Let a vehicle of the active worlds, whose estimate has been written, send it."""
+        self.launch(("broadcast", vehicle), broadcast_kernel, [self.model, *self._arguments(active), vehicle])
+
+    def finish(self, active: Any) -> None:
+        """End the tick of the active worlds."""
+        self.launch("finish", finish_kernel, [self.model, *self._arguments(active), PerWorld(self.actions)])
+
+    def _arguments(self, active: Any) -> list[PerWorld]:
+        return [PerWorld(self.state), PerWorld(active)]
+
+    def view(self, name: str) -> np.ndarray:
+        """Return a field of the state on the host, without a copy on the CPU."""
+        view = self._views.get(name)
+        if view is None:
+            view = getattr(self.state, name).numpy()
+            if self.device == "cpu":
+                self._views[name] = view
+        return view
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return a copy of everything that changes, random streams included (they are seeds and counters)."""

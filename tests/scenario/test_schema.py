@@ -139,7 +139,7 @@ def test_an_unknown_key_like_none_lists_what_is_allowed() -> None:
         ("v2x.period", 0),
         ("v2x.loss", 1.0),
         ("v2x.staleness", 0),
-        ("observer.name", "kalman"),
+        ("observer.name", "no name"),
         ("observer.k", 0.5),
         ("observer.k", -1),
         ("observer.k", [1.0, 0.4, 1.0]),

@@ -126,16 +126,19 @@ class Message:
 
     @property
     def size_bytes(self) -> int:
-        """Payload: 8 bytes a number; a rotation travels as a quaternion, a covariance as its triangle.
+        """Payload: a rotation travels as a quaternion of 4 times 8 bytes, a covariance as its triangle.
 
-        Arrays in `extra` count what they hold, so that a sender may save bytes with a narrower dtype.
+        Numbers count as wide as their array holds them, so that a sender saves bytes with a narrower dtype.
         """
-        numbers = 0 if self.position is None else 3
-        numbers += 0 if self.rotation is None else 4
+        size = sum(np.asarray(a).nbytes for a in self.extra.values())
+        if self.position is not None:
+            size += np.asarray(self.position).nbytes
+        if self.rotation is not None:
+            size += 4 * BYTES_PER_NUMBER
         if self.covariance is not None:
             n = len(self.covariance)
-            numbers += n * (n + 1) // 2
-        return BYTES_PER_NUMBER * numbers + sum(np.asarray(a).nbytes for a in self.extra.values())
+            size += n * (n + 1) // 2 * np.asarray(self.covariance).itemsize
+        return size
 
 
 @dataclass(frozen=True)
@@ -204,6 +207,10 @@ class Estimate:
     covariance: Array | None = None
     """(6, 6) over the error in `coordinates`, rad and m; None: the observer states none."""
     coordinates: Coordinates = Coordinates.LEFT
+    nis: float | None = None
+    """Normalised innovation squared r^T S^-1 r of this tick's correction; None: there was none, or it is not told."""
+    nis_dof: int = 0
+    """Its degrees of freedom: two per bearing used."""
 
 
 @runtime_checkable

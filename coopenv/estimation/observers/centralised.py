@@ -46,7 +46,7 @@ class Centralised:
         if rows:
             H = np.concatenate([row[0] for row in rows])
             N = np.diag(np.concatenate([row[2] for row in rows]))
-            dx, self.P = kalman(self.P, H, N, np.concatenate([row[1] for row in rows]))
+            dx, self.P, _ = kalman(self.P, H, N, np.concatenate([row[1] for row in rows]))
             self.move(dx)
         self.sent = [
             Message(

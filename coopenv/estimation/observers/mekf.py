@@ -16,13 +16,13 @@ from typing import ClassVar
 import numpy as np
 
 from coopenv.estimation.observers.base import Array, Coordinates, Estimate, Message, Setup, Tick
-from coopenv.estimation.observers.rotations import exp_so3, orthonormalise, skew, tangent_basis
+from coopenv.estimation.observers.rotations import IDENTITY, exp_so3, orthonormalise, skew, tangent_basis
 
 
 def innovation(R: Array, p: Array, lever_arm: Array, bearings: Array, positions: Array) -> tuple[Array, Array]:
     """Return (residual (m, 2), J (m, 2, 3)): tangent residuals and their derivative by the line d in the body frame."""
     d = (positions - p) @ R - lever_arm
-    distance = np.maximum(np.linalg.norm(d, axis=1), 1e-9)[:, None]
+    distance = np.maximum(np.sqrt((d * d).sum(axis=1)), 1e-9)[:, None]
     B = tangent_basis(d / distance)
     return (B @ bearings[..., None])[..., 0], B / distance[..., None]
 
@@ -43,13 +43,16 @@ class LeftError:
     def predicted(self, tick: Tick) -> LeftError:
         """Return the state after the tick's odometry."""
         F = transition(tick.rotation, tick.translation)
-        P = F @ self.P @ F.T + np.diag(tick.noise.odometry(tick.dt))
+        P = F @ self.P @ F.T
+        P.flat[::7] += tick.noise.odometry(tick.dt)
         return LeftError(orthonormalise(self.R @ tick.rotation), self.p + self.R @ tick.translation, P)
 
     def jacobian(self, positions: Array) -> Array:
         """Return (m, 3, 6) the derivative of the lines to map positions (m, 3)."""
-        a = (positions - self.p) @ self.R
-        return np.concatenate([skew(a), np.broadcast_to(-np.eye(3), (len(a), 3, 3))], axis=2)
+        J = np.empty((len(positions), 3, 6))
+        J[:, :, :3] = skew((positions - self.p) @ self.R)
+        J[:, :, 3:] = -IDENTITY
+        return J
 
     def moved(self, dx: Array, P: Array) -> LeftError:
         """Return the state moved by an error dx."""
@@ -57,12 +60,14 @@ class LeftError:
 
     def point_covariance(self, marker: Array) -> Array:
         """Return the covariance (3, 3) in map axes of a point of the body."""
-        J = self.R @ np.hstack([-skew(marker), np.eye(3)])
+        J = np.empty((3, 6))
+        J[:, :3] = self.R @ skew(-marker)
+        J[:, 3:] = self.R
         return J @ self.P @ J.T
 
-    def estimate(self) -> Estimate:
-        """Return the pose with its covariance."""
-        return Estimate(self.R, self.p, self.P, Coordinates.LEFT)
+    def estimate(self, nis: float | None = None, nis_dof: int = 0) -> Estimate:
+        """Return the pose with its covariance, and the normalised innovation squared of its correction."""
+        return Estimate(self.R, self.p, self.P, Coordinates.LEFT, nis, nis_dof)
 
 
 def transition(rotation: Array, translation: Array) -> Array:
@@ -73,13 +78,15 @@ def transition(rotation: Array, translation: Array) -> Array:
     return F
 
 
-def kalman(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array]:
-    """Return (dx, P+) of a Kalman update with measurement covariance N, in Joseph's form."""
+def kalman(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array, float]:
+    """Return (dx, P+, r^T S^-1 r) of a Kalman update with measurement covariance N, in Joseph's form."""
     PHt = P @ H.T
-    K = np.linalg.solve(H @ PHt + N, PHt.T).T
-    A = np.eye(len(P)) - K @ H
+    solved = np.linalg.solve(H @ PHt + N, np.concatenate([PHt.T, residual[:, None]], axis=1))
+    K = solved[:, :-1].T
+    A = -K @ H
+    A.flat[:: len(P) + 1] += 1.0
     P = A @ P @ A.T + K @ N @ K.T
-    return K @ residual, (P + P.T) / 2
+    return K @ residual, (P + P.T) / 2, float(residual @ solved[:, -1])
 
 
 class Mekf:
@@ -95,27 +102,36 @@ class Mekf:
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
         R, p = initial_pose
+        self.nis: float | None = None
+        self.nis_dof = 0
         self.state = self.belief.start(np.array(R, float), np.array(p, float), np.array(initial_covariance, float))
 
     def update(self, tick: Tick) -> Estimate:
         """Predict, then correct by every usable bearing."""
-        self.state = self.state.predicted(tick)
+        self.state, self.nis, self.nis_dof = self.state.predicted(tick), None, 0
         seen = tick.usable() if tick.due else []
         if seen:
             b, z = np.array([s[1] for s in seen]), np.array([s[2] for s in seen])
             self.correct(tick, b, z, [s[3] for s in seen])
-        return self.state.estimate()
+        return self.state.estimate(self.nis, self.nis_dof)
 
     def correct(self, tick: Tick, b: Array, z: Array, messages: list[Message | None]) -> None:
         """Correct by bearings b (m, 3) to positions z (m, 3)."""
         residual, J = innovation(self.state.R, self.state.p, tick.lever_arm, b, z)
         H = (J @ self.state.jacobian(z)).reshape(-1, 6)
-        N = tick.noise.bearing_std**2 * np.eye(len(H))
+        dx, P, self.nis = kalman(self.state.P, H, self.noise(tick, J, messages), residual.ravel())
+        self.state, self.nis_dof = self.state.moved(dx, P), len(H)
+
+    def noise(self, tick: Tick, J: Array, messages: list[Message | None]) -> Array:
+        """Return (2m, 2m) the covariance of the residuals given one's own pose; J as from `innovation`."""
+        size = 2 * len(messages)
+        N = np.zeros((size, size))
+        N.flat[:: size + 1] = tick.noise.bearing_std**2
         for n, message in enumerate(messages):
             if self.sends_covariance and message is not None and message.covariance is not None:
                 G = J[n] @ self.state.R.T
                 N[2 * n : 2 * n + 2, 2 * n : 2 * n + 2] += G @ message.covariance @ G.T
-        self.state = self.state.moved(*kalman(self.state.P, H, N, residual.ravel()))
+        return N
 
     def message(self) -> Message:
         """Return the marker's position, and its covariance if this filter sends it."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 
 from coopenv.errors import CoopenvError, suggest
 from coopenv.estimation.observers.base import Factory
@@ -15,15 +16,22 @@ GROUP = "coopenv.observers"
 
 ZOO = {
     "dead_reckoning": "dead_reckoning:DeadReckoning",
+    "p3p": "pnp:PerspectivePoints",
     "riccati": "riccati:Riccati",
     "hamel_samson": "hamel_samson:HamelSamson",
     "mekf": "mekf:Mekf",
     "mekf_covariance": "mekf_covariance:MekfCovariance",
     "covariance_intersection": "covariance_intersection:CovarianceIntersection",
+    "left_invariant": "left_invariant:LeftInvariant",
     "right_invariant": "right_invariant:RightInvariant",
+    "ukf": "ukf:Ukf",
+    "factor_graph": "factor_graph:FactorGraph",
     "centralised": "centralised:Centralised",
 }
 """Name to module and class in this package."""
+
+NEEDS = {"factor_graph": "gtsam"}
+"""Members of the zoo that need a module of the extra `bench`."""
 
 _registered: dict[str, Factory] = {}
 
@@ -48,12 +56,25 @@ def observer_names() -> list[str]:
     return sorted({*ZOO, *_registered, *_installed()})
 
 
+def missing(name: str) -> str:
+    """Return the module that an observer of the zoo needs and that is not installed; empty where nothing is missing."""
+    module = NEEDS.get(name, "")
+    return module if module and find_spec(module) is None else ""
+
+
+def available_names() -> list[str]:
+    """Return every known name whose modules are installed."""
+    return [name for name in observer_names() if not missing(name)]
+
+
 def find(name: str) -> Factory:
     """Return the factory of a name.
 
     Raises:
-        CoopenvError: unknown name, or a package's observer cannot be loaded.
+        CoopenvError: unknown name, or what it needs is not installed, or a package's observer cannot be loaded.
     """
+    if module := missing(name):
+        raise CoopenvError(f"observer '{name}' needs {module}: pip install \"coopenv[bench]\"")
     if name in ZOO:
         module, attribute = ZOO[name].split(":")
         return getattr(import_module(f"{__package__}.{module}"), attribute)

@@ -14,7 +14,7 @@ import numpy as np
 
 from coopenv.estimation.observers.base import Array, Coordinates, Estimate, Tick
 from coopenv.estimation.observers.mekf import LeftError, Mekf
-from coopenv.estimation.observers.rotations import exp_so3, orthonormalise, skew
+from coopenv.estimation.observers.rotations import IDENTITY, exp_so3, orthonormalise, skew
 
 
 def from_left(R: Array, p: Array) -> Array:
@@ -47,8 +47,10 @@ class RightError(LeftError):
 
     def jacobian(self, positions: Array) -> Array:
         """Return (m, 3, 6) the derivative of the lines to map positions (m, 3)."""
-        minus = np.broadcast_to(-np.eye(3), (len(positions), 3, 3))
-        return self.R.T @ np.concatenate([skew(positions), minus], axis=2)
+        J = np.empty((len(positions), 3, 6))
+        J[:, :, :3] = self.R.T @ skew(positions)
+        J[:, :, 3:] = -self.R.T
+        return J
 
     def moved(self, dx: Array, P: Array) -> RightError:
         """Return the state moved by an error dx."""
@@ -57,12 +59,12 @@ class RightError(LeftError):
 
     def point_covariance(self, marker: Array) -> Array:
         """Return the covariance (3, 3) in map axes of a point of the body."""
-        J = np.hstack([-skew(self.p + self.R @ marker), np.eye(3)])
+        J = np.hstack([-skew(self.p + self.R @ marker), IDENTITY])
         return J @ self.P @ J.T
 
-    def estimate(self) -> Estimate:
-        """Return the pose with its covariance."""
-        return Estimate(self.R, self.p, self.P, Coordinates.RIGHT)
+    def estimate(self, nis: float | None = None, nis_dof: int = 0) -> Estimate:
+        """Return the pose with its covariance, and the normalised innovation squared of its correction."""
+        return Estimate(self.R, self.p, self.P, Coordinates.RIGHT, nis, nis_dof)
 
 
 class RightInvariant(Mekf):

@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.observers.base import Array
+
+IDENTITY = np.eye(3)
+GENERATORS = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
+"""(3, 9) S(e) of the three axes e, one a row."""
 
 
 def skew(v: Array) -> Array:
     """Return S(v) (..., 3, 3) with S(v) y = v x y."""
     v = np.asarray(v, dtype=np.float64)
-    S = np.zeros((*v.shape, 3))
-    S[..., 0, 1], S[..., 0, 2], S[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    S[..., 1, 0], S[..., 2, 0], S[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
-    return S
+    return (v @ GENERATORS).reshape(*v.shape, 3)
 
 
 def exp_so3(w: Array) -> Array:
@@ -27,7 +29,16 @@ def exp_so3(w: Array) -> Array:
     else:
         a, b = 1.0 - square / 6.0, 0.5 - square / 24.0
     S = skew(w)
-    return np.eye(3) + a * S + b * (S @ S)
+    return IDENTITY + a * S + b * (S @ S)
+
+
+def log_so3(R: Array) -> Array:
+    """Return (3,) the rotation vector of R, of length 0..pi rad."""
+    v = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine, cosine = math.sqrt(v @ v), 0.5 * (float(np.trace(R)) - 1.0)
+    if cosine > -0.9:
+        return v * (math.atan2(sine, cosine) / sine if sine > 1e-9 else 1.0)
+    return Rotation.from_matrix(R).as_rotvec()  # near half a turn the vector part has no direction to speak of
 
 
 def orthonormalise(R: Array) -> Array:
@@ -36,9 +47,15 @@ def orthonormalise(R: Array) -> Array:
 
 
 def tangent_basis(b: Array) -> Array:
-    """Return (m, 2, 3) orthonormal rows across each unit vector b (m, 3)."""
-    helper = np.where(np.abs(b[:, :1]) > 0.7, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
-    S = skew(b)
-    first = (S @ helper[..., None])[..., 0]
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, (S @ first[..., None])[..., 0]], axis=1)
+    """Return (m, 2, 3) orthonormal rows across each unit vector b (m, 3).
+
+    Source: Duff et al., Building an orthonormal basis, revisited, Journal of Computer Graphics Techniques 6(1), 2017.
+    """
+    x, y, z = b.T
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    c = x * y * a
+    B = np.empty((len(b), 2, 3))
+    B[:, 0, 0], B[:, 0, 1], B[:, 0, 2] = 1.0 + sign * x * x * a, sign * c, -sign * x
+    B[:, 1, 0], B[:, 1, 1], B[:, 1, 2] = c, sign + y * y * a, -y
+    return B

@@ -124,7 +124,8 @@ def test_covariance_of_the_marker(coordinates: Coordinates) -> None:
 def test_joseph_update_is_the_information_form() -> None:
     rng = np.random.default_rng(0)
     P, N, H, r = spd(rng, 6), spd(rng, 4), rng.normal(size=(4, 6)), rng.normal(size=4)
-    dx, updated = kalman(P, H, N, r)
+    dx, updated, nis = kalman(P, H, N, r)
+    assert_allclose(nis, r @ np.linalg.inv(H @ P @ H.T + N) @ r, rtol=1e-12)
     information = np.linalg.inv(P) + H.T @ np.linalg.inv(N) @ H
     assert_allclose(updated, np.linalg.inv(information), atol=1e-12)
     assert_allclose(dx, np.linalg.solve(information, H.T @ np.linalg.solve(N, r)), atol=1e-12)
@@ -144,7 +145,8 @@ def test_filter_of_a_vehicle_on_a_line_is_the_scalar_kalman_filter() -> None:
         state = LeftError(state.R, state.p, np.diag([1e-18] * 3 + [state.P[3, 3], 1e-18, 1e-18]))
         b, z = np.array([[measured, 1.0, 0.0]]), np.array([[0.0, distance, 0.0]])
         residual, J = innovation(state.R, state.p, np.zeros(3), b, z)
-        state = state.moved(*kalman(state.P, (J @ state.jacobian(z))[0], sigma**2 * np.eye(2), residual[0]))
+        dx, P, _ = kalman(state.P, (J @ state.jacobian(z))[0], sigma**2 * np.eye(2), residual[0])
+        state = state.moved(dx, P)
         variance += (sv * dt) ** 2
         gain = variance / (variance + (distance * sigma) ** 2)
         x, variance = x + gain * (measured - x), (1 - gain) * variance
@@ -220,6 +222,27 @@ def test_the_weight_minimises_the_determinant() -> None:
     best = best_weight(H @ P @ H.T, own, theirs)
     assert log_determinant(best) < min(log_determinant(w) for w in grid) + 0.02
     assert log_determinant(best) < log_determinant(0.999999)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_weight_is_the_best_of_a_fine_grid(seed: int) -> None:
+    """Covariances of a bearing over eight decades, against log det P+ by the determinant lemma."""
+    rng = np.random.default_rng(seed)
+    prior, own, theirs = (10.0 ** rng.uniform(-8, 0) * spd(rng, 2) for _ in range(3))
+    w = np.concatenate([np.linspace(0.02, 0.99, 5000), 1.0 - np.logspace(-2, -6, 5000)])[:, None, None]
+    N = own + theirs / (1 - w)
+    cost = -6 * np.log(w[:, 0, 0]) + np.log(np.linalg.det(N)) - np.log(np.linalg.det(N + prior / w))
+    best = best_weight(prior, own, theirs)
+    if cost.min() >= 0.0:
+        assert best == 1.0
+    else:
+        near = np.abs(w[:, 0, 0] - best).argmin()
+        assert 0.02 <= best < 1.0
+        assert cost[near] < cost.min() + 1e-5
+
+
+def test_an_exact_neighbour_is_taken_almost_whole() -> None:
+    assert best_weight(0.01 * np.eye(2), 1e-6 * np.eye(2), np.zeros((2, 2))) == 1.0 - 1e-6
 
 
 def test_a_useless_neighbour_is_left_out() -> None:

@@ -1,0 +1,133 @@
+"""Observers in NumPy in place of the embedded one: the world goes tick by tick, they estimate in between."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from coopenv.backends.base import Senses
+from coopenv.errors import CoopenvError
+from coopenv.estimation.observers.base import Estimate
+from coopenv.estimation.observers.recording import Sensed
+from coopenv.estimation.observers.registry import find
+from coopenv.estimation.observers.team import ObserverError, Team
+from coopenv.estimation.observers.written import riccati_covariance
+from coopenv.world.world import World
+
+
+class PlugIns:
+    """A team of observers per world.
+
+    What they estimate is written into the world's state, so that observations, rewards and judgements follow from it
+    as from the embedded observer's. Where an observer states no covariance, the scenario's P(0) stands.
+    """
+
+    def __init__(self, name: str, world: World, senses: Senses) -> None:
+        """Find the observer.
+
+        Raises:
+            CoopenvError: no such observer, or the world is not on the CPU.
+        """
+        factory = find(name)
+        if world.device != "cpu":
+            raise CoopenvError(f"observer '{name}' runs on the host; use device='cpu' instead of '{world.device}'")
+        self.name, self._world, self._senses = name, world, senses
+        briefing = senses.briefing
+        self.teams = [Team(factory, briefing) for _ in range(world.worlds)]
+        self._order: Sequence[int] = briefing.order
+        self._active = wp.zeros(world.worlds, dtype=wp.int32, device=world.device)
+        self._failures: dict[int, str] = {}
+
+    def start(self, worlds: np.ndarray) -> None:
+        """Start the observers of the given worlds (indices), which have just been reset.
+
+        Raises:
+            CoopenvError: an observer cannot start.
+        """
+        R, p = self._world.view("estimate_rotation"), self._world.view("estimate_position")
+        for w in worlds.tolist():
+            self._failures.pop(w, None)
+            rotation = np.array(R[w], dtype=float)
+            position = (rotation @ np.array(p[w], dtype=float)[..., None])[..., 0]
+            try:
+                self.teams[w].start(rotation, position)
+            except ObserverError as failure:
+                raise self._failed(failure) from failure.__cause__
+
+    def advance(self, ticks: int) -> None:
+        """Run camera ticks, stopping each world at its horizon; worlds in the world's mask stay as they are.
+
+        Raises:
+            CoopenvError: an observer failed; its world has to be reset.
+        """
+        for _ in range(ticks):
+            active = (self._world.mask.numpy() == 0) & (self._world.view("tick") < self._world.model.horizon_ticks)
+            if not active.any():
+                return
+            self._tick(active)
+
+    def _tick(self, active: np.ndarray) -> None:
+        world, worlds = self._world, np.flatnonzero(active).tolist()
+        for w in worlds:
+            if w in self._failures:
+                raise CoopenvError(f"{self._failures[w]} (reset starts anew)")
+        self._active.numpy()[...] = active
+        world.sense(self._active)
+        sensed = {w: self._senses.read(w, int(world.view("tick")[w]) + 1) for w in worlds}
+        joint = self.teams[0].joint
+        if joint:
+            for w in worlds:
+                for i, estimate in enumerate(self._ask(w, None, sensed[w])):
+                    self._write(w, i, estimate)
+        for vehicle in self._order:
+            world.deliver(self._active, vehicle)
+            for w in [] if joint else worlds:
+                self._write(w, vehicle, self._ask(w, vehicle, sensed[w])[0])
+            world.broadcast(self._active, vehicle)
+        world.finish(self._active)
+
+    def _ask(self, w: int, vehicle: int | None, sensed: Sensed) -> list[Estimate]:
+        team = self.teams[w]
+        try:
+            if vehicle is None:
+                return [answer.estimate for answer in team.update_all(sensed)]
+            return [team.update(vehicle, sensed, self._world.view("inbox_tick")[w, vehicle]).estimate]
+        except ObserverError as failure:
+            raise self._failed(failure) from failure.__cause__
+
+    def _failed(self, failure: ObserverError) -> CoopenvError:
+        """Return the error, and remember it for the worlds that were in this tick: it has no end."""
+        message = f"observer '{self.name}' {failure}"
+        self._failures.update(dict.fromkeys(np.flatnonzero(self._active.numpy()).tolist(), message))
+        return CoopenvError(message)
+
+    def _write(self, w: int, vehicle: int, estimate: Estimate) -> None:
+        R, view = np.asarray(estimate.rotation, dtype=float), self._world.view
+        view("estimate_rotation")[w, vehicle] = R
+        view("estimate_position")[w, vehicle] = R.T @ np.asarray(estimate.position, dtype=float)
+        P = riccati_covariance(estimate)
+        if P is not None:
+            view("covariance")[w, vehicle] = P
+
+    def get_state(self) -> list[dict[str, Any]]:
+        """Return a deep copy of every observer and message.
+
+        Raises:
+            CoopenvError: an observer cannot be copied.
+        """
+        return [team.get_state() for team in self.teams]
+
+    def set_state(self, states: Any) -> None:
+        """Go back to what `get_state` returned.
+
+        Raises:
+            ValueError: it is of other observers.
+        """
+        if not isinstance(states, list) or len(states) != len(self.teams):
+            raise ValueError(f"state: no observers '{self.name}' in it")
+        for team, state in zip(self.teams, states, strict=True):
+            team.set_state(state)
+        self._failures.clear()

@@ -1,0 +1,199 @@
+"""A sub-dataset as a `Recording`: recorded robots on regular ticks, in the form that every observer runs on.
+
+Five planar vehicles (z = 0, yaw only) among 15 landmarks. Ticks are 0.05 s apart; tick 0 is the first odometry sample
+of any robot. A camera frame counts at the next tick; its bearings are turned by what the odometry turned in between, so
+that they are what the camera would have seen at the tick. Everybody hears everybody: at tick k the last message of
+tick k - 1 or before.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coopenv.backends.mrclam.dataset import MAX_TRUTH_GAP_S, Dataset, Robot
+from coopenv.backends.mrclam.files import ROBOTS, Array
+from coopenv.backends.mrclam.odometry import HeldCommands
+from coopenv.backends.mrclam.variants import Variant, check_variant, frames_of
+from coopenv.errors import DataError
+from coopenv.estimation.observers.base import Gains, SensorNoise, Setup
+from coopenv.estimation.observers.recording import Recording, Truth
+
+TICK_S = 0.05
+MESSAGE_PERIOD_TICKS = 2  # 10 Hz, as V2X radios send
+NOISE = SensorNoise(velocity=0.15, angular_velocity=0.3, odometry_period=TICK_S, bearing=0.03)
+"""For all sub-datasets. The commands' errors are no sensor noise but last; as white noise they amount to
+0.03 m and 0.07 rad per square root of a second."""
+GAINS = (1.0, 10.0, (0.1, 1.0), (0.01, 0.01), 0.1)  # k, q, V, P0, largest turn of a sub-step
+START_STD = (0.01, 0.01)  # rad, m
+DRIFT_STD = (0.05, 0.1)  # rad and m per square root of a second without truth before the start
+
+
+def recording_of(dataset: Dataset, variant: Variant) -> Recording:
+    """Put a sub-dataset on ticks.
+
+    Truth is NaN where motion capture is not valid. Every robot starts at its true pose; one that motion capture sees
+    later starts where dead reckoning, back from there, says.
+
+    Args:
+        dataset: what was recorded.
+        variant: `landmarks` (no robot sees another), `landmarks+robots`, or `blind` (robots 3 to 5 see robots only).
+
+    Raises:
+        DataError: unknown variant, or motion capture never sees a robot.
+    """
+    check_variant(variant)
+    subjects = [*sorted(dataset.landmarks), *ROBOTS]
+    L, N, T = len(dataset.landmarks), len(ROBOTS), len(subjects)
+    t = np.arange(int(dataset.duration_s / TICK_S) + 1, dtype=np.float64) * TICK_S
+    K = len(t)
+    rotation, translation = np.broadcast_to(np.eye(3), (K, N, 3, 3)).copy(), np.zeros((K, N, 3))
+    velocity, angular_velocity = np.zeros((K, N, 3)), np.zeros((K, N, 3))
+    bearings, visible = np.full((K, N, T, 3), np.nan), np.zeros((K, N, T), bool)
+    pose = np.full((K, N, 3), np.nan)
+    start, covariance = np.zeros((N, 3)), np.zeros((N, 6, 6))
+    for i, robot in enumerate(dataset.robots):
+        held = HeldCommands(robot)
+        velocity[:, i, 0], angular_velocity[:, i, 2] = held.commands(t)
+        turn, translation[1:, i, :2] = _increments(held, t)
+        rotation[1:, i] = _yaw(turn)
+        _see(robot, variant, held, t, subjects, bearings[:, i], visible[:, i])
+        pose[:, i] = _truth(robot, held, t)
+        start[i], covariance[i] = _start(robot, held, pose[:, i], t)
+    truth = Truth(_yaw(pose[..., 2]), np.concatenate([pose[..., :2], 0.0 * pose[..., :1]], axis=-1))
+    points = np.array([[*dataset.landmarks[subject], 0.0] for subject in subjects[:L]])
+    start_position = np.column_stack([start[:, :2], np.zeros(N)])
+    start_rotation, landmarks = _yaw(start[:, 2]), np.broadcast_to(points, (K, L, 3))
+    for array in (rotation, translation, velocity, angular_velocity, bearings, visible, start_rotation):
+        array.setflags(write=False)  # observers get views
+    return Recording(
+        setups=_setups(subjects, L),
+        order=tuple(range(N)),
+        dt=TICK_S,
+        rotation=rotation,
+        translation=translation,
+        velocity=velocity,
+        angular_velocity=angular_velocity,
+        bearings=bearings,
+        visible=visible,
+        landmarks=landmarks,
+        inbox_tick=_inbox(K, N),
+        period=MESSAGE_PERIOD_TICKS,
+        staleness=math.inf,
+        due=np.ones(K, bool),
+        start_rotation=start_rotation,
+        start_position=start_position,
+        start_covariance=covariance,
+        truth=truth,
+    )
+
+
+def _setups(subjects: list[int], landmarks: int) -> tuple[Setup, ...]:
+    names = tuple([f"landmark_{s}" for s in subjects[:landmarks]] + [f"vehicle_{s}" for s in ROBOTS])
+    k, q, V, P0, max_turn = GAINS
+    gains = Gains(k, np.full(len(subjects), q), V, P0, max_turn)
+    return tuple(
+        Setup(
+            vehicle=i,
+            name=f"vehicle_{robot}",
+            target_names=names,
+            landmarks=landmarks,
+            targets=np.delete(np.arange(len(subjects)), landmarks + i),
+            lever_arm=np.zeros(3),
+            marker=np.zeros(3),
+            noise=NOISE,
+            gains=gains,
+            planar=True,
+        )
+        for i, robot in enumerate(ROBOTS)
+    )
+
+
+def _inbox(ticks: int, vehicles: int) -> NDArray[np.int64]:
+    """Return (K, N, N) the tick of the last message heard: sent one tick ago or more."""
+    before = np.maximum(np.arange(ticks) - 1, 0)
+    last = before - before % MESSAGE_PERIOD_TICKS
+    inbox = np.repeat(last, vehicles * vehicles).reshape(ticks, vehicles, vehicles)
+    inbox[0] = -1
+    inbox[:, np.arange(vehicles), np.arange(vehicles)] = -1
+    return inbox
+
+
+def _increments(held: HeldCommands, t: Array) -> tuple[Array, Array]:
+    """Return turn (K - 1,) and displacement (K - 1, 2) over each tick, in the body frame at its start."""
+    heading, position = held.heading(t), held.position(t)
+    return np.diff(heading), _turned(np.diff(position, axis=0), -heading[:-1])
+
+
+def _see(
+    robot: Robot,
+    variant: Variant,
+    held: HeldCommands,
+    t: Array,
+    subjects: list[int],
+    bearings: Array,
+    visible: NDArray[np.bool_],
+) -> None:
+    """Fill in what one robot's camera saw: bearings (K, T, 3) and visible (K, T)."""
+    column = {subject: n for n, subject in enumerate(subjects)}
+    for frame in frames_of(robot, variant):
+        k = max(int(np.searchsorted(t, frame.t)), 1)
+        if k == len(t):
+            break
+        turned = held.heading(np.array([frame.t, t[k]]))
+        beta = frame.bearings - (turned[1] - turned[0])
+        for subject, angle in zip(frame.subjects.tolist(), beta.tolist(), strict=True):
+            if subject in column:  # a landmark that is not in the survey is of no use
+                bearings[k, column[subject]] = (math.cos(angle), math.sin(angle), 0.0)
+                visible[k, column[subject]] = True
+
+
+def _truth(robot: Robot, held: HeldCommands, t: Array) -> Array:
+    """Return x, y, heading (K, 3) at the ticks, NaN where not valid.
+
+    A row that stands alone (the next more than 0.5 s away) counts at the tick next to it, moved on by the odometry.
+    """
+    position, heading, valid, heading_valid = robot.truth.at(t)
+    pose = np.column_stack([position, heading])
+    rows = robot.truth.t
+    gap = np.diff(rows, prepend=-np.inf, append=np.inf) > MAX_TRUTH_GAP_S
+    alone = np.flatnonzero(gap[:-1] & gap[1:] & (rows >= 0) & (rows <= t[-1]))
+    k = np.rint(rows[alone] / TICK_S).astype(int)
+    alone, k = alone[k < len(t)], k[k < len(t)]
+    turn = held.heading(t[k]) - held.heading(rows[alone])
+    at_row = robot.truth.heading[alone]
+    moved = _turned(held.position(t[k]) - held.position(rows[alone]), at_row - held.heading(rows[alone]))
+    pose[k] = np.column_stack([robot.truth.position[alone] + moved, at_row + turn])
+    valid[k] = True
+    heading_valid[k] = robot.truth.at(rows[alone])[3]
+    pose[~valid] = np.nan
+    pose[~heading_valid, 2] = np.nan
+    return pose
+
+
+def _start(robot: Robot, held: HeldCommands, pose: Array, t: Array) -> tuple[Array, Array]:
+    """Return the pose (3,) at tick 0 and its covariance (6, 6), LEFT coordinates."""
+    known = np.flatnonzero(np.isfinite(pose).all(axis=1))
+    if known.size == 0:
+        raise DataError(f"robot {robot.subject}: no ground truth while it records odometry")
+    first = int(known[0])
+    position, heading = held.position(t[[0, first]]), held.heading(t[[0, first]])
+    at_start = pose[first, 2] - heading[1] + heading[0]
+    back = _turned((position[0] - position[1])[None], np.array([pose[first, 2] - heading[1]]))[0]
+    variances = np.square(START_STD) + np.square(DRIFT_STD) * t[first]
+    return np.array([*(pose[first, :2] + back), at_start]), np.diag(np.repeat(variances, 3))
+
+
+def _turned(vectors: Array, angle: Array) -> Array:
+    """Return vectors (K, 2) turned by angles (K,)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * vectors[:, 0] - s * vectors[:, 1], s * vectors[:, 0] + c * vectors[:, 1]], axis=-1)
+
+
+def _yaw(angle: Array) -> Array:
+    """Return rotations (..., 3, 3) about z; NaN where the angle is."""
+    c, s, zero = np.cos(angle), np.sin(angle), 0.0 * angle
+    rows = [np.stack(row, axis=-1) for row in ((c, -s, zero), (s, c, zero), (zero, zero, zero + 1.0))]
+    return np.stack(rows, axis=-2)

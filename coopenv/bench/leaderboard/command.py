@@ -1,0 +1,201 @@
+"""`coopenv bench observers`: from what the user asked for to tables and files."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rich.console import Console
+from rich.table import Table
+
+from coopenv.bench.leaderboard import files
+from coopenv.bench.leaderboard.basin import Basin, Draw, basins_of, plain_draws, study_basin
+from coopenv.bench.leaderboard.compare import Outcome, compare
+from coopenv.bench.leaderboard.engines import Engine
+from coopenv.bench.leaderboard.rows import Row
+from coopenv.bench.leaderboard.sources import Source, find_source, variants_of
+from coopenv.bench.leaderboard.tables import error_table, failures, new_table, quality_table, variant_table
+from coopenv.estimation.metrics import json_ready
+from coopenv.estimation.observers.faults import FAULTS
+from coopenv.estimation.observers.registry import available_names, find, missing, observer_names
+from coopenv.runs.command import progress
+from coopenv.runs.output import prepare_folder
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is to be compared."""
+
+    source: Source
+    source_text: str
+    """As the user named it."""
+    observers: tuple[str, ...]
+    variants: tuple[str, ...]
+    seeds: int
+    steady_from: float | None = None
+    basin: int = 0
+    """Draws of initial estimates; 0: no study of basins."""
+    options: tuple[str, ...] = ()
+    """Further options that the result depends on."""
+    left_out: tuple[str, ...] = ()
+    """Observers that would have been compared, but for a module that is not installed."""
+
+    @property
+    def command(self) -> str:
+        """The command that gives the same table again."""
+        words = ["coopenv", "bench", "observers", self.source_text, "--observers", ",".join(self.observers)]
+        words += ["--variants", ",".join(self.variants), "--seeds", str(self.seeds)]
+        words += [] if self.steady_from is None else ["--steady-from", f"{self.steady_from:g}"]
+        words += ["--basin", str(self.basin)] if self.basin else []
+        return shlex.join([*words, *self.options])
+
+
+def request_of(
+    text: str,
+    observers: str | None,
+    variants: str | None,
+    seeds: int,
+    steady_from: float | None,
+    basin: int,
+    data: Path | None,
+    overrides: Mapping[str, Any],
+    assignments: Sequence[str],
+) -> Request:
+    """Return the request behind the options of the command line.
+
+    Args:
+        text: environment, dataset or log file.
+        observers: names with commas between; None: all.
+        variants: the same, or `all`; None: the usual ones of the source.
+        seeds: how many.
+        steady_from: s; None: the source's own.
+        basin: draws.
+        data: folder of recorded data.
+        overrides: of the scenario.
+        assignments: the same, as they were written.
+
+    Raises:
+        CoopenvError: something of it does not exist.
+    """
+    source = find_source(text, overrides, data)
+    names = tuple(dict.fromkeys(name.strip() for name in observers.split(","))) if observers else available_names()
+    for name in names:
+        find(name)
+    left_out = () if observers else tuple(name for name in observer_names() if missing(name))
+    options = [word for assignment in assignments for word in ("--set", assignment)]
+    options += [] if data is None else ["--data", str(data)]
+    wanted = variants_of(source, variants)
+    return Request(source, text, tuple(names), wanted, seeds, steady_from, basin, tuple(options), left_out)
+
+
+def perform(request: Request, engine: Engine, out: Path | None, printed: Console, log: Console) -> None:
+    """Compare, print the tables and write the files.
+
+    Args:
+        request: what is to be compared.
+        engine: where the work is done.
+        out: folder for the files; None: no files.
+        printed: for the tables.
+        log: for the progress.
+
+    Raises:
+        CoopenvError: something that was asked for does not exist, or cannot be written.
+    """
+    names = (*files.FILES, files.BASIN_FILE) if request.basin else files.FILES
+    if out is not None:
+        prepare_folder(out, names)  # before the work, not after it
+    for name in request.left_out:
+        log.print(
+            f'left out: {name} (needs {missing(name)}: pip install "coopenv[bench]")', soft_wrap=True, markup=False
+        )
+    outcome = _with_progress(
+        log,
+        f"{len(request.observers)} observers, {len(request.variants)} variants, {request.seeds} seeds",
+        lambda update: compare(
+            request.source,
+            request.observers,
+            request.seeds,
+            request.variants,
+            request.steady_from,
+            engine,
+            update,
+        ),
+    )
+    draws: list[Draw] = []
+    if request.basin:
+        draws = _with_progress(
+            log,
+            f"{len(request.observers)} observers, {request.basin} initial estimates",
+            lambda update: study_basin(request.source, request.observers, request.basin, engine, update),
+        )
+    basins = basins_of(request.source.name, draws)
+    print_tables(outcome.rows, basins, printed)
+    if out is not None:
+        write_files(request, outcome, draws, basins, out)
+        printed.print(f"Files in {out}: {', '.join(names)}", soft_wrap=True)
+
+
+def print_tables(rows: Sequence[Row], basins: Sequence[Basin], printed: Console) -> None:
+    """Print errors and quality, faults as one table, basins, and who failed."""
+    variants = list(dict.fromkeys(row.variant for row in rows))
+    in_full = variants[:1] if all(name in FAULTS for name in variants) else variants
+    for variant in in_full:
+        own = [row for row in rows if row.variant == variant]
+        printed.print(f"\n{own[0].environment}, {variant}")
+        printed.print(error_table(own))
+        printed.print()
+        printed.print(quality_table(own))
+    if len(variants) > 1:
+        printed.print()
+        printed.print(variant_table(rows))
+    if basins:
+        printed.print()
+        printed.print(_basin_table(basins))
+    for line in failures(rows):
+        printed.print(line, soft_wrap=True)
+
+
+def _basin_table(basins: Sequence[Basin]) -> Table:
+    table = new_table("basin", ["draws", "all vehicles\nconverge", "95 %", "settled [s]\nmedian"])
+    for basin in basins:
+        low, high = (100 * end for end in basin.interval)
+        settled = basin.settle_time_s
+        table.add_row(
+            basin.observer,
+            str(basin.draws),
+            f"{100 * basin.converged_fraction:.1f} %",
+            f"{low:.1f}..{high:.1f} %",
+            f"{settled:.1f}" if settled == settled else "-",
+        )
+    return table
+
+
+def write_files(request: Request, outcome: Outcome, draws: Sequence[Draw], basins: Sequence[Basin], out: Path) -> None:
+    """Write the leaderboard as JSON and CSV, the draws as CSV, and the report.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    from coopenv.bench.leaderboard.report import Report, write_report
+
+    more = {"basin": [asdict(basin) for basin in basins]} if basins else {}
+    seeds = request.seeds if request.source.seeded else 1
+    content = files.document(outcome.rows, request.command, seeds, **more)
+    files.write_json(content, out / files.JSON_FILE)
+    files.write_rows(outcome.rows, out / files.CSV_FILE)
+    if draws:
+        table = json_ready(plain_draws(draws))
+        files.write_csv(table, list(table[0]), out / files.BASIN_FILE)
+    title = f"Observers in {request.source.name}"
+    write_report(Report(title, content, outcome.rows, outcome.samples, draws, basins), out / files.REPORT_FILE)
+
+
+def _with_progress(log: Console, description: str, work: Callable[[Callable[[float], None]], T]) -> T:
+    with progress(log) as bar:
+        task = bar.add_task(description, total=1.0)
+        return work(lambda share: bar.update(task, completed=share))

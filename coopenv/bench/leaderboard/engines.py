@@ -1,0 +1,199 @@
+"""Where the work is done: in processes of this machine, or on an existing Ray cluster.
+
+An engine maps one function over tasks. What comes out does not depend on the engine, nor on how many workers there are.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import socket
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
+
+from coopenv.errors import CoopenvError
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+"""Numerical libraries read these when they are loaded. Matrices here are small: threads would only get in the way."""
+
+AUTO = "auto"
+ENGINES = ("local", "ray")
+PATIENCE = 30.0  # s, to reach a cluster
+
+
+class Engine(Protocol):
+    """Runs tasks somewhere."""
+
+    def check(self) -> None:
+        """Make sure that it can work, before the work begins.
+
+        Raises:
+            CoopenvError: it cannot.
+        """
+        ...
+
+    def map(self, function: Callable[[T], R], tasks: Sequence[T], on_done: Callable[[int], None]) -> list[R]:
+        """Return function(task) of every task, in their order; calls `on_done(count)` whenever one is done."""
+        ...
+
+
+def cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def find_engine(name: str, jobs: int | None = None, address: str | None = None) -> Engine:
+    """Return an engine that is ready.
+
+    Args:
+        name: `local` or `ray`.
+        jobs: processes of the local one; None: one per core.
+        address: HOST:PORT of a running cluster, or `auto` for the one of this machine (None: the same).
+
+    Raises:
+        CoopenvError: no such engine, an option of the other one, or it is not ready.
+    """
+    if name not in ENGINES:
+        raise CoopenvError(f"--engine {name}: known are {', '.join(ENGINES)}")
+    if name == "local":
+        if address is not None:
+            raise CoopenvError(f"--address {address}: only --engine ray has an address")
+        return Local(jobs or cores())
+    if jobs is not None:
+        raise CoopenvError(f"--jobs {jobs}: with --engine ray the cluster decides")
+    engine = Ray(address or AUTO)
+    engine.check()
+    return engine
+
+
+@dataclass(frozen=True)
+class Local:
+    """Processes of this machine, or this very process where one is enough."""
+
+    jobs: int
+
+    def check(self) -> None:
+        """Do nothing: this machine is here."""
+
+    def map(self, function: Callable[[T], R], tasks: Sequence[T], on_done: Callable[[int], None]) -> list[R]:
+        """Return function(task) of every task."""
+        results: dict[int, R] = {}
+        jobs = min(self.jobs, len(tasks))
+        if jobs <= 1:
+            for n, task in enumerate(tasks):
+                results[n] = function(task)
+                on_done(n + 1)
+        else:
+            with (
+                single_threaded(),
+                ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool,
+            ):
+                work = {pool.submit(function, task): n for n, task in enumerate(tasks)}
+                try:
+                    for done in as_completed(work):
+                        results[work[done]] = done.result()
+                        on_done(len(results))
+                except BaseException:
+                    pool.shutdown(wait=False, cancel_futures=True)
+                    raise
+        return [results[n] for n in range(len(tasks))]
+
+
+@contextlib.contextmanager
+def single_threaded() -> Iterator[None]:
+    """Let processes that are started meanwhile compute with one thread each."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@dataclass(frozen=True)
+class Ray:
+    """Tasks of an existing Ray cluster, whose nodes have coopenv installed; one core each."""
+
+    address: str
+
+    def check(self) -> None:
+        """Connect, or say in one line why not.
+
+        Raises:
+            CoopenvError: Ray is not installed, or the cluster does not answer in time.
+        """
+        if self.address != AUTO:
+            reach(self.address)
+        self._connect()
+
+    def map(self, function: Callable[[T], R], tasks: Sequence[T], on_done: Callable[[int], None]) -> list[R]:
+        """Return function(task) of every task; Ray repeats those whose node was lost."""
+        ray = self._connect()
+        remote = ray.remote(num_cpus=1, max_retries=3)(function)
+        work = {remote.remote(task): n for n, task in enumerate(tasks)}
+        results: dict[int, R] = {}
+        waiting = list(work)
+        while waiting:
+            done, waiting = ray.wait(waiting, num_returns=1)
+            for reference in done:
+                try:
+                    results[work[reference]] = ray.get(reference)
+                except ray.exceptions.RayTaskError as error:
+                    raise error.cause or error from None
+                on_done(len(results))
+        return [results[n] for n in range(len(tasks))]
+
+    def _connect(self) -> Any:
+        os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # a failure is told in one line, here
+        try:
+            import ray
+        except ImportError:
+            raise CoopenvError("--engine ray needs Ray: pip install 'coopenv[ray]'") from None
+        if not ray.is_initialized():
+            # In a thread that may be left behind: something that accepts and never answers would hold up Ray for ever.
+            failure: list[BaseException | None] = []
+            attempt = threading.Thread(target=self._attempt, args=(ray, failure), daemon=True)
+            attempt.start()
+            attempt.join(PATIENCE)
+            if not failure or failure[0] is not None:
+                reason = str(failure[0]).strip().splitlines()[0] if failure else f"no answer within {PATIENCE:g} s"
+                raise CoopenvError(
+                    f"no Ray cluster at '{self.address}': {reason} (one with tokens needs RAY_AUTH_MODE=token and "
+                    "RAY_AUTH_TOKEN_PATH)"
+                )
+        return ray
+
+    def _attempt(self, ray: Any, failure: list[BaseException | None]) -> None:
+        environment = {"env_vars": dict.fromkeys(THREADS, "1")}
+        try:
+            ray.init(address=self.address, runtime_env=environment, log_to_driver=False, configure_logging=False)
+        except Exception as error:
+            failure.append(error)
+        else:
+            failure.append(None)
+
+
+def reach(address: str, patience: float = 10.0) -> None:
+    """Make sure that something listens at HOST:PORT.
+
+    Raises:
+        CoopenvError: nothing does, or that is no such address.
+    """
+    host, _, port = address.rpartition(":")
+    if not host or not port.isdigit():
+        raise CoopenvError(f"--address {address}: expected HOST:PORT or {AUTO}")
+    try:
+        socket.create_connection((host, int(port)), timeout=patience).close()
+    except (OSError, OverflowError) as error:
+        raise CoopenvError(f"no Ray cluster at '{address}': {error}") from None

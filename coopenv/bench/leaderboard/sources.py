@@ -1,0 +1,177 @@
+"""Where the benchmark's records come from: a simulated environment, recorded robots, or a log file.
+
+A source is small and picklable, so that a worker process makes the record itself.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+from coopenv.errors import CoopenvError, suggest
+from coopenv.estimation.metrics import STEADY_SHARE, steady_start
+from coopenv.estimation.observers.faults import FAULTS, NOMINAL, Lie
+from coopenv.estimation.observers.runner import Recording, record
+from coopenv.scenario import Scenario, load_scenario
+
+LOG_SUFFIX = ".mcap"
+ROBOTS = re.compile(r"mrclam_\d+")
+
+
+class Source(Protocol):
+    """Records of one environment in several variants."""
+
+    @property
+    def name(self) -> str:
+        """As it stands in the rows."""
+        ...
+
+    @property
+    def variants(self) -> tuple[str, ...]:
+        """All there are."""
+        ...
+
+    @property
+    def usual(self) -> tuple[str, ...]:
+        """Those that are run unless others are asked for."""
+        ...
+
+    @property
+    def seeded(self) -> bool:
+        """Whether another seed gives another record."""
+        ...
+
+    def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
+        """Return a record, and the lie that somebody tells on it."""
+        ...
+
+    def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
+        """Return when the steady state starts, s; without a record only what is asked for is checked."""
+        ...
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A scenario, once per seed, as it is and with faults."""
+
+    name: str
+    scenario: Scenario
+    variants: ClassVar[tuple[str, ...]] = tuple(FAULTS)
+    usual: ClassVar[tuple[str, ...]] = (NOMINAL,)
+    seeded: ClassVar[bool] = True
+
+    def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
+        """Return the world of a seed with a fault."""
+        return FAULTS[variant].applied(record(self.scenario, seed), seed)
+
+    def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
+        """Return when the steady state starts, s.
+
+        Raises:
+            CoopenvError: what was asked for does not lie within the horizon.
+        """
+        return steady_start(given, self.scenario.horizon)
+
+
+@dataclass(frozen=True)
+class Robots:
+    """A sub-dataset of MR.CLAM. It is judged from the start on, where the robots' poses are known."""
+
+    name: str
+    data: Path | None
+    """The folder with the data; None: as the environment variable COOPENV_DATA says."""
+    variants: ClassVar[tuple[str, ...]] = ("landmarks", "landmarks+robots", "blind")
+    usual: ClassVar[tuple[str, ...]] = variants
+    seeded: ClassVar[bool] = False
+
+    def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
+        """Return the robots' record.
+
+        Raises:
+            CoopenvError: the data are not there or not well-formed.
+        """
+        from coopenv.backends.mrclam import load_dataset
+        from coopenv.backends.mrclam.variants import VARIANTS
+        from coopenv.backends.mrclam.recording import recording_of
+
+        known = next(name for name in VARIANTS if name == variant)
+        return recording_of(load_dataset(self.name, self.data), known), None
+
+    def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
+        """Return when judging starts, s."""
+        return 0.0 if given is None else given
+
+
+@dataclass(frozen=True)
+class LogFile:
+    """A record in a file, as it is and with faults."""
+
+    name: str
+    path: Path
+    variants: ClassVar[tuple[str, ...]] = tuple(FAULTS)
+    usual: ClassVar[tuple[str, ...]] = (NOMINAL,)
+    seeded: ClassVar[bool] = False
+
+    def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
+        """Return the file's record with a fault.
+
+        Raises:
+            CoopenvError: the file is no such record.
+        """
+        from coopenv.backends.mcap import read_recording
+
+        return FAULTS[variant].applied(read_recording(self.path), seed)
+
+    def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
+        """Return when the steady state starts, s: recorded robots are judged from the start on."""
+        if given is not None or recording is None:
+            return given or 0.0
+        planar = all(setup.planar for setup in recording.setups)
+        return 0.0 if planar else STEADY_SHARE * float(recording.t[-1])
+
+
+def find_source(text: str, overrides: Mapping[str, Any] | None = None, data: Path | None = None) -> Source:
+    """Return the source of an environment's name, a scenario file, a sub-dataset's name or a log file.
+
+    Args:
+        text: what the user named.
+        overrides: of a scenario, by dotted key.
+        data: folder of recorded data.
+
+    Raises:
+        CoopenvError: there is none of that name, or overrides for what is no scenario.
+    """
+    if not (ROBOTS.fullmatch(text) or text.endswith(LOG_SUFFIX)):
+        return Simulated(Path(text).stem, load_scenario(text, overrides))
+    if overrides:
+        raise CoopenvError(f"--set {next(iter(overrides))}: {text} is recorded, it has no scenario to change")
+    if text.endswith(LOG_SUFFIX):
+        if not Path(text).is_file():
+            raise CoopenvError(f"no such log file: {text}")
+        return LogFile(Path(text).stem, Path(text))
+    return Robots(text, data)
+
+
+def variants_of(source: Source, asked: str | None) -> tuple[str, ...]:
+    """Return the variants to run.
+
+    Args:
+        source: which has them.
+        asked: names with commas between, `all`, or None for the usual ones.
+
+    Raises:
+        CoopenvError: there is none of that name.
+    """
+    if asked is None:
+        return source.usual
+    names = tuple(dict.fromkeys(name.strip() for name in asked.split(",")))
+    if names == ("all",):
+        return source.variants
+    for name in names:
+        if name not in source.variants:
+            known = ", ".join((*source.variants, "all"))
+            raise CoopenvError(f"unknown variant '{name}'{suggest(name, list(source.variants))}; known: {known}")
+    return names

@@ -1,0 +1,286 @@
+"""The observer of this project's own: consistent, hard to mislead, and at home from any start.
+
+One vehicle keeps a joint belief about itself and the vehicles that it hears. Bearings, to landmarks and to vehicles,
+correct that belief; a neighbour's messages add what the neighbour has learnt since its last one (report.py), and no
+more. So nothing that was heard before counts twice, and the neighbour's slowly varying error is no white noise.
+
+- Start and loss: with no useful prior, or when most bearings contradict the belief, the pose is searched for among all
+  P3P solutions (search.py). Meanwhile the vehicle says nothing.
+- Wrong associations: a bearing counts if it fits (chi-square gate on the innovation) and its target is ahead.
+- Liars: a message that contradicts the belief about its sender is not used; the sender is then tracked by its own
+  odometry and by bearings, until its messages have agreed for a while.
+- Loss and delay: a sender stands in the belief where its last message put it, and is carried on by its last twist.
+- Rumours: what a neighbour learnt from others may reach this vehicle by more ways than one. `SHARE` of it counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from coopenv.estimation.observers.base import Array, Coordinates, Estimate, Message, SensorNoise, Setup, Tick
+from coopenv.estimation.observers.robust.belief import Belief, Line, Member
+from coopenv.estimation.observers.robust.report import (
+    Report,
+    from_message,
+    left_error,
+    mask_of,
+    to_message,
+    tracklet,
+)
+from coopenv.estimation.observers.robust.resection import resect
+from coopenv.estimation.observers.robust.search import GATE, Search, Sighting, is_known
+from coopenv.estimation.observers.rotations import orthonormalise
+
+SHARE = 0.7
+"""Of what a neighbour that leans on others has learnt."""
+TRUST_GATE = 40.0
+"""Of the squared distance between a message and the belief about its sender: chi-square of 6, 1 - 5e-7."""
+AGREED_FOR, AGREED_DISTANCE = 1.0, 1.0
+"""s and m: how long and how closely a distrusted sender must agree before it is believed again."""
+LOST_SHARE, LOST_TIME = 0.6, 0.5
+"""Share of bearings that contradict the belief, and the time over which it is averaged, s."""
+ACCELERATION = 1.0
+"""m/s^2 by which a vehicle may leave its last known twist."""
+SPEED = 1.0
+"""m/s at which a sender may have gone on since a message that is used in the search."""
+LOST = np.diag([4.0, 4.0, 4.0, 400.0, 400.0, 400.0])
+"""Prior covariance of a search after a loss, rad^2 and m^2."""
+NOTHING, PLANE = np.zeros((3, 3)), np.eye(2)
+LEAST_VELOCITY_STD, LEAST_ANGULAR_STD = 2e-3, 2e-4
+"""m/s and rad/s, of an odometry sample: the increments of a moving vehicle are never exact."""
+
+
+@dataclass
+class Contact:
+    """What is known of a sender."""
+
+    last: Report
+    trusted: bool = True
+    agreed: float = 0.0
+    """s since which a distrusted sender has agreed."""
+
+
+class Robust:
+    """One vehicle's observer; messages hold pose and covariance (196 bytes)."""
+
+    most_members = 5
+    """The vehicle itself and those it keeps in its belief."""
+
+    def __init__(self, setup: Setup) -> None:
+        """Take what the vehicle knows before it starts."""
+        self.vehicle, self.landmarks, self.marker = setup.vehicle, setup.landmarks, setup.marker
+        self.noise = SensorNoise(
+            max(setup.noise.velocity, LEAST_VELOCITY_STD),
+            max(setup.noise.angular_velocity, LEAST_ANGULAR_STD),
+            setup.noise.odometry_period,
+            setup.noise.bearing,
+        )
+        self.variance = self.noise.bearing_std**2
+
+    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
+        """Start at a pose; one that is too uncertain to linearise about is only a hint for the search."""
+        R, p = (np.array(x, float) for x in initial_pose)
+        P = np.array(initial_covariance, float)
+        self.odometry = np.eye(3), np.zeros(3)
+        self.contacts: dict[int, Contact] = {}
+        self.leans_on = 0
+        self.missed = 0.0
+        self.belief = Belief(self.vehicle, R, p, P)
+        self.search = None if is_known(P) else Search(self.vehicle, R, p, P)
+
+    def update(self, tick: Tick) -> Estimate:
+        """Take one camera tick."""
+        R, p = self.odometry
+        self.odometry = orthonormalise(R @ tick.rotation), p + R @ tick.translation
+        noise = self.noise.odometry(tick.dt)
+        if self.search is not None:
+            self.search.move(tick, noise)
+            if tick.due:
+                self._search(tick)
+        else:
+            self.belief.move(0, tick.rotation, tick.translation, noise)
+            self.belief.own.time = tick.time
+            self._listen(tick)
+            if tick.due:
+                self._look(tick)
+        belief = self.belief if self.search is None else self.search.best
+        return Estimate(belief.own.R, belief.own.p, belief.P[:6, :6].copy(), Coordinates.LEFT)
+
+    def message(self) -> Message:
+        """Return pose, covariance and odometry, or nothing while the pose is not known."""
+        if self.search is not None or not is_known(self.belief.P[:6, :6]):
+            return Message()
+        return to_message(self.belief, self.marker, self.odometry, self.leans_on)
+
+    def _search(self, tick: Tick) -> None:
+        """Look for the pose; once only one is possible, go on with what this frame alone says of it."""
+        assert self.search is not None
+        found = self.search.look(tick, self._sightings(tick), self.variance)
+        if found is None:
+            return
+        own = found.own
+        self.belief, self.contacts, self.leans_on = Belief(self.vehicle, own.R, own.p, found.P.copy(), tick.time), {}, 0
+        self._listen(tick)
+        if resect(self.belief, lambda: self._fitting(tick)[0]) and is_known(self.belief.P[:6, :6]):
+            self.search, self.missed = None, 0.0
+
+    def _sightings(self, tick: Tick) -> list[Sighting]:
+        """Return every target in view whose place is known or told by a sender that knows it."""
+        reports = {report.vehicles[0]: report for report in self._reports(tick)}
+        result = []
+        for n in np.flatnonzero(tick.valid):
+            target = int(tick.targets[n])
+            if target < self.landmarks:
+                result.append(Sighting(tick.bearings[n], tick.landmarks[target], NOTHING))
+            elif (report := reports.get(target - self.landmarks)) is not None:
+                R, age = report.R[0], tick.time - report.time[0]
+                covariance = R @ report.P[3:6, 3:6] @ R.T + (SPEED * age) ** 2 * np.eye(3)
+                result.append(Sighting(tick.bearings[n], report.p[0], covariance))
+        return result
+
+    def _lose(self) -> None:
+        """Search anew; where the vehicle was is hardly a hint."""
+        own = self.belief.own
+        self.search = Search(self.vehicle, own.R, own.p, LOST.copy())
+
+    def _report(self, message: Message, sender: int, time: float) -> Report | None:
+        """Return what a message says."""
+        return from_message(message, sender, time)
+
+    def _speaking(self, reports: list[Report]) -> list[Report]:
+        """Return the reports whose news count."""
+        return reports
+
+    def _reports(self, tick: Tick) -> list[Report]:
+        """Return what the messages say that were heard."""
+        heard = tick.messages.items()
+        read = [self._report(m.message, target - self.landmarks, tick.time - m.age) for target, m in heard]
+        return [report for report in read if report is not None]
+
+    def _listen(self, tick: Tick) -> None:
+        """Take in the messages of those in view, and of those that are already believed in."""
+        in_view = {int(target) - self.landmarks for target in tick.targets[tick.valid]}
+        reports = self._reports(tick)
+        speaking = self._speaking(reports)
+        for report in speaking:
+            contact = self.contacts.get(report.vehicles[0])
+            if contact is not None and contact.last.vehicles == report.vehicles:
+                self._hear(contact, report)
+            elif contact is not None or in_view & set(report.vehicles):
+                self._meet(report)
+        for report in reports:  # the news of the others are in what was taken in
+            if report not in speaking and (contact := self.contacts.get(report.vehicles[0])) is not None:
+                contact.last = report
+
+    def _meet(self, report: Report) -> None:
+        """Take in a sender that is new, or tells of other vehicles than before."""
+        told = set(report.vehicles) - {self.vehicle}
+        self.belief.drop(told)
+        if len(self.belief.members) + len(told) > self.most_members:
+            return
+        numbers = [n for n, v in enumerate(report.vehicles) if v in told]
+        index = np.concatenate([np.arange(6 * n, 6 * n + 6) for n in numbers])
+        odometry = zip(report.odometry_R, report.odometry_p, strict=True)
+        poses = list(zip(report.vehicles, report.R, report.p, report.time.tolist(), odometry, strict=True))
+        self.belief.add([Member(*poses[n]) for n in numbers], report.P[np.ix_(index, index)])
+        self.contacts[report.vehicles[0]] = Contact(report)
+        self.leans_on |= report.leans_on | int(mask_of(told))
+
+    def _hear(self, contact: Contact, report: Report) -> None:
+        """Carry a sender to its new message, and take in what it has learnt since the last one."""
+        last = contact.last
+        dt = float(report.time[0] - last.time[0])
+        if dt <= 0.0:
+            return
+        contact.last = report
+        numbers = [self.belief.place(v) for v in report.vehicles]
+        for n, R, p, time in zip(numbers, report.odometry_R, report.odometry_p, report.time.tolist(), strict=True):
+            if n is not None and n > 0:
+                self.belief.follow(n, R, p, time, self.noise)
+        was_trusted = contact.trusted
+        self._judge(contact, report, dt)
+        learnt = tracklet(last, report, self.noise) if was_trusted and contact.trusted else None
+        places = [n for n in numbers if n is not None]
+        if learnt is None or len(places) < len(numbers):
+            return
+        share = SHARE if report.leans_on else 1.0
+        index = np.concatenate([np.arange(6 * n, 6 * n + 6) for n in places])
+        vector = learnt.about([self.belief.members[n] for n in places])
+        self.belief.inform(index, share * learnt.information, share * vector)
+        self.leans_on |= report.leans_on
+
+    def _judge(self, contact: Contact, report: Report, dt: float) -> None:
+        """Decide whether a sender is believed, from its message and the belief about it."""
+        n = self.belief.place(report.vehicles[0])
+        if n is None:
+            return
+        member, block = self.belief.members[n], slice(6 * n, 6 * n + 6)
+        e = left_error(member.R, member.p, report.R[0], report.p[0])
+        agrees = float(e @ np.linalg.solve(self.belief.P[block, block] + report.P[:6, :6], e)) < TRUST_GATE
+        if contact.trusted:
+            contact.trusted, contact.agreed = agrees, 0.0
+            return
+        near = agrees and float(np.linalg.norm(e[3:])) < AGREED_DISTANCE
+        contact.agreed = contact.agreed + dt if near else 0.0
+        contact.trusted = contact.agreed >= AGREED_FOR
+
+    def _look(self, tick: Tick) -> None:
+        """Correct the belief by every bearing that fits it; search anew when most do not."""
+        lines, missed = self._fitting(tick)
+        if lines:
+            self.belief.correct(
+                np.concatenate([line.H for line, _ in lines]),
+                block_diag(*[N for _, N in lines]),
+                np.concatenate([line.residual for line, _ in lines]),
+            )
+        if missed is not None:
+            self.missed += (missed - self.missed) * min(1.0, tick.dt / LOST_TIME)
+            if self.missed > LOST_SHARE:
+                self._lose()
+
+    def _fitting(self, tick: Tick) -> tuple[list[tuple[Line, Array]], float | None]:
+        """Return the bearings that fit the belief, with their noise, and the share of those that do not.
+
+        Bearings to distrusted senders do not count in the share; None if there is none that does.
+        """
+        lines: list[tuple[Line, Array]] = []
+        counted = missed = 0
+        for n in np.flatnonzero(tick.valid):
+            vehicle = int(tick.targets[n]) - self.landmarks
+            measured = self._measured(tick, int(n), vehicle)
+            if measured is None:
+                continue
+            line, N = measured
+            nis = float(line.residual @ np.linalg.solve(line.H @ self.belief.P @ line.H.T + N, line.residual))
+            fits = line.ahead and nis < GATE
+            if fits:
+                lines.append(measured)
+            contact = self.contacts.get(vehicle)
+            if contact is None or contact.trusted:
+                counted, missed = counted + 1, missed + (not fits)
+        return lines, missed / counted if counted else None
+
+    def _measured(self, tick: Tick, n: int, vehicle: int) -> tuple[Line, Array] | None:
+        """Return a bearing as a measurement with its noise; None if the target is in nobody's belief."""
+        b = tick.bearings[n]
+        if vehicle < 0:
+            line = self.belief.line(b, tick.lever_arm, tick.landmarks[vehicle + self.landmarks], None, None)
+            return line, self.variance * PLANE
+        place = self.belief.place(vehicle)
+        if place is None:
+            return None
+        member = self.belief.members[place]
+        age = tick.time - member.time
+        _, dp = member.carried(age)
+        line = self.belief.line(b, tick.lever_arm, member.p + member.R @ dp, place, dp)
+        across = line.H[:, 3:6]
+        return line, self.variance * PLANE + self._drift(age) * across @ across.T
+
+    def _drift(self, age: float) -> float:
+        """Return the variance per axis, m^2, of where a sender is a time after its last message."""
+        if age <= 0.0:
+            return 0.0
+        return float(self.noise.odometry(age)[3]) + (0.5 * ACCELERATION * age * age) ** 2

@@ -1,0 +1,179 @@
+"""Finding one's pose from nothing: every solution of the P3P problem is followed until motion has told them apart.
+
+Bearings have a sign (cheirality), which the perspective solver and the tests here heed. Each hypothesis is a small
+filter of its own; it pays for what it predicts badly, and one that pays much more than the best is given up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from coopenv.estimation.observers.base import Array, Tick
+from coopenv.estimation.observers.perspective import solve_p3p
+from coopenv.estimation.observers.robust.belief import Belief
+from coopenv.estimation.observers.robust.report import left_error
+
+MOST_HYPOTHESES = 4
+GATE = 13.8
+"""Of a bearing's normalised innovation squared: chi-square of 2, 0.999."""
+MISS = 25.0
+"""What a hypothesis pays at most for one bearing."""
+MARGIN = 30.0
+"""By how much it may have paid more than the best one: odds of exp(-15)."""
+FLOOR = 30.0
+"""What the best may have paid beyond twice what is expected of a true one."""
+LEAST_TIME = 0.5
+"""s, before a hypothesis is believed."""
+KNOWN_ANGLE, KNOWN_POSITION = 0.2, 2.0
+"""rad and m, standard deviation per axis below which a pose is one to go on with."""
+SLOW = 4.0
+"""By how much a neighbour's variance counts: its error changes slowly, so that it does not average out."""
+SAME = 16.0
+"""Squared distance, in standard deviations, below which two hypotheses are one."""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A bearing to a target whose place is known or heard."""
+
+    bearing: Array  # (3,) body frame
+    z: Array  # (3,) map frame, m
+    covariance: Array  # (3, 3) of z, m^2
+
+
+@dataclass
+class Hypothesis:
+    """A pose with covariance, and what it has paid."""
+
+    belief: Belief
+    paid: float
+    bearings: int = 0
+
+
+class Search:
+    """Hypotheses about one vehicle's pose.
+
+    Args:
+        R: (3, 3) prior orientation, carried on by odometry in the meantime.
+        p: (3,) prior position, m.
+        P: (6, 6) prior covariance.
+    """
+
+    def __init__(self, vehicle: int, R: Array, p: Array, P: Array) -> None:
+        """Start without hypotheses."""
+        self.vehicle = vehicle
+        self.prior = Belief(vehicle, R, p, P)
+        self.bank: list[Hypothesis] = []
+        self.age, self.attempts = 0.0, 0
+
+    @property
+    def best(self) -> Belief:
+        """The hypothesis that has paid least, the prior if there is none."""
+        return min(self.bank, key=lambda h: h.paid).belief if self.bank else self.prior
+
+    def move(self, tick: Tick, noise: Array) -> None:
+        """Carry everything through a tick's odometry."""
+        for belief in (self.prior, *(h.belief for h in self.bank)):
+            belief.move(0, tick.rotation, tick.translation, noise)
+
+    def look(self, tick: Tick, sightings: list[Sighting], variance: float) -> Belief | None:
+        """Take a frame's sightings; return the only hypothesis that is left after some frames."""
+        if not self.bank:
+            self.age = 0.0
+            if len(sightings) >= 3:
+                self.bank = self._solutions(tick, sightings, variance)
+                self.attempts += 1
+            return None
+        self.age += tick.dt
+        for hypothesis in self.bank:
+            _follow(hypothesis, tick, sightings, variance)
+        self._prune()
+        return self.bank[0].belief if len(self.bank) == 1 and self.age >= LEAST_TIME else None
+
+    def _solutions(self, tick: Tick, sightings: list[Sighting], variance: float) -> list[Hypothesis]:
+        """Return the poses that explain three well placed sightings, other ones at every attempt."""
+        triples = sorted(combinations(range(len(sightings)), 3), key=lambda c: -_spread(sightings, c))
+        three = triples[self.attempts % len(triples)]
+        b = np.array([sightings[n].bearing for n in three])
+        z = np.array([sightings[n].z for n in three])
+        bank = []
+        for R, camera in zip(*solve_p3p(b, z), strict=True):
+            belief = Belief(self.vehicle, R, camera - R @ tick.lever_arm, np.zeros((6, 6)))
+            P = _covariance(belief, tick, [sightings[n] for n in three], variance)
+            if P is None:
+                continue
+            belief.P = P
+            hypothesis = Hypothesis(belief, self._surprise(belief))
+            _follow(hypothesis, tick, [s for n, s in enumerate(sightings) if n not in three], variance)
+            bank.append(hypothesis)
+        return bank
+
+    def _surprise(self, belief: Belief) -> float:
+        """Return the squared distance from the prior, in its standard deviations."""
+        e = left_error(self.prior.own.R, self.prior.own.p, belief.own.R, belief.own.p)
+        return float(e @ np.linalg.solve(self.prior.P + belief.P, e))
+
+    def _prune(self) -> None:
+        """Give up what pays much more than the best, what is the same as a better one, and all if none is good."""
+        ranked = sorted(self.bank, key=lambda h: h.paid)
+        kept: list[Hypothesis] = []
+        for hypothesis in ranked:
+            if hypothesis.paid <= ranked[0].paid + MARGIN and not any(_same(hypothesis, other) for other in kept):
+                kept.append(hypothesis)
+        best = kept[0]
+        self.bank = [] if best.paid > FLOOR + 4.0 * best.bearings else kept
+
+
+def is_known(P: Array) -> bool:
+    """Return whether a pose of covariance P (6, 6) is certain enough to linearise about and to tell others."""
+    variances = np.diag(P)
+    return bool(variances[:3].max() < KNOWN_ANGLE**2 and variances[3:].max() < KNOWN_POSITION**2)
+
+
+def _spread(sightings: list[Sighting], three: tuple[int, ...]) -> float:
+    """Return the volume that three bearings span; a good triple looks in three very different directions."""
+    a, b, c = (sightings[n].bearing for n in three)
+    return float(np.linalg.norm(np.cross(b - a, c - a)))
+
+
+def _noise(H: Array, R: Array, s: Sighting, variance: float) -> Array:
+    """Return the covariance (2, 2) of a bearing, its target's uncertainty included."""
+    G = H[:, 3:6] @ R.T
+    return variance * np.eye(2) + SLOW * G @ s.covariance @ G.T
+
+
+def _covariance(belief: Belief, tick: Tick, sightings: list[Sighting], variance: float) -> Array | None:
+    """Return the covariance (6, 6) of a pose that is solved from sightings; None if they do not tell it."""
+    M = np.zeros((6, 6))
+    for s in sightings:
+        line = belief.line(s.bearing, tick.lever_arm, s.z, None, None)
+        M += line.H.T @ np.linalg.solve(_noise(line.H, belief.own.R, s, variance), line.H)
+    spectrum = np.linalg.eigvalsh(M)
+    if not spectrum[0] > 1e-12 * spectrum[-1]:
+        return None
+    P = np.linalg.inv(M)
+    return (P + P.T) / 2 if np.diag(P)[:3].max() < 1.0 else None
+
+
+def _follow(hypothesis: Hypothesis, tick: Tick, sightings: list[Sighting], variance: float) -> None:
+    """Let a hypothesis pay for a frame's sightings and learn from those that fit."""
+    belief = hypothesis.belief
+    for s in sightings:
+        line = belief.line(s.bearing, tick.lever_arm, s.z, None, None)
+        N = _noise(line.H, belief.own.R, s, variance)
+        nis = float(line.residual @ np.linalg.solve(line.H @ belief.P @ line.H.T + N, line.residual))
+        fits = line.ahead and nis < GATE
+        hypothesis.paid += min(nis, MISS) if line.ahead else MISS
+        hypothesis.bearings += 1
+        if fits:
+            belief.correct(line.H, N, line.residual)
+
+
+def _same(one: Hypothesis, other: Hypothesis) -> bool:
+    """Return whether two hypotheses cannot be told apart."""
+    a, b = one.belief, other.belief
+    e = left_error(a.own.R, a.own.p, b.own.R, b.own.p)
+    return float(e @ np.linalg.solve(a.P + b.P, e)) < SAME

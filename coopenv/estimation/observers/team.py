@@ -1,0 +1,225 @@
+"""The plug-in observers of one world's vehicles and the messages between them.
+
+Whoever has ticks drives a team with them: the runner on a record, the environment on a world or a replay.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from time import perf_counter
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from coopenv.errors import CoopenvError
+from coopenv.estimation.observers.base import (
+    Array,
+    Coordinates,
+    Estimate,
+    Factory,
+    JointObserver,
+    Message,
+    Observer,
+    Received,
+)
+from coopenv.estimation.observers.recording import Briefing, Sensed
+from coopenv.estimation.observers.registry import is_joint
+
+
+class ObserverError(CoopenvError):
+    """An observer raised or returned what is no estimate; the message says whose, when and why."""
+
+
+class Answer(NamedTuple):
+    """An estimate, and what it took, s (message included; a joint observer's time is shared out)."""
+
+    estimate: Estimate
+    elapsed: float
+
+
+class Tamper(Protocol):
+    """Changes what some vehicle broadcasts (see `faults.Lie`)."""
+
+    def applies(self, vehicle: int, time: float) -> bool:
+        """Return whether it changes the message of a vehicle at a time, s."""
+        ...
+
+    def told(self, observer: Observer, message: Message) -> Message:
+        """Return what is broadcast in place of a message."""
+        ...
+
+
+class Mail:
+    """Carries the observers' messages; which of them arrive when is the radio's business."""
+
+    def __init__(self, briefing: Briefing) -> None:
+        self.briefing = briefing
+        self.sent: list[dict[int, Message]] = [{} for _ in briefing.setups]
+        """Per sender: tick of sending to message, of those that may still be under way."""
+        self.heard: list[dict[int, tuple[int, Message]]] = [{} for _ in briefing.setups]
+        """Per receiver: sender to the last message that arrived, with its tick of sending."""
+        self.bytes = np.zeros(len(briefing.setups))
+
+    def due(self, k: int) -> bool:
+        """Return whether messages are sent at tick k."""
+        return k % self.briefing.period == 0
+
+    def post(self, vehicle: int, k: int, message: Message) -> None:
+        """Send one message; that of the start is heard but not counted."""
+        sent = self.sent[vehicle]
+        sent[k] = _copied(message)
+        while (oldest := next(iter(sent))) < k - self.briefing.flight - 1:
+            del sent[oldest]
+        if k > 0:
+            self.count(vehicle, message)
+
+    def count(self, vehicle: int, message: Message) -> None:
+        """Count the bytes of a message."""
+        self.bytes[vehicle] += message.size_bytes
+
+    def inbox(self, k: int, vehicle: int, inbox_tick: ArrayLike) -> dict[int, Received]:
+        """Return what a vehicle has heard by tick k, by target, without what is stale.
+
+        Args:
+            k: now.
+            vehicle: the receiver.
+            inbox_tick: (N,) tick of sending of the last message that the radio delivered of each sender; -1: none.
+        """
+        b, setup, heard = self.briefing, self.briefing.setups[vehicle], self.heard[vehicle]
+        ticks, received = np.asarray(inbox_tick), {}
+        for target in setup.targets[setup.targets >= setup.landmarks]:
+            sender = int(target) - setup.landmarks
+            sent = int(ticks[sender])
+            if sent in self.sent[sender]:
+                heard[sender] = (sent, self.sent[sender][sent])
+            age = (k - sent) * b.dt
+            if sent >= 0 and age <= b.staleness and sender in heard and heard[sender][0] == sent:
+                received[int(target)] = Received(heard[sender][1], age)
+        return received
+
+
+def _copied(message: Message) -> Message:
+    """Return a copy that the sender can no longer change."""
+    arrays = {
+        name: None if (value := getattr(message, name)) is None else np.array(value, np.result_type(value, np.float32))
+        for name in ("position", "rotation", "covariance")
+    }
+    return replace(message, **arrays, extra={name: np.array(value) for name, value in message.extra.items()})
+
+
+class Team:
+    """One observer per vehicle, or a joint one of all; `start` comes first and begins anew."""
+
+    def __init__(self, factory: Factory, briefing: Briefing, tamper: Tamper | None = None) -> None:
+        self.factory, self.briefing, self.tamper = factory, briefing, tamper
+        self.joint = is_joint(factory)
+
+    def start(self, rotation: Array, position: Array) -> None:
+        """Build the observers and start them at poses (N, 3, 3) and (N, 3), map frame, m.
+
+        Raises:
+            ObserverError: one of them cannot start.
+        """
+        setups = self.briefing.setups
+        self.mail = Mail(self.briefing)
+        self.coordinates: Coordinates | None = None
+        self.observers: list[Observer] = []
+        covariances = [P.copy() for P in self.briefing.start_covariance]
+        poses = [(R.copy(), p.copy()) for R, p in zip(rotation, position, strict=True)]
+        if self.joint:
+            with self._blame(0):
+                self.whole: JointObserver = self.factory(setups)
+                self.whole.reset(poses, covariances)
+            return
+        for i, setup in enumerate(setups):
+            with self._blame(0, i):
+                self.observers.append(self.factory(setup))
+                self.observers[i].reset(poses[i], covariances[i])
+                self.mail.post(i, 0, self.observers[i].message())
+
+    def update(self, vehicle: int, sensed: Sensed, inbox_tick: ArrayLike) -> Answer:
+        """Let one vehicle's observer take a tick; vehicles come in the order of the briefing.
+
+        Args:
+            vehicle: whose.
+            sensed: the tick.
+            inbox_tick: see `Mail.inbox`.
+
+        Raises:
+            ObserverError: it raised, or returned what is no estimate.
+        """
+        k = sensed.index
+        with self._blame(k, vehicle):
+            observer = self.observers[vehicle]
+            tick = sensed.tick(self.briefing.setups[vehicle], self.mail.inbox(k, vehicle, inbox_tick))
+            begin = perf_counter()
+            estimate = observer.update(tick)
+            message = observer.message() if self.mail.due(k) else None
+            elapsed = perf_counter() - begin
+            self._check(estimate)
+            if message is not None:
+                if self.tamper is not None and self.tamper.applies(vehicle, tick.time):
+                    message = self.tamper.told(observer, message)
+                self.mail.post(vehicle, k, message)
+        return Answer(estimate, elapsed)
+
+    def update_all(self, sensed: Sensed) -> list[Answer]:
+        """Let a joint observer take a tick of every vehicle.
+
+        Raises:
+            ObserverError: it raised, or returned what is no estimate.
+        """
+        setups = self.briefing.setups
+        with self._blame(sensed.index):
+            ticks = [sensed.tick(setup, {}) for setup in setups]
+            begin = perf_counter()
+            estimates = self.whole.update(ticks)
+            messages: Sequence[Message] = self.whole.messages()
+            elapsed = (perf_counter() - begin) / len(setups)
+            for i, (estimate, message) in enumerate(zip(estimates, messages, strict=True)):
+                self._check(estimate)
+                self.mail.count(i, message)
+        return [Answer(estimate, elapsed) for estimate in estimates]
+
+    def _check(self, estimate: Estimate) -> None:
+        fields = [("rotation", estimate.rotation, (3, 3)), ("position", estimate.position, (3,))]
+        if estimate.covariance is not None:
+            fields.append(("covariance", estimate.covariance, (6, 6)))
+        for name, value, shape in fields:
+            if np.shape(value) != shape or not np.isfinite(value).all():
+                raise CoopenvError(f"{name} is not a finite array of shape {shape}")
+        self.coordinates = self.coordinates or estimate.coordinates
+        if estimate.coordinates is not self.coordinates:
+            raise CoopenvError("error coordinates must stay the same")
+
+    @contextmanager
+    def _blame(self, k: int, vehicle: int | None = None) -> Iterator[None]:
+        """Say whose observer failed and when; an observer is anybody's code, so anything may come out of it."""
+        try:
+            yield
+        except Exception as error:
+            whose = "" if vehicle is None else f"of {self.briefing.setups[vehicle].name} "
+            raise ObserverError(f"{whose}at {k * self.briefing.dt:.3f} s: {type(error).__name__}: {error}") from error
+
+    def get_state(self) -> dict[str, Any]:
+        """Return a deep copy of the observers and of all messages.
+
+        Raises:
+            CoopenvError: an observer cannot be copied.
+        """
+        try:
+            return copy.deepcopy({name: value for name, value in vars(self).items() if name not in _FIXED})
+        except Exception as error:
+            raise CoopenvError(f"the observers' state cannot be copied: {type(error).__name__}: {error}") from error
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go back to what `get_state` returned; that stays unchanged."""
+        vars(self).update(copy.deepcopy(state))
+
+
+_FIXED = ("factory", "briefing", "tamper", "joint")
+"""Attributes of a team that no tick changes."""

@@ -1,0 +1,218 @@
+"""Observers in NumPy inside the environment: the world that they estimate in is the embedded observer's."""
+
+from __future__ import annotations
+
+import pickle
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from pettingzoo.test import parallel_api_test
+
+import coopenv
+import coopenv.estimation.observers.registry as registry
+from coopenv import CoopenvError
+from coopenv.api.engine import Engine
+from coopenv.estimation.observers import Coordinates, Estimate, Setup, Tick, record, register, run
+from coopenv.estimation.observers.dead_reckoning import DeadReckoning
+from coopenv.estimation.observers.riccati import Riccati
+
+CASES: dict[str, tuple[str, dict[str, Any]]] = {
+    "the paper's start": ("busy_intersection", {"horizon": 3.0}),
+    "radio": (
+        "busy_intersection",
+        {"horizon": 3.0, "v2x.delay": 3, "v2x.loss": 0.4, "v2x.period": 2, "v2x.staleness": 0.2},
+    ),
+    "slow corrections": ("busy_intersection", {"horizon": 2.0, "observer.k": 2.0, "rates.observer": 25.0}),
+    "cyclic": ("busy_intersection", {"horizon": 1.0, "topology.acyclic": False}),
+    "driven": ("urban_crossing", {"horizon": 3.0}),
+}
+SAME = (
+    "estimate_rotation",
+    "estimate_position",
+    "covariance",
+    "inbox_rotation",
+    "inbox_position",
+    "nees",
+    "log_determinant",
+    "gramian_min_eigenvalue",
+    "position_error",
+)
+
+
+class Late(DeadReckoning):
+    """Dead reckoning until 0.1 s."""
+
+    def update(self, tick: Tick) -> Estimate:
+        if tick.index == 6:
+            return self.fail(super().update(tick))
+        return super().update(tick)
+
+    def fail(self, estimate: Estimate) -> Estimate:
+        raise ZeroDivisionError("no gain")
+
+
+class Nan(Late):
+    def fail(self, estimate: Estimate) -> Estimate:
+        return Estimate(estimate.rotation, estimate.position * np.nan)
+
+
+class Locked(DeadReckoning):
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(setup)
+        self.lock = threading.Lock()
+
+
+@pytest.fixture(autouse=True)
+def plugins(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setattr(registry, "_registered", {})
+    for name, factory in {"riccati_numpy": Riccati, "late": Late, "nan": Nan, "locked": Locked}.items():
+        register(name, factory)
+    yield
+
+
+def short(observer: str | None, **options: Any) -> coopenv.CooperativeLocalisationEnv:
+    return coopenv.parallel_env("busy_intersection", observer=observer, overrides={"horizon": 0.5}, **options)
+
+
+def still(env: coopenv.CooperativeLocalisationEnv) -> dict[str, np.ndarray]:
+    return {agent: np.zeros(2, dtype=np.float32) for agent in env.agents}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_papers_observer_as_a_plugin_is_the_embedded_one(case: str) -> None:
+    name, overrides = CASES[case]
+    embedded = Engine(coopenv.load_scenario(name, overrides), 1, "float64")
+    plugin = Engine(coopenv.load_scenario(name, {**overrides, "observer.name": "riccati_numpy"}), 1, "float64")
+    vehicles = len(embedded.world.scenario.vehicles)
+    actions = np.linspace(-0.3, 0.6, 2 * vehicles).reshape(1, vehicles, 2)
+    for engine in (embedded, plugin):
+        engine.reset([5])
+    for _ in range(embedded.world.scenario.horizon_ticks // 6):
+        for engine in (embedded, plugin):
+            engine.step(actions)
+        for field in SAME:
+            assert_allclose(plugin.view(field), embedded.view(field), rtol=1e-7, atol=1e-9, err_msg=field)
+        for field in ("observation", "reward"):
+            assert_allclose(plugin.view(field), embedded.view(field), atol=1e-6)
+        for field in ("bearing", "inbox_tick", "position", "odometry_velocity", "command", "tick", "ended"):
+            assert np.array_equal(plugin.view(field), embedded.view(field)), field
+
+
+@pytest.mark.parametrize("name", ["mekf", "right_invariant", "covariance_intersection", "centralised"])
+def test_the_environment_and_the_runner_agree(name: str) -> None:
+    """Simulated once tick by tick and once recorded first: the same estimates, and the same NEES of a small error."""
+    nearly = {"position_offset": [0.02, 0.01, 0.0], "orientation_offset_wxyz": [1.0, 0.0, 0.0, 0.0], "position": None}
+    overrides = {"horizon": 1.0, "v2x.loss": 0.2, "v2x.delay": 1, "vehicles.*.initial_estimate": nearly}
+    env = coopenv.parallel_env("busy_intersection", observer=name, dtype="float64", overrides=overrides)
+    result = run(name, record(coopenv.load_scenario("busy_intersection", overrides), 3))
+    env.reset(seed=3)
+    tick = 0
+    while env.agents:
+        infos = env.step(still(env))[4]
+        tick += 6
+        for i, agent in enumerate(infos):
+            assert_allclose(infos[agent]["estimate"]["position"], result.position[tick, i], atol=1e-9)
+            assert_allclose(infos[agent]["estimate"]["rotation"], result.rotation[tick, i], atol=1e-9)
+            assert_allclose(infos[agent]["nees"], result.nees[tick, i], rtol=0.2)
+    assert result.coordinates is not Coordinates.RICCATI and not result.failure
+
+
+def test_an_observer_without_covariance_leaves_that_of_the_start() -> None:
+    class Silent(DeadReckoning):
+        def update(self, tick: Tick) -> Estimate:
+            estimate = super().update(tick)
+            return Estimate(estimate.rotation, estimate.position)
+
+    register("silent", Silent)
+    env = short("silent")
+    _, before = env.reset(seed=0)
+    _, _, _, _, after = env.step(still(env))
+    for agent in after:
+        assert np.array_equal(before[agent]["estimate"]["covariance"], after[agent]["estimate"]["covariance"])
+        assert not np.array_equal(before[agent]["estimate"]["position"], after[agent]["estimate"]["position"])
+
+
+def test_ticks_of_a_single_precision_world_are_exact_rotations_and_unit_vectors() -> None:
+    class Strict(DeadReckoning):
+        def update(self, tick: Tick) -> Estimate:
+            assert_allclose(tick.rotation @ tick.rotation.T, np.eye(3), atol=1e-13)
+            assert_allclose(np.linalg.norm(tick.bearings[tick.valid], axis=1), 1.0, atol=1e-13)
+            assert tick.bearings.dtype == tick.landmarks.dtype == np.float64 and tick.valid.any()
+            return super().update(tick)
+
+    register("strict", Strict)
+    env = short("strict", dtype="float32")
+    env.reset(seed=0)
+    while env.agents:
+        env.step(still(env))
+
+
+def test_official_test_and_observations_of_plugins() -> None:
+    parallel_api_test(short("mekf"), num_cycles=40)
+    assert short("mekf").observation_space("vehicle_1") == short(None).observation_space("vehicle_1")
+
+
+@pytest.mark.parametrize(
+    ("name", "why"), [("late", "ZeroDivisionError: no gain"), ("nan", "CoopenvError: position is not a finite array")]
+)
+def test_a_failing_observer_is_named_and_a_reset_helps(name: str, why: str) -> None:
+    env = short(name)
+    env.reset(seed=0)
+    with pytest.raises(CoopenvError, match=f"observer '{name}' of vehicle_1 at 0.100 s: {why}") as caught:
+        env.step(still(env))
+    assert caught.value.__cause__ is not None
+    with pytest.raises(CoopenvError, match="reset starts anew"):
+        env.step(still(env))
+    env.reset(seed=0)
+    assert env.agents and env.engine.view("tick")[0] == 0
+
+
+def test_unknown_observers() -> None:
+    with pytest.raises(CoopenvError, match=r"unknown observer 'meckf' \(did you mean 'mekf'\?\)"):
+        short("meckf")
+    with pytest.raises(CoopenvError, match=r"observer.name: .*pattern"):
+        short("no name")
+
+
+def test_a_batch_is_its_single_worlds() -> None:
+    options: dict[str, Any] = {"overrides": {"horizon": 0.5, "observer.name": "mekf"}, "dtype": "float64"}
+    batch = coopenv.make_vec("busy_intersection", num_worlds=3, **options)
+    rows, _ = batch.reset(seed=4)
+    alone = coopenv.parallel_env("busy_intersection", **options)
+    observations, _ = alone.reset(seed=6)
+    for step in range(7):  # five to the horizon, one that resets, one of the next episode
+        assert np.array_equal(batch.world_major(rows)[2], np.stack(list(observations.values())))
+        rows = batch.step(np.zeros((batch.num_envs, 2), dtype=np.float32))[0]
+        observations = alone.step(still(alone))[0] if step != 5 else alone.reset()[0]
+
+
+def test_saved_states_go_on_as_if_nothing_had_happened() -> None:
+    env = short("mekf_covariance", dtype="float64")
+    env.reset(seed=1)
+    env.step(still(env))
+    state, twin = env.get_state(), pickle.loads(pickle.dumps(env))
+    first = env.step(still(env))[0]
+    env.set_state(state)
+    again, other = env.step(still(env))[0], twin.step(still(twin))[0]
+    for agent in first:
+        assert np.array_equal(first[agent], again[agent]) and np.array_equal(first[agent], other[agent])
+
+
+def test_what_cannot_be_copied_is_told() -> None:
+    env = short("locked")
+    env.reset(seed=0)
+    with pytest.raises(CoopenvError, match="observers' state cannot be copied: TypeError"):
+        env.get_state()
+
+
+def test_a_state_of_the_embedded_observer_is_not_a_plugins() -> None:
+    env = short("mekf")
+    env.reset(seed=0)
+    state = env.get_state()
+    del state["observers"]
+    with pytest.raises(CoopenvError, match="no observers 'mekf' in it"):
+        env.set_state(state)

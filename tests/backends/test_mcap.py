@@ -1,0 +1,286 @@
+"""A recording comes back from its file bit for bit, viewers can read the file, and broken files are told apart."""
+
+from __future__ import annotations
+
+import builtins
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from coopenv import CoopenvError, DataError, OutputError
+from coopenv.backends.mcap import messages, read_recording, write_recording
+from coopenv.backends.mrclam import load_dataset
+from coopenv.backends.mrclam.recording import recording_of
+from coopenv.cli import main
+from coopenv.estimation.observers import Recording, run
+from coopenv.estimation.observers.recording import Truth
+from tests.backends import mrclam_files
+from tests.backends.recordings import differences, simulated
+
+pytest.importorskip("mcap", reason="needs the extra 'log'")
+
+
+def through(recording: Recording, folder: Path) -> Recording:
+    path = folder / "drive.mcap"
+    write_recording(recording, path)
+    return read_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [
+        ("busy_intersection", {}),
+        ("busy_intersection", {"v2x__delay": 3, "v2x__loss": 0.4, "v2x__staleness": 0.2, "observer__k": 2.0}),
+        ("urban_crossing", {"rates__observer": 25.0}),
+        ("crossing_path", {}),
+    ],
+)
+def test_simulated_recordings_come_back_bit_for_bit(name: str, overrides: dict[str, Any], tmp_path: Path) -> None:
+    made = simulated(name, **overrides)
+    assert differences(made, through(made, tmp_path)) == []
+
+
+@pytest.mark.parametrize("variant", ["landmarks", "landmarks+robots", "blind"])
+def test_robots_come_back_bit_for_bit(variant: Any, tmp_path: Path) -> None:
+    mrclam_files.write(tmp_path, seconds=6.0)
+    made = recording_of(load_dataset("mrclam_6", tmp_path), variant)
+    assert differences(made, through(made, tmp_path)) == []
+
+
+floats = st.floats(width=64, allow_infinity=True, allow_nan=False)
+
+
+@settings(max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_any_numbers_come_back_bit_for_bit(data: st.DataObject, tmp_path: Path) -> None:
+    """Denormals, infinities and minus zero, truth that is not known, landmarks that move, bearings nobody counts."""
+    made = simulated("crossing_path", horizon=1 / 60)
+
+    def drawn(shape: tuple[int, ...]) -> np.ndarray:
+        size = int(np.prod(shape))
+        return np.array(data.draw(st.lists(floats, min_size=size, max_size=size))).reshape(shape)
+
+    def flags(shape: tuple[int, ...]) -> np.ndarray:
+        size = int(np.prod(shape))
+        return np.array(data.draw(st.lists(st.booleans(), min_size=size, max_size=size)), bool).reshape(shape)
+
+    unknown = flags(made.truth.position.shape[:2])
+    odd = replace(
+        made,
+        translation=drawn(made.translation.shape),
+        velocity=drawn(made.velocity.shape),
+        bearings=np.where(flags(made.visible.shape)[..., None], drawn(made.bearings.shape), np.nan),
+        visible=flags(made.visible.shape),
+        landmarks=drawn(made.landmarks.shape),
+        due=flags(made.due.shape),
+        inbox_tick=made.inbox_tick - 2**40,
+        truth=Truth(
+            np.where(unknown[..., None, None], np.nan, made.truth.rotation),
+            np.where(flags(made.truth.position.shape[:2])[..., None], np.nan, made.truth.position),
+        ),
+        scenario=None,
+    )
+    assert differences(odd, through(odd, tmp_path)) == []
+
+
+def test_observers_do_the_same_on_the_file(tmp_path: Path) -> None:
+    made = simulated(v2x__loss=0.3)
+    read = through(made, tmp_path)
+    for name in ("riccati", "mekf_covariance", "centralised"):
+        a, b = run(name, made), run(name, read)
+        assert not a.failure
+        for field in ("rotation", "position", "covariance", "position_error", "nees"):
+            assert np.array_equal(getattr(a, field), getattr(b, field), equal_nan=True), field
+
+
+def test_viewers_find_standard_messages_at_their_times(tmp_path: Path) -> None:
+    """Read by the library alone, with the definitions that the file carries."""
+    from mcap.reader import make_reader
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    made, path = simulated(), tmp_path / "drive.mcap"
+    write_recording(made, path)
+    store = get_typestore(Stores.EMPTY)
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None
+        for schema in summary.schemas.values():
+            assert schema.encoding == "ros2msg"
+            found = get_types_from_msg(schema.data.decode(), schema.name)
+            store.register({name: fields for name, fields in found.items() if name not in store.fielddefs})
+        topics = {channel.topic for channel in summary.channels.values()}
+        names = ("odometry", "increment", "bearings", "v2x", "truth", "truth_exact")
+        assert topics == {f"/vehicle_{i}/{name}" for i in range(1, 6) for name in names} | {"/landmarks"}
+        shown = list(reader.iter_messages("/vehicle_3/truth"))
+        assert len(shown) == made.ticks
+        for schema, _, message in shown[::20]:
+            pose = store.deserialize_cdr(message.data, schema.name)
+            k = round(message.log_time * 60e-9)
+            stamp = pose.header.stamp.sec + 1e-9 * pose.header.stamp.nanosec
+            assert_allclose([message.log_time * 1e-9, stamp], k / 60.0, atol=1e-9)
+            q, p = pose.pose.orientation, pose.pose.position
+            assert [p.x, p.y, p.z] == made.truth.position[k, 2].tolist()
+            R = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+            assert_allclose(R, made.truth.rotation[k, 2], atol=1e-12)
+        (_, _, points) = next(reader.iter_messages("/landmarks"))
+        poses = store.deserialize_cdr(points.data, "geometry_msgs/msg/PoseArray").poses
+        assert [[q.position.x, q.position.y, q.position.z] for q in poses] == made.landmarks[0].tolist()
+
+
+# What is no recording
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("log") / "drive.mcap"
+    write_recording(simulated("crossing_path", horizon=0.1), path)
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda b: b[: len(b) // 2], "cut off, the end of the MCAP file is missing"),
+        (lambda b: b[:5], "not an MCAP file"),
+        (lambda b: b"", "not an MCAP file"),
+        (lambda b: b"hello" * 100, "not an MCAP file"),
+        (lambda b: b[:400] + bytes(200) + b[600:], "recording.json is damaged"),
+        (lambda b: b[:8] + b[-8:], "cannot be read|damaged MCAP file"),
+        (lambda b: b.replace(b'"staleness"', b'"staleless"'), "recording.json is damaged"),
+        (
+            lambda b: b.replace(b"coopenv recording 1", b"coopenv recording 9"),
+            "format 'coopenv recording 9' is not known",
+        ),
+    ],
+)
+def test_broken_files(change: Any, why: str, written: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "broken.mcap"
+    path.write_bytes(change(written))
+    with pytest.raises(DataError, match=why) as caught:
+        read_recording(path)
+    assert "broken.mcap" in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_a_flipped_byte_never_goes_unnoticed_or_crashes(seed: int, written: bytes, tmp_path: Path) -> None:
+    """Either the file is refused in one line, or the byte meant nothing (padding, library name, index)."""
+    rng, path = np.random.default_rng(seed), tmp_path / "flipped.mcap"
+    damaged = bytearray(written)
+    damaged[int(rng.integers(len(damaged)))] ^= 1 << int(rng.integers(8))
+    path.write_bytes(bytes(damaged))
+    try:
+        assert differences(simulated("crossing_path", horizon=0.1), read_recording(path)) == []
+    except DataError as error:
+        assert "flipped.mcap" in str(error)
+
+
+def test_foreign_files(tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    path = tmp_path / "foreign.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.finish()
+    with pytest.raises(DataError, match=r"foreign\.mcap: an MCAP file, but no recording of coopenv"):
+        read_recording(path)
+    with pytest.raises(DataError, match=r"nowhere\.mcap: cannot be read \(No such file"):
+        read_recording(tmp_path / "nowhere.mcap")
+
+
+def test_missing_topics_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from coopenv.backends.mcap import writer
+
+    path = tmp_path / "drive.mcap"
+    send = writer._Log._send
+    for topic, keep, why in (
+        ("/vehicle_1/bearings", lambda k: False, "topic '/vehicle_1/bearings' is missing"),
+        ("/vehicle_1/v2x", lambda k: k != 3, "topic '/vehicle_1/v2x' has 6 of 7 ticks"),
+        ("/landmarks", lambda k: False, "topic '/landmarks' is missing"),
+    ):
+
+        def lossy(
+            self: Any, name: str, kind: str, k: int, *rest: Any, t: Any = topic, q: Any = keep, **kw: Any
+        ) -> None:
+            if name != t or q(k):
+                send(self, name, kind, k, *rest, **kw)
+
+        monkeypatch.setattr(writer._Log, "_send", lossy)
+        write_recording(simulated("crossing_path", horizon=0.1), path)
+        with pytest.raises(DataError, match=why):
+            read_recording(path)
+
+
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    real = builtins.__import__
+
+    def without(name: str, *rest: Any, **options: Any) -> Any:
+        if name.split(".")[0] in ("mcap", "rosbags"):
+            raise ImportError(name)
+        return real(name, *rest, **options)
+
+    messages.codec.cache_clear()
+    monkeypatch.setattr(builtins, "__import__", without)
+    for act in (lambda: read_recording(tmp_path / "a.mcap"), lambda: write_recording(simulated(), tmp_path / "a.mcap")):
+        with pytest.raises(CoopenvError, match=r"pip install 'coopenv\[log\]'"):
+            act()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_recording(simulated(), tmp_path / "none" / "a.mcap")
+
+
+# The command
+
+
+def test_command_records_a_simulation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "drive.mcap"
+    arguments = ["record", "urban_crossing", "--seed", "3", "--policy", "random", "--set", "horizon=1.0"]
+    assert main([*arguments, "--out", str(path)]) == 0
+    assert "4 vehicles, 61 ticks, 1 s" in capsys.readouterr().out
+    read = read_recording(path)
+    parked = simulated("urban_crossing", seed=3)
+    assert read.scenario == parked.scenario
+    assert not np.array_equal(read.truth.position[-1], parked.truth.position[-1])  # somebody drove
+    assert main([*arguments, "--out", str(path)]) == 0
+    assert differences(read, read_recording(path)) == []
+
+
+def test_command_records_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mrclam_files.write(tmp_path, seconds=6.0)
+    path, data = tmp_path / "robots.mcap", ["--data", str(tmp_path)]
+    assert main(["record", "mrclam_6", *data, "--variant", "blind", "--out", str(path)]) == 0
+    assert differences(recording_of(load_dataset("mrclam_6", tmp_path), "blind"), read_recording(path)) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (["mrclam_6", "--seed", "2"], "--seed: is for a simulation, mrclam_6 is recorded"),
+        (["mrclam_12", "--data", "."], "unknown data set 'mrclam_12' (did you mean"),
+        (["mrclam_6", "--variant", "blnd", "--data", "."], "did you mean 'blind'"),
+        (["busy_intersectoin"], "did you mean 'busy_intersection'"),
+        (["busy_intersection", "--out", "drive.bag"], "the name must end in .mcap"),
+        (["busy_intersection", "--out", "none/drive.mcap"], "folder none does not exist"),
+    ],
+)
+def test_command_mistakes(
+    arguments: list[str], why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    out = [] if "--out" in arguments else ["--out", "drive.mcap"]
+    assert main(["record", *arguments, *out]) == 2
+    error = capsys.readouterr().err
+    assert why in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())

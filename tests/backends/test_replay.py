@@ -1,0 +1,233 @@
+"""What was recorded goes by again behind the same interface, with any observer, whatever the actions."""
+
+from __future__ import annotations
+
+import pickle
+import warnings
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from pettingzoo.test import parallel_api_test
+from pettingzoo.test.state_test import state_test
+from pettingzoo.utils import parallel_to_aec
+
+import coopenv
+from coopenv import CoopenvError
+from coopenv.api.engine import Engine
+from coopenv.api.parallel_env import CooperativeLocalisationEnv as Env
+from coopenv.backends.mcap import write_recording
+from coopenv.backends.mrclam import load_dataset
+from coopenv.backends.mrclam.recording import recording_of
+from coopenv.backends.replay import Replay
+from coopenv.estimation.observers import Recording, run
+from tests.backends import mrclam_files
+from tests.backends.recordings import simulated
+
+CASES: dict[str, tuple[str, dict[str, Any]]] = {
+    "plain": ("busy_intersection", {}),
+    "radio": ("busy_intersection", {"v2x__delay": 3, "v2x__loss": 0.4, "v2x__period": 2, "v2x__staleness": 0.2}),
+    "cyclic, slow corrections": ("busy_intersection", {"topology__acyclic": False, "rates__observer": 25.0}),
+    "sensed": ("urban_crossing", {}),
+    "three moving landmarks": ("crossing_path", {"rates__odometry": 37.0}),
+}
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    parent = tmp_path_factory.mktemp("data")
+    mrclam_files.write(parent, seconds=8.0)
+    return parent
+
+
+@cache
+def robots(parent: Path, variant: Any = "landmarks+robots") -> Recording:
+    return recording_of(load_dataset("mrclam_6", parent), variant)
+
+
+def replayed(recording: Recording, observer: str | None = None, **options: Any) -> Env:
+    overrides = {} if observer is None else {"observer.name": observer}
+    return Env(Replay(recording, "drive", overrides), "drive", **{"dtype": "float64", **options})
+
+
+def play(env: Env, seed: int = 0) -> list[Any]:
+    rng = np.random.default_rng(seed)
+    record: list[Any] = [env.reset(seed=seed)]
+    while env.agents:
+        record.append(env.step({agent: rng.uniform(-1, 1, 2).astype(np.float32) for agent in env.agents}))
+    return record
+
+
+def same(a: Any, b: Any) -> bool:
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, list | tuple):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    if isinstance(a, float | np.ndarray):
+        return np.array_equal(a, b, equal_nan=True)
+    return bool(a == b)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_recorded_simulation_looks_as_it_did(case: str) -> None:
+    """The kernels run on the record as they ran on the world: same observations, rewards, flags and estimates."""
+    name, overrides = CASES[case]
+    recording = simulated(name, 5, **overrides)
+    assert recording.scenario is not None
+    engines = [Engine(recording.scenario, 1, "float64")]
+    backend = Replay(recording, "drive")
+    engines.append(Engine(backend.scenario, 1, "float64", backend=backend))
+    for engine, seed in zip(engines, (5, 77), strict=True):
+        engine.reset([seed])
+    first, second = engines
+    for _ in range(recording.scenario.horizon_ticks // 6 + 1):
+        for field in ("observation", "reward"):
+            assert_allclose(second.view(field), first.view(field), atol=1e-6, err_msg=field)
+        for field in ("alive", "terminated", "truncated", "tick", "inbox_tick", "bearing_tick"):
+            assert np.array_equal(first.view(field), second.view(field)), field
+        for field in ("estimate_rotation", "estimate_position", "covariance", "nees", "position_error"):
+            assert_allclose(second.view(field), first.view(field), rtol=1e-9, atol=1e-12, err_msg=field)
+        for engine in engines:
+            engine.step(np.zeros((1, len(recording.setups), 2)))
+    assert first.view("over")[0] == 1
+
+
+@pytest.mark.parametrize("observer", ["riccati", "mekf", "centralised"])
+def test_observers_in_the_replay_do_as_in_the_runner(observer: str) -> None:
+    recording = simulated(v2x__delay=2, v2x__loss=0.3)
+    result, step = run(observer, recording), 6
+    assert not result.failure
+    for k, (*_, infos) in enumerate(play(replayed(recording, observer))[1:], start=1):
+        for i, agent in enumerate(infos):
+            estimate = infos[agent]["estimate"]
+            assert_allclose(estimate["position"], result.position[step * k, i], atol=1e-9)
+            assert_allclose(estimate["rotation"], result.rotation[step * k, i], atol=1e-9)
+
+
+@pytest.mark.parametrize("variant", ["landmarks", "landmarks+robots", "blind"])
+def test_robots_embedded_and_in_numpy_agree(data: Path, variant: str) -> None:
+    result = run("riccati", robots(data, variant))
+    assert not result.failure
+    env = coopenv.parallel_env("mrclam_6", data=data, variant=variant, dtype="float64")
+    assert env.possible_agents == [f"vehicle_{i}" for i in range(1, 6)]
+    step = env.scenario.ticks_per_decision
+    record = play(env)
+    for k, (*_, infos) in enumerate(record[1:], start=1):
+        tick = min(step * k, result.t.size - 1)
+        for i, agent in enumerate(infos):
+            assert_allclose(infos[agent]["estimate"]["position"], result.position[tick, i], atol=1e-9)
+            assert infos[agent]["time"] == pytest.approx(result.t[tick])
+    assert len(record) - 1 == -(-(result.t.size - 1) // step)
+    assert all(record[-1][3].values()) and not any(record[-1][2].values())
+
+
+def test_actions_and_seeds_change_nothing(data: Path) -> None:
+    env = replayed(robots(data))
+    for first, second in zip(play(env, 1), play(env, 2), strict=True):
+        assert same(first[0], second[0])
+        assert same(*({a: {**info, "reward_terms": {}} for a, info in step[-1].items()} for step in (first, second)))
+
+
+def test_official_tests(data: Path) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        parallel_api_test(coopenv.parallel_env("mrclam_6", data=data), num_cycles=200)
+        parallel_api_test(replayed(simulated("urban_crossing"), "mekf"), num_cycles=40)
+    env = coopenv.parallel_env("mrclam_6", data=data)
+    state_test(parallel_to_aec(env), env)
+
+
+def test_the_file_and_the_recording_are_the_same_environment(tmp_path: Path, data: Path) -> None:
+    pytest.importorskip("mcap", reason="needs the extra 'log'")
+    for recording in (simulated(v2x__loss=0.3), robots(data)):
+        write_recording(recording, tmp_path / "drive.mcap")
+        env = coopenv.parallel_env(tmp_path / "drive.mcap", dtype="float64")
+        assert same(play(env), play(replayed(recording)))
+        assert env.metadata["name"] == "drive_v0"
+
+
+def test_unknown_truth_stays_out_of_rewards_and_state(data: Path) -> None:
+    whole = robots(data)
+    position, rotation = whole.truth.position.copy(), whole.truth.rotation.copy()
+    position[40:], rotation[40:] = np.nan, np.nan
+    blind = replace(whole, truth=replace(whole.truth, position=position, rotation=rotation))
+    weights = {"reward.privileged": True, "reward.weights.position_error": 1.0, "reward.weights.orientation_error": 1.0}
+    env = Env(Replay(blind, "drive", weights), "drive", dtype="float64")
+    other = Env(Replay(whole, "drive", weights), "drive", dtype="float64")
+    for k, (a, b) in enumerate(zip(play(env), play(other), strict=True)):
+        assert same(a[0], b[0])  # observations
+        if k > 0:
+            assert (a[1] == b[1]) is (k < 20) and np.isfinite(list(a[1].values())).all()
+            assert np.isnan(a[4]["vehicle_1"]["position_error"]) == (k >= 20)
+    assert np.isfinite(env.state()).all()
+
+
+def test_it_is_drawn_and_saved_like_any_other(data: Path) -> None:
+    env = replayed(robots(data), render_mode="rgb_array")
+    env.reset(seed=0)
+    env.step({agent: np.zeros(2) for agent in env.agents})
+    picture = env.render()
+    assert picture is not None and picture.std() > 1
+    twin = pickle.loads(pickle.dumps(env))
+    state = env.get_state()
+    actions = {agent: np.zeros(2) for agent in env.agents}
+    first = env.step(actions)
+    env.set_state(state)
+    assert same(first, env.step(actions)) and same(first, twin.step(actions))
+
+
+def test_what_may_be_chosen_and_what_was_recorded(data: Path) -> None:
+    options: dict[str, Any] = {"data": data, "backend": "replay"}
+    short = coopenv.parallel_env("mrclam_6", overrides={"horizon": 2.0, "observer.k": 2.0}, **options)
+    assert short.scenario.horizon_ticks == 40 and short.scenario.observer.k == 2.0
+    for overrides, why in (
+        ({"noise.enabled": False}, "override 'noise.enabled': mrclam_6 is recorded"),
+        ({"horizon": 1000.0}, r"horizon: 1000 s are more than mrclam_6 has \(7.35 s\)"),
+        ({"observer.k": 0.1}, "observer.k|k > 0.5"),
+        ({"observer.name": "meckf"}, "did you mean 'mekf'"),
+    ):
+        with pytest.raises(CoopenvError, match=why):
+            coopenv.parallel_env("mrclam_6", overrides=overrides, **options)
+
+
+def test_names(data: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("COOPENV_DATA", raising=False)
+    for arguments, why in (
+        (("mrclam_6",), "mrclam_6: name its folder with --data DIR or COOPENV_DATA"),
+        (("mrclam_66",), "unknown data set 'mrclam_66' .did you mean 'mrclam_6'"),
+        ((tmp_path / "none.mcap",), "none.mcap: cannot be read"),
+    ):
+        with pytest.raises(CoopenvError, match=why):
+            coopenv.parallel_env(*arguments)
+    for options, why in (
+        ({"backend": "replay"}, "'busy_intersection' is no recording; known: FILE.mcap, mrclam_1 .. mrclam_9"),
+        ({"backend": "reply"}, r"unknown backend 'reply' \(did you mean 'replay'\?\); known: simulated, replay"),
+        ({"variant": "blind"}, "variant is for recorded data, 'busy_intersection' is simulated"),
+        ({"data": data}, "data is for recorded data"),
+    ):
+        with pytest.raises(CoopenvError, match=why):
+            coopenv.parallel_env("busy_intersection", **options)
+    with pytest.raises(CoopenvError, match=r"unknown variant 'blindd'.*did you mean 'blind'"):
+        coopenv.parallel_env("mrclam_6", data=data, variant="blindd")
+    monkeypatch.setenv("COOPENV_DATA", str(data))
+    assert coopenv.parallel_env("mrclam_6", variant="blind").scenario.title == "mrclam_6"
+
+
+def test_recordings_that_no_scenario_can_say(data: Path) -> None:
+    whole = robots(data)
+    gains = replace(whole.setups[2].gains, V=(1.0, 2.0))
+    other = replace(whole, setups=(*whole.setups[:2], replace(whole.setups[2], gains=gains), *whole.setups[3:]))
+    arm = replace(whole, setups=(*whole.setups[:4], replace(whole.setups[4], lever_arm=np.ones(3))))
+    due = whole.due.copy()
+    due[5:9] = False
+    for recording, why in (
+        (other, "vehicle_3 has other gains than vehicle_1"),
+        (arm, "the camera of vehicle_5 sits elsewhere"),
+        (replace(whole, due=due), "not due at a fixed rate"),
+    ):
+        with pytest.raises(CoopenvError, match=f"drive: .*{why}"):
+            replayed(recording)

@@ -1,0 +1,95 @@
+"""The filters on SE(3): exact prediction, and the update against its batch and its large-error limits."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.linalg import logm
+
+from coopenv.estimation.observers import Coordinates, Estimate, SensorNoise, run
+from coopenv.estimation.observers.left_invariant import InvariantError, LeftInvariant
+from coopenv.estimation.observers.mekf import LeftError, Mekf
+from coopenv.estimation.observers.ukf import SPREAD, Ukf, sigma_points
+from tests.estimation.observers.batch import small_record, solve
+from tests.estimation.observers.test_filters import QUIET, pose, spd, tick
+
+LARGE = np.array([1.1, -0.7, 0.9, 3.0, -2.0, 5.0])
+
+
+def matrix(state: LeftError) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = state.R, state.p
+    return T
+
+
+def invariant_error(truth: LeftError, estimate: LeftError) -> np.ndarray:
+    X = logm(np.linalg.inv(matrix(estimate)) @ matrix(truth)).real
+    return np.array([X[2, 1], X[0, 2], X[1, 0], *X[:3, 3]])
+
+
+def test_moving_by_an_error_of_any_size_makes_that_error() -> None:
+    state = InvariantError(*pose(0), np.eye(6))
+    assert_allclose(invariant_error(state.moved(LARGE, state.P), state), LARGE, atol=1e-9)
+
+
+def test_prediction_of_a_large_error_is_linear() -> None:
+    """Group affinity: the outer product of one error is carried exactly, which first order would miss by metres."""
+    state, t = InvariantError(*pose(1), np.outer(LARGE, LARGE)), tick(2, QUIET)
+    after = state.predicted(t)
+    error = invariant_error(state.moved(LARGE, state.P).predicted(t), after)
+    assert_allclose(after.P, np.outer(error, error), atol=1e-8)
+
+
+@pytest.mark.parametrize("name", ["left_invariant", "ukf"])
+def test_leader_is_at_the_most_probable_trajectory(name: str) -> None:
+    made = small_record()
+    R, p, covariance = solve(made, [0])
+    result = run(name, made)
+    assert not result.failure
+    std = np.sqrt(covariance[0, range(6), range(6)])
+    e = Coordinates.LEFT.error(R[0], p[0], result.rotation[-1, 0], result.position[-1, 0])
+    assert np.abs(e / std).max() < 0.01
+    assert_allclose(result.covariance[-1, 0] / np.outer(std, std), covariance[0] / np.outer(std, std), atol=2e-3)
+
+
+@pytest.mark.parametrize("name", ["left_invariant", "ukf"])
+def test_a_neighbour_counts_as_in_the_filter_of_left_errors(name: str) -> None:
+    """With small errors all filters that take the neighbour's covariance as noise are the same."""
+    made = small_record()
+    expected, result = run("mekf_covariance", made), run(name, made)
+    std = np.sqrt(expected.covariance[-1][:, range(6), range(6)])
+    assert_allclose((result.position - expected.position)[-1] / std[:, 3:], 0.0, atol=0.01)
+    scale = std[:, :, None] * std[:, None, :]
+    assert_allclose(result.covariance[-1] / scale, expected.covariance[-1] / scale, atol=2e-3)
+    assert_allclose(result.nis[-1], expected.nis[-1], rtol=0.01)
+    assert (result.nis_dof[-1] == expected.nis_dof[-1]).all()
+
+
+def test_sigma_points_have_the_moments() -> None:
+    P = spd(np.random.default_rng(3), 6)
+    xi = sigma_points(P)
+    assert_allclose(xi.sum(0), 0.0, atol=1e-12)
+    assert_allclose(xi.T @ xi / (2 * SPREAD), P, atol=1e-12)
+    flat = np.diag([1.0, 2.0, 0.0, 0.0, 3.0, 0.0])
+    assert_allclose(sigma_points(flat).T @ sigma_points(flat) / (2 * SPREAD), flat, atol=1e-12)
+
+
+def test_sigma_points_count_the_curvature_that_a_derivative_misses() -> None:
+    """After one frame at 60 degrees and 3 m, the filter of derivatives is far surer of the position."""
+    made = small_record(1)
+    truth = InvariantError(made.truth.rotation[1, 0], made.truth.position[1, 0], np.eye(6))
+    start = truth.moved(np.array([0.0, 0.0, 1.05, 3.0, 0.0, 0.0]), truth.P)
+    noise = SensorNoise(0.0, 0.0, made.dt, 0.02)
+    still = replace(made.tick(1, 0, {}), rotation=np.eye(3), translation=np.zeros(3), noise=noise)
+
+    def after_one_frame(own: Mekf) -> Estimate:
+        own.reset((start.R, start.p), np.diag([0.5] * 3 + [9.0] * 3))
+        return own.update(still)
+
+    unscented, linear = after_one_frame(Ukf(made.setups[0])), after_one_frame(LeftInvariant(made.setups[0]))
+    assert np.trace(unscented.covariance[3:, 3:]) > 2.0 * np.trace(linear.covariance[3:, 3:])
+    errors = [np.linalg.norm(e.position - truth.p) for e in (unscented, linear)]
+    assert errors[0] < errors[1]
