@@ -81,7 +81,9 @@ def test_held_commands_are_integrated_exactly(dataset):
     x = np.concatenate([[0.0], np.cumsum(v[:-1] * np.cos(heading[:-1])) * 1e-5])
     y = np.concatenate([[0.0], np.cumsum(v[:-1] * np.sin(heading[:-1])) * 1e-5])
     np.testing.assert_allclose(held.heading(t), np.interp(t, fine, heading), atol=1e-4)
-    np.testing.assert_allclose(held.position(t), np.stack([np.interp(t, fine, x), np.interp(t, fine, y)], -1), atol=1e-5)
+    np.testing.assert_allclose(
+        held.position(t), np.stack([np.interp(t, fine, x), np.interp(t, fine, y)], -1), atol=1e-5
+    )
 
 
 def test_a_command_is_not_held_for_ever(dataset):

@@ -131,8 +131,8 @@ def test_a_robot_never_seen_is_an_error(dataset):
 def test_observers_follow_robots_without_noise(dataset, observer, variant):
     result = run(observer, recording_of(dataset, variant))
     assert not result.failure
-    # PlanarRobust expects a lead and gains that these robots do not have
-    assert (result.position_rmse() < (0.01 if observer is PlanarEkf else 0.2)).all()
+    # bearings lag by up to a tick of driving; PlanarRobust expects a lead and gains that these robots do not have
+    assert (result.position_rmse() < (0.02 if observer is PlanarEkf else 0.2)).all()
     assert (result.anees(after=TICK_S) < 2).all()
 
 

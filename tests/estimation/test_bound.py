@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.testing import assert_allclose
 
-from coopenv.estimation.bound import cramer_rao, information, transitions
+from coopenv.estimation.bound import ancestors, cramer_rao, cramer_rao_ancestors, information, transitions
 from coopenv.estimation.observers import Coordinates, record
 from tests.estimation.observers.batch import small_errors, small_record, solve
 
@@ -90,3 +90,25 @@ def test_reference_figures() -> None:
     )
     bound = cramer_rao(record(scenario, 0)).position_rms(30.0)
     assert_allclose(bound, [0.0116, 0.0110, 0.0136, 0.0129, 0.0238], rtol=0.03)
+
+
+def test_ancestors_know_what_reaches_them() -> None:
+    """Vehicle 1 has no leader: its batch alone. The last one hears, through others, of everybody."""
+    made = small_record(3)
+    family = cramer_rao_ancestors(made)
+    joint, alone = cramer_rao(made), cramer_rao(made, joint=False)
+    assert_allclose(family.covariance[:, 0], alone.covariance[:, 0], rtol=1e-9, atol=1e-15)
+    assert_allclose(family.covariance[:, 4], joint.covariance[:, 4], rtol=1e-9, atol=1e-15)
+    assert (family.position[1:] >= joint.position[1:] * (1 - 1e-9)).all()
+    assert (family.position[1:] >= alone.position[1:] * (1 - 1e-9)).all()
+
+
+def test_ancestors_bound_is_that_of_a_smaller_world() -> None:
+    """Blind the others: the bound joint over all is then the one over the family."""
+    made = small_record(3)
+    for vehicle in range(5):
+        others = [i for i in range(5) if i not in ancestors(made, vehicle)]
+        visible = made.visible.copy()
+        visible[:, others] = False
+        expected = cramer_rao(replace(made, visible=visible)).covariance[:, vehicle]
+        assert_allclose(cramer_rao_ancestors(made).covariance[:, vehicle], expected, rtol=1e-9, atol=1e-15)

@@ -16,9 +16,10 @@ from matplotlib.figure import Figure
 
 from coopenv.bench.leaderboard.basin import Basin, Draw
 from coopenv.bench.leaderboard.basin_figure import basin_figure
-from coopenv.bench.leaderboard.figures import cost_figure, error_figure, nees_figure, variant_figure
+from coopenv.bench.leaderboard.figures import error_figure, nees_figure
 from coopenv.bench.leaderboard.judge import Sample
 from coopenv.bench.leaderboard.rows import Row
+from coopenv.bench.leaderboard.score_figures import cost_figure, variant_figure
 from coopenv.bench.leaderboard.tables import failures
 from coopenv.runs.output import writing
 from coopenv.viz.style import DPI

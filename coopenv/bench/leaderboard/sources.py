@@ -94,8 +94,8 @@ class Robots:
             CoopenvError: the data are not there or not well-formed.
         """
         from coopenv.backends.mrclam import load_dataset
-        from coopenv.backends.mrclam.variants import VARIANTS
         from coopenv.backends.mrclam.recording import recording_of
+        from coopenv.backends.mrclam.variants import VARIANTS
 
         known = next(name for name in VARIANTS if name == variant)
         return recording_of(load_dataset(self.name, self.data), known), None

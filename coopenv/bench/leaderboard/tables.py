@@ -13,6 +13,7 @@ from coopenv.bench.leaderboard.rows import Row
 MOST_COLUMNS = 6
 """Vehicles shown one by one; more are summed up as mean and worst."""
 
+_LONG = 9  # characters of a word in a heading
 _BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", "bound_single_m": "bound (alone)"}
 """Column to its line in the table of errors."""
 
@@ -74,7 +75,7 @@ def quality_table(rows: Sequence[Row]) -> Table:
                 for column in ("settled_fraction", "converged_fraction", "diverged_fraction")
             ),
             *((f"{min(anees):.2g}", f"{max(anees):.2g}") if anees else ("-", "-")),
-            f"{np.mean(nis):.2f}" if nis else "-",
+            _number(float(np.mean(nis)), 2) if nis else "-",
             f"{np.mean([row.bytes_per_s for row in own]):.0f}",
             f"{np.mean([row.us_per_update for row in own]):.0f}",
         )
@@ -84,7 +85,7 @@ def quality_table(rows: Sequence[Row]) -> Table:
 def variant_table(rows: Sequence[Row]) -> Table:
     """Return position RMSE in m, mean over the vehicles, of every observer in every variant."""
     variants = list(dict.fromkeys(row.variant for row in rows))
-    table = new_table("mean RMSE [m]", [name.replace("_", "\n").replace("+", "\n+") for name in variants])
+    table = new_table("mean RMSE [m]", [_heading(name) for name in variants])
     for name, own in by_observer(rows).items():
         cells = []
         for variant in variants:
@@ -93,6 +94,12 @@ def variant_table(rows: Sequence[Row]) -> Table:
             cells.append("failed" if failed else _errors([mean_rmse(part)], True)[0])
         table.add_row(name, *cells)
     return table
+
+
+def _heading(variant: str) -> str:
+    """Return a name on lines of few characters."""
+    words = variant.replace("+", "_+").split("_")
+    return "\n".join(word if len(word) <= _LONG else f"{word[:6]}-\n{word[6:]}" for word in words)
 
 
 def mean_rmse(rows: Sequence[Row]) -> float:
@@ -112,10 +119,10 @@ def _errors(values: Sequence[float], few: bool) -> list[str]:
 
 
 def _number(value: float, digits: int) -> str:
-    """Return at most seven characters."""
+    """Return at most five characters."""
     if not np.isfinite(value):
         return "-"
-    return f"{value:.{digits}g}" if value < 10**digits else f"{value:.0f}" if value < 1e6 else f"{value:.0e}"
+    return f"{value:.{digits}g}" if value < 10**digits else f"{value:.0f}" if value < 1e5 else f"{value:.0e}"
 
 
 def _finite(values: Iterable[float]) -> list[float]:

@@ -157,9 +157,7 @@ class Fault:
 
 FAULTS = {
     NOMINAL: Fault("as simulated"),
-    "v2x_loss": Fault(
-        f"{LOSS:.0%} of the messages are lost", lambda recording, seed: with_loss(recording, LOSS, seed)
-    ),
+    "v2x_loss": Fault(f"{LOSS:.0%} of the messages are lost", lambda recording, seed: with_loss(recording, LOSS, seed)),
     "v2x_delay": Fault(f"messages arrive {1e3 * DELAY:.0f} ms late", lambda recording, seed: with_delay(recording)),
     "wrong_association": Fault(
         f"{WRONG_SHARE:.0%} of the bearings carry the identity of another target in view",

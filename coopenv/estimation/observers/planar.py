@@ -22,7 +22,7 @@ OUT_OF_PLANE_STD = 1e-3  # rad and m
 LOWER = np.tril_indices(3)
 
 TEXTBOOK = Tuning()
-ROOMBA = Wheels(
+IROBOT_CREATE = Wheels(
     delay=(0.0, 0.1, 0.2, 0.4),
     share=(0.33, 0.42, 0.16, 0.09),
     arc=((0.15, 1.8), (0.35, 1.3), (0.8, 0.88), (1.6, 0.84), (2.6, 0.8), (3.2, 0.95), (3.8, 1.1), (4.5, 0.975)),
@@ -43,7 +43,7 @@ CALIBRATING = Tuning(
     std=(0.08, 0.03, 0.001, 0.002, 0.3, 0.05, 0.007),
     walk=(0.0003, 0.0003, 0.0, 0.0001, 0.0003, 0.0005, 0.0),
     jitter=0.08,
-    wheels=ROOMBA,
+    wheels=IROBOT_CREATE,
     fusion="intersection",
     dependent=0.25,
     arm_m=1.0,

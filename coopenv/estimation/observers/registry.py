@@ -26,6 +26,9 @@ ZOO = {
     "right_invariant": "right_invariant:RightInvariant",
     "ukf": "ukf:Ukf",
     "factor_graph": "factor_graph:FactorGraph",
+    "planar_ekf": "planar:PlanarEkf",
+    "robust": "robust:robust",
+    "robust_joint": "robust:robust_joint",
     "centralised": "centralised:Centralised",
 }
 """Name to module and class in this package."""

@@ -22,23 +22,33 @@ def skew(v: Array) -> Array:
 
 def exp_so3(w: Array) -> Array:
     """Return Exp(w), the rotation by |w| rad about w (3,)."""
-    square = float(w @ w)
+    x, y, z = w.tolist()  # scalars: a small array costs more than all of this
+    xx, yy, zz = x * x, y * y, z * z
+    square = xx + yy + zz
     if square > 1e-8:
         angle = math.sqrt(square)
         a, b = math.sin(angle) / angle, 2.0 * (math.sin(angle / 2) / angle) ** 2
     else:
         a, b = 1.0 - square / 6.0, 0.5 - square / 24.0
-    S = skew(w)
-    return IDENTITY + a * S + b * (S @ S)
+    bxy, bxz, byz, ax, ay, az = b * x * y, b * x * z, b * y * z, a * x, a * y, a * z
+    return np.array(
+        [
+            [1.0 - b * (yy + zz), bxy - az, bxz + ay],
+            [bxy + az, 1.0 - b * (xx + zz), byz - ax],
+            [bxz - ay, byz + ax, 1.0 - b * (xx + yy)],
+        ]
+    )
 
 
 def log_so3(R: Array) -> Array:
     """Return (3,) the rotation vector of R, of length 0..pi rad."""
-    v = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    sine, cosine = math.sqrt(v @ v), 0.5 * (float(np.trace(R)) - 1.0)
-    if cosine > -0.9:
-        return v * (math.atan2(sine, cosine) / sine if sine > 1e-9 else 1.0)
-    return Rotation.from_matrix(R).as_rotvec()  # near half a turn the vector part has no direction to speak of
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R.tolist()
+    x, y, z = 0.5 * (zy - yz), 0.5 * (xz - zx), 0.5 * (yx - xy)
+    sine, cosine = math.sqrt(x * x + y * y + z * z), 0.5 * (xx + yy + zz - 1.0)
+    if cosine <= -0.9:  # near half a turn the vector part has no direction to speak of
+        return Rotation.from_matrix(R).as_rotvec()
+    scale = math.atan2(sine, cosine) / sine if sine > 1e-9 else 1.0
+    return np.array([scale * x, scale * y, scale * z])
 
 
 def orthonormalise(R: Array) -> Array:

@@ -1,6 +1,19 @@
 """This project's own observer; see observer.py, and joint.py for the one with larger messages."""
 
+from coopenv.estimation.observers.base import Observer, Setup
+from coopenv.estimation.observers.planar import PlanarRobust
 from coopenv.estimation.observers.robust.joint import RobustJoint
 from coopenv.estimation.observers.robust.observer import Robust
 
-__all__ = ["Robust", "RobustJoint"]
+
+def robust(setup: Setup) -> Observer:
+    """Return the observer for a vehicle: a planar one where it moves on a plane and its odometry is its commands."""
+    return PlanarRobust(setup) if setup.planar else Robust(setup)
+
+
+def robust_joint(setup: Setup) -> Observer:
+    """Return the observer with larger messages; planar robots have one with small messages only."""
+    return PlanarRobust(setup) if setup.planar else RobustJoint(setup)
+
+
+__all__ = ["Robust", "RobustJoint", "robust", "robust_joint"]

@@ -6,16 +6,20 @@ stands at the time of its last message; until now it is carried on by its last k
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coopenv.estimation.observers.base import Array, SensorNoise
 from coopenv.estimation.observers.mekf import transition
+from coopenv.estimation.observers.robust.positive import solve_positive
 from coopenv.estimation.observers.rotations import exp_so3, log_so3, orthonormalise, skew, tangent_basis
 
-IDENTITY = np.eye(3)
+MOST_STEPS, STRAIGHT = 8, 0.01
+"""Linearisations of one correction; how far it may turn a line of sight without another one, rad."""
 TWIST_TIME = 0.3
 """s, over which a neighbour's twist is averaged."""
 
@@ -36,19 +40,27 @@ class Member:
     w: Array | None = None
     """(3,) last known angular velocity in its body, rad/s."""
 
-    def carried(self, age: float) -> tuple[Array, Array]:
-        """Return (dR, dp) of the motion at the last known twist for a time."""
+    def carried(self, age: float) -> Array:
+        """Return (3,) how far it comes in its body frame at the last known twist in a time, m."""
         if age <= 0.0 or self.v is None or self.w is None:
-            return IDENTITY, np.zeros(3)
-        return exp_so3(self.w * age), exp_so3(self.w * (age / 2)) @ self.v * age
+            return np.zeros(3)
+        return exp_so3(self.w * (age / 2)) @ self.v * age
 
 
-class Line(NamedTuple):
-    """A bearing as a measurement: residual = H x + noise, and whether the target is ahead at all."""
+class Sight(NamedTuple):
+    """Bearings as measurements, residual = H x + noise, at the poses believed."""
 
-    H: Array  # (2, 6n)
-    residual: Array  # (2,) rad
-    ahead: bool
+    H: Array  # (m, 2, 6n)
+    residual: Array  # (m, 2) rad
+    ahead: NDArray[np.bool_]  # (m,) whether the target is in front of the bearing at all
+    distance: Array  # (m,) m
+
+    def normalised(self, P: Array, noise: Array) -> Array:
+        """Return (m,) the normalised innovations squared under P and noise variances (m,)."""
+        S = self.H @ P @ np.swapaxes(self.H, 1, 2)
+        a, b, c = S[:, 0, 0] + noise, S[:, 0, 1], S[:, 1, 1] + noise
+        x, y = self.residual[:, 0], self.residual[:, 1]
+        return (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
 
 
 class Belief:
@@ -91,17 +103,16 @@ class Belief:
         F, block = transition(dR, dp), slice(6 * n, 6 * n + 6)
         self.P[block] = F @ self.P[block]
         self.P[:, block] = self.P[:, block] @ F.T
-        index = np.arange(6 * n, 6 * n + 6)
-        self.P[index, index] += noise
+        self.P.flat[6 * n * (len(self.P) + 1) : (6 * n + 6) * len(self.P) : len(self.P) + 1] += noise
 
-    def follow(self, n: int, odometry_R: Array, odometry_p: Array, time: float, noise: SensorNoise) -> None:
+    def follow(self, n: int, odometry_turn: Array, odometry_position: Array, time: float, noise: SensorNoise) -> None:
         """Carry a member on to where its own odometry says that it was at a time."""
         member = self.members[n]
         dt = time - member.time
         if dt <= 0.0 or member.odometry is None:
             return
         R, p = member.odometry
-        dR, dp = R.T @ odometry_R, R.T @ (odometry_p - p)
+        dR, dp = R.T @ odometry_turn, R.T @ (odometry_position - p)
         self.move(n, dR, dp, noise.odometry(dt))
         v, w = dp / dt, log_so3(dR) / dt
         if member.v is None or member.w is None:
@@ -109,40 +120,79 @@ class Belief:
         else:
             share = min(1.0, dt / TWIST_TIME)
             member.v, member.w = member.v + share * (v - member.v), member.w + share * (w - member.w)
-        member.time, member.odometry = time, (odometry_R, odometry_p)
+        member.time, member.odometry = time, (odometry_turn, odometry_position)
 
-    def line(self, bearing: Array, lever_arm: Array, z: Array, n: int | None, point: Array | None) -> Line:
-        """Return a bearing as a measurement.
+    def sight(
+        self, bearings: Array, lever_arm: Array, z: Array, places: Sequence[int] = (), points: Sequence[Array] = ()
+    ) -> Sight:
+        """Return bearings as measurements; the last ones are to members.
 
         Args:
-            bearing: (3,) unit vector, body frame.
+            bearings: (m, 3) unit vectors, body frame.
             lever_arm: (3,) the camera's place in the body, m.
-            z: (3,) where the target is believed to be, map frame, m.
-            n: the member that the target belongs to; None: a landmark.
-            point: (3,) of the target in that member's body, m.
+            z: (m, 3) where the targets are believed to be, map frame, m.
+            places: the members that the last targets belong to.
+            points: of these targets in their members' bodies, (3,) m each.
         """
-        own = self.own
-        a = own.R.T @ (z - own.p)
+        own, m = self.own, len(z)
+        a = (z - own.p) @ own.R
         d = a - lever_arm
-        distance = max(float(np.sqrt(d @ d)), 1e-9)
-        u = d / distance
-        B = tangent_basis(u[None])[0] / distance
-        H = np.zeros((2, len(self.P)))
-        H[:, :3], H[:, 3:6] = B @ skew(a), -B
-        if n is not None and point is not None:
-            G = B @ own.R.T @ self.members[n].R
-            H[:, 6 * n : 6 * n + 3], H[:, 6 * n + 3 : 6 * n + 6] = -G @ skew(point), G
-        return Line(H, distance * (B @ bearing), float(u @ bearing) > 0.0)
+        distance = np.maximum(np.sqrt((d * d).sum(axis=1)), 1e-9)
+        u = d / distance[:, None]
+        T = tangent_basis(u)
+        B = T / distance[:, None, None]
+        H = np.zeros((m, 2, len(self.P)))
+        H[:, :, :3], H[:, :, 3:6] = B @ skew(a), -B
+        for k, n, point in zip(range(m - len(places), m), places, points, strict=True):
+            G = B[k] @ own.R.T @ self.members[n].R
+            H[k, :, 6 * n + 3 : 6 * n + 6] = G
+            if point.any():
+                H[k, :, 6 * n : 6 * n + 3] = -G @ skew(point)
+        return Sight(H, (T @ bearings[..., None])[..., 0], (u * bearings).sum(axis=1) > 0.0, distance)
 
-    def correct(self, H: Array, N: Array, residual: Array) -> None:
-        """Take independent measurements residual = H x + noise of covariance N, in Joseph's form."""
+    def correct(self, H: Array, noise: Array, residual: Array) -> None:
+        """Take independent measurements residual = H x + noise of variances (m,), in Joseph's form."""
+        K = self.gain(H, noise)
+        self.condense(K, H, noise)
+        self.shift(K @ residual)
+
+    def settle(self, look: Callable[[], tuple[Sight, Array]], fits: NDArray[np.bool_]) -> None:
+        """Correct by bearings, linearised anew at where they put the poses while that is far from where they were.
+
+        Source: the iterated extended Kalman filter as Gauss-Newton steps, Bell and Cathey, The iterated Kalman filter
+        update as a Gauss-Newton method, IEEE Transactions on Automatic Control 38(2), 1993.
+
+        Args:
+            look: returns the frame's bearings as measurements at the poses believed now, and their noise variances.
+            fits: which of them count.
+        """
+        before = [(member.R, member.p) for member in self.members]
+        dx = np.zeros(len(self.P))
+        for _ in range(MOST_STEPS):
+            sight, noise = look()
+            H, variances = sight.H[fits].reshape(-1, len(dx)), np.repeat(noise[fits], 2)
+            K = self.gain(H, variances)
+            last, dx = dx, K @ (sight.residual[fits].ravel() + H @ dx)
+            for member, (R, p) in zip(self.members, before, strict=True):
+                member.R, member.p = R, p
+            self.shift(dx)
+            if _bend(dx - last, float(sight.distance[fits].min())) < STRAIGHT:
+                break
+        self.condense(K, H, variances)
+
+    def gain(self, H: Array, noise: Array) -> Array:
+        """Return the Kalman gain K (6n, m) of measurements H x + noise of variances (m,)."""
         PHt = self.P @ H.T
-        K = np.linalg.solve(H @ PHt + N, PHt.T).T
+        S = H @ PHt
+        S.flat[:: len(S) + 1] += noise
+        return solve_positive(S, PHt.T).T
+
+    def condense(self, K: Array, H: Array, noise: Array) -> None:
+        """Let the covariance be that after measurements H x + noise with gain K."""
         A = -K @ H
         A.flat[:: len(A) + 1] += 1.0
-        P = A @ self.P @ A.T + K @ N @ K.T
+        P = A @ self.P @ A.T + (K * noise) @ K.T
         self.P = (P + P.T) / 2
-        self.shift(K @ residual)
 
     def inform(self, index: Array, information: Array, vector: Array) -> None:
         """Take information about some errors x: their likelihood has the exponent vector^T x - x^T information x / 2.
@@ -153,12 +203,13 @@ class Belief:
             vector: (m,).
         """
         columns = self.P[:, index]
-        W = np.linalg.inv(np.eye(len(index)) + self.P[np.ix_(index, index)] @ information)
-        gain = columns @ W.T
+        A = columns[index] @ information
+        A.flat[:: len(A) + 1] += 1.0
+        W = np.linalg.inv(A)
         M = information @ W
         P = self.P - columns @ ((M + M.T) / 2) @ columns.T
         self.P = (P + P.T) / 2
-        self.shift(gain @ vector)
+        self.shift(columns @ (vector @ W))
 
     def shift(self, dx: Array) -> None:
         """Move the poses of the first members by their part of the error dx (6m,)."""
@@ -166,3 +217,9 @@ class Belief:
             member = self.members[n]
             member.p = member.p + member.R @ dx[6 * n + 3 : 6 * n + 6]
             member.R = member.R @ exp_so3(dx[6 * n : 6 * n + 3])
+
+
+def _bend(dx: Array, distance: float) -> float:
+    """Return by how much errors (6n,) turn lines of sight of a length, rad."""
+    errors = np.abs(dx).reshape(-1, 6)
+    return float(max(errors[:, :3].max(), errors[:, 3:].max() / distance))

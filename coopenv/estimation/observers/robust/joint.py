@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from coopenv.estimation.observers.base import Array, Message, Tick
+from coopenv.estimation.observers.base import Array, Message
 from coopenv.estimation.observers.robust.belief import Member
 from coopenv.estimation.observers.robust.observer import Robust
 from coopenv.estimation.observers.robust.report import Report, from_message, marker_jacobian
@@ -91,8 +91,8 @@ def _with_others(report: Report, message: Message) -> Report:
         time=np.concatenate([report.time, told["times"]]),
         R=np.array([report.R[0], *(exp_so3(pose[:3]) for pose in poses)]),
         p=np.concatenate([report.p, poses[:, 3:]]),
-        odometry_R=np.array([report.odometry_R[0], *(exp_so3(o[:3]) for o in odometries)]),
-        odometry_p=np.concatenate([report.odometry_p, odometries[:, 3:]]),
+        odometry_turn=np.array([report.odometry_turn[0], *(exp_so3(o[:3]) for o in odometries)]),
+        odometry_position=np.concatenate([report.odometry_position, odometries[:, 3:]]),
         P=L @ L.T,
         leans_on=0 if told["complete"][0] else report.leans_on,
     )

@@ -18,10 +18,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import block_diag
+from numpy.typing import NDArray
 
 from coopenv.estimation.observers.base import Array, Coordinates, Estimate, Message, SensorNoise, Setup, Tick
-from coopenv.estimation.observers.robust.belief import Belief, Line, Member
+from coopenv.estimation.observers.robust.belief import Belief, Member, Sight
+from coopenv.estimation.observers.robust.positive import solve_positive
 from coopenv.estimation.observers.robust.report import (
     Report,
     from_message,
@@ -46,9 +47,10 @@ ACCELERATION = 1.0
 """m/s^2 by which a vehicle may leave its last known twist."""
 SPEED = 1.0
 """m/s at which a sender may have gone on since a message that is used in the search."""
-LOST = np.diag([4.0, 4.0, 4.0, 400.0, 400.0, 400.0])
-"""Prior covariance of a search after a loss, rad^2 and m^2."""
-NOTHING, PLANE = np.zeros((3, 3)), np.eye(2)
+HEALTHY_SHARE, HEALTHY_TIME = 0.2, 1.0
+"""Share of contradicting bearings, and for how long, s, it must be lower for the pose to be worth remembering."""
+ANCHOR = np.diag([0.05**2] * 3 + [0.5**2] * 3)
+"""Added to the covariance of a pose that is remembered, rad^2 and m^2."""
 LEAST_VELOCITY_STD, LEAST_ANGULAR_STD = 2e-3, 2e-4
 """m/s and rad/s, of an odometry sample: the increments of a moving vehicle are never exact."""
 
@@ -90,12 +92,14 @@ class Robust:
         self.missed = 0.0
         self.belief = Belief(self.vehicle, R, p, P)
         self.search = None if is_known(P) else Search(self.vehicle, R, p, P)
+        self._drop_anchor(P)
 
     def update(self, tick: Tick) -> Estimate:
         """Take one camera tick."""
         R, p = self.odometry
         self.odometry = orthonormalise(R @ tick.rotation), p + R @ tick.translation
         noise = self.noise.odometry(tick.dt)
+        self.anchor.move(0, tick.rotation, tick.translation, noise)
         if self.search is not None:
             self.search.move(tick, noise)
             if tick.due:
@@ -116,16 +120,26 @@ class Robust:
         return to_message(self.belief, self.marker, self.odometry, self.leans_on)
 
     def _search(self, tick: Tick) -> None:
-        """Look for the pose; once only one is possible, go on with what this frame alone says of it."""
+        """Look for the pose; once only one is possible, go on with the prior, or with what this frame alone says."""
         assert self.search is not None
         found = self.search.look(tick, self._sightings(tick), self.variance)
         if found is None:
             return
-        own = found.own
-        self.belief, self.contacts, self.leans_on = Belief(self.vehicle, own.R, own.p, found.P.copy(), tick.time), {}, 0
+        if self.search.confirms_prior(found):
+            self._begin(self.search.prior, tick)
+            self.search = None
+            self._look(tick)
+            return
+        self._begin(found, tick)
+        if resect(self.belief, lambda: self._sight(tick)[:3]) and is_known(self.belief.P[:6, :6]):
+            self.search = None
+
+    def _begin(self, pose: Belief, tick: Tick) -> None:
+        """Believe in a pose and in those that are in view."""
+        own = pose.own
+        self.belief, self.contacts, self.leans_on = Belief(self.vehicle, own.R, own.p, pose.P.copy(), tick.time), {}, 0
+        self.missed = 0.0
         self._listen(tick)
-        if resect(self.belief, lambda: self._fitting(tick)[0]) and is_known(self.belief.P[:6, :6]):
-            self.search, self.missed = None, 0.0
 
     def _sightings(self, tick: Tick) -> list[Sighting]:
         """Return every target in view whose place is known or told by a sender that knows it."""
@@ -134,17 +148,22 @@ class Robust:
         for n in np.flatnonzero(tick.valid):
             target = int(tick.targets[n])
             if target < self.landmarks:
-                result.append(Sighting(tick.bearings[n], tick.landmarks[target], NOTHING))
+                result.append(Sighting(tick.bearings[n], tick.landmarks[target], 0.0))
             elif (report := reports.get(target - self.landmarks)) is not None:
-                R, age = report.R[0], tick.time - report.time[0]
-                covariance = R @ report.P[3:6, 3:6] @ R.T + (SPEED * age) ** 2 * np.eye(3)
-                result.append(Sighting(tick.bearings[n], report.p[0], covariance))
+                age = tick.time - report.time[0]
+                variance = float(np.trace(report.P[3:6, 3:6])) / 3.0 + (SPEED * age) ** 2
+                result.append(Sighting(tick.bearings[n], report.p[0], variance))
         return result
 
-    def _lose(self) -> None:
-        """Search anew; where the vehicle was is hardly a hint."""
+    def _drop_anchor(self, P: Array) -> None:
+        """Remember where the vehicle is, with a covariance P (6, 6), for a search after a loss."""
         own = self.belief.own
-        self.search = Search(self.vehicle, own.R, own.p, LOST.copy())
+        self.anchor, self.healthy = Belief(self.vehicle, own.R, own.p, P.copy()), 0.0
+
+    def _lose(self) -> None:
+        """Search anew, from where the vehicle was when most bearings fitted."""
+        own = self.anchor.own
+        self.search = Search(self.vehicle, own.R, own.p, self.anchor.P.copy())
 
     def _report(self, message: Message, sender: int, time: float) -> Report | None:
         """Return what a message says."""
@@ -183,7 +202,7 @@ class Robust:
             return
         numbers = [n for n, v in enumerate(report.vehicles) if v in told]
         index = np.concatenate([np.arange(6 * n, 6 * n + 6) for n in numbers])
-        odometry = zip(report.odometry_R, report.odometry_p, strict=True)
+        odometry = zip(report.odometry_turn, report.odometry_position, strict=True)
         poses = list(zip(report.vehicles, report.R, report.p, report.time.tolist(), odometry, strict=True))
         self.belief.add([Member(*poses[n]) for n in numbers], report.P[np.ix_(index, index)])
         self.contacts[report.vehicles[0]] = Contact(report)
@@ -197,7 +216,9 @@ class Robust:
             return
         contact.last = report
         numbers = [self.belief.place(v) for v in report.vehicles]
-        for n, R, p, time in zip(numbers, report.odometry_R, report.odometry_p, report.time.tolist(), strict=True):
+        for n, R, p, time in zip(
+            numbers, report.odometry_turn, report.odometry_position, report.time.tolist(), strict=True
+        ):
             if n is not None and n > 0:
                 self.belief.follow(n, R, p, time, self.noise)
         was_trusted = contact.trusted
@@ -219,7 +240,7 @@ class Robust:
             return
         member, block = self.belief.members[n], slice(6 * n, 6 * n + 6)
         e = left_error(member.R, member.p, report.R[0], report.p[0])
-        agrees = float(e @ np.linalg.solve(self.belief.P[block, block] + report.P[:6, :6], e)) < TRUST_GATE
+        agrees = float(e @ solve_positive(self.belief.P[block, block] + report.P[:6, :6], e)) < TRUST_GATE
         if contact.trusted:
             contact.trusted, contact.agreed = agrees, 0.0
             return
@@ -229,55 +250,47 @@ class Robust:
 
     def _look(self, tick: Tick) -> None:
         """Correct the belief by every bearing that fits it; search anew when most do not."""
-        lines, missed = self._fitting(tick)
-        if lines:
-            self.belief.correct(
-                np.concatenate([line.H for line, _ in lines]),
-                block_diag(*[N for _, N in lines]),
-                np.concatenate([line.residual for line, _ in lines]),
-            )
+        _, _, fits, missed = self._sight(tick)
+        if fits.any():
+            self.belief.settle(lambda: self._sight(tick)[:2], fits)
         if missed is not None:
             self.missed += (missed - self.missed) * min(1.0, tick.dt / LOST_TIME)
+            self.healthy = self.healthy + tick.dt if self.missed < HEALTHY_SHARE else 0.0
             if self.missed > LOST_SHARE:
                 self._lose()
+            elif self.healthy > HEALTHY_TIME:
+                self._drop_anchor(4.0 * self.belief.P[:6, :6] + ANCHOR)
 
-    def _fitting(self, tick: Tick) -> tuple[list[tuple[Line, Array]], float | None]:
-        """Return the bearings that fit the belief, with their noise, and the share of those that do not.
+    def _sight(self, tick: Tick) -> tuple[Sight, Array, NDArray[np.bool_], float | None]:
+        """Return the bearings to known targets, their noise variances, and which of them fit the belief.
 
-        Bearings to distrusted senders do not count in the share; None if there is none that does.
+        Last comes the share of those that do not, in which bearings to distrusted senders do not count; None if there
+        is none that does.
         """
-        lines: list[tuple[Line, Array]] = []
-        counted = missed = 0
+        belief = self.belief
+        known = [(n, int(tick.targets[n])) for n in np.flatnonzero(tick.valid) if tick.targets[n] < self.landmarks]
+        z = [tick.landmarks[target] for _, target in known]
+        drift, counts = [0.0] * len(known), [True] * len(known)
+        places, points = [], []
         for n in np.flatnonzero(tick.valid):
             vehicle = int(tick.targets[n]) - self.landmarks
-            measured = self._measured(tick, int(n), vehicle)
-            if measured is None:
+            if vehicle < 0 or (place := belief.place(vehicle)) is None:
                 continue
-            line, N = measured
-            nis = float(line.residual @ np.linalg.solve(line.H @ self.belief.P @ line.H.T + N, line.residual))
-            fits = line.ahead and nis < GATE
-            if fits:
-                lines.append(measured)
-            contact = self.contacts.get(vehicle)
-            if contact is None or contact.trusted:
-                counted, missed = counted + 1, missed + (not fits)
-        return lines, missed / counted if counted else None
-
-    def _measured(self, tick: Tick, n: int, vehicle: int) -> tuple[Line, Array] | None:
-        """Return a bearing as a measurement with its noise; None if the target is in nobody's belief."""
-        b = tick.bearings[n]
-        if vehicle < 0:
-            line = self.belief.line(b, tick.lever_arm, tick.landmarks[vehicle + self.landmarks], None, None)
-            return line, self.variance * PLANE
-        place = self.belief.place(vehicle)
-        if place is None:
-            return None
-        member = self.belief.members[place]
-        age = tick.time - member.time
-        _, dp = member.carried(age)
-        line = self.belief.line(b, tick.lever_arm, member.p + member.R @ dp, place, dp)
-        across = line.H[:, 3:6]
-        return line, self.variance * PLANE + self._drift(age) * across @ across.T
+            member, contact = belief.members[place], self.contacts.get(vehicle)
+            age = tick.time - member.time
+            point = member.carried(age)
+            known.append((n, vehicle))
+            z.append(member.p + member.R @ point)
+            places.append(place)
+            points.append(point)
+            drift.append(self._drift(age))
+            counts.append(contact is None or contact.trusted)
+        bearings = tick.bearings[[n for n, _ in known]]
+        sight = belief.sight(bearings, tick.lever_arm, np.array(z).reshape(-1, 3), places, points)
+        noise = self.variance + np.array(drift) / sight.distance**2
+        fits = sight.ahead & (sight.normalised(belief.P, noise) < GATE)
+        counted = np.array(counts, bool)
+        return sight, noise, fits, float(np.mean(~fits[counted])) if counted.any() else None
 
     def _drift(self, age: float) -> float:
         """Return the variance per axis, m^2, of where a sender is a time after its last message."""

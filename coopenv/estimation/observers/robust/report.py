@@ -17,6 +17,7 @@ import numpy as np
 from coopenv.estimation.observers.base import Array, Message, SensorNoise
 from coopenv.estimation.observers.mekf import transition
 from coopenv.estimation.observers.robust.belief import Belief, Member
+from coopenv.estimation.observers.robust.positive import invert_positive
 from coopenv.estimation.observers.rotations import exp_so3, log_so3, orthonormalise, skew
 
 BITS = 64
@@ -38,16 +39,16 @@ class Report:
     time: Array  # (m,) s, at which each stands
     R: Array  # (m, 3, 3)
     p: Array  # (m, 3) m, map frame, of the marker
-    odometry_R: Array  # (m, 3, 3) by dead reckoning from the start, in a frame of its own
-    odometry_p: Array  # (m, 3) m, of the marker
+    odometry_turn: Array  # (m, 3, 3) by dead reckoning from the start, in a frame of its own
+    odometry_position: Array  # (m, 3) m, of the marker
     P: Array  # (6m, 6m)
     leans_on: int
     """Bits of all vehicles whose messages are in it."""
 
     def motion_since(self, last: Report, n: int) -> tuple[Array, Array]:
         """Return member n's odometry increment (dR, dp) since the last report."""
-        R = last.odometry_R[n].T
-        return R @ self.odometry_R[n], R @ (self.odometry_p[n] - last.odometry_p[n])
+        R = last.odometry_turn[n].T
+        return R @ self.odometry_turn[n], R @ (self.odometry_position[n] - last.odometry_position[n])
 
 
 @dataclass(frozen=True)
@@ -81,9 +82,8 @@ def tracklet(last: Report, new: Report, noise: SensorNoise) -> Tracklet | None:
     before.flat[:: 6 * m + 1] += Q
     if (np.diag(new.P) > 1.01 * np.diag(before)).any():
         return None
-    after = np.linalg.inv(new.P)
-    information = after - np.linalg.inv(before)
-    return Tracklet(R, p, (information + information.T) / 2, after @ c)
+    after = invert_positive(new.P)
+    return Tracklet(R, p, after - invert_positive(before), after @ c)
 
 
 def left_error(R: Array, p: Array, R_other: Array, p_other: Array) -> Array:
@@ -136,8 +136,8 @@ def from_message(message: Message, sender: int, time: float) -> Report | None:
         time=np.array([time]),
         R=message.rotation[None],
         p=message.position[None],
-        odometry_R=exp_so3(odometry[:3])[None],
-        odometry_p=odometry[None, 3:],
+        odometry_turn=exp_so3(odometry[:3])[None],
+        odometry_position=odometry[None, 3:],
         P=np.asarray(message.covariance, float),
         leans_on=int(message.extra["leans_on"][0]),
     )

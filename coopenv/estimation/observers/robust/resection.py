@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.linalg import block_diag
+from numpy.typing import NDArray
 
 from coopenv.estimation.observers.base import Array
-from coopenv.estimation.observers.robust.belief import Belief, Line
+from coopenv.estimation.observers.robust.belief import Belief, Sight
 
 STEPS = 6
 LEAST_INFORMATION = 1e-12
 """Of the weakest direction relative to the strongest; below it the frame does not tell the pose."""
 
 
-def resect(belief: Belief, look: Callable[[], list[tuple[Line, Array]]]) -> bool:
+def resect(belief: Belief, look: Callable[[], tuple[Sight, Array, NDArray[np.bool_]]]) -> bool:
     """Put the vehicle where a frame's bearings see it, by least squares from where it is; return whether that works.
 
     The other members stay. The vehicle's covariance becomes that of the solution, which inherits the members' errors,
@@ -23,32 +23,27 @@ def resect(belief: Belief, look: Callable[[], list[tuple[Line, Array]]]) -> bool
 
     Args:
         belief: of the vehicle and the members that it sees.
-        look: returns the frame's bearings, and their own noise, as measurements at the pose that is believed now.
+        look: returns the frame's bearings at the pose that is believed now, their own noise variances, and which count.
     """
     others = belief.P[6:, 6:]
     for step in range(STEPS):
-        lines = look()
-        if len(lines) < 3:
+        sight, noise, fits = look()
+        if fits.sum() < 3:
             return False
-        H = np.concatenate([line.H for line, _ in lines])
-        own, rest = H[:, :6], H[:, 6:]
-        N = block_diag(*[noise for _, noise in lines])
+        H, N = sight.H[fits], noise[fits]
         # the weights count the others' errors bearing by bearing
-        W = block_diag(*[np.linalg.inv(noise + theirs(line, others)) for line, noise in lines])
-        M = own.T @ W @ own
+        own, rest = H[:, :, :6], H[:, :, 6:]
+        W = np.linalg.inv(N[:, None, None] * np.eye(2) + rest @ others @ np.swapaxes(rest, 1, 2))
+        weighted = np.swapaxes(own, 1, 2) @ W
+        M = (weighted @ own).sum(axis=0)
         spectrum = np.linalg.eigvalsh(M)
         if not spectrum[0] > LEAST_INFORMATION * spectrum[-1]:
             return False
-        G = np.linalg.solve(M, own.T @ W)
+        G = np.linalg.solve(M, np.concatenate(list(weighted), axis=1))
         if step < STEPS - 1:
-            belief.shift(G @ np.concatenate([line.residual for line, _ in lines]))
-    belief.P[:6, :6] = G @ (N + rest @ others @ rest.T) @ G.T
+            belief.shift(G @ sight.residual[fits].ravel())
+    rest = rest.reshape(2 * len(rest), len(others))
+    belief.P[:6, :6] = G @ (np.diag(np.repeat(N, 2)) + rest @ others @ rest.T) @ G.T
     belief.P[:6, 6:] = -G @ rest @ others
     belief.P[6:, :6] = belief.P[:6, 6:].T
     return True
-
-
-def theirs(line: Line, others: Array) -> Array:
-    """Return the covariance (2, 2) that the members' errors give a bearing."""
-    rest = line.H[:, 6:]
-    return rest @ others @ rest.T

@@ -13,17 +13,19 @@ import numpy as np
 
 from coopenv.estimation.observers.base import Array, Tick
 from coopenv.estimation.observers.perspective import solve_p3p
-from coopenv.estimation.observers.robust.belief import Belief
+from coopenv.estimation.observers.robust.belief import Belief, Sight
+from coopenv.estimation.observers.robust.positive import invert_positive
 from coopenv.estimation.observers.robust.report import left_error
 
-MOST_HYPOTHESES = 4
 GATE = 13.8
 """Of a bearing's normalised innovation squared: chi-square of 2, 0.999."""
 MISS = 25.0
 """What a hypothesis pays at most for one bearing."""
 MARGIN = 30.0
 """By how much it may have paid more than the best one: odds of exp(-15)."""
-FLOOR = 30.0
+MOST_SURPRISE = 50.0
+"""What a hypothesis pays at most for being far from the prior: that may be wrong altogether."""
+FLOOR = 80.0
 """What the best may have paid beyond twice what is expected of a true one."""
 LEAST_TIME = 0.5
 """s, before a hypothesis is believed."""
@@ -31,8 +33,8 @@ KNOWN_ANGLE, KNOWN_POSITION = 0.2, 2.0
 """rad and m, standard deviation per axis below which a pose is one to go on with."""
 SLOW = 4.0
 """By how much a neighbour's variance counts: its error changes slowly, so that it does not average out."""
-SAME = 16.0
-"""Squared distance, in standard deviations, below which two hypotheses are one."""
+SAME, SAME_PRIOR = 16.0, 30.0
+"""Squared distance, in standard deviations, below which two hypotheses are one, and one is the prior."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,7 @@ class Sighting:
 
     bearing: Array  # (3,) body frame
     z: Array  # (3,) map frame, m
-    covariance: Array  # (3, 3) of z, m^2
+    variance: float  # of z per axis, m^2
 
 
 @dataclass
@@ -94,12 +96,16 @@ class Search:
         return self.bank[0].belief if len(self.bank) == 1 and self.age >= LEAST_TIME else None
 
     def _solutions(self, tick: Tick, sightings: list[Sighting], variance: float) -> list[Hypothesis]:
-        """Return the poses that explain three well placed sightings, other ones at every attempt."""
+        """Return the poses that explain three well placed sightings, other ones at every attempt, and a known prior."""
         triples = sorted(combinations(range(len(sightings)), 3), key=lambda c: -_spread(sightings, c))
         three = triples[self.attempts % len(triples)]
         b = np.array([sightings[n].bearing for n in three])
         z = np.array([sightings[n].z for n in three])
         bank = []
+        if is_known(self.prior.P):
+            own = self.prior.own
+            bank.append(Hypothesis(Belief(self.vehicle, own.R, own.p, self.prior.P.copy()), 0.0))
+            _follow(bank[0], tick, sightings, variance)
         for R, camera in zip(*solve_p3p(b, z), strict=True):
             belief = Belief(self.vehicle, R, camera - R @ tick.lever_arm, np.zeros((6, 6)))
             P = _covariance(belief, tick, [sightings[n] for n in three], variance)
@@ -111,10 +117,14 @@ class Search:
             bank.append(hypothesis)
         return bank
 
+    def confirms_prior(self, belief: Belief) -> bool:
+        """Return whether a pose is the prior's, the prior being certain enough to go on with."""
+        return is_known(self.prior.P) and self._surprise(belief) < SAME_PRIOR
+
     def _surprise(self, belief: Belief) -> float:
-        """Return the squared distance from the prior, in its standard deviations."""
+        """Return the squared distance from the prior, in standard deviations, or `MOST_SURPRISE`."""
         e = left_error(self.prior.own.R, self.prior.own.p, belief.own.R, belief.own.p)
-        return float(e @ np.linalg.solve(self.prior.P + belief.P, e))
+        return min(float(e @ np.linalg.solve(self.prior.P + belief.P, e)), MOST_SURPRISE)
 
     def _prune(self) -> None:
         """Give up what pays much more than the best, what is the same as a better one, and all if none is good."""
@@ -139,37 +149,41 @@ def _spread(sightings: list[Sighting], three: tuple[int, ...]) -> float:
     return float(np.linalg.norm(np.cross(b - a, c - a)))
 
 
-def _noise(H: Array, R: Array, s: Sighting, variance: float) -> Array:
-    """Return the covariance (2, 2) of a bearing, its target's uncertainty included."""
-    G = H[:, 3:6] @ R.T
-    return variance * np.eye(2) + SLOW * G @ s.covariance @ G.T
+def _noise(distance: Array, sightings: list[Sighting], variance: float) -> Array:
+    """Return the variances (m,) of bearings, their targets' uncertainty included."""
+    return variance + SLOW * np.array([s.variance for s in sightings]) / distance**2
+
+
+def _seen(belief: Belief, tick: Tick, sightings: list[Sighting], variance: float) -> tuple[Sight, Array]:
+    """Return sightings as measurements at a pose, and their variances (m,)."""
+    b, z = np.array([s.bearing for s in sightings]), np.array([s.z for s in sightings])
+    sight = belief.sight(b, tick.lever_arm, z)
+    return sight, _noise(sight.distance, sightings, variance)
 
 
 def _covariance(belief: Belief, tick: Tick, sightings: list[Sighting], variance: float) -> Array | None:
     """Return the covariance (6, 6) of a pose that is solved from sightings; None if they do not tell it."""
-    M = np.zeros((6, 6))
-    for s in sightings:
-        line = belief.line(s.bearing, tick.lever_arm, s.z, None, None)
-        M += line.H.T @ np.linalg.solve(_noise(line.H, belief.own.R, s, variance), line.H)
+    sight, noise = _seen(belief, tick, sightings, variance)
+    M = (np.swapaxes(sight.H, 1, 2) / noise[:, None, None] @ sight.H).sum(axis=0)
     spectrum = np.linalg.eigvalsh(M)
     if not spectrum[0] > 1e-12 * spectrum[-1]:
         return None
-    P = np.linalg.inv(M)
-    return (P + P.T) / 2 if np.diag(P)[:3].max() < 1.0 else None
+    P = invert_positive(M)
+    return P if np.diag(P)[:3].max() < 1.0 else None
 
 
 def _follow(hypothesis: Hypothesis, tick: Tick, sightings: list[Sighting], variance: float) -> None:
     """Let a hypothesis pay for a frame's sightings and learn from those that fit."""
+    if not sightings:
+        return
     belief = hypothesis.belief
-    for s in sightings:
-        line = belief.line(s.bearing, tick.lever_arm, s.z, None, None)
-        N = _noise(line.H, belief.own.R, s, variance)
-        nis = float(line.residual @ np.linalg.solve(line.H @ belief.P @ line.H.T + N, line.residual))
-        fits = line.ahead and nis < GATE
-        hypothesis.paid += min(nis, MISS) if line.ahead else MISS
-        hypothesis.bearings += 1
-        if fits:
-            belief.correct(line.H, N, line.residual)
+    sight, noise = _seen(belief, tick, sightings, variance)
+    nis = sight.normalised(belief.P, noise)
+    hypothesis.paid += float(np.where(sight.ahead, np.minimum(nis, MISS), MISS).sum())
+    hypothesis.bearings += len(sightings)
+    fits = sight.ahead & (nis < GATE)
+    if fits.any():
+        belief.settle(lambda: _seen(belief, tick, sightings, variance), fits)
 
 
 def _same(one: Hypothesis, other: Hypothesis) -> bool:

@@ -1,0 +1,145 @@
+"""The command: tables that fit, files with every column, a report that needs nothing else."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import json
+import re
+from dataclasses import fields
+from html.parser import HTMLParser
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from coopenv.bench.leaderboard import compare, find_source
+from coopenv.bench.leaderboard.command import print_tables
+from coopenv.bench.leaderboard.rows import Row
+from coopenv.cli import main
+from coopenv.estimation.observers import registry
+from coopenv.estimation.observers.faults import FAULTS
+from tests.bench.leaderboard.test_compare import Raises
+
+REQUIRED = {
+    *("environment", "variant", "observer", "vehicle", "position_rmse_m", "orientation_rmse_deg", "bound_m", "anees"),
+    *("settled_fraction", "settle_time_s", "bytes_per_s", "us_per_update", "failure"),
+}
+
+
+class Page(HTMLParser):
+    """Collects what a page refers to, and whether its tags match."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.sources: list[str] = []
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.sources += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in ("meta", "img", "wbr"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The files of a short comparison."""
+    out = tmp_path_factory.mktemp("board") / "new"
+    words = ["bench", "observers", "overtaking", "--observers", "riccati,mekf", "--variants", "nominal,landmarks_lost"]
+    words += ["--seeds", "2", "--set", "horizon=1.0", "--basin", "2", "--jobs", "1", "--out", str(out)]
+    assert main(words) == 0
+    return out
+
+
+def test_json(folder: Path) -> None:
+    board = json.loads((folder / "leaderboard.json").read_text())
+    assert set(board) == {"command", "versions", "seeds", "rows", "basin"}
+    assert set(board["versions"]) == {"coopenv", "numpy", "scipy", "warp", "python"} and board["seeds"] == [0, 1]
+    assert list(board["rows"][0]) == [f.name for f in fields(Row)] and set(board["rows"][0]) >= REQUIRED
+    keys = [(row["variant"], row["observer"], row["vehicle"]) for row in board["rows"]]
+    assert keys == [
+        (variant, name, f"vehicle_{i}")
+        for variant in ("nominal", "landmarks_lost")
+        for name in ("riccati", "mekf")
+        for i in (1, 2)
+    ]
+    assert [basin["observer"] for basin in board["basin"]] == ["riccati", "mekf"]
+
+
+def test_the_command_in_the_file_gives_the_same_table(folder: Path, tmp_path: Path) -> None:
+    board = json.loads((folder / "leaderboard.json").read_text())
+    words = board["command"].split()
+    assert words[0] == "coopenv" and "--jobs" not in words
+    assert main([*words[1:], "--jobs", "2", "--out", str(tmp_path)]) == 0
+    again = json.loads((tmp_path / "leaderboard.json").read_text())
+    for row in (*board["rows"], *again["rows"]):
+        del row["us_per_update"]
+    assert again == board
+
+
+def test_csv(folder: Path) -> None:
+    with (folder / "leaderboard.csv").open() as file:
+        table = list(csv.DictReader(file))
+    rows = json.loads((folder / "leaderboard.json").read_text())["rows"]
+    assert [float(line["position_rmse_m"]) for line in table] == [row["position_rmse_m"] for row in rows]
+    with (folder / "basin.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == 2 * 2 * 2
+
+
+def test_report(folder: Path) -> None:
+    text = (folder / "report.html").read_text()
+    page = Page(text)
+    assert not page.open
+    assert page.sources and all(source.startswith("data:image/png;base64,") for source in page.sources)
+    for source in page.sources:
+        assert base64.b64decode(source.split(",", 1)[1]).startswith(b"\x89PNG")
+    assert "url(" not in text and "http" not in re.sub(r"base64,[^\"]*", "", text)
+    for wanted in ("--seeds 2", "numpy", "Seeds 0 to 1", "Basin of attraction", "Cost against accuracy", "Consistency"):
+        assert wanted in text
+    for name in (f.name for f in fields(Row)):
+        assert f"<dt>{name}</dt>" in text
+
+
+def test_tables_fit_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_registered", {})
+    registry.register("raises", Raises)
+    source = find_source("busy_intersection", {"horizon": 1.0})
+    rows = compare(source, ["covariance_intersection", "raises"], 1, tuple(FAULTS)).rows
+    printed = StringIO()
+    print_tables(rows, [], Console(file=printed, width=80))
+    text = printed.getvalue()
+    assert "failed" in text and "…" not in text and "bound (ancestors)" in text and "landmarks" in text
+    assert max(len(line) for line in text.splitlines() if "by design" not in line) <= 80
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["overtaking", "--observers", "ricati"], "did you mean 'riccati'"),
+        (["overtakin"], "did you mean 'overtaking'"),
+        (["overtaking", "--variants", "v2x_los"], "did you mean 'v2x_loss'"),
+        (["overtaking", "--engine", "dask"], "known are local, ray"),
+        (["overtaking", "--address", "127.0.0.1:1"], "only --engine ray"),
+        (["overtaking", "--engine", "ray", "--jobs", "2"], "the cluster decides"),
+        (["overtaking", "--engine", "ray", "--address", "nowhere"], "expected HOST:PORT"),
+        (["nowhere.mcap"], "no such log file"),
+        (["mrclam_6", "--set", "horizon=1"], "recorded"),
+    ],
+)
+def test_mistakes_have_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "observers", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert said in error and len(error.strip().splitlines()) == 1
+
+
+def test_a_folder_that_cannot_be_written_is_told_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["bench", "observers", "overtaking", "--seeds", "1000", "--out", str(tmp_path / "file")]) == 2
+    assert "file" in capsys.readouterr().err

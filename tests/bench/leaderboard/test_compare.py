@@ -1,0 +1,87 @@
+"""The comparison of observers: same ticks for all, any number of processes, failures that stop nobody else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import coopenv
+from coopenv.bench.leaderboard import compare, find_source
+from coopenv.bench.leaderboard.engines import Local
+from coopenv.bench.leaderboard.tables import failures
+from coopenv.errors import CoopenvError
+from coopenv.estimation.bound import cramer_rao, cramer_rao_ancestors
+from coopenv.estimation.observers import record, registry, run
+from coopenv.estimation.observers.base import Estimate, Tick
+from coopenv.estimation.observers.dead_reckoning import DeadReckoning
+from coopenv.estimation.observers.faults import FAULTS
+
+SHORT = {"horizon": 1.5}
+
+
+def test_rows_are_root_means_over_seeds() -> None:
+    scenario = coopenv.load_scenario("overtaking", SHORT)
+    rows = compare(find_source("overtaking", SHORT), ["riccati", "dead_reckoning"], 2, steady_from=0.5).rows
+    assert [(row.observer, row.vehicle) for row in rows] == [
+        (name, f"vehicle_{i}") for name in ("riccati", "dead_reckoning") for i in (1, 2)
+    ]
+    records = [record(scenario, seed) for seed in (0, 1)]
+    late = records[0].t > 0.5
+    errors = np.array([run("riccati", made).position_error[late] for made in records])
+    each = np.sqrt(np.mean(errors**2, axis=1))
+    assert [row.position_rmse_m for row in rows[:2]] == pytest.approx(np.sqrt(np.mean(each**2, axis=0)), rel=1e-12)
+    assert [row.position_rmse_median_m for row in rows[:2]] == pytest.approx(each.mean(axis=0), rel=1e-12)
+    for column, bound in (("bound_m", cramer_rao), ("bound_ancestors_m", cramer_rao_ancestors)):
+        squares = [np.mean(bound(made).position[late] ** 2, axis=0) for made in records]
+        assert [getattr(row, column) for row in rows[:2]] == pytest.approx(np.sqrt(np.mean(squares, axis=0)), rel=1e-12)
+    for row in rows:
+        assert row.ratio_to_bound == pytest.approx(row.position_rmse_m / row.bound_m)
+        assert row.bound_m <= row.bound_ancestors_m and row.bound_single_m <= row.bound_ancestors_m * (1 + 1e-9)
+        assert row.degradation == 1.0 and row.gramian_min_eigenvalue >= 0.0
+
+
+def test_every_fault_has_its_rows() -> None:
+    rows = compare(find_source("busy_intersection", {"horizon": 2.0}), ["mekf_covariance"], 1, list(FAULTS), 1.0).rows
+    assert list(dict.fromkeys(row.variant for row in rows)) == list(FAULTS)
+    rmse = {name: [row.position_rmse_m for row in rows if row.variant == name] for name in FAULTS}
+    for name in set(FAULTS) - {"nominal"}:
+        assert rmse[name] != rmse["nominal"]
+        ratios = [row.degradation for row in rows if row.variant == name]
+        assert ratios == pytest.approx(np.divide(rmse[name], rmse["nominal"]))
+    assert rmse["lying_neighbour"][:2] == rmse["nominal"][:2]  # the liar and its leader
+
+
+class Raises(DeadReckoning):
+    """Fails at its first update."""
+
+    def update(self, tick: Tick) -> Estimate:
+        raise ZeroDivisionError("by design")
+
+
+class Tells(DeadReckoning):
+    """Tells an innovation of 3 in 2 degrees of freedom."""
+
+    def update(self, tick: Tick) -> Estimate:
+        found = super().update(tick)
+        return Estimate(found.rotation, found.position, found.covariance, found.coordinates, 3.0, 2)
+
+
+def test_observers_registered_here_travel_to_other_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One fails, which stops nobody else; another tells its NIS."""
+    monkeypatch.setattr(registry, "_registered", {})
+    registry.register("raises", Raises)
+    registry.register("tells", Tells)
+    source = find_source("overtaking", SHORT)
+    rows = compare(source, ["raises", "tells", "dead_reckoning"], 2, None, 0.5, Local(2)).rows
+    assert len(failures(rows)) == 1 and "by design" in failures(rows)[0]
+    assert np.isnan(rows[0].position_rmse_m) and rows[0].settled_fraction == 0.0 and rows[0].diverged_fraction == 1.0
+    assert [row.nis for row in rows[2:4]] == [1.5, 1.5] and np.isnan(rows[-1].nis)
+    assert [row.position_rmse_m for row in rows[2:4]] == [row.position_rmse_m for row in rows[4:]]
+
+
+def test_mistakes_are_told_before_the_work() -> None:
+    source = find_source("overtaking", SHORT)
+    with pytest.raises(CoopenvError, match="did you mean 'riccati'"):
+        compare(source, ["ricati"], 1)
+    with pytest.raises(CoopenvError, match="steady-from"):
+        compare(source, ["riccati"], 1, steady_from=2.0)

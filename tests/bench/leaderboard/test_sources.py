@@ -1,0 +1,64 @@
+"""Where records come from: environments, recorded robots of the original file format, log files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import coopenv
+from coopenv.bench.leaderboard import compare, find_source
+from coopenv.bench.leaderboard.sources import variants_of
+from coopenv.errors import CoopenvError
+from coopenv.estimation.observers import record, run
+from coopenv.estimation.observers.faults import FAULTS
+from tests.backends import mrclam_files
+
+
+def test_a_log_file_gives_the_rows_of_what_it_recorded(tmp_path: Path) -> None:
+    mcap = pytest.importorskip("mcap", reason="needs the extra log")
+    assert mcap is not None
+    from coopenv.backends.mcap import write_recording
+
+    write_recording(record(coopenv.load_scenario("overtaking", {"horizon": 1.0}), 0), tmp_path / "drive.mcap")
+    source = find_source(str(tmp_path / "drive.mcap"))
+    replayed = compare(source, ["mekf"], 3, ["nominal", "v2x_delay"], 0.5).rows
+    simulated = compare(find_source("overtaking", {"horizon": 1.0}), ["mekf"], 1, ["nominal", "v2x_delay"], 0.5).rows
+    assert source.name == "drive"
+    assert [r.position_rmse_m for r in replayed] == [r.position_rmse_m for r in simulated]
+    assert [r.bound_m for r in replayed] == [r.bound_m for r in simulated]
+
+
+def test_variants() -> None:
+    source = find_source("overtaking")
+    assert variants_of(source, None) == ("nominal",) and variants_of(source, "all") == tuple(FAULTS)
+    assert variants_of(source, "v2x_loss, nominal,v2x_loss") == ("v2x_loss", "nominal")
+    assert variants_of(find_source("mrclam_6"), None) == ("landmarks", "landmarks+robots", "blind")
+    with pytest.raises(CoopenvError, match="unknown variant 'blind'"):
+        variants_of(source, "blind")
+    with pytest.raises(CoopenvError, match="did you mean 'v2x_delay'"):
+        variants_of(source, "v2x_dely")
+
+
+def test_what_is_recorded_has_no_scenario() -> None:
+    with pytest.raises(CoopenvError, match="recorded"):
+        find_source("mrclam_6", {"horizon": 1.0})
+    with pytest.raises(CoopenvError, match="no such log file"):
+        find_source("nowhere.mcap")
+    with pytest.raises(CoopenvError, match="did you mean 'overtaking'"):
+        find_source("overtakin")
+
+
+def test_recorded_robots_have_rows_without_a_bound(tmp_path: Path) -> None:
+    mrclam_files.write(tmp_path, seconds=15.0)
+    source = find_source("mrclam_6", data=tmp_path)
+    rows = compare(source, ["dead_reckoning", "mekf"], 4, ["landmarks", "blind"]).rows
+    assert len(rows) == 2 * 2 * 5 and all(np.isnan(row.bound_m) and not row.failure for row in rows)
+    assert all(np.isfinite([row.position_rmse_m, row.orientation_rmse_deg, row.ate_m]).all() for row in rows)
+    # One record, judged from the start on: nothing was averaged over seeds, and nothing left out but the start itself.
+    recording, _ = source.recording("landmarks", 0)
+    known = recording.truth.known & (recording.t > 0)[:, None]
+    errors = run("dead_reckoning", recording).position_error
+    expected = [np.sqrt(np.mean(errors[known[:, i], i] ** 2)) for i in range(5)]
+    assert [row.position_rmse_m for row in rows[:5]] == pytest.approx(expected, rel=1e-12)

@@ -1,0 +1,118 @@
+"""The joint belief against finite differences and the information form of the Kalman update."""
+
+import copy
+
+import numpy as np
+from numpy.testing import assert_allclose
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
+
+from coopenv.estimation.observers.base import SensorNoise
+from coopenv.estimation.observers.robust.belief import Belief, Member
+from coopenv.estimation.observers.rotations import exp_so3
+
+LEVER_ARM = np.array([0.3, 0.1, 0.5])
+NOISE = SensorNoise(velocity=0.1, angular_velocity=0.01, odometry_period=1 / 60, bearing=0.003)
+
+
+def positive(rng: np.random.Generator, n: int, scale: float = 1.0) -> np.ndarray:
+    A = rng.normal(size=(n, n))
+    return scale * (A @ A.T + 0.1 * np.eye(n))
+
+
+def belief(seed: int = 0) -> Belief:
+    rng = np.random.default_rng(seed)
+    poses = [(Rotation.random(random_state=seed + n).as_matrix(), rng.uniform(-9, 9, 3)) for n in range(3)]
+    result = Belief(0, *poses[0], positive(rng, 6, 1e-2))
+    result.add([Member(n, *poses[n], odometry=(np.eye(3), np.zeros(3))) for n in (1, 2)], positive(rng, 12, 1e-2))
+    result.P = positive(rng, 18, 1e-2)
+    return result
+
+
+def lines(b: Belief, points: list[np.ndarray]) -> np.ndarray:
+    """Directions (3, 3) to a landmark and to points of the two members, body frame, written out anew."""
+    z = [np.array([4.0, -3.0, 2.0]), *(m.p + m.R @ point for m, point in zip(b.members[1:], points, strict=True))]
+    d = np.array([b.own.R.T @ (x - b.own.p) - LEVER_ARM for x in z])
+    return d / np.linalg.norm(d, axis=1, keepdims=True)
+
+
+def test_jacobian_is_the_derivative_of_the_residual():
+    b, points = belief(), [np.zeros(3), np.array([0.4, -0.2, 0.1])]
+    z = np.array([[4.0, -3.0, 2.0], *(m.p + m.R @ point for m, point in zip(b.members[1:], points, strict=True))])
+    sight = b.sight(lines(b, points), LEVER_ARM, z, [1, 2], points)
+    assert_allclose(sight.residual, 0.0, atol=1e-12)
+    assert sight.ahead.all()
+    for e in np.eye(18):
+        moved = copy.deepcopy(b)
+        moved.shift(1e-6 * e)
+        change = b.sight(lines(moved, points), LEVER_ARM, z, [1, 2], points).residual / 1e-6
+        assert_allclose(sight.H @ e, change, atol=1e-6)
+
+
+def test_targets_behind_are_not_ahead():
+    b = belief()
+    z = np.array([[4.0, -3.0, 2.0]])
+    seen = lines(b, [np.zeros(3)] * 2)[:1]
+    assert not b.sight(-seen, LEVER_ARM, z).ahead.any()
+    assert b.sight(seen, LEVER_ARM, z).ahead.all()
+
+
+def test_correction_adds_information():
+    rng, b = np.random.default_rng(1), belief()
+    H, noise, residual = rng.normal(size=(4, 18)), rng.uniform(0.1, 1.0, 4), rng.normal(size=4)
+    expected = np.linalg.inv(np.linalg.inv(b.P) + H.T @ np.diag(1 / noise) @ H)
+    dx, before = expected @ H.T @ (residual / noise), copy.deepcopy(b.members)
+    b.correct(H, noise, residual)
+    assert_allclose(b.P, expected, rtol=1e-8, atol=1e-12)
+    for n, (old, new) in enumerate(zip(before, b.members, strict=True)):
+        assert_allclose(new.R, old.R @ exp_so3(dx[6 * n : 6 * n + 3]), atol=1e-10)
+        assert_allclose(new.p, old.p + old.R @ dx[6 * n + 3 : 6 * n + 6], atol=1e-10)
+
+
+def test_informing_is_correcting_by_an_equivalent_measurement():
+    rng, one = np.random.default_rng(2), belief()
+    other = copy.deepcopy(one)
+    index = np.arange(6, 12)
+    G, y = rng.normal(size=(4, 6)), rng.normal(size=4)  # information of rank 4 only
+    H = np.zeros((4, 18))
+    H[:, index] = G
+    one.inform(index, G.T @ G, G.T @ y)
+    other.correct(H, np.ones(4), y)
+    assert_allclose(one.P, other.P, atol=1e-12)
+    for a, c in zip(one.members, other.members, strict=True):
+        assert_allclose(a.R, c.R, atol=1e-12)
+        assert_allclose(a.p, c.p, atol=1e-12)
+
+
+def test_a_member_follows_its_own_odometry():
+    b = belief()
+    start = copy.deepcopy(b.members[1])
+    turn, step = exp_so3(np.array([0.1, -0.2, 0.3])), np.array([1.0, 2.0, 3.0])
+    b.follow(1, turn, step, 0.5, NOISE)
+    assert_allclose(b.members[1].R, start.R @ turn, atol=1e-12)
+    assert_allclose(b.members[1].p, start.p + start.R @ step, atol=1e-12)
+    assert_allclose(b.members[1].v, step / 0.5)
+    # an error before is an error after, moved along the path
+    e = 1e-6 * np.array([1.0, 2.0, -1.0, 0.5, 0.2, -0.4])
+    moved = belief()
+    moved.shift(np.concatenate([np.zeros(6), e]))
+    moved.follow(1, turn, step, 0.5, NOISE)
+    theta = Rotation.from_matrix(b.members[1].R.T @ moved.members[1].R).as_rotvec()
+    rho = b.members[1].R.T @ (moved.members[1].p - b.members[1].p)
+    flat = belief()
+    flat.P = np.zeros((18, 18))
+    flat.P[6:12, 6:12] = np.outer(e, e) * 1e12
+    flat.follow(1, turn, step, 0.5, NOISE)
+    after = np.concatenate([theta, rho]) * 1e6
+    grown = block_diag(np.zeros((6, 6)), np.outer(after, after), np.zeros((6, 6)))
+    grown[6:12, 6:12] += np.diag(NOISE.odometry(0.5))
+    assert_allclose(flat.P, grown, atol=1e-4)
+
+
+def test_dropping_keeps_the_others():
+    b = belief()
+    P = b.P
+    b.drop({1})
+    keep = [*range(6), *range(12, 18)]
+    assert [m.vehicle for m in b.members] == [0, 2]
+    assert_allclose(b.P, P[np.ix_(keep, keep)])

@@ -1,0 +1,128 @@
+"""What the robust observer promises, on records of the busy intersection."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from coopenv.estimation.bound import cramer_rao_ancestors
+from coopenv.estimation.observers import run
+from coopenv.estimation.observers.faults import find_fault
+from coopenv.estimation.observers.planar import PlanarRobust
+from coopenv.estimation.observers.registry import find
+from coopenv.estimation.observers.robust import Robust, RobustJoint
+from coopenv.estimation.observers.starts import random_start
+from tests.estimation.observers.robust.scenes import noise_free, shifted, small_errors
+
+BOTH = pytest.mark.parametrize("name", ["robust", "robust_joint"])
+
+
+def all_found(result, position=0.1, orientation=1.0):
+    return (result.position_error[-1] < position).all() and (result.orientation_error[-1] < orientation).all()
+
+
+@BOTH
+@pytest.mark.parametrize("seed", range(3))
+def test_any_start_is_left_behind(name, seed):
+    result = run(name, random_start(noise_free(4.0), seed))
+    assert not result.failure
+    assert all_found(result, 1e-3, 0.01)
+
+
+@BOTH
+def test_the_mirrored_start_is_solved(name):
+    assert all_found(run(name, noise_free(4.0, "busy_intersection_mirror")), 1e-3, 0.01)
+
+
+def test_the_origin_of_the_map_does_not_matter():
+    record = noise_free(4.0)
+    here, there = run("robust", record), run("robust", shifted(record, np.array([1000.0, -300.0, 0.0])))
+    assert all_found(there, 1e-3, 0.01)
+    np.testing.assert_allclose(there.position_error, here.position_error, atol=1e-5)
+
+
+@pytest.mark.parametrize(("name", "times"), [("robust", 5.0), ("robust_joint", 2.0)])
+def test_covariance_is_honest_and_errors_near_the_bound(name, times):
+    """Over 8 s after the first 4; tight figures over seeds are the benchmark's."""
+    record = small_errors(12.0)
+    result = run(name, record)
+    bound = cramer_rao_ancestors(record)
+    assert not result.failure
+    assert (result.anees(4.0) > 0.3).all()
+    assert (result.anees(4.0) < 2.5).all()
+    assert (result.position_rmse(4.0) < times * bound.position_rms(4.0)).all()
+
+
+@pytest.mark.parametrize(("name", "most"), [("robust", 8 * 28), ("robust_joint", 2000)])
+def test_messages_are_as_small_as_promised(name, most):
+    record = small_errors(12.0)
+    result = run(name, record)
+    messages_per_second = 1.0 / (record.period * record.dt)
+    assert (result.bytes_per_second <= most * messages_per_second * 1.001).all()
+
+
+@pytest.mark.parametrize("fault", ["v2x_loss", "v2x_delay", "wrong_association", "lying_neighbour", "landmarks_lost"])
+@BOTH
+def test_faults_do_not_mislead(name, fault):
+    record, lie = find_fault(fault).applied(small_errors(12.0), 0)
+    result = run(name, record, lie)
+    assert not result.failure
+    assert (result.position_error[-1] < 0.6).all()
+    assert (result.anees(8.0) < 6.0).all()
+
+
+def test_a_liar_is_found_out_and_tracked_all_the_same():
+    record, lie = find_fault("lying_neighbour").applied(small_errors(12.0), 0)
+    seen = {}
+
+    class Watched(Robust):
+        def update(self, tick):
+            estimate = super().update(tick)
+            seen[self.vehicle] = {v: contact.trusted for v, contact in self.contacts.items()}
+            if lie.sender in self.contacts and tick.time > lie.start:
+                member = self.belief.members[self.belief.place(lie.sender)]
+                assert np.linalg.norm(member.p - record.truth.position[tick.index, lie.sender]) < 1.0
+            return estimate
+
+    run(Watched, record, lie)
+    for vehicle, contacts in seen.items():
+        assert contacts.get(lie.sender, False) is False, vehicle
+        assert all(trusted for sender, trusted in contacts.items() if sender != lie.sender)
+
+
+def test_a_vehicle_that_is_lost_says_nothing_and_finds_itself_again():
+    record = small_errors(12.0)
+    said = []
+
+    class Kidnapped(Robust):
+        def update(self, tick):
+            if tick.index == 300 and self.vehicle == 0:
+                self.belief.own.p = self.belief.own.p + np.array([5.0, -4.0, 1.0])
+            return super().update(tick)
+
+        def message(self):
+            message = super().message()
+            if self.vehicle == 0:
+                said.append(message.position is not None)
+            return message
+
+    result = run(Kidnapped, record)
+    assert not all(said)
+    assert said[-1]
+    assert result.position_error[-1, 0] < 0.1
+    assert (result.position_error[-1] < 0.6).all()
+
+
+def test_silence_keeps_a_follower_going():
+    """With no message at all the followers dead-reckon and use landmarks; nothing fails."""
+    record = small_errors(12.0)
+    result = run("robust", replace(record, inbox_tick=np.full_like(record.inbox_tick, -1)))
+    assert not result.failure
+    assert np.isfinite(result.position_error).all()
+
+
+def test_planar_vehicles_get_the_planar_observer():
+    setup = replace(small_errors(12.0).setups[0], planar=True)
+    assert isinstance(find("robust")(setup), PlanarRobust)
+    assert isinstance(find("robust")(replace(setup, planar=False)), Robust)
+    assert isinstance(find("robust_joint")(replace(setup, planar=False)), RobustJoint)

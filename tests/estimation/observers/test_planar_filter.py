@@ -1,0 +1,206 @@
+"""The planar filter's motion, its derivatives, and what it calibrates."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from coopenv.estimation.observers.planar import CALIBRATING, IROBOT_CREATE, TEXTBOOK
+from coopenv.estimation.observers.planar_commands import (
+    ARC,
+    PATH,
+    SLOWING,
+    SWITCHING,
+    TURN,
+    TURNING,
+    CommandHistory,
+    Wheels,
+)
+from coopenv.estimation.observers.planar_filter import (
+    BIAS,
+    HEADING,
+    LEAD,
+    STATES,
+    TURN_SCALE,
+    PlanarFilter,
+    PlanarPose,
+    X,
+    Y,
+    growth,
+)
+
+DT = 0.05
+COMMANDS = [(0.07, 0.0), (0.08, 0.4), (0.05, 0.4), (0.0, -0.3), (0.067, 0.01), (0.086, -0.398), (0.086, 0.0)] * 3
+
+
+def rate(t: float, column: int) -> float:
+    """Return v or w that was commanded at t; tick k is (k DT, (k + 1) DT]."""
+    k = math.floor(t / DT)
+    return COMMANDS[k][column] if 0 <= k < len(COMMANDS) else 0.0
+
+
+def history(wheels: Wheels) -> CommandHistory:
+    result = CommandHistory(wheels, 0.6, DT)
+    for v, w in COMMANDS:
+        result.add(DT, w * DT, v * DT)
+    return result
+
+
+def test_response_is_the_delayed_and_spread_command():
+    wheels = replace(IROBOT_CREATE, arc=((0.0, 1.0),), spot=1.0, slow_gain=0.0)
+    lead, end = 0.17, len(COMMANDS) * DT
+    response = history(wheels).response(DT, lead)
+
+    def expected(function):
+        breaks = np.arange(0, end, DT)
+        total = 0.0
+        for delay, share in zip(wheels.delay, wheels.share, strict=True):
+            a, b = end - DT - lead - delay, end - lead - delay
+            inside = breaks[(breaks > a) & (breaks < b)]
+            total += share * quad(function, a, b, points=inside)[0]
+        return total
+
+    done = response.done
+    assert done[TURN] == pytest.approx(expected(lambda t: rate(t, 1)), abs=1e-9)
+    assert done[PATH] == pytest.approx(expected(lambda t: rate(t, 0)), abs=1e-9)
+    assert done[ARC] == pytest.approx(expected(lambda t: float(rate(t, 1) != 0)), abs=1e-9)
+    assert done[TURNING] == pytest.approx(done[ARC])
+    assert done[SLOWING] == pytest.approx(expected(lambda t: rate(t, 0) * abs(rate(t, 1))), abs=1e-9)
+
+
+def test_steps_of_the_rate_are_summed():
+    commands = CommandHistory(Wheels(), 0.6, DT)
+    total = 0.0
+    for w in (0.0, 0.4, 0.4, -0.2, 0.0, 0.0):
+        commands.add(DT, w * DT, 0.0)
+        total += commands.response(DT, 0.0).done[SWITCHING]
+    assert total == pytest.approx(0.4**2 + 0.6**2 + 0.2**2)
+
+
+def test_gains_of_the_wheels():
+    assert Wheels().gain(0.1, 0.3) == 1.0
+    assert IROBOT_CREATE.gain(0.0, 0.3) == IROBOT_CREATE.spot
+    assert IROBOT_CREATE.gain(0.086, 0.398) == pytest.approx(0.975, abs=0.01)  # curvature 4.57 and the last knot
+    assert IROBOT_CREATE.gain(0.07, 0.005 + 1.2 * 0.07) == pytest.approx((0.88 + 0.84) / 2)
+    assert IROBOT_CREATE.gain(0.05, 0.005 + 1.2 * 0.05) == pytest.approx((0.88 + 0.84) / 2 + IROBOT_CREATE.slow_gain)
+
+
+def numeric(function, x, step=1e-6):
+    return np.stack([(function(x + step * e) - function(x - step * e)) / (2 * step) for e in np.eye(len(x))], axis=-1)
+
+
+def test_motion_derivatives_agree_with_differences():
+    tuning = replace(CALIBRATING, walk=(0.0,) * 7, turn_noise=(0, 0, 0), path_noise=(0, 0), slide_noise=0, jitter=0)
+    x = np.array([0.3, -0.2, 0.7, 0.93, 0.97, 0.004, 0.003, 0.9, 0.183, 0.01])
+
+    def filtered(state, covariance):
+        own = PlanarFilter(tuning, np.zeros(3), np.zeros((3, 3)))
+        own.advance(DT, 0.0, 0.0)
+        own._commands = history(tuning.wheels)
+        own.state, own.covariance = state.copy(), covariance
+        own.advance(DT, 0.02, 0.004)
+        return own
+
+    f = numeric(lambda s: filtered(s, np.eye(STATES)).state, x)
+    f[:3, LEAD] = filtered(x, np.eye(STATES)).covariance[:3, LEAD]  # smoothed over half a tick: see below
+    root = np.diag(np.arange(1.0, STATES + 1))
+    np.testing.assert_allclose(filtered(x, root).covariance, f @ root @ f.T, atol=1e-6)
+
+
+def test_derivative_by_the_lead_is_the_slope_across_a_tick():
+    commands, lead = history(IROBOT_CREATE), 0.2
+    across = (commands.response(DT, lead + DT / 2).done - commands.response(DT, lead - DT / 2).done) / DT
+    np.testing.assert_allclose(commands.response(DT, lead).by_lead, across, atol=1e-12)
+
+
+@pytest.mark.parametrize("seen", [False, True])
+def test_bearing_derivatives_agree_with_differences(seen):
+    own = PlanarFilter(CALIBRATING, np.array([0.1, -0.2, 0.4]), np.diag([0.04, 0.03, 0.01]))
+    there = np.array([2.0, 1.0, 2.5])
+
+    def bearing(state):
+        dx, dy = there[:2] - state[[X, Y]]
+        return math.atan2(-dy, -dx) - there[2] if seen else math.atan2(dy, dx) - state[HEADING] + state[BIAS]
+
+    h = numeric(bearing, own.state.copy())
+    before, P, innovation = own.state.copy(), own.covariance.copy(), 0.02
+    own.tuning = replace(CALIBRATING, fusion="plain")
+    measured = bearing(before) + innovation
+    if seen:
+        own.seen(measured, PlanarPose(there, np.zeros((3, 3))))
+    else:
+        own.robot(measured, PlanarPose(there, np.zeros((3, 3))))
+    gain = P @ h / (h @ P @ h + CALIBRATING.bearing_std**2)
+    np.testing.assert_allclose(own.state - before, gain * innovation, atol=1e-8)
+    np.testing.assert_allclose(own.covariance, P - np.outer(gain, h @ P), atol=1e-8)
+
+
+def test_fusing_the_same_news_again_never_claims_more_than_either_alone():
+    tuning = replace(CALIBRATING, dependent=1.0)
+    own = PlanarFilter(tuning, np.zeros(3), np.diag([0.04, 0.04, 1e-4]))
+    theirs = np.diag([0.04, 0.04, 1e-4])
+    calibration = own.covariance[TURN_SCALE, TURN_SCALE]
+    for _ in range(200):
+        own.robot(math.atan2(1, 2), PlanarPose(np.array([2.0, 1.0, 0.0]), theirs))
+    line = np.array([-1, 2]) / math.sqrt(5)
+    assert line @ own.covariance[:2, :2] @ line > 0.5 * 0.04
+    assert own.covariance[TURN_SCALE, TURN_SCALE] == pytest.approx(calibration)  # its own business
+
+
+def test_intersection_grows_only_where_something_is_gained():
+    assert growth(own=1e-6, gain=1e-12, cost=1e-3, theirs=1.0, noise=1e-3, dependent=1.0) == (0.0, 0.0)
+    ours, theirs = growth(own=1.0, gain=1.0, cost=1.0, theirs=1e-6, noise=1e-6, dependent=1.0)
+    assert min(ours, theirs) > 1.0
+    assert growth(own=1.0, gain=1.0, cost=1.0, theirs=1e-6, noise=1e-6, dependent=0.0) == (1.0, 1.0)
+
+
+def test_outliers_are_dropped_and_doubtful_ones_count_less():
+    def after(innovation):
+        own = PlanarFilter(CALIBRATING, np.zeros(3), np.diag([1e-4, 1e-4, 1e-4]))
+        own.landmark(innovation, 2.0, 0.0)
+        return own
+
+    assert after(0.5).rejected == 1 and after(0.5).state[HEADING] == 0.0
+    small, large = after(0.02), after(0.09)
+    assert large.accepted == 1
+    assert abs(large.state[HEADING]) < 4.5 * abs(small.state[HEADING])
+    assert large.covariance[HEADING, HEADING] > small.covariance[HEADING, HEADING]
+
+
+def test_calibrates_scale_lead_and_camera_bias():
+    """A robot that turns 0.85 times what it is told, 0.25 s late, with its camera off by 0.015 rad."""
+    rng = np.random.default_rng(3)
+    scale, lead, bias, noise = 0.85, 0.25, 0.015, 0.02
+    mean = (0.94, 1.0, 0.0, 0.0, 0.0, 0.15, 0.0)
+    std = (0.08, 0.03, 1e-6, 1e-6, 1e-6, 0.08, 0.02)
+    tuning = replace(CALIBRATING, wheels=Wheels(), mean=mean, std=std, bearing_std=noise, jitter=0.0)
+    own = PlanarFilter(tuning, np.zeros(3), np.diag([1e-4, 1e-4, 1e-4]))
+    posts = [np.array([4 * math.cos(a), 4 * math.sin(a)]) for a in np.arange(6)]
+    commands = np.repeat(rng.choice([-0.4, 0.0, 0.4], 300), 20)  # for a second each
+    x, y, heading, late = 0.0, 0.0, 0.0, round(lead / DT)
+    for k, w in enumerate(commands):
+        own.advance(DT, w * DT, 0.07 * DT)
+        v = 0.07 if k >= late else 0.0
+        turn = scale * DT * (commands[k - late] if k >= late else 0.0)
+        x, y = x + v * DT * math.cos(heading + turn / 2), y + v * DT * math.sin(heading + turn / 2)
+        heading += turn
+        if k % 10 == 0:
+            post = posts[rng.integers(6)]
+            own.landmark(math.atan2(post[1] - y, post[0] - x) - heading + bias + noise * rng.standard_normal(), *post)
+    error = own.state[[TURN_SCALE, LEAD, BIAS]] - [scale, lead, bias]
+    spread = np.sqrt(np.diag(own.covariance))[[TURN_SCALE, LEAD, BIAS]]
+    assert (np.abs(error) < 3.5 * spread).all()
+    assert (spread < np.array([0.01, 0.01, 0.01])).all()
+    assert math.hypot(own.state[X] - x, own.state[Y] - y) < 0.1
+
+
+def test_textbook_filter_has_no_calibration_to_estimate():
+    own = PlanarFilter(TEXTBOOK, np.zeros(3), np.diag([0.01, 0.01, 0.01]))
+    own.advance(DT, 0.02, 0.05)
+    own.landmark(0.1, 2.0, 0.3)
+    np.testing.assert_array_equal(own.state[3:], TEXTBOOK.mean)
+    assert np.abs(own.state[:3]).max() > 0
