@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from coopenv.scenario.base import (
     NonNegative,
@@ -150,7 +150,7 @@ class InitialEstimate(Part):
     """What the observer believes at t = 0, fixed or drawn anew at each reset."""
 
     position: Vector3 | None = None
-    """Believed position in the coordinates of this file, m (default: the true one)."""
+    """Believed position in the coordinates of this file, m (default: the true one; an override says so by `true`)."""
     position_offset: Vector3 = (0.0, 0.0, 0.0)
     """Added to the believed position, map axes, m."""
     position_radius: NonNegative = 0.0
@@ -163,6 +163,13 @@ class InitialEstimate(Part):
     """Absolute believed yaw, rad; replaces R(0) above."""
     quaternion_wxyz: QuaternionWxyz | None = None
     """Absolute believed orientation; replaces R(0) above."""
+
+    @field_validator("position", mode="before")
+    @classmethod
+    def _true_position(cls, value: Any) -> Any:
+        if value is True:
+            return None
+        return tuple(value) if isinstance(value, list) else value  # what a validator returns is no JSON any more
 
     @model_validator(mode="after")
     def _one_orientation(self) -> InitialEstimate:

@@ -6,15 +6,19 @@ So along a leader-follower graph no information is lost, and none counts twice.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coopenv.estimation.observers.base import Array, Message
 from coopenv.estimation.observers.robust.belief import Member
 from coopenv.estimation.observers.robust.observer import Robust
-from coopenv.estimation.observers.robust.report import Report, from_message, marker_jacobian
+from coopenv.estimation.observers.robust.report import Report, from_message, marker_jacobian, mask_of
 from coopenv.estimation.observers.rotations import exp_so3, log_so3
+from coopenv.estimation.observers.small_matrices import cholesky
 
 MOST_TOLD = 4
 SPEAKS_FOR = 1.0
@@ -36,13 +40,15 @@ class RobustJoint(Robust):
         if self.marker.any():
             J = np.eye(len(P))
             J[:6, :6] = marker_jacobian(self.marker)
-            P = J @ P @ J.T
+            P = J.dot(P).dot(J.T)
         return replace(message, extra={**message.extra, **_told(told, P, len(told) == len(self.belief.members))})
 
     def _report(self, message: Message, sender: int, time: float) -> Report | None:
-        """Return what a message says of its sender and of the others that it tells of."""
+        """Return what a message says of its sender and, unless it leans on this vehicle, of the others it tells of."""
         report = from_message(message, sender, time)
-        return None if report is None else _with_others(report, message)
+        if report is None or report.leans_on & int(mask_of({self.vehicle})):
+            return report
+        return _with_others(report, message)
 
     def _speaking(self, reports: list[Report]) -> list[Report]:
         """Return the reports to use: those of senders whom no other one speaks for, most vehicles first."""
@@ -70,11 +76,22 @@ def _told(told: list[Member], P: Array, complete: bool) -> dict[str, Array]:
     return {
         "vehicles": np.array([member.vehicle for member in others], dtype=np.uint16),
         "times": np.array([member.time for member in others]),
-        "poses": np.array([[*log_so3(member.R), *member.p] for member in others]).reshape(-1, 6),
-        "odometries": np.array([[*log_so3(R), *p] for R, p in odometry]).reshape(-1, 6),
-        "factor": np.linalg.cholesky(P)[np.tril_indices(len(P))].astype(np.float32),
+        "poses": _six([(member.R, member.p) for member in others]),
+        "odometries": _six(odometry),
+        "factor": cholesky(P)[_triangle(len(P))].astype(np.float32),
         "complete": np.array([complete], dtype=np.uint8),
     }
+
+
+def _six(poses: Sequence[tuple[Array, Array]]) -> Array:
+    """Return poses as rotation vectors and positions (m, 6)."""
+    return np.array([np.concatenate([log_so3(R), p]) for R, p in poses]).reshape(-1, 6)
+
+
+@cache
+def _triangle(n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return where the lower triangle of an n by n matrix is."""
+    return np.tril_indices(n)
 
 
 def _with_others(report: Report, message: Message) -> Report:
@@ -84,7 +101,7 @@ def _with_others(report: Report, message: Message) -> Report:
     told = message.extra
     m = 1 + len(told["vehicles"])
     L = np.zeros((6 * m, 6 * m))
-    L[np.tril_indices(6 * m)] = told["factor"]
+    L[_triangle(6 * m)] = told["factor"]
     poses, odometries = told["poses"], told["odometries"]
     return Report(
         vehicles=(*report.vehicles, *(int(v) for v in told["vehicles"])),
@@ -93,6 +110,6 @@ def _with_others(report: Report, message: Message) -> Report:
         p=np.concatenate([report.p, poses[:, 3:]]),
         odometry_turn=np.array([report.odometry_turn[0], *(exp_so3(o[:3]) for o in odometries)]),
         odometry_position=np.concatenate([report.odometry_position, odometries[:, 3:]]),
-        P=L @ L.T,
+        P=L.dot(L.T),
         leans_on=0 if told["complete"][0] else report.leans_on,
     )

@@ -18,11 +18,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coopenv.estimation.observers.base import Array, Coordinates, Estimate, Message, SensorNoise, Setup, Tick
-from coopenv.estimation.observers.robust.belief import Belief, Member, Sight
-from coopenv.estimation.observers.robust.positive import solve_positive
+from coopenv.estimation.observers.robust.belief import AT_ONCE, Belief, Member, View, errors_of
 from coopenv.estimation.observers.robust.report import (
     Report,
     from_message,
@@ -34,6 +32,7 @@ from coopenv.estimation.observers.robust.report import (
 from coopenv.estimation.observers.robust.resection import resect
 from coopenv.estimation.observers.robust.search import GATE, Search, Sighting, is_known
 from coopenv.estimation.observers.rotations import orthonormalise
+from coopenv.estimation.observers.small_matrices import solve_positive
 
 SHARE = 0.7
 """Of what a neighbour that leans on others has learnt."""
@@ -49,7 +48,7 @@ SPEED = 1.0
 """m/s at which a sender may have gone on since a message that is used in the search."""
 HEALTHY_SHARE, HEALTHY_TIME = 0.2, 1.0
 """Share of contradicting bearings, and for how long, s, it must be lower for the pose to be worth remembering."""
-ANCHOR = np.diag([0.05**2] * 3 + [0.5**2] * 3)
+SLACK = np.diag([0.05**2] * 3 + [0.5**2] * 3)
 """Added to the covariance of a pose that is remembered, rad^2 and m^2."""
 LEAST_VELOCITY_STD, LEAST_ANGULAR_STD = 2e-3, 2e-4
 """m/s and rad/s, of an odometry sample: the increments of a moving vehicle are never exact."""
@@ -63,6 +62,17 @@ class Contact:
     trusted: bool = True
     agreed: float = 0.0
     """s since which a distrusted sender has agreed."""
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """Where the vehicle was when its bearings last fitted, or at the start."""
+
+    R: Array
+    p: Array
+    P: Array
+    odometry: tuple[Array, Array]
+    time: float
 
 
 class Robust:
@@ -81,6 +91,7 @@ class Robust:
             setup.noise.bearing,
         )
         self.variance = self.noise.bearing_std**2
+        self.may_lean_on = int(mask_of({int(t) - self.landmarks for t in setup.targets if t >= self.landmarks}))
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose; one that is too uncertain to linearise about is only a hint for the search."""
@@ -88,18 +99,18 @@ class Robust:
         P = np.array(initial_covariance, float)
         self.odometry = np.eye(3), np.zeros(3)
         self.contacts: dict[int, Contact] = {}
-        self.leans_on = 0
+        self.leans_on = self.may_lean_on
         self.missed = 0.0
-        self.belief = Belief(self.vehicle, R, p, P)
-        self.search = None if is_known(P) else Search(self.vehicle, R, p, P)
-        self._drop_anchor(P)
+        self.belief = Belief(self.vehicle, R, p, P.copy())
+        self.search = None if is_known(P) else Search(self.vehicle, R, p, P.copy())
+        self.anchor, self.healthy = Anchor(R, p, P, self.odometry, 0.0), 0.0
 
     def update(self, tick: Tick) -> Estimate:
         """Take one camera tick."""
         R, p = self.odometry
-        self.odometry = orthonormalise(R @ tick.rotation), p + R @ tick.translation
+        self.odometry = orthonormalise(R.dot(tick.rotation)), p + R.dot(tick.translation)
         noise = self.noise.odometry(tick.dt)
-        self.anchor.move(0, tick.rotation, tick.translation, noise)
+        self.nis, self.nis_dof = 0.0, 0
         if self.search is not None:
             self.search.move(tick, noise)
             if tick.due:
@@ -111,7 +122,8 @@ class Robust:
             if tick.due:
                 self._look(tick)
         belief = self.belief if self.search is None else self.search.best
-        return Estimate(belief.own.R, belief.own.p, belief.P[:6, :6].copy(), Coordinates.LEFT)
+        P, coordinates = belief.P[:6, :6].copy(), Coordinates.LEFT
+        return Estimate(belief.own.R, belief.own.p, P, coordinates, self.nis if self.nis_dof else None, self.nis_dof)
 
     def message(self) -> Message:
         """Return pose, covariance and odometry, or nothing while the pose is not known."""
@@ -131,14 +143,14 @@ class Robust:
             self._look(tick)
             return
         self._begin(found, tick)
-        if resect(self.belief, lambda: self._sight(tick)[:3]) and is_known(self.belief.P[:6, :6]):
+        if resect(self.belief, lambda: self._view(tick)) and is_known(self.belief.P[:6, :6]):
             self.search = None
 
     def _begin(self, pose: Belief, tick: Tick) -> None:
         """Believe in a pose and in those that are in view."""
         own = pose.own
-        self.belief, self.contacts, self.leans_on = Belief(self.vehicle, own.R, own.p, pose.P.copy(), tick.time), {}, 0
-        self.missed = 0.0
+        self.belief = Belief(self.vehicle, own.R, own.p, pose.P.copy(), tick.time)
+        self.contacts, self.leans_on, self.missed = {}, self.may_lean_on, 0.0
         self._listen(tick)
 
     def _sightings(self, tick: Tick) -> list[Sighting]:
@@ -155,15 +167,13 @@ class Robust:
                 result.append(Sighting(tick.bearings[n], report.p[0], variance))
         return result
 
-    def _drop_anchor(self, P: Array) -> None:
-        """Remember where the vehicle is, with a covariance P (6, 6), for a search after a loss."""
-        own = self.belief.own
-        self.anchor, self.healthy = Belief(self.vehicle, own.R, own.p, P.copy()), 0.0
-
-    def _lose(self) -> None:
-        """Search anew, from where the vehicle was when most bearings fitted."""
-        own = self.anchor.own
-        self.search = Search(self.vehicle, own.R, own.p, self.anchor.P.copy())
+    def _lose(self, time: float) -> None:
+        """Search anew, from where the vehicle was when most bearings fitted, carried on by its odometry."""
+        anchor, (R, p) = self.anchor, self.odometry
+        prior = Belief(self.vehicle, anchor.R, anchor.p, anchor.P.copy())
+        since = anchor.odometry[0].T
+        prior.move(0, since.dot(R), since.dot(p - anchor.odometry[1]), self.noise.odometry(time - anchor.time))
+        self.search = Search(self.vehicle, prior.own.R, prior.own.p, prior.P)
 
     def _report(self, message: Message, sender: int, time: float) -> Report | None:
         """Return what a message says."""
@@ -181,7 +191,7 @@ class Robust:
 
     def _listen(self, tick: Tick) -> None:
         """Take in the messages of those in view, and of those that are already believed in."""
-        in_view = {int(target) - self.landmarks for target in tick.targets[tick.valid]}
+        in_view = {target - self.landmarks for target in tick.targets[tick.valid].tolist()}
         reports = self._reports(tick)
         speaking = self._speaking(reports)
         for report in speaking:
@@ -201,7 +211,7 @@ class Robust:
         if len(self.belief.members) + len(told) > self.most_members:
             return
         numbers = [n for n, v in enumerate(report.vehicles) if v in told]
-        index = np.concatenate([np.arange(6 * n, 6 * n + 6) for n in numbers])
+        index = errors_of(numbers)
         odometry = zip(report.odometry_turn, report.odometry_position, strict=True)
         poses = list(zip(report.vehicles, report.R, report.p, report.time.tolist(), odometry, strict=True))
         self.belief.add([Member(*poses[n]) for n in numbers], report.P[np.ix_(index, index)])
@@ -212,7 +222,7 @@ class Robust:
         """Carry a sender to its new message, and take in what it has learnt since the last one."""
         last = contact.last
         dt = float(report.time[0] - last.time[0])
-        if dt <= 0.0:
+        if dt < AT_ONCE:  # the same message again
             return
         contact.last = report
         numbers = [self.belief.place(v) for v in report.vehicles]
@@ -227,11 +237,23 @@ class Robust:
         places = [n for n in numbers if n is not None]
         if learnt is None or len(places) < len(numbers):
             return
-        share = SHARE if report.leans_on else 1.0
-        index = np.concatenate([np.arange(6 * n, 6 * n + 6) for n in places])
+        share = self._share(report)
         vector = learnt.about([self.belief.members[n] for n in places])
-        self.belief.inform(index, share * learnt.information, share * vector)
+        self.belief.inform(errors_of(places), share * learnt.information, share * vector)
         self.leans_on |= report.leans_on
+
+    def _share(self, report: Report) -> float:
+        """Return how much of a sender's news counts.
+
+        All if it leans on nobody, `SHARE` if it leans on others. Where senders lean on this vehicle in turn, each of n
+        counts 1 / (n + 1): then what comes back round any loop fades, however dense the graph is.
+        """
+        if not report.leans_on:
+            return 1.0
+        own = int(mask_of({self.vehicle}))
+        if not report.leans_on & own:
+            return SHARE
+        return 1.0 / (1.0 + sum(bool(contact.last.leans_on & own) for contact in self.contacts.values()))
 
     def _judge(self, contact: Contact, report: Report, dt: float) -> None:
         """Decide whether a sender is believed, from its message and the belief about it."""
@@ -240,57 +262,58 @@ class Robust:
             return
         member, block = self.belief.members[n], slice(6 * n, 6 * n + 6)
         e = left_error(member.R, member.p, report.R[0], report.p[0])
-        agrees = float(e @ solve_positive(self.belief.P[block, block] + report.P[:6, :6], e)) < TRUST_GATE
+        agrees = float(e.dot(solve_positive(self.belief.P[block, block] + report.P[:6, :6], e))) < TRUST_GATE
         if contact.trusted:
             contact.trusted, contact.agreed = agrees, 0.0
             return
-        near = agrees and float(np.linalg.norm(e[3:])) < AGREED_DISTANCE
+        near = agrees and e[3:].dot(e[3:]) < AGREED_DISTANCE**2
         contact.agreed = contact.agreed + dt if near else 0.0
         contact.trusted = contact.agreed >= AGREED_FOR
 
     def _look(self, tick: Tick) -> None:
         """Correct the belief by every bearing that fits it; search anew when most do not."""
-        _, _, fits, missed = self._sight(tick)
-        if fits.any():
-            self.belief.settle(lambda: self._sight(tick)[:2], fits)
-        if missed is not None:
-            self.missed += (missed - self.missed) * min(1.0, tick.dt / LOST_TIME)
+        view = self._view(tick)
+        self.nis, self.nis_dof = float(view.nis[view.fits].sum()), 2 * int(view.fits.sum())
+        if view.fits.any():
+            self.belief.settle(view.sight, view.noise, view.fits, lambda: self._view(tick)[:2])
+        if view.missed is not None:
+            self.missed += (view.missed - self.missed) * min(1.0, tick.dt / LOST_TIME)
             self.healthy = self.healthy + tick.dt if self.missed < HEALTHY_SHARE else 0.0
             if self.missed > LOST_SHARE:
-                self._lose()
+                self._lose(tick.time)
             elif self.healthy > HEALTHY_TIME:
-                self._drop_anchor(4.0 * self.belief.P[:6, :6] + ANCHOR)
+                own = self.belief.own
+                self.anchor = Anchor(own.R, own.p, 4.0 * self.belief.P[:6, :6] + SLACK, self.odometry, tick.time)
 
-    def _sight(self, tick: Tick) -> tuple[Sight, Array, NDArray[np.bool_], float | None]:
-        """Return the bearings to known targets, their noise variances, and which of them fit the belief.
-
-        Last comes the share of those that do not, in which bearings to distrusted senders do not count; None if there
-        is none that does.
-        """
+    def _view(self, tick: Tick) -> View:
+        """Return the frame's bearings to landmarks and to members of the belief, as measurements."""
         belief = self.belief
-        known = [(n, int(tick.targets[n])) for n in np.flatnonzero(tick.valid) if tick.targets[n] < self.landmarks]
-        z = [tick.landmarks[target] for _, target in known]
-        drift, counts = [0.0] * len(known), [True] * len(known)
-        places, points = [], []
-        for n in np.flatnonzero(tick.valid):
-            vehicle = int(tick.targets[n]) - self.landmarks
-            if vehicle < 0 or (place := belief.place(vehicle)) is None:
+        known, z, drift, counts, places, points = [], [], [], [], [], []
+        targets = tick.targets.tolist()
+        for n in tick.valid.nonzero()[0].tolist():  # landmarks come first
+            vehicle = targets[n] - self.landmarks
+            if vehicle < 0:
+                z.append(tick.landmarks[targets[n]])
+                drift.append(0.0)
+                counts.append(True)
+            elif (place := belief.place(vehicle)) is not None:
+                member, contact = belief.members[place], self.contacts.get(vehicle)
+                age = tick.time - member.time
+                point = member.carried(age)
+                z.append(member.p + member.R.dot(point))
+                places.append(place)
+                points.append(point)
+                drift.append(self._drift(age))
+                counts.append(contact is None or contact.trusted)
+            else:
                 continue
-            member, contact = belief.members[place], self.contacts.get(vehicle)
-            age = tick.time - member.time
-            point = member.carried(age)
-            known.append((n, vehicle))
-            z.append(member.p + member.R @ point)
-            places.append(place)
-            points.append(point)
-            drift.append(self._drift(age))
-            counts.append(contact is None or contact.trusted)
-        bearings = tick.bearings[[n for n, _ in known]]
-        sight = belief.sight(bearings, tick.lever_arm, np.array(z).reshape(-1, 3), places, points)
+            known.append(n)
+        sight = belief.sight(tick.bearings[known], tick.lever_arm, np.array(z).reshape(-1, 3), places, points)
         noise = self.variance + np.array(drift) / sight.distance**2
-        fits = sight.ahead & (sight.normalised(belief.P, noise) < GATE)
-        counted = np.array(counts, bool)
-        return sight, noise, fits, float(np.mean(~fits[counted])) if counted.any() else None
+        nis = sight.normalised(belief.P, noise)
+        fits = sight.ahead & (nis < GATE)
+        judged = [fit for fit, judges in zip(fits.tolist(), counts, strict=True) if judges]
+        return View(sight, noise, nis, fits, judged.count(False) / len(judged) if judged else None)
 
     def _drift(self, age: float) -> float:
         """Return the variance per axis, m^2, of where a sender is a time after its last message."""

@@ -17,8 +17,8 @@ import numpy as np
 from coopenv.estimation.observers.base import Array, Message, SensorNoise
 from coopenv.estimation.observers.mekf import transition
 from coopenv.estimation.observers.robust.belief import Belief, Member
-from coopenv.estimation.observers.robust.positive import invert_positive
 from coopenv.estimation.observers.rotations import exp_so3, log_so3, orthonormalise, skew
+from coopenv.estimation.observers.small_matrices import invert_positive
 
 BITS = 64
 
@@ -48,7 +48,7 @@ class Report:
     def motion_since(self, last: Report, n: int) -> tuple[Array, Array]:
         """Return member n's odometry increment (dR, dp) since the last report."""
         R = last.odometry_turn[n].T
-        return R @ self.odometry_turn[n], R @ (self.odometry_position[n] - last.odometry_position[n])
+        return R.dot(self.odometry_turn[n]), R.dot(self.odometry_position[n] - last.odometry_position[n])
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Tracklet:
     def about(self, members: list[Member]) -> Array:
         """Return the vector (6m,) for errors about other poses."""
         offset = np.concatenate([left_error(R, p, m.R, m.p) for R, p, m in zip(self.R, self.p, members, strict=True)])
-        return self.vector - self.information @ offset
+        return self.vector - self.information.dot(offset)
 
 
 def tracklet(last: Report, new: Report, noise: SensorNoise) -> Tracklet | None:
@@ -76,19 +76,19 @@ def tracklet(last: Report, new: Report, noise: SensorNoise) -> Tracklet | None:
         dR, dp = new.motion_since(last, n)
         F[block, block] = transition(dR, dp)
         Q[block] = noise.odometry(max(new.time[n] - last.time[n], 0.0))
-        R[n], p[n] = orthonormalise(last.R[n] @ dR), last.p[n] + last.R[n] @ dp
+        R[n], p[n] = orthonormalise(last.R[n].dot(dR)), last.p[n] + last.R[n].dot(dp)
         c[block] = left_error(R[n], p[n], new.R[n], new.p[n])
-    before = F @ last.P @ F.T
+    before = F.dot(last.P).dot(F.T)
     before.flat[:: 6 * m + 1] += Q
-    if (np.diag(new.P) > 1.01 * np.diag(before)).any():
+    if (new.P.diagonal() > 1.01 * before.diagonal()).any():
         return None
     after = invert_positive(new.P)
-    return Tracklet(R, p, after - invert_positive(before), after @ c)
+    return Tracklet(R, p, after - invert_positive(before), after.dot(c))
 
 
 def left_error(R: Array, p: Array, R_other: Array, p_other: Array) -> Array:
     """Return (6,) the left error of the other pose against (R, p)."""
-    return np.concatenate([log_so3(R.T @ R_other), R.T @ (p_other - p)])
+    return np.concatenate([log_so3(R.T.dot(R_other)), R.T.dot(p_other - p)])
 
 
 def seen_at(marker: Array, R: Array, p: Array, P: Array) -> tuple[Array, Array]:
@@ -96,7 +96,7 @@ def seen_at(marker: Array, R: Array, p: Array, P: Array) -> tuple[Array, Array]:
     if not marker.any():
         return p, P
     J = marker_jacobian(marker)
-    return p + R @ marker, J @ P @ J.T
+    return p + R.dot(marker), J.dot(P).dot(J.T)
 
 
 def marker_jacobian(marker: Array) -> Array:
@@ -118,7 +118,7 @@ def to_message(belief: Belief, marker: Array, odometry: tuple[Array, Array], lea
         rotation=own.R,
         covariance=P.astype(np.float32),
         extra={
-            "odometry": np.concatenate([log_so3(odometry[0]), odometry[1] + odometry[0] @ marker]),
+            "odometry": np.concatenate([log_so3(odometry[0]), odometry[1] + odometry[0].dot(marker)]),
             "leans_on": np.array([leans_on], dtype=np.uint64),
         },
     )

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from coopenv.estimation.observers.base import Array
-from coopenv.estimation.observers.robust.belief import Belief, Sight
+from coopenv.estimation.observers.robust.belief import Belief, View
 
 STEPS = 6
 LEAST_INFORMATION = 1e-12
 """Of the weakest direction relative to the strongest; below it the frame does not tell the pose."""
 
 
-def resect(belief: Belief, look: Callable[[], tuple[Sight, Array, NDArray[np.bool_]]]) -> bool:
+def resect(belief: Belief, look: Callable[[], View]) -> bool:
     """Put the vehicle where a frame's bearings see it, by least squares from where it is; return whether that works.
 
     The other members stay. The vehicle's covariance becomes that of the solution, which inherits the members' errors,
@@ -23,11 +21,12 @@ def resect(belief: Belief, look: Callable[[], tuple[Sight, Array, NDArray[np.boo
 
     Args:
         belief: of the vehicle and the members that it sees.
-        look: returns the frame's bearings at the pose that is believed now, their own noise variances, and which count.
+        look: returns the frame's bearings at the pose that is believed now.
     """
     others = belief.P[6:, 6:]
     for step in range(STEPS):
-        sight, noise, fits = look()
+        view = look()
+        sight, noise, fits = view.sight, view.noise, view.fits
         if fits.sum() < 3:
             return False
         H, N = sight.H[fits], noise[fits]

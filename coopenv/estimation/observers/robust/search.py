@@ -14,8 +14,8 @@ import numpy as np
 from coopenv.estimation.observers.base import Array, Tick
 from coopenv.estimation.observers.perspective import solve_p3p
 from coopenv.estimation.observers.robust.belief import Belief, Sight
-from coopenv.estimation.observers.robust.positive import invert_positive
 from coopenv.estimation.observers.robust.report import left_error
+from coopenv.estimation.observers.small_matrices import invert_positive, solve
 
 GATE = 13.8
 """Of a bearing's normalised innovation squared: chi-square of 2, 0.999."""
@@ -52,7 +52,14 @@ class Hypothesis:
 
     belief: Belief
     paid: float
+    surprise: float
+    """Squared distance from the prior, which ranks those that have paid the same."""
     bearings: int = 0
+
+    @property
+    def price(self) -> tuple[float, float]:
+        """What the hypotheses are ranked by."""
+        return self.paid, self.surprise
 
 
 class Search:
@@ -74,7 +81,7 @@ class Search:
     @property
     def best(self) -> Belief:
         """The hypothesis that has paid least, the prior if there is none."""
-        return min(self.bank, key=lambda h: h.paid).belief if self.bank else self.prior
+        return min(self.bank, key=lambda h: h.price).belief if self.bank else self.prior
 
     def move(self, tick: Tick, noise: Array) -> None:
         """Carry everything through a tick's odometry."""
@@ -104,7 +111,7 @@ class Search:
         bank = []
         if is_known(self.prior.P):
             own = self.prior.own
-            bank.append(Hypothesis(Belief(self.vehicle, own.R, own.p, self.prior.P.copy()), 0.0))
+            bank.append(Hypothesis(Belief(self.vehicle, own.R, own.p, self.prior.P.copy()), 0.0, 0.0))
             _follow(bank[0], tick, sightings, variance)
         for R, camera in zip(*solve_p3p(b, z), strict=True):
             belief = Belief(self.vehicle, R, camera - R @ tick.lever_arm, np.zeros((6, 6)))
@@ -112,7 +119,8 @@ class Search:
             if P is None:
                 continue
             belief.P = P
-            hypothesis = Hypothesis(belief, self._surprise(belief))
+            surprise = self._surprise(belief)
+            hypothesis = Hypothesis(belief, min(surprise, MOST_SURPRISE), surprise)
             _follow(hypothesis, tick, [s for n, s in enumerate(sightings) if n not in three], variance)
             bank.append(hypothesis)
         return bank
@@ -122,13 +130,13 @@ class Search:
         return is_known(self.prior.P) and self._surprise(belief) < SAME_PRIOR
 
     def _surprise(self, belief: Belief) -> float:
-        """Return the squared distance from the prior, in standard deviations, or `MOST_SURPRISE`."""
+        """Return the squared distance from the prior, in standard deviations."""
         e = left_error(self.prior.own.R, self.prior.own.p, belief.own.R, belief.own.p)
-        return min(float(e @ np.linalg.solve(self.prior.P + belief.P, e)), MOST_SURPRISE)
+        return float(e.dot(solve(self.prior.P + belief.P, e)))
 
     def _prune(self) -> None:
         """Give up what pays much more than the best, what is the same as a better one, and all if none is good."""
-        ranked = sorted(self.bank, key=lambda h: h.paid)
+        ranked = sorted(self.bank, key=lambda h: h.price)
         kept: list[Hypothesis] = []
         for hypothesis in ranked:
             if hypothesis.paid <= ranked[0].paid + MARGIN and not any(_same(hypothesis, other) for other in kept):
@@ -139,8 +147,8 @@ class Search:
 
 def is_known(P: Array) -> bool:
     """Return whether a pose of covariance P (6, 6) is certain enough to linearise about and to tell others."""
-    variances = np.diag(P)
-    return bool(variances[:3].max() < KNOWN_ANGLE**2 and variances[3:].max() < KNOWN_POSITION**2)
+    variances = P.diagonal().tolist()
+    return max(variances[:3]) < KNOWN_ANGLE**2 and max(variances[3:]) < KNOWN_POSITION**2
 
 
 def _spread(sightings: list[Sighting], three: tuple[int, ...]) -> float:
@@ -183,11 +191,11 @@ def _follow(hypothesis: Hypothesis, tick: Tick, sightings: list[Sighting], varia
     hypothesis.bearings += len(sightings)
     fits = sight.ahead & (nis < GATE)
     if fits.any():
-        belief.settle(lambda: _seen(belief, tick, sightings, variance), fits)
+        belief.settle(sight, noise, fits, lambda: _seen(belief, tick, sightings, variance))
 
 
 def _same(one: Hypothesis, other: Hypothesis) -> bool:
     """Return whether two hypotheses cannot be told apart."""
     a, b = one.belief, other.belief
     e = left_error(a.own.R, a.own.p, b.own.R, b.own.p)
-    return float(e @ np.linalg.solve(a.P + b.P, e)) < SAME
+    return float(e.dot(solve(a.P + b.P, e))) < SAME

@@ -12,7 +12,7 @@ from coopenv.estimation.observers.planar import PlanarRobust
 from coopenv.estimation.observers.registry import find
 from coopenv.estimation.observers.robust import Robust, RobustJoint
 from coopenv.estimation.observers.starts import random_start
-from tests.estimation.observers.robust.scenes import noise_free, shifted, small_errors
+from tests.estimation.observers.robust.scenes import everybody_sees_everybody, noise_free, shifted, small_errors
 
 BOTH = pytest.mark.parametrize("name", ["robust", "robust_joint"])
 
@@ -126,3 +126,12 @@ def test_planar_vehicles_get_the_planar_observer():
     assert isinstance(find("robust")(setup), PlanarRobust)
     assert isinstance(find("robust")(replace(setup, planar=False)), Robust)
     assert isinstance(find("robust_joint")(replace(setup, planar=False)), RobustJoint)
+
+
+@BOTH
+def test_rumours_that_go_round_do_not_make_anybody_overconfident(name):
+    record = everybody_sees_everybody(8.0)
+    result = run(name, record)
+    assert not result.failure
+    assert (result.anees(3.0) < 2.0).all()
+    assert (result.position_rmse(3.0) < run("mekf_covariance", record).position_rmse(3.0) / 3.0).all()

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.observers.robust.belief import Belief, Member
+from coopenv.estimation.observers.robust.belief import Belief, Member, View
 from coopenv.estimation.observers.robust.report import left_error
 from coopenv.estimation.observers.robust.resection import resect
 from coopenv.estimation.observers.rotations import exp_so3
@@ -31,7 +31,8 @@ def solved(rng: np.random.Generator, std: float, member_error: np.ndarray, membe
     def look():
         member = start.members[1]
         sight = start.sight(bearings, np.zeros(3), np.vstack([z, member.p]), [1], [np.zeros(3)])
-        return sight, np.full(len(bearings), max(std, 1e-6) ** 2), np.ones(len(bearings), bool)
+        every = np.ones(len(bearings), bool)
+        return View(sight, np.full(len(bearings), max(std, 1e-6) ** 2), np.zeros(len(bearings)), every, 0.0)
 
     return start, resect(start, look)
 
