@@ -16,7 +16,6 @@ from coopenv.api.rewards import reward_weights
 from coopenv.backends.base import Backend
 from coopenv.backends.simulated import Simulated
 from coopenv.scenario import Scenario
-from coopenv.world.build import EMBEDDED
 from coopenv.world.launch import PerWorld
 from coopenv.world.state import check_fit, overwrite, state_fields
 
@@ -50,7 +49,7 @@ class Engine:
         backend = backend or Simulated(scenario)
         self.world = backend.world(worlds, dtype, device, threads)
         name = scenario.observer.name
-        self.plugins = None if name in EMBEDDED else PlugIns(name, self.world, backend.senses(self.world))
+        self.plugins = None if self.world.estimates else PlugIns(name, self.world, backend.senses(self.world))
         """The observers that run on the host; None where the embedded one estimates."""
         self.layout = observation_layout(scenario)
         device = self.world.device

@@ -136,8 +136,8 @@ class Observer(Part):
     """The estimator that every vehicle runs, and its gains."""
 
     name: str = Field(default="riccati", pattern=r"^[A-Za-z][A-Za-z0-9_.-]*$")
-    """`riccati`: the paper's observer; `dead_reckoning`: odometry alone, the lower reference; or any plug-in observer,
-    which runs in Python and is looked up when the world is built."""
+    """`riccati`: the paper's observer; `robust`: this project's own; `dead_reckoning`: odometry alone, the lower
+    reference; or any plug-in observer, which runs in Python and is looked up when the world is built."""
     k: Positive | tuple[Positive, ...] = 1.0
     """Gain k_i > 0.5, one for all vehicles or one per vehicle."""
     q: Positive | dict[str, Positive] = 10.0

@@ -22,7 +22,7 @@ ROTATION_OF_CAMERA = {
 """Camera to body: columns are the optical frame's x (right), y (down), z (forward)."""
 
 
-EMBEDDED = ("riccati", "dead_reckoning")
+EMBEDDED = ("riccati", "dead_reckoning", "robust")
 """Values of `observer.name` that run in the kernels; any other is a plug-in's (coopenv/api/plugins.py)."""
 
 NUMPY_OF = {wp.int32: np.int32, wp.float64: np.float64}

@@ -44,9 +44,13 @@ def start_warp() -> None:
 
 @cache
 def kernel(function: Callable[..., None], precision_name: str, differentiable: bool = False) -> wp.Kernel:
-    """Return a plain Python function as a Warp kernel whose module serves one precision only."""
+    """Return a plain Python function as a Warp kernel whose module serves one precision only.
+
+    Options that its file sets with `wp.set_module_options` hold for it.
+    """
     kind = ".differentiable" if differentiable else ""
     module = wp.get_module(f"{function.__module__}.{function.__name__}.{precision_name}{kind}")
+    module.options.update(wp.get_module(function.__module__).options)
     module.options["enable_backward"] = differentiable
     return wp.Kernel(func=function, key=function.__name__, module=module)
 

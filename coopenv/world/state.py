@@ -95,11 +95,6 @@ def state_fields(p: Precision) -> dict[str, Any]:
     return {name: var.type for name, var in state_struct(p).vars.items()}
 
 
-def read_state(state: Any, p: Precision) -> dict[str, np.ndarray]:
-    """Return a copy of every field on the host."""
-    return {name: getattr(state, name).numpy().copy() for name in state_fields(p)}
-
-
 def check_fit(arrays: Mapping[str, Any], values: Mapping[str, np.ndarray]) -> None:
     """Check that values can overwrite device arrays by name.
 

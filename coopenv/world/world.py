@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,12 @@ import warp as wp
 
 from coopenv.errors import CoopenvError
 from coopenv.scenario import Scenario
-from coopenv.world.build import build_model
+from coopenv.world.build import EMBEDDED, build_model
+from coopenv.world.embedded import ROBUST, Kernels, kernels_of
 from coopenv.world.launch import Launcher, PerWorld, default_threads
 from coopenv.world.precision import check_device, precision
 from coopenv.world.stages import broadcast_kernel, deliver_kernel, finish_kernel, sense_kernel
-from coopenv.world.state import allocate_state, check_fit, overwrite, read_state, state_fields
-from coopenv.world.step import advance_kernel, reset_kernel
+from coopenv.world.state import allocate_state, check_fit, overwrite, state_fields
 
 
 class World:
@@ -59,6 +60,8 @@ class World:
             self.threads = 1
         self.model = self._build_model()
         self.state = allocate_state(self.model, worlds, self.precision, self.device)
+        self.memory: Any = self._allocate_memory()
+        """What the embedded observer remembers besides the state; None where it needs no more."""
         self.actions = wp.zeros((worlds, self.model.vehicles), dtype=self.precision.vec2, device=self.device)
         self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         """(W,) worlds that `restart` resets and that `advance` leaves alone; zero between calls."""
@@ -67,6 +70,31 @@ class World:
 
     def _build_model(self) -> Any:
         return build_model(self.scenario, self.precision, self.device)
+
+    @property
+    def estimates(self) -> bool:
+        """Whether the scenario's observer is embedded; others run on the host, see `PlugIns`."""
+        return self.scenario.observer.name in EMBEDDED
+
+    def _allocate_memory(self) -> Any:
+        if not self.estimates or self.scenario.observer.name != ROBUST:
+            return None
+        from coopenv.world.robust.state import allocate_robust
+
+        return allocate_robust(self.model, self.worlds, self._start_covariance(), self.device)
+
+    def _start_covariance(self) -> np.ndarray:
+        """Return the covariances (N, 6, 6) of the initial estimates, left errors."""
+        from coopenv.estimation.observers.setups import start_covariance
+
+        return np.array([start_covariance(self.scenario, i) for i in range(self.model.vehicles)])
+
+    @cached_property
+    def _kernels(self) -> Kernels:
+        return kernels_of(self.memory)
+
+    def _changing(self) -> list[PerWorld]:
+        return [PerWorld(record) for record in (self.state, self.memory) if record is not None]
 
     def reset(self, seeds: Sequence[int] | np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
         """Start a new episode in the worlds of `mask` (all by default).
@@ -87,12 +115,12 @@ class World:
 
     def restart(self) -> None:
         """Start the next episode in the worlds of `self.mask`, on the device."""
-        self.launch("restart", reset_kernel, [self.model, PerWorld(self.state), PerWorld(self.mask)])
+        self.launch("restart", self._kernels.reset, [self.model, *self._changing(), PerWorld(self.mask)])
 
     def advance(self, ticks: int) -> None:
         """Run camera ticks under `self.actions`, stopping each world at its horizon."""
-        state, actions, mask = PerWorld(self.state), PerWorld(self.actions), PerWorld(self.mask)
-        self.launch(("advance", ticks), advance_kernel, [self.model, state, actions, mask, ticks])
+        moving = [*self._changing(), PerWorld(self.actions), PerWorld(self.mask), ticks]
+        self.launch(("advance", ticks), self._kernels.advance, [self.model, *moving])
 
     # One tick in stages, for estimators on the host: sense, then per vehicle deliver and broadcast, then finish.
 
@@ -126,7 +154,7 @@ class World:
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return a copy of everything that changes, random streams included (they are seeds and counters)."""
-        return {**read_state(self.state, self.precision), "actions": self.actions.numpy().copy()}
+        return {name: array.numpy().copy() for name, array in self.state_arrays().items()}
 
     def set_state(self, values: Mapping[str, np.ndarray]) -> None:
         """Restore what `get_state` returned.
@@ -140,4 +168,6 @@ class World:
     def state_arrays(self) -> dict[str, Any]:
         """Return every array that `set_state` writes, by name."""
         fields = {name: getattr(self.state, name) for name in state_fields(self.precision)}
-        return {**fields, "actions": self.actions}
+        remembered = [] if self.memory is None else list(self.memory._cls.vars)
+        own = {f"observer_{name}": getattr(self.memory, name) for name in remembered}
+        return {**fields, **own, "actions": self.actions}

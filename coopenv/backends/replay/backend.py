@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from coopenv.backends.replay.record import upload
 from coopenv.backends.replay.scenario import scenario_of
 from coopenv.estimation.observers.recording import Briefing, Recording, Sensed
 from coopenv.scenario import Scenario
+from coopenv.world.embedded import ROBUST, Kernels
 from coopenv.world.launch import PerWorld
 from coopenv.world.world import World
 
@@ -67,6 +69,23 @@ class ReplayWorld(World):
         super().__init__(scenario, worlds, dtype, device, threads)
         self._record = upload(recording, scenario.rates.odometry, self.precision, self.device)
 
+    @property
+    def estimates(self) -> bool:
+        """Whether the observer is embedded; `robust` has no embedded form for robots on a plane."""
+        planar = any(setup.planar for setup in self._recording.setups)
+        return super().estimates and not (planar and self.scenario.observer.name == ROBUST)
+
+    def _start_covariance(self) -> np.ndarray:
+        return self._recording.start_covariance
+
+    @cached_property
+    def _kernels(self) -> Kernels:
+        if self.memory is None:
+            return Kernels(replay_kernel, rewind_kernel)
+        from coopenv.backends.replay.robust_kernels import replay_robust_kernel, rewind_robust_kernel
+
+        return Kernels(replay_robust_kernel, rewind_robust_kernel)
+
     def _build_model(self) -> Any:
         model = super()._build_model()
         order = np.array(self._recording.order, dtype=np.int32)
@@ -77,12 +96,12 @@ class ReplayWorld(World):
 
     def restart(self) -> None:
         """Go back to the recording's start in the worlds of `self.mask`."""
-        self.launch("restart", rewind_kernel, [*self._recorded(), PerWorld(self.mask)])
+        self.launch("restart", self._kernels.reset, [self.model, *self._changing(), self._record, PerWorld(self.mask)])
 
     def advance(self, ticks: int) -> None:
         """Run recorded ticks with the embedded observer."""
-        moving = [PerWorld(self.actions), PerWorld(self.mask), ticks]
-        self.launch(("advance", ticks), replay_kernel, [*self._recorded(), *moving])
+        moving = [*self._changing(), self._record, PerWorld(self.actions), PerWorld(self.mask), ticks]
+        self.launch(("advance", ticks), self._kernels.advance, [self.model, *moving])
 
     def sense(self, active: Any) -> None:
         """Recall the next tick."""

@@ -93,11 +93,9 @@ def redeliver_kernel(model: Any, state: Any, record: Any, active: wp.array(dtype
         redeliver(model, state, record, world, vehicle, state.tick[world] + 1)
 
 
-def rewind_kernel(model: Any, state: Any, record: Any, mask: wp.array(dtype=wp.int32)):
-    """Go to the start of the recording in every world whose mask is set. One thread per world."""
-    world = wp.tid()
-    if mask[world] == 0:
-        return
+@wp.func
+def rewind(model: Any, state: Any, record: Any, world: int):
+    """Go to the start of the recording in one world."""
     state.episode[world] = state.episode[world] + wp.uint32(1)
     state.tick[world] = 0
     for agent in range(model.agents):
@@ -115,3 +113,10 @@ def rewind_kernel(model: Any, state: Any, record: Any, mask: wp.array(dtype=wp.i
         vehicle = model.order[place]
         redeliver(model, state, record, world, vehicle, 0)
         broadcast(model, state, world, vehicle, 0)
+
+
+def rewind_kernel(model: Any, state: Any, record: Any, mask: wp.array(dtype=wp.int32)):
+    """Go to the start of the recording in every world whose mask is set. One thread per world."""
+    world = wp.tid()
+    if mask[world] != 0:
+        rewind(model, state, record, world)

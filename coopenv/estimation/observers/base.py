@@ -70,7 +70,8 @@ class SensorNoise:
         The noise is taken as white of density sigma^2 times the period; exact where both rates are equal.
         """
         scale = self.odometry_period * dt
-        return np.repeat([self.angular_velocity**2 * scale, self.velocity**2 * scale], 3)
+        turn, step = self.angular_velocity**2 * scale, self.velocity**2 * scale
+        return np.array([turn, turn, turn, step, step, step])
 
     @property
     def bearing_std(self) -> float:
@@ -187,9 +188,10 @@ class Tick:
         The message is None for a landmark.
         """
         result: list[tuple[int, Array, Array, Message | None]] = []
-        for n in np.flatnonzero(self.valid):
-            target = int(self.targets[n])
-            if target < len(self.landmarks):
+        targets, landmarks = self.targets.tolist(), len(self.landmarks)
+        for n in self.valid.nonzero()[0].tolist():
+            target = targets[n]
+            if target < landmarks:
                 result.append((target, self.bearings[n], self.landmarks[target], None))
             elif (heard := self.messages.get(target)) is not None and heard.message.position is not None:
                 result.append((target, self.bearings[n], heard.message.position, heard.message))

@@ -42,11 +42,10 @@ class Centralised:
     def update(self, ticks: Sequence[Tick]) -> list[Estimate]:
         """Predict every vehicle, then correct by all bearings in one update."""
         self.predict(ticks)
-        rows = [row for i, tick in enumerate(ticks) if tick.due for row in self.rows(i, tick)]
+        rows = [self.rows(i, tick) for i, tick in enumerate(ticks) if tick.due and tick.valid.any()]
         if rows:
-            H = np.concatenate([row[0] for row in rows])
-            N = np.diag(np.concatenate([row[2] for row in rows]))
-            dx, self.P, _ = kalman(self.P, H, N, np.concatenate([row[1] for row in rows]))
+            H, residual, variances = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+            dx, self.P, _ = kalman(self.P, H, np.diag(variances), residual)
             self.move(dx)
         self.sent = [
             Message(
@@ -67,29 +66,30 @@ class Centralised:
         F = np.zeros_like(self.P)
         for i, (tick, (R, p)) in enumerate(zip(ticks, self.poses, strict=True)):
             F[self.block(i), self.block(i)] = transition(tick.rotation, tick.translation)
-            self.poses[i] = orthonormalise(R @ tick.rotation), p + R @ tick.translation
+            self.poses[i] = orthonormalise(R.dot(tick.rotation)), p + R.dot(tick.translation)
         noise = np.concatenate([tick.noise.odometry(tick.dt) for tick in ticks])
-        self.P = F @ self.P @ F.T + np.diag(noise)
+        self.P = F.dot(self.P).dot(F.T) + np.diag(noise)
 
-    def rows(self, i: int, tick: Tick) -> list[tuple[Array, Array, Array]]:
-        """Return (H (2, 6N), residual (2,), variances (2,)) of every bearing of vehicle i."""
+    def rows(self, i: int, tick: Tick) -> tuple[Array, Array, Array]:
+        """Return (H (2m, 6N), residual (2m,), variances (2m,)) of the bearings of vehicle i."""
         R, p = self.poses[i]
-        own = LeftError(R, p, self.P)
-        result = []
-        for n in np.flatnonzero(tick.valid):
-            j = int(tick.targets[n]) - self.landmarks
-            if j < 0:
-                z = tick.landmarks[int(tick.targets[n])]
-            else:
-                Rj, pj = self.poses[j]
-                z = pj + Rj @ self.markers[j]
-            residual, J = innovation(R, p, tick.lever_arm, tick.bearings[n : n + 1], z[None])
-            H = np.zeros((2, len(self.P)))
-            H[:, self.block(i)] = (J @ own.jacobian(z[None]))[0]
-            if j >= 0:
-                H[:, self.block(j)] = J[0] @ R.T @ Rj @ np.hstack([-skew(self.markers[j]), np.eye(3)])
-            result.append((H, residual[0], np.full(2, tick.noise.bearing_std**2)))
-        return result
+        targets = tick.targets[tick.valid].tolist()
+        z = np.array([self.place(target, tick) for target in targets])
+        residual, J = innovation(R, p, tick.lever_arm, tick.bearings[tick.valid], z)
+        H = np.zeros((len(z), 2, len(self.P)))
+        H[:, :, self.block(i)] = J @ LeftError(R, p, self.P).jacobian(z)
+        for n, target in enumerate(targets):
+            if (j := target - self.landmarks) >= 0:
+                G = J[n].dot(R.T).dot(self.poses[j][0])
+                H[n, :, self.block(j)] = np.concatenate([G.dot(skew(-self.markers[j])), G], axis=1)
+        return H.reshape(-1, len(self.P)), residual.ravel(), np.full(2 * len(z), tick.noise.bearing_std**2)
+
+    def place(self, target: int, tick: Tick) -> Array:
+        """Return (3,) where a target is, or is believed to be, map frame, m."""
+        if target < self.landmarks:
+            return tick.landmarks[target]
+        R, p = self.poses[target - self.landmarks]
+        return p + R.dot(self.markers[target - self.landmarks])
 
     def move(self, dx: Array) -> None:
         """Move every pose by its part of the error."""

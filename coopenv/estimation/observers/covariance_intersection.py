@@ -41,13 +41,10 @@ class CovarianceIntersection(Mekf):
     def intersect(self, tick: Tick, b: Array, z: Array, covariance: Array) -> None:
         """Fuse one bearing to a neighbour with the covariance (3, 3) of its position."""
         residual, J = innovation(self.state.R, self.state.p, tick.lever_arm, b, z)
-        H = (J @ self.state.jacobian(z))[0]
-        G = J[0] @ self.state.R.T
-        own, theirs, prior = (
-            np.diag([tick.noise.bearing_std**2] * 2),
-            G @ covariance @ G.T,
-            H @ self.state.P @ H.T,
-        )
+        H = J[0].dot(self.state.jacobian(z)[0])
+        G = J[0].dot(self.state.R.T)
+        own = tick.noise.bearing_std**2 * np.eye(2)
+        theirs, prior = G.dot(covariance).dot(G.T), H.dot(self.state.P).dot(H.T)
         w = best_weight(prior, own, theirs)
         if w < 1.0:
             dx, P, _ = kalman(self.state.P / w, H, own + theirs / (1.0 - w), residual[0])

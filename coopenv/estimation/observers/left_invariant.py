@@ -30,15 +30,15 @@ class InvariantError(LeftError):
     def predicted(self, tick: Tick) -> InvariantError:
         """Return the state after the tick's odometry."""
         E = tick.rotation.T
-        F = adjoint(E, -E @ tick.translation)
-        P = F @ self.P @ F.T
+        F = adjoint(E, -E.dot(tick.translation))
+        P = F.dot(self.P).dot(F.T)
         P.flat[::7] += tick.noise.odometry(tick.dt)
-        return InvariantError(orthonormalise(self.R @ tick.rotation), self.p + self.R @ tick.translation, P)
+        return InvariantError(orthonormalise(self.R.dot(tick.rotation)), self.p + self.R.dot(tick.translation), P)
 
     def moved(self, dx: Array, P: Array) -> InvariantError:
         """Return the state moved by an error dx = xi."""
         turn, shift = exp_se3(np.asarray(dx))
-        return InvariantError(self.R @ turn, self.p + self.R @ shift, P)
+        return InvariantError(self.R.dot(turn), self.p + self.R.dot(shift), P)
 
 
 class LeftInvariant(Mekf):

@@ -17,11 +17,12 @@ import numpy as np
 
 from coopenv.estimation.observers.base import Array, Coordinates, Estimate, Message, Setup, Tick
 from coopenv.estimation.observers.rotations import IDENTITY, exp_so3, orthonormalise, skew, tangent_basis
+from coopenv.estimation.observers.small_matrices import solve
 
 
 def innovation(R: Array, p: Array, lever_arm: Array, bearings: Array, positions: Array) -> tuple[Array, Array]:
     """Return (residual (m, 2), J (m, 2, 3)): tangent residuals and their derivative by the line d in the body frame."""
-    d = (positions - p) @ R - lever_arm
+    d = (positions - p).dot(R) - lever_arm
     distance = np.maximum(np.sqrt((d * d).sum(axis=1)), 1e-9)[:, None]
     B = tangent_basis(d / distance)
     return (B @ bearings[..., None])[..., 0], B / distance[..., None]
@@ -43,27 +44,27 @@ class LeftError:
     def predicted(self, tick: Tick) -> LeftError:
         """Return the state after the tick's odometry."""
         F = transition(tick.rotation, tick.translation)
-        P = F @ self.P @ F.T
+        P = F.dot(self.P).dot(F.T)
         P.flat[::7] += tick.noise.odometry(tick.dt)
-        return LeftError(orthonormalise(self.R @ tick.rotation), self.p + self.R @ tick.translation, P)
+        return LeftError(orthonormalise(self.R.dot(tick.rotation)), self.p + self.R.dot(tick.translation), P)
 
     def jacobian(self, positions: Array) -> Array:
         """Return (m, 3, 6) the derivative of the lines to map positions (m, 3)."""
         J = np.empty((len(positions), 3, 6))
-        J[:, :, :3] = skew((positions - self.p) @ self.R)
+        J[:, :, :3] = skew((positions - self.p).dot(self.R))
         J[:, :, 3:] = -IDENTITY
         return J
 
     def moved(self, dx: Array, P: Array) -> LeftError:
         """Return the state moved by an error dx."""
-        return LeftError(self.R @ exp_so3(dx[:3]), self.p + self.R @ dx[3:], P)
+        return LeftError(self.R.dot(exp_so3(dx[:3])), self.p + self.R.dot(dx[3:]), P)
 
     def point_covariance(self, marker: Array) -> Array:
         """Return the covariance (3, 3) in map axes of a point of the body."""
         J = np.empty((3, 6))
-        J[:, :3] = self.R @ skew(-marker)
+        J[:, :3] = self.R.dot(skew(-marker))
         J[:, 3:] = self.R
-        return J @ self.P @ J.T
+        return J.dot(self.P).dot(J.T)
 
     def estimate(self, nis: float | None = None, nis_dof: int = 0) -> Estimate:
         """Return the pose with its covariance, and the normalised innovation squared of its correction."""
@@ -73,20 +74,21 @@ class LeftError:
 def transition(rotation: Array, translation: Array) -> Array:
     """Return F of the left error over an odometry increment (dR, dp)."""
     F = np.zeros((6, 6))
-    F[:3, :3] = F[3:, 3:] = rotation.T
-    F[3:, :3] = -rotation.T @ skew(translation)
+    E = rotation.T
+    F[:3, :3] = F[3:, 3:] = E
+    F[3:, :3] = E.dot(skew(-translation))
     return F
 
 
 def kalman(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array, float]:
     """Return (dx, P+, r^T S^-1 r) of a Kalman update with measurement covariance N, in Joseph's form."""
-    PHt = P @ H.T
-    solved = np.linalg.solve(H @ PHt + N, np.concatenate([PHt.T, residual[:, None]], axis=1))
+    PHt = P.dot(H.T)
+    solved = solve(H.dot(PHt) + N, np.concatenate([PHt.T, residual[:, None]], axis=1))
     K = solved[:, :-1].T
-    A = -K @ H
+    A = -K.dot(H)
     A.flat[:: len(P) + 1] += 1.0
-    P = A @ P @ A.T + K @ N @ K.T
-    return K @ residual, (P + P.T) / 2, float(residual @ solved[:, -1])
+    P = A.dot(P).dot(A.T) + K.dot(N).dot(K.T)
+    return K.dot(residual), (P + P.T) / 2, float(residual.dot(solved[:, -1]))
 
 
 class Mekf:
@@ -129,11 +131,11 @@ class Mekf:
         N.flat[:: size + 1] = tick.noise.bearing_std**2
         for n, message in enumerate(messages):
             if self.sends_covariance and message is not None and message.covariance is not None:
-                G = J[n] @ self.state.R.T
-                N[2 * n : 2 * n + 2, 2 * n : 2 * n + 2] += G @ message.covariance @ G.T
+                G = J[n].dot(self.state.R.T)
+                N[2 * n : 2 * n + 2, 2 * n : 2 * n + 2] += G.dot(message.covariance).dot(G.T)
         return N
 
     def message(self) -> Message:
         """Return the marker's position, and its covariance if this filter sends it."""
         covariance = self.state.point_covariance(self.marker) if self.sends_covariance else None
-        return Message(position=self.state.p + self.state.R @ self.marker, covariance=covariance)
+        return Message(position=self.state.p + self.state.R.dot(self.marker), covariance=covariance)

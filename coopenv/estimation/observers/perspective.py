@@ -148,6 +148,8 @@ def _polished(distances: Array, gaps: Array, a: Array) -> Array:
         moved = distances - step / determinant[..., None]
         f_moved = _misfit(moved, gaps, a)
         better = ((f_moved**2).sum(-1) < (f**2).sum(-1))[..., None]
+        if not better.any():
+            break
         distances, f = np.where(better, moved, distances), np.where(better, f_moved, f)
     return distances
 

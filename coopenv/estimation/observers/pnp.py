@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from coopenv.estimation.observers.base import Array, Estimate, Message, Setup, Tick
 from coopenv.estimation.observers.mekf import LeftError, innovation
 from coopenv.estimation.observers.perspective import solve_p3p_batch
+from coopenv.estimation.observers.small_matrices import solve
 
 MOST_TRIPLES = 20
 ITERATIONS = 8
@@ -35,6 +36,7 @@ NARROW_STD = 0.5
 LARGEST_STD = 0.15
 """Of the position, over the distance to the nearest point: beyond it the geometry is too weak."""
 
+ALL, PLANE = np.eye(6), np.eye(2)
 EXACT = np.zeros((3, 3))
 """Of a point that is known, or whose sender states no covariance."""
 
@@ -93,7 +95,7 @@ class PerspectivePoints:
     def message(self) -> Message:
         """Return the marker's position and covariance."""
         return Message(
-            position=self.state.p + self.state.R @ self.marker, covariance=self.state.point_covariance(self.marker)
+            position=self.state.p + self.state.R.dot(self.marker), covariance=self.state.point_covariance(self.marker)
         )
 
 
@@ -109,9 +111,9 @@ def linearised(pose: LeftError, tick: Tick, data: Bearings) -> tuple[Array, Arra
     """Return residuals (m, 2), their derivative H (m, 2, 6) and their covariance (m, 2, 2) given the pose."""
     b, z, covariances = data
     residual, J = innovation(pose.R, pose.p, tick.lever_arm, b, z)
-    G = J @ pose.R.T
+    G = J.dot(pose.R.T)
     N = G @ covariances @ G.transpose(0, 2, 1)
-    N[:, [0, 1], [0, 1]] += tick.noise.bearing_std**2
+    N += tick.noise.bearing_std**2 * PLANE
     return residual, J @ pose.jacobian(z), N
 
 
@@ -135,7 +137,7 @@ def normalised(residual: Array, N: Array) -> Array:
 
 def ahead(pose: LeftError, tick: Tick, data: Bearings) -> NDArray[np.bool_]:
     """Return (m,) whether the points are where the bearings point, and not opposite."""
-    return (((data[1] - pose.p) @ pose.R - tick.lever_arm) * data[0]).sum(1) > 0.0
+    return (((data[1] - pose.p).dot(pose.R) - tick.lever_arm) * data[0]).sum(1) > 0.0
 
 
 def refined(start: LeftError, tick: Tick, data: Bearings) -> LeftError | None:
@@ -145,15 +147,15 @@ def refined(start: LeftError, tick: Tick, data: Bearings) -> LeftError | None:
         residual, H, N = linearised(pose, tick, data)
         weighted = np.linalg.solve(N, H).reshape(-1, 6)
         try:
-            P = np.linalg.inv(H.reshape(-1, 6).T @ weighted)
+            P = solve(H.reshape(-1, 6).T.dot(weighted), ALL)
         except np.linalg.LinAlgError:
             return None
-        gradient = residual.ravel() @ weighted
-        step = P @ gradient
-        if not (step[:3] @ step[:3] < LONGEST_TURN**2 and firm(P, pose, data)):  # NaN fails as well
+        gradient = residual.ravel().dot(weighted)
+        step = P.dot(gradient)
+        if not (step[:3].dot(step[:3]) < LONGEST_TURN**2 and firm(P, pose, data)):  # NaN fails as well
             return None
         pose = pose.moved(step, (P + P.T) / 2)
-        if step @ gradient < CONVERGED:
+        if step.dot(gradient) < CONVERGED:
             fits = ahead(pose, tick, data) & (normalised(residual - H @ step, N) < BEARING_GATE)
             return pose if fits.all() else None
     return None
@@ -170,7 +172,7 @@ def distance(pose: LeftError, predicted: LeftError) -> float:
 
     The rotation counts by twice the vector part of its quaternion.
     """
-    tilde = predicted.R.T @ pose.R
+    tilde = predicted.R.T.dot(pose.R)
     vector = np.array([tilde[2, 1] - tilde[1, 2], tilde[0, 2] - tilde[2, 0], tilde[1, 0] - tilde[0, 1]])
-    e = np.concatenate([vector / sqrt(max(1.0 + tilde.trace(), 1e-9)), predicted.R.T @ (pose.p - predicted.p)])
-    return float(e @ np.linalg.solve(pose.P + predicted.P, e))
+    e = np.concatenate([vector / sqrt(max(1.0 + tilde.trace(), 1e-9)), predicted.R.T.dot(pose.p - predicted.p)])
+    return float(e.dot(solve(pose.P + predicted.P, e)))

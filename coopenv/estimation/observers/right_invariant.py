@@ -21,7 +21,7 @@ def from_left(R: Array, p: Array) -> Array:
     """Return G, which turns left errors (theta, rho) at a pose into right ones."""
     G = np.zeros((6, 6))
     G[:3, :3] = G[3:, 3:] = R
-    G[3:, :3] = skew(p) @ R
+    G[3:, :3] = skew(p).dot(R)
     return G
 
 
@@ -37,13 +37,13 @@ class RightError(LeftError):
     def start(cls, R: Array, p: Array, P: Array) -> RightError:
         """Return the state of a pose with a covariance in LEFT coordinates."""
         G = from_left(R, p)
-        return cls(R, p, G @ P @ G.T)
+        return cls(R, p, G.dot(P).dot(G.T))
 
     def predicted(self, tick: Tick) -> RightError:
         """Return the state after the tick's odometry."""
-        R, p = orthonormalise(self.R @ tick.rotation), self.p + self.R @ tick.translation
+        R, p = orthonormalise(self.R.dot(tick.rotation)), self.p + self.R.dot(tick.translation)
         G = from_left(R, p)
-        return RightError(R, p, self.P + (G * tick.noise.odometry(tick.dt)) @ G.T)
+        return RightError(R, p, self.P + (G * tick.noise.odometry(tick.dt)).dot(G.T))
 
     def jacobian(self, positions: Array) -> Array:
         """Return (m, 3, 6) the derivative of the lines to map positions (m, 3)."""
@@ -55,12 +55,12 @@ class RightError(LeftError):
     def moved(self, dx: Array, P: Array) -> RightError:
         """Return the state moved by an error dx."""
         turn = exp_so3(dx[:3])
-        return RightError(turn @ self.R, turn @ self.p + dx[3:], P)
+        return RightError(turn.dot(self.R), turn.dot(self.p) + dx[3:], P)
 
     def point_covariance(self, marker: Array) -> Array:
         """Return the covariance (3, 3) in map axes of a point of the body."""
-        J = np.hstack([-skew(self.p + self.R @ marker), IDENTITY])
-        return J @ self.P @ J.T
+        J = np.concatenate([skew(-self.p - self.R.dot(marker)), IDENTITY], axis=1)
+        return J.dot(self.P).dot(J.T)
 
     def estimate(self, nis: float | None = None, nis_dof: int = 0) -> Estimate:
         """Return the pose with its covariance, and the normalised innovation squared of its correction."""

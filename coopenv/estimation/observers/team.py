@@ -8,7 +8,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from time import perf_counter
 from typing import Any, NamedTuple, Protocol
 
@@ -63,6 +62,8 @@ class Mail:
         self.heard: list[dict[int, tuple[int, Message]]] = [{} for _ in briefing.setups]
         """Per receiver: sender to the last message that arrived, with its tick of sending."""
         self.bytes = np.zeros(len(briefing.setups))
+        self._senders = [[int(t) for t in setup.targets if t >= setup.landmarks] for setup in briefing.setups]
+        """Per receiver: the targets that are vehicles."""
 
     def due(self, k: int) -> bool:
         """Return whether messages are sent at tick k."""
@@ -89,26 +90,34 @@ class Mail:
             vehicle: the receiver.
             inbox_tick: (N,) tick of sending of the last message that the radio delivered of each sender; -1: none.
         """
-        b, setup, heard = self.briefing, self.briefing.setups[vehicle], self.heard[vehicle]
-        ticks, received = np.asarray(inbox_tick), {}
-        for target in setup.targets[setup.targets >= setup.landmarks]:
-            sender = int(target) - setup.landmarks
-            sent = int(ticks[sender])
+        b, landmarks, heard = self.briefing, self.briefing.setups[vehicle].landmarks, self.heard[vehicle]
+        ticks, received = np.asarray(inbox_tick).tolist(), {}
+        for target in self._senders[vehicle]:
+            sender = target - landmarks
+            sent = ticks[sender]
             if sent in self.sent[sender]:
                 heard[sender] = (sent, self.sent[sender][sent])
             age = (k - sent) * b.dt
             if sent >= 0 and age <= b.staleness and sender in heard and heard[sender][0] == sent:
-                received[int(target)] = Received(heard[sender][1], age)
+                received[target] = Received(heard[sender][1], age)
         return received
 
 
 def _copied(message: Message) -> Message:
     """Return a copy that the sender can no longer change."""
-    arrays = {
-        name: None if (value := getattr(message, name)) is None else np.array(value, np.result_type(value, np.float32))
-        for name in ("position", "rotation", "covariance")
-    }
-    return replace(message, **arrays, extra={name: np.array(value) for name, value in message.extra.items()})
+    return Message(
+        position=_floats(message.position),
+        rotation=_floats(message.rotation),
+        covariance=_floats(message.covariance),
+        extra={name: np.array(value) for name, value in message.extra.items()},
+    )
+
+
+def _floats(value: Array | None) -> Array | None:
+    """Return a copy in double precision, or in single precision if it came so."""
+    if value is None:
+        return None
+    return np.array(value, np.float32 if getattr(value, "dtype", None) == np.float32 else np.float64)
 
 
 class Team:

@@ -16,6 +16,7 @@ from coopenv.estimation.observers.base import Array, Message, Tick
 from coopenv.estimation.observers.left_invariant import InvariantError
 from coopenv.estimation.observers.mekf import LeftError, Mekf, innovation
 from coopenv.estimation.observers.rigid_motions import exp_se3
+from coopenv.estimation.observers.small_matrices import cholesky, solve
 
 SPREAD = 6.0
 """Squared distance of the sigma points from the mean in standard deviations: alpha = 1 in six dimensions."""
@@ -39,24 +40,25 @@ class Ukf(Mekf):
         basis = J * distance[:, None, None]
         xi = sigma_points(P)  # (12, 6)
         turn, shift = exp_se3(xi)
-        d = ((z - p) @ R - shift[:, None]) @ turn - tick.lever_arm  # (12, m, 3)
+        d = ((z - p).dot(R) - shift[:, None]) @ turn - tick.lever_arm  # (12, m, 3)
         bearings = d / np.maximum(np.sqrt((d * d).sum(-1, keepdims=True)), 1e-9)
         y = (basis @ bearings[..., None])[..., 0].reshape(len(xi), -1)  # (12, 2m), 0 for the mean
         mean = WEIGHT * y.sum(0)
         y -= mean
-        S = WEIGHT * y.T @ y + MEAN_WEIGHT * np.outer(mean, mean)
+        S = WEIGHT * y.T.dot(y) + MEAN_WEIGHT * np.outer(mean, mean)
         S += self.noise(tick, J, messages)
         r = residual.ravel() - mean
-        solved = np.linalg.solve(S, np.concatenate([WEIGHT * y.T @ xi, r[:, None]], axis=1))
+        solved = solve(S, np.concatenate([WEIGHT * y.T.dot(xi), r[:, None]], axis=1))
         gain = solved[:, :-1].T
-        P = P - gain @ S @ gain.T
-        self.state, self.nis, self.nis_dof = self.state.moved(gain @ r, (P + P.T) / 2), float(r @ solved[:, -1]), len(r)
+        P = P - gain.dot(S).dot(gain.T)
+        self.state = self.state.moved(gain.dot(r), (P + P.T) / 2)
+        self.nis, self.nis_dof = float(r.dot(solved[:, -1])), len(r)
 
 
 def sigma_points(P: Array) -> Array:
     """Return (12, 6) the sigma points but the mean: plus and minus the columns of a square root of SPREAD P."""
     try:
-        root = np.linalg.cholesky(SPREAD * P).T
+        root = cholesky(SPREAD * P).T
     except np.linalg.LinAlgError:  # singular to rounding
         values, vectors = np.linalg.eigh(SPREAD * P)
         root = (vectors * np.sqrt(np.maximum(values, 0.0))).T

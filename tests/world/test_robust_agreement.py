@@ -1,0 +1,123 @@
+"""The embedded observer `robust` does as the one in NumPy does, tick by tick, to 1e-9 in float64."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from coopenv.api.engine import Engine
+from coopenv.estimation.observers import Estimate, Recording, record, run
+from coopenv.estimation.observers.faults import FAULTS, Lie
+from coopenv.estimation.observers.starts import random_start, with_start
+from coopenv.estimation.observers.written import riccati_covariance
+from coopenv.scenario import load_scenario
+from coopenv.world.world import World
+from tests.world.replays import Played, replayed
+
+ISOTROPIC = {"noise.bearing.model": "isotropic", "noise.bearing.scale": 0.0029}
+LOSSY = {"v2x.delay": 6, "v2x.loss": 0.3}
+STALE = {"v2x.delay": 3, "v2x.loss": 0.4, "v2x.period": 2, "v2x.staleness": 0.2}
+
+
+def driven(engine: Engine) -> np.ndarray:
+    generator = np.random.default_rng(int(engine.view("tick")[0]))
+    return generator.uniform(-1, 1, (1, engine.world.model.vehicles, 2))
+
+
+@cache
+def recorded(name: str = "busy_intersection", seed: int = 0, **overrides: Any) -> Recording:
+    options = ISOTROPIC if name == "busy_intersection" else {}
+    return record(
+        load_scenario(name, {**options, **{k.replace("__", "."): v for k, v in overrides.items()}}), seed, driven
+    )
+
+
+def near(recording: Recording) -> Recording:
+    start = recording.truth.position[0] + 0.05
+    return with_start(recording, recording.truth.rotation[0], start, np.diag([1e-4] * 3 + [4e-3] * 3))
+
+
+def dotted(options: dict[str, Any]) -> dict[str, Any]:
+    return {key.replace(".", "__"): value for key, value in options.items()}
+
+
+CASES: dict[str, Callable[[float], Recording]] = {
+    "near": lambda horizon: near(recorded(horizon=horizon)),
+    "the paper's start": lambda horizon: recorded(horizon=horizon),
+    "noise off": lambda horizon: random_start(recorded(horizon=horizon, noise__enabled=False), 1),
+    "any start": lambda horizon: random_start(recorded(horizon=horizon), 2),
+    "stale radio": lambda horizon: random_start(recorded(horizon=horizon, **dotted(STALE)), 3),
+    "late radio": lambda horizon: near(recorded(horizon=horizon, **dotted(LOSSY))),
+    "wrong association": lambda horizon: FAULTS["wrong_association"].applied(near(recorded(horizon=horizon)), 4)[0],
+    "landmarks lost": lambda horizon: FAULTS["landmarks_lost"].applied(near(recorded(horizon=horizon)), 4)[0],
+    "slow corrections": lambda horizon: near(recorded(horizon=horizon, rates__observer=25.0, rates__odometry=37.0)),
+    "cyclic": lambda horizon: near(recorded(horizon=horizon, topology__acyclic=False)),
+    "sensed": lambda horizon: recorded("urban_crossing", horizon=horizon),
+    "three landmarks": lambda horizon: recorded("crossing_path", horizon=horizon),
+    "mirror": lambda horizon: recorded("busy_intersection_mirror", horizon=horizon),
+}
+
+
+def check(recording: Recording, played: Played, tamper: Lie | None = None) -> None:
+    result = run("robust", recording, tamper)
+    assert not result.failure
+    assert_allclose(played.position[1:], result.position[1:], rtol=0, atol=1e-9)
+    assert_allclose(played.rotation[1:], result.rotation[1:], rtol=0, atol=1e-9)
+    for k in range(1, recording.ticks, 50):
+        for i in range(len(recording.setups)):
+            P = result.covariance[k, i]
+            expected = riccati_covariance(Estimate(result.rotation[k, i], result.position[k, i], P))
+            assert expected is not None
+            scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+            assert_allclose(played.covariance[k, i] / scale, expected / scale, rtol=0, atol=1e-7)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_it_does_as_the_one_in_numpy(case: str) -> None:
+    recording = CASES[case](4.0)
+    check(recording, replayed(recording))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+def test_it_does_so_over_a_whole_episode(case: str) -> None:
+    recording = CASES[case](50.0)
+    check(recording, replayed(recording))
+
+
+def test_a_search_ends_for_leaders_first() -> None:
+    played = replayed(CASES["any start"](4.0))
+    found = (~played.searching).argmax(axis=0)
+    assert played.searching[0].all()
+    assert 0 < found[0] < found[1] < found[2] < found[3]
+
+
+def test_a_liar_is_found_out_as_in_numpy() -> None:
+    recording = near(recorded(horizon=5.0, v2x__delay=1))
+    lie = Lie(sender=1, start=2.0, std=2.0**-7)  # whose square single precision holds exactly
+    told = {}
+
+    def meddle(world: World, tick: int) -> None:
+        if lie.applies(1, tick * recording.dt):
+            slot = tick % world.model.radio.slots
+            memory: Any = world.memory
+            memory.outbox_position.numpy()[0, 1, slot] += lie.offset
+            memory.outbox_covariance.numpy()[0, 1, slot] = lie.std**2 * np.eye(6)
+        told[tick] = world.memory.distrusted.numpy()[0, 2].max()
+
+    check(recording, replayed(recording, meddle), lie)
+    assert told[119] == 0 and told[125] == 1
+
+
+def test_single_precision_worlds_estimate_alike() -> None:
+    recording = CASES["any start"](4.0)
+    wide, narrow = replayed(recording), replayed(recording, dtype="float32")
+    assert narrow.world.view("estimate_position").dtype == np.float32
+    late = slice(-30, None)
+    assert_allclose(narrow.position[late, :4], wide.position[late, :4], atol=2e-3)
+    assert_allclose(narrow.rotation[late, :4], wide.rotation[late, :4], atol=2e-4)

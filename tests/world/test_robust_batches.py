@@ -1,0 +1,121 @@
+"""What the embedded observer `robust` remembers belongs to its world: batches, resets, saved states."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coopenv.scenario import Scenario
+from coopenv.world.world import World
+from tests.world.builders import constant, reset, same_bits, scenario, start, vehicle
+from tests.world.calls import DTYPES
+
+State = dict[str, np.ndarray]
+LOST = {"position_radius": 4.0, "orientation_angle": "uniform"}
+SURE = {"position_radius": 0.1, "orientation_angle": 0.02}
+
+
+def noisy() -> Scenario:
+    """Return a world in which one vehicle knows its start, one searches, and one needs the others."""
+    wide = {"orientation": "body", "miss_probability": 0.1, "position": [0.2, 0.0, 0.1]}
+    return scenario(
+        [
+            vehicle((0.0, 0.0, 0.5), initial_estimate=SURE, motion=constant([0.3, 0, 0], [0, 0, 0.2])),
+            vehicle((-3.0, -2.0, 0.2), initial_estimate=LOST, motion=constant([0.5, 0, 0])),
+            vehicle(
+                (2.0, -4.0, 0.5),
+                initial_estimate=LOST,
+                motion=constant([0.4, 0, 0], [0, 0, -0.3]),
+                neighbours=["L1", "L2", "vehicle_1", "vehicle_2"],
+            ),
+        ],
+        horizon=5.0,
+        noise={"velocity": 0.1, "angular_velocity": 0.05, "bearing": {"model": "isotropic", "scale": 0.003}},
+        camera=wide,
+        v2x={"delay": 2, "loss": 0.3},
+        observer={"name": "robust"},
+    )
+
+
+def assert_same(a: State, b: State, rows_a: object = slice(None), rows_b: object = slice(None)) -> None:
+    assert a.keys() == b.keys() and any(name.startswith("observer_") for name in a)
+    for name in a:
+        assert same_bits(a[name][rows_a], b[name][rows_b]), name
+
+
+def played(world: World, ticks: int = 150) -> State:
+    for _ in range(ticks // 6):
+        world.advance(6)
+    return world.get_state()
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_world_does_not_know_its_batch(dtype: str) -> None:
+    alone = played(start(noisy(), [123 + 17], dtype))
+    many = played(start(noisy(), range(123, 123 + 64), dtype))
+    assert_same(alone, many, slice(0, 1), slice(17, 18))
+    assert not many["observer_searching"].all() and (many["observer_members"] == 3).any()
+    assert len(np.unique(many["observer_p"].reshape(64, -1), axis=0)) == 64
+
+
+def test_threads_change_nothing() -> None:
+    worlds = [World(noisy(), 8, "float64", threads=threads) for threads in (1, 3)]
+    for world in worlds:
+        reset(world, range(8))
+    assert_same(*(played(world) for world in worlds))
+
+
+def test_a_reset_leaves_nothing_of_the_last_episode() -> None:
+    world = start(noisy(), [3, 4])
+    fresh = world.get_state()
+    assert not (fresh["observer_searching"][:, 0]).any() and fresh["observer_searching"][:, 1:].all()
+    played(world)
+    reset(world, [3, 4])
+    assert_same(fresh, world.get_state())
+
+
+def test_a_reset_by_mask_touches_the_masked_only() -> None:
+    world = start(noisy(), range(6))
+    before = played(world, 60)
+    mask = np.array([True, False, True, False, False, True])
+    reset(world, mask=mask)
+    assert_same(before, world.get_state(), ~mask, ~mask)
+    straight = start(noisy(), range(6))
+    played(straight, 60)
+    assert_same(played(world, 60), played(straight, 60), ~mask, ~mask)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_saved_state_continues_as_if_nothing_happened(dtype: str) -> None:
+    world = start(noisy(), [1, 2], dtype)
+    played(world, 24)  # the second vehicle is still searching
+    saved = world.get_state()
+    assert saved["observer_searching"].any() and saved["observer_hypotheses"].any()
+    straight = played(world, 90)
+    other = start(noisy(), [77, 78], dtype)
+    played(other, 42)
+    other.set_state(saved)
+    assert_same(saved, other.get_state())
+    assert_same(straight, played(other, 90))
+
+
+def test_a_saved_state_without_the_memory_is_refused() -> None:
+    world = start(noisy(), [1])
+    saved = world.get_state()
+    with pytest.raises(ValueError, match="observer_searching"):
+        world.set_state({name: value for name, value in saved.items() if name != "observer_searching"})
+
+
+def test_other_observers_remember_nothing_more() -> None:
+    description = noisy().model_copy(update={"observer": noisy().observer.model_copy(update={"name": "riccati"})})
+    world = start(description, [1])
+    assert world.memory is None and not any(name.startswith("observer_") for name in world.get_state())
+
+
+def test_lost_vehicles_find_themselves() -> None:
+    world = start(noisy(), range(20))
+    state = played(world, 300)
+    p = np.einsum("wnij,wnj->wni", state["estimate_rotation"], state["estimate_position"])
+    error = np.linalg.norm(p - state["position"][:, world.model.landmarks :], axis=2)
+    assert not state["observer_searching"].any()
+    assert error.max() < 0.2

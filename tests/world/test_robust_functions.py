@@ -1,0 +1,135 @@
+"""Functions of the embedded observer `robust` against SciPy, NumPy and the perspective solver in NumPy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from coopenv.estimation.observers.perspective import solve_p3p
+from coopenv.world.launch import start_warp
+from coopenv.world.robust.algebra import inverse6, is_regular, left_error, log_so3, transition
+from coopenv.world.robust.perspective import distances_of, polished, solves
+from coopenv.world.robust.types import mat33d, mat43d, mat66d, vec3d, vec6d
+
+start_warp()
+RNG = np.random.default_rng(7)
+
+
+@wp.kernel(enable_backward=False, module_options={"max_unroll": 1}, module="unique")
+def algebra_kernel(
+    R: wp.array(dtype=mat33d),
+    p: wp.array(dtype=vec3d),
+    A: wp.array(dtype=mat66d),
+    w: wp.array(dtype=vec3d),
+    e: wp.array(dtype=vec6d),
+    F: wp.array(dtype=mat66d),
+    inverse: wp.array(dtype=mat66d),
+    regular: wp.array(dtype=wp.bool),
+):
+    n = wp.tid()
+    w[n] = log_so3(R[n])
+    e[n] = left_error(R[n], p[n], R[0], p[0])
+    F[n] = transition(R[n], p[n])
+    inverse[n] = inverse6(A[n])
+    regular[n] = is_regular(A[n], wp.float64(1.0e-6))
+
+
+@wp.kernel(enable_backward=False, module_options={"max_unroll": 1}, module="unique")
+def perspective_kernel(sides: wp.array(dtype=vec3d), gaps: wp.array(dtype=vec3d), distances: wp.array(dtype=mat43d)):
+    n = wp.tid()
+    rows = distances_of(sides[n], gaps[n])
+    for k in range(4):
+        d = polished(rows[k], gaps[n], sides[n])
+        if not solves(d, gaps[n], sides[n]):
+            d = vec3d()
+        rows[k] = d
+    distances[n] = rows
+
+
+def array(values: np.ndarray, dtype: Any) -> wp.array:
+    return wp.array(np.ascontiguousarray(values), dtype=dtype, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def algebra() -> dict[str, np.ndarray]:
+    turns = RNG.normal(size=(200, 3))
+    turns *= (RNG.uniform(0, np.pi, 200) / np.linalg.norm(turns, axis=1))[:, None]
+    turns[:3] *= np.array([1e-12, 1e-7, 0.0])[:, None] / np.maximum(np.linalg.norm(turns[:3], axis=1), 1e-3)[:, None]
+    turns[3:20] *= ((np.pi - np.geomspace(1e-9, 0.3, 17)) / np.linalg.norm(turns[3:20], axis=1))[:, None]
+    U = np.linalg.qr(RNG.normal(size=(200, 6, 6)))[0]
+    spectrum = 10.0 ** RNG.uniform(-4, 4, (200, 6))
+    given = {
+        "R": Rotation.from_rotvec(turns).as_matrix(),
+        "p": RNG.normal(size=(200, 3)),
+        "A": U * spectrum[:, None] @ np.swapaxes(U, 1, 2),
+    }
+    shapes = {"w": vec3d, "e": vec6d, "F": mat66d, "inverse": mat66d, "regular": wp.bool}
+    out = {name: wp.zeros(200, dtype=dtype, device="cpu") for name, dtype in shapes.items()}
+    inputs = [array(given[name], dtype) for name, dtype in (("R", mat33d), ("p", vec3d), ("A", mat66d))]
+    wp.launch(algebra_kernel, dim=200, inputs=[*inputs, *out.values()], device="cpu")
+    return {**given, "turns": turns, **{name: value.numpy() for name, value in out.items()}}
+
+
+def test_rotation_vectors(algebra: dict[str, np.ndarray]) -> None:
+    assert_allclose(algebra["w"], algebra["turns"], rtol=0, atol=1e-9)
+    assert_allclose(algebra["w"][20:], algebra["turns"][20:], rtol=0, atol=1e-13)
+
+
+def test_left_errors(algebra: dict[str, np.ndarray]) -> None:
+    R, p = algebra["R"], algebra["p"]
+    Rt = np.swapaxes(R, 1, 2)
+    expected = np.concatenate([Rotation.from_matrix(Rt @ R[0]).as_rotvec(), np.einsum("nij,nj->ni", Rt, p[0] - p)], 1)
+    assert_allclose(algebra["e"], expected, rtol=0, atol=1e-9)
+
+
+def test_the_transition_is_the_derivative_of_the_error(algebra: dict[str, np.ndarray]) -> None:
+    """Moving a pose and its neighbour by the same odometry turns a small left error x into F x."""
+    x = 1e-6 * RNG.normal(size=6)
+    for dR, dp, F in zip(algebra["R"][30:60], algebra["p"][30:60], algebra["F"][30:60], strict=True):
+        moved = Rotation.from_rotvec(x[:3]).as_matrix()
+        theta = Rotation.from_matrix(dR.T @ moved @ dR).as_rotvec()
+        rho = dR.T @ (x[3:] + moved @ dp - dp)
+        assert_allclose(F @ x, np.concatenate([theta, rho]), rtol=0, atol=1e-11)
+
+
+def test_inverses(algebra: dict[str, np.ndarray]) -> None:
+    for A, inverse in zip(algebra["A"], algebra["inverse"], strict=True):
+        assert_allclose(inverse @ A, np.eye(6), rtol=0, atol=1e-13 * np.linalg.cond(A))
+
+
+def test_regularity_is_that_of_the_spectrum(algebra: dict[str, np.ndarray]) -> None:
+    spectrum = np.linalg.eigvalsh(algebra["A"])
+    assert np.array_equal(algebra["regular"], spectrum[:, 0] > 1e-6 * spectrum[:, -1])
+    assert 0 < algebra["regular"].sum() < 200
+
+
+def test_distances_to_three_points_are_those_of_the_solver_in_numpy() -> None:
+    """Every solution, and no other: as sets, since their order is nobody's business."""
+    z = RNG.uniform(-10, 10, (400, 3, 3))
+    R, c = Rotation.random(400, RNG).as_matrix(), RNG.uniform(-15, 15, (400, 3))
+    lines = z - c[:, None]
+    b = np.einsum("nji,nkj->nki", R, lines / np.linalg.norm(lines, axis=2, keepdims=True))
+    pairs = ((0, 1), (0, 2), (1, 2))
+    sides = np.stack([((z[:, i] - z[:, j]) ** 2).sum(1) for i, j in pairs], axis=1)
+    gaps = np.stack([((b[:, i] - b[:, j]) ** 2).sum(1) for i, j in pairs], axis=1)
+    longest = sides.max(axis=1, keepdims=True)
+    out = wp.zeros(400, dtype=mat43d, device="cpu")
+    inputs = [array(sides / longest, vec3d), array(gaps, vec3d), out]
+    wp.launch(perspective_kernel, dim=400, inputs=inputs, device="cpu")
+    counts = np.zeros(400, int)
+    for n in range(400):
+        found = np.sqrt(longest[n]) * out.numpy()[n]
+        found = found[found.any(axis=1)]
+        cameras = solve_p3p(b[n], z[n])[1]
+        expected = np.linalg.norm(z[n] - cameras[:, None], axis=2)
+        counts[n] = len(expected)
+        assert len(found) == len(expected)
+        apart = np.abs(found[:, None] - expected).max(axis=2)
+        assert apart.min(axis=0).max() < 1e-6 and apart.min(axis=1).max() < 1e-6
+        assert np.abs(expected - np.linalg.norm(lines[n], axis=1)).max(axis=1).min() < 1e-6
+    assert counts.min() >= 1 and counts.max() == 4
