@@ -6,17 +6,22 @@ filter of its own; it pays for what it predicts badly, and one that pays much mo
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
 from coopenv.estimation.observers.base import Array, Tick
-from coopenv.estimation.observers.perspective import solve_p3p
+from coopenv.estimation.observers.perspective import solve_p3p_batch
 from coopenv.estimation.observers.robust.belief import Belief, Sight
 from coopenv.estimation.observers.robust.report import left_error
+from coopenv.estimation.observers.rotations import tangent_basis
 from coopenv.estimation.observers.small_matrices import invert_positive, solve
 
+MOVED = 2.0
+"""By how many standard deviations a measurement is moved to look for solutions that noise may hide."""
+MOST_HYPOTHESES = 6
 GATE = 13.8
 """Of a bearing's normalised innovation squared: chi-square of 2, 0.999."""
 MISS = 25.0
@@ -27,6 +32,8 @@ MOST_SURPRISE = 50.0
 """What a hypothesis pays at most for being far from the prior: that may be wrong altogether."""
 FLOOR = 80.0
 """What the best may have paid beyond twice what is expected of a true one."""
+CLEAR_TIME, PATIENCE = 0.25, 15.0
+"""s, for which all solutions must have been well determined, and after which that is asked no more."""
 LEAST_TIME = 0.5
 """s, before a hypothesis is believed."""
 KNOWN_ANGLE, KNOWN_POSITION = 0.2, 2.0
@@ -76,7 +83,7 @@ class Search:
         self.vehicle = vehicle
         self.prior = Belief(vehicle, R, p, P)
         self.bank: list[Hypothesis] = []
-        self.age, self.attempts = 0.0, 0
+        self.age, self.waited, self.clear, self.attempts = 0.0, 0.0, 0.0, 0
 
     @property
     def best(self) -> Belief:
@@ -91,10 +98,8 @@ class Search:
     def look(self, tick: Tick, sightings: list[Sighting], variance: float) -> Belief | None:
         """Take a frame's sightings; return the only hypothesis that is left after some frames."""
         if not self.bank:
-            self.age = 0.0
             if len(sightings) >= 3:
-                self.bank = self._solutions(tick, sightings, variance)
-                self.attempts += 1
+                self._begin(tick, sightings, variance)
             return None
         self.age += tick.dt
         for hypothesis in self.bank:
@@ -102,28 +107,46 @@ class Search:
         self._prune()
         return self.bank[0].belief if len(self.bank) == 1 and self.age >= LEAST_TIME else None
 
-    def _solutions(self, tick: Tick, sightings: list[Sighting], variance: float) -> list[Hypothesis]:
-        """Return the poses that explain three well placed sightings, other ones at every attempt, and a known prior."""
+    def _begin(self, tick: Tick, sightings: list[Sighting], variance: float) -> None:
+        """Follow a frame's solutions, other sightings at every attempt, if for a while all were well determined.
+
+        Where two solutions nearly meet, where they may be is no ellipsoid, and noise makes them come and go. A
+        follower's leaders improve meanwhile, which sets them apart.
+        """
         triples = sorted(combinations(range(len(sightings)), 3), key=lambda c: -_spread(sightings, c))
         three = triples[self.attempts % len(triples)]
-        b = np.array([sightings[n].bearing for n in three])
-        z = np.array([sightings[n].z for n in three])
-        bank = []
+        self.waited += tick.dt
+        solutions = self._solutions(tick, [sightings[n] for n in three], variance)
+        self.clear = 0.0 if solutions is None else self.clear + tick.dt
+        if solutions is None or (self.clear < CLEAR_TIME and self.waited < PATIENCE):
+            return
+        for hypothesis in solutions:
+            _follow(hypothesis, tick, [s for n, s in enumerate(sightings) if n not in three], variance)
         if is_known(self.prior.P):
             own = self.prior.own
-            bank.append(Hypothesis(Belief(self.vehicle, own.R, own.p, self.prior.P.copy()), 0.0, 0.0))
-            _follow(bank[0], tick, sightings, variance)
-        for R, camera in zip(*solve_p3p(b, z), strict=True):
+            prior = Hypothesis(Belief(self.vehicle, own.R, own.p, self.prior.P.copy()), 0.0, 0.0)
+            _follow(prior, tick, sightings, variance)
+            solutions.append(prior)
+        self.bank = sorted(solutions, key=lambda h: h.price)[:MOST_HYPOTHESES]
+        self.age, self.clear, self.attempts = 0.0, 0.0, self.attempts + 1
+
+    def _solutions(self, tick: Tick, three: list[Sighting], variance: float) -> list[Hypothesis] | None:
+        """Return the different poses that explain three sightings; None if one of them is not well determined."""
+        result: list[Hypothesis] = []
+        for R, camera in _perspectives(three, variance):
             belief = Belief(self.vehicle, R, camera - R @ tick.lever_arm, np.zeros((6, 6)))
-            P = _covariance(belief, tick, [sightings[n] for n in three], variance)
-            if P is None:
-                continue
+            P = _covariance(belief, tick, three, variance)
+            if P is None or max(P.diagonal()[:3].tolist()) > KNOWN_ANGLE**2:
+                if self.waited < PATIENCE:
+                    return None
+                if P is None:
+                    continue
             belief.P = P
             surprise = self._surprise(belief)
             hypothesis = Hypothesis(belief, min(surprise, MOST_SURPRISE), surprise)
-            _follow(hypothesis, tick, [s for n, s in enumerate(sightings) if n not in three], variance)
-            bank.append(hypothesis)
-        return bank
+            if not any(_same(hypothesis, other) for other in result):
+                result.append(hypothesis)
+        return result
 
     def confirms_prior(self, belief: Belief) -> bool:
         """Return whether a pose is the prior's, the prior being certain enough to go on with."""
@@ -155,6 +178,31 @@ def _spread(sightings: list[Sighting], three: tuple[int, ...]) -> float:
     """Return the volume that three bearings span; a good triple looks in three very different directions."""
     a, b, c = (sightings[n].bearing for n in three)
     return float(np.linalg.norm(np.cross(b - a, c - a)))
+
+
+def _perspectives(three: list[Sighting], variance: float) -> list[tuple[Array, Array]]:
+    """Return the poses (R, camera) that explain three sightings, or what they may have been.
+
+    Where two solutions lie close together noise can make both of them vanish. So every bearing, and every place that is
+    not exactly known, is also moved by `MOVED` standard deviations to each side.
+    """
+    b, z = np.array([s.bearing for s in three]), np.array([s.z for s in three])
+    bearings, places = [b], [z]
+    for n, s in enumerate(three):
+        for side in (MOVED, -MOVED):
+            for axis in tangent_basis(b[n : n + 1])[0]:
+                moved = b.copy()
+                moved[n] += side * math.sqrt(variance) * axis
+                moved[n] /= np.linalg.norm(moved[n])
+                bearings.append(moved)
+                places.append(z)
+            for axis in np.eye(3) if s.variance > 0.0 else ():
+                moved = z.copy()
+                moved[n] += side * math.sqrt(s.variance) * axis
+                bearings.append(b)
+                places.append(moved)
+    R, camera, mask = solve_p3p_batch(np.array(bearings), np.array(places))
+    return list(zip(R[mask], camera[mask], strict=True))
 
 
 def _noise(distance: Array, sightings: list[Sighting], variance: float) -> Array:

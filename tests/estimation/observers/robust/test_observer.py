@@ -29,6 +29,16 @@ def test_any_start_is_left_behind(name, seed):
     assert all_found(result, 1e-3, 0.01)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(4))
+def test_any_start_is_left_behind_under_noise(seed):
+    """Where noise hides solutions the last vehicle must wait for its leaders rather than believe what is left."""
+    result = run("robust", random_start(small_errors(40.0), seed))
+    assert not result.failure
+    assert all_found(result, 0.3, 3.0)
+    assert (result.anees(30.0) < 6.0).all()
+
+
 @BOTH
 def test_the_mirrored_start_is_solved(name):
     assert all_found(run(name, noise_free(4.0, "busy_intersection_mirror")), 1e-3, 0.01)
