@@ -260,7 +260,7 @@ def bench_observers(
             help="Environment (name or TOML file), recorded robots (mrclam_1 .. mrclam_9) or a log file.",
         ),
     ],
-    observers: Annotated[str | None, typer.Option(help="Names with commas between (default: all).")] = None,
+    observers: Annotated[str | None, typer.Option(help="Names with commas between (default: all that suit).")] = None,
     variants: Annotated[
         str | None,
         typer.Option(help="Names with commas between, or `all`: faults of an environment, what recorded robots see."),

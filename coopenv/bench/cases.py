@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from coopenv.scenario import Scenario
+from coopenv.world.embedded import ROBUST
 from coopenv.world.launch import default_threads
 
 SINGLE, BATCH = "ParallelEnv", "make_vec"
 BATCHES = (1, 32, 1024, 8192)
 QUICK_BATCHES = (1, 32, 1024)
+ROBUST_BATCH = 1024
 LONGEST_BATCH = 1 << 20
 """Worlds; enough for `default_threads` to return every core that may be used."""
 
@@ -59,7 +61,7 @@ def all_threads() -> int:
 def own_cases(
     environment: str, scenario: Scenario, overrides: Mapping[str, Any] | None = None, quick: bool = False
 ) -> list[Case]:
-    """Return coopenv's cases: one world, batches, precisions, threads, with and without infos.
+    """Return coopenv's cases: one world, batches, precisions, threads, with and without infos, the robust observer.
 
     Visibility is sensed, unless `overrides` set `topology.mode`; where the file says otherwise, two cases follow that
     are as the file says.
@@ -77,6 +79,10 @@ def own_cases(
     for worlds in QUICK_BATCHES if quick else BATCHES:
         for threads in sorted({1, min(worlds, all_threads())}):
             cases += [case(BATCH, worlds, threads, dtype, infos, sensed) for dtype in dtypes for infos in (True, False)]
+    if not quick and scenario.observer.name != ROBUST and "observer.name" not in given:
+        robust = {**sensed, "observer.name": ROBUST}
+        for threads in sorted({1, all_threads()}):
+            cases.append(case(f"{BATCH}, {ROBUST}", ROBUST_BATCH, threads, "float32", True, robust))
     if scenario.topology.mode != "sensed" and "topology.mode" not in given:
         label = f"{{}}, {scenario.topology.mode}"
         cases.append(case(label.format(SINGLE), 1, 1, "float32", True, given))

@@ -97,6 +97,6 @@ def _single_step(env: Any) -> Callable[[], int]:
 def array_bytes(engine: Engine) -> int:
     """Return the size of every array that has the world as leading axis."""
     world = engine.world
-    records = [engine.report, world.state]
+    records = [engine.report, world.state, *([] if world.memory is None else [world.memory])]
     arrays = [getattr(record, name) for record in records for name in record._cls.vars]
     return sum(a.capacity for a in [*arrays, world.actions, world.mask])

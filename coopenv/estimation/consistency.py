@@ -72,8 +72,10 @@ def position_std(covariance: Array, coordinates: Coordinates, rotation: Array, p
         position: (..., 3) estimate, map, m.
     """
     if coordinates is Coordinates.LEFT:
-        return np.sqrt(np.trace(covariance[..., 3:, 3:], axis1=-2, axis2=-1))
-    if coordinates is Coordinates.RICCATI:
-        position = (np.swapaxes(rotation, -1, -2) @ position[..., None])[..., 0]
-    J = np.concatenate([-skew(position), np.broadcast_to(np.eye(3), (*position.shape, 3))], axis=-1)
-    return np.sqrt(np.einsum("...ij,...jk,...ik->...", J, covariance, J))
+        variance = np.trace(covariance[..., 3:, 3:], axis1=-2, axis2=-1)
+    else:
+        if coordinates is Coordinates.RICCATI:
+            position = (np.swapaxes(rotation, -1, -2) @ position[..., None])[..., 0]
+        J = np.concatenate([-skew(position), np.broadcast_to(np.eye(3), (*position.shape, 3))], axis=-1)
+        variance = np.einsum("...ij,...jk,...ik->...", J, covariance, J)
+    return np.sqrt(np.where(variance >= 0.0, variance, np.nan))  # not every P that is stated is a covariance

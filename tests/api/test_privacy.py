@@ -9,15 +9,18 @@ import coopenv
 from coopenv.api.engine import Engine
 from coopenv.scenario import Scenario, load_scenario
 
+OBSERVERS = ("riccati", "robust")
 
-def silent(name: str) -> Scenario:
+
+def silent(name: str, observer: str) -> Scenario:
     """An environment whose cameras see nothing, so that no measurement can depend on where anybody is."""
-    return load_scenario(name, {"topology.mode": "sensed", "camera.range": 1e-6})
+    return load_scenario(name, {"topology.mode": "sensed", "camera.range": 1e-6, "observer.name": observer})
 
 
+@pytest.mark.parametrize("observer", OBSERVERS)
 @pytest.mark.parametrize("name", coopenv.list_envs())
-def test_observation_does_not_move_with_hidden_truth(name: str) -> None:
-    scenario = silent(name)
+def test_observation_does_not_move_with_hidden_truth(name: str, observer: str) -> None:
+    scenario = silent(name, observer)
     engine = Engine(scenario, 2, "float64")
     engine.reset([5, 5])
     state = engine.get_state()
@@ -32,10 +35,12 @@ def test_observation_does_not_move_with_hidden_truth(name: str) -> None:
     assert not np.allclose(engine.view("position_error")[0], engine.view("position_error")[1])
 
 
+@pytest.mark.parametrize("observer", OBSERVERS)
 @pytest.mark.parametrize("name", coopenv.list_envs())
-def test_observation_does_not_move_when_everything_moves_together(name: str) -> None:
+def test_observation_does_not_move_when_everything_moves_together(name: str, observer: str) -> None:
     """Other vehicles' truth reaches a vehicle through bearings alone: scaling a scene about a camera keeps them."""
-    scenario = load_scenario(name, {"noise.enabled": False, "topology.mode": "fixed", "camera.miss_probability": 0.0})
+    plain = {"noise.enabled": False, "topology.mode": "fixed", "camera.miss_probability": 0.0}
+    scenario = load_scenario(name, {**plain, "observer.name": observer})
     engine = Engine(scenario, 2, "float64")
     engine.reset([5, 5])
     L = len(scenario.landmarks)
@@ -50,9 +55,10 @@ def test_observation_does_not_move_when_everything_moves_together(name: str) -> 
         assert np.array_equal(engine.view("observation")[0, 0], engine.view("observation")[1, 0])
 
 
-def test_truth_is_not_in_the_observation_by_value() -> None:
+@pytest.mark.parametrize("observer", OBSERVERS)
+def test_truth_is_not_in_the_observation_by_value(observer: str) -> None:
     """No entry of the observation tracks the true position closer than the estimate does."""
-    env = coopenv.parallel_env("busy_intersection", dtype="float64")
+    env = coopenv.parallel_env("busy_intersection", dtype="float64", observer=observer)
     observations, infos = env.reset(seed=0)
     scale = env.observation_layout["estimate_position"].scale
     for agent, seen in observations.items():

@@ -50,7 +50,10 @@ def test_cases_cover_what_is_promised() -> None:
     }
     assert all(c.options["overrides"] == {"topology.mode": "sensed"} for c in batches)
     given = own_cases("busy_intersection", coopenv.load_scenario("busy_intersection"), {"topology.mode": "fixed"})
-    assert all(c.options["overrides"] == {"topology.mode": "fixed"} for c in given)
+    robust = [c for c in given if c.name == "make_vec, robust"]
+    assert {c.threads for c in robust} == {1, max(c.threads for c in batches)}
+    assert all(c.options["overrides"] == {"topology.mode": "fixed", "observer.name": "robust"} for c in robust)
+    assert all(c.options["overrides"] == {"topology.mode": "fixed"} for c in given if c not in robust)
     assert [(c.name, c.worlds) for c in peer_cases()] == [
         ("highway-env intersection", 1),
         *(("VMAS navigation", n) for n in (1, 32, 1024)),

@@ -13,14 +13,17 @@ from numpy.testing import assert_allclose
 from coopenv.api.engine import Engine
 from coopenv.estimation.observers import Estimate, Recording, record, run
 from coopenv.estimation.observers.faults import FAULTS, Lie
+from coopenv.estimation.observers.robust.search import PATIENCE
 from coopenv.estimation.observers.starts import random_start, with_start
 from coopenv.estimation.observers.written import riccati_covariance
 from coopenv.scenario import load_scenario
 from coopenv.world.world import World
+from tests.world.builders import constant, scenario, vehicle
 from tests.world.replays import Played, replayed
 
 ISOTROPIC = {"noise.bearing.model": "isotropic", "noise.bearing.scale": 0.0029}
 LOSSY = {"v2x.delay": 6, "v2x.loss": 0.3}
+LOST = {"position_radius": 4.0, "orientation_angle": "uniform"}
 STALE = {"v2x.delay": 3, "v2x.loss": 0.4, "v2x.period": 2, "v2x.staleness": 0.2}
 
 
@@ -88,6 +91,29 @@ def test_it_does_as_the_one_in_numpy(case: str) -> None:
 def test_it_does_so_over_a_whole_episode(case: str) -> None:
     recording = CASES[case](50.0)
     check(recording, replayed(recording))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_it_does_so_while_a_follower_waits_for_its_leaders(seed: int) -> None:
+    recording = random_start(recorded(horizon=20.0, seed=seed), seed)
+    played = replayed(recording)
+    check(recording, played)
+    found = (~played.searching).argmax(axis=0) * recording.dt
+    assert found[3] < 5.0 < 10.0 < found[4] < 20.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_it_does_so_when_patience_ends(seed: int) -> None:
+    """Where two solutions nearly meet and the vehicle hardly moves, it goes on with badly determined ones at last."""
+    slow = vehicle((-3.0, -2.0, 0.2), initial_estimate=LOST, motion=constant([0.005, 0, 0]))
+    noise = {"velocity": 0.1, "angular_velocity": 0.05, "bearing": {"model": "isotropic", "scale": 0.003}}
+    recording = record(scenario([slow], horizon=PATIENCE + 3.0, noise=noise), seed, driven)
+    played = replayed(recording)
+    check(recording, played)
+    found = (~played.searching[:, 0]).argmax() * recording.dt
+    assert PATIENCE < found < PATIENCE + 1.0
 
 
 def test_a_search_ends_for_leaders_first() -> None:

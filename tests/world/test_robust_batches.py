@@ -15,7 +15,7 @@ LOST = {"position_radius": 4.0, "orientation_angle": "uniform"}
 SURE = {"position_radius": 0.1, "orientation_angle": 0.02}
 
 
-def noisy() -> Scenario:
+def noisy(horizon: float = 5.0) -> Scenario:
     """Return a world in which one vehicle knows its start, one searches, and one needs the others."""
     wide = {"orientation": "body", "miss_probability": 0.1, "position": [0.2, 0.0, 0.1]}
     return scenario(
@@ -29,7 +29,7 @@ def noisy() -> Scenario:
                 neighbours=["L1", "L2", "vehicle_1", "vehicle_2"],
             ),
         ],
-        horizon=5.0,
+        horizon=horizon,
         noise={"velocity": 0.1, "angular_velocity": 0.05, "bearing": {"model": "isotropic", "scale": 0.003}},
         camera=wide,
         v2x={"delay": 2, "loss": 0.3},
@@ -113,8 +113,8 @@ def test_other_observers_remember_nothing_more() -> None:
 
 
 def test_lost_vehicles_find_themselves() -> None:
-    world = start(noisy(), range(20))
-    state = played(world, 300)
+    world = start(noisy(horizon=8.0), range(20))  # some wait until two solutions no longer nearly meet
+    state = played(world, 480)
     p = np.einsum("wnij,wnj->wni", state["estimate_rotation"], state["estimate_position"])
     error = np.linalg.norm(p - state["position"][:, world.model.landmarks :], axis=2)
     assert not state["observer_searching"].any()

@@ -101,6 +101,16 @@ def draw_starts(task: BasinTask) -> list[Draw]:
     return found
 
 
+def check_source(source: Source) -> None:
+    """Make sure that basins can be studied on a source.
+
+    Raises:
+        CoopenvError: they cannot.
+    """
+    if not source.seeded:
+        raise CoopenvError(f"--basin: {source.name} is recorded; basins are studied in simulated environments")
+
+
 def study_basin(
     source: Source,
     observers: Sequence[str],
@@ -120,8 +130,7 @@ def study_basin(
     Raises:
         CoopenvError: an unknown observer, or a source whose geometry is not the question.
     """
-    if not source.seeded:
-        raise CoopenvError(f"--basin: {source.name} is recorded; basins are studied in simulated environments")
+    check_source(source)
     factories = {name: find(name) for name in observers}
     tasks = [BasinTask(source, (draw,), factories) for draw in range(draws)]
     found = engine.map(draw_starts, tasks, lambda done: on_progress(done / draws))

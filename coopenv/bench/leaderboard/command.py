@@ -12,14 +12,22 @@ from rich.console import Console
 from rich.table import Table
 
 from coopenv.bench.leaderboard import files
-from coopenv.bench.leaderboard.basin import Basin, Draw, basins_of, plain_draws, study_basin
+from coopenv.bench.leaderboard.basin import Basin, Draw, basins_of, check_source, plain_draws, study_basin
 from coopenv.bench.leaderboard.compare import Outcome, compare
 from coopenv.bench.leaderboard.engines import Engine
 from coopenv.bench.leaderboard.rows import Row
 from coopenv.bench.leaderboard.sources import Source, find_source, variants_of
-from coopenv.bench.leaderboard.tables import error_table, failures, new_table, quality_table, variant_table
+from coopenv.bench.leaderboard.tables import (
+    degradation_table,
+    error_table,
+    failures,
+    honest_line,
+    new_table,
+    quality_table,
+    variant_table,
+)
 from coopenv.estimation.metrics import json_ready
-from coopenv.estimation.observers.faults import FAULTS
+from coopenv.estimation.observers.faults import FAULTS, NOMINAL
 from coopenv.estimation.observers.registry import available_names, find, missing, observer_names
 from coopenv.runs.command import progress
 from coopenv.runs.output import prepare_folder
@@ -70,7 +78,7 @@ def request_of(
 
     Args:
         text: environment, dataset or log file.
-        observers: names with commas between; None: all.
+        observers: names with commas between; None: all that are meant for such vehicles.
         variants: the same, or `all`; None: the usual ones of the source.
         seeds: how many.
         steady_from: s; None: the source's own.
@@ -83,14 +91,21 @@ def request_of(
         CoopenvError: something of it does not exist.
     """
     source = find_source(text, overrides, data)
-    names = tuple(dict.fromkeys(name.strip() for name in observers.split(","))) if observers else available_names()
+    names = names_of(observers) if observers else tuple(available_names(source.planar))
     for name in names:
         find(name)
     left_out = () if observers else tuple(name for name in observer_names() if missing(name))
+    if basin:
+        check_source(source)
     options = [word for assignment in assignments for word in ("--set", assignment)]
     options += [] if data is None else ["--data", str(data)]
     wanted = variants_of(source, variants)
-    return Request(source, text, tuple(names), wanted, seeds, steady_from, basin, tuple(options), left_out)
+    return Request(source, text, names, wanted, seeds, steady_from, basin, tuple(options), left_out)
+
+
+def names_of(text: str) -> tuple[str, ...]:
+    """Return names with commas between, each once."""
+    return tuple(dict.fromkeys(name.strip() for name in text.split(",")))
 
 
 def perform(request: Request, engine: Engine, out: Path | None, printed: Console, log: Console) -> None:
@@ -150,9 +165,14 @@ def print_tables(rows: Sequence[Row], basins: Sequence[Basin], printed: Console)
         printed.print(error_table(own))
         printed.print()
         printed.print(quality_table(own))
+        if line := honest_line(own):
+            printed.print(line, soft_wrap=True)
     if len(variants) > 1:
         printed.print()
         printed.print(variant_table(rows))
+        if NOMINAL in variants:
+            printed.print()
+            printed.print(degradation_table(rows))
     if basins:
         printed.print()
         printed.print(_basin_table(basins))
@@ -192,7 +212,8 @@ def write_files(request: Request, outcome: Outcome, draws: Sequence[Draw], basin
         table = json_ready(plain_draws(draws))
         files.write_csv(table, list(table[0]), out / files.BASIN_FILE)
     title = f"Observers in {request.source.name}"
-    write_report(Report(title, content, outcome.rows, outcome.samples, draws, basins), out / files.REPORT_FILE)
+    report = Report(title, content, outcome.rows, outcome.samples, request.source.variants, draws, basins)
+    write_report(report, out / files.REPORT_FILE)
 
 
 def _with_progress(log: Console, description: str, work: Callable[[Callable[[float], None]], T]) -> T:

@@ -8,10 +8,12 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import pickle
 import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
@@ -91,6 +93,7 @@ class Local:
                 results[n] = function(task)
                 on_done(n + 1)
         else:
+            _check_sendable(tasks[0])
             with (
                 single_threaded(),
                 ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool,
@@ -100,10 +103,27 @@ class Local:
                     for done in as_completed(work):
                         results[work[done]] = done.result()
                         on_done(len(results))
+                except BrokenProcessPool:
+                    raise CoopenvError("a process died: out of memory, or killed, or an observer ended it") from None
                 except BaseException:
                     pool.shutdown(wait=False, cancel_futures=True)
                     raise
         return [results[n] for n in range(len(tasks))]
+
+
+def _check_sendable(task: object) -> None:
+    """Make sure that a task can be sent to another process.
+
+    Raises:
+        CoopenvError: it cannot, most likely because an observer is a lambda or defined within a function.
+    """
+    try:
+        pickle.dumps(task)
+    except Exception as error:
+        raise CoopenvError(
+            f"cannot be sent to another process: {error} (define observers at the top level of a module, or use "
+            "--jobs 1)"
+        ) from None
 
 
 @contextlib.contextmanager

@@ -31,6 +31,8 @@ from coopenv.viz.style import (
 )
 
 MOST_VEHICLES = 6
+NEES_RANGE = (1e-4, 1e4)
+"""Of NEES over its dimension what is drawn; beyond it an observer is as wrong as it can be."""
 WIDTH = 10.5  # inches
 _HEAD, _FOOT = 0.75, 0.5  # inches above and below the panels
 _DASHED, _DOTTED = (0, (4, 1.5)), (0, (1, 1))
@@ -57,7 +59,7 @@ def error_figure(samples: Sequence[Sample]) -> Figure | None:
     scene = samples[0].scene
     shown = _chosen(len(scene.vehicles))
     height = _HEAD + _FOOT + 1.05 * len(groups)
-    figure, axes = _grid(len(groups), len(shown), height, left=0.15)
+    figure, axes = _grid(len(groups), len(shown), height, left=0.17)
     for (name, own), line in zip(groups.items(), axes, strict=True):
         error = np.median([sample.series.position_error for sample in own], axis=0)
         spread = np.median([sample.series.position_std for sample in own], axis=0)
@@ -73,21 +75,23 @@ def error_figure(samples: Sequence[Sample]) -> Figure | None:
                 ax.plot(
                     scene.t, drawable(factor * values[:, i], positive=True), color=colour, linestyle=style, lw=width
                 )
-            ax.axvline(scene.steady_from, color=INK, linewidth=0.6, linestyle=_DOTTED)
+            if scene.steady_from > 0.0:
+                ax.axvline(scene.steady_from, color=INK, linewidth=0.6, linestyle=_DOTTED)
             _time(ax, scene.t)
         _row_title(line[0], name)
     _share_decades(axes)
     _outer_labels(axes, [vehicle_label(scene.vehicles[i]) for i in shown])
-    axes[0, 0].text(0.0, 1.06, "position error [m]", transform=axes[0, 0].transAxes, ha="right", **_TEXT)
-    _legend(
-        figure,
-        [
-            Line2D([], [], color=BLUE, lw=1.2, label="error, median over seeds"),
-            Line2D([], [], color=VERMILION, lw=1.2, ls=_DASHED, label="3 standard deviations claimed, median"),
-            Line2D([], [], color=GREY, lw=1.2, label="Cramér-Rao bound (joint)"),
-            Line2D([], [], color=INK, lw=0.8, ls=_DOTTED, label="steady state begins"),
-        ],
-    )
+    figure.supylabel("position error [m]", x=0.004, **_TEXT)
+    median = ", median over seeds" if len(next(iter(groups.values()))) > 1 else ""
+    handles = [
+        Line2D([], [], color=BLUE, lw=1.2, label=f"error{median}"),
+        Line2D([], [], color=VERMILION, lw=1.2, ls=_DASHED, label=f"3 standard deviations claimed{median}"),
+    ]
+    if np.isfinite(scene.bound).any():
+        handles.append(Line2D([], [], color=GREY, lw=1.2, label="Cramér-Rao bound (joint)"))
+    if scene.steady_from > 0.0:
+        handles.append(Line2D([], [], color=INK, lw=0.8, ls=_DOTTED, label="steady state begins"))
+    _legend(figure, handles)
     return figure
 
 
@@ -112,7 +116,8 @@ def nees_figure(samples: Sequence[Sample]) -> Figure | None:
         ax.axhline(1.0, color=GREY, linewidth=0.7)
         mean = np.mean([sample.series.nees for sample in own], axis=0) / dof
         for i in _chosen(len(scene.vehicles)):
-            ax.plot(scene.t, drawable(mean[:, i], positive=True), color=vehicle_colour(i), linewidth=0.8)
+            shown = np.clip(drawable(mean[:, i], positive=True), *NEES_RANGE)
+            ax.plot(scene.t, shown, color=vehicle_colour(i), linewidth=0.8)
         ax.set_yscale("log")
         _time(ax, scene.t)
         ax.set_title(name, fontsize=NORMAL, color=INK, pad=3)
@@ -123,7 +128,7 @@ def nees_figure(samples: Sequence[Sample]) -> Figure | None:
         lowest = n + columns >= len(groups)
         ax.tick_params(labelbottom=lowest, labelleft=n % columns == 0)
         ax.set_xlabel("time [s]" if lowest else "", fontsize=NORMAL, color=INK)
-    figure.supylabel(f"NEES / {dof}, mean over runs", fontsize=NORMAL, color=INK, x=0.006)
+    figure.supylabel(f"NEES / {dof}" + (", mean over runs" if runs > 1 else ""), x=0.004, **_TEXT)
     vehicles = [
         Line2D([], [], color=vehicle_colour(i), lw=1.4, label=vehicle_label(scene.vehicles[i]))
         for i in _chosen(len(scene.vehicles))

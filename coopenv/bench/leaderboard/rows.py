@@ -16,7 +16,7 @@ from coopenv.bench.leaderboard.judge import (
     SETTLED_POSITION,
     Sample,
 )
-from coopenv.estimation.consistency import DIVERGED_ORIENTATION, DIVERGED_POSITION
+from coopenv.estimation.consistency import DIVERGED_ORIENTATION, DIVERGED_POSITION, LEVEL, Interval, mean_bounds
 from coopenv.estimation.observers.faults import NOMINAL
 
 
@@ -65,11 +65,22 @@ class Row:
     rpe_m: float = _column(f"relative trajectory error (evo's RPE) over {RELATIVE_DELTA:g} s, m")
     rpe_deg: float = _column(f"its angle over {RELATIVE_DELTA:g} s, deg")
     nis: float = _column("mean NIS in the steady state divided by its degrees of freedom; 1 for a consistent filter")
+    anees_low: float = _column(
+        f"with anees_high: where that of an honest filter lies in {LEVEL:.0%} of all instants, for as many runs "
+        "(chi-square); the mean over time lies closer to 1"
+    )
+    anees_high: float = _column("see anees_low")
+    nis_low: float = _column(
+        f"with nis_high: where that of a consistent filter lies with a probability of {LEVEL:.0%} (chi-square)"
+    )
+    nis_high: float = _column("see nis_low")
     gramian_min_eigenvalue: float = _column(
         "smallest eigenvalue over the run of the observability Gramian over 1 s, about the map origin; mixed units"
     )
     gramian_local_eigenvalue: float = _column("the same about the vehicle, in units of the targets' range; no unit")
 
+
+NOWHERE = Interval(float("nan"), float("nan"))
 
 MEASURED = ("us_per_update",)
 """Columns that differ between two runs of the same command."""
@@ -98,6 +109,9 @@ def _row(environment: str, variant: str, observer: str, vehicle: str, i: int, ow
     each = np.sqrt(over_seeds("position_mse"))
     settle, converge = over_seeds("settle_time"), over_seeds("converge_time")
     joint, family = bound("bound_mse"), bound("bound_ancestors_mse")
+    anees = over_seeds("anees")
+    honest = mean_bounds(own[0].nees_dof, len(own)) if np.isfinite(anees).all() else NOWHERE
+    consistent = mean_bounds(int(dof)) if dof > 0 else NOWHERE
     return Row(
         environment=environment,
         variant=variant,
@@ -106,7 +120,7 @@ def _row(environment: str, variant: str, observer: str, vehicle: str, i: int, ow
         position_rmse_m=rmse,
         orientation_rmse_deg=_root_mean(over_seeds("orientation_mse")),
         bound_m=joint,
-        anees=float(np.mean(over_seeds("anees"))),
+        anees=float(np.mean(anees)),
         settled_fraction=float(np.mean(np.isfinite(settle))),
         settle_time_s=_median(settle),
         bytes_per_s=float(np.mean(over_seeds("bytes_per_s"))),
@@ -127,6 +141,10 @@ def _row(environment: str, variant: str, observer: str, vehicle: str, i: int, ow
         rpe_m=_root_mean(over_seeds("rpe") ** 2),
         rpe_deg=_root_mean(over_seeds("rpe_orientation") ** 2),
         nis=float(over_seeds("nis").sum() / dof) if dof > 0 else float("nan"),
+        anees_low=honest.low,
+        anees_high=honest.high,
+        nis_low=consistent.low,
+        nis_high=consistent.high,
         gramian_min_eigenvalue=float(np.min([sample.scene.gramian[i] for sample in own])),
         gramian_local_eigenvalue=float(np.min([sample.scene.gramian_local[i] for sample in own])),
     )

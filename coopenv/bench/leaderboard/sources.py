@@ -30,8 +30,8 @@ class Source(Protocol):
         ...
 
     @property
-    def variants(self) -> tuple[str, ...]:
-        """All there are."""
+    def variants(self) -> Mapping[str, str]:
+        """All there are, each with what it is."""
         ...
 
     @property
@@ -42,6 +42,11 @@ class Source(Protocol):
     @property
     def seeded(self) -> bool:
         """Whether another seed gives another record."""
+        ...
+
+    @property
+    def planar(self) -> bool:
+        """Whether its vehicles are robots on a plane, which some observers are for and others are not."""
         ...
 
     def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
@@ -59,9 +64,10 @@ class Simulated:
 
     name: str
     scenario: Scenario
-    variants: ClassVar[tuple[str, ...]] = tuple(FAULTS)
+    variants: ClassVar[Mapping[str, str]] = {name: fault.summary for name, fault in FAULTS.items()}
     usual: ClassVar[tuple[str, ...]] = (NOMINAL,)
     seeded: ClassVar[bool] = True
+    planar: ClassVar[bool] = False
 
     def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
         """Return the world of a seed with a fault."""
@@ -83,9 +89,14 @@ class Robots:
     name: str
     data: Path | None
     """The folder with the data; None: as the environment variable COOPENV_DATA says."""
-    variants: ClassVar[tuple[str, ...]] = ("landmarks", "landmarks+robots", "blind")
-    usual: ClassVar[tuple[str, ...]] = variants
+    variants: ClassVar[Mapping[str, str]] = {
+        "landmarks": "no robot sees another",
+        "landmarks+robots": "everything that was seen counts",
+        "blind": "robots 3 to 5 see no landmark",
+    }
+    usual: ClassVar[tuple[str, ...]] = tuple(variants)
     seeded: ClassVar[bool] = False
+    planar: ClassVar[bool] = True
 
     def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
         """Return the robots' record.
@@ -111,9 +122,18 @@ class LogFile:
 
     name: str
     path: Path
-    variants: ClassVar[tuple[str, ...]] = tuple(FAULTS)
+    variants: ClassVar[Mapping[str, str]] = {name: fault.summary for name, fault in FAULTS.items()}
     usual: ClassVar[tuple[str, ...]] = (NOMINAL,)
     seeded: ClassVar[bool] = False
+
+    @property
+    def planar(self) -> bool:
+        """Whether its vehicles are robots on a plane.
+
+        Raises:
+            CoopenvError: the file is no record.
+        """
+        return _is_planar(self.recording(NOMINAL, 0)[0])
 
     def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
         """Return the file's record with a fault.
@@ -129,8 +149,11 @@ class LogFile:
         """Return when the steady state starts, s: recorded robots are judged from the start on."""
         if given is not None or recording is None:
             return given or 0.0
-        planar = all(setup.planar for setup in recording.setups)
-        return 0.0 if planar else STEADY_SHARE * float(recording.t[-1])
+        return 0.0 if _is_planar(recording) else STEADY_SHARE * float(recording.t[-1])
+
+
+def _is_planar(recording: Recording) -> bool:
+    return all(setup.planar for setup in recording.setups)
 
 
 def find_source(text: str, overrides: Mapping[str, Any] | None = None, data: Path | None = None) -> Source:
@@ -142,8 +165,10 @@ def find_source(text: str, overrides: Mapping[str, Any] | None = None, data: Pat
         data: folder of recorded data.
 
     Raises:
-        CoopenvError: there is none of that name, or overrides for what is no scenario.
+        CoopenvError: there is none of that name, or an option for what is no such source.
     """
+    if data is not None and not ROBOTS.fullmatch(text):
+        raise CoopenvError(f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9")
     if not (ROBOTS.fullmatch(text) or text.endswith(LOG_SUFFIX)):
         return Simulated(Path(text).stem, load_scenario(text, overrides))
     if overrides:
@@ -169,7 +194,7 @@ def variants_of(source: Source, asked: str | None) -> tuple[str, ...]:
         return source.usual
     names = tuple(dict.fromkeys(name.strip() for name in asked.split(",")))
     if names == ("all",):
-        return source.variants
+        return tuple(source.variants)
     for name in names:
         if name not in source.variants:
             known = ", ".join((*source.variants, "all"))

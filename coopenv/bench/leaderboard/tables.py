@@ -9,18 +9,19 @@ from rich import box
 from rich.table import Table
 
 from coopenv.bench.leaderboard.rows import Row
+from coopenv.estimation.observers.faults import NOMINAL
 
 MOST_COLUMNS = 6
 """Vehicles shown one by one; more are summed up as mean and worst."""
 
 _LONG = 9  # characters of a word in a heading
-_BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", "bound_single_m": "bound (alone)"}
+BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", "bound_single_m": "bound (alone)"}
 """Column to its line in the table of errors."""
 
 
 def new_table(first: str, headings: Sequence[str]) -> Table:
     """Return an empty table: names, then numbers."""
-    table = Table(box=box.HORIZONTALS, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
+    table = Table(box=box.HORIZONTALS, padding=0, pad_edge=False, show_edge=False)
     table.add_column(first, no_wrap=True)
     for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
@@ -40,7 +41,7 @@ def error_table(rows: Sequence[Row]) -> Table:
     first = next(iter(by_observer(rows).values()))
     few = len(first) <= MOST_COLUMNS
     headings = [f"f{i + 1}" for i in range(len(first))] if few else ["mean", "worst"]
-    bounded = {column: line for column, line in _BOUNDS.items() if np.isfinite(getattr(first[0], column))}
+    bounded = {column: line for column, line in BOUNDS.items() if np.isfinite(getattr(first[0], column))}
     ratios = ["x joint\nworst", "x anc.\nworst"] if bounded else []
     table = new_table("position RMSE [m]", [*headings, *([] if bounded or not few else ["mean"]), *ratios])
     for column, line in bounded.items():
@@ -58,6 +59,14 @@ def error_table(rows: Sequence[Row]) -> Table:
             cells += _errors([float(np.mean(errors))], True)
         table.add_row(name, *cells)
     return table
+
+
+def honest_line(rows: Sequence[Row]) -> str:
+    """Return where the ANEES of an honest filter lies, empty where nobody states a covariance."""
+    bounds = [(row.anees_low, row.anees_high) for row in rows if np.isfinite(row.anees_low)]
+    return (
+        f"ANEES of an honest filter: 1 ({bounds[0][0]:.2f} to {bounds[0][1]:.2f} at 95 % of instants)" if bounds else ""
+    )
 
 
 def quality_table(rows: Sequence[Row]) -> Table:
@@ -96,6 +105,21 @@ def variant_table(rows: Sequence[Row]) -> Table:
     return table
 
 
+def degradation_table(rows: Sequence[Row]) -> Table:
+    """Return how much worse than the nominal one every observer is in every other variant."""
+    variants = [name for name in dict.fromkeys(row.variant for row in rows) if name != NOMINAL]
+    table = new_table("RMSE / nominal", [_heading(name) for name in variants])
+    for name, own in by_observer(rows).items():
+        table.add_row(name, *(_number(degradation(own, variant), 3) for variant in variants))
+    return table
+
+
+def degradation(rows: Sequence[Row], variant: str) -> float:
+    """Return the mean RMSE of one observer's rows in a variant over that in the nominal one; NaN without one."""
+    errors = {name: mean_rmse([row for row in rows if row.variant == name]) for name in (variant, NOMINAL)}
+    return errors[variant] / errors[NOMINAL]
+
+
 def _heading(variant: str) -> str:
     """Return a name on lines of few characters."""
     words = variant.replace("+", "_+").split("_")
@@ -103,14 +127,17 @@ def _heading(variant: str) -> str:
 
 
 def mean_rmse(rows: Sequence[Row]) -> float:
-    """Return the mean over vehicles of the position RMSE, m."""
-    return float(np.mean([row.position_rmse_m for row in rows]))
+    """Return the mean over vehicles of the position RMSE, m; NaN without any."""
+    return float(np.mean([row.position_rmse_m for row in rows])) if rows else float("nan")
 
 
 def failures(rows: Sequence[Row]) -> list[str]:
-    """Return one line per observer and variant that failed."""
-    failed = {(row.observer, row.variant): row.failure for row in rows if row.failure}
-    return [f"{observer} ({variant}): failed {why}" for (observer, variant), why in failed.items()]
+    """Return one line per observer that failed and way in which it did, with the variants."""
+    failed: dict[tuple[str, str], dict[str, None]] = {}
+    for row in rows:
+        if row.failure:
+            failed.setdefault((row.observer, row.failure), {})[row.variant] = None
+    return [f"{observer} ({', '.join(variants)}): failed {why}" for (observer, why), variants in failed.items()]
 
 
 def _errors(values: Sequence[float], few: bool) -> list[str]:

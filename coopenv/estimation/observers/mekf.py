@@ -16,14 +16,14 @@ from typing import ClassVar
 import numpy as np
 
 from coopenv.estimation.observers.base import Array, Coordinates, Estimate, Message, Setup, Tick
-from coopenv.estimation.observers.rotations import IDENTITY, exp_so3, orthonormalise, skew, tangent_basis
+from coopenv.estimation.observers.rotations import IDENTITY, exp_so3, lengths, orthonormalise, skew, tangent_basis
 from coopenv.estimation.observers.small_matrices import solve
 
 
 def innovation(R: Array, p: Array, lever_arm: Array, bearings: Array, positions: Array) -> tuple[Array, Array]:
     """Return (residual (m, 2), J (m, 2, 3)): tangent residuals and their derivative by the line d in the body frame."""
     d = (positions - p).dot(R) - lever_arm
-    distance = np.maximum(np.sqrt((d * d).sum(axis=1)), 1e-9)[:, None]
+    distance = np.maximum(lengths(d), 1e-9)[:, None]
     B = tangent_basis(d / distance)
     return (B @ bearings[..., None])[..., 0], B / distance[..., None]
 

@@ -32,8 +32,9 @@ def solve_p3p(bearings: Array, positions: Array) -> tuple[Array, Array]:
         positions: (3, 3) the points, map frame, m, one a row.
 
     Returns:
-        Rotations (n, 3, 3) from body to map and camera positions (n, 3) in the map frame, n = 0..4; a double one may
-        come twice. None for degenerate input: points on a line, bearings not of length 1, values that are not finite.
+        Rotations (n, 3, 3) from body to map and camera positions (n, 3) in the map frame, n = 0..4, ordered by distance
+        from the first point; a double one may come twice. None for degenerate input: points on a line, bearings not of
+        length 1, values that are not finite.
     """
     R, c, mask = solve_p3p_batch(np.asarray(bearings)[None], np.asarray(positions)[None])
     return R[0, mask[0]], c[0, mask[0]]
@@ -59,6 +60,7 @@ def solve_p3p_batch(bearings: Array, positions: Array) -> tuple[Array, Array, ND
         a = np.where(sound[:, None], sides / longest[:, None], 1.0)
         gaps = ((b[:, FIRST] - b[:, SECOND]) ** 2).sum(-1)
         distances = _polished(_distances(a, 1.0 - gaps / 2), gaps, a)
+        distances = np.take_along_axis(distances, distances[..., :1].argsort(axis=1), axis=1)
         missed = np.abs(_misfit(distances, gaps[:, None], a[:, None])).max(-1)
         mask = sound[:, None] & (distances > 0.0).all(-1) & (missed < TOLERANCE)
         points = (distances * np.sqrt(longest)[:, None, None])[..., None] * b[:, None]

@@ -37,6 +37,7 @@ LARGEST_STD = 0.15
 """Of the position, over the distance to the nearest point: beyond it the geometry is too weak."""
 
 ALL, PLANE = np.eye(6), np.eye(2)
+ADJUGATE = np.array([[1.0, -1.0], [-1.0, 1.0]])
 EXACT = np.zeros((3, 3))
 """Of a point that is known, or whose sender states no covariance."""
 
@@ -135,6 +136,12 @@ def normalised(residual: Array, N: Array) -> Array:
     return (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
 
 
+def inverses(N: Array) -> Array:
+    """Return the inverses of symmetric matrices (m, 2, 2)."""
+    a, b, d = N[:, 0, 0], N[:, 0, 1], N[:, 1, 1]
+    return N[:, ::-1, ::-1] * ADJUGATE / (a * d - b * b)[:, None, None]
+
+
 def ahead(pose: LeftError, tick: Tick, data: Bearings) -> NDArray[np.bool_]:
     """Return (m,) whether the points are where the bearings point, and not opposite."""
     return (((data[1] - pose.p).dot(pose.R) - tick.lever_arm) * data[0]).sum(1) > 0.0
@@ -145,7 +152,7 @@ def refined(start: LeftError, tick: Tick, data: Bearings) -> LeftError | None:
     pose = start
     for _ in range(ITERATIONS):
         residual, H, N = linearised(pose, tick, data)
-        weighted = np.linalg.solve(N, H).reshape(-1, 6)
+        weighted = (inverses(N) @ H).reshape(-1, 6)
         try:
             P = solve(H.reshape(-1, 6).T.dot(weighted), ALL)
         except np.linalg.LinAlgError:

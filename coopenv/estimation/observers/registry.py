@@ -36,6 +36,12 @@ ZOO = {
 NEEDS = {"factor_graph": "gtsam"}
 """Members of the zoo that need a module of the extra `bench`."""
 
+ON_A_PLANE = {"planar_ekf"}
+"""Members of the zoo for robots on a plane whose odometry is their commands (`Setup.planar`), and for no others."""
+IN_SPACE = {"p3p", "robust_joint"}
+"""Members that are for all others: on a plane bearings to three points say more than a pose needs, and joint messages
+do not exist (`robust_joint` is `robust` there)."""
+
 _registered: dict[str, Factory] = {}
 
 
@@ -65,9 +71,14 @@ def missing(name: str) -> str:
     return module if module and find_spec(module) is None else ""
 
 
-def available_names() -> list[str]:
-    """Return every known name whose modules are installed."""
-    return [name for name in observer_names() if not missing(name)]
+def available_names(planar: bool | None = None) -> list[str]:
+    """Return every known name whose modules are installed.
+
+    Args:
+        planar: only those that are meant for robots on a plane (True) or for vehicles in space (False).
+    """
+    strangers: set[str] = set() if planar is None else IN_SPACE if planar else ON_A_PLANE
+    return [name for name in observer_names() if not missing(name) and name not in strangers]
 
 
 def find(name: str) -> Factory:

@@ -12,13 +12,18 @@ from coopenv.estimation.observers.base import Array
 IDENTITY = np.eye(3)
 GENERATORS = np.array([[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], float)
 """(3, 9) S(e) of the three axes e, one a row."""
-ACROSS_Z = IDENTITY[:2]
+ONES = np.ones(3)
 
 
 def skew(v: Array) -> Array:
     """Return S(v) (..., 3, 3) with S(v) y = v x y."""
     v = np.asarray(v, dtype=np.float64)
     return v.dot(GENERATORS).reshape(*v.shape, 3)
+
+
+def lengths(v: Array) -> Array:
+    """Return the lengths (m,) of vectors (m, 3)."""
+    return np.sqrt((v * v).dot(ONES))
 
 
 def exp_so3(w: Array) -> Array:
@@ -60,8 +65,13 @@ def orthonormalise(R: Array) -> Array:
 def tangent_basis(b: Array) -> Array:
     """Return (m, 2, 3) orthonormal rows across each unit vector b (m, 3).
 
-    They are two rows of the Householder reflection I - w w^T / (1 + |b_z|) that takes b to the z axis, up to its sign.
+    Source: Duff et al., Building an orthonormal basis, revisited, Journal of Computer Graphics Techniques 6(1), 2017.
     """
-    w = b.copy()
-    w[:, 2] += np.copysign(1.0, w[:, 2])
-    return ACROSS_Z - (w[:, :2] / np.abs(w[:, 2:]))[..., None] * w[:, None]
+    x, y, z = b.T
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    c = x * y * a
+    B = np.empty((len(b), 2, 3))
+    B[:, 0, 0], B[:, 0, 1], B[:, 0, 2] = 1.0 + sign * x * x * a, sign * c, -sign * x
+    B[:, 1, 0], B[:, 1, 1], B[:, 1, 2] = c, sign + y * y * a, -y
+    return B

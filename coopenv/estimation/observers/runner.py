@@ -30,6 +30,9 @@ __all__ = ["Recording", "Run", "Truth", "record", "run"]
 PLANAR_STATES = (2, 3, 4)
 """Yaw, x and y among (theta, rho): what NEES is about for vehicles on a plane, whose other errors are zero."""
 
+MOST_BENT = 1e-3
+"""By how much R R^T of an estimate may differ from I."""
+
 
 @dataclass(frozen=True)
 class Run:
@@ -187,6 +190,7 @@ class _Log:
     def result(self, team: Team) -> Run:
         """Compare with the truth, where it is known."""
         r, coordinates = self.recording, team.coordinates or Coordinates.LEFT
+        self.failure = self.failure or self._bent()
         judged = r.truth.known
         known = judged & np.isfinite(self.position[..., 0])
         position_error, orientation_error, nees = (np.full(known.shape, np.nan) for _ in range(3))
@@ -220,6 +224,15 @@ class _Log:
             microseconds_per_update=np.array(micro),
             failure=self.failure,
         )
+
+    def _bent(self) -> str:
+        """Return whose estimate is no rotation first, and when; empty where there is none."""
+        residual = np.abs(self.rotation @ np.swapaxes(self.rotation, -1, -2) - np.eye(3)).max(axis=(-1, -2))
+        bent = np.argwhere(residual > MOST_BENT)
+        if not len(bent):
+            return ""
+        k, i = bent[0]
+        return f"of {self.recording.setups[i].name} at {k * self.recording.dt:.3f} s: rotation is not orthogonal"
 
 
 def _solve(P: Array, e: Array) -> Array:

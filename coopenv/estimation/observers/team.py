@@ -8,6 +8,8 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from math import isfinite
+from operator import index
 from time import perf_counter
 from typing import Any, NamedTuple, Protocol
 
@@ -101,6 +103,11 @@ class Mail:
             if sent >= 0 and age <= b.staleness and sender in heard and heard[sender][0] == sent:
                 received[target] = Received(heard[sender][1], age)
         return received
+
+
+def is_finite(values: Array) -> bool:
+    """Return whether every one of some numbers is finite; a sum of squares tells it sooner, unless that overflows."""
+    return isfinite(abs(np.vdot(values, values))) or bool(np.isfinite(values).all())
 
 
 def _copied(message: Message) -> Message:
@@ -199,8 +206,12 @@ class Team:
         if estimate.covariance is not None:
             fields.append(("covariance", estimate.covariance, (6, 6)))
         for name, value, shape in fields:
-            if np.shape(value) != shape or not np.isfinite(value).all():
+            if np.shape(value) != shape or not is_finite(value):
                 raise CoopenvError(f"{name} is not a finite array of shape {shape}")
+            if np.iscomplexobj(value):
+                raise CoopenvError(f"{name} is complex")
+        if estimate.nis is not None and not (isfinite(estimate.nis) and index(estimate.nis_dof) >= 0):
+            raise CoopenvError("nis is not finite, or nis_dof negative")
         self.coordinates = self.coordinates or estimate.coordinates
         if estimate.coordinates is not self.coordinates:
             raise CoopenvError("error coordinates must stay the same")
@@ -210,9 +221,10 @@ class Team:
         """Say whose observer failed and when; an observer is anybody's code, so anything may come out of it."""
         try:
             yield
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             whose = "" if vehicle is None else f"of {self.briefing.setups[vehicle].name} "
-            raise ObserverError(f"{whose}at {k * self.briefing.dt:.3f} s: {type(error).__name__}: {error}") from error
+            what = " ".join(f"{type(error).__name__}: {error}".split())  # on one line
+            raise ObserverError(f"{whose}at {k * self.briefing.dt:.3f} s: {what}") from error
 
     def get_state(self) -> dict[str, Any]:
         """Return a deep copy of the observers and of all messages.

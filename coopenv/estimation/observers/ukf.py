@@ -16,6 +16,7 @@ from coopenv.estimation.observers.base import Array, Message, Tick
 from coopenv.estimation.observers.left_invariant import InvariantError
 from coopenv.estimation.observers.mekf import LeftError, Mekf, innovation
 from coopenv.estimation.observers.rigid_motions import exp_se3
+from coopenv.estimation.observers.rotations import lengths
 from coopenv.estimation.observers.small_matrices import cholesky, solve
 
 SPREAD = 6.0
@@ -36,7 +37,7 @@ class Ukf(Mekf):
         """Correct by bearings b (m, 3) to positions z (m, 3)."""
         R, p, P = self.state.R, self.state.p, self.state.P
         residual, J = innovation(R, p, tick.lever_arm, b, z)
-        distance = 1.0 / np.sqrt((J[:, 0] ** 2).sum(-1))
+        distance = 1.0 / lengths(J[:, 0])
         basis = J * distance[:, None, None]
         xi = sigma_points(P)  # (12, 6)
         turn, shift = exp_se3(xi)

@@ -8,7 +8,7 @@ import warp as wp
 
 from coopenv.estimation.observers.robust.search import FLOOR, MARGIN, SAME
 from coopenv.world.robust.algebra import distance_squared, left_error
-from coopenv.world.robust.state import MOST_SOLUTIONS
+from coopenv.world.robust.state import SPARE_PLACE
 
 MOST_DEBT, CREDIT = wp.constant(MARGIN), wp.constant(FLOOR)
 INDISTINCT = wp.constant(SAME)
@@ -54,10 +54,9 @@ def copy_hypothesis(mind: Any, world: int, i: int, h: int, to: int):
 @wp.func
 def swap(mind: Any, world: int, i: int, h: int, g: int):
     """Exchange two hypotheses, by way of the place behind all."""
-    spare = int(MOST_SOLUTIONS) + 1
-    copy_hypothesis(mind, world, i, h, spare)
+    copy_hypothesis(mind, world, i, h, SPARE_PLACE)
     copy_hypothesis(mind, world, i, g, h)
-    copy_hypothesis(mind, world, i, spare, g)
+    copy_hypothesis(mind, world, i, SPARE_PLACE, g)
 
 
 @wp.func
@@ -70,21 +69,33 @@ def are_same(mind: Any, world: int, i: int, h: int, g: int):
 
 
 @wp.func
-def prune(mind: Any, world: int, i: int):
-    """Give up what pays much more than the best, what is the same as a better one, and all if none is good."""
+def is_new(mind: Any, world: int, i: int, h: int, count: int) -> bool:
+    """Return whether a hypothesis can be told apart from each of the first `count`."""
+    for g in range(count):
+        if are_same(mind, world, i, h, g):
+            return False
+    return True
+
+
+@wp.func
+def rank(mind: Any, world: int, i: int):
+    """Put the cheapest first."""
     count = mind.hypotheses[world, i]
-    for h in range(count):  # cheapest first
+    for h in range(count):
         for g in range(h + 1, count):
             if is_cheaper(mind, world, i, g, h):
                 swap(mind, world, i, h, g)
+
+
+@wp.func
+def prune(mind: Any, world: int, i: int):
+    """Give up what pays much more than the best, what is the same as a better one, and all if none is good."""
+    count = mind.hypotheses[world, i]
+    rank(mind, world, i)
     least = mind.paid[world, i, 0]
     kept = int(0)
     for h in range(count):
-        stays = mind.paid[world, i, h] <= least + wp.float64(MOST_DEBT)
-        for g in range(kept):
-            if stays:
-                stays = not are_same(mind, world, i, h, g)
-        if stays:
+        if mind.paid[world, i, h] <= least + wp.float64(MOST_DEBT) and is_new(mind, world, i, h, kept):
             copy_hypothesis(mind, world, i, h, kept)
             kept += 1
     if least > wp.float64(CREDIT) + wp.float64(4.0) * wp.float64(mind.bearings[world, i, 0]):

@@ -140,3 +140,21 @@ def solves(d: Any, gaps: Any, a: Any):
     missed = wp.max(wp.max(wp.abs(f[0]), wp.abs(f[1])), wp.abs(f[2]))
     o = wp.float64(0.0)
     return d[0] > o and d[1] > o and d[2] > o and missed < wp.float64(MOST_MISFIT)
+
+
+@wp.func
+def solutions_of(a: Any, gaps: Any):
+    """Return how many solutions there are, and their distances, row by row, nearest to the first point first."""
+    rows = distances_of(a, gaps)
+    result = mat43d()
+    count = int(0)
+    for n in range(4):
+        d = polished(rows[n], gaps, a)
+        if solves(d, gaps, a):
+            place = count
+            while place > 0 and d[0] < result[wp.max(place - 1, 0), 0]:
+                result[place] = result[place - 1]
+                place -= 1
+            result[place] = d
+            count += 1
+    return count, result

@@ -8,7 +8,7 @@ import warp as wp
 
 from coopenv.world.robust.observer import collect, start_vehicle
 from coopenv.world.robust.report import tell
-from coopenv.world.robust.state import MOST_HYPOTHESES, MOST_MEMBERS
+from coopenv.world.robust.state import BANK_PLACES, MOST_MEMBERS
 from coopenv.world.robust.types import (
     mat26d,
     mat33d,
@@ -56,8 +56,10 @@ def forget_search(mind: Any, world: int, i: int):
     mind.prior_covariance[world, i] = mat66d()
     mind.hypotheses[world, i] = 0
     mind.age[world, i] = wp.float64(0.0)
+    mind.waited[world, i] = wp.float64(0.0)
+    mind.clear[world, i] = wp.float64(0.0)
     mind.attempts[world, i] = 0
-    for h in range(MOST_HYPOTHESES):
+    for h in range(BANK_PLACES):
         mind.bank_rotation[world, i, h] = mat33d()
         mind.bank_position[world, i, h] = vec3d()
         mind.bank_covariance[world, i, h] = mat66d()

@@ -6,13 +6,15 @@ import numpy as np
 import warp as wp
 
 from coopenv.estimation.observers.robust.observer import Robust
+from coopenv.estimation.observers.robust.search import MOST_HYPOTHESES
 from coopenv.world.robust.types import mat26d, mat33d, mat62d, mat66d, mat66f, vec2d, vec3d, vec6d
 
 MOST_MEMBERS = wp.constant(Robust.most_members)
-MOST_SOLUTIONS = wp.constant(4)
-"""Of the P3P problem."""
-MOST_HYPOTHESES = wp.constant(6)
-"""The prior, the solutions of one frame, and a spare place."""
+MOST_SUPPOSED = wp.constant(MOST_HYPOTHESES)
+"""Hypotheses that one frame gives, or that are followed."""
+SPARE_PLACE = wp.constant(MOST_HYPOTHESES + 1)
+BANK_PLACES = wp.constant(MOST_HYPOTHESES + 2)
+"""What one frame gives, the prior, and a spare place."""
 
 
 @wp.struct
@@ -64,7 +66,9 @@ class RobustState:
     paid: wp.array3d(dtype=wp.float64)  # (W, N, H)
     surprise: wp.array3d(dtype=wp.float64)  # (W, N, H) squared distance from the prior
     bearings: wp.array3d(dtype=wp.int32)  # (W, N, H) for which it has paid
-    age: wp.array2d(dtype=wp.float64)  # (W, N) s
+    age: wp.array2d(dtype=wp.float64)  # (W, N) s, for which hypotheses have been followed
+    waited: wp.array2d(dtype=wp.float64)  # (W, N) s, for which there were none
+    clear: wp.array2d(dtype=wp.float64)  # (W, N) s, for which the last frames' solutions have been well determined
     attempts: wp.array2d(dtype=wp.int32)  # (W, N)
 
     outbox_says: wp.array3d(dtype=wp.int32)  # (W, N, S) 0: an empty message
@@ -127,7 +131,7 @@ def _shape(name: str, worlds: int, vehicles: int, agents: int, slots: int) -> tu
     if name.startswith("inbox_"):
         return worlds, vehicles, vehicles
     if name in PER_HYPOTHESIS:
-        return worlds, vehicles, MOST_HYPOTHESES
+        return worlds, vehicles, BANK_PLACES
     if name in PER_MEMBER or name.startswith("report_"):
         return (worlds, vehicles, *(MOST_MEMBERS,) * (2 if name == "P" else 1))
     return worlds, vehicles

@@ -6,7 +6,7 @@ import base64
 import csv
 import json
 import re
-from dataclasses import fields
+from dataclasses import fields, replace
 from html.parser import HTMLParser
 from io import StringIO
 from pathlib import Path
@@ -34,11 +34,16 @@ class Page(HTMLParser):
     def __init__(self, text: str) -> None:
         super().__init__()
         self.sources: list[str] = []
+        self.anchors: list[str] = []
+        self.places: list[str] = []
         self.open: list[str] = []
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.sources += [value or "" for name, value in attrs if name in ("src", "href")]
+        given = {name: value or "" for name, value in attrs}
+        self.sources += [given["src"]] if "src" in given else []
+        self.anchors += [given["href"]] if "href" in given else []
+        self.places += [f"#{given['id']}"] if "id" in given else []
         if tag not in ("meta", "img", "wbr"):
             self.open.append(tag)
 
@@ -95,12 +100,14 @@ def test_report(folder: Path) -> None:
     text = (folder / "report.html").read_text()
     page = Page(text)
     assert not page.open
+    assert page.anchors == page.places
     assert page.sources and all(source.startswith("data:image/png;base64,") for source in page.sources)
     for source in page.sources:
         assert base64.b64decode(source.split(",", 1)[1]).startswith(b"\x89PNG")
     assert "url(" not in text and "http" not in re.sub(r"base64,[^\"]*", "", text)
     for wanted in ("--seeds 2", "numpy", "Seeds 0 to 1", "Basin of attraction", "Cost against accuracy", "Consistency"):
         assert wanted in text
+    assert "no landmark is seen for 10 s" in text and "ANEES of an honest filter: 1 (" in text and "× " in text
     for name in (f.name for f in fields(Row)):
         assert f"<dt>{name}</dt>" in text
 
@@ -113,8 +120,20 @@ def test_tables_fit_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     printed = StringIO()
     print_tables(rows, [], Console(file=printed, width=80))
     text = printed.getvalue()
+    assert text.count("by design") == 1  # the same in every variant
     assert "failed" in text and "…" not in text and "bound (ancestors)" in text and "landmarks" in text
     assert max(len(line) for line in text.splitlines() if "by design" not in line) <= 80
+
+
+def test_large_numbers_fit_as_well() -> None:
+    """Those of an observer that diverges and sends a lot."""
+    rows = compare(find_source("overtaking", {"horizon": 0.5}), ["covariance_intersection"], 1, None, 0.2).rows
+    worst = {"anees": 1.3e-11, "nis": 2814.3, "bytes_per_s": 123456.7, "us_per_update": 12345.6}
+    far = {"position_rmse_m": 12345.6, "ratio_to_bound": 1e7, "ratio_to_bound_ancestors": 1e7, "diverged_fraction": 1.0}
+    row = replace(rows[0], **worst, **far, settled_fraction=1.0, converged_fraction=1.0)
+    printed = StringIO()
+    print_tables([row] * 5, [], Console(file=printed, width=80))
+    assert "…" not in printed.getvalue() and max(len(line) for line in printed.getvalue().splitlines()) <= 80
 
 
 @pytest.mark.parametrize(
@@ -129,6 +148,12 @@ def test_tables_fit_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
         (["overtaking", "--engine", "ray", "--address", "nowhere"], "expected HOST:PORT"),
         (["nowhere.mcap"], "no such log file"),
         (["mrclam_6", "--set", "horizon=1"], "recorded"),
+        (["mrclam_6", "--basin", "2"], "basins are studied in simulated environments"),
+        (["mrclam_6", "--variants", "v2x_loss"], "known: landmarks, landmarks+robots, blind"),
+        (["overtaking", "--data", "."], "not one of the recorded robots"),
+        (["overtaking", "--variants", "blind"], "known: nominal"),
+        (["overtaking", "--seeds", "0"], "'--seeds'"),
+        (["overtaking", "--observers", "mekf", "--steady-from", "1000"], "not within the run"),
     ],
 )
 def test_mistakes_have_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 import coopenv
 from coopenv.bench.leaderboard import compare, find_source
 from coopenv.bench.leaderboard.engines import Local
-from coopenv.bench.leaderboard.tables import failures
+from coopenv.bench.leaderboard.tables import degradation, failures
 from coopenv.errors import CoopenvError
 from coopenv.estimation.bound import cramer_rao, cramer_rao_ancestors
 from coopenv.estimation.observers import record, registry, run
@@ -48,6 +49,7 @@ def test_every_fault_has_its_rows() -> None:
         assert rmse[name] != rmse["nominal"]
         ratios = [row.degradation for row in rows if row.variant == name]
         assert ratios == pytest.approx(np.divide(rmse[name], rmse["nominal"]))
+        assert degradation(rows, name) == pytest.approx(sum(rmse[name]) / sum(rmse["nominal"]))
     assert rmse["lying_neighbour"][:2] == rmse["nominal"][:2]  # the liar and its leader
 
 
@@ -77,6 +79,10 @@ def test_observers_registered_here_travel_to_other_processes(monkeypatch: pytest
     assert np.isnan(rows[0].position_rmse_m) and rows[0].settled_fraction == 0.0 and rows[0].diverged_fraction == 1.0
     assert [row.nis for row in rows[2:4]] == [1.5, 1.5] and np.isnan(rows[-1].nis)
     assert [row.position_rmse_m for row in rows[2:4]] == [row.position_rmse_m for row in rows[4:]]
+    dof = 2 * 2 * 60  # of two seeds, 1 s at 60 Hz
+    assert [rows[2].nis_low, rows[2].nis_high] == pytest.approx(chi2.ppf([0.025, 0.975], dof) / dof)
+    assert [rows[2].anees_low, rows[2].anees_high] == pytest.approx(chi2.ppf([0.025, 0.975], 12) / 12)
+    assert np.isnan([rows[0].anees_low, rows[-1].nis_low]).all()
 
 
 def test_mistakes_are_told_before_the_work() -> None:

@@ -40,6 +40,16 @@ def test_processes_compute_with_one_thread(monkeypatch: pytest.MonkeyPatch) -> N
     assert os.environ[THREADS[0]] == "7"
 
 
+def test_what_cannot_be_sent_to_a_process_is_told() -> None:
+    with pytest.raises(CoopenvError, match="or use --jobs 1"):
+        Local(2).map(lambda x: x, [lambda: None] * 2, lambda _: None)
+
+
+def test_a_process_that_dies_is_told() -> None:
+    with pytest.raises(CoopenvError, match="a process died"):
+        Local(2).map(os._exit, [1, 1], lambda _: None)
+
+
 def test_nobody_listens() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))  # bound but not listening: nobody else takes it, and nobody answers

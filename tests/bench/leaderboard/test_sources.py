@@ -9,6 +9,7 @@ import pytest
 
 import coopenv
 from coopenv.bench.leaderboard import compare, find_source
+from coopenv.bench.leaderboard.command import request_of
 from coopenv.bench.leaderboard.sources import variants_of
 from coopenv.errors import CoopenvError
 from coopenv.estimation.observers import record, run
@@ -39,6 +40,18 @@ def test_variants() -> None:
         variants_of(source, "blind")
     with pytest.raises(CoopenvError, match="did you mean 'v2x_delay'"):
         variants_of(source, "v2x_dely")
+
+
+def test_observers_are_compared_where_they_are_meant_to_be() -> None:
+    """Unless they are asked for by name."""
+
+    def names(source: str, observers: str | None = None) -> tuple[str, ...]:
+        return request_of(source, observers, None, 1, None, 0, None, {}, ()).observers
+
+    space, plane = names("overtaking"), names("mrclam_6")
+    assert "planar_ekf" not in space and {"p3p", "robust", "robust_joint"} <= {*space}
+    assert not {"p3p", "robust_joint"} & {*plane} and {"planar_ekf", "robust", "riccati"} <= {*plane}
+    assert names("overtaking", "planar_ekf,mekf,mekf") == ("planar_ekf", "mekf")
 
 
 def test_what_is_recorded_has_no_scenario() -> None:

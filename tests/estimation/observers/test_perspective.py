@@ -64,6 +64,13 @@ def test_every_solution_sees_the_points_where_they_are(seed: int, shift: float) 
         assert_allclose(np.linalg.det(R), 1.0, atol=1e-12)
 
 
+@given(seed=SEEDS)
+def test_solutions_are_ordered_by_distance_from_the_first_point(seed: int) -> None:
+    _, _, z, b = scene(seed)
+    distances = np.linalg.norm(solve_p3p(b, z)[1] - z[0], axis=1)
+    assert (np.diff(distances) > -1e-9).all()
+
+
 def test_four_solutions_of_a_symmetric_scene() -> None:
     """Above the centre of an equilateral triangle, near it: the symmetric pose and one tilted about each corner."""
     angles = np.arange(3) * 2 * np.pi / 3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import runpy
+import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -28,6 +29,7 @@ from coopenv.estimation.observers import (
     register,
     run,
 )
+from coopenv.estimation.observers.team import is_finite
 from coopenv.scenario import load_scenario
 from tests.estimation.observers.batch import small_errors
 
@@ -125,7 +127,7 @@ def test_odometry_without_noise_is_the_true_motion() -> None:
     assert result.orientation_error.max() < 1e-8
 
 
-@pytest.mark.parametrize("name", sorted({*registry.ZOO} & {*registry.available_names()}))
+@pytest.mark.parametrize("name", sorted({*registry.ZOO} & {*registry.available_names(planar=False)}))
 def test_truth_does_not_leak(name: str) -> None:
     made = recording(horizon=0.2)
     lie = replace(made.truth, rotation=made.truth.rotation[:, ::-1], position=made.truth.position + 100.0)
@@ -167,6 +169,33 @@ def test_failures_end_in_a_word_not_in_a_crash() -> None:
     assert np.isfinite(result.position_error[6, :2]).all()
     assert np.isnan(result.position_error[6:, 2:]).all() and np.isnan(result.position_error[7:]).all()
     assert "of vehicle_1 at 0.017 s" in run(Nan, recording()).failure and "finite" in run(Nan, recording()).failure
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda e: sys.exit(3), "SystemExit: 3"),
+        (lambda e: (_ for _ in ()).throw(ValueError("one\nand two")), "ValueError: one and two"),
+        (lambda e: None, "AttributeError"),
+        (lambda e: replace(e, position=e.position[None]), "position is not a finite array of shape (3,)"),
+        (lambda e: replace(e, position=1j * e.position), "position is complex"),
+        (lambda e: replace(e, covariance=np.full((6, 6), np.inf)), "covariance is not a finite array"),
+        (lambda e: replace(e, rotation=np.ones((3, 3))), "rotation is not orthogonal"),
+        (lambda e: replace(e, nis=float("nan")), "nis"),
+        (lambda e: replace(e, nis="small", nis_dof=2), "TypeError"),
+    ],
+)
+def test_what_is_no_estimate_is_told_in_one_line(change: Any, said: str) -> None:
+    class Odd(Probe):
+        def update(self, tick: Tick) -> Estimate:
+            return change(super().update(tick))
+
+    failure = run(Odd, recording()).failure
+    assert "of vehicle_1 at 0.017 s" in failure and said in failure and "\n" not in failure
+
+
+def test_large_numbers_are_finite() -> None:
+    assert is_finite(np.array([1e200, -1e300])) and not is_finite(np.array([1e200, np.inf]))
 
 
 def test_a_sent_message_does_not_change_any_more() -> None:

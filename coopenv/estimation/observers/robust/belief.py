@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from coopenv.estimation.observers.base import Array, SensorNoise
 from coopenv.estimation.observers.mekf import transition
-from coopenv.estimation.observers.rotations import exp_so3, log_so3, orthonormalise, skew, tangent_basis
+from coopenv.estimation.observers.rotations import exp_so3, lengths, log_so3, orthonormalise, skew, tangent_basis
 from coopenv.estimation.observers.small_matrices import solve, solve_positive
 
 MOST_STEPS, STRAIGHT = 8, 0.01
@@ -151,7 +151,7 @@ class Belief:
         own, m = self.own, len(z)
         a = (z - own.p).dot(own.R)
         d = a - lever_arm
-        distance = np.maximum(np.sqrt((d * d).sum(axis=1)), 1e-9)
+        distance = np.maximum(lengths(d), 1e-9)
         u = d / distance[:, None]
         T = tangent_basis(u)
         B = T / distance[:, None, None]
@@ -213,7 +213,7 @@ class Belief:
         P = A.dot(self.P).dot(A.T) + (K * noise).dot(K.T)
         self.P = (P + P.T) / 2
 
-    def inform(self, index: Array, information: Array, vector: Array) -> None:
+    def inform(self, index: NDArray[np.int64], information: Array, vector: Array) -> None:
         """Take information about some errors x: their likelihood has the exponent vector^T x - x^T information x / 2.
 
         Args:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from coopenv.estimation.observers.robust.belief import Belief, View
+from coopenv.estimation.observers.small_matrices import solve
 
 STEPS = 6
 LEAST_INFORMATION = 1e-12
@@ -32,15 +33,15 @@ def resect(belief: Belief, look: Callable[[], View]) -> bool:
         H, N = sight.H[fits], noise[fits]
         # the weights count the others' errors bearing by bearing
         own, rest = H[:, :, :6], H[:, :, 6:]
-        W = np.linalg.inv(N[:, None, None] * np.eye(2) + rest @ others @ np.swapaxes(rest, 1, 2))
-        weighted = np.swapaxes(own, 1, 2) @ W
+        W = np.linalg.inv(N[:, None, None] * np.eye(2) + rest @ others @ rest.transpose(0, 2, 1))
+        weighted = own.transpose(0, 2, 1) @ W
         M = (weighted @ own).sum(axis=0)
         spectrum = np.linalg.eigvalsh(M)
         if not spectrum[0] > LEAST_INFORMATION * spectrum[-1]:
             return False
-        G = np.linalg.solve(M, np.concatenate(list(weighted), axis=1))
+        G = solve(M, np.concatenate(weighted, axis=1))
         if step < STEPS - 1:
-            belief.shift(G @ sight.residual[fits].ravel())
+            belief.shift(G.dot(sight.residual[fits].ravel()))
     rest = rest.reshape(2 * len(rest), len(others))
     belief.P[:6, :6] = G @ (np.diag(np.repeat(N, 2)) + rest @ others @ rest.T) @ G.T
     belief.P[:6, 6:] = -G @ rest @ others

@@ -7,13 +7,14 @@ filter of its own; it pays for what it predicts badly, and one that pays much mo
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
 from coopenv.estimation.observers.base import Array, Tick
-from coopenv.estimation.observers.perspective import solve_p3p_batch
+from coopenv.estimation.observers.perspective import solve_p3p, solve_p3p_batch
 from coopenv.estimation.observers.robust.belief import Belief, Sight
 from coopenv.estimation.observers.robust.report import left_error
 from coopenv.estimation.observers.rotations import tangent_basis
@@ -108,43 +109,56 @@ class Search:
         return self.bank[0].belief if len(self.bank) == 1 and self.age >= LEAST_TIME else None
 
     def _begin(self, tick: Tick, sightings: list[Sighting], variance: float) -> None:
-        """Follow a frame's solutions, other sightings at every attempt, if for a while all were well determined.
+        """Follow a known prior at first; then a frame's solutions, too, if for a while all were well determined.
 
-        Where two solutions nearly meet, where they may be is no ellipsoid, and noise makes them come and go. A
-        follower's leaders improve meanwhile, which sets them apart.
+        Every attempt takes other sightings. Where two solutions nearly meet, where they may be is no ellipsoid, and
+        noise makes them come and go. A follower's leaders improve meanwhile, which sets them apart.
         """
+        if self.attempts == 0 and is_known(self.prior.P):
+            self.bank, self.age, self.attempts = [self._prior(tick, sightings, variance)], 0.0, 1
+            return
         triples = sorted(combinations(range(len(sightings)), 3), key=lambda c: -_spread(sightings, c))
         three = triples[self.attempts % len(triples)]
         self.waited += tick.dt
-        solutions = self._solutions(tick, [sightings[n] for n in three], variance)
-        self.clear = 0.0 if solutions is None else self.clear + tick.dt
-        if solutions is None or (self.clear < CLEAR_TIME and self.waited < PATIENCE):
+        poses = self._poses(tick, [sightings[n] for n in three], variance)
+        self.clear = 0.0 if poses is None else self.clear + tick.dt
+        if poses is None or (self.clear < CLEAR_TIME and self.waited < PATIENCE):
             return
+        solutions = self._different(poses)
         for hypothesis in solutions:
             _follow(hypothesis, tick, [s for n, s in enumerate(sightings) if n not in three], variance)
         if is_known(self.prior.P):
-            own = self.prior.own
-            prior = Hypothesis(Belief(self.vehicle, own.R, own.p, self.prior.P.copy()), 0.0, 0.0)
-            _follow(prior, tick, sightings, variance)
-            solutions.append(prior)
+            solutions.append(self._prior(tick, sightings, variance))
         self.bank = sorted(solutions, key=lambda h: h.price)[:MOST_HYPOTHESES]
         self.age, self.clear, self.attempts = 0.0, 0.0, self.attempts + 1
 
-    def _solutions(self, tick: Tick, three: list[Sighting], variance: float) -> list[Hypothesis] | None:
-        """Return the different poses that explain three sightings; None if one of them is not well determined."""
-        result: list[Hypothesis] = []
+    def _prior(self, tick: Tick, sightings: list[Sighting], variance: float) -> Hypothesis:
+        """Return the prior as a hypothesis."""
+        own = self.prior.own
+        prior = Hypothesis(Belief(self.vehicle, own.R, own.p, self.prior.P.copy()), 0.0, 0.0)
+        _follow(prior, tick, sightings, variance)
+        return prior
+
+    def _poses(self, tick: Tick, three: list[Sighting], variance: float) -> list[Belief] | None:
+        """Return the poses that explain three sightings; None if one of them is not well determined."""
+        result = []
         for R, camera in _perspectives(three, variance):
             belief = Belief(self.vehicle, R, camera - R @ tick.lever_arm, np.zeros((6, 6)))
             P = _covariance(belief, tick, three, variance)
-            if P is None or max(P.diagonal()[:3].tolist()) > KNOWN_ANGLE**2:
-                if self.waited < PATIENCE:
-                    return None
-                if P is None:
-                    continue
-            belief.P = P
+            if self.waited < PATIENCE and (P is None or not is_known(P)):
+                return None
+            if P is not None:
+                belief.P = P
+                result.append(belief)
+        return result
+
+    def _different(self, poses: list[Belief]) -> list[Hypothesis]:
+        """Return hypotheses of the first poses that can be told apart from those before."""
+        result: list[Hypothesis] = []
+        for belief in poses:
             surprise = self._surprise(belief)
             hypothesis = Hypothesis(belief, min(surprise, MOST_SURPRISE), surprise)
-            if not any(_same(hypothesis, other) for other in result):
+            if len(result) < MOST_HYPOTHESES and not any(_same(hypothesis, other) for other in result):
                 result.append(hypothesis)
         return result
 
@@ -180,14 +194,15 @@ def _spread(sightings: list[Sighting], three: tuple[int, ...]) -> float:
     return float(np.linalg.norm(np.cross(b - a, c - a)))
 
 
-def _perspectives(three: list[Sighting], variance: float) -> list[tuple[Array, Array]]:
-    """Return the poses (R, camera) that explain three sightings, or what they may have been.
+def _perspectives(three: list[Sighting], variance: float) -> Iterator[tuple[Array, Array]]:
+    """Yield the poses (R, camera) that explain three sightings, then what they may have been.
 
     Where two solutions lie close together noise can make both of them vanish. So every bearing, and every place that is
     not exactly known, is also moved by `MOVED` standard deviations to each side.
     """
     b, z = np.array([s.bearing for s in three]), np.array([s.z for s in three])
-    bearings, places = [b], [z]
+    yield from zip(*solve_p3p(b, z), strict=True)
+    bearings, places = [], []
     for n, s in enumerate(three):
         for side in (MOVED, -MOVED):
             for axis in tangent_basis(b[n : n + 1])[0]:
@@ -202,7 +217,7 @@ def _perspectives(three: list[Sighting], variance: float) -> list[tuple[Array, A
                 bearings.append(b)
                 places.append(moved)
     R, camera, mask = solve_p3p_batch(np.array(bearings), np.array(places))
-    return list(zip(R[mask], camera[mask], strict=True))
+    yield from zip(R[mask], camera[mask], strict=True)
 
 
 def _noise(distance: Array, sightings: list[Sighting], variance: float) -> Array:
