@@ -4,7 +4,10 @@ Source: Tichavsky, Muravchik and Nehorai, Posterior Cramer-Rao bounds for discre
 Transactions on Signal Processing 46(5), 1998, on the stacked left errors of all vehicles (R = Rhat Exp(theta),
 p = phat + Rhat rho), linearised at the truth:
 
-    J_{k+1} = (F_k J_k^-1 F_k^T + Q_k)^-1 + sum over visible (i, j) of H_ij^T H_ij / sigma^2.
+    J_{k+1} = (F_k J_k^-1 F_k^T + Q_k)^-1 + sum over visible (i, j) of H_ij^T N_ij^-1 H_ij.
+
+Noise that is not Gaussian, as the paper's on the image plane, counts with its covariance: then it is the bound of what
+is linear in the measurements. Without noise of bearings there is none, and every entry is NaN.
 
 The edges are those that were realised, so the bound is conditional on them: average it over seeds. It is first order in
 the orientation, meaningful below about 10 deg, and does not count what "not seen" tells. It bounds the problem in which
@@ -110,6 +113,8 @@ def _covariances(recording: Recording, F: Array, M: Array, groups: Sequence[Sequ
 
 
 def _bound(recording: Recording, blocks: Array) -> Bound:
+    if any(setup.noise.bearing == 0.0 for setup in recording.setups):
+        blocks = np.full_like(blocks, np.nan)
     trace = np.trace(blocks[..., 3:, 3:], axis1=-2, axis2=-1)
     angle = np.trace(blocks[..., :3, :3], axis1=-2, axis2=-1)
     return Bound(recording.t, np.sqrt(trace), np.degrees(np.sqrt(angle)), blocks)
@@ -130,7 +135,7 @@ def transitions(recording: Recording) -> Array:
 
 
 def information(recording: Recording, joint: bool = True, observers: Collection[int] | None = None) -> Array:
-    """Return sum of H^T H / sigma^2 (K, 6N, 6N) over the visible edges at each tick, linearised at the truth.
+    """Return sum of H^T N^-1 H (K, 6N, 6N) over the visible edges at each tick, linearised at the truth.
 
     Args:
         recording: with the truth and the visible edges.
@@ -156,15 +161,15 @@ def information(recording: Recording, joint: bool = True, observers: Collection[
             distance = np.maximum(np.linalg.norm(d, axis=-1), 1e-9)
             u = d / distance[:, None]
             across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / distance[:, None, None]
-            weight = recording.visible[:, i, target] / setup.noise.bearing_std**2
+            weight = recording.visible[:, i, target, None, None] * setup.noise.bearing_information(u)
             Hi = across @ np.concatenate([skew(a), minus], axis=-1)
-            Hi_t = np.swapaxes(Hi, -1, -2) * weight[:, None, None]
+            Hi_t = np.swapaxes(Hi, -1, -2) @ weight
             M[:, own, own] += Hi_t @ Hi
             if j < 0 or not joint:
                 continue
             other = slice(6 * j, 6 * j + 6)
             Hj = across @ Rt @ R[:, j] @ np.hstack([-skew(marker), np.eye(3)])
-            Hj_t = np.swapaxes(Hj, -1, -2) * weight[:, None, None]
+            Hj_t = np.swapaxes(Hj, -1, -2) @ weight
             M[:, other, other] += Hj_t @ Hj
             M[:, own, other] += Hi_t @ Hj
             M[:, other, own] += Hj_t @ Hi

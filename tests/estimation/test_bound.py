@@ -8,7 +8,9 @@ import numpy as np
 from numpy.testing import assert_allclose
 
 from coopenv.estimation.bound import ancestors, cramer_rao, cramer_rao_ancestors, information, transitions
-from coopenv.estimation.observers import Coordinates, record
+from coopenv.estimation.observers import Coordinates, SensorNoise, record
+from coopenv.estimation.observers.base import MIN_BEARING_STD
+from coopenv.scenario import load_scenario
 from tests.estimation.observers.batch import small_errors, small_record, solve
 
 
@@ -112,3 +114,25 @@ def test_ancestors_bound_is_that_of_a_smaller_world() -> None:
         visible[:, others] = False
         expected = cramer_rao(replace(made, visible=visible)).covariance[:, vehicle]
         assert_allclose(cramer_rao_ancestors(made).covariance[:, vehicle], expected, rtol=1e-9, atol=1e-15)
+
+
+def test_the_papers_noise_counts_with_its_covariance():
+    """Uniform deviations on the image plane across z, drawn, against the information of a bearing."""
+    rng = np.random.default_rng(0)
+    scale = 0.005
+    noise = SensorNoise(0.1, 0.01, 1 / 60, scale / np.sqrt(3), (0.0, 0.0, 1.0))
+    u = np.array([0.8, -0.3, 0.4]) / np.linalg.norm([0.8, -0.3, 0.4])
+    xy = u[:2] / u[2] + rng.uniform(-scale, scale, (400_000, 2))
+    drawn = np.column_stack([xy, np.ones(len(xy))])
+    drawn /= np.linalg.norm(drawn, axis=1, keepdims=True)
+    covariance = np.cov(drawn.T)
+    information = noise.bearing_information(u[None])[0]
+    across = np.eye(3) - np.outer(u, u)
+    assert_allclose(information @ (covariance + MIN_BEARING_STD**2 * across), across, atol=0.01)
+    on_axis = noise.bearing_information(np.array([[0.0, 0.0, 1.0]]))[0]
+    assert_allclose(on_axis, np.diag([1.0, 1.0, 0.0]) / (noise.bearing**2 + 1e-8), rtol=1e-6)
+
+
+def test_no_noise_no_bound():
+    made = record(load_scenario("busy_intersection", {"horizon": 0.2, "noise.enabled": False}), 0)
+    assert np.isnan(cramer_rao(made).position).all()

@@ -45,6 +45,7 @@ def _setup_facts(setup: Setup) -> dict[str, Any]:
             "angular_velocity": noise.angular_velocity,
             "odometry_period": noise.odometry_period,
             "bearing": noise.bearing,
+            "image_axis": None if noise.image_axis is None else list(noise.image_axis),
         },
         "gains": {
             "k": gains.k,
@@ -54,6 +55,18 @@ def _setup_facts(setup: Setup) -> dict[str, Any]:
             "max_turn": gains.max_turn,
         },
     }
+
+
+def _noise(facts: Mapping[str, Any]) -> SensorNoise:
+    axis = facts["image_axis"]
+    x, y, z = (0.0, 0.0, 0.0) if axis is None else _array(axis, 3).tolist()
+    return SensorNoise(
+        velocity=float(facts["velocity"]),
+        angular_velocity=float(facts["angular_velocity"]),
+        odometry_period=float(facts["odometry_period"]),
+        bearing=float(facts["bearing"]),
+        image_axis=None if axis is None else (x, y, z),
+    )
 
 
 def setup_from(facts: Mapping[str, Any]) -> Setup:
@@ -67,7 +80,7 @@ def setup_from(facts: Mapping[str, Any]) -> Setup:
         targets=np.array(facts["targets"], np.int64),
         lever_arm=_array(facts["lever_arm"], 3),
         marker=_array(facts["marker"], 3),
-        noise=SensorNoise(**{name: float(value) for name, value in facts["noise"].items()}),
+        noise=_noise(facts["noise"]),
         gains=Gains(
             k=float(gains["k"]),
             q=_array(gains["q"], len(facts["target_names"])),

@@ -63,6 +63,8 @@ class SensorNoise:
     bearing: float
     """rad, of each tangent axis of a bearing. For the paper's noise model this is the standard deviation on the image
     plane, which is reached on the optical axis only and is an upper bound elsewhere."""
+    image_axis: tuple[float, float, float] | None = None
+    """Axis of that image plane, unit vector in the body frame; None: the noise is in the tangent plane."""
 
     def odometry(self, dt: float) -> Array:
         """Return the variances (6,) of (rotation, translation) of the increment over dt.
@@ -72,6 +74,22 @@ class SensorNoise:
         scale = self.odometry_period * dt
         turn, step = self.angular_velocity**2 * scale, self.velocity**2 * scale
         return np.array([turn, turn, turn, step, step, step])
+
+    def bearing_information(self, bearings: Array) -> Array:
+        """Return the information matrices (m, 3, 3), 1/rad^2, of unit bearings (m, 3), body frame, about themselves.
+
+        On the image plane across an axis the coordinates of u are those of u / (u . axis), so that a deviation there
+        counts |u . axis| times across u, and once more where it lies in the plane of u and the axis.
+        """
+        u = np.asarray(bearings, dtype=np.float64)
+        across = np.eye(3) - u[:, :, None] * u[:, None, :]
+        if self.image_axis is None:
+            return across / self.bearing_std**2
+        axis = np.array(self.image_axis)
+        plane = np.linalg.svd(axis[None])[2][1:].T  # (3, 2) two axes of the image plane
+        J = np.abs(u @ axis)[:, None, None] * (across @ plane)
+        covariance = self.bearing**2 * J @ np.swapaxes(J, 1, 2) + MIN_BEARING_STD**2 * across
+        return np.linalg.pinv(covariance, rcond=1e-9, hermitian=True)
 
     @property
     def bearing_std(self) -> float:

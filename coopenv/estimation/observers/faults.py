@@ -108,17 +108,16 @@ class Lie:
         """Return the message as it is broadcast.
 
         The position is moved, and a covariance of whatever size becomes std^2 I. Other entries only their observer can
-        change: if it has a method `tampered(message, offset)`, that one makes the lie.
+        change: if it has a method `tampered(message)`, that one makes them agree with the lie.
         """
-        offset = np.array(self.offset)
-        if (tampered := getattr(observer, "tampered", None)) is not None:
-            return tampered(message, offset)
-        position, covariance = message.position, message.covariance
-        return replace(
+        position, P = message.position, message.covariance
+        lie = replace(
             message,
-            position=None if position is None else position + offset,
-            covariance=None if covariance is None else self.std**2 * np.eye(len(covariance)),
+            position=None if position is None else position + np.array(self.offset),
+            covariance=None if P is None else self.std**2 * np.eye(len(P), dtype=P.dtype),
         )
+        tampered = getattr(observer, "tampered", None)
+        return lie if tampered is None else tampered(lie)
 
 
 def liar(recording: Recording) -> int:

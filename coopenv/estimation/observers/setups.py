@@ -20,7 +20,11 @@ def setups_of(scenario: Scenario, model: Any) -> tuple[Setup, ...]:
     noise, observer = model.noise, model.observer
     bearing = float(noise.bearing) / (math.sqrt(3.0) if noise.bearing_paper else 1.0)
     sensor_noise = SensorNoise(
-        float(noise.velocity), float(noise.angular_velocity), 1.0 / scenario.rates.odometry, bearing
+        float(noise.velocity),
+        float(noise.angular_velocity),
+        1.0 / scenario.rates.odometry,
+        bearing,
+        _image_axis(scenario, model) if noise.bearing_paper else None,
     )
     L = len(scenario.landmarks)
     targets, counts = model.targets.numpy(), model.target_count.numpy()
@@ -39,6 +43,13 @@ def setups_of(scenario: Scenario, model: Any) -> tuple[Setup, ...]:
         )
         for i, name in enumerate(scenario.vehicle_names)
     )
+
+
+def _image_axis(scenario: Scenario, model: Any) -> tuple[float, float, float]:
+    """Return the axis of the paper's noise formula, unit vector in the body frame."""
+    axis = np.array(model.camera.rotation, dtype=float).reshape(3, 3) @ np.array(scenario.noise.bearing.axis, float)
+    x, y, z = (axis / np.linalg.norm(axis)).tolist()
+    return x, y, z
 
 
 def start_covariance(scenario: Scenario, vehicle: int) -> Array:

@@ -146,12 +146,13 @@ def test_followers_hear_the_lie_and_the_liar_does_not_change() -> None:
 
 def test_an_observer_may_lie_in_its_own_words() -> None:
     class Own:
-        def tampered(self, message: Message, offset: np.ndarray) -> Message:
-            return Message(extra={"offset": offset})
+        def tampered(self, message: Message) -> Message:
+            return replace(message, extra={"twice": 2.0 * message.position})
 
-    assert_array_equal(Lie(0, 0.0).told(Own(), Message()).extra["offset"], [3.0, 4.0, 0.0])
-    bare = Lie(0, 0.0).told(object(), Message(position=np.ones(3), covariance=np.eye(6)))
+    assert_array_equal(Lie(0, 0.0).told(Own(), Message(position=np.ones(3))).extra["twice"], [8.0, 10.0, 2.0])
+    bare = Lie(0, 0.0).told(object(), Message(position=np.ones(3), covariance=np.eye(6, dtype=np.float32)))
     assert bare.covariance is not None and bare.covariance.shape == (6, 6) and bare.rotation is None
+    assert bare.covariance.dtype == np.float32  # a lie takes no more bytes
 
 
 def test_nobody_to_lie_to() -> None:

@@ -43,6 +43,15 @@ class RobustJoint(Robust):
             P = J.dot(P).dot(J.T)
         return replace(message, extra={**message.extra, **_told(told, P, len(told) == len(self.belief.members))})
 
+    @staticmethod
+    def tampered(message: Message) -> Message:
+        """Return a message whose joint belief claims what its covariance does, for studies of liars."""
+        if message.covariance is None or "factor" not in message.extra:
+            return message
+        P = _joint_covariance(message)
+        P[:6, 6:], P[6:, :6], P[:6, :6] = 0.0, 0.0, message.covariance
+        return replace(message, extra={**message.extra, "factor": _factor(P)})
+
     def _report(self, message: Message, sender: int, time: float) -> Report | None:
         """Return what a message says of its sender and, unless it leans on this vehicle, of the others it tells of."""
         report = from_message(message, sender, time)
@@ -113,3 +122,16 @@ def _with_others(report: Report, message: Message) -> Report:
         P=L.dot(L.T),
         leans_on=0 if told["complete"][0] else report.leans_on,
     )
+
+
+def _factor(P: Array) -> Array:
+    """Return the Cholesky factor of a joint covariance as it travels."""
+    return np.linalg.cholesky(P)[np.tril_indices(len(P))].astype(np.float32)
+
+
+def _joint_covariance(message: Message) -> Array:
+    """Return the joint covariance (6m, 6m) of a message that holds its factor."""
+    n = 6 * (1 + len(message.extra["vehicles"]))
+    L = np.zeros((n, n))
+    L[np.tril_indices(n)] = message.extra["factor"]
+    return L @ L.T

@@ -7,7 +7,7 @@ import pytest
 
 from coopenv.estimation.bound import cramer_rao_ancestors
 from coopenv.estimation.observers import run
-from coopenv.estimation.observers.faults import find_fault
+from coopenv.estimation.observers.faults import Lie, find_fault
 from coopenv.estimation.observers.planar import PlanarRobust
 from coopenv.estimation.observers.registry import find
 from coopenv.estimation.observers.robust import Robust, RobustJoint
@@ -79,6 +79,25 @@ def test_faults_do_not_mislead(name, fault):
     assert not result.failure
     assert (result.position_error[-1] < 0.6).all()
     assert (result.anees(8.0) < 6.0).all()
+
+
+def test_a_joint_liar_is_as_sure_in_every_entry():
+    record = small_errors(12.0)
+    lies = []
+
+    class Watched(RobustJoint):
+        def message(self):
+            message = super().message()
+            if self.vehicle == 2 and message.position is not None and "factor" in message.extra:
+                lies.append(Lie(2, 0.0).told(self, message))
+            return message
+
+    run(Watched, record)
+    reports = [RobustJoint(record.setups[0])._report(lie, 2, 0.0) for lie in lies]
+    assert reports
+    for lie, report in zip(lies, reports, strict=True):
+        np.testing.assert_allclose(report.P[:6, :6], lie.covariance, rtol=1e-5, atol=1e-12)
+        assert not report.P[:6, 6:].any()
 
 
 def test_a_liar_is_found_out_and_tracked_all_the_same():
