@@ -11,13 +11,15 @@ import pytest
 from numpy.testing import assert_allclose
 
 from coopenv.api.engine import Engine
-from coopenv.estimation.observers import Estimate, Recording, record, run
+from coopenv.estimation.observers import Estimate, Recording, Tick, record, run
 from coopenv.estimation.observers.faults import FAULTS, Lie
+from coopenv.estimation.observers.robust import Robust
 from coopenv.estimation.observers.robust.search import PATIENCE
 from coopenv.estimation.observers.starts import random_start, with_start
 from coopenv.estimation.observers.written import riccati_covariance
 from coopenv.scenario import load_scenario
 from coopenv.world.world import World
+from tests.estimation.observers.robust.scenes import crowd
 from tests.world.builders import constant, scenario, vehicle
 from tests.world.replays import Played, replayed
 
@@ -114,6 +116,30 @@ def test_it_does_so_when_patience_ends(seed: int) -> None:
     check(recording, played)
     found = (~played.searching[:, 0]).argmax() * recording.dt
     assert PATIENCE < found < PATIENCE + 1.0
+
+
+@pytest.mark.parametrize(("leaders", "gone"), [(6, 4), (9, 7)])
+def test_the_same_members_make_room(leaders: int, gone: int) -> None:
+    recording = crowd(6.0, leaders, gone)
+    members = {}
+
+    def note(world: World, tick: int) -> None:
+        memory: Any = world.memory
+        members[tick] = memory.vehicle.numpy()[0, leaders, : memory.members.numpy()[0, leaders]].tolist()
+
+    class Noted(Robust):
+        def update(self, tick: Tick) -> Estimate:
+            estimate = super().update(tick)
+            if self.vehicle == leaders:
+                expected[tick.index] = [member.vehicle for member in self.belief.members]
+            return estimate
+
+    expected: dict[int, list[int]] = {}
+    check(recording, replayed(recording, note))
+    run(Noted, recording)
+    assert {tick: members[tick] for tick in expected} == expected
+    assert members[100] == [leaders, 0, 1, 2, 3]
+    assert members[recording.ticks - 1][-2:] == [leaders - 2, leaders - 1]
 
 
 def test_a_search_ends_for_leaders_first() -> None:

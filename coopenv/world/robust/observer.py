@@ -15,6 +15,7 @@ from coopenv.world.robust.belief import begin, move, place_of
 from coopenv.world.robust.look import drop_anchor, look
 from coopenv.world.robust.report import collect, hear, may_lean_on, meet
 from coopenv.world.robust.resection import resect
+from coopenv.world.robust.room import notice
 from coopenv.world.robust.search import begin_search, confirms_prior, look_around, move_search
 from coopenv.world.robust.types import lower_blocks, wide_matrix, wide_vector
 from coopenv.world.v2x import fresh
@@ -37,6 +38,7 @@ def start_vehicle(model: Any, state: Any, mind: Any, world: int, i: int):
 @wp.func
 def listen(model: Any, state: Any, mind: Any, world: int, i: int, tick: int):
     """Take in the messages of those in view, and of those that are already believed in."""
+    notice(model, state, mind, world, i, tick)
     for n in range(model.target_count[i]):
         target = model.targets[i, n]
         sender = target - model.landmarks
@@ -46,7 +48,7 @@ def listen(model: Any, state: Any, mind: Any, world: int, i: int, tick: int):
                 if place > 0:
                     hear(model, mind, world, i, place, sender)
                 elif state.sight[world, i, target] == VISIBLE:
-                    meet(mind, world, i, sender)
+                    meet(model, mind, world, i, sender, tick)
 
 
 @wp.func

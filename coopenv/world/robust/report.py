@@ -21,7 +21,7 @@ from coopenv.world.robust.algebra import (
     with_noise,
 )
 from coopenv.world.robust.belief import add, inform, move
-from coopenv.world.robust.state import MOST_MEMBERS
+from coopenv.world.robust.room import make_room
 from coopenv.world.robust.types import lower_blocks, mat66d, mat66f, second_half, wide_vector
 
 RUMOUR_SHARE = wp.constant(SHARE)
@@ -122,14 +122,15 @@ def remember(mind: Any, world: int, i: int, n: int, sender: int):
 
 
 @wp.func
-def meet(mind: Any, world: int, i: int, sender: int):
+def meet(model: Any, mind: Any, world: int, i: int, sender: int, tick: int):
     """Take in a sender that is new, if there is room."""
-    n = mind.members[world, i]
-    if n >= MOST_MEMBERS:
+    if not make_room(model, mind, world, i, tick):
         return
+    n = mind.members[world, i]
     R = mind.inbox_rotation[world, i, sender]
     add(mind, world, i, sender, R, mind.inbox_position[world, i, sender], covariance_heard(mind, world, i, sender))
     remember(mind, world, i, n, sender)
+    mind.seen_tick[world, i, n] = tick
     mind.distrusted[world, i, n] = 0
     mind.agreed[world, i, n] = wp.float64(0.0)
     leans_on = mind.inbox_leans_on[world, i, sender] | bit_of(sender)

@@ -36,6 +36,7 @@ def forget_members(mind: Any, world: int, i: int):
         mind.twists[world, i, n] = 0
         mind.v[world, i, n] = vec3d()
         mind.w[world, i, n] = vec3d()
+        mind.seen_tick[world, i, n] = 0
         mind.report_tick[world, i, n] = 0
         mind.report_rotation[world, i, n] = mat33d()
         mind.report_position[world, i, n] = vec3d()

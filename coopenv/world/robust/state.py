@@ -36,6 +36,7 @@ class RobustState:
     twists: wp.array3d(dtype=wp.int32)  # (W, N, M) whether a twist is known
     v: wp.array3d(dtype=vec3d)  # (W, N, M) m/s, body
     w: wp.array3d(dtype=vec3d)  # (W, N, M) rad/s, body
+    seen_tick: wp.array3d(dtype=wp.int32)  # (W, N, M) when a member was last in view
     report_tick: wp.array3d(dtype=wp.int32)  # (W, N, M) last report of a member: when it was sent
     report_rotation: wp.array3d(dtype=mat33d)  # (W, N, M)
     report_position: wp.array3d(dtype=vec3d)  # (W, N, M)
@@ -106,7 +107,7 @@ class RobustState:
     before_covariance: wp.array3d(dtype=mat66d)  # (W, M, M)
 
 
-PER_MEMBER = ("vehicle", "R", "p", "P", "twists", "v", "w", "distrusted", "agreed")
+PER_MEMBER = ("vehicle", "R", "p", "P", "twists", "v", "w", "seen_tick", "distrusted", "agreed")
 PER_HYPOTHESIS = ("bank_rotation", "bank_position", "bank_covariance", "paid", "surprise", "bearings")
 
 

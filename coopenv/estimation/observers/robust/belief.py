@@ -41,6 +41,8 @@ class Member:
     """(3,) last known velocity in its body, m/s; None before a second message."""
     w: Array | None = None
     """(3,) last known angular velocity in its body, rad/s."""
+    seen: float = 0.0
+    """s, when it was last in view, or was told of along with one in view."""
 
     def carried(self, age: float) -> Array:
         """Return (3,) how far it comes in its body frame at the last known twist in a time, m."""

@@ -59,12 +59,9 @@ class RobustJoint(Robust):
             return report
         return _with_others(report, message)
 
-    def _speaking(self, reports: list[Report]) -> list[Report]:
-        """Return the reports to use: those of senders whom no other one speaks for, most vehicles first."""
-        ranked = sorted(reports, key=lambda r: -len(r.vehicles))
-        known = {contact.last.vehicles[0]: contact.last for contact in self.contacts.values()}
-        known |= {report.vehicles[0]: report for report in ranked}
-        return [r for r in ranked if not any(_speaks_for(other, r) for other in known.values())]
+    def _is_spoken_for(self, report: Report, taken: list[Report]) -> bool:
+        """Return whether a report that was taken in says all that this one does."""
+        return any(_speaks_for(other, report) for other in taken)
 
 
 def _speaks_for(other: Report, report: Report) -> bool:

@@ -10,6 +10,7 @@ more. So nothing that was heard before counts twice, and the neighbour's slowly 
 - Liars: a message that contradicts the belief about its sender is not used; the sender is then tracked by its own
   odometry and by bearings, until its messages have agreed for a while.
 - Loss and delay: a sender stands in the belief where its last message put it, and is carried on by its last twist.
+- Many neighbours: where there is no room for one in view, those that have been out of view for longest make room.
 - Rumours: what a neighbour learnt from others may reach this vehicle by more ways than one. `SHARE` of it counts.
 """
 
@@ -30,6 +31,7 @@ from coopenv.estimation.observers.robust.report import (
     tracklet,
 )
 from coopenv.estimation.observers.robust.resection import resect
+from coopenv.estimation.observers.robust.room import room_for
 from coopenv.estimation.observers.robust.search import GATE, Search, Sighting, is_known
 from coopenv.estimation.observers.rotations import orthonormalise
 from coopenv.estimation.observers.small_matrices import solve_positive
@@ -179,9 +181,9 @@ class Robust:
         """Return what a message says."""
         return from_message(message, sender, time)
 
-    def _speaking(self, reports: list[Report]) -> list[Report]:
-        """Return the reports whose news count."""
-        return reports
+    def _is_spoken_for(self, report: Report, taken: list[Report]) -> bool:
+        """Return whether a report's news are in those that were taken in."""
+        return False
 
     def _reports(self, tick: Tick) -> list[Report]:
         """Return what the messages say that were heard."""
@@ -192,31 +194,56 @@ class Robust:
     def _listen(self, tick: Tick) -> None:
         """Take in the messages of those in view, and of those that are already believed in."""
         in_view = {target - self.landmarks for target in tick.targets[tick.valid].tolist()}
-        reports = self._reports(tick)
-        speaking = self._speaking(reports)
-        for report in speaking:
+        reports = sorted(self._reports(tick), key=lambda report: -len(report.vehicles))
+        self._notice(in_view, reports, tick.time)
+        heard = {report.vehicles[0] for report in reports}
+        taken = [contact.last for sender, contact in self.contacts.items() if sender not in heard]
+        for report in reports:
             contact = self.contacts.get(report.vehicles[0])
+            if self._is_spoken_for(report, taken):
+                if contact is not None:
+                    contact.last = report
+                continue
             if contact is not None and contact.last.vehicles == report.vehicles:
                 self._hear(contact, report)
-            elif contact is not None or in_view & set(report.vehicles):
-                self._meet(report)
-        for report in reports:  # the news of the others are in what was taken in
-            if report not in speaking and (contact := self.contacts.get(report.vehicles[0])) is not None:
-                contact.last = report
+            elif contact is not None or not in_view.isdisjoint(report.vehicles):
+                self._meet(report, tick.time)
+            if (contact := self.contacts.get(report.vehicles[0])) is not None:
+                taken.append(contact.last)
+        self._forget_contacts()
 
-    def _meet(self, report: Report) -> None:
-        """Take in a sender that is new, or tells of other vehicles than before."""
+    def _notice(self, in_view: set[int], reports: list[Report], time: float) -> None:
+        """Remember when members were last in view; all that a member tells of count as in view when one of them is."""
+        noticed = set(in_view)
+        for report in reports:
+            if report.vehicles[0] in self.contacts and not in_view.isdisjoint(report.vehicles):
+                noticed.update(report.vehicles)
+        for member in self.belief.members:
+            if member.vehicle in noticed:
+                member.seen = time
+
+    def _meet(self, report: Report, time: float) -> None:
+        """Take in a sender that is new, or tells of other vehicles than before, if there is room."""
         told = set(report.vehicles) - {self.vehicle}
-        self.belief.drop(told)
-        if len(self.belief.members) + len(told) > self.most_members:
+        forgotten = room_for(self.belief, told, self.most_members, time)
+        if forgotten is None:
             return
+        self.belief.drop(told | forgotten)
         numbers = [n for n, v in enumerate(report.vehicles) if v in told]
         index = errors_of(numbers)
         odometry = zip(report.odometry_turn, report.odometry_position, strict=True)
         poses = list(zip(report.vehicles, report.R, report.p, report.time.tolist(), odometry, strict=True))
-        self.belief.add([Member(*poses[n]) for n in numbers], report.P[np.ix_(index, index)])
+        self.belief.add([Member(*poses[n], seen=time) for n in numbers], report.P[np.ix_(index, index)])
         self.contacts[report.vehicles[0]] = Contact(report)
+        self._forget_contacts()
         self.leans_on |= report.leans_on | int(mask_of(told))
+
+    def _forget_contacts(self) -> None:
+        """Forget the senders that tell of vehicles which are not members; they may be met again."""
+        members = {member.vehicle for member in self.belief.members}
+        self.contacts = {
+            v: contact for v, contact in self.contacts.items() if members.issuperset(contact.last.vehicles)
+        }
 
     def _hear(self, contact: Contact, report: Report) -> None:
         """Carry a sender to its new message, and take in what it has learnt since the last one."""
@@ -225,17 +252,17 @@ class Robust:
         if dt < AT_ONCE:  # the same message again
             return
         contact.last = report
-        numbers = [self.belief.place(v) for v in report.vehicles]
+        members = [member.vehicle for member in self.belief.members]
+        places = [members.index(v) for v in report.vehicles]
         for n, R, p, time in zip(
-            numbers, report.odometry_turn, report.odometry_position, report.time.tolist(), strict=True
+            places, report.odometry_turn, report.odometry_position, report.time.tolist(), strict=True
         ):
-            if n is not None and n > 0:
+            if n > 0:
                 self.belief.follow(n, R, p, time, self.noise)
         was_trusted = contact.trusted
         self._judge(contact, report, dt)
         learnt = tracklet(last, report, self.noise) if was_trusted and contact.trusted else None
-        places = [n for n in numbers if n is not None]
-        if learnt is None or len(places) < len(numbers):
+        if learnt is None:
             return
         share = self._share(report)
         vector = learnt.about([self.belief.members[n] for n in places])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -72,3 +73,39 @@ def shifted(recording: Recording, by: np.ndarray) -> Recording:
 def first_tick(recording: Recording, vehicle: int = 0, k: int = 1) -> Tick:
     """What a vehicle senses at a tick, without messages."""
     return recording.tick(k, vehicle, {})
+
+
+@cache
+def crowd(horizon: float, leaders: int, gone: int, telling: bool = False) -> Recording:
+    """One vehicle that hears more leaders than it can keep; the first of them are out of its view from a third on.
+
+    Args:
+        horizon: s.
+        leaders: how many.
+        gone: how many go out of view.
+        telling: whether each leader hears the one before, so that its joint messages tell of others.
+    """
+    scenario = load_scenario("busy_intersection_tracking", {"horizon": horizon})
+    template, names = scenario.vehicles[0], [f"vehicle_{n + 1}" for n in range(leaders)]
+    landmarks = tuple(landmark.name for landmark in scenario.landmarks)
+    lead = dict.fromkeys(names, landmarks)
+    if telling:
+        lead |= {name: (*landmarks, before) for before, name in pairwise(names)}
+    places = [(-2.0 - 1.5 * n, -10.0 + 2.0 * n, 2.0) for n in range(leaders)] + [(-12.0, -16.0, 2.5)]
+    vehicles = tuple(
+        template.model_copy(
+            update={
+                "neighbours": neighbours,
+                "initial_pose": template.initial_pose.model_copy(update={"position": place}),
+                "motion": template.motion.model_copy(
+                    update={"linear": (0.0, 0.6 if place is places[-1] else 0.3, 0.0)}
+                ),
+            }
+        )
+        for neighbours, place in zip([*lead.values(), tuple(names)], places, strict=True)
+    )
+    recording = record(scenario.model_copy(update={"vehicles": vehicles}), 0)
+    visible = recording.visible.copy()
+    first = recording.landmarks.shape[1]
+    visible[recording.ticks // 3 :, leaders, first : first + gone] = False
+    return replace(recording, visible=visible, bearings=np.where(visible[..., None], recording.bearings, np.nan))
