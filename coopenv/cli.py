@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from coopenv.errors import CoopenvError
+from coopenv.errors import CoopenvError, DataWarning, OutputError
 
 UsageError: Any = typer.BadParameter.__base__
 """What typer raises for every mistake in the options; it has no public name."""
@@ -155,6 +155,7 @@ def record_command(
     overrides: Overrides = None,
     data: Annotated[Path | None, typer.Option(help="Folder of data sets (default: COOPENV_DATA).")] = None,
     variant: Annotated[str | None, typer.Option(help="Of a data set: landmarks, landmarks+robots, blind.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
 ) -> None:
     """Write what vehicles sense, tick by tick, to an MCAP file, which Foxglove opens and coopenv replays."""
     from coopenv.backends.mcap import check_target, write_recording
@@ -162,11 +163,19 @@ def record_command(
     from coopenv.runs.log import read_recorded, simulate
 
     check_target(out)
+    if out.exists() and not force:
+        raise OutputError(f"{out}: exists already; --force replaces it")
     parsed = parse_overrides(overrides)
     if is_recorded(environment):
         asked = {"--set": parsed, "--seed": seed, "--policy": policy if policy != "zero" else None}
-        recording = read_recorded(environment, data, variant, {name: value for name, value in asked.items() if value})
+        with warned():
+            recording = read_recorded(
+                environment, data, variant, {name: value for name, value in asked.items() if value}
+            )
     else:
+        for option, value in (("--data", data), ("--variant", variant)):
+            if value is not None:
+                raise CoopenvError(f"{option} {value}: is for recorded data, {environment} is simulated")
         recording = simulate(load(environment, parsed), seed, policy)
     write_recording(recording, out)
     console().print(
@@ -286,6 +295,7 @@ def bench_observers(
         request = request_of(
             source, observers, variants, seeds, steady_from, basin, data, parse_overrides(overrides), overrides or ()
         )
+        request.source.check()
     perform(request, find_engine(engine, jobs, address), out, printed, log)
 
 
@@ -304,13 +314,14 @@ def load(environment: str, overrides: dict[str, Any]) -> Any:
 
 @contextmanager
 def warned() -> Iterator[None]:
-    """Print the warnings of scenarios that are loaded meanwhile as one line each."""
+    """Print the warnings of scenarios and data that are loaded meanwhile as one line each."""
     from coopenv.scenario import ScenarioWarning
 
     with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", ScenarioWarning)
+        for category in (ScenarioWarning, DataWarning):
+            warnings.simplefilter("always", category)
         yield
-    for warning in (w for w in caught if issubclass(w.category, ScenarioWarning)):
+    for warning in (w for w in caught if issubclass(w.category, (ScenarioWarning, DataWarning))):
         print(f"warning: {warning.message}", file=sys.stderr)
 
 

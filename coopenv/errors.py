@@ -34,6 +34,10 @@ class DataError(CoopenvError):
     """A recorded file is not what it claims to be."""
 
 
+class DataWarning(UserWarning):
+    """A recorded file is what it claims to be, but says less than it should."""
+
+
 def checked_seed(seed: object) -> int:
     """Return a seed as an int.
 

@@ -17,6 +17,7 @@ from gymnasium.vector.utils import batch_space
 from coopenv.api.arrays import ArrayKind, Exchange
 from coopenv.api.engine import Engine
 from coopenv.api.layout import Field, action_space, flat_space
+from coopenv.backends.replay.source import is_recorded
 from coopenv.errors import CoopenvError, checked_seed, suggest
 from coopenv.scenario import Scenario, load_scenario
 
@@ -300,6 +301,8 @@ def make_vec(
     Raises:
         CoopenvError: any argument is not valid.
     """
+    if is_recorded(name_or_path):
+        raise CoopenvError(f"'{name_or_path}' is recorded, which is one world: replay it with parallel_env")
     return CooperativeVectorEnv(
         load_scenario(name_or_path, overrides),
         Path(str(name_or_path)).stem,

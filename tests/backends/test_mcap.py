@@ -253,7 +253,9 @@ def test_command_records_a_simulation(tmp_path: Path, capsys: pytest.CaptureFixt
     parked = simulated("urban_crossing", seed=3)
     assert read.scenario == parked.scenario
     assert not np.array_equal(read.truth.position[-1], parked.truth.position[-1])  # somebody drove
-    assert main([*arguments, "--out", str(path)]) == 0
+    assert main([*arguments, "--out", str(path)]) == 2
+    assert "exists already; --force replaces it" in capsys.readouterr().err
+    assert main([*arguments, "--force", "--out", str(path)]) == 0
     assert differences(read, read_recording(path)) == []
 
 
@@ -262,6 +264,10 @@ def test_command_records_robots(tmp_path: Path, capsys: pytest.CaptureFixture[st
     path, data = tmp_path / "robots.mcap", ["--data", str(tmp_path)]
     assert main(["record", "mrclam_6", *data, "--variant", "blind", "--out", str(path)]) == 0
     assert differences(recording_of(load_dataset("mrclam_6", tmp_path), "blind"), read_recording(path)) == []
+    assert not capsys.readouterr().err
+    (tmp_path / "MRCLAM_Dataset6" / "Robot5_Measurement.dat").write_text("")
+    assert main(["record", "mrclam_6", *data, "--force", "--out", str(path)]) == 0
+    assert capsys.readouterr().err == "warning: mrclam_6: no detections of robot 5\n"
 
 
 @pytest.mark.parametrize(
@@ -270,6 +276,8 @@ def test_command_records_robots(tmp_path: Path, capsys: pytest.CaptureFixture[st
         (["mrclam_6", "--seed", "2"], "--seed: is for a simulation, mrclam_6 is recorded"),
         (["mrclam_12", "--data", "."], "unknown data set 'mrclam_12' (did you mean"),
         (["mrclam_6", "--variant", "blnd", "--data", "."], "did you mean 'blind'"),
+        (["busy_intersection", "--variant", "blind"], "--variant blind: is for recorded data"),
+        (["busy_intersection", "--data", "."], "--data .: is for recorded data"),
         (["busy_intersectoin"], "did you mean 'busy_intersection'"),
         (["busy_intersection", "--out", "drive.bag"], "the name must end in .mcap"),
         (["busy_intersection", "--out", "none/drive.mcap"], "folder none does not exist"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from coopenv.backends.mrclam.dataset import Truth, make_dataset
 from coopenv.backends.mrclam.files import read_recording
 from coopenv.backends.mrclam.odometry import MAX_HOLD_S, HeldCommands
 from coopenv.backends.mrclam.variants import check_variant, frames_of
-from coopenv.errors import DataError
+from coopenv.errors import DataError, DataWarning
 from tests.backends.mrclam_files import LANDMARKS, write
 
 
@@ -91,3 +92,21 @@ def test_a_command_is_not_held_for_ever(dataset):
     np.testing.assert_allclose(held.heading(np.array([1.0, 5.0, 20.0])), [0.5, 0.5 * MAX_HOLD_S, 0.5 * MAX_HOLD_S])
     v, _ = held.commands(np.array([-1.0, 1.0, 5.0, 9.5, 20.0]))
     assert v.tolist() == [0.0, 0.2, 0.0, 0.1, 0.0]
+
+
+def test_what_is_of_no_use_is_told(tmp_path):
+    folder = write(tmp_path, seconds=6.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        load_dataset("mrclam_6", folder)
+    (folder / "Robot5_Measurement.dat").write_text("")
+    path = folder / "Robot2_Measurement.dat"
+    seen = sum(len(np.loadtxt(folder / f"Robot{robot}_Measurement.dat")) for robot in range(1, 5))
+    own = len(np.loadtxt(path))
+    table = np.loadtxt(path)
+    table[1:, 1] = 999
+    np.savetxt(path, table)
+    with pytest.warns(DataWarning) as caught:
+        load_dataset("mrclam_6", folder)
+    said = f"{own - 1} of {seen} detections left out, nobody carries their barcode"
+    assert [str(w.message) for w in caught] == [f"mrclam_6: no detections of robot 5; {said}"]

@@ -120,6 +120,32 @@ def test_binary_file(folder):
     assert "Robot1_Odometry.dat:" in message(folder)
 
 
+@pytest.mark.parametrize("file", ["Robot2_Odometry.dat", "Robot3_Groundtruth.dat"])
+@pytest.mark.parametrize("late", [1e300, ORIGIN + 1e4])
+def test_a_pause_of_hours_is_a_broken_time_stamp(folder, file, late):
+    lines = (folder / file).read_text().splitlines()
+    change(folder / file, len(lines), f"{late:.3f}" + lines[-1][lines[-1].index(" ") :] + "\n")
+    assert message(folder).startswith(f"{folder / file}:{len(lines)}: ")
+    assert "s after the row above, at most 3600" in message(folder)
+
+
+def test_a_record_of_days_is_in_other_units(folder):
+    path = folder / "Robot1_Odometry.dat"
+    table = np.loadtxt(path)
+    table[:, 0] = ORIGIN + 1e4 * (table[:, 0] - ORIGIN)
+    np.savetxt(path, table, fmt="%.6f")
+    line = 1 + int(np.argmax(table[:, 0] - table[0, 0] > 6 * 3600))
+    assert f"{path}:{line}: " in message(folder) and "s after the first row, at most 21600" in message(folder)
+
+
+def test_clocks_that_are_days_apart(folder):
+    path = folder / "Robot4_Odometry.dat"
+    table = np.loadtxt(path)
+    table[:, 0] += 86400.0
+    np.savetxt(path, table, fmt="%.6f")
+    assert f"{path}:1: 86400 s apart from Robot1_Odometry.dat" in message(folder)
+
+
 def test_unknown_barcodes_are_counted_and_left_out(folder):
     before = read_recording("mrclam_6", folder).robots[3]
     change(folder / "Robot4_Measurement.dat", 5, f"{ORIGIN + 1.04} 999 2.0 0.1\n")

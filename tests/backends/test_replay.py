@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 import warnings
 from dataclasses import replace
 from functools import cache
@@ -198,11 +199,18 @@ def test_names(data: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> N
     monkeypatch.delenv("COOPENV_DATA", raising=False)
     for arguments, why in (
         (("mrclam_6",), "mrclam_6: name its folder with --data DIR or COOPENV_DATA"),
+        (("mrclam_scene",), "unknown environment 'mrclam_scene'"),
         (("mrclam_66",), "unknown data set 'mrclam_66' .did you mean 'mrclam_6'"),
         ((tmp_path / "none.mcap",), "none.mcap: cannot be read"),
     ):
         with pytest.raises(CoopenvError, match=why):
             coopenv.parallel_env(*arguments)
+    for name in ("drive.mcap", "mrclam_6"):
+        with pytest.raises(CoopenvError, match=f"'{name}' is recorded.*parallel_env"):
+            coopenv.make_vec(name, num_worlds=2)
+    shutil.copy(Path(__file__).parents[2] / "envs" / "overtaking.toml", tmp_path / "mrclam_scene.toml")
+    monkeypatch.chdir(tmp_path)
+    assert coopenv.parallel_env("mrclam_scene.toml").possible_agents == ["vehicle_1", "vehicle_2"]
     for options, why in (
         ({"backend": "replay"}, "'busy_intersection' is no recording; known: FILE.mcap, mrclam_1 .. mrclam_9"),
         ({"backend": "reply"}, r"unknown backend 'reply' \(did you mean 'replay'\?\); known: simulated, replay"),

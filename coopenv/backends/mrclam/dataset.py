@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.backends.mrclam.files import Array, Recording, RobotRecord, Subjects, read_recording
+from coopenv.errors import DataWarning
 
 MAX_TRUTH_GAP_S = 0.5  # motion capture runs at 60 to 70 Hz; a longer pause is a robot out of its sight
 
@@ -116,7 +118,7 @@ def wrap(angle: Array) -> Array:
 
 
 def load_dataset(name: str, data: str | Path | None = None) -> Dataset:
-    """Read a sub-dataset and put it on a common clock.
+    """Read a sub-dataset and put it on a common clock, with a `DataWarning` of what of it is of no use.
 
     Args:
         name: `mrclam_1` .. `mrclam_9`.
@@ -125,7 +127,21 @@ def load_dataset(name: str, data: str | Path | None = None) -> Dataset:
     Raises:
         DataError: a folder, file or line is not what the format says.
     """
-    return make_dataset(read_recording(name, data))
+    dataset = make_dataset(read_recording(name, data))
+    if remark := remark_on(dataset):
+        warnings.warn(DataWarning(remark), stacklevel=2)
+    return dataset
+
+
+def remark_on(dataset: Dataset) -> str:
+    """Return, in one line, which robots saw nothing and how many detections were left out; empty where neither is."""
+    skipped = sum(robot.skipped for robot in dataset.robots)
+    used = sum(frame.subjects.size for robot in dataset.robots for frame in robot.frames)
+    blind = [str(robot.subject) for robot in dataset.robots if not robot.frames]
+    remarks = [f"no detections of robot {', '.join(blind)}"] if blind else []
+    if skipped:
+        remarks.append(f"{skipped} of {skipped + used} detections left out, nobody carries their barcode")
+    return f"{dataset.name}: {'; '.join(remarks)}" if remarks else ""
 
 
 def make_dataset(recording: Recording) -> Dataset:

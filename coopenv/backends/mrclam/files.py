@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -18,6 +18,11 @@ from coopenv.errors import DataError, suggest
 ROBOTS = (1, 2, 3, 4, 5)
 NAMES = tuple(f"mrclam_{number}" for number in range(1, 10))
 ENVIRONMENT_VARIABLE = "COOPENV_DATA"
+
+MAX_PAUSE_S = 3600.0
+"""Between two rows; more is a broken time stamp."""
+MAX_LENGTH_S = 6 * 3600.0
+"""Of a whole sub-dataset, whose clocks agree; the longest one takes 40 minutes."""
 
 Array = NDArray[np.float64]
 Subjects = NDArray[np.int64]
@@ -132,6 +137,7 @@ def read_recording(name: str, data: str | Path | None = None) -> Recording:
         barcode: who for barcode, who in barcodes.items() if who in ROBOTS or who in {m.subject for m in landmarks}
     }
     robots = tuple(_robot(folder, number, known) for number in ROBOTS)
+    _check_clocks(folder, robots)
     return Recording(name=name, folder=folder, barcodes=barcodes, landmarks=landmarks, robots=robots)
 
 
@@ -194,8 +200,22 @@ def _timed(path: Path, columns: int, least: int) -> Array:
     back = np.flatnonzero(np.diff(table[:, 0]) < 0)
     if back.size:
         row = int(back[0]) + 1
-        _fail(path, row, f"time runs backwards, {table[row, 0]:.3f} after {table[row - 1, 0]:.3f}")
+        _fail(path, row, f"time runs backwards, {table[row, 0]:.14g} after {table[row - 1, 0]:.14g}")
+    for before in np.flatnonzero(np.diff(table[:, 0]) > MAX_PAUSE_S).tolist():
+        pause = table[before + 1, 0] - table[before, 0]
+        _fail(path, before + 1, f"{pause:g} s after the row above, at most {MAX_PAUSE_S:g}")
+    for late in np.flatnonzero(table[:, 0] - table[:1, 0] > MAX_LENGTH_S).tolist():
+        _fail(path, late, f"{table[late, 0] - table[0, 0]:g} s after the first row, at most {MAX_LENGTH_S:g}")
     return table
+
+
+def _check_clocks(folder: Path, robots: Sequence[RobotRecord]) -> None:
+    begin = robots[0].odometry[0, 0]
+    for robot in robots:
+        apart = abs(robot.odometry[0, 0] - begin)
+        if apart > MAX_LENGTH_S:
+            why = f"{apart:g} s apart from Robot{robots[0].subject}_Odometry.dat, at most {MAX_LENGTH_S:g}"
+            _fail(folder / f"Robot{robot.subject}_Odometry.dat", 0, why)
 
 
 def _whole(path: Path, table: Array, columns: tuple[int, ...]) -> Subjects:

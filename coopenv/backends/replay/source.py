@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import cast
 
@@ -9,13 +10,13 @@ from coopenv.errors import DataError
 from coopenv.estimation.observers.recording import Recording
 
 SUFFIX = ".mcap"
-DATASETS = "mrclam"
+DATASETS = re.compile(r"mrclam_\d+")
 DEFAULT_VARIANT = "landmarks+robots"
 
 
 def is_recorded(name: str | Path) -> bool:
     """Return whether a name is that of a recording and not of an environment."""
-    return str(name).endswith(SUFFIX) or str(name).startswith(DATASETS)
+    return str(name).endswith(SUFFIX) or DATASETS.fullmatch(str(name)) is not None
 
 
 def open_recording(name: str | Path, data: str | Path | None = None, variant: str | None = None) -> Recording:

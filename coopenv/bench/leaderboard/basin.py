@@ -69,6 +69,10 @@ class Basin:
     by_vehicle: tuple[float, ...]
     settle_time_s: float
     """Median over the draws that converge of the time at which the last vehicle has settled."""
+    failed: int
+    """Draws in which the observer failed; they count as not converged."""
+    failure: str
+    """Who failed in the first of them, when and why; empty where there is none."""
 
 
 def draw_starts(task: BasinTask) -> list[Draw]:
@@ -146,6 +150,7 @@ def basins_of(environment: str, draws: Sequence[Draw]) -> list[Basin]:
     for name, own in groups.items():
         converged = np.array([draw.converged for draw in own])
         everybody = converged.all(axis=1)
+        failures = [draw.failure for draw in own if draw.failure]
         last = np.array([draw.settle_time.max() for draw in own])[everybody]
         basins.append(
             Basin(
@@ -156,9 +161,20 @@ def basins_of(environment: str, draws: Sequence[Draw]) -> list[Basin]:
                 interval=wilson_interval(int(everybody.sum()), len(own)),
                 by_vehicle=tuple(converged.mean(axis=0).tolist()),
                 settle_time_s=float(np.median(last)) if len(last) else float("nan"),
+                failed=len(failures),
+                failure=failures[0] if failures else "",
             )
         )
     return basins
+
+
+def basin_failures(basins: Sequence[Basin]) -> list[str]:
+    """Return one line per observer that failed from some of the initial estimates."""
+    return [
+        f"{basin.observer} (basin): failed in {basin.failed} of {basin.draws} draws, first {basin.failure}"
+        for basin in basins
+        if basin.failed
+    ]
 
 
 def by_angle(draws: Sequence[Draw]) -> list[tuple[int, int]]:
@@ -182,6 +198,7 @@ def plain_draws(draws: Sequence[Draw]) -> list[dict[str, Any]]:
             "settle_time_s": float(draw.settle_time[i]),
             "final_position_error_m": float(draw.end_position[i]),
             "final_orientation_error_deg": float(draw.end_orientation[i]),
+            "failure": draw.failure,
         }
         for draw in draws
         for i, vehicle in enumerate(draw.vehicles)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,11 +12,19 @@ from rich.console import Console
 from rich.table import Table
 
 from coopenv.bench.leaderboard import files
-from coopenv.bench.leaderboard.basin import Basin, Draw, basins_of, check_source, plain_draws, study_basin
+from coopenv.bench.leaderboard.basin import (
+    Basin,
+    Draw,
+    basin_failures,
+    basins_of,
+    check_source,
+    plain_draws,
+    study_basin,
+)
 from coopenv.bench.leaderboard.compare import Outcome, compare
 from coopenv.bench.leaderboard.engines import Engine
 from coopenv.bench.leaderboard.rows import Row
-from coopenv.bench.leaderboard.sources import Source, find_source, variants_of
+from coopenv.bench.leaderboard.sources import ALL, Source, find_source, variants_of
 from coopenv.bench.leaderboard.tables import (
     degradation_table,
     error_table,
@@ -28,7 +36,7 @@ from coopenv.bench.leaderboard.tables import (
 )
 from coopenv.estimation.metrics import json_ready
 from coopenv.estimation.observers.faults import FAULTS, NOMINAL
-from coopenv.estimation.observers.registry import available_names, find, missing, observer_names
+from coopenv.estimation.observers.registry import available_names, find, observer_names, obstacle
 from coopenv.runs.command import progress
 from coopenv.runs.output import prepare_folder
 
@@ -50,8 +58,8 @@ class Request:
     """Draws of initial estimates; 0: no study of basins."""
     options: tuple[str, ...] = ()
     """Further options that the result depends on."""
-    left_out: tuple[str, ...] = ()
-    """Observers that would have been compared, but for a module that is not installed."""
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    """Observers and variants that would have been compared, but for a reason that is told."""
 
     @property
     def command(self) -> str:
@@ -94,13 +102,16 @@ def request_of(
     names = names_of(observers) if observers else tuple(available_names(source.planar))
     for name in names:
         find(name)
-    left_out = () if observers else tuple(name for name in observer_names() if missing(name))
+    left_out = {} if observers else {name: obstacle(name) for name in observer_names()}
     if basin:
         check_source(source)
     options = [word for assignment in assignments for word in ("--set", assignment)]
     options += [] if data is None else ["--data", str(data)]
     wanted = variants_of(source, variants)
-    return Request(source, text, names, wanted, seeds, steady_from, basin, tuple(options), left_out)
+    if variants is not None and variants.strip() == ALL:
+        left_out |= {name: source.obstacle(name) for name in source.variants}
+    told = {name: reason for name, reason in left_out.items() if reason}
+    return Request(source, text, names, wanted, seeds, steady_from, basin, tuple(options), told)
 
 
 def names_of(text: str) -> tuple[str, ...]:
@@ -124,10 +135,8 @@ def perform(request: Request, engine: Engine, out: Path | None, printed: Console
     names = (*files.FILES, files.BASIN_FILE) if request.basin else files.FILES
     if out is not None:
         prepare_folder(out, names)  # before the work, not after it
-    for name in request.left_out:
-        log.print(
-            f'left out: {name} (needs {missing(name)}: pip install "coopenv[bench]")', soft_wrap=True, markup=False
-        )
+    for name, reason in request.left_out.items():
+        log.print(f"left out: {name} ({reason})", soft_wrap=True, markup=False)
     outcome = _with_progress(
         log,
         f"{len(request.observers)} observers, {len(request.variants)} variants, {request.seeds} seeds",
@@ -176,18 +185,19 @@ def print_tables(rows: Sequence[Row], basins: Sequence[Basin], printed: Console)
     if basins:
         printed.print()
         printed.print(_basin_table(basins))
-    for line in failures(rows):
+    for line in (*failures(rows), *basin_failures(basins)):
         printed.print(line, soft_wrap=True)
 
 
 def _basin_table(basins: Sequence[Basin]) -> Table:
-    table = new_table("basin", ["draws", "all vehicles\nconverge", "95 %", "settled [s]\nmedian"])
+    table = new_table("basin", ["draws", "failed", "all vehicles\nconverge", "95 %", "settled [s]\nmedian"])
     for basin in basins:
         low, high = (100 * end for end in basin.interval)
         settled = basin.settle_time_s
         table.add_row(
             basin.observer,
             str(basin.draws),
+            str(basin.failed),
             f"{100 * basin.converged_fraction:.1f} %",
             f"{low:.1f}..{high:.1f} %",
             f"{settled:.1f}" if settled == settled else "-",

@@ -11,7 +11,7 @@ import numpy as np
 
 from coopenv.bench.leaderboard.basin import Basin
 from coopenv.bench.leaderboard.rows import Row
-from coopenv.bench.leaderboard.tables import BOUNDS, by_observer, degradation, failures, mean_rmse
+from coopenv.bench.leaderboard.tables import BOUNDS, by_observer, degradation, mean_rmse
 
 _NAMES = ("environment", "variant", "observer", "vehicle")
 _LEAST_SHOWN = 1e-3
@@ -80,6 +80,7 @@ def basin_table(basins: Sequence[Basin]) -> str:
             [
                 escape(b.observer),
                 str(b.draws),
+                str(b.failed),
                 f"{100 * b.converged_fraction:.1f} %",
                 f"{100 * b.interval.low:.1f}–{100 * b.interval.high:.1f} %",
                 f"{', '.join(f'{100 * share:.0f}' for share in b.by_vehicle)} %",
@@ -89,14 +90,21 @@ def basin_table(basins: Sequence[Basin]) -> str:
         for b in basins
     ]
     return _table(
-        ["observer", "draws", "all vehicles converge", "95 % interval", "by vehicle", "last one settles, median [s]"],
+        [
+            "observer",
+            "draws",
+            "failed",
+            "all vehicles converge",
+            "95 % interval",
+            "by vehicle",
+            "last one settles, median [s]",
+        ],
         lines,
     )
 
 
-def failure_list(rows: Sequence[Row]) -> str:
-    """Return who failed, when and why; nothing where nobody did."""
-    lines = failures(rows)
+def failure_list(lines: Sequence[str]) -> str:
+    """Return who failed, when and why, one line each; nothing where nobody did."""
     return "<ul class='failure'>" + "".join(f"<li>{escape(line)}</li>" for line in lines) + "</ul>" if lines else ""
 
 

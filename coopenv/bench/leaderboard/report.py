@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 from matplotlib.figure import Figure
 
 from coopenv.bench.leaderboard import html_tables as tables
-from coopenv.bench.leaderboard.basin import RADIUS, Basin, Draw
+from coopenv.bench.leaderboard.basin import RADIUS, Basin, Draw, basin_failures
 from coopenv.bench.leaderboard.basin_figure import basin_figure
 from coopenv.bench.leaderboard.figures import error_figure, nees_figure
 from coopenv.bench.leaderboard.judge import Sample
 from coopenv.bench.leaderboard.rows import Row
 from coopenv.bench.leaderboard.score_figures import cost_figure, variant_figure
-from coopenv.bench.leaderboard.tables import honest_line
+from coopenv.bench.leaderboard.tables import failures, honest_line
 from coopenv.estimation.observers.faults import NOMINAL
 from coopenv.runs.output import writing
 from coopenv.viz.style import DPI
@@ -61,8 +61,8 @@ $body
 
 BOUNDS_NOTE = (
     "Posterior Cramér-Rao bounds: joint over all vehicles, joint over a vehicle and its ancestors (all whose messages "
-    "can reach it), and alone with neighbours' poses known. The paper's bearing noise is smaller off the optical axis than "
-    "they assume, so errors may lie below them there. "
+    "can reach it), and alone with neighbours' poses known. The paper's bearing noise is smaller off the optical axis "
+    "than they assume, so errors may lie below them there. "
 )
 
 
@@ -126,7 +126,7 @@ def _results(report: Report) -> list[Section]:
         bounds = BOUNDS_NOTE if math.isfinite(own[0].bound_m) else ""
         notes = _note(f"Position RMSE per vehicle in the steady state. {bounds}{honest_line(own)}")
         sections.append(Section(f"Leaderboard ({variant})", tables.overview(own) + notes))
-    sections[0] = Section(sections[0].heading, sections[0].body + tables.failure_list(report.rows))
+    sections[0] = Section(sections[0].heading, sections[0].body + tables.failure_list(failures(report.rows)))
     if (heat := variant_figure(report.rows)) is not None:
         sections.append(Section("Variants", _variants(report, heat)))
     if (cost := cost_figure([row for row in report.rows if row.variant == first])) is not None:
@@ -137,7 +137,8 @@ def _results(report: Report) -> list[Section]:
             f"Attitude uniform over SO(3), position uniform in a ball of {RADIUS:g} m. A draw converges if every "
             "vehicle ends below 0.1 m and 1 deg; 95 % intervals after Wilson."
         )
-        body = tables.basin_table(report.basins) + _figure("basin", caption, basin_figure(report.draws))
+        failed = tables.failure_list(basin_failures(report.basins))
+        body = tables.basin_table(report.basins) + failed + _figure("basin", caption, basin_figure(report.draws))
         sections.append(Section("Basin of attraction", body))
     return sections
 

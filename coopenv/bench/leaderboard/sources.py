@@ -5,18 +5,24 @@ A source is small and picklable, so that a worker process makes the record itsel
 
 from __future__ import annotations
 
+import math
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
-from coopenv.errors import CoopenvError, suggest
+from coopenv.errors import CoopenvError, DataWarning, suggest
 from coopenv.estimation.metrics import STEADY_SHARE, steady_start
-from coopenv.estimation.observers.faults import FAULTS, NOMINAL, Lie
+from coopenv.estimation.observers.faults import FAULTS, NOMINAL, Lie, followers
 from coopenv.estimation.observers.runner import Recording, record
 from coopenv.scenario import Scenario, load_scenario
+from coopenv.scenario.checks import neighbour_sets
 
+ALL = "all"
+"""Asks for every variant that the source can have."""
+NOBODY_FOLLOWS = "no vehicle has another one as its neighbour"
 LOG_SUFFIX = ".mcap"
 ROBOTS = re.compile(r"mrclam_\d+")
 
@@ -53,6 +59,18 @@ class Source(Protocol):
         """Return a record, and the lie that somebody tells on it."""
         ...
 
+    def obstacle(self, variant: str) -> str:
+        """Return why it cannot have one of the variants; empty where it can."""
+        ...
+
+    def check(self) -> None:
+        """Look at recorded data, so that errors and warnings come before the work.
+
+        Raises:
+            CoopenvError: they are not there or not well-formed.
+        """
+        ...
+
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
         """Return when the steady state starts, s; without a record only what is asked for is checked."""
         ...
@@ -72,6 +90,15 @@ class Simulated:
     def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
         """Return the world of a seed with a fault."""
         return FAULTS[variant].applied(record(self.scenario, seed), seed)
+
+    def obstacle(self, variant: str) -> str:
+        """Return why no vehicle can lie to another, where that is so."""
+        L = len(self.scenario.landmarks)
+        followed = any(target >= L for targets in neighbour_sets(self.scenario) for target in targets)
+        return NOBODY_FOLLOWS if FAULTS[variant].lies and not followed else ""
+
+    def check(self) -> None:
+        """Do nothing: the scenario has been checked."""
 
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
         """Return when the steady state starts, s.
@@ -109,11 +136,31 @@ class Robots:
         from coopenv.backends.mrclam.variants import VARIANTS
 
         known = next(name for name in VARIANTS if name == variant)
-        return recording_of(load_dataset(self.name, self.data), known), None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # `check` has told
+            return recording_of(load_dataset(self.name, self.data), known), None
+
+    def obstacle(self, variant: str) -> str:
+        """Return nothing: every sub-dataset has all variants."""
+        return ""
+
+    def check(self) -> None:
+        """Read the data once.
+
+        Raises:
+            CoopenvError: the data are not there or not well-formed.
+        """
+        from coopenv.backends.mrclam import load_dataset
+
+        load_dataset(self.name, self.data)
 
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
-        """Return when judging starts, s."""
-        return 0.0 if given is None else given
+        """Return when judging starts, s: as given, or at the start.
+
+        Raises:
+            CoopenvError: what was asked for does not lie within the record.
+        """
+        return 0.0 if given is None else _within(given, recording)
 
 
 @dataclass(frozen=True)
@@ -145,15 +192,42 @@ class LogFile:
 
         return FAULTS[variant].applied(read_recording(self.path), seed)
 
+    def obstacle(self, variant: str) -> str:
+        """Return why no vehicle can lie to another, where that is so.
+
+        Raises:
+            CoopenvError: the file is no record.
+        """
+        if not FAULTS[variant].lies:
+            return ""
+        recording, _ = self.recording(NOMINAL, 0)
+        return "" if any(followers(recording, i) for i in recording.order) else NOBODY_FOLLOWS
+
+    def check(self) -> None:
+        """Do nothing: `planar` has read the file."""
+
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
-        """Return when the steady state starts, s: recorded robots are judged from the start on."""
-        if given is not None or recording is None:
-            return given or 0.0
-        return 0.0 if _is_planar(recording) else STEADY_SHARE * float(recording.t[-1])
+        """Return when the steady state starts, s: recorded robots are judged from the start on.
+
+        Raises:
+            CoopenvError: what was asked for does not lie within the record.
+        """
+        if given is not None:
+            return _within(given, recording)
+        if recording is None or _is_planar(recording):
+            return 0.0
+        return STEADY_SHARE * float(recording.t[-1])
 
 
 def _is_planar(recording: Recording) -> bool:
     return all(setup.planar for setup in recording.setups)
+
+
+def _within(given: float, recording: Recording | None) -> float:
+    """Return a start of the steady state that lies within the record, as far as that is known."""
+    if not 0.0 <= given < math.inf:
+        raise CoopenvError(f"--steady-from {given:g} is not within the run")
+    return given if recording is None else steady_start(given, float(recording.t[-1]))
 
 
 def find_source(text: str, overrides: Mapping[str, Any] | None = None, data: Path | None = None) -> Source:
@@ -185,7 +259,7 @@ def variants_of(source: Source, asked: str | None) -> tuple[str, ...]:
 
     Args:
         source: which has them.
-        asked: names with commas between, `all`, or None for the usual ones.
+        asked: names with commas between, `all` that there can be, or None for the usual ones.
 
     Raises:
         CoopenvError: there is none of that name.
@@ -193,10 +267,10 @@ def variants_of(source: Source, asked: str | None) -> tuple[str, ...]:
     if asked is None:
         return source.usual
     names = tuple(dict.fromkeys(name.strip() for name in asked.split(",")))
-    if names == ("all",):
-        return tuple(source.variants)
+    if names == (ALL,):
+        return tuple(name for name in source.variants if not source.obstacle(name))
     for name in names:
         if name not in source.variants:
-            known = ", ".join((*source.variants, "all"))
+            known = ", ".join((*source.variants, ALL))
             raise CoopenvError(f"unknown variant '{name}'{suggest(name, list(source.variants))}; known: {known}")
     return names

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,25 +45,30 @@ class Sensed:
     due: bool  # whether the scenario's observer rate asks for a correction
 
     def tick(self, setup: Setup, messages: Mapping[int, Received]) -> Tick:
-        """Return what one vehicle senses, with the messages that it has."""
+        """Return what one vehicle senses, with the messages that it has; nobody can write to it."""
         i = setup.vehicle
         return Tick(
             index=self.index,
             time=self.index * self.dt,
             dt=self.dt,
-            rotation=self.rotation[i],
-            translation=self.translation[i],
-            velocity=self.velocity[i],
-            angular_velocity=self.angular_velocity[i],
-            targets=setup.targets,
-            bearings=self.bearings[i].take(setup.targets, axis=0),
-            valid=self.visible[i].take(setup.targets),
-            landmarks=self.landmarks,
+            rotation=_sealed(self.rotation[i]),
+            translation=_sealed(self.translation[i]),
+            velocity=_sealed(self.velocity[i]),
+            angular_velocity=_sealed(self.angular_velocity[i]),
+            targets=_sealed(setup.targets[:]),
+            bearings=_sealed(self.bearings[i].take(setup.targets, axis=0)),
+            valid=_sealed(self.visible[i].take(setup.targets)),
+            landmarks=_sealed(self.landmarks[:]),
             messages=messages,
-            lever_arm=setup.lever_arm,
+            lever_arm=_sealed(setup.lever_arm[:]),
             noise=setup.noise,
             due=self.due,
         )
+
+
+def _sealed(view: NDArray[Any]) -> NDArray[Any]:
+    view.setflags(write=False)
+    return view
 
 
 @dataclass(frozen=True)

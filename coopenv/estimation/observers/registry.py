@@ -5,6 +5,7 @@ A package offers its own under the entry point group `coopenv.observers`.
 
 from __future__ import annotations
 
+import re
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -42,15 +43,25 @@ IN_SPACE = {"p3p", "robust_joint"}
 """Members that are for all others: on a plane bearings to three points say more than a pose needs, and joint messages
 do not exist (`robust_joint` is `robust` there)."""
 
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
+
 _registered: dict[str, Factory] = {}
 
 
 def register(name: str, factory: Factory) -> None:
     """Make an observer known by name in this program.
 
+    Args:
+        name: letters, digits and `_.-`, a letter first, as scenarios and the command line take it.
+        factory: class, or function of a setup.
+
     Raises:
-        CoopenvError: the name is taken by another observer.
+        CoopenvError: it is no such name, taken by another observer, or the factory cannot be called.
     """
+    if not isinstance(name, str) or not NAME.fullmatch(name):
+        raise CoopenvError(f"an observer's name is a letter and then letters, digits or any of _.-, got {name!r}")
+    if not callable(factory):
+        raise CoopenvError(f"observer '{name}': expected a class or function, got {factory!r:.60}")
     if name in ZOO or _registered.get(name, factory) is not factory:
         raise CoopenvError(f"an observer named '{name}' exists already")
     _registered[name] = factory
@@ -71,14 +82,26 @@ def missing(name: str) -> str:
     return module if module and find_spec(module) is None else ""
 
 
+def obstacle(name: str) -> str:
+    """Return why a known observer cannot be used here, in one line; empty where it can."""
+    if module := missing(name):
+        return f'needs {module}: pip install "coopenv[bench]"'
+    if name not in ZOO and name not in _registered:
+        try:
+            find(name)
+        except CoopenvError as error:
+            return str(error)
+    return ""
+
+
 def available_names(planar: bool | None = None) -> list[str]:
-    """Return every known name whose modules are installed.
+    """Return every known name whose modules are installed and, where it is of another package, which can be loaded.
 
     Args:
         planar: only those that are meant for robots on a plane (True) or for vehicles in space (False).
     """
     strangers: set[str] = set() if planar is None else IN_SPACE if planar else ON_A_PLANE
-    return [name for name in observer_names() if not missing(name) and name not in strangers]
+    return [name for name in observer_names() if name not in strangers and not obstacle(name)]
 
 
 def find(name: str) -> Factory:
@@ -87,8 +110,8 @@ def find(name: str) -> Factory:
     Raises:
         CoopenvError: unknown name, or what it needs is not installed, or a package's observer cannot be loaded.
     """
-    if module := missing(name):
-        raise CoopenvError(f"observer '{name}' needs {module}: pip install \"coopenv[bench]\"")
+    if missing(name):
+        raise CoopenvError(f"observer '{name}' {obstacle(name)}")
     if name in ZOO:
         module, attribute = ZOO[name].split(":")
         return getattr(import_module(f"{__package__}.{module}"), attribute)
@@ -100,8 +123,9 @@ def find(name: str) -> Factory:
         raise CoopenvError(f"unknown observer '{name}'{suggest(name, names)}; known: {', '.join(names)}")
     try:
         return point.load()
-    except Exception as error:
-        raise CoopenvError(f"observer '{name}' ({point.value}) cannot be loaded: {error}") from error
+    except (Exception, SystemExit) as error:  # anybody's code
+        what = " ".join(f"{type(error).__name__}: {error}".split())  # on one line
+        raise CoopenvError(f"observer '{name}' ({point.value}) cannot be loaded: {what}") from error
 
 
 def is_joint(factory: Factory) -> bool:

@@ -30,9 +30,6 @@ __all__ = ["Recording", "Run", "Truth", "record", "run"]
 PLANAR_STATES = (2, 3, 4)
 """Yaw, x and y among (theta, rho): what NEES is about for vehicles on a plane, whose other errors are zero."""
 
-MOST_BENT = 1e-3
-"""By how much R R^T of an estimate may differ from I."""
-
 
 @dataclass(frozen=True)
 class Run:
@@ -60,15 +57,19 @@ class Run:
         return np.sqrt(self.mean(self.position_error**2, self.t >= after))
 
     def anees(self, after: float = 0.0) -> Array:
-        """Return (N,) the mean NEES from a time on divided by its dimension; 1 for an honest covariance."""
-        return self.mean(self.nees, self.t >= after) / self.nees_dof
+        """Return (N,) the mean NEES from a time on divided by its dimension; 1 for an honest covariance.
+
+        Ticks at which the observer states no covariance, such as the start, do not count; NaN where it never does.
+        """
+        silent = np.isnan(self.covariance).any(axis=(-1, -2)) & np.isfinite(self.position).all(axis=-1)
+        return self.mean(self.nees, (self.t >= after)[:, None] & ~silent) / self.nees_dof
 
     def mean(self, values: Array, when: NDArray[np.bool_]) -> Array:
-        """Return (N,) the mean of values (K, N) over some ticks (K,), those without a known truth left out.
+        """Return (N,) the mean of values (K, N) over some ticks (K,) or (K, N), those without a known truth left out.
 
         NaN where the observer failed, and where there is no such tick.
         """
-        counted = self.judged & when[:, None]
+        counted = self.judged & when.reshape(len(when), -1)
         count = counted.sum(axis=0)
         return np.where(count > 0, np.where(counted, values, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
 
@@ -190,7 +191,6 @@ class _Log:
     def result(self, team: Team) -> Run:
         """Compare with the truth, where it is known."""
         r, coordinates = self.recording, team.coordinates or Coordinates.LEFT
-        self.failure = self.failure or self._bent()
         judged = r.truth.known
         known = judged & np.isfinite(self.position[..., 0])
         position_error, orientation_error, nees = (np.full(known.shape, np.nan) for _ in range(3))
@@ -224,15 +224,6 @@ class _Log:
             microseconds_per_update=np.array(micro),
             failure=self.failure,
         )
-
-    def _bent(self) -> str:
-        """Return whose estimate is no rotation first, and when; empty where there is none."""
-        residual = np.abs(self.rotation @ np.swapaxes(self.rotation, -1, -2) - np.eye(3)).max(axis=(-1, -2))
-        bent = np.argwhere(residual > MOST_BENT)
-        if not len(bent):
-            return ""
-        k, i = bent[0]
-        return f"of {self.recording.setups[i].name} at {k * self.recording.dt:.3f} s: rotation is not orthogonal"
 
 
 def _solve(P: Array, e: Array) -> Array:

@@ -8,8 +8,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from math import isfinite
-from operator import index
 from time import perf_counter
 from typing import Any, NamedTuple, Protocol
 
@@ -27,6 +25,7 @@ from coopenv.estimation.observers.base import (
     Observer,
     Received,
 )
+from coopenv.estimation.observers.checks import check_estimate, check_message
 from coopenv.estimation.observers.recording import Briefing, Sensed
 from coopenv.estimation.observers.registry import is_joint
 
@@ -104,20 +103,33 @@ class Mail:
                 received[target] = Received(heard[sender][1], age)
         return received
 
-
-def is_finite(values: Array) -> bool:
-    """Return whether every one of some numbers is finite; a sum of squares tells it sooner, unless that overflows."""
-    return isfinite(abs(np.vdot(values, values))) or bool(np.isfinite(values).all())
+    def seal(self) -> None:
+        """Keep receivers from writing to messages: all hear the same arrays, and copies of arrays are writable."""
+        for sent in self.sent:
+            for message in sent.values():
+                _sealed(message)
+        for heard in self.heard:
+            for _, message in heard.values():
+                _sealed(message)
 
 
 def _copied(message: Message) -> Message:
-    """Return a copy that the sender can no longer change."""
-    return Message(
-        position=_floats(message.position),
-        rotation=_floats(message.rotation),
-        covariance=_floats(message.covariance),
-        extra={name: np.array(value) for name, value in message.extra.items()},
+    """Return a copy that nobody can change, the sender included."""
+    return _sealed(
+        Message(
+            position=_floats(message.position),
+            rotation=_floats(message.rotation),
+            covariance=_floats(message.covariance),
+            extra={name: np.array(value) for name, value in message.extra.items()},
+        )
     )
+
+
+def _sealed(message: Message) -> Message:
+    for array in (message.position, message.rotation, message.covariance, *message.extra.values()):
+        if array is not None:
+            array.setflags(write=False)
+    return message
 
 
 def _floats(value: Array | None) -> Array | None:
@@ -155,7 +167,9 @@ class Team:
             with self._blame(0, i):
                 self.observers.append(self.factory(setup))
                 self.observers[i].reset(poses[i], covariances[i])
-                self.mail.post(i, 0, self.observers[i].message())
+                message = self.observers[i].message()
+                check_message(message)
+                self.mail.post(i, 0, message)
 
     def update(self, vehicle: int, sensed: Sensed, inbox_tick: ArrayLike) -> Answer:
         """Let one vehicle's observer take a tick; vehicles come in the order of the briefing.
@@ -178,6 +192,7 @@ class Team:
             elapsed = perf_counter() - begin
             self._check(estimate)
             if message is not None:
+                check_message(message)
                 if self.tamper is not None and self.tamper.applies(vehicle, tick.time):
                     message = self.tamper.told(observer, message)
                 self.mail.post(vehicle, k, message)
@@ -198,20 +213,12 @@ class Team:
             elapsed = (perf_counter() - begin) / len(setups)
             for i, (estimate, message) in enumerate(zip(estimates, messages, strict=True)):
                 self._check(estimate)
+                check_message(message)
                 self.mail.count(i, message)
         return [Answer(estimate, elapsed) for estimate in estimates]
 
     def _check(self, estimate: Estimate) -> None:
-        fields = [("rotation", estimate.rotation, (3, 3)), ("position", estimate.position, (3,))]
-        if estimate.covariance is not None:
-            fields.append(("covariance", estimate.covariance, (6, 6)))
-        for name, value, shape in fields:
-            if np.shape(value) != shape or not is_finite(value):
-                raise CoopenvError(f"{name} is not a finite array of shape {shape}")
-            if np.iscomplexobj(value):
-                raise CoopenvError(f"{name} is complex")
-        if estimate.nis is not None and not (isfinite(estimate.nis) and index(estimate.nis_dof) >= 0):
-            raise CoopenvError("nis is not finite, or nis_dof negative")
+        check_estimate(estimate)
         self.coordinates = self.coordinates or estimate.coordinates
         if estimate.coordinates is not self.coordinates:
             raise CoopenvError("error coordinates must stay the same")
@@ -235,11 +242,13 @@ class Team:
         try:
             return copy.deepcopy({name: value for name, value in vars(self).items() if name not in _FIXED})
         except Exception as error:
-            raise CoopenvError(f"the observers' state cannot be copied: {type(error).__name__}: {error}") from error
+            what = " ".join(f"{type(error).__name__}: {error}".split())  # on one line
+            raise CoopenvError(f"the observers' state cannot be copied: {what}") from error
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go back to what `get_state` returned; that stays unchanged."""
         vars(self).update(copy.deepcopy(state))
+        self.mail.seal()
 
 
 _FIXED = ("factory", "briefing", "tamper", "joint")

@@ -2,13 +2,29 @@
 
 from __future__ import annotations
 
+from io import StringIO
+
 import numpy as np
 import pytest
+from rich.console import Console
 
 from coopenv.bench.leaderboard import find_source
-from coopenv.bench.leaderboard.basin import Draw, basins_of, by_angle, plain_draws, study_basin
+from coopenv.bench.leaderboard.basin import (
+    BasinTask,
+    Draw,
+    basin_failures,
+    basins_of,
+    by_angle,
+    draw_starts,
+    plain_draws,
+    study_basin,
+)
+from coopenv.bench.leaderboard.command import print_tables
 from coopenv.bench.leaderboard.engines import Local
+from coopenv.bench.leaderboard.html_tables import basin_table
 from coopenv.errors import CoopenvError
+from coopenv.estimation.observers import Estimate, Tick, find
+from coopenv.estimation.observers.dead_reckoning import DeadReckoning
 
 
 def draw(number: int, angles: list[float], ends: list[float], settled: float) -> Draw:
@@ -38,6 +54,35 @@ def test_a_draw_converges_when_every_vehicle_does() -> None:
 def test_a_failed_run_does_not_converge() -> None:
     (basin,) = basins_of("here", [draw(0, [10, 10], [np.nan, np.nan], np.nan)])
     assert basin.converged_fraction == 0.0 and np.isnan(basin.settle_time_s)
+
+
+class RaisesUpsideDown(DeadReckoning):
+    """Fails from wide starts only."""
+
+    def update(self, tick: Tick) -> Estimate:
+        estimate = super().update(tick)
+        return 1 / 0 if estimate.rotation[2, 2] < 0 else estimate  # type: ignore[return-value]
+
+
+def test_failures_are_counted_and_told() -> None:
+    factories = {"raises": RaisesUpsideDown, "mekf": find("mekf")}
+    draws = draw_starts(BasinTask(find_source("overtaking", {"horizon": 0.1}), range(6), factories))
+    raises, mekf = basins_of("here", draws)
+    failures = [draw.failure for draw in draws if draw.failure]
+    assert 0 < raises.failed == len(failures) < 6 and raises.failure == failures[0]
+    assert (mekf.failed, mekf.failure) == (0, "")
+    (line,) = basin_failures([raises, mekf])
+    assert line.startswith(f"raises (basin): failed in {raises.failed} of 6 draws, first of vehicle_")
+    assert "ZeroDivisionError" in line
+    by_observer = {
+        name: [row["failure"] for row in plain_draws(draws) if row["observer"] == name] for name in factories
+    }
+    assert {*by_observer["mekf"]} == {""} and sum(map(bool, by_observer["raises"])) == 2 * raises.failed
+    printed = StringIO()
+    print_tables([], [raises, mekf], Console(file=printed, width=80))
+    assert line in printed.getvalue()
+    assert printed.getvalue().splitlines()[4].split()[:3] == ["raises", "6", str(raises.failed)]
+    assert f"<td>6</td><td>{raises.failed}</td>" in basin_table([raises])
 
 
 def test_draws_are_reproducible() -> None:

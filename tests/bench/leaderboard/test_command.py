@@ -8,6 +8,7 @@ import json
 import re
 from dataclasses import fields, replace
 from html.parser import HTMLParser
+from importlib.metadata import EntryPoint
 from io import StringIO
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from coopenv.bench.leaderboard.rows import Row
 from coopenv.cli import main
 from coopenv.estimation.observers import registry
 from coopenv.estimation.observers.faults import FAULTS
+from tests.backends import mrclam_files
 from tests.bench.leaderboard.test_compare import Raises
 
 REQUIRED = {
@@ -154,12 +156,46 @@ def test_large_numbers_fit_as_well() -> None:
         (["overtaking", "--variants", "blind"], "known: nominal"),
         (["overtaking", "--seeds", "0"], "'--seeds'"),
         (["overtaking", "--observers", "mekf", "--steady-from", "1000"], "not within the run"),
+        (["crossing_path", "--observers", "mekf", "--variants", "lying_neighbour"], "none can lie to another"),
     ],
 )
 def test_mistakes_have_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "observers", *arguments]) == 2
     error = capsys.readouterr().err
     assert said in error and len(error.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("start", ["nan", "-5", "99999", "inf"])
+def test_the_steady_state_of_recorded_robots_lies_within_the_record(
+    start: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mrclam_files.write(tmp_path, seconds=6.0)
+    words = ["bench", "observers", "mrclam_6", "--data", str(tmp_path), "--observers", "mekf", "--jobs", "1"]
+    assert main([*words, "--steady-from", start]) == 2
+    assert "not within the run" in capsys.readouterr().err
+
+
+def test_data_of_no_use_are_told_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (mrclam_files.write(tmp_path, seconds=6.0) / "Robot5_Measurement.dat").write_text("")
+    words = ["bench", "observers", "mrclam_6", "--data", str(tmp_path), "--observers", "mekf,dead_reckoning"]
+    assert main([*words, "--jobs", "1"]) == 0
+    assert capsys.readouterr().err.count("warning: mrclam_6: no detections of robot 5\n") == 1
+
+
+def test_what_cannot_be_compared_is_left_out_with_its_reason(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A variant that a single vehicle cannot have, and a package's observer that cannot be loaded."""
+    monkeypatch.setattr(registry, "entry_points", lambda group: [EntryPoint("broken", "no_such_module:Thing", group)])
+    short = ["--set", "horizon=0.3", "--seeds", "1", "--jobs", "1"]
+    assert main(["bench", "observers", "crossing_path", "--variants", "all", *short]) == 0
+    told = capsys.readouterr()
+    left_out = {line.split()[2]: line for line in told.err.splitlines() if line.startswith("left out: ")}
+    assert "no vehicle has another one as its neighbour" in left_out["lying_neighbour"]
+    assert "no_such_module" in left_out["broken"]
+    assert "nominal" in told.out and "lying" not in told.out and "mekf" in told.out and "broken" not in told.out
+    assert main(["bench", "observers", "crossing_path", "--observers", "mekf,broken", *short]) == 2
+    assert "'broken' (no_such_module:Thing) cannot be loaded" in capsys.readouterr().err
 
 
 def test_a_folder_that_cannot_be_written_is_told_before_the_work(

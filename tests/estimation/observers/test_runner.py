@@ -29,7 +29,7 @@ from coopenv.estimation.observers import (
     register,
     run,
 )
-from coopenv.estimation.observers.team import is_finite
+from coopenv.estimation.observers.team import Team
 from coopenv.scenario import load_scenario
 from tests.estimation.observers.batch import small_errors
 
@@ -180,7 +180,8 @@ def test_failures_end_in_a_word_not_in_a_crash() -> None:
         (lambda e: replace(e, position=e.position[None]), "position is not a finite array of shape (3,)"),
         (lambda e: replace(e, position=1j * e.position), "position is complex"),
         (lambda e: replace(e, covariance=np.full((6, 6), np.inf)), "covariance is not a finite array"),
-        (lambda e: replace(e, rotation=np.ones((3, 3))), "rotation is not orthogonal"),
+        (lambda e: replace(e, rotation=np.zeros((3, 3))), "rotation is not orthogonal"),
+        (lambda e: replace(e, covariance=-np.eye(6)), "covariance is not positive semidefinite"),
         (lambda e: replace(e, nis=float("nan")), "nis"),
         (lambda e: replace(e, nis="small", nis_dof=2), "TypeError"),
     ],
@@ -192,10 +193,6 @@ def test_what_is_no_estimate_is_told_in_one_line(change: Any, said: str) -> None
 
     failure = run(Odd, recording()).failure
     assert "of vehicle_1 at 0.017 s" in failure and said in failure and "\n" not in failure
-
-
-def test_large_numbers_are_finite() -> None:
-    assert is_finite(np.array([1e200, -1e300])) and not is_finite(np.array([1e200, np.inf]))
 
 
 def test_a_sent_message_does_not_change_any_more() -> None:
@@ -214,13 +211,71 @@ def test_a_sent_message_does_not_change_any_more() -> None:
     assert late[0].messages[3].message.position[0] == 17.0
 
 
-def test_what_is_recorded_cannot_be_written_to() -> None:
+def test_what_is_no_message_is_told_in_one_line() -> None:
+    class Mute(Probe):
+        def message(self) -> Message:
+            return Message(position=self.p * (np.nan if self.index == 6 else 1.0))
+
+    assert run(Mute, recording()).failure.endswith(
+        "at 0.100 s: CoopenvError: message: position is not a finite array of shape (3,)"
+    )
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "rotation",
+        "translation",
+        "velocity",
+        "angular_velocity",
+        "targets",
+        "bearings",
+        "valid",
+        "landmarks",
+        "lever_arm",
+    ],
+)
+def test_what_is_sensed_cannot_be_written_to(name: str) -> None:
     class Vandal(Probe):
         def update(self, tick: Tick) -> Estimate:
-            tick.translation[:] = 0.0
+            getattr(tick, name)[:] = 0
             return super().update(tick)
 
     assert "read-only" in run(Vandal, recording()).failure
+
+
+@pytest.mark.parametrize("restored", [False, True])
+def test_what_all_receivers_hear_none_can_write_to(restored: bool) -> None:
+    made = recording()
+    team = Team(Probe, made.briefing)
+    team.start(made.start_rotation, made.start_position)
+    sensed = made.at(1)
+    for i in made.order:
+        team.update(i, sensed, made.inbox_tick[1, i])
+    if restored:
+        team.set_state(team.get_state())
+    heard = [r.message for i in made.order for r in team.mail.inbox(1, i, made.inbox_tick[1, i]).values()]
+    assert heard
+    for message in heard:
+        assert message.position is not None and not message.position.flags.writeable
+        assert not message.extra["index"].flags.writeable
+
+
+def test_the_mean_nees_is_over_the_ticks_with_a_covariance() -> None:
+    class Sometimes(Probe):
+        def update(self, tick: Tick) -> Estimate:
+            estimate = super().update(tick)
+            return replace(estimate, covariance=np.eye(6)) if tick.index % 3 == 0 else estimate
+
+    class Breaks(Sometimes):
+        def update(self, tick: Tick) -> Estimate:
+            return 1 / 0 if tick.index == 40 else super().update(tick)
+
+    result = run(Sometimes, recording())
+    assert_allclose(result.anees(), result.nees[3::3].mean(axis=0) / 6)
+    assert np.isfinite(run("mekf", recording()).anees()).all()
+    assert np.isnan(run(Probe, recording()).anees()).all()
+    assert np.isnan(run(Breaks, recording()).anees()).all()
 
 
 def test_errors_in_every_coordinates_are_about_the_same_thing() -> None:
@@ -264,6 +319,12 @@ def test_registry(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("mine", "riccati"):
         with pytest.raises(CoopenvError, match="exists already"):
             register(name, Message)
+    for odd in (5, "", "a,b", "a b", "all\n"):
+        with pytest.raises(CoopenvError, match="an observer's name is"):
+            register(odd, Probe)  # type: ignore[arg-type]
+    with pytest.raises(CoopenvError, match="'x': expected a class or function, got 3"):
+        register("x", 3)
+    assert "x" not in observer_names()
 
 
 def test_observers_of_installed_packages(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -277,6 +338,9 @@ def test_observers_of_installed_packages(monkeypatch: pytest.MonkeyPatch) -> Non
     assert find("theirs") is Probe
     with pytest.raises(CoopenvError, match=r"'broken'.*cannot be loaded.*no_such_module"):
         find("broken")
+    assert "broken" in observer_names() and "broken" not in registry.available_names()
+    assert "theirs" in registry.available_names() and not registry.obstacle("theirs")
+    assert "no_such_module" in registry.obstacle("broken") and "\n" not in registry.obstacle("broken")
 
 
 def test_the_example_is_better_than_odometry(

@@ -1,0 +1,78 @@
+"""What is no estimate or no message is refused in one line that names the field."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from coopenv import CoopenvError
+from coopenv.estimation.observers import Estimate, Message
+from coopenv.estimation.observers.checks import check_estimate, check_message, is_finite
+
+POSE: dict[str, Any] = {"rotation": np.eye(3), "position": np.zeros(3)}
+LOPSIDED = np.eye(6) + np.eye(6, k=1) * 1e-3
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"rotation": np.zeros((3, 3))}, "rotation is not orthogonal"),
+        ({"rotation": np.eye(3) * (1 + 1e-5)}, "rotation is not orthogonal"),
+        ({"rotation": np.eye(3) + np.eye(3, k=1) * 1e-5}, "rotation is not orthogonal"),
+        ({"rotation": -np.eye(3)}, "rotation is a reflection"),
+        ({"rotation": np.eye(3).astype(str)}, "rotation is not a finite array"),
+        ({"position": [1.0, 2.0]}, r"position is not a finite array of shape \(3,\)"),
+        ({"position": np.zeros(3, complex)}, "position is complex"),
+        ({"covariance": -np.eye(6)}, "covariance is not positive semidefinite"),
+        ({"covariance": np.diag([1.0, 1, 1, 1, 1, -1e-6])}, "covariance is not positive semidefinite"),
+        ({"covariance": LOPSIDED}, "covariance is not symmetric"),
+        ({"covariance": LOPSIDED.T}, "covariance is not symmetric"),
+        ({"covariance": np.full((6, 6), np.nan)}, "covariance is not a finite array"),
+        ({"covariance": np.eye(3)}, r"covariance is not a finite array of shape \(6, 6\)"),
+        ({"nis": float("nan"), "nis_dof": 2}, "nis is not finite"),
+        ({"nis": 1.0, "nis_dof": -2}, "nis_dof negative"),
+    ],
+)
+def test_what_is_no_estimate(fields: dict[str, Any], said: str) -> None:
+    with pytest.raises(CoopenvError, match=said):
+        check_estimate(Estimate(**{**POSE, **fields}))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 6), st.floats(-8.0, 8.0))
+def test_rotations_and_covariances_of_any_rank_and_size_are_estimates(seed: int, rank: int, size: float) -> None:
+    generator = np.random.default_rng(seed)
+    root = 10.0**size * generator.standard_normal((6, rank))
+    R = Rotation.random(random_state=generator).as_matrix()
+    check_estimate(Estimate(R, generator.standard_normal(3), root @ root.T))
+    check_estimate(Estimate(R.astype(np.float32), [1, 2, 3]))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"position": np.array([0.0, np.nan, 0.0])}, "message: position is not a finite array"),
+        ({"position": np.zeros(2)}, r"message: position .* of shape \(3,\)"),
+        ({"position": np.zeros(3, complex)}, "message: position is complex"),
+        ({"rotation": np.zeros(4)}, r"message: rotation .* of shape \(3, 3\)"),
+        ({"covariance": np.eye(4)}, r"message: covariance .* of shape \(3, 3\) or \(6, 6\)"),
+        ({"extra": {"me": np.array([object()])}}, "message: extra 'me' is no array of numbers"),
+    ],
+)
+def test_what_is_no_message(fields: dict[str, Any], said: str) -> None:
+    with pytest.raises(CoopenvError, match=said):
+        check_message(Message(**fields))
+
+
+def test_messages_of_both_sizes_and_any_numbers() -> None:
+    check_message(Message())
+    check_message(Message(np.zeros(3), np.eye(3), np.eye(3), {"ids": np.array([1, 2]), "late": np.array(np.nan)}))
+    check_message(Message(np.zeros(3, np.float32), covariance=np.eye(6)))
+
+
+def test_large_numbers_are_finite() -> None:
+    assert is_finite(np.array([1e200, -1e300])) and not is_finite(np.array([1e200, np.inf]))
