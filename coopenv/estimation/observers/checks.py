@@ -60,14 +60,15 @@ def check_message(message: Message) -> None:
 
 def is_finite(values: NDArray[Any]) -> bool:
     """Return whether every one of some numbers is finite; a sum of squares tells it sooner, unless that overflows."""
-    return isfinite(abs(np.vdot(values, values))) or bool(np.isfinite(values).all())
+    return isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all())
 
 
 def _check_array(name: str, value: ArrayLike, *shapes: tuple[int, ...]) -> None:
     array = np.asarray(value)
-    if array.dtype.kind == "c":
+    kind = array.dtype.kind
+    if kind == "c":
         raise CoopenvError(f"{name} is complex")
-    if array.shape not in shapes or array.dtype.kind not in "iuf" or not is_finite(array):
+    if array.shape not in shapes or kind not in "iuf" or not is_finite(array):
         raise CoopenvError(f"{name} is not a finite array of shape {' or '.join(map(str, shapes))}")
 
 

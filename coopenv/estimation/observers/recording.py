@@ -31,7 +31,7 @@ class Briefing:
 
 @dataclass(frozen=True)
 class Sensed:
-    """What N vehicles sense at one tick; T targets, of which the first L are landmarks."""
+    """What N vehicles sense at one tick; T targets, of which the first L are landmarks. Nobody can write to it."""
 
     index: int
     dt: float  # s
@@ -51,14 +51,14 @@ class Sensed:
             index=self.index,
             time=self.index * self.dt,
             dt=self.dt,
-            rotation=_sealed(self.rotation[i]),
-            translation=_sealed(self.translation[i]),
-            velocity=_sealed(self.velocity[i]),
-            angular_velocity=_sealed(self.angular_velocity[i]),
+            rotation=self.rotation[i],
+            translation=self.translation[i],
+            velocity=self.velocity[i],
+            angular_velocity=self.angular_velocity[i],
             targets=_sealed(setup.targets[:]),
             bearings=_sealed(self.bearings[i].take(setup.targets, axis=0)),
             valid=_sealed(self.visible[i].take(setup.targets)),
-            landmarks=_sealed(self.landmarks[:]),
+            landmarks=self.landmarks,
             messages=messages,
             lever_arm=_sealed(setup.lever_arm[:]),
             noise=setup.noise,
@@ -139,13 +139,13 @@ class Recording:
         return Sensed(
             index=k,
             dt=self.dt,
-            rotation=self.rotation[k],
-            translation=self.translation[k],
-            velocity=self.velocity[k],
-            angular_velocity=self.angular_velocity[k],
-            bearings=self.bearings[k],
-            visible=self.visible[k],
-            landmarks=self.landmarks[k],
+            rotation=_sealed(self.rotation[k]),
+            translation=_sealed(self.translation[k]),
+            velocity=_sealed(self.velocity[k]),
+            angular_velocity=_sealed(self.angular_velocity[k]),
+            bearings=_sealed(self.bearings[k]),
+            visible=_sealed(self.visible[k]),
+            landmarks=_sealed(self.landmarks[k]),
             due=bool(self.due[k]),
         )
 

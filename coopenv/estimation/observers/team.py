@@ -6,8 +6,7 @@ Whoever has ticks drives a team with them: the runner on a record, the environme
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from time import perf_counter
 from typing import Any, NamedTuple, Protocol
 
@@ -32,6 +31,10 @@ from coopenv.estimation.observers.registry import is_joint
 
 class ObserverError(CoopenvError):
     """An observer raised or returned what is no estimate; the message says whose, when and why."""
+
+
+ANYTHING = (Exception, SystemExit)
+"""What may come out of an observer, which is anybody's code."""
 
 
 class Answer(NamedTuple):
@@ -113,6 +116,11 @@ class Mail:
                 _sealed(message)
 
 
+def _told(error: BaseException) -> str:
+    """Return what an error says, on one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
 def _copied(message: Message) -> Message:
     """Return a copy that nobody can change, the sender included."""
     return _sealed(
@@ -159,17 +167,21 @@ class Team:
         covariances = [P.copy() for P in self.briefing.start_covariance]
         poses = [(R.copy(), p.copy()) for R, p in zip(rotation, position, strict=True)]
         if self.joint:
-            with self._blame(0):
+            try:
                 self.whole: JointObserver = self.factory(setups)
                 self.whole.reset(poses, covariances)
+            except ANYTHING as error:
+                raise self._blamed(error, 0) from error
             return
         for i, setup in enumerate(setups):
-            with self._blame(0, i):
+            try:
                 self.observers.append(self.factory(setup))
                 self.observers[i].reset(poses[i], covariances[i])
                 message = self.observers[i].message()
                 check_message(message)
                 self.mail.post(i, 0, message)
+            except ANYTHING as error:
+                raise self._blamed(error, 0, i) from error
 
     def update(self, vehicle: int, sensed: Sensed, inbox_tick: ArrayLike) -> Answer:
         """Let one vehicle's observer take a tick; vehicles come in the order of the briefing.
@@ -183,7 +195,7 @@ class Team:
             ObserverError: it raised, or returned what is no estimate.
         """
         k = sensed.index
-        with self._blame(k, vehicle):
+        try:
             observer = self.observers[vehicle]
             tick = sensed.tick(self.briefing.setups[vehicle], self.mail.inbox(k, vehicle, inbox_tick))
             begin = perf_counter()
@@ -196,6 +208,8 @@ class Team:
                 if self.tamper is not None and self.tamper.applies(vehicle, tick.time):
                     message = self.tamper.told(observer, message)
                 self.mail.post(vehicle, k, message)
+        except ANYTHING as error:
+            raise self._blamed(error, k, vehicle) from error
         return Answer(estimate, elapsed)
 
     def update_all(self, sensed: Sensed) -> list[Answer]:
@@ -205,7 +219,7 @@ class Team:
             ObserverError: it raised, or returned what is no estimate.
         """
         setups = self.briefing.setups
-        with self._blame(sensed.index):
+        try:
             ticks = [sensed.tick(setup, {}) for setup in setups]
             begin = perf_counter()
             estimates = self.whole.update(ticks)
@@ -215,6 +229,8 @@ class Team:
                 self._check(estimate)
                 check_message(message)
                 self.mail.count(i, message)
+        except ANYTHING as error:
+            raise self._blamed(error, sensed.index) from error
         return [Answer(estimate, elapsed) for estimate in estimates]
 
     def _check(self, estimate: Estimate) -> None:
@@ -223,15 +239,10 @@ class Team:
         if estimate.coordinates is not self.coordinates:
             raise CoopenvError("error coordinates must stay the same")
 
-    @contextmanager
-    def _blame(self, k: int, vehicle: int | None = None) -> Iterator[None]:
-        """Say whose observer failed and when; an observer is anybody's code, so anything may come out of it."""
-        try:
-            yield
-        except (Exception, SystemExit) as error:
-            whose = "" if vehicle is None else f"of {self.briefing.setups[vehicle].name} "
-            what = " ".join(f"{type(error).__name__}: {error}".split())  # on one line
-            raise ObserverError(f"{whose}at {k * self.briefing.dt:.3f} s: {what}") from error
+    def _blamed(self, error: BaseException, k: int, vehicle: int | None = None) -> ObserverError:
+        """Return an error that says whose observer failed, when, and how."""
+        whose = "" if vehicle is None else f"of {self.briefing.setups[vehicle].name} "
+        return ObserverError(f"{whose}at {k * self.briefing.dt:.3f} s: {_told(error)}")
 
     def get_state(self) -> dict[str, Any]:
         """Return a deep copy of the observers and of all messages.
@@ -242,8 +253,7 @@ class Team:
         try:
             return copy.deepcopy({name: value for name, value in vars(self).items() if name not in _FIXED})
         except Exception as error:
-            what = " ".join(f"{type(error).__name__}: {error}".split())  # on one line
-            raise CoopenvError(f"the observers' state cannot be copied: {what}") from error
+            raise CoopenvError(f"the observers' state cannot be copied: {_told(error)}") from error
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Go back to what `get_state` returned; that stays unchanged."""
