@@ -13,24 +13,25 @@ from coopenv.bench.leaderboard.figures import WIDTH
 from coopenv.estimation.consistency import wilson_interval
 from coopenv.viz.style import BLUE, INK, NORMAL, SMALL, VERMILION, new_figure, tidy
 
-_COLUMNS = 3
+_MOST_COLUMNS = 3
 _PANEL, _HEAD = 2.9, 0.35  # inches
 
 
 def basin_figure(draws: Sequence[Draw]) -> Figure:
     """Draw, per observer, every vehicle of every draw at its initial errors, and the share by angle below."""
     basins = basins_of("", draws)
-    rows = -(-len(basins) // _COLUMNS)
+    columns = min(_MOST_COLUMNS, len(basins))
+    rows, step = -(-len(basins) // columns), 0.96 / columns
     height = _HEAD + _PANEL * rows
     figure = new_figure(WIDTH, height)
     for n, basin in enumerate(basins):
         own = [draw for draw in draws if draw.observer == basin.observer]
-        left = 0.06 + (n % _COLUMNS) * 0.32
-        bottom = 1 - (_HEAD + _PANEL * (n // _COLUMNS + 1)) / height
-        cloud = figure.add_axes((left, bottom + 1.3 / height, 0.27, 1.2 / height))
-        bars = figure.add_axes((left, bottom + 0.5 / height, 0.27, 0.65 / height), sharex=cloud)
-        _draw_cloud(cloud, own, first=n % _COLUMNS == 0)
-        _draw_shares(bars, own, first=n % _COLUMNS == 0)
+        left = 0.06 + (n % columns) * step
+        bottom = 1 - (_HEAD + _PANEL * (n // columns + 1)) / height
+        cloud = figure.add_axes((left, bottom + 1.3 / height, step - 0.05, 1.2 / height))
+        bars = figure.add_axes((left, bottom + 0.5 / height, step - 0.05, 0.65 / height), sharex=cloud)
+        _draw_cloud(cloud, own, first=n % columns == 0)
+        _draw_shares(bars, own, first=n % columns == 0)
         low, high = (100 * end for end in basin.interval)
         share = f"all vehicles: {100 * basin.converged_fraction:.1f} %  [{low:.1f}, {high:.1f}]"
         cloud.set_title(f"{basin.observer}\n{share}", fontsize=SMALL + 0.5, color=INK, pad=3)

@@ -104,7 +104,7 @@ def nees_figure(samples: Sequence[Sample]) -> Figure | None:
     groups = {name: own for name, own in observers_of(samples).items() if np.isfinite(own[0].series.nees[1:]).any()}
     if not groups:
         return None
-    scene, columns = samples[0].scene, 3
+    scene, columns = samples[0].scene, min(3, len(groups))
     rows = -(-len(groups) // columns)
     height = _HEAD + _FOOT + 1.5 * rows
     figure, axes = _grid(rows, columns, height, left=0.07, between=0.38)
