@@ -23,7 +23,7 @@ def test_a_missing_module_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPat
 
 def test_of_bearings_at_key_frames_it_is_the_filter() -> None:
     """With small errors, what is most probable at the last frame does not depend on smoothing the others."""
-    pytest.importorskip("gtsam")
+    pytest.importorskip("gtsam", reason="needs the extra 'bench'")
     made = small_record(12)  # 6 ticks of 60 Hz are one key frame
     visible = made.visible.copy()
     visible[[*range(1, 6), *range(7, 12)]] = False
@@ -38,7 +38,7 @@ def test_of_bearings_at_key_frames_it_is_the_filter() -> None:
 
 def test_bearings_between_key_frames_count_as_well() -> None:
     """Of six equally good frames the mean has a sixth of the variance, if odometry between them is exact."""
-    pytest.importorskip("gtsam")
+    pytest.importorskip("gtsam", reason="needs the extra 'bench'")
     made = small_record(6)
     exact = [replace(s, noise=replace(s.noise, velocity=1e-7, angular_velocity=1e-7)) for s in made.setups]
     made = replace(made, setups=tuple(exact))
@@ -52,14 +52,14 @@ def test_bearings_between_key_frames_count_as_well() -> None:
 
 
 def test_between_key_frames_it_is_dead_reckoning() -> None:
-    pytest.importorskip("gtsam")
+    pytest.importorskip("gtsam", reason="needs the extra 'bench'")
     made = small_record(5)
     smoothed, reckoned = run("factor_graph", made), run("dead_reckoning", made)
     assert_allclose(smoothed.position, reckoned.position, atol=1e-12)
 
 
 def test_nothing_seen_leaves_the_odometry_s_covariance() -> None:
-    pytest.importorskip("gtsam")
+    pytest.importorskip("gtsam", reason="needs the extra 'bench'")
     made = small_record(20)
     blind = replace(made, visible=np.zeros_like(made.visible))
     smoothed, reckoned = run("factor_graph", blind), run("dead_reckoning", blind)

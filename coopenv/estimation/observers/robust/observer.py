@@ -63,18 +63,19 @@ class Contact:
     last: Report
     trusted: bool = True
     agreed: float = 0.0
-    """s since which a distrusted sender has agreed."""
+    """s, for which a distrusted sender has agreed."""
 
 
 @dataclass(frozen=True)
 class Anchor:
     """Where the vehicle was when its bearings last fitted, or at the start."""
 
-    R: Array
-    p: Array
-    P: Array
+    R: Array  # (3, 3) body to map
+    p: Array  # (3,) map frame, m
+    P: Array  # (6, 6) left error, rad and m
     odometry: tuple[Array, Array]
-    time: float
+    """(3, 3) and (3,) m: its pose by dead reckoning then."""
+    time: float  # s
 
 
 class Robust:
