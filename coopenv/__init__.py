@@ -3,11 +3,15 @@
 import coopenv
 env = coopenv.parallel_env("busy_intersection")
 observations, infos = env.reset(seed=0)
+
+Names that need the simulation are loaded when they are first used (PEP 562), so that the import and the command line
+start quickly.
 """
 
-from coopenv.api.parallel_env import CooperativeLocalisationEnv, parallel_env
+from importlib import import_module
+from typing import TYPE_CHECKING
+
 from coopenv.api.registration import register_all
-from coopenv.api.vector_env import CooperativeVectorEnv, make_vec
 from coopenv.errors import (
     ActionError,
     CoopenvError,
@@ -17,9 +21,40 @@ from coopenv.errors import (
     ScenarioError,
     UnknownEnvironmentError,
 )
-from coopenv.scenario import Scenario, list_envs, load_scenario
+from coopenv.shipped import list_envs
 
-__version__ = "0.1.0"
+if TYPE_CHECKING:
+    from coopenv.api.parallel_env import CooperativeLocalisationEnv, parallel_env
+    from coopenv.api.vector_env import CooperativeVectorEnv, make_vec
+    from coopenv.scenario import Scenario, load_scenario
+
+    __version__: str
+else:
+    _HOMES = {
+        "CooperativeLocalisationEnv": "coopenv.api.parallel_env",
+        "CooperativeVectorEnv": "coopenv.api.vector_env",
+        "Scenario": "coopenv.scenario",
+        "load_scenario": "coopenv.scenario",
+        "make_vec": "coopenv.api.vector_env",
+        "parallel_env": "coopenv.api.parallel_env",
+    }
+    """Module of each name that is loaded when it is first used."""
+
+    def __getattr__(name):
+        if name == "__version__":
+            from coopenv.shipped import version
+
+            value = version()
+        elif name in _HOMES:
+            value = getattr(import_module(_HOMES[name]), name)
+        else:
+            raise AttributeError(f"module 'coopenv' has no attribute '{name}'")
+        globals()[name] = value
+        return value
+
+    def __dir__():
+        return sorted({*globals(), *_HOMES, "__version__"})
+
 
 __all__ = [
     "ActionError",

@@ -9,8 +9,8 @@ import pytest
 
 import coopenv
 from coopenv.bench.agents import play, score
-from coopenv.policies import list_agents, load_agent, read_card
-from coopenv.scenario import data_directory
+from coopenv.policies import load_agent, read_card
+from coopenv.shipped import data_directory, list_agents
 
 PAIRS = [(agent, env) for agent in list_agents() for env in read_card(agent).environments]
 

@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 
 import coopenv
-from coopenv.cli import main, parse_value
+from coopenv.cli import main
+from coopenv.cli.options import parse_value
 from coopenv.estimation.trajectory import Trajectory
 
 FIGURES = {

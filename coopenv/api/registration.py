@@ -1,16 +1,22 @@
-"""Register every shipped environment with Gymnasium and PettingZoo as `coopenv/<CamelCase>-v0`."""
+"""Register every shipped environment with Gymnasium and PettingZoo as `coopenv/<CamelCase>-v0`.
+
+Entry points are strings, and what they need is imported when an environment is made: `import coopenv` costs little.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import pettingzoo
-from pettingzoo import AECEnv, aec_registry, parallel_registry
-from pettingzoo.utils import parallel_to_aec
+from pettingzoo import aec_registry, parallel_registry
 
-from coopenv.api.parallel_env import CooperativeLocalisationEnv, parallel_env
-from coopenv.scenario import list_envs, load_scenario
+from coopenv.shipped import list_envs
+
+if TYPE_CHECKING:
+    from pettingzoo import AECEnv
+
+    from coopenv.api.parallel_env import CooperativeLocalisationEnv
 
 
 def environment_id(name: str) -> str:
@@ -26,6 +32,9 @@ def make_parallel(name: str, max_cycles: int | None = None, **options: Any) -> C
         max_cycles: decision steps per episode instead of the scenario's horizon.
         options: those of `coopenv.parallel_env`.
     """
+    from coopenv.api.parallel_env import parallel_env
+    from coopenv.scenario import load_scenario
+
     if max_cycles is not None:
         rate = load_scenario(name, options.get("overrides")).rates.decision
         options["overrides"] = {**(options.get("overrides") or {}), "horizon": max_cycles / rate}
@@ -34,6 +43,8 @@ def make_parallel(name: str, max_cycles: int | None = None, **options: Any) -> C
 
 def make_aec(name: str, **options: Any) -> AECEnv[str, Any, Any]:
     """Entry point of PettingZoo's AEC registry; arguments as for `make_parallel`."""
+    from pettingzoo.utils import parallel_to_aec
+
     return parallel_to_aec(make_parallel(name, **options))
 
 

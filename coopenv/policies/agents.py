@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from coopenv.api.layout import Field
 from coopenv.errors import CoopenvError, suggest
 from coopenv.policies.base import Policy
-from coopenv.scenario import data_directory
+from coopenv.shipped import data_directory, list_agents
 
 
 class AgentCard(BaseModel):
@@ -28,11 +28,6 @@ class AgentCard(BaseModel):
     environments: tuple[str, ...]
     """Environments that it was made for."""
     options: dict[str, Any] = {}
-
-
-def list_agents() -> list[str]:
-    """Return the names of the drivers that ship with coopenv."""
-    return sorted(path.parent.name for path in data_directory("agents").glob("*/agent.toml"))
 
 
 def agent_path(name_or_path: str | Path) -> Path:

@@ -13,6 +13,7 @@ from coopenv.estimation.metrics import observability_of, settling_times, summari
 from coopenv.estimation.observability import Observability
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.recording import ARRIVED, COLLIDED, UNDER_WAY, Ending, Recording
+from coopenv.shipped import version
 
 COARSE_POSITION_M = 0.5
 COARSE_ORIENTATION_DEG = 5.0
@@ -88,8 +89,6 @@ def run_metrics(
     outcome: str,
 ) -> dict[str, Any]:
     """Return the contents of `metrics.json`."""
-    from coopenv import __version__
-
     simulated = recording.ticks_recorded / recording.scenario.rates.camera
     engine = recording.engine
     return {
@@ -101,7 +100,7 @@ def run_metrics(
         "dtype": engine.world.precision.name,
         "device": engine.world.device,
         "versions": {
-            "coopenv": __version__,
+            "coopenv": version(),
             "warp": warp.__version__,
             "numpy": np.__version__,
             "python": platform.python_version(),

@@ -8,7 +8,8 @@ import numpy as np
 
 from coopenv.api.layout import Field
 from coopenv.errors import CoopenvError, suggest
-from coopenv.policies import list_agents, load_agent
+from coopenv.policies import load_agent
+from coopenv.shipped import list_agents
 
 Policy = Callable[[np.ndarray], np.ndarray]
 """Maps the observations of all vehicles, (N, D), to their actions in [-1, 1], (N, 2)."""

@@ -6,7 +6,6 @@ import json
 import tomllib
 from collections.abc import Mapping
 from difflib import get_close_matches
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,22 +14,10 @@ from pydantic import BaseModel, ValidationError
 
 from coopenv.errors import ScenarioError, UnknownEnvironmentError, suggest
 from coopenv.scenario.schema import Scenario
+from coopenv.shipped import data_directory, list_envs
 
 DEFAULTS_KEY = "vehicle_defaults"
 """A table of the file whose entries every vehicle takes over unless it says otherwise."""
-
-
-@cache
-def data_directory(kind: str) -> Path:
-    """Return the folder of `envs` or `agents`: inside the installed wheel, else beside the checkout's package."""
-    package = Path(__file__).resolve().parents[1]
-    shipped = package / "data" / kind
-    return shipped if shipped.is_dir() else package.parent / kind
-
-
-def list_envs() -> list[str]:
-    """Return the names of the environments that ship with coopenv: the file stems of `envs/`."""
-    return sorted(path.stem for path in data_directory("envs").glob("*.toml"))
 
 
 def scenario_path(name_or_path: str | Path) -> Path:

@@ -19,8 +19,9 @@ from coopenv.cli import main
 from coopenv.scenario import words
 from coopenv.scenario.agents import ConstantMotion, InitialEstimate, SegmentMotion, TwistSegment, WaypointMotion
 from coopenv.scenario.describe import describe_scenario, settings
-from coopenv.scenario.files import apply_vehicle_defaults, data_directory, parse_scenario
+from coopenv.scenario.files import apply_vehicle_defaults, parse_scenario
 from coopenv.scenario.json_schema import schema_text
+from coopenv.shipped import data_directory
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "scenario.schema.json"
 

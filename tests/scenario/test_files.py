@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 
 from coopenv.errors import ScenarioError, UnknownEnvironmentError
-from coopenv.scenario import ScenarioWarning, list_envs, load_scenario, scenario_path
+from coopenv.scenario import ScenarioWarning, load_scenario, scenario_path
+from coopenv.shipped import list_envs
 
 MINIMAL = """
 title = "t"

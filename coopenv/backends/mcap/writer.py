@@ -14,6 +14,7 @@ from coopenv.backends.mcap.facts import facts_of
 from coopenv.backends.mcap.messages import ATTACHMENT, EXACT, FORMAT, LANDMARKS, LANDMARKS_TYPE, SHOWN, codec, topic
 from coopenv.errors import OutputError
 from coopenv.estimation.observers.recording import Recording
+from coopenv.shipped import version
 
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 
@@ -62,22 +63,18 @@ class _Log:
     def __init__(self, stream: Any, recording: Recording) -> None:
         from mcap.writer import Writer
 
-        from coopenv import __version__
-
         self.recording, self.codec = recording, codec()
         self.types = self.codec.types
         self.writer = Writer(stream)
-        self.writer.start(profile="ros2", library=f"coopenv {__version__}")
+        self.writer.start(profile="ros2", library=f"coopenv {version()}")
         self.schemas: dict[str, int] = {}
         self.channels: dict[str, int] = {}
 
     def write(self) -> None:
         """Write everything."""
-        from coopenv import __version__
-
         r = self.recording
         facts = json.dumps(facts_of(r), allow_nan=False).encode()
-        about = {"format": FORMAT, "version": __version__, "sha256": hashlib.sha256(facts).hexdigest()}
+        about = {"format": FORMAT, "version": version(), "sha256": hashlib.sha256(facts).hexdigest()}
         self.writer.add_metadata("coopenv", about)
         self.writer.add_attachment(0, 0, ATTACHMENT, "application/json", facts)
         for i, setup in enumerate(r.setups):  # so that topics are there even if nothing is ever known

@@ -1,0 +1,125 @@
+"""`coopenv bench ...`: measure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coopenv.cli.options import Environment, Overrides, SteadyFrom, console, load, parse_overrides, warned
+
+bench = typer.Typer(help="Measure: steps per second, drivers.", no_args_is_help=True)
+
+
+@bench.command("speed")
+def bench_speed(
+    environment: Annotated[str, typer.Argument(metavar="ENV", help="Environment to step.")] = "busy_intersection",
+    overrides: Overrides = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.01, help="Time per case and round (default: 0.5).", show_default=False)
+    ] = None,
+    repeats: Annotated[
+        int | None, typer.Option(min=1, help="Rounds, of which the median counts (default: 5).", show_default=False)
+    ] = None,
+    growth: Annotated[bool, typer.Option("--growth", help="Also grow vehicles, landmarks and worlds.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer cases and shorter rounds: under a minute.")] = False,
+    peers: Annotated[bool, typer.Option(help="Also measure other projects' environments.")] = True,
+    out: Annotated[Path | None, typer.Option(help="Folder for speed.json and pictures (default: none).")] = None,
+) -> None:
+    """Measure steps per second of coopenv and, where installed, of its peers, alternating in one run."""
+    parsed = parse_overrides(overrides)
+    scenario = load(environment, parsed)
+    from coopenv.bench.speed import SpeedRequest, execute
+
+    request = SpeedRequest(environment, scenario, parsed, seconds, repeats, out, growth, quick, peers)
+    execute(request, console(), console(stderr=True))
+
+
+@bench.command("agents")
+def bench_agents(
+    agents: Annotated[list[str] | None, typer.Argument(metavar="[AGENT]...", help="Default: all.")] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Episodes, seeds 0, 1, ...")] = 20,
+) -> None:
+    """Let drivers cross their environments: who arrives, who collides, who knows where it is."""
+    from coopenv.api.parallel_env import parallel_env
+    from coopenv.bench.agents import play, score
+    from coopenv.bench.tables import score_table
+    from coopenv.policies import load_agent, read_card
+    from coopenv.runs.command import progress
+    from coopenv.shipped import list_agents
+
+    rows = []
+    for agent in agents or list_agents():
+        for name in read_card(agent).environments:
+            env = parallel_env(name)
+            policy = load_agent(agent, env.observation_layout)
+            with progress(console(stderr=True)) as bar:
+                episodes = bar.track(range(seeds), description=f"{agent} in {name}")
+                rows.append((agent, name, score(play(env, policy, seed) for seed in episodes)))
+    console().print(score_table(rows))
+
+
+@bench.command("seeds")
+def bench_seeds(
+    environment: Environment,
+    seeds: Annotated[int, typer.Option(min=1, help="How many.")] = 20,
+    first: Annotated[int, typer.Option(min=0, help="The first one.")] = 0,
+    overrides: Overrides = None,
+    steady_from: SteadyFrom = None,
+) -> None:
+    """Run an environment over many seeds at once: who settles, and the steady errors with their spread."""
+    scenario = load(environment, parse_overrides(overrides))
+    from coopenv.bench.seed_table import seed_table
+    from coopenv.bench.seeds import study_seeds
+    from coopenv.estimation.metrics import steady_start
+    from coopenv.runs.command import progress
+
+    start = steady_start(steady_from, scenario.horizon)
+    with progress(console(stderr=True)) as bar:
+        task = bar.add_task(f"{seeds} seeds", total=1.0)
+        study = study_seeds(
+            scenario, range(first, first + seeds), start, on_progress=lambda share: bar.update(task, completed=share)
+        )
+    out = console()
+    out.print(seed_table(study))
+    out.print(f"Steady: after {start:g} s. Settled: below 0.5 m and 5 deg until the end.")
+
+
+@bench.command("observers")
+def bench_observers(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="ENV|DATASET|FILE.mcap",
+            help="Environment (name or TOML file), recorded robots (mrclam_1 .. mrclam_9) or a log file.",
+        ),
+    ],
+    observers: Annotated[str | None, typer.Option(help="Names with commas between (default: all that suit).")] = None,
+    variants: Annotated[
+        str | None,
+        typer.Option(help="Names with commas between, or `all`: faults of an environment, what recorded robots see."),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Seeds 0, 1, ...")] = 5,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes (default: one per core).")] = None,
+    engine: Annotated[str, typer.Option(help="`local`, or `ray`: an existing Ray cluster.")] = "local",
+    address: Annotated[str | None, typer.Option(help="Of the Ray cluster: HOST:PORT (default: auto).")] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Folder with the data of recorded robots (default: COOPENV_DATA).")
+    ] = None,
+    basin: Annotated[int, typer.Option(min=0, help="Random initial estimates for maps of the basins.")] = 0,
+    overrides: Overrides = None,
+    steady_from: SteadyFrom = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the leaderboard and the report.")] = None,
+) -> None:
+    """Compare observers on the same ticks, against the truth and the Cramér-Rao bound."""
+    from coopenv.bench.leaderboard.command import perform, request_of
+    from coopenv.bench.leaderboard.engines import find_engine
+
+    printed, log = console(), console(stderr=True)
+    with warned():
+        request = request_of(
+            source, observers, variants, seeds, steady_from, basin, data, parse_overrides(overrides), overrides or ()
+        )
+        request.source.check()
+    perform(request, find_engine(engine, jobs, address), out, printed, log)

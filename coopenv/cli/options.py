@@ -1,0 +1,88 @@
+"""Options that several commands share, and what they are read into."""
+
+from __future__ import annotations
+
+import sys
+import tomllib
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from coopenv.errors import CoopenvError, DataWarning
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
+
+Environment = Annotated[str, typer.Argument(metavar="ENV", help="Name (see `coopenv list`) or path of a TOML file.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Override a dotted key of the scenario, e.g. noise.enabled=false; the value is TOML, or else a string. "
+        "Repeatable.",
+    ),
+]
+SteadyFrom = Annotated[
+    float | None,
+    typer.Option(help="Start of the steady state in s (default: 70 % of the horizon).", show_default=False),
+]
+
+
+def console(stderr: bool = False) -> Console:
+    """Return a console that prints scenario texts as they are."""
+    from rich.console import Console
+
+    return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
+
+
+def load(environment: str, overrides: dict[str, Any]) -> Any:
+    """Return a scenario, its warnings printed as one line each."""
+    from coopenv.scenario import load_scenario
+
+    with warned():
+        return load_scenario(environment, overrides)
+
+
+@contextmanager
+def warned() -> Iterator[None]:
+    """Print the warnings of scenarios and data that are loaded meanwhile as one line each."""
+    from coopenv.scenario import ScenarioWarning
+
+    with warnings.catch_warnings(record=True) as caught:
+        for category in (ScenarioWarning, DataWarning):
+            warnings.simplefilter("always", category)
+        yield
+    for warning in (w for w in caught if issubclass(w.category, (ScenarioWarning, DataWarning))):
+        print(f"warning: {warning.message}", file=sys.stderr)
+
+
+def parse_overrides(assignments: Sequence[str] | None) -> dict[str, Any]:
+    """Return `key=value` texts as a dict; a value that is not TOML is a string.
+
+    Raises:
+        CoopenvError: no `=`, or nothing before it.
+    """
+    overrides = {}
+    for assignment in assignments or ():
+        key, equals, text = assignment.partition("=")
+        key, text = key.strip(), text.strip()
+        if not equals or not key:
+            raise CoopenvError(f"--set {assignment}: expected KEY=VALUE, e.g. --set noise.enabled=false")
+        overrides[key] = parse_value(text)
+    return overrides
+
+
+def parse_value(text: str) -> Any:
+    """Return a TOML value, or the text itself when it is none."""
+    try:
+        document = tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return text
+    return document["value"] if len(document) == 1 else text

@@ -1,0 +1,84 @@
+"""`coopenv run | record`: simulate an environment, or keep what vehicles sense."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coopenv.cli.options import INTERRUPTED, Environment, Overrides, SteadyFrom, console, load, parse_overrides, warned
+from coopenv.errors import CoopenvError, OutputError
+
+
+def run(
+    environment: Environment,
+    seed: Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")] = 0,
+    overrides: Overrides = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Decisions to run (default: up to the horizon).")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the results (default: out/ENV).")] = None,
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, ...")] = "cpu",
+    dtype: Annotated[str, typer.Option(help="float32 or float64.")] = "float64",
+    policy: Annotated[str, typer.Option(help="Of driven vehicles: zero, random, or the name of an agent.")] = "zero",
+    steady_from: SteadyFrom = None,
+    video: Annotated[bool, typer.Option("--video", help="Also film the top view.")] = False,
+) -> None:
+    """Run an environment and write metrics, record and figures."""
+    parsed = parse_overrides(overrides)
+    scenario = load(environment, parsed)
+    from coopenv.runs.command import RunRequest, execute
+
+    name = Path(environment).stem
+    request = RunRequest(
+        name=name,
+        scenario=scenario,
+        folder=out if out is not None else Path("out") / name,
+        overrides=parsed,
+        seed=seed,
+        steps=steps,
+        device=device,
+        dtype=dtype,
+        policy=policy,
+        steady_from=steady_from,
+        video=video,
+    )
+    if not execute(request, console(), console(stderr=True)):
+        raise typer.Exit(INTERRUPTED)
+
+
+def record_command(
+    environment: Annotated[
+        str, typer.Argument(metavar="ENV|DATASET", help="Environment, TOML file, or a data set such as mrclam_6.")
+    ],
+    out: Annotated[Path, typer.Option(help="MCAP file to write.")],
+    seed: Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")] = 0,
+    policy: Annotated[str, typer.Option(help="Of driven vehicles: zero, random, or the name of an agent.")] = "zero",
+    overrides: Overrides = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of data sets (default: COOPENV_DATA).")] = None,
+    variant: Annotated[str | None, typer.Option(help="Of a data set: landmarks, landmarks+robots, blind.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+) -> None:
+    """Write what vehicles sense, tick by tick, to an MCAP file, which Foxglove opens and coopenv replays."""
+    from coopenv.backends.mcap import check_target, write_recording
+    from coopenv.backends.replay import is_recorded
+    from coopenv.runs.log import read_recorded, simulate
+
+    check_target(out)
+    if out.exists() and not force:
+        raise OutputError(f"{out}: exists already; --force replaces it")
+    parsed = parse_overrides(overrides)
+    if is_recorded(environment):
+        asked = {"--set": parsed, "--seed": seed, "--policy": policy if policy != "zero" else None}
+        with warned():
+            recording = read_recorded(
+                environment, data, variant, {name: value for name, value in asked.items() if value}
+            )
+    else:
+        for option, value in (("--data", data), ("--variant", variant)):
+            if value is not None:
+                raise CoopenvError(f"{option} {value}: is for recorded data, {environment} is simulated")
+        recording = simulate(load(environment, parsed), seed, policy)
+    write_recording(recording, out)
+    console().print(
+        f"{out}: {len(recording.setups)} vehicles, {recording.ticks} ticks, {recording.t[-1]:g} s", soft_wrap=True
+    )

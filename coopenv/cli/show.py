@@ -1,0 +1,42 @@
+"""`coopenv list | describe | schema`: what there is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coopenv.cli.options import Environment, Overrides, console, load, parse_overrides
+
+
+def list_command() -> None:
+    """List the environments that ship with coopenv."""
+    from coopenv.scenario.describe import environment_table
+    from coopenv.shipped import list_envs
+
+    out = console()
+    out.print(environment_table({name: load(name, {}) for name in list_envs()}))
+
+
+def describe(environment: Environment, overrides: Overrides = None) -> None:
+    """Print a scenario for people: who is in it, how they sense and estimate, and what an observation holds."""
+    from coopenv.scenario.describe import describe_scenario
+
+    out = console()
+    for part in describe_scenario(load(environment, parse_overrides(overrides))):
+        out.print(part)
+
+
+def schema(
+    out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None,
+) -> None:
+    """Write the JSON schema of scenario files, for editors and other tools."""
+    from coopenv.runs.output import writing
+    from coopenv.scenario.json_schema import schema_text
+
+    if out is None:
+        print(schema_text(), end="")
+        return
+    with writing(out):
+        out.write_text(schema_text(), encoding="utf-8")

@@ -1,0 +1,69 @@
+"""The import and the help load neither the simulation nor what only results need."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import coopenv
+
+HEAVY = {"warp", "scipy", "matplotlib", "PIL", "pandas", "mcap", "torch", "joblib", "jinja2"}
+LIGHT = {"errors", "shipped", "api", "api.registration", "cli", "cli.options", "cli.show", "cli.run", "cli.bench"}
+
+
+def modules_after(statement: str) -> set[str]:
+    """Return the names of the modules that a fresh interpreter holds after the statement."""
+    code = f"import sys\n{statement}\nprint('MODULES', *sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(result.stdout.rpartition("MODULES ")[2].split())
+
+
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "import coopenv",
+        "import coopenv.errors",
+        "from coopenv.cli import main; main(['--help'])",
+        "from coopenv.cli import main; main(['run', '--help'])",
+        "from coopenv.cli import main; main(['--version'])",
+        "from coopenv.cli import main; main(['frobnicate'])",
+    ],
+)
+def test_start_loads_no_simulation(statement: str) -> None:
+    loaded = modules_after(statement)
+    assert "coopenv.errors" in loaded
+    assert not HEAVY & {name.partition(".")[0] for name in loaded}
+    own = {name.removeprefix("coopenv.") for name in loaded if name.startswith("coopenv.")}
+    assert own <= LIGHT
+
+
+def test_make_finds_environments_after_the_import_alone() -> None:
+    loaded = modules_after(
+        "import coopenv, gymnasium\nassert gymnasium.make('coopenv/UrbanCrossing-v0').unwrapped.reset(seed=0)"
+    )
+    assert "warp" in loaded
+
+
+def test_lazy_names_are_those_that_type_checkers_see() -> None:
+    tree = ast.parse(Path(coopenv.__file__).read_text(encoding="utf-8"))
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    seen = {
+        alias.name: statement.module
+        for statement in block.body
+        if isinstance(statement, ast.ImportFrom)
+        for alias in statement.names
+    }
+    assert seen == coopenv._HOMES
+    assert set(seen) <= set(coopenv.__all__)
+
+
+def test_every_public_name_is_found_and_listed() -> None:
+    for name in [*coopenv.__all__, "__version__"]:
+        assert getattr(coopenv, name) is not None
+        assert name in dir(coopenv)
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        _ = coopenv.nothing
