@@ -10,6 +10,25 @@ from typing import Any
 
 import warp as wp
 
+EPSILON64 = wp.constant(2.0**-52)
+EPSILON32 = wp.constant(2.0**-23)
+PIVOT_FLOOR = wp.constant(2.0**-7)
+"""Smallest pivot of a Cholesky factor over the trace, in units of the machine epsilon."""
+SWEEPS = wp.constant(12)
+"""At most; about five are needed."""
+
+
+@wp.func
+def epsilon(x: wp.float64):
+    """Return the machine epsilon of the precision of `x`: the distance from 1 to the next larger number."""
+    return wp.float64(EPSILON64)
+
+
+@wp.func
+def epsilon(x: wp.float32):  # noqa: F811 (an overload: Warp chooses by the type of the argument)
+    """Return the machine epsilon of the precision of `x`: the distance from 1 to the next larger number."""
+    return wp.float32(EPSILON32)
+
 
 @wp.func
 def symmetric_part(A: Any):
@@ -25,10 +44,7 @@ def cholesky3(A: Any):
     """
     o = A.dtype(0.0)
     one = A.dtype(1.0)
-    rounding = A.dtype(1.0e-18)
-    if one + A.dtype(1.0e-9) == one:
-        rounding = A.dtype(1.0e-9)
-    tiny = wp.max(rounding * wp.trace(A), A.dtype(1.0e-30))
+    tiny = wp.max(A.dtype(PIVOT_FLOOR) * epsilon(one) * wp.trace(A), A.dtype(1.0e-30))
     i00 = one / wp.sqrt(wp.max(A[0, 0], tiny))
     l10 = A[1, 0] * i00
     l20 = A[2, 0] * i00
@@ -90,13 +106,16 @@ def jacobi_rotation(a_pp: Any, a_qq: Any, a_pq: Any):
 
 @wp.func
 def eigen_symmetric6(M: Any, identity: Any):
-    """Return (D, U) with M = U D U^T, D diagonal up to rounding, by cyclic Jacobi sweeps."""
+    """Return (D, U) with M = U D U^T, D diagonal up to rounding, by cyclic Jacobi sweeps.
+
+    An entry is annihilated only if |a_pq| > eps sqrt(|a_pp a_qq|) (Demmel and Veselic 1992, Jacobi's method is more
+    accurate than QR): within a repeated eigenvalue a_pp - a_qq is rounding alone, and a rotation by its angle, up to
+    45 degrees, would undo the ones before it.
+    """
     A = M
     U = identity
-    rounding = A.dtype(1.0e-33)
-    if A.dtype(1.0) + A.dtype(1.0e-9) == A.dtype(1.0):
-        rounding = A.dtype(1.0e-15)
-    for _ in range(12):
+    rounding = epsilon(A[0, 0]) * epsilon(A[0, 0])
+    for _ in range(SWEEPS):
         off = A.dtype(0.0)
         scale = A.dtype(0.0)
         for i in range(6):
@@ -106,8 +125,7 @@ def eigen_symmetric6(M: Any, identity: Any):
         if off > scale * rounding:
             for p in range(5):
                 for q in range(p + 1, 6):
-                    # An entry lost in the rounding of its diagonal is zero already.
-                    if A[p, q] * A[p, q] > wp.abs(A[p, p] * A[q, q]) * rounding * rounding:
+                    if A[p, q] * A[p, q] > wp.abs(A[p, p] * A[q, q]) * rounding:
                         c, s = jacobi_rotation(A[p, p], A[q, q], A[p, q])
                         for k in range(6):
                             akp = A[k, p]

@@ -55,6 +55,33 @@ def test_eigenvalues_and_vectors(name: str, dtype: str) -> None:
     assert (size(D - diagonal[:, None] * np.eye(6)) <= bound).all()
 
 
+REPEATED = {
+    "twofold": [1e-3, 1e-3, 0.3, 1.0, 2.0, 2.0],
+    "threefold": [1e-3, 1e-3, 1e-3, 1.0, 1.0, 1.0],
+    "three_pairs": [0.1, 0.1, 1.0, 1.0, 10.0, 10.0],
+    "threefold_zero": [0.0, 0.0, 0.0, 1.0, 1.0, 3.0],
+    "pairs_of_eight_decades": [1e-8, 1e-8, 1e-4, 1e-4, 1.0, 1.0],
+    "pairs_of_both_signs": [-1.0, -1.0, 1.0, 1.0, 2.0, -2.0],
+}
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("name", REPEATED)
+def test_repeated_eigenvalues_of_many_matrices(name: str, dtype: str) -> None:
+    """20,000 matrices per spectrum; a solver that turns within a cluster for ever fails for 1 to 10 of 10,000."""
+    rng = np.random.default_rng(1)
+    U = np.linalg.qr(rng.normal(size=(20_000, 6, 6)))[0]
+    M = U @ (np.array(REPEATED[name])[:, None] * np.swapaxes(U, 1, 2))
+    M = ((M + np.swapaxes(M, 1, 2)) / 2).astype(dtype).astype(float)
+    D, U = call("eigen_symmetric6", dtype, M)
+    diagonal = np.diagonal(D, axis1=1, axis2=2)
+    unit = EPSILON[dtype] * size(M)
+    assert (size(D - diagonal[:, None] * np.eye(6)) <= 3 * unit).all()
+    assert (size(U @ (diagonal[..., None] * np.swapaxes(U, 1, 2)) - M) <= 50 * unit).all()
+    assert np.abs(np.swapaxes(U, 1, 2) @ U - np.eye(6)).max() <= 30 * EPSILON[dtype]
+    assert (np.abs(np.sort(diagonal) - np.sort(REPEATED[name])).max(axis=1) <= 50 * unit).all()
+
+
 def test_eigenvalues_of_matrices_with_zeros() -> None:
     """Diagonal, block diagonal and zero-diagonal matrices, where a rotation could divide by zero."""
     block = np.kron(np.diag([1.0, 0.0, 3.0]), np.array([[2.0, 1.0], [1.0, 2.0]]))
