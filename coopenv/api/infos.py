@@ -8,10 +8,11 @@ import numpy as np
 
 from coopenv.api.engine import Engine
 from coopenv.api.rewards import TERMS
-from coopenv.estimation.trajectory import Sight
+from coopenv.estimation.trajectory import Outcome, Sight
 from coopenv.scenario import Scenario
 
-OUTCOMES = ("under way", "arrived", "collided")
+OUTCOMES = tuple(outcome.words for outcome in Outcome)
+"""Words of `info["outcome"]`, in the order of the field `ended`."""
 
 
 class InfoWriter:

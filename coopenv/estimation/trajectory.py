@@ -22,6 +22,19 @@ class Sight(IntEnum):
     MISSED = 5
 
 
+class Outcome(IntEnum):
+    """How a vehicle's episode has ended so far."""
+
+    UNDER_WAY = 0
+    ARRIVED = 1
+    COLLIDED = 2
+
+    @property
+    def words(self) -> str:
+        """The name in small letters: "under way", "arrived", "collided"."""
+        return self.name.lower().replace("_", " ")
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """K camera ticks (t = 0 included) of N vehicles and T targets (landmarks first, then vehicles).

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.colors import to_rgba_array
 from matplotlib.patheffects import withStroke
 
-from coopenv.estimation.trajectory import Sight
+from coopenv.estimation.trajectory import Outcome, Sight
 from coopenv.scenario import Scenario
 from coopenv.scenario.agents import Body, Landmark, Vehicle
 from coopenv.viz.style import DARK_BLUE, INK, NORMAL, vehicle_colour
@@ -41,7 +41,6 @@ from coopenv.viz.topview_ground import (
 from coopenv.viz.topview_layers import Layers
 from coopenv.viz.window import Window
 
-_ARRIVED, _COLLIDED = 1, 2  # values of the field `ended`
 _SHORTEST = 28  # px, drawn length of a vehicle
 _POINTER = 13  # px
 _LABEL = 11  # px beside a vehicle
@@ -235,8 +234,8 @@ class TopView:
     def _place_marks(self, R: np.ndarray, position: np.ndarray, ended: np.ndarray) -> None:
         L = self._landmarks
         place = outlines(R[L:], position[L:, :2], self._box.mean(axis=1, keepdims=True))[:, 0]
-        self._arrived.set_data(*place[ended == _ARRIVED].T)
-        self._collided.set_data(*place[ended == _COLLIDED].T)
+        self._arrived.set_data(*place[ended == Outcome.ARRIVED].T)
+        self._collided.set_data(*place[ended == Outcome.COLLIDED].T)
         beside = outlines(R[L:], position[L:, :2], self._label[:, None])[:, 0]
         for name, (x, y) in zip(self._names, beside.tolist(), strict=True):
             name.set_position((x, y))

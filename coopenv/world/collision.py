@@ -6,9 +6,11 @@ from typing import Any
 
 import warp as wp
 
-UNDER_WAY = wp.constant(0)
-ARRIVED = wp.constant(1)
-COLLIDED = wp.constant(2)
+from coopenv.estimation.trajectory import Outcome
+
+UNDER_WAY = wp.constant(int(Outcome.UNDER_WAY))
+ARRIVED = wp.constant(int(Outcome.ARRIVED))
+COLLIDED = wp.constant(int(Outcome.COLLIDED))
 
 
 @wp.func

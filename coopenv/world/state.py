@@ -35,7 +35,7 @@ def state_struct(p: Precision) -> Any:
         speed: wp.array2d(dtype=scalar)  # (W, N) of the bicycle, m/s
         steering: wp.array2d(dtype=scalar)  # (W, N) rad
         command: wp.array2d(dtype=vec2)  # (W, N) action in force
-        ended: wp.array2d(dtype=wp.int32)  # (W, N) 0 under way, 1 arrived, 2 collided
+        ended: wp.array2d(dtype=wp.int32)  # (W, N) values of `Outcome`
         collided: wp.array2d(dtype=wp.int32)  # (W, N) touching something now
 
         odometry_velocity: wp.array2d(dtype=vec3)  # (W, N) last sample, m/s

@@ -9,10 +9,9 @@ import pytest
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
+from coopenv.estimation.trajectory import Outcome
 from tests.world.builders import command, constant, landmark, reset, run, scenario, start, vehicle
 from tests.world.calls import DTYPES, call
-
-UNDER_WAY, ARRIVED, COLLIDED = 0, 1, 2
 
 
 def overlap(ca: np.ndarray, Ra: np.ndarray, ha: np.ndarray, cb: np.ndarray, Rb: np.ndarray, hb: np.ndarray) -> float:
@@ -124,15 +123,15 @@ def test_a_collision_ends_both_episodes_for_good() -> None:
     np.testing.assert_array_equal(touching[~border, 0], expected[~border])
     np.testing.assert_array_equal(touching[:, 1], touching[:, 0])
     first = int(np.argmax(touching[:, 0]))
-    assert (ended[:first] == UNDER_WAY).all()
-    assert (ended[first:, :2] == COLLIDED).all()
-    assert (ended[:, 2] == UNDER_WAY).all()
+    assert (ended[:first] == Outcome.UNDER_WAY).all()
+    assert (ended[first:, :2] == Outcome.COLLIDED).all()
+    assert (ended[:, 2] == Outcome.UNDER_WAY).all()
 
 
 def test_collisions_may_be_tolerated() -> None:
     states = crash(collision=False)
     assert any(s["collided"][0, 0] for s in states)
-    assert all((s["ended"][0] == UNDER_WAY).all() for s in states)
+    assert all((s["ended"][0] == Outcome.UNDER_WAY).all() for s in states)
 
 
 @pytest.mark.parametrize("arrival", [True, False])
@@ -146,7 +145,9 @@ def test_arrival_is_by_horizontal_distance(arrival: bool) -> None:
     inside = np.hypot(2.01 - np.arange(181) / 60, 0.3) < 0.5
     first = int(np.argmax(inside))
     assert first == 97
-    np.testing.assert_array_equal(ended, (np.arange(181) >= first) * (ARRIVED if arrival else UNDER_WAY))
+    np.testing.assert_array_equal(
+        ended, (np.arange(181) >= first) * (Outcome.ARRIVED if arrival else Outcome.UNDER_WAY)
+    )
 
 
 def test_a_goal_in_a_wall_is_a_collision() -> None:
@@ -155,8 +156,8 @@ def test_a_goal_in_a_wall_is_a_collision() -> None:
     ended = [int(s["ended"][0, 0]) for s in run(start(scenario([car], obstacles=[wall])), 60)]
     near = vehicle((0, 0, 0), body=BODY, motion=constant([1.0, 0, 0]), goal={"position": [2, 0, 0], "radius": 1.29})
     late = [int(s["ended"][0, 0]) for s in run(start(scenario([near], obstacles=[wall])), 60)]
-    assert ended[-1] == ARRIVED
-    assert late[-1] == COLLIDED
+    assert ended[-1] == Outcome.ARRIVED
+    assert late[-1] == Outcome.COLLIDED
 
 
 def test_reset_clears_the_end() -> None:
@@ -164,8 +165,8 @@ def test_reset_clears_the_end() -> None:
     world = start(made)
     command(world, [1.0, 0.0])
     world.advance(120)
-    assert world.get_state()["ended"][0, 0] == ARRIVED
+    assert world.get_state()["ended"][0, 0] == Outcome.ARRIVED
     reset(world)
-    assert world.get_state()["ended"][0, 0] == UNDER_WAY
+    assert world.get_state()["ended"][0, 0] == Outcome.UNDER_WAY
     world.advance(120)
-    assert world.get_state()["ended"][0, 0] == ARRIVED
+    assert world.get_state()["ended"][0, 0] == Outcome.ARRIVED
