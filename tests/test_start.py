@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +11,11 @@ from pathlib import Path
 import pytest
 
 import coopenv
+from coopenv.cli import complete
 
 HEAVY = {"warp", "scipy", "matplotlib", "PIL", "pandas", "mcap", "torch", "joblib", "jinja2"}
-LIGHT = {"errors", "shipped", "api", "api.registration", "cli", "cli.options", "cli.show", "cli.run", "cli.bench"}
+LIGHT = {"errors", "shipped", "api", "api.registration"}
+LIGHT |= {"cli", *(f"cli.{name}" for name in ("bench", "complete", "options", "run", "show"))}
 
 
 def modules_after(statement: str) -> set[str]:
@@ -67,3 +70,37 @@ def test_every_public_name_is_found_and_listed() -> None:
         assert name in dir(coopenv)
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
         _ = coopenv.nothing
+
+
+def test_the_shell_completes_without_the_simulation() -> None:
+    loaded = modules_after("from coopenv.cli.complete import *; environments(''), agents(''), policies('')")
+    assert not {name for name in loaded if name.startswith("coopenv.")} - {f"coopenv.{name}" for name in LIGHT}
+    assert not HEAVY & modules_after("from coopenv.cli.complete import *; observers('')") - {"scipy"}
+    assert not HEAVY & modules_after("from coopenv.cli.complete import *; override_keys('')") - {"scipy"}
+
+
+def test_completions() -> None:
+    assert complete.environments("busy") == [name for name in coopenv.list_envs() if name.startswith("busy")]
+    assert complete.agents("give") == ["give_way"]
+    assert complete.policies("") == ["zero", "random", *complete.agents("")]
+    assert complete.observers("riccati,mek") == ["riccati,mekf", "riccati,mekf_covariance"]
+    assert "mekf" not in complete.observers("mekf,me")
+    assert complete.override_keys("noise.e") == ["noise.enabled="]
+    assert complete.override_keys("vehicles.*.goal") == ["vehicles.*.goal.position=", "vehicles.*.goal.radius="]
+
+
+def test_every_completed_key_is_one_that_the_loader_knows() -> None:
+    keys = [key.removesuffix("=") for key in complete.override_keys("") if "*" not in key]
+    assert len(keys) > 50
+    for key in keys:
+        try:
+            coopenv.load_scenario("urban_crossing", {key: {"no": "such value"}})
+        except coopenv.ScenarioError as error:
+            assert "unknown" not in str(error), key
+
+
+def test_completion_is_offered_by_the_program() -> None:
+    asked = {"_COOPENV_COMPLETE": "complete_bash", "COMP_WORDS": "coopenv run cross", "COMP_CWORD": "2"}
+    command = [sys.executable, "-c", "from coopenv.cli import app; app(prog_name='coopenv')"]
+    result = subprocess.run(command, env={**os.environ, **asked}, capture_output=True, text=True, check=False)
+    assert result.stdout.split() == ["crossing_path"]

@@ -24,7 +24,6 @@ UsageError: Any = typer.BadParameter.__base__
 app = typer.Typer(
     name="coopenv",
     help="Cooperative localisation of connected vehicles.",
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
-from coopenv.cli.options import Environment, Overrides, SteadyFrom, console, load, parse_overrides, warned
+from coopenv.cli import complete
+from coopenv.cli.options import DataFolder, Environment, Overrides, SteadyFrom, console, load, parse_overrides, warned
 
-bench = typer.Typer(help="Measure: steps per second, drivers.", no_args_is_help=True)
+bench = typer.Typer(help="Compare observers, study seeds, score drivers.", no_args_is_help=True)
 
 
 @bench.command("speed")
@@ -27,7 +28,10 @@ def bench_speed(
     peers: Annotated[bool, typer.Option(help="Also measure other projects' environments.")] = True,
     out: Annotated[Path | None, typer.Option(help="Folder for speed.json and pictures (default: none).")] = None,
 ) -> None:
-    """Measure steps per second of coopenv and, where installed, of its peers, alternating in one run."""
+    """Measure steps per second, beside other projects.
+
+    Peers are measured where they are installed, alternating with coopenv in one run.
+    """
     parsed = parse_overrides(overrides)
     scenario = load(environment, parsed)
     from coopenv.bench.speed import SpeedRequest, execute
@@ -38,10 +42,13 @@ def bench_speed(
 
 @bench.command("agents")
 def bench_agents(
-    agents: Annotated[list[str] | None, typer.Argument(metavar="[AGENT]...", help="Default: all.")] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Episodes, seeds 0, 1, ...")] = 20,
+    agents: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[AGENT]...", help="Names of agents (default: all).", autocompletion=complete.agents),
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of episodes, with the seeds 0, 1, ...")] = 20,
 ) -> None:
-    """Let drivers cross their environments: who arrives, who collides, who knows where it is."""
+    """Score drivers: who arrives, who collides, who knows its pose."""
     from coopenv.api.parallel_env import parallel_env
     from coopenv.bench.agents import play, score
     from coopenv.bench.tables import score_table
@@ -63,12 +70,12 @@ def bench_agents(
 @bench.command("seeds")
 def bench_seeds(
     environment: Environment,
-    seeds: Annotated[int, typer.Option(min=1, help="How many.")] = 20,
-    first: Annotated[int, typer.Option(min=0, help="The first one.")] = 0,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 20,
+    first: Annotated[int, typer.Option(min=0, help="The first seed.")] = 0,
     overrides: Overrides = None,
     steady_from: SteadyFrom = None,
 ) -> None:
-    """Run an environment over many seeds at once: who settles, and the steady errors with their spread."""
+    """Run many seeds at once: who settles, and the steady errors."""
     scenario = load(environment, parse_overrides(overrides))
     from coopenv.bench.seed_table import seed_table
     from coopenv.bench.seeds import study_seeds
@@ -93,26 +100,32 @@ def bench_observers(
         typer.Argument(
             metavar="ENV|DATASET|FILE.mcap",
             help="Environment (name or TOML file), recorded robots (mrclam_1 .. mrclam_9) or a log file.",
+            autocompletion=complete.environments,
         ),
     ],
-    observers: Annotated[str | None, typer.Option(help="Names with commas between (default: all that suit).")] = None,
+    observers: Annotated[
+        str | None,
+        typer.Option(
+            help="Names of observers with commas between (default: all that suit).", autocompletion=complete.observers
+        ),
+    ] = None,
     variants: Annotated[
         str | None,
-        typer.Option(help="Names with commas between, or `all`: faults of an environment, what recorded robots see."),
+        typer.Option(
+            help="Names of variants with commas between, or `all`: faults of an environment, what recorded robots see."
+        ),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Seeds 0, 1, ...")] = 5,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes (default: one per core).")] = None,
-    engine: Annotated[str, typer.Option(help="`local`, or `ray`: an existing Ray cluster.")] = "local",
-    address: Annotated[str | None, typer.Option(help="Of the Ray cluster: HOST:PORT (default: auto).")] = None,
-    data: Annotated[
-        Path | None, typer.Option(help="Folder with the data of recorded robots (default: COOPENV_DATA).")
-    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds: 0, 1, ...")] = 5,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None,
+    engine: Annotated[str, typer.Option(help="Where to compute: `local`, or `ray` (an existing cluster).")] = "local",
+    address: Annotated[str | None, typer.Option(help="Address of the Ray cluster, HOST:PORT (default: auto).")] = None,
+    data: DataFolder = None,
     basin: Annotated[int, typer.Option(min=0, help="Random initial estimates for maps of the basins.")] = 0,
     overrides: Overrides = None,
     steady_from: SteadyFrom = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the leaderboard and the report.")] = None,
 ) -> None:
-    """Compare observers on the same ticks, against the truth and the Cramér-Rao bound."""
+    """Compare observers on the same data and with their bound."""
     from coopenv.bench.leaderboard.command import perform, request_of
     from coopenv.bench.leaderboard.engines import find_engine
 

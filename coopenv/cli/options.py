@@ -7,10 +7,12 @@ import tomllib
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from coopenv.cli import complete
 from coopenv.errors import CoopenvError, DataWarning
 
 if TYPE_CHECKING:
@@ -19,15 +21,35 @@ if TYPE_CHECKING:
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 
-Environment = Annotated[str, typer.Argument(metavar="ENV", help="Name (see `coopenv list`) or path of a TOML file.")]
+Environment = Annotated[
+    str,
+    typer.Argument(
+        metavar="ENV",
+        help="Name of an environment (see `coopenv list`) or path of a TOML file.",
+        autocompletion=complete.environments,
+    ),
+]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
         metavar="KEY=VALUE",
-        help="Override a dotted key of the scenario, e.g. noise.enabled=false; the value is TOML, or else a string. "
+        help="Override a dotted key of the scenario, e.g. noise.enabled=false. The value is TOML, or else a string. "
         "Repeatable.",
+        autocompletion=complete.override_keys,
     ),
+]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the random generator.")]
+PolicyName = Annotated[
+    str,
+    typer.Option(
+        "--policy",
+        help="Policy of the driven vehicles: zero, random, or the name of an agent.",
+        autocompletion=complete.policies,
+    ),
+]
+DataFolder = Annotated[
+    Path | None, typer.Option("--data", help="Folder of recorded data sets (default: the variable COOPENV_DATA).")
 ]
 SteadyFrom = Annotated[
     float | None,

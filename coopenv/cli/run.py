@@ -7,23 +7,36 @@ from typing import Annotated
 
 import typer
 
-from coopenv.cli.options import INTERRUPTED, Environment, Overrides, SteadyFrom, console, load, parse_overrides, warned
+from coopenv.cli import complete
+from coopenv.cli.options import (
+    INTERRUPTED,
+    DataFolder,
+    Environment,
+    Overrides,
+    PolicyName,
+    Seed,
+    SteadyFrom,
+    console,
+    load,
+    parse_overrides,
+    warned,
+)
 from coopenv.errors import CoopenvError, OutputError
 
 
 def run(
     environment: Environment,
-    seed: Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")] = 0,
+    seed: Seed = 0,
     overrides: Overrides = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Decisions to run (default: up to the horizon).")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the results (default: out/ENV).")] = None,
-    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:0, ...")] = "cpu",
-    dtype: Annotated[str, typer.Option(help="float32 or float64.")] = "float64",
-    policy: Annotated[str, typer.Option(help="Of driven vehicles: zero, random, or the name of an agent.")] = "zero",
+    device: Annotated[str, typer.Option(help="Device that computes: cpu, cuda, cuda:0, ...")] = "cpu",
+    dtype: Annotated[str, typer.Option(help="Precision: float32 or float64.")] = "float64",
+    policy: PolicyName = "zero",
     steady_from: SteadyFrom = None,
-    video: Annotated[bool, typer.Option("--video", help="Also film the top view.")] = False,
+    video: Annotated[bool, typer.Option("--video", help="Also write a video of the top view.")] = False,
 ) -> None:
-    """Run an environment and write metrics, record and figures."""
+    """Run an environment; write metrics, arrays and figures."""
     parsed = parse_overrides(overrides)
     scenario = load(environment, parsed)
     from coopenv.runs.command import RunRequest, execute
@@ -48,17 +61,25 @@ def run(
 
 def record_command(
     environment: Annotated[
-        str, typer.Argument(metavar="ENV|DATASET", help="Environment, TOML file, or a data set such as mrclam_6.")
+        str,
+        typer.Argument(
+            metavar="ENV|DATASET",
+            help="Environment, TOML file, or a data set such as mrclam_6.",
+            autocompletion=complete.environments,
+        ),
     ],
     out: Annotated[Path, typer.Option(help="MCAP file to write.")],
-    seed: Annotated[int, typer.Option(min=0, help="Of everything that is drawn.")] = 0,
-    policy: Annotated[str, typer.Option(help="Of driven vehicles: zero, random, or the name of an agent.")] = "zero",
+    seed: Seed = 0,
+    policy: PolicyName = "zero",
     overrides: Overrides = None,
-    data: Annotated[Path | None, typer.Option(help="Folder of data sets (default: COOPENV_DATA).")] = None,
-    variant: Annotated[str | None, typer.Option(help="Of a data set: landmarks, landmarks+robots, blind.")] = None,
+    data: DataFolder = None,
+    variant: Annotated[str | None, typer.Option(help="Variant of a data set, e.g. landmarks or blind.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
 ) -> None:
-    """Write what vehicles sense, tick by tick, to an MCAP file, which Foxglove opens and coopenv replays."""
+    """Write what vehicles sense to an MCAP file.
+
+    The file holds every tick; Foxglove opens it and coopenv replays it.
+    """
     from coopenv.backends.mcap import check_target, write_recording
     from coopenv.backends.replay import is_recorded
     from coopenv.runs.log import read_recorded, simulate

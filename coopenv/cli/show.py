@@ -20,7 +20,7 @@ def list_command() -> None:
 
 
 def describe(environment: Environment, overrides: Overrides = None) -> None:
-    """Print a scenario for people: who is in it, how they sense and estimate, and what an observation holds."""
+    """Say what an environment is: vehicles, sensors, observer."""
     from coopenv.scenario.describe import describe_scenario
 
     out = console()
@@ -31,7 +31,7 @@ def describe(environment: Environment, overrides: Overrides = None) -> None:
 def schema(
     out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None,
 ) -> None:
-    """Write the JSON schema of scenario files, for editors and other tools."""
+    """Write the JSON schema of scenario files, for editors."""
     from coopenv.runs.output import writing
     from coopenv.scenario.json_schema import schema_text
 
