@@ -52,7 +52,7 @@ format: $(VENV)/.dev ## let ruff rewrite what it can
 	@$(BIN)/ruff format .
 
 bench: $(VENV)/.base ## measure steps per second
-	@$(BIN)/coopenv bench speed
+	@$(BIN)/python -m benchmarks.speed
 
 schema: $(VENV)/.base ## write the JSON schema of scenario files, which editors complete from
 	@$(BIN)/coopenv schema --out docs/scenario.schema.json

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from rich.table import Table
 
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
+from coopenv.bench.tables import number_table
 from coopenv.policies.base import Policy
 
 
@@ -20,6 +22,7 @@ class Score:
     arrived: float
     collided: float
     under_way: float
+    """Neither when the episode ended."""
     mean_return: float
     """Sum of the rewards of all vehicles, mean over episodes."""
     std_return: float
@@ -58,3 +61,20 @@ def score(episodes: Iterator[tuple[float, list[str], list[float]]]) -> Score:
         float(np.median(errors)),
         float(np.percentile(errors, 95)),
     )
+
+
+def score_table(rows: Iterable[tuple[str, str, Score]]) -> Table:
+    """Return one row per (driver, environment, score)."""
+    outcomes = ("arri-\nved", "colli-\nded", "out of\ntime")
+    table = number_table(("agent", "environment"), ("runs", *outcomes, "return", "median\nerror", "95 %\nerror"))
+    for agent, environment, s in rows:
+        table.add_row(
+            agent,
+            environment,
+            str(s.episodes),
+            *(f"{100 * share:.0f} %" for share in (s.arrived, s.collided, s.under_way)),
+            f"{s.mean_return:.1f}±{s.std_return:.1f}",
+            f"{s.median_position_error_m:.3f}",
+            f"{s.p95_position_error_m:.3f}",
+        )
+    return table

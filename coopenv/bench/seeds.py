@@ -6,8 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from rich.table import Table
 
 from coopenv.api.engine import Engine
+from coopenv.bench.tables import number_table
 from coopenv.estimation.metrics import settling_time
 from coopenv.scenario import Scenario
 
@@ -71,3 +73,31 @@ def study_seeds(
         final_position_error=position[-1],
         final_orientation_error=orientation[-1],
     )
+
+
+def seed_table(study: SeedStudy) -> Table:
+    """Return one row per vehicle: settled seeds, settling time, steady RMSE as mean, spread and worst."""
+    table = number_table(
+        ("vehicle",),
+        (
+            "settled\nseeds",
+            "settles at [s]\nmedian (last)",
+            "position RMSE [m]\nmean±std (worst)",
+            "orientation [deg]\nmean±std (worst)",
+        ),
+    )
+    for i, vehicle in enumerate(study.vehicles):
+        times = study.settle_time[:, i]
+        settled = times[np.isfinite(times)]
+        table.add_row(
+            vehicle,
+            f"{len(settled)}/{len(times)}",
+            f"{np.median(settled):.1f} ({settled.max():.1f})" if len(settled) else "-",
+            _spread(study.position_rmse[:, i], 4),
+            _spread(study.orientation_rmse[:, i], 2),
+        )
+    return table
+
+
+def _spread(values: np.ndarray, digits: int) -> str:
+    return f"{values.mean():.{digits}f}±{values.std():.{digits}f} ({values.max():.{digits}f})"

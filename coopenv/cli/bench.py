@@ -13,33 +13,6 @@ from coopenv.cli.options import DataFolder, Environment, Overrides, SteadyFrom, 
 bench = typer.Typer(help="Compare observers, study seeds, score drivers.", no_args_is_help=True)
 
 
-@bench.command("speed")
-def bench_speed(
-    environment: Annotated[str, typer.Argument(metavar="ENV", help="Environment to step.")] = "busy_intersection",
-    overrides: Overrides = None,
-    seconds: Annotated[
-        float | None, typer.Option(min=0.01, help="Time per case and round (default: 0.5).", show_default=False)
-    ] = None,
-    repeats: Annotated[
-        int | None, typer.Option(min=1, help="Rounds, of which the median counts (default: 5).", show_default=False)
-    ] = None,
-    growth: Annotated[bool, typer.Option("--growth", help="Also grow vehicles, landmarks and worlds.")] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer cases and shorter rounds: under a minute.")] = False,
-    peers: Annotated[bool, typer.Option(help="Also measure other projects' environments.")] = True,
-    out: Annotated[Path | None, typer.Option(help="Folder for speed.json and pictures (default: none).")] = None,
-) -> None:
-    """Measure steps per second, beside other projects.
-
-    Peers are measured where they are installed, alternating with coopenv in one run.
-    """
-    parsed = parse_overrides(overrides)
-    scenario = load(environment, parsed)
-    from coopenv.bench.speed import SpeedRequest, execute
-
-    request = SpeedRequest(environment, scenario, parsed, seconds, repeats, out, growth, quick, peers)
-    execute(request, console(), console(stderr=True))
-
-
 @bench.command("agents")
 def bench_agents(
     agents: Annotated[
@@ -50,8 +23,7 @@ def bench_agents(
 ) -> None:
     """Score drivers: who arrives, who collides, who knows its pose."""
     from coopenv.api.parallel_env import parallel_env
-    from coopenv.bench.agents import play, score
-    from coopenv.bench.tables import score_table
+    from coopenv.bench.agents import play, score, score_table
     from coopenv.policies import load_agent, read_card
     from coopenv.runs.command import progress
     from coopenv.shipped import list_agents
@@ -77,8 +49,7 @@ def bench_seeds(
 ) -> None:
     """Run many seeds at once: who settles, and the steady errors."""
     scenario = load(environment, parse_overrides(overrides))
-    from coopenv.bench.seed_table import seed_table
-    from coopenv.bench.seeds import study_seeds
+    from coopenv.bench.seeds import seed_table, study_seeds
     from coopenv.estimation.metrics import steady_start
     from coopenv.runs.command import progress
 

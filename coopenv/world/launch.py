@@ -19,6 +19,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.errors import CoopenvError
+from coopenv.machine import available_cores
 
 WORLDS_PER_THREAD = 32
 """Smaller shares are not worth the handing over between threads."""
@@ -66,8 +67,7 @@ def default_threads(worlds: int, device: str) -> int:
     wanted = os.environ.get("COOPENV_THREADS", "")
     if wanted and not (wanted.isascii() and wanted.isdecimal() and int(wanted) > 0):
         raise CoopenvError(f"COOPENV_THREADS must be a positive whole number, got '{wanted}'")
-    available = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, min(int(wanted or available), worlds // WORLDS_PER_THREAD))
+    return max(1, min(int(wanted or available_cores()), worlds // WORLDS_PER_THREAD))
 
 
 @dataclass(frozen=True)

@@ -30,10 +30,10 @@ from coopenv.bench.leaderboard.tables import (
     error_table,
     failures,
     honest_line,
-    new_table,
     quality_table,
     variant_table,
 )
+from coopenv.bench.tables import number_table
 from coopenv.estimation.metrics import json_ready
 from coopenv.estimation.observers.faults import FAULTS, NOMINAL
 from coopenv.estimation.observers.registry import available_names, find, observer_names, obstacle
@@ -190,7 +190,7 @@ def print_tables(rows: Sequence[Row], basins: Sequence[Basin], printed: Console)
 
 
 def _basin_table(basins: Sequence[Basin]) -> Table:
-    table = new_table("basin", ["draws", "failed", "all vehicles\nconverge", "95 %", "settled [s]\nmedian"])
+    table = number_table(["basin"], ["draws", "failed", "all vehicles\nconverge", "95 %", "settled [s]\nmedian"], gap=0)
     for basin in basins:
         low, high = (100 * end for end in basin.interval)
         settled = basin.settle_time_s

@@ -5,25 +5,22 @@ An engine maps one function over tasks. What comes out does not depend on the en
 
 from __future__ import annotations
 
-import contextlib
 import multiprocessing
 import os
 import pickle
 import socket
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 from coopenv.errors import CoopenvError
+from coopenv.machine import ONE_THREAD, available_cores, environment
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-"""Numerical libraries read these when they are loaded. Matrices here are small: threads would only get in the way."""
 
 AUTO = "auto"
 ENGINES = ("local", "ray")
@@ -46,11 +43,6 @@ class Engine(Protocol):
         ...
 
 
-def cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def find_engine(name: str, jobs: int | None = None, address: str | None = None) -> Engine:
     """Return an engine that is ready.
 
@@ -67,7 +59,7 @@ def find_engine(name: str, jobs: int | None = None, address: str | None = None) 
     if name == "local":
         if address is not None:
             raise CoopenvError(f"--address {address}: only --engine ray has an address")
-        return Local(jobs or cores())
+        return Local(jobs or available_cores())
     if jobs is not None:
         raise CoopenvError(f"--jobs {jobs}: with --engine ray the cluster decides")
     engine = Ray(address or AUTO)
@@ -95,7 +87,7 @@ class Local:
         else:
             _check_sendable(tasks[0])
             with (
-                single_threaded(),
+                environment(ONE_THREAD),  # matrices here are small: threads would only get in the way
                 ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool,
             ):
                 work = {pool.submit(function, task): n for n, task in enumerate(tasks)}
@@ -124,21 +116,6 @@ def _check_sendable(task: object) -> None:
             f"cannot be sent to another process: {error} (define observers at the top level of a module, or use "
             "--jobs 1)"
         ) from None
-
-
-@contextlib.contextmanager
-def single_threaded() -> Iterator[None]:
-    """Let processes that are started meanwhile compute with one thread each."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
 
 
 @dataclass(frozen=True)
@@ -195,9 +172,9 @@ class Ray:
         return ray
 
     def _attempt(self, ray: Any, failure: list[BaseException | None]) -> None:
-        environment = {"env_vars": dict.fromkeys(THREADS, "1")}
+        runtime = {"env_vars": dict(ONE_THREAD)}
         try:
-            ray.init(address=self.address, runtime_env=environment, log_to_driver=False, configure_logging=False)
+            ray.init(address=self.address, runtime_env=runtime, log_to_driver=False, configure_logging=False)
         except Exception as error:
             failure.append(error)
         else:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from rich import box
 from rich.table import Table
 
 from coopenv.bench.leaderboard.rows import Row
+from coopenv.bench.tables import number_table
 from coopenv.estimation.observers.faults import NOMINAL
 
 MOST_COLUMNS = 6
@@ -17,15 +17,6 @@ MOST_COLUMNS = 6
 _LONG = 9  # characters of a word in a heading
 BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", "bound_single_m": "bound (alone)"}
 """Column to its line in the table of errors."""
-
-
-def new_table(first: str, headings: Sequence[str]) -> Table:
-    """Return an empty table: names, then numbers."""
-    table = Table(box=box.HORIZONTALS, padding=0, pad_edge=False, show_edge=False)
-    table.add_column(first, no_wrap=True)
-    for heading in headings:
-        table.add_column(heading, justify="right", no_wrap=True)
-    return table
 
 
 def by_observer(rows: Iterable[Row]) -> dict[str, list[Row]]:
@@ -43,7 +34,7 @@ def error_table(rows: Sequence[Row]) -> Table:
     headings = [f"f{i + 1}" for i in range(len(first))] if few else ["mean", "worst"]
     bounded = {column: line for column, line in BOUNDS.items() if np.isfinite(getattr(first[0], column))}
     ratios = ["x joint\nworst", "x anc.\nworst"] if bounded else []
-    table = new_table("position RMSE [m]", [*headings, *([] if bounded or not few else ["mean"]), *ratios])
+    table = number_table(["position RMSE [m]"], [*headings, *([] if bounded or not few else ["mean"]), *ratios], gap=0)
     for column, line in bounded.items():
         table.add_row(line, *_errors([getattr(row, column) for row in first], few))
     for name, own in by_observer(rows).items():
@@ -72,7 +63,7 @@ def honest_line(rows: Sequence[Row]) -> str:
 def quality_table(rows: Sequence[Row]) -> Table:
     """Return, of one variant over all vehicles: who settles, consistency (1 is honest) and costs."""
     headings = ["set-\ntled", "con-\nverged", "di-\nverged", "ANEES\nbest", "ANEES\nworst", "NIS", "sent\nB/s", "us"]
-    table = new_table("observer", headings)
+    table = number_table(["observer"], headings, gap=0)
     for name, own in by_observer(rows).items():
         if any(row.failure for row in own):
             continue
@@ -94,7 +85,7 @@ def quality_table(rows: Sequence[Row]) -> Table:
 def variant_table(rows: Sequence[Row]) -> Table:
     """Return position RMSE in m, mean over the vehicles, of every observer in every variant."""
     variants = list(dict.fromkeys(row.variant for row in rows))
-    table = new_table("mean RMSE [m]", [_heading(name) for name in variants])
+    table = number_table(["mean RMSE [m]"], [_heading(name) for name in variants], gap=0)
     for name, own in by_observer(rows).items():
         cells = []
         for variant in variants:
@@ -108,7 +99,7 @@ def variant_table(rows: Sequence[Row]) -> Table:
 def degradation_table(rows: Sequence[Row]) -> Table:
     """Return how much worse than the nominal one every observer is in every other variant."""
     variants = [name for name in dict.fromkeys(row.variant for row in rows) if name != NOMINAL]
-    table = new_table("RMSE / nominal", [_heading(name) for name in variants])
+    table = number_table(["RMSE / nominal"], [_heading(name) for name in variants], gap=0)
     for name, own in by_observer(rows).items():
         table.add_row(name, *(_number(degradation(own, variant), 3) for variant in variants))
     return table

@@ -66,7 +66,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_json(folder: Path) -> None:
     board = json.loads((folder / "leaderboard.json").read_text())
     assert set(board) == {"command", "versions", "seeds", "rows", "basin"}
-    assert set(board["versions"]) == {"coopenv", "numpy", "scipy", "warp", "python"} and board["seeds"] == [0, 1]
+    assert set(board["versions"]) == {"coopenv", "numpy", "scipy", "warp-lang", "python"} and board["seeds"] == [0, 1]
     assert list(board["rows"][0]) == [f.name for f in fields(Row)] and set(board["rows"][0]) >= REQUIRED
     keys = [(row["variant"], row["observer"], row["vehicle"]) for row in board["rows"]]
     assert keys == [

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import Any
 
-from coopenv.bench.cases import Case
-from coopenv.bench.fleet import Fleet, WorkerError
+from benchmarks.speed.cases import Case
+from benchmarks.speed.workers import WorkerError, Workers
 
 OnProgress = Callable[[str], None]
 """Told, before each unit of work, what it is."""
@@ -20,8 +20,9 @@ class Result:
 
     case: Case
     built: dict[str, Any] = field(default_factory=dict)
-    """The worker's reply, see `coopenv.bench.worker`."""
+    """What `Workers.build` returned."""
     rounds: list[dict[str, Any]] = field(default_factory=list)
+    """What `Workers.run` returned."""
     problem: str = ""
     """Why there are no figures."""
 
@@ -70,7 +71,6 @@ class Result:
             "vehicles": case.vehicles,
             "threads": case.threads,
             "dtype": case.dtype,
-            "infos": case.infos,
             "env_steps_per_s": self.env_steps_per_s,
             "agent_steps_per_s": self.agent_steps_per_s,
             "vehicle_ticks_per_s": self.vehicle_ticks_per_s,
@@ -88,7 +88,7 @@ class Result:
 
 def measure(
     cases: list[Case],
-    fleet: Fleet,
+    workers: Workers,
     seconds: float,
     repeats: int,
     on_progress: OnProgress = lambda text: None,
@@ -101,7 +101,7 @@ def measure(
     for result in results:
         on_progress(f"building {describe(result.case)}")
         try:
-            result.built = fleet.build(result.case)
+            result.built = workers.build(result.case)
         except WorkerError as error:
             result.problem = f"failed: {error}"
     for _ in range(repeats):
@@ -110,7 +110,7 @@ def measure(
             if result.problem:
                 continue
             try:
-                result.rounds.append(fleet.run(result.case, result.built["id"], seconds))
+                result.rounds.append(workers.run(result.case, result.built["id"], seconds))
             except WorkerError as error:
                 result.problem = f"failed: {error}"
     return results

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coopenv.bench.growth import WORLDS, Sweep, fit_power_law, growth_scenario, summarise, sweeps
-from coopenv.bench.measure import Result
+from benchmarks.speed.growth import WORLDS, Sweep, fit_power_law, growth_scenario, summarise, sweeps
+from benchmarks.speed.measure import Result
 from coopenv.scenario.checks import neighbour_sets
 
 

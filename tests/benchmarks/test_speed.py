@@ -1,21 +1,18 @@
-"""`coopenv bench speed` as a whole."""
+"""`python -m benchmarks.speed` as a whole."""
 
 from __future__ import annotations
 
 import json
 import re
-from io import StringIO
 from pathlib import Path
 
 import pytest
 from jsonschema import validate
-from rich.console import Console
 
-import coopenv
-from coopenv.bench import peers, speed
-from coopenv.bench.speed import SpeedRequest
-from coopenv.cli import main
-from tests.bench.fake_peer import FAKE, fake_case
+from benchmarks.speed import peer_cases, run
+from benchmarks.speed.__main__ import command, main, parser
+from benchmarks.speed.report import BUSY
+from tests.benchmarks.fake_library import FAKE, fake_case
 
 NUMBER = {"type": "number", "exclusiveMinimum": 0}
 COUNT = {"type": "integer", "minimum": 1}
@@ -27,7 +24,6 @@ ROW = {
         "vehicles": COUNT,
         "threads": COUNT,
         "dtype": {"enum": ["float32", "float64"]},
-        "infos": {"type": "boolean"},
         "env_steps_per_s": NUMBER,
         "agent_steps_per_s": NUMBER,
         "vehicle_ticks_per_s": NUMBER,
@@ -40,7 +36,7 @@ ROW["required"] = list(ROW["properties"])  # type: ignore[call-overload]
 DOCUMENT = {
     "type": "object",
     "properties": {
-        "command": {"type": "string", "pattern": "^coopenv bench speed "},
+        "command": {"type": "string", "pattern": "^python -m benchmarks.speed "},
         "rows": {"type": "array", "items": ROW, "minItems": 1},
         "machine": {"type": "object", "required": ["processor", "cores_available", "memory_bytes", "system"]},
         "versions": {"type": "object", "required": ["python", "coopenv", "warp-lang", "numpy"]},
@@ -63,9 +59,6 @@ def terminal(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     ("line", "message"),
     [
         ("busy_intersecton", "did you mean 'busy_intersection'"),
-        ("--repeats 0", "--repeats"),
-        ("--seconds 0", "--seconds"),
-        ("--seconds nan", "--seconds"),
         ("--out occupied", "it is not a folder"),
         ("--out occupied/below", "cannot write to"),
         ("--out taken", "speed.json: it is a folder"),
@@ -75,7 +68,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def test_mistakes_end_with_one_line_and_status_2(line: str, message: str, capfd: pytest.CaptureFixture[str]) -> None:
     Path("occupied").write_text("")
     Path("taken/speed.json").mkdir(parents=True)
-    assert main(["bench", "speed", *line.split()]) == 2
+    assert main(line.split()) == 2
     captured = capfd.readouterr()
     assert captured.out == ""
     assert captured.err.startswith("error: ")
@@ -83,45 +76,49 @@ def test_mistakes_end_with_one_line_and_status_2(line: str, message: str, capfd:
     assert message in captured.err
 
 
-def test_a_peer_that_is_not_installed_is_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(peers, "find_spec", lambda name: None)
-    assert not any(peers.installed(peer) for peer in peers.PEERS)
-    assert peers.install_hint(peers.MPE2) == "not installed: pip install mpe2"
+@pytest.mark.parametrize("option", ["--repeats 0", "--seconds 0", "--seconds nan", "--seconds soon"])
+def test_numbers_are_positive(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(option.split())
+    assert option.split()[0] in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_peer_that_is_not_installed_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(peer_cases, "find_spec", lambda name: None)
+    assert not any(peer_cases.installed(peer) for peer in peer_cases.PEERS)
+    assert peer_cases.install_hint(peer_cases.MPE2) == "not installed: pip install mpe2"
 
 
 def test_the_command_is_written_as_it_can_be_typed() -> None:
-    request = SpeedRequest("urban_crossing", None, {"horizon": 20.0}, seconds=1.5, growth=True, peers=False)  # type: ignore[arg-type]
-    assert request.command == (
-        "coopenv bench speed urban_crossing --seconds 1.5 --repeats 5 --set horizon=20.0 --growth --no-peers"
-    )
+    line = "urban_crossing --set horizon=20.0 --seconds=1.5 --growth --no-peers"
+    asked = parser().parse_args([*line.split(), "--out", "here"])
+    assert command(asked) == f"python -m benchmarks.speed {line}"
 
 
-def test_a_run_with_a_fake_peer(monkeypatch: pytest.MonkeyPatch) -> None:
-    absent = peers.peer_cases(quick=True)[0]
-    monkeypatch.setattr(speed, "PEERS", (FAKE, peers.HIGHWAY))
-    monkeypatch.setattr(speed, "installed", lambda library: library is FAKE)
-    monkeypatch.setattr(speed, "peer_cases", lambda quick: [fake_case(), absent])
-    monkeypatch.setattr(speed, "own_cases", lambda *_: [fake_case("make_vec", worlds=32)])
-    scenario = coopenv.load_scenario("busy_intersection")
-    out = StringIO()
-    request = SpeedRequest("busy_intersection", scenario, seconds=0.01, repeats=1, quick=True, out=Path("here"))
-    report = speed.execute(request, Console(file=out, width=80), Console(file=StringIO()))
+def test_a_run_with_a_fake_peer(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    absent = peer_cases.peer_cases(quick=True)[0]
+    monkeypatch.setattr(run, "PEERS", (FAKE, peer_cases.HIGHWAY))
+    monkeypatch.setattr(run, "installed", lambda library: library is FAKE)
+    monkeypatch.setattr(run, "peer_cases", lambda quick: [fake_case(), absent])
+    monkeypatch.setattr(run, "own_cases", lambda *_: [fake_case("make_vec", worlds=32)])
+    assert main(["--seconds", "0.01", "--repeats", "1", "--quick", "--out", "here"]) == 0
+    out = capsys.readouterr().out
     document = json.loads(Path("here/speed.json").read_text())
     validate(document, DOCUMENT)
     assert [row["name"] for row in document["rows"]] == ["make_vec", "fake"]
     assert document["without_figures"][0]["reason"] == "not installed: pip install highway-env"
-    assert set(report.startup.imports) == {"coopenv", "fake"}
-    assert "install highway-env" in out.getvalue()
-    used = re.search(r"Cores used: (\d\.\d\d) by cases on 1", out.getvalue())
-    assert used is not None and float(used[1]) < speed.BUSY  # the fake one sleeps
-    assert "figures are too low" in " ".join(out.getvalue().split())
-    assert "For fake: scans." in out.getvalue()
-    assert "Files in here: speed.json, speed.png" in out.getvalue()
+    assert set(document["startup_s"]["imports"]) == {"coopenv", "fake"}
+    assert "install highway-env" in out
+    used = re.search(r"Cores used: (\d\.\d\d) by cases on 1", out)
+    assert used is not None and float(used[1]) < BUSY  # the fake one sleeps
+    assert "figures are too low" in " ".join(out.split())
+    assert "For fake: scans." in out
+    assert "Files in here: speed.json, speed.png" in out
 
 
 @pytest.mark.slow
 def test_quick_from_end_to_end(capsys: pytest.CaptureFixture[str]) -> None:
-    line = "bench speed --quick --growth --seconds 0.02 --repeats 1 --out here"
+    line = "--quick --growth --seconds 0.02 --repeats 1 --out here"
     assert main(line.split()) == 0
     out = capsys.readouterr().out
     document = json.loads(Path("here/speed.json").read_text())
@@ -130,9 +127,8 @@ def test_quick_from_end_to_end(capsys: pytest.CaptureFixture[str]) -> None:
     assert "…" not in out
     assert {path.name for path in Path("here").iterdir()} == {"speed.json", "speed.png", "growth.png"}
     shown = {row["name"] for row in document["rows"]} | {row["name"] for row in document["without_figures"]}
-    assert {case.name for case in peers.peer_cases()} <= shown
-    own = {(row["worlds"], row["infos"]) for row in document["rows"] if row["name"] == "make_vec"}
-    assert own == {(worlds, infos) for worlds in (1, 32, 1024) for infos in (True, False)}
+    assert {case.name for case in peer_cases.peer_cases()} <= shown
+    assert {row["worlds"] for row in document["rows"] if row["name"] == "make_vec"} == {1, 32, 1024}
     assert all(row["array_bytes_per_world"] > 1000 for row in document["rows"] if row["library"] == "coopenv")
     assert len(document["growth"]) == 4
     assert all(growth["costs"] for growth in document["growth"])

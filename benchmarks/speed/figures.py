@@ -1,4 +1,4 @@
-"""Pictures of a measurement: rates over worlds, costs over sizes."""
+"""Figures of a measurement: rates over worlds, costs over sizes."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from coopenv.bench.cases import BATCH, SINGLE
-from coopenv.bench.growth import WORLDS, Growth
-from coopenv.bench.measure import Result
-from coopenv.bench.tables import count
+from benchmarks.speed.coopenv_cases import BATCH, SINGLE
+from benchmarks.speed.growth import WORLDS, Growth
+from benchmarks.speed.measure import Result
+from benchmarks.speed.tables import count
 from coopenv.viz import style
 
 PEER_LOOKS = {
@@ -25,7 +25,7 @@ GROWTH_LOOKS = {True: (style.BLUE, "o"), False: (style.VERMILION, "s")}
 
 def draw_speed(results: list[Result], path: Path) -> Path:
     """Draw agent steps and vehicle ticks per second over the number of worlds."""
-    shown = [r for r in results if not r.problem and r.case.infos]
+    shown = [r for r in results if not r.problem]
     figure = style.new_figure(8.4, 4.3)
     left, right = figure.subplots(1, 2)
     curves = _curves(shown)

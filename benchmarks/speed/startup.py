@@ -9,9 +9,9 @@ import tempfile
 from dataclasses import dataclass, field
 from statistics import median
 
-from coopenv.bench.cases import COOPENV, Library
-from coopenv.bench.fleet import worker_environment
-from coopenv.bench.measure import OnProgress
+from benchmarks.speed.cases import COOPENV, Library
+from benchmarks.speed.measure import OnProgress
+from benchmarks.speed.workers import VARIABLES
 
 IMPORT = "import time; start = time.perf_counter(); import {module}; print(time.perf_counter() - start)"
 FIRST_STEP = """
@@ -73,11 +73,10 @@ def _fresh_process(script: str, variables: dict[str, str]) -> float | None:
     """Return the last number that a script prints, None when it fails."""
     done = subprocess.run(
         [sys.executable, "-P", "-W", "ignore", "-c", script],
-        env={**worker_environment(), **variables},
+        env={**os.environ, **VARIABLES, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), **variables},
         capture_output=True,
         text=True,
         stdin=subprocess.DEVNULL,
-        cwd=os.curdir,
     )
     lines = done.stdout.split()
     return float(lines[-1]) if done.returncode == 0 and lines else None

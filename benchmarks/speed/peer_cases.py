@@ -1,25 +1,23 @@
-"""Environments of other projects, measured beside coopenv where they are installed; builders run in workers.
+"""Environments of other projects, measured beside coopenv where they are installed; builders run in worker processes.
 
 Actions are drawn beforehand and resets are included, as in coopenv's own cases.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from importlib.util import find_spec
 from itertools import cycle
 from typing import Any
 
 import numpy as np
 
-from coopenv.bench.cases import Case, Library
-from coopenv.bench.worker import Built
+from benchmarks.speed.cases import Built, Case, Library, parallel_step
 
 HIGHWAY = Library(
-    "highway-env", "highway_env", "coopenv.bench.peers:build_highway", ("highway-env", "gymnasium", "numpy")
+    "highway-env", "highway_env", "benchmarks.speed.peer_cases:build_highway", ("highway-env", "gymnasium", "numpy")
 )
-VMAS = Library("VMAS", "vmas", "coopenv.bench.peers:build_vmas", ("vmas", "torch", "gym", "pyglet"))
-MPE2 = Library("mpe2", "mpe2.simple_spread_v3", "coopenv.bench.peers:build_mpe2", ("mpe2", "pettingzoo"))
+VMAS = Library("VMAS", "vmas", "benchmarks.speed.peer_cases:build_vmas", ("vmas", "torch", "gym", "pyglet"))
+MPE2 = Library("mpe2", "mpe2.simple_spread_v3", "benchmarks.speed.peer_cases:build_mpe2", ("mpe2", "pettingzoo"))
 PEERS = (HIGHWAY, VMAS, MPE2)
 
 CONTROLLED = 4
@@ -129,19 +127,6 @@ def build_mpe2(case: Case) -> Built:
 
     env = simple_spread_v3.parallel_env(N=case.vehicles)
     env.reset(seed=0)
-    return Built(_parallel_step(env))
-
-
-def _parallel_step(env: Any) -> Callable[[], int]:
     rng = np.random.default_rng(0)
-    n = env.action_space(env.possible_agents[0]).n
-    actions = cycle([{agent: int(rng.integers(n)) for agent in env.possible_agents} for _ in range(64)])
-
-    def step() -> int:
-        if not env.agents:
-            env.reset()
-        action, agents = next(actions), env.agents
-        env.step({agent: action[agent] for agent in agents})
-        return len(action)
-
-    return step
+    actions = env.action_space(env.possible_agents[0]).n
+    return Built(parallel_step(env, lambda: int(rng.integers(actions)), 1))

@@ -5,10 +5,9 @@ from __future__ import annotations
 import os
 import time
 
-from coopenv.bench.cases import Case, Library
-from coopenv.bench.worker import Built
+from benchmarks.speed.cases import Built, Case, Library
 
-FAKE = Library("fake", "json", "tests.bench.fake_peer:build", ("pytest",))
+FAKE = Library("fake", "json", "tests.benchmarks.fake_library:build", ("pytest",))
 STEP = 0.002
 """s"""
 
@@ -21,6 +20,8 @@ def build(case: Case) -> Built:
     print("libraries print whatever they like on standard output")
     if "import_error" in case.options:
         raise ImportError("no module\nof that name")
+    if "tell" in case.options:
+        raise ValueError(f"{case.options['tell']} is {os.environ[case.options['tell']]}")
     steps_left = case.options.get("steps_left", 1 << 30)
     ballast = bytearray(case.options.get("bytes", 0))
     ballast[::4096] = b"x" * len(ballast[::4096])

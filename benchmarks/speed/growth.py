@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from coopenv.bench.cases import COOPENV, Case
-from coopenv.bench.measure import Result
+from benchmarks.speed.cases import COOPENV, Case
+from benchmarks.speed.measure import Result
 from coopenv.scenario import Scenario, ScenarioWarning, parse_scenario, scenario_path
 from coopenv.scenario.files import apply_vehicle_defaults
 

@@ -1,0 +1,1 @@
+"""Steps per second of coopenv and of other projects' environments: `python -m benchmarks.speed`."""
