@@ -34,6 +34,10 @@ class DataError(CoopenvError):
     """A recorded file is not what it claims to be."""
 
 
+class ScenarioWarning(UserWarning):
+    """The scenario is possible but the theory's conditions may not hold."""
+
+
 class DataWarning(UserWarning):
     """A recorded file is what it claims to be, but says less than it should."""
 

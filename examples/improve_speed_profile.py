@@ -7,7 +7,7 @@ Run: python examples/improve_speed_profile.py
 import numpy as np
 
 import coopenv
-from coopenv.world.gradient import DifferentiableWorld
+from coopenv.observers.riccati.gradient import DifferentiableWorld
 
 overrides = {
     "noise.enabled": False,

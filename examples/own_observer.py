@@ -6,7 +6,8 @@ Run: python examples/own_observer.py
 import numpy as np
 
 from coopenv import load_scenario, parallel_env
-from coopenv.estimation.observers import Estimate, Message, Setup, Tick, record, register, run
+from coopenv.observers import Estimate, Message, Setup, Tick, register, run
+from coopenv.runs.recorder import record
 
 
 class Complementary:

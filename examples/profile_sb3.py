@@ -8,7 +8,7 @@ from time import perf_counter
 import torch
 from stable_baselines3 import PPO
 
-from coopenv.api.sb3 import CooperativeSB3VecEnv
+from coopenv.api.trainers.sb3 import CooperativeSB3VecEnv
 from coopenv.scenario import load_scenario
 
 torch.set_num_threads(1)

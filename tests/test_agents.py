@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import coopenv
-from coopenv.bench.agents import play, score
+from coopenv.bench.drivers import play, score
 from coopenv.policies import load_agent, read_card
 from coopenv.shipped import data_directory, list_agents
 

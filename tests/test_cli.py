@@ -123,7 +123,7 @@ def test_results_that_cannot_be_written_are_found_before_the_run(
     name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("coopenv.runs.video.find_spec", lambda name: None)
-    monkeypatch.setattr("coopenv.runs.recording.Recording.play", lambda self: pytest.fail("simulated"))
+    monkeypatch.setattr("coopenv.runs.rollouts.Rollout.play", lambda self: pytest.fail("simulated"))
     (Path("there") / name).mkdir(parents=True)
     assert main(["run", "overtaking", "--out", "there", "--video"]) == 2
     assert capsys.readouterr().err == f"error: cannot write to there/{name}: it is a folder\n"
@@ -177,16 +177,16 @@ def test_scenarios_from_a_path_and_their_warnings(capsys: pytest.CaptureFixture[
 def test_an_interrupt_keeps_the_record_and_exits_with_130(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from coopenv.runs.recording import Recording
+    from coopenv.runs.rollouts import Rollout
 
-    take = Recording._take
+    take = Rollout._take
 
-    def interrupted(self: Recording) -> None:
+    def interrupted(self: Rollout) -> None:
         if self.ticks_recorded == 30:
             raise KeyboardInterrupt
         take(self)
 
-    monkeypatch.setattr(Recording, "_take", interrupted)
+    monkeypatch.setattr(Rollout, "_take", interrupted)
     assert main(["run", "busy_intersection", "--out", "cut"]) == 130
     assert "interrupted at 0.5 s" in capsys.readouterr().out
     assert len(Trajectory.load(Path("cut/trajectory.npz")).t) == 31

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from coopenv.estimation.observers import record, run
-from coopenv.estimation.observers.registry import find
+from coopenv.observers import run
+from coopenv.observers.registry import find
+from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 
 DOCS = Path(__file__).parents[1] / "docs"

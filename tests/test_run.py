@@ -16,7 +16,7 @@ from coopenv.errors import CoopenvError, DeviceError, OutputError
 from coopenv.estimation.metrics import settling_time
 from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.trajectory import Sight, Trajectory
-from coopenv.runs import Recording, record
+from coopenv.runs import Rollout, rollout
 from coopenv.runs.metrics import outcome_line, run_metrics, vehicle_metrics
 from coopenv.runs.output import prepare_folder, write_results
 from coopenv.runs.table import figure, metrics_table, percent, remarks, seconds
@@ -36,7 +36,7 @@ def test_recorded_ticks_equal_the_environment_stepped_by_decisions(name: str, ov
     scenario = coopenv.load_scenario(name, overrides)
     actions = np.random.default_rng(5).uniform(-1.0, 1.0, (100, len(scenario.vehicles), 2))
     given = iter(actions)
-    run = record(scenario, seed=7, policy=lambda observations: next(given))
+    run = rollout(scenario, seed=7, policy=lambda observations: next(given))
     env = coopenv.parallel_env(name, dtype="float64", overrides=overrides)
     env.reset(seed=7)
     tick = 0
@@ -59,7 +59,7 @@ def test_recorded_ticks_equal_the_environment_stepped_by_decisions(name: str, ov
 
 
 def test_noise_free_busy_intersection_settles_as_measured() -> None:
-    run = record(coopenv.load_scenario("busy_intersection", {"noise.enabled": False}))
+    run = rollout(coopenv.load_scenario("busy_intersection", {"noise.enabled": False}))
     assert len(run.t) == 3001
     assert run.t[-1] == 50.0
     assert run.position_error[-1].max() < 1e-6
@@ -69,7 +69,7 @@ def test_noise_free_busy_intersection_settles_as_measured() -> None:
 
 def test_the_record_has_the_documented_arrays() -> None:
     scenario = coopenv.load_scenario("crossing_path", {"horizon": 1.0})
-    run = record(scenario, seed=1)
+    run = rollout(scenario, seed=1)
     K, N, T = 61, 1, 6
     assert run.t == pytest.approx(np.arange(K) / 60.0)
     assert run.position.shape == run.velocity.shape == run.position_estimate.shape == (K, N, 3)
@@ -89,26 +89,26 @@ def test_the_record_has_the_documented_arrays() -> None:
 
 def test_steps_are_decisions_and_end_at_the_horizon() -> None:
     scenario = coopenv.load_scenario("busy_intersection", {"horizon": 2.0})
-    assert len(record(scenario, steps=3).t) == 1 + 3 * 6
-    assert len(record(scenario, steps=1000).t) == 1 + 120
+    assert len(rollout(scenario, steps=3).t) == 1 + 3 * 6
+    assert len(rollout(scenario, steps=1000).t) == 1 + 120
 
 
 def test_policies_are_seeded_and_reach_the_vehicles() -> None:
     scenario = coopenv.load_scenario("urban_crossing")
-    first, again = (record(scenario, seed=4, steps=20, policy="random") for _ in range(2))
+    first, again = (rollout(scenario, seed=4, steps=20, policy="random") for _ in range(2))
     assert np.array_equal(first.position, again.position)
-    assert not np.array_equal(first.position, record(scenario, seed=5, steps=20, policy="random").position)
-    straight = record(scenario, seed=4, steps=20)
+    assert not np.array_equal(first.position, rollout(scenario, seed=5, steps=20, policy="random").position)
+    straight = rollout(scenario, seed=4, steps=20)
     assert not np.array_equal(first.position, straight.position)
     assert np.array_equal(first.position[0], straight.position[0])
-    clipped = record(scenario, seed=4, steps=20, policy=lambda o: np.full((4, 2), 9.0))
-    full = record(scenario, seed=4, steps=20, policy=lambda o: np.ones((4, 2)))
+    clipped = rollout(scenario, seed=4, steps=20, policy=lambda o: np.full((4, 2), 9.0))
+    full = rollout(scenario, seed=4, steps=20, policy=lambda o: np.ones((4, 2)))
     assert np.array_equal(clipped.position, full.position)
 
 
 def test_the_run_ends_with_the_last_vehicle() -> None:
     scenario = coopenv.load_scenario("urban_crossing", {"vehicles.*.goal.radius": 30.0})
-    recording = Recording(scenario)
+    recording = Rollout(scenario)
     ticks = list(recording.play())
     assert ticks == list(range(scenario.ticks_per_decision + 1))
     assert {ending.outcome for ending in recording.endings()} == {"arrived"}
@@ -118,12 +118,12 @@ def test_the_run_ends_with_the_last_vehicle() -> None:
 def test_on_tick_sees_every_tick() -> None:
     seen: list[tuple[int, int]] = []
     scenario = coopenv.load_scenario("busy_intersection")
-    record(scenario, steps=2, on_tick=lambda engine, tick: seen.append((tick, int(engine.view("tick")[0]))))
+    rollout(scenario, steps=2, on_tick=lambda engine, tick: seen.append((tick, int(engine.view("tick")[0]))))
     assert seen == [(k, k) for k in range(13)]
 
 
 def test_float32_is_recorded_in_float32() -> None:
-    assert record(coopenv.load_scenario("busy_intersection"), steps=1, dtype="float32").covariance.dtype == np.float32
+    assert rollout(coopenv.load_scenario("busy_intersection"), steps=1, dtype="float32").covariance.dtype == np.float32
 
 
 @pytest.mark.parametrize(
@@ -138,11 +138,11 @@ def test_float32_is_recorded_in_float32() -> None:
 )
 def test_bad_arguments_are_named(arguments: dict[str, Any], error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
-        record(coopenv.load_scenario("busy_intersection"), **arguments)
+        rollout(coopenv.load_scenario("busy_intersection"), **arguments)
 
 
 def test_an_interrupted_run_keeps_what_was_recorded(tmp_path: Path) -> None:
-    recording = Recording(coopenv.load_scenario("busy_intersection"), seed=2)
+    recording = Rollout(coopenv.load_scenario("busy_intersection"), seed=2)
     for tick in recording.play():
         if tick == 100:
             break
@@ -154,7 +154,7 @@ def test_an_interrupted_run_keeps_what_was_recorded(tmp_path: Path) -> None:
 
 
 def test_metrics_file_is_strict_json_with_figures_of_every_vehicle(tmp_path: Path) -> None:
-    recording = Recording(coopenv.load_scenario("busy_intersection"), seed=3, steps=60)
+    recording = Rollout(coopenv.load_scenario("busy_intersection"), seed=3, steps=60)
     for _ in recording.play():
         pass
     trajectory = recording.trajectory()
@@ -179,7 +179,7 @@ def test_metrics_file_is_strict_json_with_figures_of_every_vehicle(tmp_path: Pat
 
 
 def test_a_record_shorter_than_any_window_still_has_metrics() -> None:
-    recording = Recording(coopenv.load_scenario("busy_intersection"))
+    recording = Rollout(coopenv.load_scenario("busy_intersection"))
     next(recording.play())
     trajectory = recording.trajectory()
     vehicles = vehicle_metrics(trajectory, analyse_observability(trajectory), recording.endings(), 0.0)
@@ -231,8 +231,8 @@ def test_a_file_that_may_not_be_replaced_is_found_beforehand(tmp_path: Path, mon
         prepare_folder(tmp_path, ["errors.png"])
 
 
-def vehicles_of(name: str, policy: str = "zero", **overrides: Any) -> tuple[Recording, list[dict[str, Any]]]:
-    recording = Recording(coopenv.load_scenario(name, overrides), seed=1, policy=policy)
+def vehicles_of(name: str, policy: str = "zero", **overrides: Any) -> tuple[Rollout, list[dict[str, Any]]]:
+    recording = Rollout(coopenv.load_scenario(name, overrides), seed=1, policy=policy)
     for _ in recording.play():
         pass
     run = recording.trajectory()

@@ -8,14 +8,14 @@ import pytest
 import coopenv
 from coopenv.bench.seeds import study_seeds
 from coopenv.cli import main
-from coopenv.runs import record
+from coopenv.runs import rollout
 
 
 def test_study_equals_single_runs() -> None:
     scenario = coopenv.load_scenario("overtaking", {"horizon": 4.0})
     study = study_seeds(scenario, range(5, 8), 2.0)
     for row, seed in enumerate(study.seeds):
-        run = record(scenario, seed=seed)
+        run = rollout(scenario, seed=seed)
         steady = run.t > 2.0
         expected = np.sqrt((run.position_error[steady] ** 2).mean(axis=0))
         np.testing.assert_allclose(study.position_rmse[row], expected, rtol=1e-12)

@@ -17,8 +17,8 @@ from coopenv.api.infos import InfoWriter
 from coopenv.api.layout import Field, action_space, dict_space, flat_space
 from coopenv.api.state import state_space, state_vector
 from coopenv.backends.base import Backend
-from coopenv.backends.select import open_backend
 from coopenv.backends.simulated import Simulated
+from coopenv.backends.sources import open_backend
 from coopenv.errors import CoopenvError, ScenarioError, checked_seed, suggest
 from coopenv.scenario import Scenario
 
@@ -247,7 +247,7 @@ def parallel_env(
     Args:
         name_or_path: for example "busy_intersection"; "mrclam_6" or "drive.mcap" replay what was recorded.
         render_mode: None, "rgb_array" or "human".
-        observer: estimator that every vehicle runs, embedded or a plug-in (`coopenv.estimation.observers.register`);
+        observer: estimator that every vehicle runs, embedded or a plug-in (`coopenv.observers.register`);
             None: as the scenario says.
         backend: where measurements come from, "simulated" or "replay"; None: as the name says.
         observation: "flat" Box or one-level "dict".

@@ -10,16 +10,16 @@ import warp as wp
 
 from coopenv.backends.base import Senses
 from coopenv.errors import CoopenvError
-from coopenv.estimation.observers.base import Estimate
-from coopenv.estimation.observers.recording import Sensed
-from coopenv.estimation.observers.registry import find
-from coopenv.estimation.observers.team import ObserverError, Team
-from coopenv.estimation.observers.written import riccati_covariance
+from coopenv.observers.contract import Estimate
+from coopenv.observers.group import Group, ObserverError
+from coopenv.observers.recording import Sensed
+from coopenv.observers.registry import find
+from coopenv.observers.riccati_coordinates import riccati_covariance
 from coopenv.world.world import World
 
 
 class PlugIns:
-    """A team of observers per world.
+    """A group of observers per world.
 
     What they estimate is written into the world's state, so that observations, rewards and judgements follow from it
     as from the embedded observer's. Where an observer states no covariance, the scenario's P(0) stands.
@@ -36,7 +36,7 @@ class PlugIns:
             raise CoopenvError(f"observer '{name}' runs on the host; use device='cpu' instead of '{world.device}'")
         self.name, self._world, self._senses = name, world, senses
         briefing = senses.briefing
-        self.teams = [Team(factory, briefing) for _ in range(world.worlds)]
+        self.groups = [Group(factory, briefing) for _ in range(world.worlds)]
         self._order: Sequence[int] = briefing.order
         self._active = wp.zeros(world.worlds, dtype=wp.int32, device=world.device)
         self._failures: dict[int, str] = {}
@@ -53,7 +53,7 @@ class PlugIns:
             rotation = np.array(R[w], dtype=float)
             position = (rotation @ np.array(p[w], dtype=float)[..., None])[..., 0]
             try:
-                self.teams[w].start(rotation, position)
+                self.groups[w].start(rotation, position)
             except ObserverError as failure:
                 raise self._failed(failure) from failure.__cause__
 
@@ -77,7 +77,7 @@ class PlugIns:
         self._active.numpy()[...] = active
         world.sense(self._active)
         sensed = {w: self._senses.read(w, int(world.view("tick")[w]) + 1) for w in worlds}
-        joint = self.teams[0].joint
+        joint = self.groups[0].joint
         if joint:
             for w in worlds:
                 for i, estimate in enumerate(self._ask(w, None, sensed[w])):
@@ -90,11 +90,11 @@ class PlugIns:
         world.finish(self._active)
 
     def _ask(self, w: int, vehicle: int | None, sensed: Sensed) -> list[Estimate]:
-        team = self.teams[w]
+        group = self.groups[w]
         try:
             if vehicle is None:
-                return [answer.estimate for answer in team.update_all(sensed)]
-            return [team.update(vehicle, sensed, self._world.view("inbox_tick")[w, vehicle]).estimate]
+                return [answer.estimate for answer in group.update_all(sensed)]
+            return [group.update(vehicle, sensed, self._world.view("inbox_tick")[w, vehicle]).estimate]
         except ObserverError as failure:
             raise self._failed(failure) from failure.__cause__
 
@@ -118,7 +118,7 @@ class PlugIns:
         Raises:
             CoopenvError: an observer cannot be copied.
         """
-        return [team.get_state() for team in self.teams]
+        return [group.get_state() for group in self.groups]
 
     def set_state(self, states: Any) -> None:
         """Go back to what `get_state` returned.
@@ -126,8 +126,8 @@ class PlugIns:
         Raises:
             ValueError: it is of other observers.
         """
-        if not isinstance(states, list) or len(states) != len(self.teams):
+        if not isinstance(states, list) or len(states) != len(self.groups):
             raise ValueError(f"state: no observers '{self.name}' in it")
-        for team, state in zip(self.teams, states, strict=True):
-            team.set_state(state)
+        for group, state in zip(self.groups, states, strict=True):
+            group.set_state(state)
         self._failures.clear()

@@ -7,7 +7,10 @@ import warp as wp
 
 from coopenv.api.observation import write_observation
 from coopenv.api.rewards import TERMS, weigh, write_terms
-from coopenv.estimation.quality import (
+from coopenv.estimation.so3 import rotation_angle
+from coopenv.world.collision import UNDER_WAY, goal_distance
+from coopenv.world.precision import Precision
+from coopenv.world.quality import (
     cholesky_of,
     gramian_smallest_eigenvalue,
     log_determinant,
@@ -15,9 +18,6 @@ from coopenv.estimation.quality import (
     observer_error,
     targets_in_view,
 )
-from coopenv.estimation.so3 import rotation_angle
-from coopenv.world.collision import UNDER_WAY, goal_distance
-from coopenv.world.precision import Precision
 
 DEGREES = wp.constant(57.29577951308232)
 

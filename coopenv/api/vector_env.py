@@ -14,7 +14,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from coopenv.api.arrays import ArrayKind, Exchange
+from coopenv.api.array_io import ArrayKind, Exchange
 from coopenv.api.engine import Engine
 from coopenv.api.layout import Field, action_space, flat_space
 from coopenv.backends.replay.source import is_recorded

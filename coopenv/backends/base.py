@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from coopenv.estimation.observers.recording import Briefing, Sensed
+from coopenv.observers.recording import Briefing, Sensed
 from coopenv.scenario import Scenario
 from coopenv.world.world import World
 

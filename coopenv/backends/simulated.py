@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from coopenv.estimation.observers.recording import Briefing, Sensed
-from coopenv.estimation.observers.setups import briefing_of
 from coopenv.estimation.trajectory import Sight
+from coopenv.observers.briefing import briefing_of
+from coopenv.observers.recording import Briefing, Sensed
 from coopenv.scenario import Scenario
 from coopenv.world.world import World
 

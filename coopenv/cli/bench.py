@@ -23,7 +23,7 @@ def bench_agents(
 ) -> None:
     """Score drivers: who arrives, who collides, who knows its pose."""
     from coopenv.api.parallel_env import parallel_env
-    from coopenv.bench.agents import play, score, score_table
+    from coopenv.bench.drivers import play, score, score_table
     from coopenv.policies import load_agent, read_card
     from coopenv.runs.command import progress
     from coopenv.shipped import list_agents
@@ -97,8 +97,8 @@ def bench_observers(
     out: Annotated[Path | None, typer.Option(help="Folder for the leaderboard and the report.")] = None,
 ) -> None:
     """Compare observers on the same data and with their bound."""
-    from coopenv.bench.leaderboard.command import perform, request_of
-    from coopenv.bench.leaderboard.engines import find_engine
+    from coopenv.bench.observers.command import perform, request_of
+    from coopenv.bench.observers.executors import find_engine
 
     printed, log = console(), console(stderr=True)
     with warned():

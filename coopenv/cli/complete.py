@@ -25,7 +25,7 @@ def policies(incomplete: str) -> list[str]:
 
 def observers(incomplete: str) -> list[str]:
     """Return lists of observers, names with commas between, that continue this one."""
-    from coopenv.estimation.observers.registry import observer_names
+    from coopenv.observers.registry import observer_names
 
     done, comma, last = incomplete.rpartition(",")
     return [f"{done}{comma}{name}" for name in _matching(observer_names(), last) if name not in done.split(",")]

@@ -75,7 +75,7 @@ def load(environment: str, overrides: dict[str, Any]) -> Any:
 @contextmanager
 def warned() -> Iterator[None]:
     """Print the warnings of scenarios and data that are loaded meanwhile as one line each."""
-    from coopenv.scenario import ScenarioWarning
+    from coopenv.errors import ScenarioWarning
 
     with warnings.catch_warnings(record=True) as caught:
         for category in (ScenarioWarning, DataWarning):

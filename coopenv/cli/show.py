@@ -12,7 +12,7 @@ from coopenv.cli.options import Environment, Overrides, console, load, parse_ove
 
 def list_command() -> None:
     """List the environments that ship with coopenv."""
-    from coopenv.scenario.describe import environment_table
+    from coopenv.runs.describe import environment_table
     from coopenv.shipped import list_envs
 
     out = console()
@@ -21,7 +21,7 @@ def list_command() -> None:
 
 def describe(environment: Environment, overrides: Overrides = None) -> None:
     """Say what an environment is: vehicles, sensors, observer."""
-    from coopenv.scenario.describe import describe_scenario
+    from coopenv.runs.describe import describe_scenario
 
     out = console()
     for part in describe_scenario(load(environment, parse_overrides(overrides))):

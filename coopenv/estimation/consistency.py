@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2, norm
 
-from coopenv.estimation.observers.base import Array, Coordinates
-from coopenv.estimation.observers.rotations import skew
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.coordinates import Coordinates
+from coopenv.estimation.rotations import skew
 
 LEVEL = 0.95
 

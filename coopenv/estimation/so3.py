@@ -104,3 +104,10 @@ def quaternion_vector(R: Any, zero: Any):
     if wp.dot(axis, sine) < R.dtype(0.0):
         axis = -axis
     return axis * wp.sqrt(wp.max(R.dtype(1.0) - scalar_squared, R.dtype(0.0)))
+
+
+@wp.func
+def increment(rotation: Any, translation: Any, v: Any, w: Any, dt: Any):
+    """Append a body twist held for dt to the increment (dR, dp)."""
+    step = w * dt
+    return rotation * exp_so3(step), translation + rotation * (left_jacobian(step) * (v * dt))

@@ -1,5 +1,6 @@
-"""One run of an environment: simulate and record it, judge it, write it down."""
+"""One run of an environment: simulate it, judge it, write it down."""
 
-from coopenv.runs.recording import Recording, record
+from coopenv.runs.recorder import record
+from coopenv.runs.rollouts import Rollout, rollout
 
-__all__ = ["Recording", "record"]
+__all__ = ["Rollout", "record", "rollout"]

@@ -17,7 +17,7 @@ from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import Observability, analyse_observability
 from coopenv.runs.metrics import outcome_line, run_metrics, vehicle_metrics
 from coopenv.runs.output import METRICS_FILE, TRAJECTORY_FILE, prepare_folder, write_results
-from coopenv.runs.recording import Recording
+from coopenv.runs.rollouts import Rollout
 from coopenv.runs.table import metrics_table, remarks
 from coopenv.runs.video import Film, GifFilm, film_name, frame_stride, open_film
 from coopenv.scenario import Scenario
@@ -50,7 +50,7 @@ def execute(request: RunRequest, out: Console, log: Console) -> bool:
         CoopenvError: an argument is not valid, or the results cannot be written.
     """
     scenario = request.scenario
-    recording = Recording(scenario, request.seed, request.steps, request.dtype, request.device, request.policy)
+    recording = Rollout(scenario, request.seed, request.steps, request.dtype, request.device, request.policy)
     if request.policy != "zero" and not scenario.driven:
         log.print("note: all motion here is prescribed, the policy has no effect", soft_wrap=True)
     end = recording.ticks_planned / scenario.rates.camera
@@ -84,7 +84,7 @@ def _fps(scenario: Scenario) -> float:
     return scenario.rates.camera / frame_stride(scenario)
 
 
-def _simulate(recording: Recording, film: Film | None, log: Console) -> bool:
+def _simulate(recording: Rollout, film: Film | None, log: Console) -> bool:
     """Play the recording to its end; return False if the user interrupted it after it had begun."""
     view = None
     if film is not None:
@@ -108,7 +108,7 @@ def _simulate(recording: Recording, film: Film | None, log: Console) -> bool:
 
 
 def _draw(
-    folder: Path, recording: Recording, observability: Observability, steady_from: float, log: Console
+    folder: Path, recording: Rollout, observability: Observability, steady_from: float, log: Console
 ) -> list[Path]:
     with progress(log) as bar:
         bar.add_task("drawing figures", total=None)

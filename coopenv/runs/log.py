@@ -11,9 +11,9 @@ import numpy as np
 from coopenv.api.engine import Engine
 from coopenv.api.layout import observation_layout
 from coopenv.errors import CoopenvError
-from coopenv.estimation.observers.recording import Recording
-from coopenv.estimation.observers.runner import record
+from coopenv.observers.recording import Recording
 from coopenv.runs.policies import make_policy
+from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario
 
 

@@ -12,7 +12,7 @@ import warp
 from coopenv.estimation.metrics import observability_of, settling_times, summarise
 from coopenv.estimation.observability import Observability
 from coopenv.estimation.trajectory import Trajectory
-from coopenv.runs.recording import ARRIVED, COLLIDED, UNDER_WAY, Ending, Recording
+from coopenv.runs.rollouts import ARRIVED, COLLIDED, UNDER_WAY, Ending, Rollout
 from coopenv.shipped import version
 
 COARSE_POSITION_M = 0.5
@@ -62,7 +62,7 @@ def observability_metrics(observability: Observability) -> dict[str, Any]:
     }
 
 
-def outcome_line(recording: Recording, interrupted: bool = False) -> str:
+def outcome_line(recording: Rollout, interrupted: bool = False) -> str:
     """Return how the run ended, in words."""
     endings = recording.endings()
     scenario = recording.scenario
@@ -83,7 +83,7 @@ def outcome_line(recording: Recording, interrupted: bool = False) -> str:
 def run_metrics(
     name: str,
     overrides: Mapping[str, Any],
-    recording: Recording,
+    recording: Rollout,
     vehicles: list[dict[str, Any]],
     steady_from: float,
     outcome: str,

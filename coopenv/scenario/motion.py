@@ -12,7 +12,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from coopenv.scenario.agents import ConstantMotion, SegmentMotion, WaypointMotion
+from coopenv.scenario.bodies import ConstantMotion, SegmentMotion, WaypointMotion
 
 SPLINE_STEP = 0.02
 """s between the poses at which a waypoint spline is met exactly."""

@@ -6,8 +6,8 @@ from pydantic import Field, field_validator, model_validator
 
 from coopenv.errors import suggest
 from coopenv.scenario import checks
-from coopenv.scenario.agents import Landmark, Obstacle, Road, Vehicle
 from coopenv.scenario.base import Part, Positive, Vector3
+from coopenv.scenario.bodies import Landmark, Obstacle, Road, Vehicle
 from coopenv.scenario.learning import Action, Dynamics, Observation, Reward, Termination
 from coopenv.scenario.sensing import Camera, Noise, Observer, Rates, Topology, V2x
 

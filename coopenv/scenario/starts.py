@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coopenv.scenario.agents import Body, Landmark, Vehicle
+from coopenv.errors import ScenarioWarning
+from coopenv.scenario.bodies import Body, Landmark, Vehicle
 from coopenv.scenario.motion import path_heading
-from coopenv.scenario.warning import ScenarioWarning
 
 if TYPE_CHECKING:
     from coopenv.scenario.schema import Scenario

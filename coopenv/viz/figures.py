@@ -10,7 +10,7 @@ from coopenv.estimation.observability import Observability, analyse_observabilit
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.scenario import Scenario
 from coopenv.viz.consistency import consistency_figure
-from coopenv.viz.errors import error_figure
+from coopenv.viz.error_figure import error_figure
 from coopenv.viz.observability import observability_figure
 from coopenv.viz.style import save
 from coopenv.viz.topology import topology_figure

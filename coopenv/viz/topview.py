@@ -10,7 +10,7 @@ from matplotlib.patheffects import withStroke
 
 from coopenv.estimation.trajectory import Outcome, Sight
 from coopenv.scenario import Scenario
-from coopenv.scenario.agents import Body, Landmark, Vehicle
+from coopenv.scenario.bodies import Body, Landmark, Vehicle
 from coopenv.viz.style import DARK_BLUE, INK, NORMAL, vehicle_colour
 from coopenv.viz.topview_geometry import (
     box_shape,

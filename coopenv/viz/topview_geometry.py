@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coopenv.scenario import Scenario
-from coopenv.scenario.agents import Landmark, Obstacle, Vehicle
+from coopenv.scenario.bodies import Landmark, Obstacle, Vehicle
 from coopenv.scenario.motion import TwistTable, compile_motion, left_jacobian
 from coopenv.scenario.sensing import Camera
 from coopenv.world.build import ROTATION_OF_CAMERA, agent_starts

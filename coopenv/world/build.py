@@ -9,7 +9,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from coopenv.scenario import Scenario, checks
-from coopenv.scenario.agents import Body, Landmark, Vehicle
+from coopenv.scenario.bodies import Body, Landmark, Vehicle
 from coopenv.scenario.motion import TwistTable, compile_motion
 from coopenv.scenario.starts import agent_starts, rotation_of
 from coopenv.world.model import DRIVEN, PRESCRIBED, STATIC, model_struct

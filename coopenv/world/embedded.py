@@ -22,6 +22,6 @@ def kernels_of(memory: Any) -> Kernels:
     """Return the kernels of worlds whose observer has a memory, or (None) has not."""
     if memory is None:
         return Kernels(advance_kernel, reset_kernel)
-    from coopenv.world.robust.kernels import advance_robust_kernel, reset_robust_kernel
+    from coopenv.observers.robust.kernels import advance_robust_kernel, reset_robust_kernel
 
     return Kernels(advance_robust_kernel, reset_robust_kernel)

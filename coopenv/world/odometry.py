@@ -10,8 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.riccati import increment
-from coopenv.estimation.so3 import identity3
+from coopenv.estimation.so3 import identity3, increment
 from coopenv.world.dynamics import drive, segment_at
 from coopenv.world.model import DRIVEN
 from coopenv.world.random import ODOMETRY_FIRST, ODOMETRY_SECOND, draw, gaussian_vectors

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.world.observer import sample_gramian
+from coopenv.world.gramian import sample_gramian
 from coopenv.world.step import finish, sense
 from coopenv.world.v2x import broadcast, deliver
 

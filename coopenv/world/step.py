@@ -6,11 +6,11 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.observers.riccati.kernels import estimate
 from coopenv.world.camera import observe
 from coopenv.world.collision import referee
 from coopenv.world.dynamics import prescribe
 from coopenv.world.model import PRESCRIBED
-from coopenv.world.observer import estimate
 from coopenv.world.odometry import measure_motion
 from coopenv.world.reset import reset_world
 from coopenv.world.v2x import broadcast, deliver

@@ -79,13 +79,13 @@ class World:
     def _allocate_memory(self) -> Any:
         if not self.estimates or self.scenario.observer.name != ROBUST:
             return None
-        from coopenv.world.robust.state import allocate_robust
+        from coopenv.observers.robust.state import allocate_robust
 
         return allocate_robust(self.model, self.worlds, self._start_covariance(), self.device)
 
     def _start_covariance(self) -> np.ndarray:
         """Return the covariances (N, 6, 6) of the initial estimates, left errors."""
-        from coopenv.estimation.observers.setups import start_covariance
+        from coopenv.observers.briefing import start_covariance
 
         return np.array([start_covariance(self.scenario, i) for i in range(self.model.vehicles)])
 

@@ -7,7 +7,7 @@ import pytest
 from pettingzoo.test import parallel_api_test
 
 import coopenv
-from coopenv.api.plain import NUMBERS, PlainInfos
+from coopenv.api.trainers.numeric_infos import NUMBERS, PlainInfos
 
 
 def test_infos_are_numbers_and_hold_no_truth() -> None:

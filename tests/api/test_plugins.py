@@ -13,12 +13,13 @@ from numpy.testing import assert_allclose
 from pettingzoo.test import parallel_api_test
 
 import coopenv
-import coopenv.estimation.observers.registry as registry
+import coopenv.observers.registry as registry
 from coopenv import CoopenvError
 from coopenv.api.engine import Engine
-from coopenv.estimation.observers import Coordinates, Estimate, Setup, Tick, record, register, run
-from coopenv.estimation.observers.dead_reckoning import DeadReckoning
-from coopenv.estimation.observers.riccati import Riccati
+from coopenv.observers import Coordinates, Estimate, Setup, Tick, register, run
+from coopenv.observers.dead_reckoning import DeadReckoning
+from coopenv.observers.riccati.plugin import Riccati
+from coopenv.runs.recorder import record
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "the paper's start": ("busy_intersection", {"horizon": 3.0}),

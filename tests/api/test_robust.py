@@ -13,10 +13,10 @@ from numpy.testing import assert_allclose
 from pettingzoo.test import parallel_api_test
 
 import coopenv
-import coopenv.estimation.observers.registry as registry
+import coopenv.observers.registry as registry
 from coopenv.api.engine import Engine
-from coopenv.estimation.observers import register
-from coopenv.estimation.observers.robust import Robust
+from coopenv.observers import register
+from coopenv.observers.robust.plugin import Robust
 from tests.backends import mrclam_files
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.estimation.observers import Recording, record
+from coopenv.observers import Recording
+from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 
 

@@ -19,8 +19,8 @@ from coopenv.backends.mcap import messages, read_recording, write_recording
 from coopenv.backends.mrclam import load_dataset
 from coopenv.backends.mrclam.recording import recording_of
 from coopenv.cli import main
-from coopenv.estimation.observers import Recording, run
-from coopenv.estimation.observers.recording import Truth
+from coopenv.observers import Recording, run
+from coopenv.observers.recording import Truth
 from tests.backends import mrclam_files
 from tests.backends.recordings import differences, simulated
 

@@ -14,8 +14,8 @@ from coopenv.backends.mrclam import load_dataset
 from coopenv.backends.mrclam.dataset import Truth
 from coopenv.backends.mrclam.recording import DRIFT_STD, MESSAGE_PERIOD_TICKS, START_STD, TICK_S, recording_of
 from coopenv.errors import DataError
-from coopenv.estimation.observers.planar import PlanarEkf, PlanarRobust
-from coopenv.estimation.observers.runner import run
+from coopenv.observers.planar.plugin import PlanarEkf, PlanarRobust
+from coopenv.observers.runner import run
 from tests.backends.mrclam_files import LANDMARKS, pose, real_folder, write
 
 REAL = real_folder()

@@ -25,7 +25,7 @@ from coopenv.backends.mcap import write_recording
 from coopenv.backends.mrclam import load_dataset
 from coopenv.backends.mrclam.recording import recording_of
 from coopenv.backends.replay import Replay
-from coopenv.estimation.observers import Recording, run
+from coopenv.observers import Recording, run
 from tests.backends import mrclam_files
 from tests.backends.recordings import simulated
 

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.testing import assert_allclose
 
-from coopenv.estimation.bound import ancestors, cramer_rao, cramer_rao_ancestors, information, transitions
-from coopenv.estimation.observers import Coordinates, SensorNoise, record
-from coopenv.estimation.observers.base import MIN_BEARING_STD
+from coopenv.observers import Coordinates, SensorNoise
+from coopenv.observers.bound import ancestors, cramer_rao, cramer_rao_ancestors, information, transitions
+from coopenv.observers.contract import MIN_BEARING_STD
+from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.estimation.observers.batch import small_errors, small_record, solve
 

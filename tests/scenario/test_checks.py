@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from coopenv.errors import ScenarioError
-from coopenv.scenario import Scenario, ScenarioWarning, checks, parse_scenario
+from coopenv.errors import ScenarioError, ScenarioWarning
+from coopenv.scenario import Scenario, checks, parse_scenario
 from tests.world import builders
 from tests.world.builders import errors, landmark, run, start, vehicle
 

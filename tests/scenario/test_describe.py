@@ -16,9 +16,9 @@ from rich.console import Console
 import coopenv
 from coopenv.api.layout import observation_layout
 from coopenv.cli import main
-from coopenv.scenario import words
-from coopenv.scenario.agents import ConstantMotion, InitialEstimate, SegmentMotion, TwistSegment, WaypointMotion
-from coopenv.scenario.describe import describe_scenario, settings
+from coopenv.runs import scenario_text as words
+from coopenv.runs.describe import describe_scenario, settings
+from coopenv.scenario.bodies import ConstantMotion, InitialEstimate, SegmentMotion, TwistSegment, WaypointMotion
 from coopenv.scenario.files import apply_vehicle_defaults, parse_scenario
 from coopenv.scenario.json_schema import schema_text
 from coopenv.shipped import data_directory

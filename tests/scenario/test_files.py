@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from coopenv.errors import ScenarioError, UnknownEnvironmentError
-from coopenv.scenario import ScenarioWarning, load_scenario, scenario_path
+from coopenv.errors import ScenarioError, ScenarioWarning, UnknownEnvironmentError
+from coopenv.scenario import load_scenario, scenario_path
 from coopenv.shipped import list_envs
 
 MINIMAL = """

@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
-from coopenv.scenario.agents import ConstantMotion, SegmentMotion, StaticMotion, TwistSegment, Waypoint, WaypointMotion
+from coopenv.scenario.bodies import ConstantMotion, SegmentMotion, StaticMotion, TwistSegment, Waypoint, WaypointMotion
 from coopenv.scenario.motion import TwistTable, compile_motion, left_jacobian, path_heading
 from tests.oracles import continuous
 

@@ -13,7 +13,7 @@ from benchmarl.algorithms import IppoConfig, MappoConfig
 from benchmarl.experiment import Experiment, ExperimentConfig
 from benchmarl.models.mlp import MlpConfig
 
-from coopenv.api.benchmarl import task
+from coopenv.api.trainers.benchmarl import task
 
 pytestmark = [pytest.mark.benchmarl, pytest.mark.filterwarnings("ignore")]
 torch.set_num_threads(1)

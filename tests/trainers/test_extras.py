@@ -11,9 +11,9 @@ import pytest
 @pytest.mark.parametrize(
     ("module", "needed", "extra"),
     [
-        ("coopenv.api.sb3", "stable_baselines3.common.vec_env", "train"),
-        ("coopenv.api.rllib", "ray.rllib.env.multi_agent_env", "rllib"),
-        ("coopenv.api.benchmarl", "benchmarl.environments.common", "benchmarl"),
+        ("coopenv.api.trainers.sb3", "stable_baselines3.common.vec_env", "train"),
+        ("coopenv.api.trainers.rllib", "ray.rllib.env.multi_agent_env", "rllib"),
+        ("coopenv.api.trainers.benchmarl", "benchmarl.environments.common", "benchmarl"),
     ],
 )
 def test_missing_extra(module: str, needed: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ import torch
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.env.multi_agent_env_runner import MultiAgentEnvRunner
 
-from coopenv.api.rllib import CooperativeMultiAgentEnv
+from coopenv.api.trainers.rllib import CooperativeMultiAgentEnv
 
 pytestmark = pytest.mark.rllib
 torch.set_num_threads(1)

@@ -19,7 +19,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 import coopenv
-from coopenv.api.plain import PlainInfos
+from coopenv.api.trainers.numeric_infos import PlainInfos
 
 pytestmark = [pytest.mark.torchrl, pytest.mark.filterwarnings("ignore:PettingZoo in TorchRL is tested")]
 torch.set_num_threads(1)

@@ -29,7 +29,7 @@ from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.trajectory import Sight, Trajectory
 from coopenv.viz import consistency, style
 from coopenv.viz.clipping import clipped
-from coopenv.viz.errors import error_figure
+from coopenv.viz.error_figure import error_figure
 from coopenv.viz.figures import FIGURE_NAMES, save_figures
 from coopenv.viz.labels import place_names
 from coopenv.viz.observability import observability_figure

@@ -22,7 +22,7 @@ from coopenv.api.engine import Engine
 from coopenv.estimation.metrics import error_coordinates
 from coopenv.estimation.trajectory import Sight
 from coopenv.scenario import load_scenario
-from coopenv.scenario.agents import Obstacle
+from coopenv.scenario.bodies import Obstacle
 from coopenv.scenario.sensing import Camera
 from coopenv.viz.style import ORANGE, vehicle_colour
 from coopenv.viz.topview import TopView

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coopenv.scenario import Scenario, ScenarioWarning, parse_scenario
+from coopenv.errors import ScenarioWarning
+from coopenv.scenario import Scenario, parse_scenario
 from coopenv.world.world import World
 from tests.oracles import continuous
 

@@ -7,8 +7,9 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from coopenv.estimation import linalg, quality, riccati, so3
-from coopenv.world import camera, collision, random
+from coopenv.estimation import linalg, so3
+from coopenv.observers.riccati import equations as riccati
+from coopenv.world import camera, collision, quality, random
 from coopenv.world.precision import Precision, precision
 
 DTYPES = ("float64", "float32")

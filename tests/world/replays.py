@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coopenv.backends.replay import Replay
-from coopenv.estimation.observers import Recording
+from coopenv.observers import Recording
 from coopenv.world.world import World
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import coopenv
+from coopenv.observers.riccati.gradient import DifferentiableWorld, check_differentiable, tick_intervals
 from coopenv.scenario import Scenario
-from coopenv.world.gradient import DifferentiableWorld, check_differentiable, tick_intervals
 from coopenv.world.world import World
 
 SMOOTH: dict[str, Any] = {

@@ -11,12 +11,13 @@ import pytest
 from numpy.testing import assert_allclose
 
 from coopenv.api.engine import Engine
-from coopenv.estimation.observers import Estimate, Recording, Tick, record, run
-from coopenv.estimation.observers.faults import FAULTS, Lie
-from coopenv.estimation.observers.robust import Robust
-from coopenv.estimation.observers.robust.search import PATIENCE
-from coopenv.estimation.observers.starts import random_start, with_start
-from coopenv.estimation.observers.written import riccati_covariance
+from coopenv.bench.observers.faults import FAULTS, Lie
+from coopenv.bench.observers.initial_estimates import random_start, with_start
+from coopenv.observers import Estimate, Recording, Tick, run
+from coopenv.observers.riccati_coordinates import riccati_covariance
+from coopenv.observers.robust.plugin import Robust
+from coopenv.observers.robust.reference.search import PATIENCE
+from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from coopenv.world.world import World
 from tests.estimation.observers.robust.scenes import crowd

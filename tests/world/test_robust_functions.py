@@ -10,11 +10,11 @@ import warp as wp
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.observers.perspective import solve_p3p
+from coopenv.estimation.p3p import solve_p3p
+from coopenv.observers.robust.algebra import inverse6, is_regular, left_error, log_so3, transition
+from coopenv.observers.robust.p3p import solutions_of
+from coopenv.observers.robust.types import mat33d, mat43d, mat66d, vec3d, vec6d
 from coopenv.world.launch import start_warp
-from coopenv.world.robust.algebra import inverse6, is_regular, left_error, log_so3, transition
-from coopenv.world.robust.perspective import solutions_of
-from coopenv.world.robust.types import mat33d, mat43d, mat66d, vec3d, vec6d
 
 start_warp()
 RNG = np.random.default_rng(7)

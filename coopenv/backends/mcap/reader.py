@@ -9,10 +9,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from coopenv.backends.mcap.facts import constants_from
+from coopenv.backends.mcap.header import constants_from
 from coopenv.backends.mcap.messages import ATTACHMENT, EXACT, FORMAT, LANDMARKS, LANDMARKS_TYPE, codec, topic
 from coopenv.errors import DataError
-from coopenv.estimation.observers.recording import Recording, Truth
+from coopenv.observers.recording import Recording, Truth
 
 MAGIC = b"\x89MCAP0\r\n"
 

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.mcap.facts import facts_of
+from coopenv.backends.mcap.header import facts_of
 from coopenv.backends.mcap.messages import ATTACHMENT, EXACT, FORMAT, LANDMARKS, LANDMARKS_TYPE, SHOWN, codec, topic
 from coopenv.errors import OutputError
-from coopenv.estimation.observers.recording import Recording
+from coopenv.observers.recording import Recording
 from coopenv.shipped import version
 
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])

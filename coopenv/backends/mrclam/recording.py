@@ -18,8 +18,8 @@ from coopenv.backends.mrclam.files import ROBOTS, Array
 from coopenv.backends.mrclam.odometry import HeldCommands
 from coopenv.backends.mrclam.variants import Variant, check_variant, frames_of
 from coopenv.errors import DataError
-from coopenv.estimation.observers.base import Gains, SensorNoise, Setup
-from coopenv.estimation.observers.recording import Recording, Truth
+from coopenv.observers.contract import Gains, SensorNoise, Setup
+from coopenv.observers.recording import Recording, Truth
 
 TICK_S = 0.05
 MESSAGE_PERIOD_TICKS = 2  # 10 Hz, as V2X radios send

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from coopenv.backends.replay.device_recording import upload
 from coopenv.backends.replay.kernels import redeliver_kernel, replay_kernel, resense_kernel, rewind_kernel
-from coopenv.backends.replay.record import upload
 from coopenv.backends.replay.scenario import scenario_of
-from coopenv.estimation.observers.recording import Briefing, Recording, Sensed
+from coopenv.observers.recording import Briefing, Recording, Sensed
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import ROBUST, Kernels
 from coopenv.world.launch import PerWorld

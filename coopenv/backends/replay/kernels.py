@@ -6,9 +6,9 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.observers.riccati.kernels import estimate
 from coopenv.world.camera import NOT_A_NEIGHBOUR, OUT_OF_VIEW, VISIBLE
 from coopenv.world.collision import referee, touches_anything
-from coopenv.world.observer import estimate
 from coopenv.world.reset import believe, place_agent, place_vehicle
 from coopenv.world.step import finish
 from coopenv.world.v2x import broadcast

@@ -7,9 +7,9 @@ from typing import Any
 import warp as wp
 
 from coopenv.backends.replay.kernels import redeliver, resense, rewind
-from coopenv.world.robust.observer import update
-from coopenv.world.robust.report import tell
-from coopenv.world.robust.start import start_world
+from coopenv.observers.robust.observer import update
+from coopenv.observers.robust.start import start_world
+from coopenv.observers.robust.tracklets import tell
 from coopenv.world.step import finish
 from coopenv.world.v2x import broadcast
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.errors import CoopenvError, DataError
-from coopenv.estimation.observers.recording import Recording, due_ticks
+from coopenv.observers.recording import Recording, due_ticks
 from coopenv.scenario import Scenario
 from coopenv.scenario.files import override, parse_scenario
 

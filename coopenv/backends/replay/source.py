@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import cast
 
 from coopenv.errors import DataError
-from coopenv.estimation.observers.recording import Recording
+from coopenv.observers.recording import Recording
 
 SUFFIX = ".mcap"
 DATASETS = re.compile(r"mrclam_\d+")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from coopenv.bench.leaderboard import find_source
-from coopenv.bench.leaderboard.basin import (
+from coopenv.bench.observers import find_source
+from coopenv.bench.observers.basin import (
     BasinTask,
     Draw,
     basin_failures,
@@ -19,12 +19,12 @@ from coopenv.bench.leaderboard.basin import (
     plain_draws,
     study_basin,
 )
-from coopenv.bench.leaderboard.command import print_tables
-from coopenv.bench.leaderboard.engines import Local
-from coopenv.bench.leaderboard.html_tables import basin_table
+from coopenv.bench.observers.command import print_tables
+from coopenv.bench.observers.executors import Local
+from coopenv.bench.observers.html_tables import basin_table
 from coopenv.errors import CoopenvError
-from coopenv.estimation.observers import Estimate, Tick, find
-from coopenv.estimation.observers.dead_reckoning import DeadReckoning
+from coopenv.observers import Estimate, Tick, find
+from coopenv.observers.dead_reckoning import DeadReckoning
 
 
 def draw(number: int, angles: list[float], ends: list[float], settled: float) -> Draw:

@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from coopenv.bench.leaderboard import compare, find_source
-from coopenv.bench.leaderboard.command import print_tables
-from coopenv.bench.leaderboard.rows import Row
+from coopenv.bench.observers import compare, find_source
+from coopenv.bench.observers.command import print_tables
+from coopenv.bench.observers.faults import FAULTS
+from coopenv.bench.observers.rows import Row
 from coopenv.cli import main
-from coopenv.estimation.observers import registry
-from coopenv.estimation.observers.faults import FAULTS
+from coopenv.observers import registry
 from tests.backends import mrclam_files
 from tests.bench.leaderboard.test_compare import Raises
 

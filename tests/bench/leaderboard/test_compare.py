@@ -7,15 +7,16 @@ import pytest
 from scipy.stats import chi2
 
 import coopenv
-from coopenv.bench.leaderboard import compare, find_source
-from coopenv.bench.leaderboard.engines import Local
-from coopenv.bench.leaderboard.tables import degradation, failures
+from coopenv.bench.observers import compare, find_source
+from coopenv.bench.observers.executors import Local
+from coopenv.bench.observers.faults import FAULTS
+from coopenv.bench.observers.tables import degradation, failures
 from coopenv.errors import CoopenvError
-from coopenv.estimation.bound import cramer_rao, cramer_rao_ancestors
-from coopenv.estimation.observers import record, registry, run
-from coopenv.estimation.observers.base import Estimate, Tick
-from coopenv.estimation.observers.dead_reckoning import DeadReckoning
-from coopenv.estimation.observers.faults import FAULTS
+from coopenv.observers import registry, run
+from coopenv.observers.bound import cramer_rao, cramer_rao_ancestors
+from coopenv.observers.contract import Estimate, Tick
+from coopenv.observers.dead_reckoning import DeadReckoning
+from coopenv.runs.recorder import record
 
 SHORT = {"horizon": 1.5}
 

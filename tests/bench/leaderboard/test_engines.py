@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from coopenv.bench.leaderboard.engines import Local, find_engine, reach
+from coopenv.bench.observers.executors import Local, find_engine, reach
 from coopenv.errors import CoopenvError
 from coopenv.machine import ONE_THREAD
 

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 import coopenv
-from coopenv.bench.leaderboard import compare, find_source
-from coopenv.bench.leaderboard.command import request_of
-from coopenv.bench.leaderboard.sources import variants_of
+from coopenv.bench.observers import compare, find_source
+from coopenv.bench.observers.command import request_of
+from coopenv.bench.observers.faults import FAULTS
+from coopenv.bench.observers.sources import variants_of
 from coopenv.errors import CoopenvError
-from coopenv.estimation.observers import record, run
-from coopenv.estimation.observers.faults import FAULTS
+from coopenv.observers import run
+from coopenv.runs.recorder import record
 from tests.backends import mrclam_files
 
 

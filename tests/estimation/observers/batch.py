@@ -12,8 +12,8 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.observers import Recording
-from coopenv.estimation.observers.runner import record
+from coopenv.observers import Recording
+from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.motion import ConstantMotion
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from coopenv import CoopenvError
-from coopenv.estimation.observers import Estimate, Message
-from coopenv.estimation.observers.checks import check_estimate, check_message, is_finite
+from coopenv.observers import Estimate, Message
+from coopenv.observers.checks import check_estimate, check_message, is_finite
 
 POSE: dict[str, Any] = {"rotation": np.eye(3), "position": np.zeros(3)}
 LOPSIDED = np.eye(6) + np.eye(6, k=1) * 1e-3

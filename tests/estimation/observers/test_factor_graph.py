@@ -9,8 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from coopenv.errors import CoopenvError
-from coopenv.estimation.observers import Coordinates, run
-from coopenv.estimation.observers.registry import NEEDS, available_names, find, observer_names
+from coopenv.observers import Coordinates, run
+from coopenv.observers.registry import NEEDS, available_names, find, observer_names
 from tests.estimation.observers.batch import small_record
 
 

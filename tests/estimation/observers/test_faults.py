@@ -11,10 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import binom
 
 import coopenv
-from coopenv.errors import CoopenvError
-from coopenv.estimation.observers import Message, Recording, record, run
-from coopenv.estimation.observers.base import Setup
-from coopenv.estimation.observers.faults import (
+from coopenv.bench.observers.faults import (
     FAULTS,
     Lie,
     find_fault,
@@ -24,7 +21,11 @@ from coopenv.estimation.observers.faults import (
     with_wrong_association,
     without_landmarks,
 )
-from coopenv.estimation.observers.mekf_covariance import MekfCovariance
+from coopenv.errors import CoopenvError
+from coopenv.observers import Message, Recording, run
+from coopenv.observers.contract import Setup
+from coopenv.observers.mekf_covariance import MekfCovariance
+from coopenv.runs.recorder import record
 
 
 @cache

@@ -10,10 +10,11 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.observers import Coordinates, Recording, SensorNoise, Tick, record, run
-from coopenv.estimation.observers.covariance_intersection import CovarianceIntersection, best_weight
-from coopenv.estimation.observers.mekf import LeftError, innovation, kalman, transition
-from coopenv.estimation.observers.right_invariant import RightError, from_left
+from coopenv.observers import Coordinates, Recording, SensorNoise, Tick, run
+from coopenv.observers.covariance_intersection import CovarianceIntersection, best_weight
+from coopenv.observers.mekf import LeftError, innovation, kalman, transition
+from coopenv.observers.right_invariant import RightError, from_left
+from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.estimation.observers.batch import small_record, solve
 

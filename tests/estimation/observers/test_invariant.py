@@ -9,10 +9,10 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import logm
 
-from coopenv.estimation.observers import Coordinates, Estimate, SensorNoise, run
-from coopenv.estimation.observers.left_invariant import InvariantError, LeftInvariant
-from coopenv.estimation.observers.mekf import LeftError, Mekf
-from coopenv.estimation.observers.ukf import SPREAD, Ukf, sigma_points
+from coopenv.observers import Coordinates, Estimate, SensorNoise, run
+from coopenv.observers.left_invariant import InvariantError, LeftInvariant
+from coopenv.observers.mekf import LeftError, Mekf
+from coopenv.observers.ukf import SPREAD, Ukf, sigma_points
 from tests.estimation.observers.batch import small_record, solve
 from tests.estimation.observers.test_filters import QUIET, pose, spd, tick
 

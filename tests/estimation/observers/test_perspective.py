@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.observers.perspective import solve_p3p, solve_p3p_batch
+from coopenv.estimation.p3p import solve_p3p, solve_p3p_batch
 
 SEEDS = st.integers(0, 2**32 - 1)
 

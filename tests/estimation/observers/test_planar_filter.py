@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from coopenv.estimation.observers.planar import CALIBRATING, IROBOT_CREATE, TEXTBOOK
-from coopenv.estimation.observers.planar_commands import (
+from coopenv.observers.planar.commands import (
     ARC,
     PATH,
     SLOWING,
@@ -20,7 +19,7 @@ from coopenv.estimation.observers.planar_commands import (
     CommandHistory,
     Wheels,
 )
-from coopenv.estimation.observers.planar_filter import (
+from coopenv.observers.planar.filter import (
     BIAS,
     HEADING,
     LEAD,
@@ -32,6 +31,7 @@ from coopenv.estimation.observers.planar_filter import (
     Y,
     growth,
 )
+from coopenv.observers.planar.plugin import CALIBRATING, IROBOT_CREATE, TEXTBOOK
 
 DT = 0.05
 COMMANDS = [(0.07, 0.0), (0.08, 0.4), (0.05, 0.4), (0.0, -0.3), (0.067, 0.01), (0.086, -0.398), (0.086, 0.0)] * 3

@@ -10,9 +10,9 @@ from numpy.testing import assert_allclose
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.observers import Message, Received, Tick, run
-from coopenv.estimation.observers.mekf import LeftError
-from coopenv.estimation.observers.pnp import PerspectivePoints
+from coopenv.observers import Message, Received, Tick, run
+from coopenv.observers.mekf import LeftError
+from coopenv.observers.single_frame import PerspectivePoints
 from tests.estimation.observers.batch import small_record
 from tests.estimation.observers.test_filters import QUIET, tick
 

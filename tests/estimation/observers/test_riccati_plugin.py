@@ -9,7 +9,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from coopenv.api.engine import Engine
-from coopenv.estimation.observers import record, run
+from coopenv.observers import run
+from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from tests.estimation.observers.batch import small_errors
 

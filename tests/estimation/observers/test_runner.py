@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-import coopenv.estimation.observers.registry as registry
+import coopenv.observers.registry as registry
 from coopenv import CoopenvError
-from coopenv.estimation.observers import (
+from coopenv.observers import (
     Coordinates,
     Estimate,
     Message,
@@ -25,11 +25,11 @@ from coopenv.estimation.observers import (
     Tick,
     find,
     observer_names,
-    record,
     register,
     run,
 )
-from coopenv.estimation.observers.team import Team
+from coopenv.observers.group import Group
+from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.estimation.observers.batch import small_errors
 
@@ -247,14 +247,14 @@ def test_what_is_sensed_cannot_be_written_to(name: str) -> None:
 @pytest.mark.parametrize("restored", [False, True])
 def test_what_all_receivers_hear_none_can_write_to(restored: bool) -> None:
     made = recording()
-    team = Team(Probe, made.briefing)
-    team.start(made.start_rotation, made.start_position)
+    group = Group(Probe, made.briefing)
+    group.start(made.start_rotation, made.start_position)
     sensed = made.at(1)
     for i in made.order:
-        team.update(i, sensed, made.inbox_tick[1, i])
+        group.update(i, sensed, made.inbox_tick[1, i])
     if restored:
-        team.set_state(team.get_state())
-    heard = [r.message for i in made.order for r in team.mail.inbox(1, i, made.inbox_tick[1, i]).values()]
+        group.set_state(group.get_state())
+    heard = [r.message for i in made.order for r in group.mail.inbox(1, i, made.inbox_tick[1, i]).values()]
     assert heard
     for message in heard:
         assert message.position is not None and not message.position.flags.writeable

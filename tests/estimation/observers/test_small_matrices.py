@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from coopenv.estimation.observers.small_matrices import cholesky, invert_positive, solve, solve_positive
+from coopenv.estimation.small_matrices import cholesky, invert_positive, solve, solve_positive
 
 
 @pytest.mark.parametrize("n", [1, 2, 6, 24])

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 import coopenv
-from coopenv.estimation.observers import Recording, record, run
-from coopenv.estimation.observers.starts import random_start, with_start
+from coopenv.bench.observers.initial_estimates import random_start, with_start
+from coopenv.observers import Recording, run
+from coopenv.runs.recorder import record
 
 
 @cache

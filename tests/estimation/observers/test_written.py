@@ -7,8 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.observers import Coordinates, Estimate
-from coopenv.estimation.observers.written import riccati_covariance, riccati_jacobian
+from coopenv.observers import Coordinates, Estimate
+from coopenv.observers.riccati_coordinates import riccati_covariance, riccati_jacobian
 
 R_HAT = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
 P_HAT = np.array([3.0, -2.0, 0.5])

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.estimation.observers import Recording, Tick, record
-from coopenv.estimation.observers.recording import Truth
+from coopenv.observers import Recording, Tick
+from coopenv.observers.recording import Truth
+from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 
 ISOTROPIC = {

@@ -7,9 +7,9 @@ from numpy.testing import assert_allclose
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.observers.base import SensorNoise
-from coopenv.estimation.observers.robust.belief import Belief, Member
-from coopenv.estimation.observers.rotations import exp_so3
+from coopenv.estimation.rotations import exp_so3
+from coopenv.observers.contract import SensorNoise
+from coopenv.observers.robust.reference.belief import Belief, Member
 
 LEVER_ARM = np.array([0.3, 0.1, 0.5])
 NOISE = SensorNoise(velocity=0.1, angular_velocity=0.01, odometry_period=1 / 60, bearing=0.003)

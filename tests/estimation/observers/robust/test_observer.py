@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coopenv.estimation.bound import cramer_rao_ancestors
-from coopenv.estimation.observers import run
-from coopenv.estimation.observers.faults import Lie, find_fault
-from coopenv.estimation.observers.planar import PlanarRobust
-from coopenv.estimation.observers.registry import find
-from coopenv.estimation.observers.robust import Robust, RobustJoint
-from coopenv.estimation.observers.starts import random_start
+from coopenv.bench.observers.faults import Lie, find_fault
+from coopenv.bench.observers.initial_estimates import random_start
+from coopenv.observers import run
+from coopenv.observers.bound import cramer_rao_ancestors
+from coopenv.observers.planar.plugin import PlanarRobust
+from coopenv.observers.registry import find
+from coopenv.observers.robust.plugin import Robust, RobustJoint
 from tests.estimation.observers.robust.scenes import everybody_sees_everybody, noise_free, shifted, small_errors
 
 BOTH = pytest.mark.parametrize("name", ["robust", "robust_joint"])

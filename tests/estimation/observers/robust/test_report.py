@@ -5,9 +5,10 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.observers.base import Message, SensorNoise
-from coopenv.estimation.observers.robust.belief import Belief, Member
-from coopenv.estimation.observers.robust.report import (
+from coopenv.estimation.rotations import exp_so3
+from coopenv.observers.contract import Message, SensorNoise
+from coopenv.observers.robust.reference.belief import Belief, Member
+from coopenv.observers.robust.reference.tracklets import (
     Report,
     from_message,
     left_error,
@@ -16,7 +17,6 @@ from coopenv.estimation.observers.robust.report import (
     to_message,
     tracklet,
 )
-from coopenv.estimation.observers.rotations import exp_so3
 
 NOISE = SensorNoise(velocity=0.1, angular_velocity=0.01, odometry_period=1 / 60, bearing=0.003)
 DT = 1 / 60

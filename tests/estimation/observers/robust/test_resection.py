@@ -4,10 +4,10 @@ import numpy as np
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.observers.robust.belief import Belief, Member, View
-from coopenv.estimation.observers.robust.report import left_error
-from coopenv.estimation.observers.robust.resection import resect
-from coopenv.estimation.observers.rotations import exp_so3
+from coopenv.estimation.rotations import exp_so3
+from coopenv.observers.robust.reference.belief import Belief, Member, View
+from coopenv.observers.robust.reference.resection import resect
+from coopenv.observers.robust.reference.tracklets import left_error
 
 R, P = Rotation.random(random_state=3).as_matrix(), np.array([1.0, -2.0, 0.5])
 LANDMARKS = np.array([[8.0, 1.0, 2.0], [3.0, 9.0, -1.0], [-4.0, -3.0, 5.0]])

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coopenv.estimation.bound import cramer_rao_ancestors
-from coopenv.estimation.observers import run
-from coopenv.estimation.observers.base import Received
-from coopenv.estimation.observers.robust import Robust, RobustJoint
-from coopenv.estimation.observers.robust.belief import Belief, Member
-from coopenv.estimation.observers.robust.room import FORGET_TIME, room_for
+from coopenv.observers import run
+from coopenv.observers.bound import cramer_rao_ancestors
+from coopenv.observers.contract import Received
+from coopenv.observers.robust.plugin import Robust, RobustJoint
+from coopenv.observers.robust.reference.belief import Belief, Member
+from coopenv.observers.robust.reference.eviction import FORGET_TIME, room_for
 from tests.estimation.observers.robust.scenes import crowd, small_errors
 
 VEHICLES = 12

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.metrics import orientation_error_deg
-from coopenv.estimation.observers.base import MIN_BEARING_STD
-from coopenv.estimation.observers.robust.search import Search, Sighting, is_known
+from coopenv.observers.contract import MIN_BEARING_STD
+from coopenv.observers.robust.reference.search import Search, Sighting, is_known
 from tests.estimation.observers.robust.scenes import first_tick, noise_free
 
 WIDE = np.diag([1.8] * 3 + [45.0] * 3)

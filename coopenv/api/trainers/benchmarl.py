@@ -1,0 +1,115 @@
+"""BenchMARL: every environment as a task. Needs the extra `benchmarl`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import count, repeat
+from pathlib import Path
+from typing import Any
+
+from coopenv.api.parallel_env import parallel_env
+from coopenv.api.trainers.numeric_infos import NUMBERS, PlainInfos
+
+try:
+    from benchmarl.environments.common import TaskClass
+    from torchrl.data import Composite
+    from torchrl.envs import EnvBase
+    from torchrl.envs.libs.pettingzoo import PettingZooWrapper
+except ImportError as error:
+    raise ImportError("coopenv.api.trainers.benchmarl needs BenchMARL: pip install 'coopenv[benchmarl]'") from error
+
+
+class CooperativeTask(TaskClass):
+    """One world per environment, all vehicles in the group `vehicle`; `task(name, **options)` builds it."""
+
+    def get_env_fun(
+        self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any
+    ) -> Callable[[], EnvBase]:
+        """Return a maker of worlds, each with the next seed; BenchMARL makes `num_envs` and runs them in turn."""
+        options = {k: v for k, v in self.config.items() if k != "env"}
+        seeds: Iterator[int | None] = repeat(None) if seed is None else count(seed)
+        return lambda: PettingZooWrapper(
+            PlainInfos(parallel_env(self.config["env"], **options)),
+            done_on_any=False,
+            use_mask=True,
+            return_state=True,
+            seed=next(seeds),
+            device=device,
+        )
+
+    def supports_continuous_actions(self) -> bool:
+        """Return True."""
+        return True
+
+    def supports_discrete_actions(self) -> bool:
+        """Return False."""
+        return False
+
+    def max_steps(self, env: EnvBase) -> int:
+        """Return the decision steps to the horizon."""
+        scenario = env.unwrapped.scenario
+        return round(scenario.horizon * scenario.rates.decision)
+
+    def has_render(self, env: EnvBase) -> bool:
+        """Return whether the world was built to be drawn."""
+        return env.unwrapped.render_mode == "rgb_array"
+
+    def group_map(self, env: EnvBase) -> dict[str, list[str]]:
+        """Return {"vehicle": all}."""
+        return env.group_map
+
+    def observation_spec(self, env: EnvBase) -> Composite:
+        """Return the spec of what the vehicles see."""
+        return _only(env, "observation")
+
+    def info_spec(self, env: EnvBase) -> Composite:
+        """Return the spec of `coopenv.api.trainers.numeric_infos.NUMBERS`."""
+        return _only(env, "info")
+
+    def state_spec(self, env: EnvBase) -> Composite:
+        """Return the spec of the truth, which a central critic may see."""
+        return Composite({"state": env.observation_spec["state"].clone()})
+
+    def action_spec(self, env: EnvBase) -> Composite:
+        """Return the spec of the actions."""
+        return env.full_action_spec
+
+    def action_mask_spec(self, env: EnvBase) -> None:
+        """Return None: all actions are possible."""
+        return None
+
+    @staticmethod
+    def env_name() -> str:
+        """Return "coopenv"."""
+        return "coopenv"
+
+    @staticmethod
+    def log_info(batch: Any) -> dict[str, float]:
+        """Return means over the vehicles under way, and how many arrived and collided."""
+        alive = batch["vehicle", "mask"]
+        info = batch["next", "vehicle", "info"]
+        events = ("arrived", "collided")
+        return {
+            f"collection/{name}": float(info[name][alive].sum() if name in events else info[name][alive].mean())
+            for name in NUMBERS
+        }
+
+
+def task(name_or_path: str | Path, **options: Any) -> CooperativeTask:
+    """Return an environment as a task for `benchmarl.experiment.Experiment`.
+
+    Args:
+        name_or_path: for example "urban_crossing".
+        options: those of `coopenv.parallel_env`.
+    """
+    return CooperativeTask(name=Path(str(name_or_path)).stem, config={"env": name_or_path, **options})
+
+
+def _only(env: EnvBase, kept: str) -> Composite:
+    """Return the group's part of the observation spec with one entry left."""
+    spec = env.observation_spec.clone()
+    del spec["state"]
+    for key in list(spec["vehicle"].keys()):
+        if key != kept:
+            del spec["vehicle"][key]
+    return spec

@@ -1,0 +1,64 @@
+"""RLlib, new API stack: one world as a `MultiAgentEnv`. Needs the extra `rllib`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from coopenv.api.parallel_env import parallel_env
+from coopenv.api.trainers.numeric_infos import PlainInfos
+
+try:
+    from ray.rllib.env.multi_agent_env import MultiAgentEnv
+except ImportError as error:
+    raise ImportError("coopenv.api.trainers.rllib needs RLlib: pip install 'coopenv[rllib]'") from error
+
+
+class CooperativeMultiAgentEnv(MultiAgentEnv):
+    """One world as RLlib wants it.
+
+    Differs from RLlib's `ParallelPettingZooEnv` in what it says at the horizon: `truncateds["__all__"]`, and nothing of
+    single vehicles. An episode whose agents are all flagged, be it as truncated, counts as terminated in RLlib (2.60):
+    the time limit would be learnt as a death. Vehicles that arrive or collide are flagged, in that step too.
+    """
+
+    def __init__(self, config: dict[str, Any] | None = None) -> None:
+        """Build the world.
+
+        Args:
+            config: `env`: name or TOML file; the other entries are options of `coopenv.parallel_env`.
+        """
+        options = dict(config or {})
+        self.env = PlainInfos(parallel_env(options.pop("env", "urban_crossing"), **options))
+        self.possible_agents = list(self.env.possible_agents)
+        self.agents = list(self.possible_agents)
+        self.observation_spaces = {agent: self.env.observation_space(agent) for agent in self.possible_agents}
+        self.action_spaces = {agent: self.env.action_space(agent) for agent in self.possible_agents}
+        self.observation_space = spaces.Dict(self.observation_spaces)
+        self.action_space = spaces.Dict(self.action_spaces)
+        self.render_mode = self.env.unwrapped.render_mode
+        super().__init__()
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
+        """Start an episode."""
+        observations, infos = self.env.reset(seed=seed, options=options)
+        self.agents = list(self.env.agents)
+        return observations, infos
+
+    def step(self, action_dict: dict[str, np.ndarray]) -> tuple[Any, Any, Any, Any, Any]:
+        """Drive for one decision period."""
+        observations, rewards, terminated, truncated, infos = self.env.step(action_dict)
+        self.agents = list(self.env.agents)
+        horizon = any(truncated.values())
+        over = {**terminated, "__all__": not self.agents and not horizon}
+        return observations, rewards, over, {"__all__": horizon}, infos
+
+    def render(self) -> Any:
+        """Draw the top view."""
+        return self.env.render()
+
+    def close(self) -> None:
+        """Close the window, if any."""
+        self.env.close()

@@ -1,0 +1,206 @@
+"""Basins of attraction: from which initial estimates an observer finds the truth.
+
+One record, and many draws of the initial estimates on it: attitude uniform over SO(3), position uniform in a ball.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from coopenv.bench.observers.executors import Engine
+from coopenv.bench.observers.initial_estimates import random_start
+from coopenv.bench.observers.judge import CONVERGED_ORIENTATION, CONVERGED_POSITION
+from coopenv.bench.observers.sources import Source
+from coopenv.errors import CoopenvError
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.consistency import Interval, wilson_interval
+from coopenv.estimation.metrics import settling_time
+from coopenv.observers.contract import Factory
+from coopenv.observers.registry import find
+from coopenv.observers.runner import run
+
+RADIUS = 15.0  # m
+ANGLE_BINS = tuple(range(0, 181, 30))  # deg
+
+
+@dataclass(frozen=True)
+class BasinTask:
+    """Some draws for all observers."""
+
+    source: Source
+    draws: Sequence[int]
+    observers: Mapping[str, Factory]
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One observer from one draw of the initial estimates; arrays (N,)."""
+
+    draw: int
+    observer: str
+    vehicles: tuple[str, ...]
+    initial_angle: Array  # deg
+    initial_distance: Array  # m
+    settle_time: Array  # s from which on the errors stay below 0.1 m and 1 deg; NaN where they do not
+    end_position: Array  # m
+    end_orientation: Array  # deg
+    failure: str
+
+    @property
+    def converged(self) -> np.ndarray:
+        """(N,) whether the vehicle ends below 0.1 m and 1 deg."""
+        return (self.end_position < CONVERGED_POSITION) & (self.end_orientation < CONVERGED_ORIENTATION)
+
+
+@dataclass(frozen=True)
+class Basin:
+    """How many draws converge."""
+
+    environment: str
+    observer: str
+    draws: int
+    converged_fraction: float
+    """Of the draws: those in which every vehicle ends converged."""
+    interval: Interval
+    """95 %, Wilson."""
+    by_vehicle: tuple[float, ...]
+    settle_time_s: float
+    """Median over the draws that converge of the time at which the last vehicle has settled."""
+    failed: int
+    """Draws in which the observer failed; they count as not converged."""
+    failure: str
+    """Who failed in the first of them, when and why; empty where there is none."""
+
+
+def draw_starts(task: BasinTask) -> list[Draw]:
+    """Run every observer from every draw of a task."""
+    recording, _ = task.source.recording(task.source.usual[0], 0)
+    found = []
+    for draw in task.draws:
+        started = random_start(recording, draw, RADIUS)
+        for name, factory in task.observers.items():
+            result = run(factory, started)
+            found.append(
+                Draw(
+                    draw=draw,
+                    observer=name,
+                    vehicles=tuple(setup.name for setup in recording.setups),
+                    initial_angle=result.orientation_error[0],
+                    initial_distance=result.position_error[0],
+                    settle_time=settling_time(
+                        result.t,
+                        result.position_error,
+                        result.orientation_error,
+                        CONVERGED_POSITION,
+                        CONVERGED_ORIENTATION,
+                    ),
+                    end_position=result.position_error[-1],
+                    end_orientation=result.orientation_error[-1],
+                    failure=result.failure,
+                )
+            )
+    return found
+
+
+def check_source(source: Source) -> None:
+    """Make sure that basins can be studied on a source.
+
+    Raises:
+        CoopenvError: they cannot.
+    """
+    if not source.seeded:
+        raise CoopenvError(f"--basin: {source.name} is recorded; basins are studied in simulated environments")
+
+
+def study_basin(
+    source: Source,
+    observers: Sequence[str],
+    draws: int,
+    engine: Engine,
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> list[Draw]:
+    """Return the draws 0, 1, ... of every observer, on the record of seed 0.
+
+    Args:
+        source: of the record.
+        observers: names.
+        draws: how many.
+        engine: where the work is done.
+        on_progress: called with the share that is done.
+
+    Raises:
+        CoopenvError: an unknown observer, or a source whose geometry is not the question.
+    """
+    check_source(source)
+    factories = {name: find(name) for name in observers}
+    tasks = [BasinTask(source, (draw,), factories) for draw in range(draws)]
+    found = engine.map(draw_starts, tasks, lambda done: on_progress(done / draws))
+    return [draw for name in factories for part in found for draw in part if draw.observer == name]
+
+
+def basins_of(environment: str, draws: Sequence[Draw]) -> list[Basin]:
+    """Sum up draws by observer."""
+    groups: dict[str, list[Draw]] = {}
+    for draw in draws:
+        groups.setdefault(draw.observer, []).append(draw)
+    basins = []
+    for name, own in groups.items():
+        converged = np.array([draw.converged for draw in own])
+        everybody = converged.all(axis=1)
+        failures = [draw.failure for draw in own if draw.failure]
+        last = np.array([draw.settle_time.max() for draw in own])[everybody]
+        basins.append(
+            Basin(
+                environment=environment,
+                observer=name,
+                draws=len(own),
+                converged_fraction=float(everybody.mean()),
+                interval=wilson_interval(int(everybody.sum()), len(own)),
+                by_vehicle=tuple(converged.mean(axis=0).tolist()),
+                settle_time_s=float(np.median(last)) if len(last) else float("nan"),
+                failed=len(failures),
+                failure=failures[0] if failures else "",
+            )
+        )
+    return basins
+
+
+def basin_failures(basins: Sequence[Basin]) -> list[str]:
+    """Return one line per observer that failed from some of the initial estimates."""
+    return [
+        f"{basin.observer} (basin): failed in {basin.failed} of {basin.draws} draws, first {basin.failure}"
+        for basin in basins
+        if basin.failed
+    ]
+
+
+def by_angle(draws: Sequence[Draw]) -> list[tuple[int, int]]:
+    """Return (converged, all) vehicles in each bin of `ANGLE_BINS` of their own initial angle."""
+    angle = np.concatenate([draw.initial_angle for draw in draws])
+    converged = np.concatenate([draw.converged for draw in draws])
+    bins = np.clip(np.digitize(angle, ANGLE_BINS) - 1, 0, len(ANGLE_BINS) - 2)
+    return [(int(converged[bins == b].sum()), int((bins == b).sum())) for b in range(len(ANGLE_BINS) - 1)]
+
+
+def plain_draws(draws: Sequence[Draw]) -> list[dict[str, Any]]:
+    """Return one line per draw, observer and vehicle."""
+    return [
+        {
+            "draw": draw.draw,
+            "observer": draw.observer,
+            "vehicle": vehicle,
+            "initial_orientation_error_deg": float(draw.initial_angle[i]),
+            "initial_position_error_m": float(draw.initial_distance[i]),
+            "converged": bool(draw.converged[i]),
+            "settle_time_s": float(draw.settle_time[i]),
+            "final_position_error_m": float(draw.end_position[i]),
+            "final_orientation_error_deg": float(draw.end_orientation[i]),
+            "failure": draw.failure,
+        }
+        for draw in draws
+        for i, vehicle in enumerate(draw.vehicles)
+    ]

@@ -1,0 +1,257 @@
+"""One record, judged: what every observer makes of it, against the truth and the bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from coopenv.bench.observers.sources import Source
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.consistency import diverged, position_std
+from coopenv.estimation.metrics import fit_exponential_rate, settling_time
+from coopenv.estimation.observability import analyse_observability
+from coopenv.estimation.trajectory_error import absolute_error, relative_error
+from coopenv.observers.bound import Bound, cramer_rao, cramer_rao_ancestors
+from coopenv.observers.contract import Factory
+from coopenv.observers.recording import Recording
+from coopenv.observers.runner import Run, run
+
+SETTLED_POSITION, SETTLED_ORIENTATION = 0.5, 5.0
+"""m and deg below which a vehicle counts as settled under noise."""
+
+CONVERGED_POSITION, CONVERGED_ORIENTATION = 0.1, 1.0
+"""m and deg below which it counts as converged."""
+
+RELATIVE_DELTA = 1.0
+"""s between the poses of a pair of the relative trajectory error."""
+
+SERIES_TICKS = 250
+"""Instants that are kept for figures."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One record and who runs on it; small, so that it travels to a worker."""
+
+    source: Source
+    variant: str
+    seed: int
+    observers: Mapping[str, Factory]
+    steady_from: float | None
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What belongs to the record and not to an observer; arrays (N,), NaN where unknown."""
+
+    vehicles: tuple[str, ...]
+    bound_mse: Array  # m^2 in the steady state: joint over all vehicles,
+    bound_ancestors_mse: Array  # joint over a vehicle and its ancestors,
+    bound_single_mse: Array  # and alone with known neighbours
+    gramian: Array  # smallest eigenvalue over the run, as in the theorem: about the map origin, mixed units
+    gramian_local: Array  # the same about the vehicle, without unit
+    steady_from: float  # s
+    t: Array  # (S,) s
+    bound: Array  # (S, N) m, joint
+
+
+class Series(NamedTuple):
+    """What figures show, at `Scene.t`; arrays (S, N)."""
+
+    position_error: Array  # m
+    position_std: Array  # m, NaN where the observer states no covariance
+    nees: Array
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One observer on one record; arrays (N,), NaN where it failed."""
+
+    variant: str
+    observer: str
+    scene: Scene
+    position_mse: Array  # m^2, in the steady state
+    orientation_mse: Array  # deg^2
+    anees: Array
+    nis: Array  # sums over the steady state
+    nis_dof: Array
+    settle_time: Array  # s
+    converge_time: Array  # s
+    rate: Array  # 1/s
+    diverged: Array  # bool
+    ate: Array  # m
+    rpe: Array  # m
+    rpe_orientation: Array  # deg
+    bytes_per_s: Array
+    us_per_update: Array
+    nees_dof: int
+    failure: str
+    series: Series
+
+
+def judge(task: Task) -> list[Sample]:
+    """Make the record and run every observer of a task on it."""
+    recording, lie = task.source.recording(task.variant, task.seed)
+    steady_from = task.source.steady_from(task.steady_from, recording)
+    scene = scene_of(recording, steady_from)
+    return [
+        sample_of(task.variant, name, scene, recording, run(factory, recording, lie))
+        for name, factory in task.observers.items()
+    ]
+
+
+def scene_of(recording: Recording, steady_from: float) -> Scene:
+    """Return the bounds and the observability of a record.
+
+    The noise of recorded robots is not known, and so neither is their bound.
+    """
+    N = len(recording.setups)
+    kept, unknown = _kept(recording), np.full(N, np.nan)
+    known = bool(recording.truth.known.all())
+    bounds: list[Bound] = []
+    if known and not any(setup.planar for setup in recording.setups):
+        bounds = [cramer_rao(recording), cramer_rao_ancestors(recording), cramer_rao(recording, joint=False)]
+    steady = recording.t > steady_from
+    squares = [np.mean(bound.position[steady] ** 2, axis=0) for bound in bounds] or [unknown] * 3
+    gramian = gramian_local = unknown
+    if known:
+        observability = analyse_observability(_Geometry(recording))
+        gramian, gramian_local = (
+            values.min(axis=0, initial=np.inf)
+            for values in (observability.min_eigenvalue, observability.local_eigenvalue)
+        )
+    return Scene(
+        vehicles=tuple(setup.name for setup in recording.setups),
+        bound_mse=squares[0],
+        bound_ancestors_mse=squares[1],
+        bound_single_mse=squares[2],
+        gramian=gramian,
+        gramian_local=gramian_local,
+        steady_from=steady_from,
+        t=recording.t[kept],
+        bound=bounds[0].position[kept] if bounds else np.full((len(kept), N), np.nan),
+    )
+
+
+class _Geometry:
+    """A record as `analyse_observability` reads it."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.t = recording.t
+        self.position, self.rotation = recording.truth.position, recording.truth.rotation
+        self.target_position = np.concatenate([recording.landmarks, _markers(recording)], axis=1)
+        self.visible = recording.visible
+        self.vehicles = np.array([setup.name for setup in recording.setups])
+
+
+def _markers(recording: Recording) -> Array:
+    """Return (K, N, 3) the points of the vehicles that cameras see."""
+    marker = np.array([setup.marker for setup in recording.setups])
+    return recording.truth.position + (recording.truth.rotation @ marker[..., None])[..., 0]
+
+
+def sample_of(variant: str, observer: str, scene: Scene, recording: Recording, result: Run) -> Sample:
+    """Judge one run. Where it failed, everything but its costs is NaN."""
+    steady = result.t > scene.steady_from
+    N = len(scene.vehicles)
+    if result.failure:
+        nothing: dict[str, Any] = dict.fromkeys(_JUDGED, np.full(N, np.nan))
+        gone = Series(*np.full((3, len(scene.t), N), np.nan))
+        return Sample(
+            variant=variant,
+            observer=observer,
+            scene=scene,
+            **nothing,
+            diverged=np.ones(N, bool),
+            **_costs(result),
+            failure=result.failure,
+            series=gone,
+        )
+    ends = _last(result.position_error), _last(result.orientation_error)
+    relative = _relative(recording, result)
+    told = np.where(steady[:, None], result.nis_dof, 0)
+    return Sample(
+        variant=variant,
+        observer=observer,
+        scene=scene,
+        position_mse=result.mean(result.position_error**2, steady),
+        orientation_mse=result.mean(result.orientation_error**2, steady),
+        anees=result.mean(result.nees, steady) / result.nees_dof,
+        nis=np.where(told > 0, result.nis, 0.0).sum(axis=0),
+        nis_dof=told.sum(axis=0).astype(float),
+        settle_time=_settling(result, SETTLED_POSITION, SETTLED_ORIENTATION),
+        converge_time=_settling(result, CONVERGED_POSITION, CONVERGED_ORIENTATION),
+        rate=np.array([_rate(result, i) for i in range(N)]),
+        diverged=diverged(*ends),
+        ate=np.array([absolute_error(recording.truth.position[:, i], result.position[:, i]) for i in range(N)]),
+        rpe=relative[0],
+        rpe_orientation=relative[1],
+        **_costs(result),
+        failure="",
+        series=_series(recording, result),
+    )
+
+
+_JUDGED = (
+    *("position_mse", "orientation_mse", "anees", "nis", "nis_dof", "settle_time", "converge_time", "rate"),
+    *("ate", "rpe", "rpe_orientation"),
+)
+
+
+def _costs(result: Run) -> dict[str, Any]:
+    return {
+        "bytes_per_s": result.bytes_per_second,
+        "us_per_update": result.microseconds_per_update,
+        "nees_dof": result.nees_dof,
+    }
+
+
+def _relative(recording: Recording, result: Run) -> Array:
+    """Return (2, N): RPE in m and deg."""
+    delta = max(1, round(RELATIVE_DELTA / recording.dt))
+    truth = recording.truth
+    return np.array(
+        [
+            relative_error(
+                truth.rotation[:, i], truth.position[:, i], result.rotation[:, i], result.position[:, i], delta
+            )
+            for i in range(result.position.shape[1])
+        ]
+    ).T
+
+
+def _settling(result: Run, position: float, orientation: float) -> Array:
+    """Return (N,) s, judged where the truth is known."""
+    times = np.full(result.judged.shape[1], np.nan)
+    for i, judged in enumerate(result.judged.T):
+        if judged.any():
+            t, errors = result.t[judged], (result.position_error[judged, i], result.orientation_error[judged, i])
+            times[i] = settling_time(t, *errors, position, orientation)
+    return times
+
+
+def _rate(result: Run, vehicle: int) -> float:
+    judged = result.judged[:, vehicle]
+    if not judged.any():
+        return float("nan")
+    return fit_exponential_rate(result.t[judged], result.position_error[judged, vehicle]).rate
+
+
+def _last(error: Array) -> Array:
+    """Return (N,) the last error that is known."""
+    known = np.isfinite(error)
+    last = len(error) - 1 - np.argmax(known[::-1], axis=0)
+    return error[last, np.arange(error.shape[1])]
+
+
+def _kept(recording: Recording) -> np.ndarray:
+    return np.unique(np.linspace(0, recording.ticks - 1, SERIES_TICKS).round().astype(int))
+
+
+def _series(recording: Recording, result: Run) -> Series:
+    kept = _kept(recording)
+    std = position_std(result.covariance[kept], result.coordinates, result.rotation[kept], result.position[kept])
+    return Series(result.position_error[kept], std, result.nees[kept])

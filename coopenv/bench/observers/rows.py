@@ -1,0 +1,168 @@
+"""The leaderboard's rows: one observer, one vehicle, one variant, summed up over all seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from coopenv.bench.observers.faults import NOMINAL
+from coopenv.bench.observers.judge import (
+    CONVERGED_ORIENTATION,
+    CONVERGED_POSITION,
+    RELATIVE_DELTA,
+    SETTLED_ORIENTATION,
+    SETTLED_POSITION,
+    Sample,
+)
+from coopenv.estimation.consistency import DIVERGED_ORIENTATION, DIVERGED_POSITION, LEVEL, Interval, mean_bounds
+
+
+def _column(meaning: str) -> Any:
+    """Declare a column with what it means, which the report prints."""
+    return field(metadata={"meaning": meaning})
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the leaderboard; NaN where there is no such figure, and throughout where a run failed."""
+
+    environment: str = _column("environment, dataset or log file")
+    variant: str = _column("nominal, a fault, or what the robots see")
+    observer: str = _column("name of the observer")
+    vehicle: str = _column("name of the vehicle")
+    position_rmse_m: float = _column("root of the mean over seeds of the squared position error in the steady state, m")
+    orientation_rmse_deg: float = _column("the same of the geodesic angle between true and estimated orientation, deg")
+    bound_m: float = _column("posterior Cramér-Rao bound of the position, joint over all vehicles, m")
+    anees: float = _column("mean NEES in the steady state divided by its dimension; 1 for an honest covariance")
+    settled_fraction: float = _column(
+        f"share of seeds whose errors stay below {SETTLED_POSITION:g} m and {SETTLED_ORIENTATION:g} deg to the end"
+    )
+    settle_time_s: float = _column("median over these seeds of the time from which on they do, s")
+    bytes_per_s: float = _column("payload that the vehicle broadcasts, bytes per second")
+    us_per_update: float = _column("median time of an update with its message, microseconds; depends on the machine")
+    failure: str = _column("who failed first, when and why; empty where nobody did")
+    bound_ancestors_m: float = _column("the bound joint over the vehicle and all whose messages can reach it, m")
+    bound_single_m: float = _column("the bound of the vehicle alone, as if its neighbours' poses were known, m")
+    ratio_to_bound: float = _column("position_rmse_m / bound_m")
+    ratio_to_bound_ancestors: float = _column("position_rmse_m / bound_ancestors_m")
+    degradation: float = _column("position_rmse_m over that of the nominal variant")
+    position_rmse_median_m: float = _column("median over seeds of each run's RMSE, m")
+    position_rmse_p90_m: float = _column("90 % quantile over seeds of each run's RMSE, m")
+    converged_fraction: float = _column(
+        f"share of seeds whose errors stay below {CONVERGED_POSITION:g} m and {CONVERGED_ORIENTATION:g} deg to the end"
+    )
+    convergence_time_s: float = _column("median over these seeds of the time from which on they do, s")
+    convergence_rate_per_s: float = _column(
+        "median over seeds of the Theil-Sen slope of -log of the error's descent, 1/s"
+    )
+    diverged_fraction: float = _column(
+        f"share of seeds that end above {DIVERGED_POSITION:g} m or {DIVERGED_ORIENTATION:g} deg, or that failed"
+    )
+    ate_m: float = _column("absolute trajectory error over the whole run (evo's APE, nothing aligned), m")
+    rpe_m: float = _column(f"relative trajectory error (evo's RPE) over {RELATIVE_DELTA:g} s, m")
+    rpe_deg: float = _column(f"its angle over {RELATIVE_DELTA:g} s, deg")
+    nis: float = _column("mean NIS in the steady state divided by its degrees of freedom; 1 for a consistent filter")
+    anees_low: float = _column(
+        f"with anees_high: where that of an honest filter lies in {LEVEL:.0%} of all instants, for as many runs "
+        "(chi-square); the mean over time lies closer to 1"
+    )
+    anees_high: float = _column("see anees_low")
+    nis_low: float = _column(
+        f"with nis_high: where that of a consistent filter lies with a probability of {LEVEL:.0%} (chi-square)"
+    )
+    nis_high: float = _column("see nis_low")
+    gramian_min_eigenvalue: float = _column(
+        "smallest eigenvalue over the run of the observability Gramian over 1 s, about the map origin; mixed units"
+    )
+    gramian_local_eigenvalue: float = _column("the same about the vehicle, in units of the targets' range; no unit")
+
+
+NOWHERE = Interval(float("nan"), float("nan"))
+
+MEASURED = ("us_per_update",)
+"""Columns that differ between two runs of the same command."""
+
+
+def rows_of(environment: str, samples: Sequence[Sample]) -> list[Row]:
+    """Sum up samples over seeds, in the order of variants and observers in which they come."""
+    groups: dict[tuple[str, str], list[Sample]] = {}
+    for sample in samples:
+        groups.setdefault((sample.variant, sample.observer), []).append(sample)
+    rows = []
+    for (variant, observer), own in groups.items():
+        for i, vehicle in enumerate(own[0].scene.vehicles):
+            rows.append(_row(environment, variant, observer, vehicle, i, own))
+    return _with_degradation(rows)
+
+
+def _row(environment: str, variant: str, observer: str, vehicle: str, i: int, own: Sequence[Sample]) -> Row:
+    def over_seeds(name: str) -> np.ndarray:
+        return np.array([getattr(sample, name)[i] for sample in own], float)
+
+    def bound(name: str) -> float:
+        return _root_mean([getattr(sample.scene, name)[i] for sample in own])
+
+    rmse, dof = _root_mean(over_seeds("position_mse")), over_seeds("nis_dof").sum()
+    each = np.sqrt(over_seeds("position_mse"))
+    settle, converge = over_seeds("settle_time"), over_seeds("converge_time")
+    joint, family = bound("bound_mse"), bound("bound_ancestors_mse")
+    anees = over_seeds("anees")
+    honest = mean_bounds(own[0].nees_dof, len(own)) if np.isfinite(anees).all() else NOWHERE
+    consistent = mean_bounds(int(dof)) if dof > 0 else NOWHERE
+    return Row(
+        environment=environment,
+        variant=variant,
+        observer=observer,
+        vehicle=vehicle,
+        position_rmse_m=rmse,
+        orientation_rmse_deg=_root_mean(over_seeds("orientation_mse")),
+        bound_m=joint,
+        anees=float(np.mean(anees)),
+        settled_fraction=float(np.mean(np.isfinite(settle))),
+        settle_time_s=_median(settle),
+        bytes_per_s=float(np.mean(over_seeds("bytes_per_s"))),
+        us_per_update=_median(over_seeds("us_per_update")),
+        failure=next((sample.failure for sample in own if sample.failure), ""),
+        bound_ancestors_m=family,
+        bound_single_m=bound("bound_single_mse"),
+        ratio_to_bound=rmse / joint,
+        ratio_to_bound_ancestors=rmse / family,
+        degradation=float("nan"),
+        position_rmse_median_m=float(np.quantile(each, 0.5)),
+        position_rmse_p90_m=float(np.quantile(each, 0.9)),
+        converged_fraction=float(np.mean(np.isfinite(converge))),
+        convergence_time_s=_median(converge),
+        convergence_rate_per_s=_median(over_seeds("rate")),
+        diverged_fraction=float(np.mean(over_seeds("diverged"))),
+        ate_m=_root_mean(over_seeds("ate") ** 2),
+        rpe_m=_root_mean(over_seeds("rpe") ** 2),
+        rpe_deg=_root_mean(over_seeds("rpe_orientation") ** 2),
+        nis=float(over_seeds("nis").sum() / dof) if dof > 0 else float("nan"),
+        anees_low=honest.low,
+        anees_high=honest.high,
+        nis_low=consistent.low,
+        nis_high=consistent.high,
+        gramian_min_eigenvalue=float(np.min([sample.scene.gramian[i] for sample in own])),
+        gramian_local_eigenvalue=float(np.min([sample.scene.gramian_local[i] for sample in own])),
+    )
+
+
+def _with_degradation(rows: Sequence[Row]) -> list[Row]:
+    nominal = {(row.observer, row.vehicle): row.position_rmse_m for row in rows if row.variant == NOMINAL}
+    nan = float("nan")
+    return [
+        replace(row, degradation=row.position_rmse_m / nominal.get((row.observer, row.vehicle), nan)) for row in rows
+    ]
+
+
+def _root_mean(squares: Sequence[float] | np.ndarray) -> float:
+    return float(np.sqrt(np.mean(squares)))
+
+
+def _median(values: np.ndarray) -> float:
+    """Return the median of what is finite, NaN where nothing is."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else float("nan")

@@ -1,0 +1,102 @@
+"""Whether what an observer returns is an estimate or a message at all; every tick pays for it, so it is kept cheap."""
+
+from __future__ import annotations
+
+from math import isfinite
+from operator import index
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg.lapack import dpotrf
+
+from coopenv.errors import CoopenvError
+from coopenv.estimation.arrays import Array
+from coopenv.observers.contract import Estimate, Message
+
+MOST_BENT = 1e-6
+"""By how much entries of R^T R may differ from those of I."""
+MOST_LOPSIDED = 1e-6
+"""By how much P and its transpose may differ, relative to P, in Frobenius' norm."""
+MOST_NEGATIVE = 1e-9
+"""How far below zero an eigenvalue of P may lie, relative to the largest one."""
+
+POSITION, ROTATION, COVARIANCE = (3,), (3, 3), (6, 6)
+SENT_COVARIANCES = (ROTATION, COVARIANCE)
+"""Shapes: of the marker's position, or of the whole pose."""
+
+
+def check_estimate(estimate: Estimate) -> None:
+    """Refuse what is no estimate.
+
+    Raises:
+        CoopenvError: a field has another shape, is not real and finite, or is no rotation or covariance.
+    """
+    _check_array("rotation", estimate.rotation, ROTATION)
+    _check_array("position", estimate.position, POSITION)
+    _check_rotation(np.asarray(estimate.rotation))
+    if estimate.covariance is not None:
+        _check_array("covariance", estimate.covariance, COVARIANCE)
+        _check_covariance(np.asarray(estimate.covariance))
+    if estimate.nis is not None and not (isfinite(estimate.nis) and index(estimate.nis_dof) >= 0):
+        raise CoopenvError("nis is not finite, or nis_dof negative")
+
+
+def check_message(message: Message) -> None:
+    """Refuse what is no message; `extra` is the observer's own business, as long as it holds numbers.
+
+    Raises:
+        CoopenvError: a field has another shape, or is not real and finite.
+    """
+    if message.position is not None:
+        _check_array("message: position", message.position, POSITION)
+    if message.rotation is not None:
+        _check_array("message: rotation", message.rotation, ROTATION)
+    if message.covariance is not None:
+        _check_array("message: covariance", message.covariance, *SENT_COVARIANCES)
+    for name, value in message.extra.items():
+        if np.asarray(value).dtype.kind not in "biufc":
+            raise CoopenvError(f"message: extra '{name}' is no array of numbers")
+
+
+def is_finite(values: NDArray[Any]) -> bool:
+    """Return whether every one of some numbers is finite; a sum of squares tells it sooner, unless that overflows."""
+    return isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all())
+
+
+def _check_array(name: str, value: ArrayLike, *shapes: tuple[int, ...]) -> None:
+    array = np.asarray(value)
+    kind = array.dtype.kind
+    if kind == "c":
+        raise CoopenvError(f"{name} is complex")
+    if array.shape not in shapes or kind not in "iuf" or not is_finite(array):
+        raise CoopenvError(f"{name} is not a finite array of shape {' or '.join(map(str, shapes))}")
+
+
+def _check_rotation(R: Array) -> None:
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()  # numbers of Python: faster than arrays this small
+    off = (a * b + d * e + g * h, a * c + d * f + g * i, b * c + e * f + h * i)
+    norms = (a * a + d * d + g * g, b * b + e * e + h * h, c * c + f * f + i * i)
+    if max(map(abs, off)) > MOST_BENT or max(norms) > 1.0 + MOST_BENT or min(norms) < 1.0 - MOST_BENT:
+        raise CoopenvError("rotation is not orthogonal")
+    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) < 0.0:
+        raise CoopenvError("rotation is a reflection")
+
+
+def _check_covariance(P: Array) -> None:
+    lopsided = P - P.T
+    if np.vdot(lopsided, lopsided) > MOST_LOPSIDED**2 * np.vdot(P, P):
+        raise CoopenvError("covariance is not symmetric")
+    if _has_factor(P) or _has_factor(P + MOST_NEGATIVE * P.diagonal().max() * _IDENTITY):
+        return  # the second one for those that are singular, as robots' on a plane are
+    eigenvalues = np.linalg.eigvalsh(P)
+    if eigenvalues[0] < -MOST_NEGATIVE * eigenvalues[-1]:
+        raise CoopenvError("covariance is not positive semidefinite")
+
+
+def _has_factor(P: Array) -> bool:
+    """Return whether the Cholesky factor exists."""
+    return bool(dpotrf(P)[1] == 0)
+
+
+_IDENTITY = np.eye(6)

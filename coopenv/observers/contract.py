@@ -1,0 +1,247 @@
+"""What a researcher's observer reads and writes: one class in NumPy for one vehicle.
+
+Frames: positions in the map frame, rotations from body to map, bearings as unit vectors from the camera to the target
+in the BODY frame (the paper's g_ij is the negative).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.coordinates import Coordinates
+
+BYTES_PER_NUMBER = 8
+MIN_BEARING_STD = 1e-4
+"""rad; noise-free scenarios would leave a Kalman filter with a singular innovation."""
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Standard deviations at the scenario's rates."""
+
+    velocity: float
+    """m/s, of each component of an odometry sample."""
+    angular_velocity: float
+    """rad/s, of each component of an odometry sample."""
+    odometry_period: float
+    """s, for which a sample is held."""
+    bearing: float
+    """rad, of each tangent axis of a bearing. For the paper's noise model this is the standard deviation on the image
+    plane, which is reached on the optical axis only and is an upper bound elsewhere."""
+    image_axis: tuple[float, float, float] | None = None
+    """Axis of that image plane, unit vector in the body frame; None: the noise is in the tangent plane."""
+
+    def odometry(self, dt: float) -> Array:
+        """Return the variances (6,) of (rotation, translation) of the increment over dt.
+
+        The noise is taken as white of density sigma^2 times the period; exact where both rates are equal.
+        """
+        scale = self.odometry_period * dt
+        turn, step = self.angular_velocity**2 * scale, self.velocity**2 * scale
+        return np.array([turn, turn, turn, step, step, step])
+
+    def bearing_information(self, bearings: Array) -> Array:
+        """Return the information matrices (m, 3, 3), 1/rad^2, of unit bearings (m, 3), body frame, about themselves.
+
+        On the image plane across an axis the coordinates of u are those of u / (u . axis), so that a deviation there
+        counts |u . axis| times across u, and once more where it lies in the plane of u and the axis.
+        """
+        u = np.asarray(bearings, dtype=np.float64)
+        across = np.eye(3) - u[:, :, None] * u[:, None, :]
+        if self.image_axis is None:
+            return across / self.bearing_std**2
+        axis = np.array(self.image_axis)
+        plane = np.linalg.svd(axis[None])[2][1:].T  # (3, 2) two axes of the image plane
+        J = np.abs(u @ axis)[:, None, None] * (across @ plane)
+        covariance = self.bearing**2 * J @ np.swapaxes(J, 1, 2) + MIN_BEARING_STD**2 * across
+        return np.linalg.pinv(covariance, rcond=1e-9, hermitian=True)
+
+    @property
+    def bearing_std(self) -> float:
+        """The bearing's standard deviation, but at least `MIN_BEARING_STD`, rad."""
+        return max(self.bearing, MIN_BEARING_STD)
+
+
+@dataclass(frozen=True)
+class Gains:
+    """The scenario's gains for the Riccati observer of one vehicle."""
+
+    k: float
+    q: Array  # (T,) per target
+    V: tuple[float, float]
+    P0: tuple[float, float]
+    max_turn: float  # rad
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What one vehicle knows before it starts. Targets are landmarks first, then vehicles."""
+
+    vehicle: int
+    name: str
+    target_names: tuple[str, ...]
+    landmarks: int
+    """How many of the targets are landmarks; vehicle j is target `landmarks + j`."""
+    targets: NDArray[np.int64]
+    """(m,) its neighbours."""
+    lever_arm: Array
+    """(3,) the camera's place in the body, m."""
+    marker: Array
+    """(3,) the point of this vehicle that others' cameras measure, in its body, m."""
+    noise: SensorNoise
+    gains: Gains
+    planar: bool = False
+    """Whether the vehicle moves on a plane (z = 0, yaw only) and its odometry is the commands it was given, which
+    need calibration; so it is for recorded robots."""
+
+
+@dataclass(frozen=True)
+class Message:
+    """What a vehicle broadcasts; an observer fills what it wants to send, and `size_bytes` counts that.
+
+    `position` is where the others' cameras see the sender (its marker) and `covariance` is the 3x3 covariance of that
+    point, both in the map frame. `extra` holds anything else, as arrays.
+    """
+
+    position: Array | None = None
+    rotation: Array | None = None
+    covariance: Array | None = None
+    extra: Mapping[str, Array] = field(default_factory=dict)
+
+    @property
+    def size_bytes(self) -> int:
+        """Payload: a rotation travels as a quaternion of 4 times 8 bytes, a covariance as its triangle.
+
+        Numbers count as wide as their array holds them, so that a sender saves bytes with a narrower dtype.
+        """
+        size = sum(np.asarray(a).nbytes for a in self.extra.values())
+        if self.position is not None:
+            size += np.asarray(self.position).nbytes
+        if self.rotation is not None:
+            size += 4 * BYTES_PER_NUMBER
+        if self.covariance is not None:
+            n = len(self.covariance)
+            size += n * (n + 1) // 2 * np.asarray(self.covariance).itemsize
+        return size
+
+
+@dataclass(frozen=True)
+class Received:
+    """A neighbour's latest message that arrived and is not stale."""
+
+    message: Message
+    age: float
+    """s since it was sent."""
+
+
+@dataclass(frozen=True)
+class Tick:
+    """Everything that one vehicle senses and hears at one camera frame."""
+
+    index: int
+    time: float  # s
+    dt: float  # s since the last tick
+    rotation: Array
+    """(3, 3) odometry dR over the tick: R <- R dR."""
+    translation: Array
+    """(3,) odometry dp over the tick, in the body frame at its start: p <- p + R dp, m."""
+    velocity: Array
+    """(3,) last odometry sample, body frame, m/s."""
+    angular_velocity: Array
+    """(3,) last odometry sample, body frame, rad/s."""
+    targets: NDArray[np.int64]
+    """(m,) indices of the neighbours: landmarks first, then vehicles."""
+    bearings: Array
+    """(m, 3) unit vectors camera -> target in the body frame; NaN where not valid."""
+    valid: NDArray[np.bool_]
+    """(m,) whether the target was measured in this frame."""
+    landmarks: Array
+    """(L, 3) known positions of the landmarks now, map frame, m."""
+    messages: Mapping[int, Received]
+    """By target index."""
+    lever_arm: Array
+    """(3,) the camera's place in the body, m."""
+    noise: SensorNoise
+    due: bool = True
+    """Whether the scenario's observer rate (`rates.observer`) asks for a correction at this frame."""
+
+    def usable(self) -> list[tuple[int, Array, Array, Message | None]]:
+        """Return (target, bearing, position, message) of every target measured whose position is known or heard.
+
+        The message is None for a landmark.
+        """
+        result: list[tuple[int, Array, Array, Message | None]] = []
+        targets, landmarks = self.targets.tolist(), len(self.landmarks)
+        for n in self.valid.nonzero()[0].tolist():
+            target = targets[n]
+            if target < landmarks:
+                result.append((target, self.bearings[n], self.landmarks[target], None))
+            elif (heard := self.messages.get(target)) is not None and heard.message.position is not None:
+                result.append((target, self.bearings[n], heard.message.position, heard.message))
+        return result
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Where an observer believes its vehicle to be."""
+
+    rotation: Array
+    """(3, 3) body to map."""
+    position: Array
+    """(3,) of the body's origin in the MAP frame, m (the paper's pbar; its p_i is rotation.T @ position)."""
+    covariance: Array | None = None
+    """(6, 6) over the error in `coordinates`, rad and m; None: the observer states none."""
+    coordinates: Coordinates = Coordinates.LEFT
+    nis: float | None = None
+    """Normalised innovation squared r^T S^-1 r of this tick's correction; None: there was none, or it is not told."""
+    nis_dof: int = 0
+    """Its degrees of freedom: two per bearing used."""
+
+
+@runtime_checkable
+class Observer(Protocol):
+    """One vehicle's estimator. It is built as `factory(setup)`."""
+
+    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
+        """Start at a pose (rotation (3, 3), map position (3,)) with a covariance (6, 6) in LEFT coordinates."""
+        ...
+
+    def update(self, tick: Tick) -> Estimate:
+        """Take one camera tick."""
+        ...
+
+    def message(self) -> Message:
+        """Return what to broadcast now; called after `update` (or `reset`) when a message is due."""
+        ...
+
+
+@runtime_checkable
+class JointObserver(Protocol):
+    """An estimator of all vehicles at once that has everybody's measurements: a reference, not deployable.
+
+    Its class has `joint = True`, and it is built as `factory(setups)`, one setup per vehicle.
+    """
+
+    joint: bool
+
+    def reset(self, initial_poses: Sequence[tuple[Array, Array]], initial_covariances: Sequence[Array]) -> None:
+        """Start at one pose and covariance per vehicle, as for `Observer`."""
+        ...
+
+    def update(self, ticks: Sequence[Tick]) -> list[Estimate]:
+        """Take one camera tick of every vehicle; received messages in it are empty."""
+        ...
+
+    def messages(self) -> list[Message]:
+        """Return what each vehicle had to send for this tick."""
+        ...
+
+
+Factory = Any
+"""Builds an `Observer` from a `Setup`, or a `JointObserver` from a sequence of them."""

@@ -1,0 +1,95 @@
+"""Error-state filter that fuses neighbours by split covariance intersection.
+
+Source: Julier and Uhlmann, A non-divergent estimation algorithm in the presence of unknown correlations, 1997. For a
+bearing to a neighbour P becomes P / w, and the neighbour's part of the noise H_j P_j H_j^T / (1 - w): the two may be
+correlated in any way. The bearing's own noise is independent and stays whole. w minimises det P+. Consistent, at the
+price of information.
+"""
+
+from __future__ import annotations
+
+from math import log
+
+import numpy as np
+from scipy.optimize import brentq
+
+from coopenv.estimation.arrays import Array
+from coopenv.observers.contract import Message, Tick
+from coopenv.observers.mekf import Mekf, innovation, kalman
+
+LOWEST, HIGHEST = 0.02, 1.0 - 1e-6
+"""Limits of w short of 1, which leaves the measurement out."""
+
+
+class CovarianceIntersection(Mekf):
+    """Landmarks by a Kalman update, then neighbours one at a time by covariance intersection.
+
+    It tells the normalised innovation of the landmarks; an inflated one has no distribution.
+    """
+
+    sends_covariance = True
+
+    def correct(self, tick: Tick, b: Array, z: Array, messages: list[Message | None]) -> None:
+        """Correct by bearings b (m, 3) to positions z (m, 3)."""
+        known = np.array([m is None or m.covariance is None for m in messages])
+        if known.any():
+            super().correct(tick, b[known], z[known], [None] * int(known.sum()))
+        for n in np.flatnonzero(~known):
+            message = messages[n]
+            if message is not None and message.covariance is not None:
+                self.intersect(tick, b[n : n + 1], z[n : n + 1], message.covariance)
+
+    def intersect(self, tick: Tick, b: Array, z: Array, covariance: Array) -> None:
+        """Fuse one bearing to a neighbour with the covariance (3, 3) of its position."""
+        residual, J = innovation(self.state.R, self.state.p, tick.lever_arm, b, z)
+        H = J[0].dot(self.state.jacobian(z)[0])
+        G = J[0].dot(self.state.R.T)
+        own = tick.noise.bearing_std**2 * np.eye(2)
+        theirs, prior = G.dot(covariance).dot(G.T), H.dot(self.state.P).dot(H.T)
+        w = best_weight(prior, own, theirs)
+        if w < 1.0:
+            dx, P, _ = kalman(self.state.P / w, H, own + theirs / (1.0 - w), residual[0])
+            self.state = self.state.moved(dx, P)
+
+
+def best_weight(prior: Array, own: Array, theirs: Array) -> float:
+    """Return the w in (0, 1] that minimises det P+, for covariances (2, 2) of a bearing.
+
+    With v = 1 - w, N = own + theirs / v and the determinant lemma,
+    log det P+ - log det P = -6 log w + log det N - log det(N + prior / w) = -4 log w + log f - log g, where
+    f = det(v own + theirs) and g = det(w v own + w theirs + v prior). It is 0 at w = 1, and convex: the information
+    w P^-1 + H^T N^-1 H is concave in w, N^-1 being a parallel sum, and so is log det.
+    """
+    o, t, p = _determinant(own), _determinant(theirs), _determinant(prior)
+    ot, op, tp = _mixed(own, theirs), _mixed(own, prior), _mixed(theirs, prior)
+
+    def f_and_g(w: float) -> tuple[float, float]:
+        v = 1.0 - w
+        return (v * o + ot) * v + t, w * w * ((v * o + ot) * v + t) + v * (w * (v * op + tp) + v * p)
+
+    def slope(w: float) -> float:
+        v = 1.0 - w
+        f, g = f_and_g(w)
+        by_f = -2.0 * v * o - ot
+        by_g = 2.0 * w * f + w * w * by_f + (v - w) * (v * op + tp) - w * v * op - 2.0 * v * p
+        return -4.0 / w + by_f / f - by_g / g
+
+    if slope(HIGHEST) <= 0.0:
+        w = HIGHEST
+    else:
+        w = LOWEST if slope(LOWEST) >= 0.0 else brentq(slope, LOWEST, HIGHEST, xtol=1e-9, rtol=1e-9)
+    f, g = f_and_g(w)
+    return w if -4.0 * log(w) + log(f / g) < 0.0 else 1.0
+
+
+def _determinant(A: Array) -> float:
+    """Return det A of a symmetric (2, 2)."""
+    a, b, _, d = A.ravel().tolist()
+    return a * d - b * b
+
+
+def _mixed(A: Array, B: Array) -> float:
+    """Return the factor m of det(x A + y B) = x^2 det A + x y m + y^2 det B, for symmetric (2, 2)."""
+    a, b, _, d = A.ravel().tolist()
+    e, g, _, h = B.ravel().tolist()
+    return a * h + d * e - 2.0 * b * g

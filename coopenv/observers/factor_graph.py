@@ -1,0 +1,156 @@
+"""Fixed-lag smoother over a factor graph, with the neighbours' covariance as prior on their positions.
+
+Source: Dellaert and Kaess, Factor graphs for robot perception, Foundations and Trends in Robotics 6, 2017; fixed-lag
+smoother of GTSAM. Variables are the camera's pose at key frames and the points seen from them. Factors: odometry
+between key frames, points known to lie at a position, and bearings, which are averaged between key frames: of each
+target the mean residual to the predicted bearing, in map axes, added to the bearing predicted at the key frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.se3 import adjoint
+from coopenv.observers.contract import Estimate, Message, Setup, Tick
+from coopenv.observers.mekf import LeftError
+
+LAG = 1.0
+"""s."""
+KEY_PERIOD = 0.1
+"""s between key frames."""
+RELINEARISE = 0.01
+"""rad and m, by which a variable moves before its factors are linearised anew."""
+EXACT = 1e-10 * np.eye(3)
+"""m^2, of points that are known."""
+
+
+@dataclass
+class Residuals:
+    """What one target's bearings since the last key frame miss of the predicted ones."""
+
+    position: Array = field(default_factory=lambda: np.zeros(3))  # m, map frame, last one
+    covariance: Array = field(default_factory=lambda: np.zeros((3, 3)))  # m^2, of it
+    total: Array = field(default_factory=lambda: np.zeros(3))  # rad, map axes
+    count: int = 0
+
+
+class FactorGraph:
+    """Smooths at key frames, adds odometry between them; sends position and covariance."""
+
+    def __init__(self, setup: Setup) -> None:
+        """Remember the marker, which is what others measure, and the camera's place."""
+        self.marker, self.lever_arm, self.noise = setup.marker, setup.lever_arm, setup.noise
+        self.to_camera = adjoint(np.eye(3), -setup.lever_arm)
+        self.to_body = adjoint(np.eye(3), setup.lever_arm)
+
+    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
+        """Start at a pose."""
+        R, p = initial_pose
+        self.state = LeftError(np.array(R, float), np.array(p, float), np.array(initial_covariance, float))
+        self.time = 0.0
+        self.keys = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin a graph at the present pose."""
+        parameters = gtsam.ISAM2Params()
+        parameters.relinearizeSkip = 1
+        parameters.setRelinearizeThreshold(RELINEARISE)
+        self.smoother = gtsam.IncrementalFixedLagSmoother(LAG, parameters)
+        self.clear()
+        self.pose_key = self.add(self.camera())
+        prior = self.to_camera @ self.state.P @ self.to_camera.T
+        self.graph.add(gtsam.PriorFactorPose3(self.pose_key, self.camera(), gaussian(prior)))
+
+    def clear(self) -> None:
+        """Begin to collect for the next key frame."""
+        self.graph, self.values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self.stamps: dict[int, float] = {}
+        self.key_time = self.time
+        self.increment = LeftError(np.eye(3), np.zeros(3), np.zeros((6, 6)))
+        self.residuals: dict[int, Residuals] = {}
+
+    def camera(self) -> gtsam.Pose3:
+        """Return the camera's pose, with the axes of the body."""
+        return gtsam.Pose3(gtsam.Rot3(self.state.R), self.state.p + self.state.R @ self.lever_arm)
+
+    def add(self, value: gtsam.Pose3 | Array) -> int:
+        """Add a variable at the present time and return its key."""
+        self.keys += 1
+        self.values.insert(self.keys, value)
+        self.stamps[self.keys] = self.time
+        return self.keys
+
+    def update(self, tick: Tick) -> Estimate:
+        """Append the increment, collect the bearings, and smooth when a key frame is due."""
+        self.state, self.increment = self.state.predicted(tick), self.increment.predicted(tick)
+        self.time = tick.time
+        if tick.due:
+            self.collect(tick)
+            if self.time - self.key_time > KEY_PERIOD - 0.5 * tick.dt:
+                self.smooth()
+        return self.state.estimate()
+
+    def collect(self, tick: Tick) -> None:
+        """Add up what the bearings of a frame miss."""
+        R, p = self.state.R, self.state.p
+        for target, bearing, position, message in tick.usable():
+            seen = self.residuals.setdefault(target, Residuals())
+            seen.position, seen.covariance = position, np.zeros((3, 3))
+            if message is not None and message.covariance is not None:
+                seen.covariance = message.covariance
+            seen.total = seen.total + R @ (bearing - unit((position - p) @ R - self.lever_arm))
+            seen.count += 1
+
+    def smooth(self) -> None:
+        """Add a key frame and take the smoother's pose and covariance; start anew where it fails."""
+        self.add_odometry()
+        for seen in self.residuals.values():
+            self.add_bearing(seen)
+        try:
+            self.smoother.update(self.graph, self.values, self.stamps)
+            pose = self.smoother.calculateEstimatePose3(self.pose_key)
+            covariance = self.smoother.marginalCovariance(self.pose_key)
+        except RuntimeError:  # what the graph holds does not determine its variables
+            self.restart()
+            return
+        R, P = pose.rotation().matrix(), self.to_body @ covariance @ self.to_body.T
+        self.state = LeftError(R, pose.translation() - R @ self.lever_arm, (P + P.T) / 2)
+        self.clear()
+
+    def add_odometry(self) -> None:
+        """Add the pose of a key frame, held to the last one by odometry."""
+        before, turn, c = self.pose_key, self.increment.R, self.lever_arm
+        moved = gtsam.Pose3(gtsam.Rot3(turn), self.increment.p + turn @ c - c)
+        spread = self.to_camera @ self.increment.P @ self.to_camera.T
+        self.pose_key = self.add(self.camera())
+        self.graph.add(gtsam.BetweenFactorPose3(before, self.pose_key, moved, gaussian(spread)))
+
+    def add_bearing(self, seen: Residuals) -> None:
+        """Add a point and the bearing to it."""
+        point = self.add(seen.position)
+        self.graph.add(gtsam.PriorFactorPoint3(point, seen.position, gaussian(seen.covariance + EXACT)))
+        line = self.state.R.T @ (seen.position - self.camera().translation())
+        mean = gtsam.Unit3(unit(line) + self.state.R.T @ seen.total / seen.count)
+        noise = gtsam.noiseModel.Isotropic.Sigma(2, self.noise.bearing_std / np.sqrt(seen.count))
+        self.graph.add(gtsam.BearingFactor3D(self.pose_key, point, mean, noise))
+
+    def message(self) -> Message:
+        """Return the marker's position and covariance."""
+        return Message(
+            position=self.state.p + self.state.R @ self.marker, covariance=self.state.point_covariance(self.marker)
+        )
+
+
+def gaussian(covariance: Array) -> gtsam.noiseModel.Gaussian:
+    """Return GTSAM's noise model of a covariance."""
+    return gtsam.noiseModel.Gaussian.Covariance(covariance)
+
+
+def unit(v: Array) -> Array:
+    """Return v (3,) at length 1."""
+    return v / np.sqrt(v @ v)

@@ -1,0 +1,172 @@
+"""The plug-in observers of one world's vehicles and the messages between them.
+
+Whoever has ticks drives a group with them: the runner on a record, the environment on a world or a replay.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from time import perf_counter
+from typing import Any, NamedTuple, Protocol
+
+from numpy.typing import ArrayLike
+
+from coopenv.errors import CoopenvError
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.coordinates import Coordinates
+from coopenv.observers.checks import check_estimate, check_message
+from coopenv.observers.contract import Estimate, Factory, JointObserver, Message, Observer
+from coopenv.observers.mailbox import Mailbox
+from coopenv.observers.recording import Briefing, Sensed
+from coopenv.observers.registry import is_joint
+
+
+class ObserverError(CoopenvError):
+    """An observer raised or returned what is no estimate; the message says whose, when and why."""
+
+
+ANYTHING = (Exception, SystemExit)
+"""What may come out of an observer, which is anybody's code."""
+
+
+class Answer(NamedTuple):
+    """An estimate, and what it took, s (message included; a joint observer's time is shared out)."""
+
+    estimate: Estimate
+    elapsed: float
+
+
+class Tamper(Protocol):
+    """Changes what some vehicle broadcasts (see `faults.Lie`)."""
+
+    def applies(self, vehicle: int, time: float) -> bool:
+        """Return whether it changes the message of a vehicle at a time, s."""
+        ...
+
+    def told(self, observer: Observer, message: Message) -> Message:
+        """Return what is broadcast in place of a message."""
+        ...
+
+
+def _told(error: BaseException) -> str:
+    """Return what an error says, on one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
+class Group:
+    """One observer per vehicle, or a joint one of all; `start` comes first and begins anew."""
+
+    def __init__(self, factory: Factory, briefing: Briefing, tamper: Tamper | None = None) -> None:
+        self.factory, self.briefing, self.tamper = factory, briefing, tamper
+        self.joint = is_joint(factory)
+
+    def start(self, rotation: Array, position: Array) -> None:
+        """Build the observers and start them at poses (N, 3, 3) and (N, 3), map frame, m.
+
+        Raises:
+            ObserverError: one of them cannot start.
+        """
+        setups = self.briefing.setups
+        self.mail = Mailbox(self.briefing)
+        self.coordinates: Coordinates | None = None
+        self.observers: list[Observer] = []
+        covariances = [P.copy() for P in self.briefing.start_covariance]
+        poses = [(R.copy(), p.copy()) for R, p in zip(rotation, position, strict=True)]
+        if self.joint:
+            try:
+                self.whole: JointObserver = self.factory(setups)
+                self.whole.reset(poses, covariances)
+            except ANYTHING as error:
+                raise self._blamed(error, 0) from error
+            return
+        for i, setup in enumerate(setups):
+            try:
+                self.observers.append(self.factory(setup))
+                self.observers[i].reset(poses[i], covariances[i])
+                message = self.observers[i].message()
+                check_message(message)
+                self.mail.post(i, 0, message)
+            except ANYTHING as error:
+                raise self._blamed(error, 0, i) from error
+
+    def update(self, vehicle: int, sensed: Sensed, inbox_tick: ArrayLike) -> Answer:
+        """Let one vehicle's observer take a tick; vehicles come in the order of the briefing.
+
+        Args:
+            vehicle: whose.
+            sensed: the tick.
+            inbox_tick: see `Mail.inbox`.
+
+        Raises:
+            ObserverError: it raised, or returned what is no estimate.
+        """
+        k = sensed.index
+        try:
+            observer = self.observers[vehicle]
+            tick = sensed.tick(self.briefing.setups[vehicle], self.mail.inbox(k, vehicle, inbox_tick))
+            begin = perf_counter()
+            estimate = observer.update(tick)
+            message = observer.message() if self.mail.due(k) else None
+            elapsed = perf_counter() - begin
+            self._check(estimate)
+            if message is not None:
+                check_message(message)
+                if self.tamper is not None and self.tamper.applies(vehicle, tick.time):
+                    message = self.tamper.told(observer, message)
+                self.mail.post(vehicle, k, message)
+        except ANYTHING as error:
+            raise self._blamed(error, k, vehicle) from error
+        return Answer(estimate, elapsed)
+
+    def update_all(self, sensed: Sensed) -> list[Answer]:
+        """Let a joint observer take a tick of every vehicle.
+
+        Raises:
+            ObserverError: it raised, or returned what is no estimate.
+        """
+        setups = self.briefing.setups
+        try:
+            ticks = [sensed.tick(setup, {}) for setup in setups]
+            begin = perf_counter()
+            estimates = self.whole.update(ticks)
+            messages: Sequence[Message] = self.whole.messages()
+            elapsed = (perf_counter() - begin) / len(setups)
+            for i, (estimate, message) in enumerate(zip(estimates, messages, strict=True)):
+                self._check(estimate)
+                check_message(message)
+                self.mail.count(i, message)
+        except ANYTHING as error:
+            raise self._blamed(error, sensed.index) from error
+        return [Answer(estimate, elapsed) for estimate in estimates]
+
+    def _check(self, estimate: Estimate) -> None:
+        check_estimate(estimate)
+        self.coordinates = self.coordinates or estimate.coordinates
+        if estimate.coordinates is not self.coordinates:
+            raise CoopenvError("error coordinates must stay the same")
+
+    def _blamed(self, error: BaseException, k: int, vehicle: int | None = None) -> ObserverError:
+        """Return an error that says whose observer failed, when, and how."""
+        whose = "" if vehicle is None else f"of {self.briefing.setups[vehicle].name} "
+        return ObserverError(f"{whose}at {k * self.briefing.dt:.3f} s: {_told(error)}")
+
+    def get_state(self) -> dict[str, Any]:
+        """Return a deep copy of the observers and of all messages.
+
+        Raises:
+            CoopenvError: an observer cannot be copied.
+        """
+        try:
+            return copy.deepcopy({name: value for name, value in vars(self).items() if name not in _FIXED})
+        except Exception as error:
+            raise CoopenvError(f"the observers' state cannot be copied: {_told(error)}") from error
+
+    def set_state(self, state: dict[str, Any]) -> None:
+        """Go back to what `get_state` returned; that stays unchanged."""
+        vars(self).update(copy.deepcopy(state))
+        self.mail.seal()
+
+
+_FIXED = ("factory", "briefing", "tamper", "joint")
+"""Attributes of a group that no tick changes."""

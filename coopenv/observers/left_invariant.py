@@ -1,0 +1,49 @@
+"""Left-invariant extended Kalman filter on SE(3), with the neighbours' covariance as measurement noise.
+
+Source: Barrau and Bonnabel, The invariant extended Kalman filter as a stable observer, IEEE Transactions on Automatic
+Control 62(4), 2017. Errors: T = That Exp(xi). Odometry T <- T U is group affine, so that xi <- Ad(U^-1) xi is exact for
+errors of any size. H is that of mekf.py: the errors agree to first order, and the filters differ by the retraction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.rotations import orthonormalise
+from coopenv.estimation.se3 import adjoint, exp_se3
+from coopenv.observers.contract import Tick
+from coopenv.observers.mekf import LeftError, Mekf
+
+
+@dataclass(frozen=True)
+class InvariantError(LeftError):
+    """A pose with a covariance over xi, which is also that over the left error to first order."""
+
+    @classmethod
+    def start(cls, R: Array, p: Array, P: Array) -> InvariantError:
+        """Return the state of a pose with a covariance in LEFT coordinates."""
+        return cls(R, p, P)
+
+    def predicted(self, tick: Tick) -> InvariantError:
+        """Return the state after the tick's odometry."""
+        E = tick.rotation.T
+        F = adjoint(E, -E.dot(tick.translation))
+        P = F.dot(self.P).dot(F.T)
+        P.flat[::7] += tick.noise.odometry(tick.dt)
+        return InvariantError(orthonormalise(self.R.dot(tick.rotation)), self.p + self.R.dot(tick.translation), P)
+
+    def moved(self, dx: Array, P: Array) -> InvariantError:
+        """Return the state moved by an error dx = xi."""
+        turn, shift = exp_se3(np.asarray(dx))
+        return InvariantError(self.R.dot(turn), self.p + self.R.dot(shift), P)
+
+
+class LeftInvariant(Mekf):
+    """Invariant filter; sends position and covariance."""
+
+    belief: ClassVar[type[LeftError]] = InvariantError
+    sends_covariance = True

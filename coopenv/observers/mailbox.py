@@ -1,0 +1,96 @@
+"""Messages between the plug-in observers of one world: contents on the host, delivery as the radio decided."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from coopenv.estimation.arrays import Array
+from coopenv.observers.contract import Message, Received
+from coopenv.observers.recording import Briefing
+
+
+class Mailbox:
+    """Carries the observers' messages; which of them arrive when is the radio's business."""
+
+    def __init__(self, briefing: Briefing) -> None:
+        self.briefing = briefing
+        self.sent: list[dict[int, Message]] = [{} for _ in briefing.setups]
+        """Per sender: tick of sending to message, of those that may still be under way."""
+        self.heard: list[dict[int, tuple[int, Message]]] = [{} for _ in briefing.setups]
+        """Per receiver: sender to the last message that arrived, with its tick of sending."""
+        self.bytes = np.zeros(len(briefing.setups))
+        self._senders = [[int(t) for t in setup.targets if t >= setup.landmarks] for setup in briefing.setups]
+        """Per receiver: the targets that are vehicles."""
+
+    def due(self, k: int) -> bool:
+        """Return whether messages are sent at tick k."""
+        return k % self.briefing.period == 0
+
+    def post(self, vehicle: int, k: int, message: Message) -> None:
+        """Send one message; that of the start is heard but not counted."""
+        sent = self.sent[vehicle]
+        sent[k] = _copied(message)
+        while (oldest := next(iter(sent))) < k - self.briefing.flight - 1:
+            del sent[oldest]
+        if k > 0:
+            self.count(vehicle, message)
+
+    def count(self, vehicle: int, message: Message) -> None:
+        """Count the bytes of a message."""
+        self.bytes[vehicle] += message.size_bytes
+
+    def inbox(self, k: int, vehicle: int, inbox_tick: ArrayLike) -> dict[int, Received]:
+        """Return what a vehicle has heard by tick k, by target, without what is stale.
+
+        Args:
+            k: now.
+            vehicle: the receiver.
+            inbox_tick: (N,) tick of sending of the last message that the radio delivered of each sender; -1: none.
+        """
+        b, landmarks, heard = self.briefing, self.briefing.setups[vehicle].landmarks, self.heard[vehicle]
+        ticks, received = np.asarray(inbox_tick).tolist(), {}
+        for target in self._senders[vehicle]:
+            sender = target - landmarks
+            sent = ticks[sender]
+            if sent in self.sent[sender]:
+                heard[sender] = (sent, self.sent[sender][sent])
+            age = (k - sent) * b.dt
+            if sent >= 0 and age <= b.staleness and sender in heard and heard[sender][0] == sent:
+                received[target] = Received(heard[sender][1], age)
+        return received
+
+    def seal(self) -> None:
+        """Keep receivers from writing to messages: all hear the same arrays, and copies of arrays are writable."""
+        for sent in self.sent:
+            for message in sent.values():
+                _sealed(message)
+        for heard in self.heard:
+            for _, message in heard.values():
+                _sealed(message)
+
+
+def _copied(message: Message) -> Message:
+    """Return a copy that nobody can change, the sender included."""
+    return _sealed(
+        Message(
+            position=_floats(message.position),
+            rotation=_floats(message.rotation),
+            covariance=_floats(message.covariance),
+            extra={name: np.array(value) for name, value in message.extra.items()},
+        )
+    )
+
+
+def _sealed(message: Message) -> Message:
+    for array in (message.position, message.rotation, message.covariance, *message.extra.values()):
+        if array is not None:
+            array.setflags(write=False)
+    return message
+
+
+def _floats(value: Array | None) -> Array | None:
+    """Return a copy in double precision, or in single precision if it came so."""
+    if value is None:
+        return None
+    return np.array(value, np.float32 if getattr(value, "dtype", None) == np.float32 else np.float64)

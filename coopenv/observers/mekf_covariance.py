@@ -1,0 +1,15 @@
+"""The error-state filter with the neighbours' covariance as measurement noise.
+
+Source: N + H_j P_j H_j^T, as if neighbours' errors were independent of one's own (Roumeliotis and Bekey, Distributed
+multirobot localization, 2002, keep the cross-correlation that this leaves out). Overconfident down the chain.
+"""
+
+from __future__ import annotations
+
+from coopenv.observers.mekf import Mekf
+
+
+class MekfCovariance(Mekf):
+    """Sends position and covariance, and adds the latter to the bearing's noise."""
+
+    sends_covariance = True

@@ -1,0 +1,1 @@
+"""Observers for robots on a plane whose odometry is their commands."""

@@ -1,0 +1,101 @@
+"""What a planar robot was told to do, and what its wheels made of it a moment later."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from coopenv.estimation.arrays import Array
+
+TURNING_RATE = 1e-6  # rad/s; a smaller command is one to drive straight
+DRIVING_SPEED = 1e-6  # m/s; a smaller command is one to turn on the spot
+TURN, TURNING, PATH, ARC, SLOWING, SWITCHING = range(6)
+
+
+@dataclass(frozen=True, slots=True)
+class Wheels:
+    """How a kind of robot follows its commands v and w; the default does at once what it is told.
+
+    Attributes:
+        delay: s after the lead by which commands are early.
+        share: of the response at these delays; they sum to one.
+        arc: (curvature |w| / v in 1/m, gain): how much it turns against what it is told, between and beyond linear.
+        spot: the same gain of turns on the spot.
+        slow: m/s; below this speed arcs tighter than 1/m gain `slow_gain` more.
+        slow_gain: see there.
+        centre: rad/s, the logged w at which it drives straight, for the curvature.
+    """
+
+    delay: tuple[float, ...] = (0.0,)
+    share: tuple[float, ...] = (1.0,)
+    arc: tuple[tuple[float, float], ...] = ((0.0, 1.0),)
+    spot: float = 1.0
+    slow: float = 0.0
+    slow_gain: float = 0.0
+    centre: float = 0.0
+
+    def gain(self, v: float, w: float) -> float:
+        """Return turn against commanded turn at v in m/s and w in rad/s."""
+        if abs(v) <= DRIVING_SPEED:
+            return self.spot
+        curvature = abs(w - self.centre) / abs(v)
+        curvatures, gains = zip(*self.arc, strict=True)
+        more = self.slow_gain if abs(v) < self.slow and curvature > 1.0 else 0.0
+        return float(np.interp(curvature, curvatures, gains)) + more
+
+
+class Response(NamedTuple):
+    """What the wheels made of the commands in one tick.
+
+    Attributes:
+        done: (6,) by TURN: rad, commanded turn times gain; TURNING: s of commanded turning times gain; PATH: m
+            commanded; ARC: s of commanded turning; SLOWING: m rad/s, path times rate of turn; SWITCHING: rad^2/s^2, the
+            squares of the steps in the commanded rate.
+        by_lead: (6,) their derivatives by the lead, per s.
+    """
+
+    done: Array
+    by_lead: Array
+
+
+class CommandHistory:
+    """The last commands of one robot.
+
+    Args:
+        wheels: how it follows them.
+        longest: s, the longest lead asked for.
+        dt: s, the shortest tick.
+    """
+
+    def __init__(self, wheels: Wheels, longest: float, dt: float) -> None:
+        self._wheels = wheels
+        self._delay, self._share = np.array(wheels.delay), np.array(wheels.share)
+        ticks = int((longest + self._delay.max()) / dt) + 4
+        self._t = np.arange(-ticks, 1) * dt
+        self._sum = np.zeros((6, ticks + 1))
+        self._rate = 0.0
+
+    def add(self, dt: float, turn: float, path: float) -> None:
+        """Take what was commanded over the last dt in s: rad, m."""
+        v, w = path / dt, turn / dt
+        turning = dt if abs(w) > TURNING_RATE else 0.0
+        gain = self._wheels.gain(v, w) if turning else 1.0
+        self._t[:-1] = self._t[1:]
+        self._sum[:, :-1] = self._sum[:, 1:]
+        self._t[-1] += dt
+        self._sum[:, -1] += gain * turn, gain * turning, path, turning, path * abs(w), (w - self._rate) ** 2
+        self._rate = w
+
+    def response(self, dt: float, lead: float) -> Response:
+        """Return what the wheels did in the last dt in s, if commands are early by `lead` in s."""
+        now, half = self._t[-1] - lead, dt / 2
+        ends = np.array([now - dt - half, now - dt, now - half, now, now + half])
+        at = (ends[:, None] - self._delay).ravel()
+        k = np.clip(np.searchsorted(self._t, at), 1, len(self._t) - 1)
+        share = np.minimum((at - self._t[k - 1]) / (self._t[k] - self._t[k - 1]), 1.0)
+        before = self._sum[:, k - 1]
+        sums = (before + share * (self._sum[:, k] - before)).reshape(6, len(ends), -1) @ self._share
+        earlier, start, middle, end, later = sums.T
+        return Response(end - start, -(later - 2 * middle + earlier) / dt)

@@ -1,0 +1,161 @@
+"""What vehicles sense, tick by tick: of one tick, and of a whole record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coopenv.estimation.arrays import Array
+from coopenv.observers.contract import Received, Setup, Tick
+
+if TYPE_CHECKING:
+    from coopenv.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class Briefing:
+    """What observers are told before the first tick, and how their messages travel."""
+
+    setups: tuple[Setup, ...]
+    order: tuple[int, ...]
+    """Vehicles in the order in which they estimate: leaders first."""
+    dt: float  # s
+    period: int  # ticks between messages
+    staleness: float  # s
+    flight: int  # ticks that a message may be under way
+    start_covariance: Array  # (N, 6, 6) LEFT coordinates
+
+
+@dataclass(frozen=True)
+class Sensed:
+    """What N vehicles sense at one tick; T targets, of which the first L are landmarks. Nobody can write to it."""
+
+    index: int
+    dt: float  # s
+    rotation: Array  # (N, 3, 3) odometry increments
+    translation: Array  # (N, 3) m
+    velocity: Array  # (N, 3) m/s, last odometry sample
+    angular_velocity: Array  # (N, 3) rad/s
+    bearings: Array  # (N, T, 3) camera -> target, body frame, NaN where not measured
+    visible: NDArray[np.bool_]  # (N, T)
+    landmarks: Array  # (L, 3) map, m
+    due: bool  # whether the scenario's observer rate asks for a correction
+
+    def tick(self, setup: Setup, messages: Mapping[int, Received]) -> Tick:
+        """Return what one vehicle senses, with the messages that it has; nobody can write to it."""
+        i = setup.vehicle
+        return Tick(
+            index=self.index,
+            time=self.index * self.dt,
+            dt=self.dt,
+            rotation=self.rotation[i],
+            translation=self.translation[i],
+            velocity=self.velocity[i],
+            angular_velocity=self.angular_velocity[i],
+            targets=_sealed(setup.targets[:]),
+            bearings=_sealed(self.bearings[i].take(setup.targets, axis=0)),
+            valid=_sealed(self.visible[i].take(setup.targets)),
+            landmarks=self.landmarks,
+            messages=messages,
+            lever_arm=_sealed(setup.lever_arm[:]),
+            noise=setup.noise,
+            due=self.due,
+        )
+
+
+def _sealed(view: NDArray[Any]) -> NDArray[Any]:
+    view.setflags(write=False)
+    return view
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What no observer reads. Tick 0 is the start; NaN where it is not known."""
+
+    rotation: Array  # (K, N, 3, 3) body to map
+    position: Array  # (K, N, 3) map, m
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(K, N) where the whole pose is known."""
+        return np.isfinite(np.concatenate([self.rotation, self.position[..., None]], axis=-1)).all(axis=(-1, -2))
+
+
+@dataclass(frozen=True)
+class Recording:
+    """K ticks (t = 0 included) of N vehicles and T targets, of which the first L are landmarks."""
+
+    setups: tuple[Setup, ...]
+    order: tuple[int, ...]
+    """Vehicles in the order in which they estimate: leaders first."""
+    dt: float  # s
+    rotation: Array  # (K, N, 3, 3) odometry increments
+    translation: Array  # (K, N, 3) m
+    velocity: Array  # (K, N, 3) m/s, last odometry sample
+    angular_velocity: Array  # (K, N, 3) rad/s
+    bearings: Array  # (K, N, T, 3) camera -> target, body frame, NaN where not measured
+    visible: NDArray[np.bool_]  # (K, N, T)
+    landmarks: Array  # (K, L, 3) map, m
+    inbox_tick: NDArray[np.int64]  # (K, N receiver, N sender) tick of sending of the last message heard; -1: none
+    period: int  # ticks between messages
+    staleness: float  # s
+    due: NDArray[np.bool_]  # (K,) whether the scenario's observer rate asks for a correction
+    start_rotation: Array  # (N, 3, 3) initial estimates
+    start_position: Array  # (N, 3) map, m
+    start_covariance: Array  # (N, 6, 6) LEFT coordinates
+    truth: Truth
+    scenario: Scenario | None = None
+    """The world that was recorded; None for recorded robots."""
+
+    @property
+    def ticks(self) -> int:
+        """K, the start included."""
+        return len(self.rotation)
+
+    @property
+    def t(self) -> Array:
+        """(K,) s."""
+        return self.dt * np.arange(self.ticks, dtype=np.float64)
+
+    @property
+    def flight(self) -> int:
+        """Ticks that a message was under way at most."""
+        arrived = np.diff(self.inbox_tick, axis=0, prepend=-1) > 0
+        lag = np.arange(self.ticks)[:, None, None] - self.inbox_tick
+        return int(lag[arrived].max(initial=0))
+
+    @property
+    def briefing(self) -> Briefing:
+        """What observers are told before the first tick."""
+        return Briefing(
+            self.setups, self.order, self.dt, self.period, self.staleness, self.flight, self.start_covariance
+        )
+
+    def at(self, k: int) -> Sensed:
+        """Return what all vehicles sense at tick k."""
+        return Sensed(
+            index=k,
+            dt=self.dt,
+            rotation=_sealed(self.rotation[k]),
+            translation=_sealed(self.translation[k]),
+            velocity=_sealed(self.velocity[k]),
+            angular_velocity=_sealed(self.angular_velocity[k]),
+            bearings=_sealed(self.bearings[k]),
+            visible=_sealed(self.visible[k]),
+            landmarks=_sealed(self.landmarks[k]),
+            due=bool(self.due[k]),
+        )
+
+    def tick(self, k: int, vehicle: int, messages: Mapping[int, Received]) -> Tick:
+        """Return what one vehicle senses at tick k, with the messages that it has."""
+        return self.at(k).tick(self.setups[vehicle], messages)
+
+
+def due_ticks(ticks: int, ratio: float) -> NDArray[np.bool_]:
+    """Return (K,) at which ticks a correction at `ratio` times the camera's rate is due."""
+    counts = np.floor(np.arange(ticks) * ratio + 1e-9)
+    return np.diff(counts, prepend=counts[:1]) > 0

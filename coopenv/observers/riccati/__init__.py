@@ -1,0 +1,1 @@
+"""The Riccati observer of the paper: equations, kernels, plug-in, derivatives."""

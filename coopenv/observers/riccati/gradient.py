@@ -1,0 +1,230 @@
+"""A differentiable rollout: from commands to the uncertainty of every vehicle, through Warp's tape.
+
+It covers what has a derivative: noise off, no losses and no delay, k = 1, and ticks in which one linearisation
+suffices. Whether a target is in view is taken as it falls out on the way forward. Contact and arrival end nothing here:
+vehicles drive on through one another.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from coopenv.errors import ActionError, ScenarioError, ScenarioWarning, checked_seed
+from coopenv.observers.riccati.gradient_kernels import (
+    Belief,
+    Held,
+    Information,
+    Truth,
+    correct_kernel,
+    drive_kernel,
+    inform_kernel,
+    predict_kernel,
+    scalar,
+    show_kernel,
+    trace_kernel,
+    vec2,
+)
+from coopenv.scenario import Scenario
+from coopenv.scenario.topology import processing_order
+from coopenv.world.dynamics import LONGEST_SUBSTEP
+from coopenv.world.launch import kernel
+from coopenv.world.world import World
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """Result of `DifferentiableWorld.rollout`."""
+
+    uncertainty: float
+    """Sum over worlds and vehicles of trace P at the end (rad^2 + m^2)."""
+    gradient: np.ndarray
+    """Its derivative with respect to the commands, same shape as they."""
+    covariance: np.ndarray
+    """P at the end, (W, N, 6, 6)."""
+    position: np.ndarray
+    """True positions at the end, (W, N, 3) m."""
+    position_estimate: np.ndarray
+    """Estimated positions at the end, (W, N, 3) m."""
+
+
+class DifferentiableWorld:
+    """Worlds in which every vehicle is driven, in float64."""
+
+    def __init__(self, scenario: Scenario, worlds: int = 1, device: str = "cpu") -> None:
+        """Build the worlds.
+
+        Raises:
+            ScenarioError: the scenario has something without a derivative.
+        """
+        check_differentiable(scenario)
+        self.scenario = scenario
+        self._world = World(scenario, worlds, "float64", device)
+        self._order = processing_order(scenario)
+
+    def rollout(self, commands: np.ndarray, seed: int = 0) -> Rollout:
+        """Drive commands (T, W, N, 2) in (-1, 1), one per decision, and differentiate the final uncertainty.
+
+        Raises:
+            ActionError: the commands have another shape.
+        """
+        world = self._world
+        expected = (world.worlds, world.model.vehicles, 2)
+        commands = np.asarray(commands)
+        numeric = commands.dtype.kind in "fiu"
+        if not numeric or commands.ndim != 4 or len(commands) == 0 or commands.shape[1:] != expected:
+            raise ActionError(f"commands have shape {commands.shape}, expected (decisions, W, N, 2) = (T, *{expected})")
+        if not np.isfinite(commands).all():
+            raise ActionError("commands are not finite")
+        if len(commands) * self.scenario.ticks_per_decision > self.scenario.horizon_ticks:
+            raise ActionError(f"{len(commands)} decisions reach beyond the horizon of {self.scenario.horizon:g} s")
+        world.reset([checked_seed(seed) + w for w in range(world.worlds)])
+        decisions = [self._array(c, vec2) for c in commands]
+        total, turn = self._array(np.zeros(1), scalar), wp.zeros(1, dtype=scalar, device=world.device)
+        truth, held, belief = self._start()
+        tape = wp.Tape()
+        with tape:
+            for tick in range(1, len(commands) * self.scenario.ticks_per_decision + 1):
+                command = self._command(decisions, tick)
+                truth, held = self._move(truth, held, command, tick)
+                belief = self._estimate(truth, held, belief, tick, turn)
+                held = self._make(Held, velocity=held.velocity, angular_velocity=held.angular_velocity)
+            self._launch(trace_kernel, [belief, total])
+        tape.backward(total)
+        if float(turn.numpy()[0]) > self.scenario.observer.max_turn:
+            warnings.warn(
+                "an attitude turned by more than observer.max_turn within a tick: this rollout does not re-linearise",
+                ScenarioWarning,
+                stacklevel=2,
+            )
+        estimate = np.einsum("wnij,wnj->wni", belief.rotation.numpy(), belief.position.numpy())
+        return Rollout(
+            float(total.numpy()[0]),
+            np.stack([c.grad.numpy() for c in decisions]),
+            belief.covariance.numpy(),
+            truth.position.numpy(),
+            estimate,
+        )
+
+    def _array(self, values: np.ndarray, dtype: Any) -> Any:
+        return wp.array(values, dtype=dtype, device=self._world.device, requires_grad=True)
+
+    def _make(self, struct: Any, **given: Any) -> Any:
+        """Return a record with some arrays given and new ones for the rest; new rotations are identities."""
+        made, shape = struct(), (self._world.worlds, self._world.model.vehicles)
+        for name, var in struct.vars.items():
+            value = given.get(name)
+            if value is None:
+                dtype = var.type.dtype
+                blank = np.zeros((*shape, *getattr(dtype, "_shape_", ())))
+                value = self._array(blank + np.eye(3) if name == "rotation" else blank, dtype)
+            elif isinstance(value, np.ndarray):
+                value = self._array(value, var.type.dtype)
+            setattr(made, name, value)
+        return made
+
+    def _start(self) -> tuple[Any, Any, Any]:
+        state, L = self._world.state, self._world.model.landmarks
+        speed = state.speed.numpy()
+        truth = self._make(
+            Truth,
+            rotation=np.ascontiguousarray(state.rotation.numpy()[:, L:]),
+            position=np.ascontiguousarray(state.position.numpy()[:, L:]),
+            speed=speed,
+            steering=state.steering.numpy(),
+        )
+        held = self._make(Held, velocity=np.stack([speed, 0 * speed, 0 * speed], axis=-1))
+        belief = self._make(
+            Belief,
+            rotation=state.estimate_rotation.numpy(),
+            position=state.estimate_position.numpy(),
+            covariance=state.covariance.numpy(),
+        )
+        return truth, held, belief
+
+    def _command(self, decisions: list[Any], tick: int) -> Any:
+        """Return the command in force during a tick, see `command_in_force` in `step.py`."""
+        decision, elapsed = divmod(tick - 1, self.scenario.ticks_per_decision)
+        if elapsed >= self._world.model.dynamics.latency_ticks:
+            return decisions[decision]
+        return decisions[decision - 1] if decision > 0 else self._world.state.command
+
+    def _move(self, truth: Any, held: Any, command: Any, tick: int) -> tuple[Any, Any]:
+        for duration, sample in tick_intervals(tick, self.scenario.rates.camera, self.scenario.rates.odometry):
+            steps = max(1, math.ceil(duration / float(LONGEST_SUBSTEP)))
+            for step in range(steps):
+                new_truth, new_held = self._make(Truth), self._make(Held)
+                due = int(sample and step == steps - 1)
+                self._launch(
+                    drive_kernel,
+                    [self._world.model, truth, command, held, due, wp.float64(duration / steps), new_truth, new_held],
+                )
+                truth, held = new_truth, new_held
+        return truth, held
+
+    def _estimate(self, truth: Any, held: Any, belief: Any, tick: int, turn: Any) -> Any:
+        world, rate = self._world, self.scenario.rates.camera
+        wp.launch(
+            kernel(show_kernel, "float64"),
+            dim=(world.worlds, world.model.agents),
+            inputs=[world.model, truth, world.state, wp.float64(tick / rate)],
+            device=world.device,
+            record_tape=False,
+        )
+        dt = wp.float64(1.0 / rate)
+        predicted, after, sums = self._make(Belief), self._make(Belief), self._make(Information)
+        self._launch(predict_kernel, [world.model, held, belief, predicted, dt])
+        counts = world.model.target_count.numpy()
+        for vehicle in self._order:
+            seen = [world.model, world.state, truth, predicted, after, vehicle, sums]
+            self._launch(inform_kernel, seen, dim=(world.worlds, int(counts[vehicle])))
+            self._launch(correct_kernel, [predicted, sums, after, vehicle, dt, turn], dim=world.worlds)
+        return after
+
+    def _launch(self, function: Any, arguments: list[Any], dim: Any = None) -> None:
+        grid = (self._world.worlds, self._world.model.vehicles) if dim is None else dim
+        compiled = kernel(function, "float64", differentiable=True)
+        wp.launch(compiled, dim=grid, inputs=arguments, device=self._world.device)
+
+
+def tick_intervals(tick: int, camera: float, odometry: float) -> list[tuple[float, bool]]:
+    """Return the intervals between the events of a camera tick: (duration s, an odometry sample ends it)."""
+    now, end = (tick - 1) / camera, tick / camera
+    first = math.floor(now * odometry + 1e-9) + 1  # the sample at t = 0 is the start speed
+    intervals = []
+    sample = first
+    while sample / odometry <= end + 1e-9:
+        intervals.append((sample / odometry - now, True))
+        now = sample / odometry
+        sample += 1
+    if end - now > 1e-12:
+        intervals.append((end - now, False))
+    return intervals
+
+
+def check_differentiable(scenario: Scenario) -> None:
+    """Refuse what has no derivative or what this rollout leaves out.
+
+    Raises:
+        ScenarioError: the first such setting.
+    """
+    v2x, camera, observer = scenario.v2x, scenario.camera, scenario.observer
+    reasons = {
+        "every vehicle must have the motion 'driven'": all(v.motion.kind == "driven" for v in scenario.vehicles),
+        "noise.enabled must be false": not scenario.noise.enabled,
+        "v2x must have delay 0, period 1, no loss, range or staleness": (
+            (v2x.delay, v2x.period, v2x.loss, v2x.range, v2x.staleness) == (0, 1, 0.0, None, None)
+        ),
+        "camera.miss_probability must be 0": camera.miss_probability == 0.0,
+        "camera.quantise must be false and camera.undistort true": camera.undistort and not camera.quantise,
+        "observer.name must be 'riccati' with k = 1": observer.name == "riccati" and observer.k == 1.0,
+        "rates.observer must not be below rates.camera": (scenario.rates.observer or math.inf) >= scenario.rates.camera,
+    }
+    for reason, holds in reasons.items():
+        if not holds:
+            raise ScenarioError(f"a differentiable rollout needs another scenario: {reason}")

@@ -1,0 +1,19 @@
+"""This project's own observer; see reference/observer.py, and reference/joint.py for the one with larger messages."""
+
+from coopenv.observers.contract import Observer, Setup
+from coopenv.observers.planar.plugin import PlanarRobust
+from coopenv.observers.robust.reference.joint import RobustJoint
+from coopenv.observers.robust.reference.observer import Robust
+
+
+def robust(setup: Setup) -> Observer:
+    """Return the observer for a vehicle: a planar one where it moves on a plane and its odometry is its commands."""
+    return PlanarRobust(setup) if setup.planar else Robust(setup)
+
+
+def robust_joint(setup: Setup) -> Observer:
+    """Return the observer with larger messages; planar robots have one with small messages only."""
+    return PlanarRobust(setup) if setup.planar else RobustJoint(setup)
+
+
+__all__ = ["Robust", "RobustJoint", "robust", "robust_joint"]

@@ -1,0 +1,1 @@
+"""The observer `robust` in NumPy: the specification of its kernels."""

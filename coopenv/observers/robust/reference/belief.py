@@ -1,0 +1,252 @@
+"""What one vehicle believes about itself and the vehicles that it hears: poses with one covariance over all of them.
+
+Errors are left errors, R = Rhat Exp(theta), p = phat + Rhat rho, six per member, the vehicle itself first. A member
+stands at the time of its last message; until now it is carried on by its last known twist.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.rotations import exp_so3, lengths, log_so3, orthonormalise, skew, tangent_basis
+from coopenv.estimation.small_matrices import solve, solve_positive
+from coopenv.observers.contract import SensorNoise
+from coopenv.observers.mekf import transition
+
+MOST_STEPS, STRAIGHT = 8, 0.01
+"""Linearisations of one correction; how far it may turn a line of sight without another one, rad."""
+AT_ONCE = 1e-6
+"""s; times that differ by less differ by rounding only."""
+TWIST_TIME = 0.3
+"""s, over which a neighbour's twist is averaged."""
+
+
+@dataclass
+class Member:
+    """One vehicle in a belief."""
+
+    vehicle: int
+    R: Array  # (3, 3) body to map
+    p: Array  # (3,) map frame, m
+    time: float = 0.0
+    """s, at which it stands."""
+    odometry: tuple[Array, Array] | None = None
+    """Its pose by dead reckoning at that time; not needed of the vehicle itself."""
+    v: Array | None = None
+    """(3,) last known velocity in its body, m/s; None before a second message."""
+    w: Array | None = None
+    """(3,) last known angular velocity in its body, rad/s."""
+    seen: float = 0.0
+    """s, when it was last in view, or was told of along with one in view."""
+
+    def carried(self, age: float) -> Array:
+        """Return (3,) how far it comes in its body frame at the last known twist in a time, m."""
+        if age <= 0.0 or self.v is None or self.w is None:
+            return np.zeros(3)
+        return exp_so3(self.w * (age / 2)).dot(self.v) * age
+
+
+class Sight(NamedTuple):
+    """Bearings as measurements, residual = H x + noise, at the poses believed."""
+
+    H: Array  # (m, 2, 6n)
+    residual: Array  # (m, 2) rad
+    ahead: NDArray[np.bool_]  # (m,) whether the target is in front of the bearing at all
+    distance: Array  # (m,) m
+
+    def normalised(self, P: Array, noise: Array) -> Array:
+        """Return (m,) the normalised innovations squared under P and noise variances (m,)."""
+        H = self.H
+        S = H.reshape(-1, len(P)).dot(P).reshape(H.shape) @ H.transpose(0, 2, 1)
+        a, b, c = S[:, 0, 0] + noise, S[:, 0, 1], S[:, 1, 1] + noise
+        x, y = self.residual[:, 0], self.residual[:, 1]
+        return (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
+
+
+class View(NamedTuple):
+    """A frame's bearings to known targets."""
+
+    sight: Sight
+    noise: Array  # (m,) variances
+    nis: Array  # (m,) normalised innovations squared
+    fits: NDArray[np.bool_]  # (m,) whether they fit the belief
+    missed: float | None
+    """Share of those that do not, without bearings to distrusted senders; None if there is no bearing."""
+
+
+class Belief:
+    """Members and their joint covariance (6n, 6n)."""
+
+    def __init__(self, vehicle: int, R: Array, p: Array, P: Array, time: float = 0.0) -> None:
+        """Start with the vehicle itself."""
+        self.members = [Member(vehicle, R, p, time)]
+        self.P = P
+
+    @property
+    def own(self) -> Member:
+        """The vehicle itself."""
+        return self.members[0]
+
+    def place(self, vehicle: int) -> int | None:
+        """Return a vehicle's number among the members, None if it is not one."""
+        return next((n for n, member in enumerate(self.members) if member.vehicle == vehicle), None)
+
+    def add(self, members: list[Member], P: Array) -> None:
+        """Take in members whose errors are independent of those of the others."""
+        n, m = len(self.P), len(P)
+        joint = np.zeros((n + m, n + m))
+        joint[:n, :n], joint[n:, n:] = self.P, P
+        self.P = joint
+        self.members.extend(members)
+
+    def drop(self, vehicles: set[int]) -> None:
+        """Forget members."""
+        keep = [n for n, member in enumerate(self.members) if member.vehicle not in vehicles]
+        index = errors_of(keep)
+        self.P = self.P[np.ix_(index, index)]
+        self.members = [self.members[n] for n in keep]
+
+    def move(self, n: int, dR: Array, dp: Array, noise: Array) -> None:
+        """Carry a member through an odometry increment with noise variances (6,)."""
+        member = self.members[n]
+        member.p = member.p + member.R.dot(dp)
+        member.R = orthonormalise(member.R.dot(dR))
+        F, block = transition(dR, dp), slice(6 * n, 6 * n + 6)
+        self.P[block] = F.dot(self.P[block])
+        self.P[:, block] = self.P[:, block].dot(F.T)
+        self.P.flat[6 * n * (len(self.P) + 1) : (6 * n + 6) * len(self.P) : len(self.P) + 1] += noise
+
+    def follow(self, n: int, odometry_turn: Array, odometry_position: Array, time: float, noise: SensorNoise) -> None:
+        """Carry a member on to where its own odometry says that it was at a time."""
+        member = self.members[n]
+        dt = time - member.time
+        if dt < AT_ONCE or member.odometry is None:
+            return
+        R, p = member.odometry
+        dR, dp = R.T.dot(odometry_turn), R.T.dot(odometry_position - p)
+        self.move(n, dR, dp, noise.odometry(dt))
+        v, w = dp / dt, log_so3(dR) / dt
+        if member.v is None or member.w is None:
+            member.v, member.w = v, w
+        else:
+            share = min(1.0, dt / TWIST_TIME)
+            member.v, member.w = member.v + share * (v - member.v), member.w + share * (w - member.w)
+        member.time, member.odometry = time, (odometry_turn, odometry_position)
+
+    def sight(
+        self, bearings: Array, lever_arm: Array, z: Array, places: Sequence[int] = (), points: Sequence[Array] = ()
+    ) -> Sight:
+        """Return bearings as measurements; the last ones are to members.
+
+        Args:
+            bearings: (m, 3) unit vectors, body frame.
+            lever_arm: (3,) the camera's place in the body, m.
+            z: (m, 3) where the targets are believed to be, map frame, m.
+            places: the members that the last targets belong to.
+            points: of these targets in their members' bodies, (3,) m each.
+        """
+        own, m = self.own, len(z)
+        a = (z - own.p).dot(own.R)
+        d = a - lever_arm
+        distance = np.maximum(lengths(d), 1e-9)
+        u = d / distance[:, None]
+        T = tangent_basis(u)
+        B = T / distance[:, None, None]
+        H = np.zeros((m, 2, len(self.P)))
+        H[:, :, :3], H[:, :, 3:6] = B @ skew(a), -B
+        for k, n, point in zip(range(m - len(places), m), places, points, strict=True):
+            G = B[k].dot(own.R.T).dot(self.members[n].R)
+            H[k, :, 6 * n + 3 : 6 * n + 6] = G
+            if point.any():
+                H[k, :, 6 * n : 6 * n + 3] = G.dot(skew(-point))
+        return Sight(H, (T @ bearings[..., None])[..., 0], (u * bearings).sum(axis=1) > 0.0, distance)
+
+    def correct(self, H: Array, noise: Array, residual: Array) -> None:
+        """Take independent measurements residual = H x + noise of variances (m,), in Joseph's form."""
+        K = self.gain(H, noise)
+        self.condense(K, H, noise)
+        self.shift(K.dot(residual))
+
+    def settle(
+        self, sight: Sight, noise: Array, fits: NDArray[np.bool_], look: Callable[[], tuple[Sight, Array]]
+    ) -> None:
+        """Correct by bearings, linearised anew at where they put the poses while that is far from where they were.
+
+        Source: the iterated extended Kalman filter as Gauss-Newton steps, Bell and Cathey, The iterated Kalman filter
+        update as a Gauss-Newton method, IEEE Transactions on Automatic Control 38(2), 1993.
+
+        Args:
+            sight: the frame's bearings as measurements.
+            noise: (m,) their variances.
+            fits: which of them count.
+            look: returns sight and noise again, at the poses believed by then.
+        """
+        before = [(member.R, member.p) for member in self.members]
+        dx = np.zeros(len(self.P))
+        for step in range(MOST_STEPS):
+            if step > 0:
+                sight, noise = look()
+            H, variances = sight.H[fits].reshape(-1, len(dx)), np.repeat(noise[fits], 2)
+            K = self.gain(H, variances)
+            last, dx = dx, K.dot(sight.residual[fits].ravel() + H.dot(dx))
+            for member, (R, p) in zip(self.members, before, strict=True):
+                member.R, member.p = R, p
+            self.shift(dx)
+            if _bend(dx - last, float(sight.distance[fits].min())) < STRAIGHT:
+                break
+        self.condense(K, H, variances)
+
+    def gain(self, H: Array, noise: Array) -> Array:
+        """Return the Kalman gain K (6n, m) of measurements H x + noise of variances (m,)."""
+        PHt = self.P.dot(H.T)
+        S = H.dot(PHt)
+        S.flat[:: len(S) + 1] += noise
+        return solve_positive(S, PHt.T).T
+
+    def condense(self, K: Array, H: Array, noise: Array) -> None:
+        """Let the covariance be that after measurements H x + noise with gain K."""
+        A = -K.dot(H)
+        A.flat[:: len(A) + 1] += 1.0
+        P = A.dot(self.P).dot(A.T) + (K * noise).dot(K.T)
+        self.P = (P + P.T) / 2
+
+    def inform(self, index: NDArray[np.int64], information: Array, vector: Array) -> None:
+        """Take information about some errors x: their likelihood has the exponent vector^T x - x^T information x / 2.
+
+        Args:
+            index: (m,) which errors.
+            information: (m, m).
+            vector: (m,).
+        """
+        columns = self.P.take(index, axis=1)
+        A = columns.take(index, axis=0).dot(information)
+        A.flat[:: len(A) + 1] += 1.0
+        W = solve(A, np.eye(len(A)))
+        M = information.dot(W)
+        P = self.P - columns.dot((M + M.T) / 2).dot(columns.T)
+        self.P = (P + P.T) / 2
+        self.shift(columns.dot(vector.dot(W)))
+
+    def shift(self, dx: Array) -> None:
+        """Move the poses of the first members by their part of the error dx (6m,)."""
+        for n in range(len(dx) // 6):
+            member = self.members[n]
+            member.p = member.p + member.R.dot(dx[6 * n + 3 : 6 * n + 6])
+            member.R = member.R.dot(exp_so3(dx[6 * n : 6 * n + 3]))
+
+
+def errors_of(members: Sequence[int]) -> NDArray[np.int64]:
+    """Return (6m,) the indices of the errors of some members."""
+    return np.concatenate([np.arange(6 * n, 6 * n + 6) for n in members])
+
+
+def _bend(dx: Array, distance: float) -> float:
+    """Return by how much errors (6n,) turn lines of sight of a length, rad."""
+    errors = np.abs(dx).reshape(-1, 6)
+    return float(max(errors[:, :3].max(), errors[:, 3:].max() / distance))

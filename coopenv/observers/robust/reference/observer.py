@@ -1,0 +1,352 @@
+"""The observer of this project's own: consistent, hard to mislead, and at home from any start.
+
+One vehicle keeps a joint belief about itself and the vehicles that it hears. Bearings, to landmarks and to vehicles,
+correct that belief; a neighbour's messages add what the neighbour has learnt since its last one (report.py), and no
+more. So nothing that was heard before counts twice, and the neighbour's slowly varying error is no white noise.
+
+- Start and loss: with no useful prior, or when most bearings contradict the belief, the pose is searched for among all
+  P3P solutions (search.py). Meanwhile the vehicle says nothing.
+- Wrong associations: a bearing counts if it fits (chi-square gate on the innovation) and its target is ahead.
+- Liars: a message that contradicts the belief about its sender is not used; the sender is then tracked by its own
+  odometry and by bearings, until its messages have agreed for a while.
+- Loss and delay: a sender stands in the belief where its last message put it, and is carried on by its last twist.
+- Many neighbours: where there is no room for one in view, those that have been out of view for longest make room.
+- Rumours: what a neighbour learnt from others may reach this vehicle by more ways than one. `SHARE` of it counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.coordinates import Coordinates
+from coopenv.estimation.rotations import orthonormalise
+from coopenv.estimation.small_matrices import solve_positive
+from coopenv.observers.contract import Estimate, Message, SensorNoise, Setup, Tick
+from coopenv.observers.robust.reference.belief import AT_ONCE, Belief, Member, View, errors_of
+from coopenv.observers.robust.reference.eviction import room_for
+from coopenv.observers.robust.reference.resection import resect
+from coopenv.observers.robust.reference.search import GATE, Search, Sighting, is_known
+from coopenv.observers.robust.reference.tracklets import (
+    Report,
+    from_message,
+    left_error,
+    mask_of,
+    to_message,
+    tracklet,
+)
+
+SHARE = 0.7
+"""Of what a neighbour that leans on others has learnt."""
+TRUST_GATE = 40.0
+"""Of the squared distance between a message and the belief about its sender: chi-square of 6, 1 - 5e-7."""
+AGREED_FOR, AGREED_DISTANCE = 1.0, 1.0
+"""s and m: how long and how closely a distrusted sender must agree before it is believed again."""
+LOST_SHARE, LOST_TIME = 0.6, 0.5
+"""Share of bearings that contradict the belief, and the time over which it is averaged, s."""
+ACCELERATION = 1.0
+"""m/s^2 by which a vehicle may leave its last known twist."""
+SPEED = 1.0
+"""m/s at which a sender may have gone on since a message that is used in the search."""
+HEALTHY_SHARE, HEALTHY_TIME = 0.2, 1.0
+"""Share of contradicting bearings, and for how long, s, it must be lower for the pose to be worth remembering."""
+SLACK = np.diag([0.05**2] * 3 + [0.5**2] * 3)
+"""Added to the covariance of a pose that is remembered, rad^2 and m^2."""
+LEAST_VELOCITY_STD, LEAST_ANGULAR_STD = 2e-3, 2e-4
+"""m/s and rad/s, of an odometry sample: the increments of a moving vehicle are never exact."""
+
+
+@dataclass
+class Contact:
+    """What is known of a sender."""
+
+    last: Report
+    trusted: bool = True
+    agreed: float = 0.0
+    """s, for which a distrusted sender has agreed."""
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """Where the vehicle was when its bearings last fitted, or at the start."""
+
+    R: Array  # (3, 3) body to map
+    p: Array  # (3,) map frame, m
+    P: Array  # (6, 6) left error, rad and m
+    odometry: tuple[Array, Array]
+    """(3, 3) and (3,) m: its pose by dead reckoning then."""
+    time: float  # s
+
+
+class Robust:
+    """One vehicle's observer; messages hold pose and covariance (196 bytes)."""
+
+    most_members = 5
+    """The vehicle itself and those it keeps in its belief."""
+
+    def __init__(self, setup: Setup) -> None:
+        """Take what the vehicle knows before it starts."""
+        self.vehicle, self.landmarks, self.marker = setup.vehicle, setup.landmarks, setup.marker
+        self.noise = SensorNoise(
+            max(setup.noise.velocity, LEAST_VELOCITY_STD),
+            max(setup.noise.angular_velocity, LEAST_ANGULAR_STD),
+            setup.noise.odometry_period,
+            setup.noise.bearing,
+        )
+        self.variance = self.noise.bearing_std**2
+        self.may_lean_on = int(mask_of({int(t) - self.landmarks for t in setup.targets if t >= self.landmarks}))
+
+    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
+        """Start at a pose; one that is too uncertain to linearise about is only a hint for the search."""
+        R, p = (np.array(x, float) for x in initial_pose)
+        P = np.array(initial_covariance, float)
+        self.odometry = np.eye(3), np.zeros(3)
+        self.contacts: dict[int, Contact] = {}
+        self.leans_on = self.may_lean_on
+        self.missed = 0.0
+        self.belief = Belief(self.vehicle, R, p, P.copy())
+        self.search = None if is_known(P) else Search(self.vehicle, R, p, P.copy())
+        self.anchor, self.healthy = Anchor(R, p, P, self.odometry, 0.0), 0.0
+
+    def update(self, tick: Tick) -> Estimate:
+        """Take one camera tick."""
+        R, p = self.odometry
+        self.odometry = orthonormalise(R.dot(tick.rotation)), p + R.dot(tick.translation)
+        noise = self.noise.odometry(tick.dt)
+        self.nis, self.nis_dof = 0.0, 0
+        if self.search is not None:
+            self.search.move(tick, noise)
+            if tick.due:
+                self._search(tick)
+        else:
+            self.belief.move(0, tick.rotation, tick.translation, noise)
+            self.belief.own.time = tick.time
+            self._listen(tick)
+            if tick.due:
+                self._look(tick)
+        belief = self.belief if self.search is None else self.search.best
+        P, coordinates = belief.P[:6, :6].copy(), Coordinates.LEFT
+        return Estimate(belief.own.R, belief.own.p, P, coordinates, self.nis if self.nis_dof else None, self.nis_dof)
+
+    def message(self) -> Message:
+        """Return pose, covariance and odometry, or nothing while the pose is not known."""
+        if self.search is not None or not is_known(self.belief.P[:6, :6]):
+            return Message()
+        return to_message(self.belief, self.marker, self.odometry, self.leans_on)
+
+    def _search(self, tick: Tick) -> None:
+        """Look for the pose; once only one is possible, go on with the prior, or with what this frame alone says."""
+        assert self.search is not None
+        found = self.search.look(tick, self._sightings(tick), self.variance)
+        if found is None:
+            return
+        if self.search.confirms_prior(found):
+            self._begin(self.search.prior, tick)
+            self.search = None
+            self._look(tick)
+            return
+        self._begin(found, tick)
+        if resect(self.belief, lambda: self._view(tick)) and is_known(self.belief.P[:6, :6]):
+            self.search = None
+
+    def _begin(self, pose: Belief, tick: Tick) -> None:
+        """Believe in a pose and in those that are in view."""
+        own = pose.own
+        self.belief = Belief(self.vehicle, own.R, own.p, pose.P.copy(), tick.time)
+        self.contacts, self.leans_on, self.missed = {}, self.may_lean_on, 0.0
+        self._listen(tick)
+
+    def _sightings(self, tick: Tick) -> list[Sighting]:
+        """Return every target in view whose place is known or told by a sender that knows it."""
+        reports = {report.vehicles[0]: report for report in self._reports(tick)}
+        result = []
+        for n in np.flatnonzero(tick.valid):
+            target = int(tick.targets[n])
+            if target < self.landmarks:
+                result.append(Sighting(tick.bearings[n], tick.landmarks[target], 0.0))
+            elif (report := reports.get(target - self.landmarks)) is not None:
+                age = tick.time - report.time[0]
+                variance = float(np.trace(report.P[3:6, 3:6])) / 3.0 + (SPEED * age) ** 2
+                result.append(Sighting(tick.bearings[n], report.p[0], variance))
+        return result
+
+    def _lose(self, time: float) -> None:
+        """Search anew, from where the vehicle was when most bearings fitted, carried on by its odometry."""
+        anchor, (R, p) = self.anchor, self.odometry
+        prior = Belief(self.vehicle, anchor.R, anchor.p, anchor.P.copy())
+        since = anchor.odometry[0].T
+        prior.move(0, since.dot(R), since.dot(p - anchor.odometry[1]), self.noise.odometry(time - anchor.time))
+        self.search = Search(self.vehicle, prior.own.R, prior.own.p, prior.P)
+
+    def _report(self, message: Message, sender: int, time: float) -> Report | None:
+        """Return what a message says."""
+        return from_message(message, sender, time)
+
+    def _is_spoken_for(self, report: Report, taken: list[Report]) -> bool:
+        """Return whether a report's news are in those that were taken in."""
+        return False
+
+    def _reports(self, tick: Tick) -> list[Report]:
+        """Return what the messages say that were heard."""
+        heard = tick.messages.items()
+        read = [self._report(m.message, target - self.landmarks, tick.time - m.age) for target, m in heard]
+        return [report for report in read if report is not None]
+
+    def _listen(self, tick: Tick) -> None:
+        """Take in the messages of those in view, and of those that are already believed in."""
+        in_view = {target - self.landmarks for target in tick.targets[tick.valid].tolist()}
+        reports = sorted(self._reports(tick), key=lambda report: -len(report.vehicles))
+        self._notice(in_view, reports, tick.time)
+        heard = {report.vehicles[0] for report in reports}
+        taken = [contact.last for sender, contact in self.contacts.items() if sender not in heard]
+        for report in reports:
+            contact = self.contacts.get(report.vehicles[0])
+            if self._is_spoken_for(report, taken):
+                if contact is not None:
+                    contact.last = report
+                continue
+            if contact is not None and contact.last.vehicles == report.vehicles:
+                self._hear(contact, report)
+            elif contact is not None or not in_view.isdisjoint(report.vehicles):
+                self._meet(report, tick.time)
+            if (contact := self.contacts.get(report.vehicles[0])) is not None:
+                taken.append(contact.last)
+        self._forget_contacts()
+
+    def _notice(self, in_view: set[int], reports: list[Report], time: float) -> None:
+        """Remember when members were last in view; all that a member tells of count as in view when one of them is."""
+        noticed = set(in_view)
+        for report in reports:
+            if report.vehicles[0] in self.contacts and not in_view.isdisjoint(report.vehicles):
+                noticed.update(report.vehicles)
+        for member in self.belief.members:
+            if member.vehicle in noticed:
+                member.seen = time
+
+    def _meet(self, report: Report, time: float) -> None:
+        """Take in a sender that is new, or tells of other vehicles than before, if there is room."""
+        told = set(report.vehicles) - {self.vehicle}
+        forgotten = room_for(self.belief, told, self.most_members, time)
+        if forgotten is None:
+            return
+        self.belief.drop(told | forgotten)
+        numbers = [n for n, v in enumerate(report.vehicles) if v in told]
+        index = errors_of(numbers)
+        odometry = zip(report.odometry_turn, report.odometry_position, strict=True)
+        poses = list(zip(report.vehicles, report.R, report.p, report.time.tolist(), odometry, strict=True))
+        self.belief.add([Member(*poses[n], seen=time) for n in numbers], report.P[np.ix_(index, index)])
+        self.contacts[report.vehicles[0]] = Contact(report)
+        self._forget_contacts()
+        self.leans_on |= report.leans_on | int(mask_of(told))
+
+    def _forget_contacts(self) -> None:
+        """Forget the senders that tell of vehicles which are not members; they may be met again."""
+        members = {member.vehicle for member in self.belief.members}
+        self.contacts = {
+            v: contact for v, contact in self.contacts.items() if members.issuperset(contact.last.vehicles)
+        }
+
+    def _hear(self, contact: Contact, report: Report) -> None:
+        """Carry a sender to its new message, and take in what it has learnt since the last one."""
+        last = contact.last
+        dt = float(report.time[0] - last.time[0])
+        if dt < AT_ONCE:  # the same message again
+            return
+        contact.last = report
+        members = [member.vehicle for member in self.belief.members]
+        places = [members.index(v) for v in report.vehicles]
+        for n, R, p, time in zip(
+            places, report.odometry_turn, report.odometry_position, report.time.tolist(), strict=True
+        ):
+            if n > 0:
+                self.belief.follow(n, R, p, time, self.noise)
+        was_trusted = contact.trusted
+        self._judge(contact, report, dt)
+        learnt = tracklet(last, report, self.noise) if was_trusted and contact.trusted else None
+        if learnt is None:
+            return
+        share = self._share(report)
+        vector = learnt.about([self.belief.members[n] for n in places])
+        self.belief.inform(errors_of(places), share * learnt.information, share * vector)
+        self.leans_on |= report.leans_on
+
+    def _share(self, report: Report) -> float:
+        """Return how much of a sender's news counts.
+
+        All if it leans on nobody, `SHARE` if it leans on others. Where senders lean on this vehicle in turn, each of n
+        counts 1 / (n + 1): then what comes back round any loop fades, however dense the graph is.
+        """
+        if not report.leans_on:
+            return 1.0
+        own = int(mask_of({self.vehicle}))
+        if not report.leans_on & own:
+            return SHARE
+        return 1.0 / (1.0 + sum(bool(contact.last.leans_on & own) for contact in self.contacts.values()))
+
+    def _judge(self, contact: Contact, report: Report, dt: float) -> None:
+        """Decide whether a sender is believed, from its message and the belief about it."""
+        n = self.belief.place(report.vehicles[0])
+        if n is None:
+            return
+        member, block = self.belief.members[n], slice(6 * n, 6 * n + 6)
+        e = left_error(member.R, member.p, report.R[0], report.p[0])
+        agrees = float(e.dot(solve_positive(self.belief.P[block, block] + report.P[:6, :6], e))) < TRUST_GATE
+        if contact.trusted:
+            contact.trusted, contact.agreed = agrees, 0.0
+            return
+        near = agrees and e[3:].dot(e[3:]) < AGREED_DISTANCE**2
+        contact.agreed = contact.agreed + dt if near else 0.0
+        contact.trusted = contact.agreed >= AGREED_FOR
+
+    def _look(self, tick: Tick) -> None:
+        """Correct the belief by every bearing that fits it; search anew when most do not."""
+        view = self._view(tick)
+        self.nis, self.nis_dof = float(view.nis[view.fits].sum()), 2 * int(view.fits.sum())
+        if view.fits.any():
+            self.belief.settle(view.sight, view.noise, view.fits, lambda: self._view(tick)[:2])
+        if view.missed is not None:
+            self.missed += (view.missed - self.missed) * min(1.0, tick.dt / LOST_TIME)
+            self.healthy = self.healthy + tick.dt if self.missed < HEALTHY_SHARE else 0.0
+            if self.missed > LOST_SHARE:
+                self._lose(tick.time)
+            elif self.healthy > HEALTHY_TIME:
+                own = self.belief.own
+                self.anchor = Anchor(own.R, own.p, 4.0 * self.belief.P[:6, :6] + SLACK, self.odometry, tick.time)
+
+    def _view(self, tick: Tick) -> View:
+        """Return the frame's bearings to landmarks and to members of the belief, as measurements."""
+        belief = self.belief
+        known, z, drift, counts, places, points = [], [], [], [], [], []
+        targets = tick.targets.tolist()
+        for n in tick.valid.nonzero()[0].tolist():  # landmarks come first
+            vehicle = targets[n] - self.landmarks
+            if vehicle < 0:
+                z.append(tick.landmarks[targets[n]])
+                drift.append(0.0)
+                counts.append(True)
+            elif (place := belief.place(vehicle)) is not None:
+                member, contact = belief.members[place], self.contacts.get(vehicle)
+                age = tick.time - member.time
+                point = member.carried(age)
+                z.append(member.p + member.R.dot(point))
+                places.append(place)
+                points.append(point)
+                drift.append(self._drift(age))
+                counts.append(contact is None or contact.trusted)
+            else:
+                continue
+            known.append(n)
+        sight = belief.sight(tick.bearings[known], tick.lever_arm, np.array(z).reshape(-1, 3), places, points)
+        noise = self.variance + np.array(drift) / sight.distance**2
+        nis = sight.normalised(belief.P, noise)
+        fits = sight.ahead & (nis < GATE)
+        judged = [fit for fit, judges in zip(fits.tolist(), counts, strict=True) if judges]
+        return View(sight, noise, nis, fits, judged.count(False) / len(judged) if judged else None)
+
+    def _drift(self, age: float) -> float:
+        """Return the variance per axis, m^2, of where a sender is a time after its last message."""
+        if age <= 0.0:
+            return 0.0
+        return float(self.noise.odometry(age)[3]) + (0.5 * ACCELERATION * age * age) ** 2

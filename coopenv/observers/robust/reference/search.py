@@ -1,0 +1,265 @@
+"""Finding one's pose from nothing: every solution of the P3P problem is followed until motion has told them apart.
+
+Bearings have a sign (cheirality), which the perspective solver and the tests here heed. Each hypothesis is a small
+filter of its own; it pays for what it predicts badly, and one that pays much more than the best is given up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.p3p import solve_p3p, solve_p3p_batch
+from coopenv.estimation.rotations import tangent_basis
+from coopenv.estimation.small_matrices import invert_positive, solve
+from coopenv.observers.contract import Tick
+from coopenv.observers.robust.reference.belief import Belief, Sight
+from coopenv.observers.robust.reference.tracklets import left_error
+
+MOVED = 2.0
+"""By how many standard deviations a measurement is moved to look for solutions that noise may hide."""
+MOST_HYPOTHESES = 6
+GATE = 13.8
+"""Of a bearing's normalised innovation squared: chi-square of 2, 0.999."""
+MISS = 25.0
+"""What a hypothesis pays at most for one bearing."""
+MARGIN = 30.0
+"""By how much it may have paid more than the best one: odds of exp(-15)."""
+MOST_SURPRISE = 50.0
+"""What a hypothesis pays at most for being far from the prior: that may be wrong altogether."""
+FLOOR = 80.0
+"""What the best may have paid beyond twice what is expected of a true one."""
+CLEAR_TIME, PATIENCE = 0.25, 15.0
+"""s, for which all solutions must have been well determined, and after which that is asked no more."""
+LEAST_TIME = 0.5
+"""s, before a hypothesis is believed."""
+KNOWN_ANGLE, KNOWN_POSITION = 0.2, 2.0
+"""rad and m, standard deviation per axis below which a pose is one to go on with."""
+SLOW = 4.0
+"""By how much a neighbour's variance counts: its error changes slowly, so that it does not average out."""
+SAME, SAME_PRIOR = 16.0, 30.0
+"""Squared distance, in standard deviations, below which two hypotheses are one, and one is the prior."""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A bearing to a target whose place is known or heard."""
+
+    bearing: Array  # (3,) body frame
+    z: Array  # (3,) map frame, m
+    variance: float  # of z per axis, m^2
+
+
+@dataclass
+class Hypothesis:
+    """A pose with covariance, and what it has paid."""
+
+    belief: Belief
+    paid: float
+    surprise: float
+    """Squared distance from the prior, which ranks those that have paid the same."""
+    bearings: int = 0
+
+    @property
+    def price(self) -> tuple[float, float]:
+        """What the hypotheses are ranked by."""
+        return self.paid, self.surprise
+
+
+class Search:
+    """Hypotheses about one vehicle's pose.
+
+    Args:
+        R: (3, 3) prior orientation, carried on by odometry in the meantime.
+        p: (3,) prior position, m.
+        P: (6, 6) prior covariance.
+    """
+
+    def __init__(self, vehicle: int, R: Array, p: Array, P: Array) -> None:
+        """Start without hypotheses."""
+        self.vehicle = vehicle
+        self.prior = Belief(vehicle, R, p, P)
+        self.bank: list[Hypothesis] = []
+        self.age, self.waited, self.clear, self.attempts = 0.0, 0.0, 0.0, 0
+
+    @property
+    def best(self) -> Belief:
+        """The hypothesis that has paid least, the prior if there is none."""
+        return min(self.bank, key=lambda h: h.price).belief if self.bank else self.prior
+
+    def move(self, tick: Tick, noise: Array) -> None:
+        """Carry everything through a tick's odometry."""
+        for belief in (self.prior, *(h.belief for h in self.bank)):
+            belief.move(0, tick.rotation, tick.translation, noise)
+
+    def look(self, tick: Tick, sightings: list[Sighting], variance: float) -> Belief | None:
+        """Take a frame's sightings; return the only hypothesis that is left after some frames."""
+        if not self.bank:
+            if len(sightings) >= 3:
+                self._begin(tick, sightings, variance)
+            return None
+        self.age += tick.dt
+        for hypothesis in self.bank:
+            _follow(hypothesis, tick, sightings, variance)
+        self._prune()
+        return self.bank[0].belief if len(self.bank) == 1 and self.age >= LEAST_TIME else None
+
+    def _begin(self, tick: Tick, sightings: list[Sighting], variance: float) -> None:
+        """Follow a known prior at first; then a frame's solutions, too, if for a while all were well determined.
+
+        Every attempt takes other sightings. Where two solutions nearly meet, where they may be is no ellipsoid, and
+        noise makes them come and go. A follower's leaders improve meanwhile, which sets them apart.
+        """
+        if self.attempts == 0 and is_known(self.prior.P):
+            self.bank, self.age, self.attempts = [self._prior(tick, sightings, variance)], 0.0, 1
+            return
+        triples = sorted(combinations(range(len(sightings)), 3), key=lambda c: -_spread(sightings, c))
+        three = triples[self.attempts % len(triples)]
+        self.waited += tick.dt
+        poses = self._poses(tick, [sightings[n] for n in three], variance)
+        self.clear = 0.0 if poses is None else self.clear + tick.dt
+        if poses is None or (self.clear < CLEAR_TIME and self.waited < PATIENCE):
+            return
+        solutions = self._different(poses)
+        for hypothesis in solutions:
+            _follow(hypothesis, tick, [s for n, s in enumerate(sightings) if n not in three], variance)
+        if is_known(self.prior.P):
+            solutions.append(self._prior(tick, sightings, variance))
+        self.bank = sorted(solutions, key=lambda h: h.price)[:MOST_HYPOTHESES]
+        self.age, self.clear, self.attempts = 0.0, 0.0, self.attempts + 1
+
+    def _prior(self, tick: Tick, sightings: list[Sighting], variance: float) -> Hypothesis:
+        """Return the prior as a hypothesis."""
+        own = self.prior.own
+        prior = Hypothesis(Belief(self.vehicle, own.R, own.p, self.prior.P.copy()), 0.0, 0.0)
+        _follow(prior, tick, sightings, variance)
+        return prior
+
+    def _poses(self, tick: Tick, three: list[Sighting], variance: float) -> list[Belief] | None:
+        """Return the poses that explain three sightings; None if one of them is not well determined."""
+        result = []
+        for R, camera in _perspectives(three, variance):
+            belief = Belief(self.vehicle, R, camera - R @ tick.lever_arm, np.zeros((6, 6)))
+            P = _covariance(belief, tick, three, variance)
+            if self.waited < PATIENCE and (P is None or not is_known(P)):
+                return None
+            if P is not None:
+                belief.P = P
+                result.append(belief)
+        return result
+
+    def _different(self, poses: list[Belief]) -> list[Hypothesis]:
+        """Return hypotheses of the first poses that can be told apart from those before."""
+        result: list[Hypothesis] = []
+        for belief in poses:
+            surprise = self._surprise(belief)
+            hypothesis = Hypothesis(belief, min(surprise, MOST_SURPRISE), surprise)
+            if len(result) < MOST_HYPOTHESES and not any(_same(hypothesis, other) for other in result):
+                result.append(hypothesis)
+        return result
+
+    def confirms_prior(self, belief: Belief) -> bool:
+        """Return whether a pose is the prior's, the prior being certain enough to go on with."""
+        return is_known(self.prior.P) and self._surprise(belief) < SAME_PRIOR
+
+    def _surprise(self, belief: Belief) -> float:
+        """Return the squared distance from the prior, in standard deviations."""
+        e = left_error(self.prior.own.R, self.prior.own.p, belief.own.R, belief.own.p)
+        return float(e.dot(solve(self.prior.P + belief.P, e)))
+
+    def _prune(self) -> None:
+        """Give up what pays much more than the best, what is the same as a better one, and all if none is good."""
+        ranked = sorted(self.bank, key=lambda h: h.price)
+        kept: list[Hypothesis] = []
+        for hypothesis in ranked:
+            if hypothesis.paid <= ranked[0].paid + MARGIN and not any(_same(hypothesis, other) for other in kept):
+                kept.append(hypothesis)
+        best = kept[0]
+        self.bank = [] if best.paid > FLOOR + 4.0 * best.bearings else kept
+
+
+def is_known(P: Array) -> bool:
+    """Return whether a pose of covariance P (6, 6) is certain enough to linearise about and to tell others."""
+    variances = P.diagonal().tolist()
+    return max(variances[:3]) < KNOWN_ANGLE**2 and max(variances[3:]) < KNOWN_POSITION**2
+
+
+def _spread(sightings: list[Sighting], three: tuple[int, ...]) -> float:
+    """Return the volume that three bearings span; a good triple looks in three very different directions."""
+    a, b, c = (sightings[n].bearing for n in three)
+    return float(np.linalg.norm(np.cross(b - a, c - a)))
+
+
+def _perspectives(three: list[Sighting], variance: float) -> Iterator[tuple[Array, Array]]:
+    """Yield the poses (R, camera) that explain three sightings, then what they may have been.
+
+    Where two solutions lie close together noise can make both of them vanish. So every bearing, and every place that is
+    not exactly known, is also moved by `MOVED` standard deviations to each side.
+    """
+    b, z = np.array([s.bearing for s in three]), np.array([s.z for s in three])
+    yield from zip(*solve_p3p(b, z), strict=True)
+    bearings, places = [], []
+    for n, s in enumerate(three):
+        for side in (MOVED, -MOVED):
+            for axis in tangent_basis(b[n : n + 1])[0]:
+                moved = b.copy()
+                moved[n] += side * math.sqrt(variance) * axis
+                moved[n] /= np.linalg.norm(moved[n])
+                bearings.append(moved)
+                places.append(z)
+            for axis in np.eye(3) if s.variance > 0.0 else ():
+                moved = z.copy()
+                moved[n] += side * math.sqrt(s.variance) * axis
+                bearings.append(b)
+                places.append(moved)
+    R, camera, mask = solve_p3p_batch(np.array(bearings), np.array(places))
+    yield from zip(R[mask], camera[mask], strict=True)
+
+
+def _noise(distance: Array, sightings: list[Sighting], variance: float) -> Array:
+    """Return the variances (m,) of bearings, their targets' uncertainty included."""
+    return variance + SLOW * np.array([s.variance for s in sightings]) / distance**2
+
+
+def _seen(belief: Belief, tick: Tick, sightings: list[Sighting], variance: float) -> tuple[Sight, Array]:
+    """Return sightings as measurements at a pose, and their variances (m,)."""
+    b, z = np.array([s.bearing for s in sightings]), np.array([s.z for s in sightings])
+    sight = belief.sight(b, tick.lever_arm, z)
+    return sight, _noise(sight.distance, sightings, variance)
+
+
+def _covariance(belief: Belief, tick: Tick, sightings: list[Sighting], variance: float) -> Array | None:
+    """Return the covariance (6, 6) of a pose that is solved from sightings; None if they do not tell it."""
+    sight, noise = _seen(belief, tick, sightings, variance)
+    M = (np.swapaxes(sight.H, 1, 2) / noise[:, None, None] @ sight.H).sum(axis=0)
+    spectrum = np.linalg.eigvalsh(M)
+    if not spectrum[0] > 1e-12 * spectrum[-1]:
+        return None
+    P = invert_positive(M)
+    return P if np.diag(P)[:3].max() < 1.0 else None
+
+
+def _follow(hypothesis: Hypothesis, tick: Tick, sightings: list[Sighting], variance: float) -> None:
+    """Let a hypothesis pay for a frame's sightings and learn from those that fit."""
+    if not sightings:
+        return
+    belief = hypothesis.belief
+    sight, noise = _seen(belief, tick, sightings, variance)
+    nis = sight.normalised(belief.P, noise)
+    hypothesis.paid += float(np.where(sight.ahead, np.minimum(nis, MISS), MISS).sum())
+    hypothesis.bearings += len(sightings)
+    fits = sight.ahead & (nis < GATE)
+    if fits.any():
+        belief.settle(sight, noise, fits, lambda: _seen(belief, tick, sightings, variance))
+
+
+def _same(one: Hypothesis, other: Hypothesis) -> bool:
+    """Return whether two hypotheses cannot be told apart."""
+    a, b = one.belief, other.belief
+    e = left_error(a.own.R, a.own.p, b.own.R, b.own.p)
+    return float(e.dot(solve(a.P + b.P, e))) < SAME

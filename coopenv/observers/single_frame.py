@@ -1,0 +1,186 @@
+"""The pose from the bearings of one frame (P3P, PnP); odometry carries it to the next one, and counts no further.
+
+Source: candidates by perspective.py; among them that which agrees with most bearings, then that nearest to the pose
+predicted by odometry (Fischler and Bolles, Random sample consensus, Communications of the ACM 24(6), 1981, with all
+triples in place of random ones); then Gauss-Newton over all bearings that agree. Where Gauss-Newton from the predicted
+pose ends at a pose that fits, that is the candidate nearest to it, and the closed form is not needed.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from math import inf, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.p3p import solve_p3p_batch
+from coopenv.estimation.small_matrices import solve
+from coopenv.observers.contract import Estimate, Message, Setup, Tick
+from coopenv.observers.mekf import LeftError, innovation
+
+MOST_TRIPLES = 20
+ITERATIONS = 8
+CONVERGED = 1e-2
+"""Squared length of a step in standard deviations."""
+LONGEST_TURN = 1.0
+"""rad, of a step."""
+BEARING_GATE = 25.0
+"""Squared residual of a bearing over its variance, (5 sigma)^2."""
+POSE_GATE = 45.0
+"""Squared distance to the predicted pose over its variance; chi-square with 6 degrees of freedom beyond it: 5e-8."""
+PATIENCE = 1.0
+"""s for which bearings must contradict the predicted pose before a pose far from it is believed."""
+NARROW_STD = 0.5
+"""rad, of the predicted orientation: below it Gauss-Newton from there finds what is to be found near it."""
+LARGEST_STD = 0.15
+"""Of the position, over the distance to the nearest point: beyond it the geometry is too weak."""
+
+ALL, PLANE = np.eye(6), np.eye(2)
+ADJUGATE = np.array([[1.0, -1.0], [-1.0, 1.0]])
+EXACT = np.zeros((3, 3))
+"""Of a point that is known, or whose sender states no covariance."""
+
+Bearings = tuple[Array, Array, Array]
+"""Unit bearings (m, 3), positions (m, 3) and covariances of positions (m, 3, 3)."""
+
+
+class PerspectivePoints:
+    """One pose a frame from three bearings or more, else dead reckoning; sends position and covariance."""
+
+    def __init__(self, setup: Setup) -> None:
+        """Remember the marker, which is what others measure."""
+        self.marker = setup.marker
+
+    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
+        """Start at a pose."""
+        R, p = initial_pose
+        self.state = LeftError(np.array(R, float), np.array(p, float), np.array(initial_covariance, float))
+        self.contradicted = 0.0
+
+    def update(self, tick: Tick) -> Estimate:
+        """Append the increment, and replace the pose by that of the frame where it has one."""
+        self.state = self.state.predicted(tick)
+        seen = tick.usable() if tick.due else []
+        if len(seen) >= 3:
+            covariances = [EXACT if m is None or m.covariance is None else m.covariance for *_, m in seen]
+            data = np.array([s[1] for s in seen]), np.array([s[2] for s in seen]), np.array(covariances)
+            self.take(tick, data)
+        return self.state.estimate()
+
+    def take(self, tick: Tick, data: Bearings) -> None:
+        """Take the pose of a frame if there is one to be believed."""
+        found = refined(self.state, tick, data)
+        if found is None or distance(found, self.state) > POSE_GATE:
+            expected = (misfits(self.state, tick, data, self.state.P) < BEARING_GATE).all()
+            self.contradicted = 0.0 if expected else self.contradicted + tick.dt
+            if expected and self.state.P[0, 0] + self.state.P[1, 1] + self.state.P[2, 2] < NARROW_STD**2:
+                return  # weak geometry at a pose that may well be right
+            found = self.chosen(tick, data)
+        if found is not None and (distance(found, self.state) < POSE_GATE or self.contradicted > PATIENCE):
+            self.state, self.contradicted = found, 0.0
+
+    def chosen(self, tick: Tick, data: Bearings) -> LeftError | None:
+        """Return of all candidates that which agrees with most bearings, then that nearest to the predicted pose."""
+        best, most, nearest = None, 3, inf
+        for R, p in candidates(tick, data):
+            start = LeftError(R, p, self.state.P)
+            agrees = misfits(start, tick, data) < BEARING_GATE
+            if (count := int(agrees.sum())) < most:
+                continue
+            pose = refined(start, tick, (data[0][agrees], data[1][agrees], data[2][agrees]))
+            if pose is not None and (count > most or distance(pose, self.state) < nearest):
+                best, most, nearest = pose, count, distance(pose, self.state)
+        return best
+
+    def message(self) -> Message:
+        """Return the marker's position and covariance."""
+        return Message(
+            position=self.state.p + self.state.R.dot(self.marker), covariance=self.state.point_covariance(self.marker)
+        )
+
+
+def candidates(tick: Tick, data: Bearings) -> list[tuple[Array, Array]]:
+    """Return the poses (R, p) of the body that P3P finds for triples of the bearings."""
+    b, z, _ = data
+    triples = np.array(list(combinations(range(len(b)), 3))[:MOST_TRIPLES])
+    R, camera, mask = solve_p3p_batch(b[triples], z[triples])
+    return [(turn, place - turn @ tick.lever_arm) for turn, place in zip(R[mask], camera[mask], strict=True)]
+
+
+def linearised(pose: LeftError, tick: Tick, data: Bearings) -> tuple[Array, Array, Array]:
+    """Return residuals (m, 2), their derivative H (m, 2, 6) and their covariance (m, 2, 2) given the pose."""
+    b, z, covariances = data
+    residual, J = innovation(pose.R, pose.p, tick.lever_arm, b, z)
+    G = J.dot(pose.R.T)
+    N = G @ covariances @ G.transpose(0, 2, 1)
+    N += tick.noise.bearing_std**2 * PLANE
+    return residual, J @ pose.jacobian(z), N
+
+
+def misfits(pose: LeftError, tick: Tick, data: Bearings, P: Array | None = None) -> Array:
+    """Return (m,) the squared residuals over their variance, infinite for bearings from behind.
+
+    With P, the variance is that given a pose with this covariance.
+    """
+    residual, H, N = linearised(pose, tick, data)
+    if P is not None:
+        N = N + H @ P @ H.transpose(0, 2, 1)
+    return np.where(ahead(pose, tick, data), normalised(residual, N), inf)
+
+
+def normalised(residual: Array, N: Array) -> Array:
+    """Return (m,) r^T N^-1 r of residuals (m, 2)."""
+    x, y = residual.T
+    a, b, d = N[:, 0, 0], N[:, 0, 1], N[:, 1, 1]
+    return (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
+
+
+def inverses(N: Array) -> Array:
+    """Return the inverses of symmetric matrices (m, 2, 2)."""
+    a, b, d = N[:, 0, 0], N[:, 0, 1], N[:, 1, 1]
+    return N[:, ::-1, ::-1] * ADJUGATE / (a * d - b * b)[:, None, None]
+
+
+def ahead(pose: LeftError, tick: Tick, data: Bearings) -> NDArray[np.bool_]:
+    """Return (m,) whether the points are where the bearings point, and not opposite."""
+    return (((data[1] - pose.p).dot(pose.R) - tick.lever_arm) * data[0]).sum(1) > 0.0
+
+
+def refined(start: LeftError, tick: Tick, data: Bearings) -> LeftError | None:
+    """Return the least-squares pose near a start with its covariance, None where it fails, misfits or is too weak."""
+    pose = start
+    for _ in range(ITERATIONS):
+        residual, H, N = linearised(pose, tick, data)
+        weighted = (inverses(N) @ H).reshape(-1, 6)
+        try:
+            P = solve(H.reshape(-1, 6).T.dot(weighted), ALL)
+        except np.linalg.LinAlgError:
+            return None
+        gradient = residual.ravel().dot(weighted)
+        step = P.dot(gradient)
+        if not (step[:3].dot(step[:3]) < LONGEST_TURN**2 and firm(P, pose, data)):  # NaN fails as well
+            return None
+        pose = pose.moved(step, (P + P.T) / 2)
+        if step.dot(gradient) < CONVERGED:
+            fits = ahead(pose, tick, data) & (normalised(residual - H @ step, N) < BEARING_GATE)
+            return pose if fits.all() else None
+    return None
+
+
+def firm(P: Array, pose: LeftError, data: Bearings) -> bool:
+    """Return whether the geometry holds the position well enough for the covariance P to be meant."""
+    nearest = sqrt(((data[1] - pose.p) ** 2).sum(1).min())
+    return bool(0.0 < P[3, 3] + P[4, 4] + P[5, 5] < (LARGEST_STD * nearest) ** 2)
+
+
+def distance(pose: LeftError, predicted: LeftError) -> float:
+    """Return the squared Mahalanobis distance of two poses whose errors are independent.
+
+    The rotation counts by twice the vector part of its quaternion.
+    """
+    tilde = predicted.R.T.dot(pose.R)
+    vector = np.array([tilde[2, 1] - tilde[1, 2], tilde[0, 2] - tilde[2, 0], tilde[1, 0] - tilde[0, 1]])
+    e = np.concatenate([vector / sqrt(max(1.0 + tilde.trace(), 1e-9)), predicted.R.T.dot(pose.p - predicted.p)])
+    return float(e.dot(solve(pose.P + predicted.P, e)))

@@ -1,0 +1,176 @@
+"""Scenarios printed for people, in 80 columns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from pydantic import BaseModel
+from rich import box
+from rich.console import RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from coopenv.api.layout import layout_size, observation_layout
+from coopenv.api.registration import environment_id
+from coopenv.runs import scenario_text as words
+from coopenv.scenario.schema import Scenario
+from coopenv.scenario.sensing import Camera
+
+SECTIONS = ("camera", "rates", "noise", "topology", "v2x", "observer", "observation", "reward", "termination")
+DRIVEN_SECTIONS = ("dynamics", "action")
+"""Sections that matter only where actions drive a vehicle."""
+
+VALUE_WIDTH = 17
+
+IMAGE_FIELDS = ("image_size", "focal_length", "principal_point", "distortion", "undistort", "quantise")
+"""Settings of a camera that matter only where it has an image, as a pinhole camera does."""
+
+
+def environment_table(scenarios: Mapping[str, Scenario]) -> Table:
+    """Return one row per environment; title and registered id stand below its name."""
+    table = _table("environment", "vehicles", "landmarks", "motion", "horizon")
+    for column in (1, 2, 4):
+        table.columns[column].justify = "right"
+    for name, scenario in scenarios.items():
+        if table.row_count:
+            table.add_row()
+        cell = Text(f"{name}\n", "bold").append(f"{scenario.title}\n{environment_id(name)}", "not bold")
+        table.add_row(
+            cell,
+            str(len(scenario.vehicles)),
+            str(len(scenario.landmarks)),
+            "driven" if scenario.driven else "prescribed",
+            f"{scenario.horizon:g} s",
+        )
+    return table
+
+
+def describe_scenario(scenario: Scenario) -> Iterator[RenderableType]:
+    """Yield everything about a scenario, part by part."""
+    yield Text(f"{scenario.title}\n", "bold")
+    for text in (scenario.description, scenario.source and f"Source: {scenario.source.strip()}"):
+        if text:
+            yield f"{' '.join(text.split())}\n"
+    steps = round(scenario.horizon * scenario.rates.decision)
+    yield f"Horizon: {scenario.horizon:g} s, {steps} decisions of {scenario.ticks_per_decision} camera ticks each.\n"
+    yield from _spaced(vehicle_table(scenario))
+    if scenario.landmarks:
+        yield from _spaced(landmark_table(scenario))
+    timed = motion_table(scenario)
+    if timed.row_count:
+        yield from _spaced(timed)
+    if scenario.obstacles:
+        yield from _spaced(obstacle_table(scenario))
+    yield Text("Settings (* differs from the default)\n", "bold")
+    names = [*SECTIONS, *(DRIVEN_SECTIONS if scenario.driven else ())]
+    width = max(len(key) for name in names for key, *_ in settings(getattr(scenario, name))) + 2
+    for name in names:
+        yield from _spaced(section_table(name, getattr(scenario, name), width))
+    yield observation_table(scenario)
+
+
+def vehicle_table(scenario: Scenario) -> Table:
+    """Return one row per vehicle: start, initial estimate, motion, neighbours."""
+    table = _table("vehicle", "start", "initial estimate", "motion", "may measure", title="Vehicles (m)")
+    table.columns[0].no_wrap = True
+    for name, vehicle, neighbours in zip(
+        scenario.vehicle_names, scenario.vehicles, words.neighbours(scenario), strict=True
+    ):
+        table.add_row(
+            name,
+            words.start(vehicle),
+            words.estimate(vehicle.initial_estimate),
+            words.vehicle_motion(vehicle),
+            neighbours,
+        )
+    return table
+
+
+def landmark_table(scenario: Scenario) -> Table:
+    """Return one row per landmark."""
+    table = _table("landmark", "position", "motion", "body", title="Landmarks (m)")
+    for landmark in scenario.landmarks:
+        table.add_row(
+            landmark.name,
+            words.vector(landmark.position),
+            words.motion(landmark.motion),
+            words.body(landmark.body) or "none",
+        )
+    return table
+
+
+def motion_table(scenario: Scenario) -> Table:
+    """Return one row per stage of every motion that is prescribed stage by stage."""
+    table = _table("who", "time", "motion", title="Stages of motion (s)")
+    table.columns[0].no_wrap = table.columns[1].no_wrap = True
+    motions = [*(v.motion for v in scenario.vehicles), *(m.motion for m in scenario.landmarks)]
+    names = [*scenario.vehicle_names, *(m.name for m in scenario.landmarks)]
+    for name, motion in zip(names, motions, strict=True):
+        for i, (time, stage) in enumerate(words.stages(motion)):
+            table.add_row("" if i else name, time, stage)
+    return table
+
+
+def obstacle_table(scenario: Scenario) -> Table:
+    """Return one row per building."""
+    table = _table("building", "centre", "size", "yaw", title="Buildings (m)")
+    for obstacle in scenario.obstacles:
+        yaw = words.orientation(obstacle.yaw, None) or ""
+        size = " x ".join(words.number(edge) for edge in obstacle.size)
+        table.add_row(obstacle.name, words.vector(obstacle.center), size, yaw.removeprefix("yaw "))
+    return table
+
+
+def settings(part: BaseModel, prefix: str = "") -> Iterator[tuple[str, str, str, bool]]:
+    """Yield (dotted key, value, meaning, whether it differs from the default) of a section's fields that matter."""
+    unused = IMAGE_FIELDS if isinstance(part, Camera) and part.model != "pinhole" else ()
+    for name, info in type(part).model_fields.items():
+        if name in unused:
+            continue
+        value = getattr(part, name)
+        if isinstance(value, BaseModel):
+            yield from settings(value, f"{prefix}{name}.")
+        else:
+            meaning = " ".join((info.description or "").split())
+            yield f"{prefix}{name}", words.setting(value), meaning, value != info.get_default()
+
+
+def section_table(name: str, part: BaseModel, key_width: int) -> Table:
+    """Return one row per setting of a section: key, value, meaning with its unit."""
+    doc = " ".join((type(part).__doc__ or "").split())
+    table = _table(f"[{name}]", "value", "meaning", title=doc)
+    table.columns[0].width, table.columns[1].width = key_width, VALUE_WIDTH
+    for key, value, meaning, differs in settings(part):
+        table.add_row(f"{key} *" if differs else key, value, meaning, style="bold" if differs else None)
+    return table
+
+
+def observation_table(scenario: Scenario) -> Table:
+    """Return one row per field of the flat observation."""
+    layout = observation_layout(scenario)
+    title = f"Observation: {layout_size(layout)} entries per vehicle, each value / scale, clipped"
+    table = _table("field", "slice", "shape", "unit", "scale", "meaning", title=title)
+    for column in table.columns[:-1]:
+        column.no_wrap = True
+    for name, field in layout.items():
+        shape = "x".join(str(n) for n in field.shape)
+        scale = words.number(field.scale)
+        table.add_row(name, f"{field.start}:{field.stop}", shape, field.unit, scale, field.meaning)
+    return table
+
+
+def _spaced(table: Table) -> Iterator[RenderableType]:
+    yield table
+    yield ""
+
+
+def _table(*columns: str, title: str | None = None) -> Table:
+    return Table(
+        *columns,
+        title=title,
+        title_justify="left",
+        title_style="italic",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+        show_edge=False,
+    )

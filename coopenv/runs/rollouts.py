@@ -1,0 +1,189 @@
+"""Run one world by decisions of a policy and record it at every camera tick."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+
+from coopenv.api.engine import Engine
+from coopenv.api.infos import OUTCOMES
+from coopenv.errors import CoopenvError
+from coopenv.estimation.trajectory import Sight, Trajectory
+from coopenv.runs.policies import Policy, make_policy
+from coopenv.scenario import Scenario
+
+RECORDED = (
+    "position",
+    "rotation",
+    "velocity",
+    "angular_velocity",
+    "estimate_rotation",
+    "estimate_position",
+    "covariance",
+    "position_error",
+    "orientation_error",
+    "nees",
+    "sight",
+    "ended",
+)
+"""Views of the engine that are kept of every camera tick."""
+
+UNDER_WAY, ARRIVED, COLLIDED = OUTCOMES
+
+
+class Ending(NamedTuple):
+    """How a vehicle's run ended: a value of `OUTCOMES`, and when, s (`under way`: the end of the record)."""
+
+    outcome: str
+    time: float
+
+
+class Rollout:
+    """One world, its policy, and all that has been recorded so far."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        seed: int = 0,
+        steps: int | None = None,
+        dtype: str = "float64",
+        device: str = "cpu",
+        policy: str | Policy = "zero",
+    ) -> None:
+        """Build the world; arguments as for `rollout`."""
+        if steps is not None and steps < 1:
+            raise CoopenvError(f"steps must be at least 1, got {steps}")
+        self.scenario = scenario
+        self.seed = seed
+        self.engine = Engine(scenario, 1, dtype, device)
+        self.policy = make_policy(policy, seed, self.engine.layout) if isinstance(policy, str) else policy
+        self.policy_name = policy if isinstance(policy, str) else getattr(policy, "__name__", "custom")
+        self.ticks_planned = scenario.horizon_ticks
+        if steps is not None:
+            self.ticks_planned = min(self.ticks_planned, steps * scenario.ticks_per_decision)
+        self.wall_time = 0.0
+        self._rows: dict[str, list[np.ndarray]] = {}
+        self._taken = 0
+
+    @property
+    def ticks_recorded(self) -> int:
+        """Camera ticks since t = 0 that have been recorded."""
+        return max(0, self._taken - 1)
+
+    def warm_up(self) -> None:
+        """Load all kernels, compiling those that this machine has not compiled yet."""
+        self.engine.reset([self.seed])
+        self.engine.step(ticks=0)
+
+    def play(self) -> Iterator[int]:
+        """Start the episode and yield the number of each camera tick, from 0, once it is recorded.
+
+        The run ends at the horizon, after `steps` decisions, or with the decision in which the last vehicle ended.
+        `wall_time` (s) counts what is spent in here, not what the caller does between two ticks.
+        """
+        start = perf_counter()
+        self._rows = {name: [] for name in RECORDED}
+        self._taken = 0
+        self.wall_time = 0.0
+        self.engine.reset([self.seed])
+        self._take()
+        for tick in range(self.ticks_planned + 1):
+            if tick > 0:
+                self.engine.step(ticks=1)
+                self._take()
+            self.wall_time += perf_counter() - start
+            yield tick
+            start = perf_counter()
+            if tick % self.scenario.ticks_per_decision == 0:
+                if self.engine.view("ended")[0].all():
+                    return
+                self._decide()
+
+    def _decide(self) -> None:
+        actions = np.asarray(self.policy(self.engine.view("observation")[0].copy()), dtype=np.float64)
+        expected = (len(self.scenario.vehicles), 2)
+        if actions.shape != expected:
+            raise CoopenvError(f"the policy returned actions of shape {actions.shape}, expected {expected}")
+        self.engine.set_actions(np.clip(actions, -1.0, 1.0)[None])
+
+    def _take(self) -> None:
+        for name, rows in self._rows.items():
+            rows.append(self.engine.view(name)[0].copy())
+        self._taken += 1
+
+    def _recorded(self, name: str) -> np.ndarray:
+        """Return (K, ...) of one view; an interrupted tick is left out."""
+        return np.stack(self._rows[name][: self._taken])
+
+    def trajectory(self) -> Trajectory:
+        """Return what has been recorded so far; `play` must have yielded at least once."""
+        L = len(self.scenario.landmarks)
+        position, sight = self._recorded("position"), self._recorded("sight")
+        rotation_estimate = self._recorded("estimate_rotation")
+        position_estimate = np.matmul(rotation_estimate, self._recorded("estimate_position")[..., None])[..., 0]
+        moving = [landmark.motion.kind != "static" for landmark in self.scenario.landmarks]
+        return Trajectory(
+            t=np.arange(len(position)) / self.scenario.rates.camera,
+            position=position[:, L:],
+            rotation=self._recorded("rotation")[:, L:],
+            position_estimate=position_estimate,
+            rotation_estimate=rotation_estimate,
+            position_error=self._recorded("position_error"),
+            orientation_error=self._recorded("orientation_error"),
+            covariance=self._recorded("covariance"),
+            nees=self._recorded("nees"),
+            velocity=self._recorded("velocity")[:, L:],
+            angular_velocity=self._recorded("angular_velocity")[:, L:],
+            target_position=position,
+            visible=sight == Sight.VISIBLE,
+            sight=sight,
+            vehicles=np.array(self.scenario.vehicle_names),
+            targets=np.array(self.scenario.target_names),
+            target_moving=np.array([*moving, *(True for _ in self.scenario.vehicles)]),
+        )
+
+    def endings(self) -> list[Ending]:
+        """Return how each vehicle's run has ended so far."""
+        ended = self._recorded("ended")
+        first = np.where(ended.any(axis=0), np.argmax(ended != 0, axis=0), len(ended) - 1)
+        rate = self.scenario.rates.camera
+        return [
+            Ending(OUTCOMES[outcome], tick / rate)
+            for outcome, tick in zip(ended[-1].tolist(), first.tolist(), strict=True)
+        ]
+
+
+def rollout(
+    scenario: Scenario,
+    seed: int = 0,
+    steps: int | None = None,
+    dtype: str = "float64",
+    device: str = "cpu",
+    policy: str | Policy = "zero",
+    on_tick: Callable[[Engine, int], None] | None = None,
+) -> Trajectory:
+    """Run one episode and return its record, every camera tick from t = 0.
+
+        trajectory = rollout(coopenv.load_scenario("busy_intersection"), seed=3)
+
+    Args:
+        scenario: the world.
+        seed: of all that is drawn: starts, noise, losses, and the actions of the policy "random".
+        steps: decisions (None: up to the horizon, where a run ends in any case).
+        dtype: "float32" or "float64".
+        device: "cpu" or a CUDA device.
+        policy: "zero", "random", an agent's name, or a function of the observations (N, D) that returns actions
+            (N, 2); vehicles with prescribed motion ignore their actions.
+        on_tick: called with the engine and the tick's number after every tick, 0 included.
+
+    Raises:
+        CoopenvError: an argument is not valid.
+    """
+    run = Rollout(scenario, seed, steps, dtype, device, policy)
+    for tick in run.play():
+        if on_tick is not None:
+            on_tick(run.engine, tick)
+    return run.trajectory()
