@@ -18,7 +18,7 @@ from benchmarks.speed.report import Report
 from benchmarks.speed.workers import Workers
 from coopenv.errors import CoopenvError
 from coopenv.machine import versions
-from coopenv.runs.command import progress
+from coopenv.runs.console import Progress
 from coopenv.scenario import Scenario
 
 IMPORTS = 3
@@ -64,12 +64,8 @@ def measured(
     imports, compiled = (1, ()) if quick else (IMPORTS, ("float32", "float64"))
     total = units_of_work(cases, rounds) + startup.units_of_work(libraries, compiled, imports)
     total += sum(units_of_work(found, rounds) for _, found in grown)
-    with progress(log) as bar:
-        task = bar.add_task("starting", total=total)
-
-        def on_progress(text: str) -> None:
-            bar.update(task, description=text, advance=1)
-
+    with Progress(log, "starting", total) as progress:
+        on_progress = progress.advance
         waits = startup.measure_startup(libraries, environment, dict(overrides), compiled, imports, on_progress)
         with Workers(libraries) as workers:
             results = measure(cases, workers, seconds, rounds, on_progress)

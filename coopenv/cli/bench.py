@@ -25,7 +25,7 @@ def bench_agents(
     from coopenv.api.parallel_env import parallel_env
     from coopenv.bench.drivers import play, score, score_table
     from coopenv.policies import load_agent, read_card
-    from coopenv.runs.command import progress
+    from coopenv.runs.console import Progress
     from coopenv.shipped import list_agents
 
     rows = []
@@ -33,9 +33,8 @@ def bench_agents(
         for name in read_card(agent).environments:
             env = parallel_env(name)
             policy = load_agent(agent, env.observation_layout)
-            with progress(console(stderr=True)) as bar:
-                episodes = bar.track(range(seeds), description=f"{agent} in {name}")
-                rows.append((agent, name, score(play(env, policy, seed) for seed in episodes)))
+            with Progress(console(stderr=True), f"{agent} in {name}") as progress:
+                rows.append((agent, name, score(play(env, policy, seed) for seed in progress.track(range(seeds)))))
     console().print(score_table(rows))
 
 
@@ -51,14 +50,11 @@ def bench_seeds(
     scenario = load(environment, parse_overrides(overrides))
     from coopenv.bench.seeds import seed_table, study_seeds
     from coopenv.estimation.metrics import steady_start
-    from coopenv.runs.command import progress
+    from coopenv.runs.console import Progress
 
     start = steady_start(steady_from, scenario.horizon)
-    with progress(console(stderr=True)) as bar:
-        task = bar.add_task(f"{seeds} seeds", total=1.0)
-        study = study_seeds(
-            scenario, range(first, first + seeds), start, on_progress=lambda share: bar.update(task, completed=share)
-        )
+    with Progress(console(stderr=True), f"{seeds} seeds", total=1.0) as progress:
+        study = study_seeds(scenario, range(first, first + seeds), start, on_progress=progress.update)
     out = console()
     out.print(seed_table(study))
     out.print(f"Steady: after {start:g} s. Settled: below 0.5 m and 5 deg until the end.")

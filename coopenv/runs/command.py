@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.padding import Padding
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import Observability, analyse_observability
+from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.metrics import outcome_line, run_metrics, vehicle_metrics
 from coopenv.runs.output import METRICS_FILE, TRAJECTORY_FILE, prepare_folder, write_results
 from coopenv.runs.rollouts import Rollout
 from coopenv.runs.table import metrics_table, remarks
 from coopenv.runs.video import Film, GifFilm, film_name, frame_stride, open_film
 from coopenv.scenario import Scenario
-
-COMPILE_NOTICE_AFTER = 1.5
-"""s; kernels in the cache load well within it, compiling takes longer."""
 
 
 @dataclass(frozen=True)
@@ -93,13 +87,12 @@ def _simulate(recording: Rollout, film: Film | None, log: Console) -> bool:
         view = TopView(recording.scenario)
     stride = frame_stride(recording.scenario)
     try:
-        with progress(log) as bar:
-            task = bar.add_task("simulating", total=recording.ticks_planned)
+        with Progress(log, "simulating", recording.ticks_planned) as progress:
             for tick in recording.play():
                 if tick % stride == 0:
                     if film is not None and view is not None:
                         film.add(view.draw(recording.engine))
-                    bar.update(task, completed=tick)
+                    progress.update(tick)
     except KeyboardInterrupt:
         if recording.ticks_recorded < 1:
             raise
@@ -110,8 +103,7 @@ def _simulate(recording: Rollout, film: Film | None, log: Console) -> bool:
 def _draw(
     folder: Path, recording: Rollout, observability: Observability, steady_from: float, log: Console
 ) -> list[Path]:
-    with progress(log) as bar:
-        bar.add_task("drawing figures", total=None)
+    with Progress(log, "drawing figures"):
         from coopenv.viz.figures import save_figures
 
         return save_figures(
@@ -125,8 +117,7 @@ def _draw(
 
 
 def _finish(film: Film, log: Console) -> Path:
-    with progress(log) as bar:
-        bar.add_task(f"finishing {film.path.name}", total=None)
+    with Progress(log, f"finishing {film.path.name}"):
         film.close()
     if isinstance(film, GifFilm):
         log.print("video: written as GIF; for MP4: pip install 'coopenv[video]'", soft_wrap=True)
@@ -154,28 +145,3 @@ def report(request: RunRequest, metrics: dict[str, Any], paths: list[Path], out:
     out.print(f"Outcome: {metrics['outcome']}. Simulated at {factor:.3g} times real time.")
     out.print(f"Files in {request.folder}:", soft_wrap=True)
     out.print(Padding(", ".join(path.name for path in paths), (0, 0, 0, 2)))
-
-
-def progress(log: Console) -> Progress:
-    """Return a progress display that vanishes when done, and is silent where nobody looks."""
-    return Progress(
-        SpinnerColumn(),
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TimeRemainingColumn(),
-        console=log,
-        transient=True,
-        disable=not log.is_terminal,
-    )
-
-
-@contextmanager
-def compile_notice(log: Console) -> Iterator[None]:
-    """Say what takes so long when kernels are not found in Warp's cache."""
-    timer = threading.Timer(COMPILE_NOTICE_AFTER, lambda: log.print("compiling kernels (once per machine) ..."))
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()

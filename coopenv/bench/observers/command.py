@@ -37,7 +37,7 @@ from coopenv.bench.observers.tables import (
 from coopenv.bench.tables import number_table
 from coopenv.estimation.metrics import json_ready
 from coopenv.observers.registry import available_names, find, observer_names, obstacle
-from coopenv.runs.command import progress
+from coopenv.runs.console import Progress
 from coopenv.runs.output import prepare_folder
 
 T = TypeVar("T")
@@ -227,6 +227,5 @@ def write_files(request: Request, outcome: Outcome, draws: Sequence[Draw], basin
 
 
 def _with_progress(log: Console, description: str, work: Callable[[Callable[[float], None]], T]) -> T:
-    with progress(log) as bar:
-        task = bar.add_task(description, total=1.0)
-        return work(lambda share: bar.update(task, completed=share))
+    with Progress(log, description, total=1.0) as progress:
+        return work(progress.update)

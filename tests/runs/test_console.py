@@ -1,0 +1,71 @@
+"""Progress: a bar on a terminal, lines elsewhere."""
+
+from __future__ import annotations
+
+import io
+from time import sleep
+
+import pytest
+from rich.console import Console
+
+from coopenv.runs import console as module
+from coopenv.runs.console import Progress, compile_notice
+
+
+@pytest.fixture
+def text(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
+    monkeypatch.setattr(module, "LINE_PERIOD", 0.01)
+    return io.StringIO()
+
+
+def wait_for(text: io.StringIO, words: str) -> None:
+    """Wait until a line says so; the line is written by another thread."""
+    while words not in text.getvalue():
+        sleep(0.005)
+
+
+def test_lines_where_there_is_no_terminal(text: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([100.0])
+    monkeypatch.setattr(module, "monotonic", lambda: next(clock, 120.0))
+    with Progress(Console(file=text, width=20), "simulating a long name", total=4) as progress:
+        wait_for(text, "simulating a long name: 20 s\n")
+        progress.update(1)
+        wait_for(text, "simulating a long name: 25 % after 20 s, about 60 s left\n")
+        progress.advance("drawing")
+        wait_for(text, "drawing: 50 % after 20 s, about 20 s left\n")
+
+
+def test_tracked_items_are_counted(text: io.StringIO) -> None:
+    with Progress(Console(file=text), "episodes") as progress:
+        assert list(progress.track(range(5))) == [0, 1, 2, 3, 4]
+        assert progress.line().startswith("episodes: 100 % after ")
+        assert list(progress.track(iter("ab"))) == ["a", "b"]
+
+
+def test_quick_work_says_nothing_where_there_is_no_terminal() -> None:
+    text = io.StringIO()
+    with Progress(Console(file=text), "quick", total=1) as progress:
+        progress.update(1)
+    assert text.getvalue() == ""
+
+
+def test_a_terminal_has_a_bar_that_vanishes(text: io.StringIO) -> None:
+    with Progress(Console(file=text, force_terminal=True, width=80), "simulating", total=2) as progress:
+        progress.update(1)
+        wait_for(text, "simulating")
+    assert " % after" not in text.getvalue()
+    assert text.getvalue().endswith("\x1b[2K")
+
+
+def test_an_error_ends_the_lines(text: io.StringIO) -> None:
+    with pytest.raises(KeyboardInterrupt), Progress(Console(file=text), "work") as progress:
+        raise KeyboardInterrupt
+    progress._lines.join(5.0)
+    assert not progress._lines.is_alive()
+
+
+def test_compiling_is_told_when_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "COMPILE_NOTICE_AFTER", 0.01)
+    text = io.StringIO()
+    with compile_notice(Console(file=text)):
+        wait_for(text, "compiling kernels (once per machine) ...\n")
