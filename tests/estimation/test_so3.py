@@ -92,7 +92,7 @@ def test_angle_in_float32() -> None:
 
 def test_angle_between_near_rotations() -> None:
     """The rotations themselves are of any size; only their difference is small or near a half turn."""
-    base = Rotation.random(200, rng=1).as_matrix()
+    base = Rotation.random(200, np.random.default_rng(1)).as_matrix()
     for angle in (1e-10, 1e-6, np.pi - 1e-10, np.pi - 1e-6):
         other = base @ Rotation.from_rotvec(angle * axes(174)[:200]).as_matrix()
         between = call("rotation_angle", "float64", np.swapaxes(base, 1, 2) @ other)
@@ -127,7 +127,7 @@ def test_quaternion_vector_is_scipys(q: tuple[float, float, float, float]) -> No
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_orthonormalise_removes_the_first_order(dtype: str) -> None:
     rng = np.random.default_rng(2)
-    R = Rotation.random(100, rng=rng).as_matrix()
+    R = Rotation.random(100, rng).as_matrix()
     dent = 1e-4 * rng.uniform(-1, 1, (100, 3, 3))
     mended = call("orthonormalise", dtype, R + dent)
     gram = np.swapaxes(mended, 1, 2) @ mended - np.eye(3)

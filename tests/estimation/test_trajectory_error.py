@@ -24,11 +24,11 @@ def paths() -> tuple[Path, Path]:
 def test_evo_s_figures() -> None:
     """As evo 1.38.1 gives them for these paths: APE, the same aligned by SE(3) Umeyama, RPE over 7 frames."""
     (R, p), (R_hat, p_hat) = paths()
-    assert absolute_error(p, p_hat) == pytest.approx(17.621529806694294, rel=1e-12)
-    assert absolute_error(p, p_hat, align=True) == pytest.approx(1.734678963076203, rel=1e-12)
-    assert relative_error(R, p, R_hat, p_hat, 7) == pytest.approx((4.392742811945746, 28.448216086288816), rel=1e-12)
+    assert absolute_error(p, p_hat) == pytest.approx(17.621529806694294, rel=1e-9)
+    assert absolute_error(p, p_hat, align=True) == pytest.approx(1.734678963076203, rel=1e-9)
+    assert relative_error(R, p, R_hat, p_hat, 7) == pytest.approx((4.392742811945746, 28.448216086288816), rel=1e-9)
     assert relative_error(R, p, R_hat, p_hat, 7, all_pairs=True) == pytest.approx(
-        (4.457429845532961, 28.417932637233935), rel=1e-12
+        (4.457429845532961, 28.417932637233935), rel=1e-9
     )
 
 

@@ -233,7 +233,7 @@ def test_a_scenario_is_frozen() -> None:
 def test_quaternions_are_normalised() -> None:
     data = changed("vehicles.0.initial_estimate.orientation_offset_wxyz", [0.7071, 0, 0, 0.7071])
     q = parse_scenario(data, "here").vehicles[0].initial_estimate.orientation_offset_wxyz
-    assert sum(x * x for x in q) == pytest.approx(1.0, abs=1e-15)
+    assert sum(x * x for x in q) == pytest.approx(1.0, abs=1e-14)
 
 
 def test_derived_counts_and_names() -> None:

@@ -152,7 +152,7 @@ def test_default_belief_is_the_truth() -> None:
     )
     world = start(made)
     position, angle = errors(world, world.get_state())
-    assert position.max() < 1e-14
+    assert position.max() < 1e-13
     assert angle.max() < 1e-6
 
 

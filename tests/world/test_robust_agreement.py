@@ -164,7 +164,7 @@ def test_a_liar_is_found_out_as_in_numpy() -> None:
         told[tick] = world.memory.distrusted.numpy()[0, 2].max()
 
     check(recording, replayed(recording, meddle), lie)
-    assert told[119] == 0 and told[125] == 1
+    assert told[119] == 0 and told[180] == 1
 
 
 def test_single_precision_worlds_estimate_alike() -> None:

@@ -17,7 +17,6 @@ from coopenv.observers.robust.types import mat33d, mat43d, mat66d, vec3d, vec6d
 from coopenv.world.launch import start_warp
 
 start_warp()
-RNG = np.random.default_rng(7)
 
 
 @wp.kernel(enable_backward=False, module_options={"max_unroll": 1}, module="unique")
@@ -52,15 +51,16 @@ def array(values: np.ndarray, dtype: Any) -> wp.array:
 
 @pytest.fixture(scope="module")
 def algebra() -> dict[str, np.ndarray]:
-    turns = RNG.normal(size=(200, 3))
-    turns *= (RNG.uniform(0, np.pi, 200) / np.linalg.norm(turns, axis=1))[:, None]
+    rng = np.random.default_rng(7)
+    turns = rng.normal(size=(200, 3))
+    turns *= (rng.uniform(0, np.pi, 200) / np.linalg.norm(turns, axis=1))[:, None]
     turns[:3] *= np.array([1e-12, 1e-7, 0.0])[:, None] / np.maximum(np.linalg.norm(turns[:3], axis=1), 1e-3)[:, None]
     turns[3:20] *= ((np.pi - np.geomspace(1e-9, 0.3, 17)) / np.linalg.norm(turns[3:20], axis=1))[:, None]
-    U = np.linalg.qr(RNG.normal(size=(200, 6, 6)))[0]
-    spectrum = 10.0 ** RNG.uniform(-4, 4, (200, 6))
+    U = np.linalg.qr(rng.normal(size=(200, 6, 6)))[0]
+    spectrum = 10.0 ** rng.uniform(-4, 4, (200, 6))
     given = {
         "R": Rotation.from_rotvec(turns).as_matrix(),
-        "p": RNG.normal(size=(200, 3)),
+        "p": rng.normal(size=(200, 3)),
         "A": U * spectrum[:, None] @ np.swapaxes(U, 1, 2),
     }
     shapes = {"w": vec3d, "e": vec6d, "F": mat66d, "inverse": mat66d, "regular": wp.bool}
@@ -84,7 +84,7 @@ def test_left_errors(algebra: dict[str, np.ndarray]) -> None:
 
 def test_the_transition_is_the_derivative_of_the_error(algebra: dict[str, np.ndarray]) -> None:
     """Moving a pose and its neighbour by the same odometry turns a small left error x into F x."""
-    x = 1e-6 * RNG.normal(size=6)
+    x = 1e-6 * np.random.default_rng(8).normal(size=6)
     for dR, dp, F in zip(algebra["R"][30:60], algebra["p"][30:60], algebra["F"][30:60], strict=True):
         moved = Rotation.from_rotvec(x[:3]).as_matrix()
         theta = Rotation.from_matrix(dR.T @ moved @ dR).as_rotvec()
@@ -99,14 +99,17 @@ def test_inverses(algebra: dict[str, np.ndarray]) -> None:
 
 def test_regularity_is_that_of_the_spectrum(algebra: dict[str, np.ndarray]) -> None:
     spectrum = np.linalg.eigvalsh(algebra["A"])
-    assert np.array_equal(algebra["regular"], spectrum[:, 0] > 1e-6 * spectrum[:, -1])
-    assert 0 < algebra["regular"].sum() < 200
+    ratio = spectrum[:, 0] / spectrum[:, -1]
+    clear = np.abs(np.log(ratio / 1e-6)) > 1e-3
+    assert (algebra["regular"] == (ratio > 1e-6))[clear].all()
+    assert 0 < algebra["regular"].sum() < 200 and clear.sum() > 190
 
 
 def test_distances_to_three_points_are_those_of_the_solver_in_numpy() -> None:
     """Every solution, and no other, in the same order."""
-    z = RNG.uniform(-10, 10, (400, 3, 3))
-    R, c = Rotation.random(400, RNG).as_matrix(), RNG.uniform(-15, 15, (400, 3))
+    rng = np.random.default_rng(9)
+    z = rng.uniform(-10, 10, (400, 3, 3))
+    R, c = Rotation.random(400, rng).as_matrix(), rng.uniform(-15, 15, (400, 3))
     lines = z - c[:, None]
     b = np.einsum("nji,nkj->nki", R, lines / np.linalg.norm(lines, axis=2, keepdims=True))
     pairs = ((0, 1), (0, 2), (1, 2))

@@ -39,7 +39,7 @@ def test_rows_are_root_means_over_seeds() -> None:
     for row in rows:
         assert row.ratio_to_bound == pytest.approx(row.position_rmse_m / row.bound_m)
         assert max(row.bound_m, row.bound_single_m) <= row.bound_ancestors_m * (1 + 1e-9)
-        assert row.degradation == 1.0 and row.gramian_min_eigenvalue >= 0.0
+        assert row.degradation == pytest.approx(1.0) and row.gramian_min_eigenvalue >= 0.0
 
 
 def test_every_fault_has_its_rows() -> None:
@@ -47,11 +47,11 @@ def test_every_fault_has_its_rows() -> None:
     assert list(dict.fromkeys(row.variant for row in rows)) == list(FAULTS)
     rmse = {name: [row.position_rmse_m for row in rows if row.variant == name] for name in FAULTS}
     for name in set(FAULTS) - {"nominal"}:
-        assert rmse[name] != rmse["nominal"]
+        assert rmse[name] != pytest.approx(rmse["nominal"], rel=1e-3)
         ratios = [row.degradation for row in rows if row.variant == name]
         assert ratios == pytest.approx(np.divide(rmse[name], rmse["nominal"]))
         assert degradation(rows, name) == pytest.approx(sum(rmse[name]) / sum(rmse["nominal"]))
-    assert rmse["lying_neighbour"][:2] == rmse["nominal"][:2]  # the liar and its leader
+    assert rmse["lying_neighbour"][:2] == pytest.approx(rmse["nominal"][:2], rel=1e-9)  # the liar and its leader
 
 
 class Raises(DeadReckoning):
@@ -78,8 +78,8 @@ def test_observers_registered_here_travel_to_other_processes(monkeypatch: pytest
     rows = compare(source, ["raises", "tells", "dead_reckoning"], 2, None, 0.5, Local(2)).rows
     assert len(failures(rows)) == 1 and "by design" in failures(rows)[0]
     assert np.isnan(rows[0].position_rmse_m) and rows[0].settled_fraction == 0.0 and rows[0].diverged_fraction == 1.0
-    assert [row.nis for row in rows[2:4]] == [1.5, 1.5] and np.isnan(rows[-1].nis)
-    assert [row.position_rmse_m for row in rows[2:4]] == [row.position_rmse_m for row in rows[4:]]
+    assert [row.nis for row in rows[2:4]] == pytest.approx([1.5, 1.5]) and np.isnan(rows[-1].nis)
+    assert [row.position_rmse_m for row in rows[2:4]] == pytest.approx([row.position_rmse_m for row in rows[4:]])
     dof = 2 * 2 * 60  # of two seeds, 1 s at 60 Hz
     assert [rows[2].nis_low, rows[2].nis_high] == pytest.approx(chi2.ppf([0.025, 0.975], dof) / dof)
     assert [rows[2].anees_low, rows[2].anees_high] == pytest.approx(chi2.ppf([0.025, 0.975], 12) / 12)

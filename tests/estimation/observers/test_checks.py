@@ -47,7 +47,7 @@ def test_what_is_no_estimate(fields: dict[str, Any], said: str) -> None:
 def test_rotations_and_covariances_of_any_rank_and_size_are_estimates(seed: int, rank: int, size: float) -> None:
     generator = np.random.default_rng(seed)
     root = 10.0**size * generator.standard_normal((6, rank))
-    R = Rotation.random(random_state=generator).as_matrix()
+    R = Rotation.random(None, generator).as_matrix()
     check_estimate(Estimate(R, generator.standard_normal(3), root @ root.T))
     check_estimate(Estimate(R.astype(np.float32), [1, 2, 3]))  # type: ignore[arg-type]
 

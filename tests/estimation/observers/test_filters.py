@@ -28,7 +28,7 @@ def spd(rng: np.random.Generator, n: int) -> np.ndarray:
 
 def pose(seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    return Rotation.random(random_state=seed).as_matrix(), rng.uniform(-5, 5, 3)
+    return Rotation.random(None, np.random.default_rng(seed)).as_matrix(), rng.uniform(-5, 5, 3)
 
 
 def tick(seed: int, noise: SensorNoise) -> Tick:

@@ -17,7 +17,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 def scene(seed: int, spread: float = 10.0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return (rotation, camera, points (3, 3), bearings (3, 3))."""
     rng = np.random.default_rng(seed)
-    R, c = Rotation.random(random_state=rng).as_matrix(), rng.uniform(-5, 5, 3)
+    R, c = Rotation.random(None, rng).as_matrix(), rng.uniform(-5, 5, 3)
     z = rng.uniform(-spread, spread, (3, 3))
     return R, c, z, seen(R, c, z)
 

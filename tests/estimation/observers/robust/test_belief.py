@@ -22,7 +22,7 @@ def positive(rng: np.random.Generator, n: int, scale: float = 1.0) -> np.ndarray
 
 def belief(seed: int = 0) -> Belief:
     rng = np.random.default_rng(seed)
-    poses = [(Rotation.random(random_state=seed + n).as_matrix(), rng.uniform(-9, 9, 3)) for n in range(3)]
+    poses = [(Rotation.random(None, rng).as_matrix(), rng.uniform(-9, 9, 3)) for _ in range(3)]
     result = Belief(0, *poses[0], positive(rng, 6, 1e-2))
     result.add([Member(n, *poses[n], odometry=(np.eye(3), np.zeros(3))) for n in (1, 2)], positive(rng, 12, 1e-2))
     result.P = positive(rng, 18, 1e-2)

@@ -28,7 +28,7 @@ class Sender:
     def __init__(self, seed: int) -> None:
         self.rng = np.random.default_rng(seed)
         self.belief = Belief(
-            1, Rotation.random(random_state=seed).as_matrix(), self.rng.normal(size=3), 0.01 * np.eye(6)
+            1, Rotation.random(None, np.random.default_rng(seed)).as_matrix(), self.rng.normal(size=3), 0.01 * np.eye(6)
         )
         self.odometry = np.eye(3), np.zeros(3)
         self.time = 0.0
@@ -77,7 +77,7 @@ def test_messages_hold_pose_and_covariance_and_no_more():
     rng = np.random.default_rng(0)
     A = rng.normal(size=(6, 6))
     marker = np.array([0.5, 0.0, 1.0])
-    belief = Belief(3, Rotation.random(random_state=1).as_matrix(), rng.normal(size=3), A @ A.T)
+    belief = Belief(3, Rotation.random(None, np.random.default_rng(1)).as_matrix(), rng.normal(size=3), A @ A.T)
     odometry = exp_so3(np.array([0.3, -2.0, 0.4])), rng.normal(size=3)
     message = to_message(belief, marker, odometry, mask_of({0, 5}))
     assert message.size_bytes <= 8 * (7 + 21)  # position, quaternion, triangle of the covariance
@@ -99,7 +99,7 @@ def test_other_observers_messages_are_not_ours():
 
 def test_covariance_at_the_marker():
     marker = np.array([0.5, -0.3, 1.0])
-    R, p = Rotation.random(random_state=2).as_matrix(), np.array([1.0, 2.0, 3.0])
+    R, p = Rotation.random(None, np.random.default_rng(2)).as_matrix(), np.array([1.0, 2.0, 3.0])
     e = 1e-7 * np.array([1.0, -2.0, 0.5, 0.3, 0.1, -0.7])
     moved_R, moved_p = R @ exp_so3(e[:3]), p + R @ e[3:]
     error = left_error(R, p + R @ marker, moved_R, moved_p + moved_R @ marker)

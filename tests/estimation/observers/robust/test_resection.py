@@ -9,7 +9,7 @@ from coopenv.observers.robust.reference.belief import Belief, Member, View
 from coopenv.observers.robust.reference.resection import resect
 from coopenv.observers.robust.reference.tracklets import left_error
 
-R, P = Rotation.random(random_state=3).as_matrix(), np.array([1.0, -2.0, 0.5])
+R, P = Rotation.random(None, np.random.default_rng(3)).as_matrix(), np.array([1.0, -2.0, 0.5])
 LANDMARKS = np.array([[8.0, 1.0, 2.0], [3.0, 9.0, -1.0], [-4.0, -3.0, 5.0]])
 MEMBER = np.array([-6.0, 7.0, 1.0])
 STD = 0.003

@@ -34,7 +34,7 @@ def searched(recording, search, ticks):
 def test_motion_tells_the_solutions_apart(seed):
     recording = noise_free(3.0)
     rng = np.random.default_rng(seed)
-    R = Rotation.random(rng=rng).as_matrix()
+    R = Rotation.random(None, rng).as_matrix()
     search = Search(0, R, recording.truth.position[0, 0] + rng.normal(size=3) * 5, WIDE.copy())
     k, found = searched(recording, search, recording.ticks)
     assert found is not None
