@@ -136,15 +136,6 @@ def analyse_observability(
     )
 
 
-def observability_gramian(scene: Scene, window: float = DEFAULT_WINDOW) -> tuple[np.ndarray, np.ndarray]:
-    """Return the window starts (M,) in s and W(t) (M, N, 6, 6) over (2 lambda, p) in the body frame at t."""
-    start, W, anchor = _windows_about_anchor(scene, window)
-    R = scene.rotation[start]
-    blocks = np.zeros((*R.shape[:-2], 6, 6))
-    blocks[..., :3, :3] = blocks[..., 3:, 3:] = R
-    return scene.t[start], np.swapaxes(blocks, -1, -2) @ _move_origin(W, -anchor) @ blocks
-
-
 def _windows_about_anchor(scene: Scene, window: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return start ticks (M,), W in map axes (M, N, 6, 6), and the points (N, 3) in m that it is taken about.
 

@@ -1,9 +1,7 @@
 """Absolute and relative trajectory error, as the tool evo defines them (APE and RPE), in NumPy.
 
-Sources: Sturm, Engelhard, Endres, Burgard and Cremers, A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012
-(both errors); Umeyama, Least-squares estimation of transformation parameters between two point patterns, IEEE PAMI
-13(4), 1991 (alignment). Maps here are global, so nothing is aligned unless asked for: an alignment would hide the
-mirrored solution.
+Source: Sturm, Engelhard, Endres, Burgard and Cremers, A benchmark for the evaluation of RGB-D SLAM systems, IROS 2012.
+Maps here are global, so nothing is aligned: an alignment would hide the mirrored solution.
 """
 
 from __future__ import annotations
@@ -25,48 +23,26 @@ class RelativeError(NamedTuple):
     orientation: float  # deg
 
 
-def absolute_error(position: Array, position_estimate: Array, align: bool = False) -> float:
+def absolute_error(position: Array, position_estimate: Array) -> float:
     """Return ATE: the root mean square of |p - phat| in m, over the ticks whose truth is known.
 
     Args:
         position: (K, 3) map, m; rows with NaN are left out.
         position_estimate: (K, 3) map, m.
-        align: move the estimate rigidly to the truth first (SE(3), Umeyama).
     """
     known = np.isfinite(position).all(axis=-1)
     if not known.any():
         return float("nan")
-    p, p_hat = position[known], position_estimate[known]
-    if align:
-        R, t = rigid_alignment(p_hat, p)
-        p_hat = p_hat @ R.T + t
-    return float(np.sqrt(np.mean(np.sum((p - p_hat) ** 2, axis=-1))))
-
-
-def rigid_alignment(source: Array, target: Array) -> tuple[Array, Array]:
-    """Return the rotation R (3, 3) and translation t (3,) that minimise sum |target - R source - t|^2.
-
-    Of points on one line the turn about it is arbitrary.
-
-    Args:
-        source: (K, 3).
-        target: (K, 3).
-    """
-    a, b = source.mean(axis=0), target.mean(axis=0)
-    U, _, Vt = np.linalg.svd((target - b).T @ (source - a))
-    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))]) @ Vt
-    return R, b - R @ a
+    difference = position[known] - position_estimate[known]
+    return float(np.sqrt(np.mean(np.sum(difference**2, axis=-1))))
 
 
 def relative_error(
-    rotation: Array,
-    position: Array,
-    rotation_estimate: Array,
-    position_estimate: Array,
-    delta: int,
-    all_pairs: bool = False,
+    rotation: Array, position: Array, rotation_estimate: Array, position_estimate: Array, delta: int
 ) -> RelativeError:
     """Return RPE: the root mean square over pairs (k, k + delta) of E = (P_k^-1 P_k+)^-1 (Phat_k^-1 Phat_k+).
+
+    Pairs do not overlap: k = 0, delta, 2 delta, ...
 
     Args:
         rotation: (K, 3, 3) true, body to map; pairs with NaN are left out.
@@ -74,9 +50,8 @@ def relative_error(
         rotation_estimate: (K, 3, 3).
         position_estimate: (K, 3) m.
         delta: ticks, at least 1; relative errors of different deltas cannot be compared.
-        all_pairs: pairs that overlap, k = 0, 1, ...; False: k = 0, delta, 2 delta, ...
     """
-    start = np.arange(0, max(len(position) - delta, 0), 1 if all_pairs else delta)
+    start = np.arange(0, max(len(position) - delta, 0), delta)
     known: NDArray[np.bool_] = np.isfinite(np.concatenate([rotation, position[..., None]], axis=-1)).all(axis=(-1, -2))
     start = start[known[start] & known[start + delta]]
     if not len(start):

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.observability import analyse_observability, observability_gramian
+from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.trajectory import Sight, Trajectory
 from tests.synthetic import LANDMARKS, NEIGHBOURS, START, VELOCITY, make_trajectory
 
@@ -81,14 +81,12 @@ def reference_gramian(vehicle: int, start: float, window: float) -> np.ndarray:
 def test_gramian_agrees_with_an_ode_solver_while_the_body_turns(vehicle: int) -> None:
     run = make_trajectory(ticks=121, yaw_rate=YAW_RATE)
     run = dataclasses.replace(run, visible=run.sight != Sight.NOT_A_NEIGHBOUR)
-    t, W = observability_gramian(run, window=1.0)
-    assert len(t) == 61
-    reference = reference_gramian(vehicle, t[30], 1.0)
-    assert_allclose(W[30, vehicle], reference, atol=2e-6 * np.abs(reference).max())
     result = analyse_observability(run, window=1.0)
-    eigenvalues = np.linalg.eigvalsh(reference)
-    assert result.min_eigenvalue[30, vehicle] == pytest.approx(eigenvalues[0], rel=1e-3)
-    assert result.condition_number[30, vehicle] == pytest.approx(eigenvalues[-1] / eigenvalues[0], rel=1e-3)
+    assert len(result.t) == 61
+    for k in (0, 30, 60):
+        eigenvalues = np.linalg.eigvalsh(reference_gramian(vehicle, result.t[k], 1.0))
+        assert result.min_eigenvalue[k, vehicle] == pytest.approx(eigenvalues[0], rel=1e-3)
+        assert result.condition_number[k, vehicle] == pytest.approx(eigenvalues[-1] / eigenvalues[0], rel=1e-3)
 
 
 def test_gramian_agrees_with_the_notes_on_the_busy_intersection() -> None:
@@ -98,13 +96,12 @@ def test_gramian_agrees_with_the_notes_on_the_busy_intersection() -> None:
 
 
 def test_switching_visibility_is_integrated_over_time() -> None:
-    """A target seen during half of the window weighs half: the trapezoid across the switch, tick by tick."""
-    run = scene(np.zeros(3), LANDMARKS[:1])
-    seen = np.arange(61)[:, None, None] < 30
-    half = dataclasses.replace(run, visible=seen)
-    _, W = observability_gramian(run)
-    _, W_half = observability_gramian(half)
-    assert_allclose(W_half[0, 0], W[0, 0] * 29.5 / 60, rtol=1e-12, atol=1e-14)
+    """Targets seen during half of the window weigh half: the trapezoid across the switch, tick by tick."""
+    run = scene(np.zeros(3), LANDMARKS)
+    half = dataclasses.replace(run, visible=run.visible & (np.arange(61)[:, None, None] < 30))
+    whole, part = analyse_observability(run), analyse_observability(half)
+    assert_allclose(part.min_eigenvalue[0], whole.min_eigenvalue[0] * 29.5 / 60, rtol=1e-9)
+    assert_allclose(part.condition_number[0], whole.condition_number[0], rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -209,7 +206,8 @@ def test_uneven_ticks_weigh_by_their_duration() -> None:
         if f.name not in ("vehicles", "targets", "target_moving")
     }
     window = 2.0
-    _, W = observability_gramian(dataclasses.replace(even, **uneven), window)
-    _, W_even = observability_gramian(even, window)
+    result = analyse_observability(dataclasses.replace(even, **uneven), window)
+    expected = analyse_observability(even, window)
     for vehicle in (0, 1, 2):  # whose visibility does not switch in this time
-        assert_allclose(W[0, vehicle], W_even[0, vehicle], atol=1e-4 * np.abs(W_even[0, vehicle]).max())
+        for name in ("min_eigenvalue", "condition_number", "local_eigenvalue"):
+            assert getattr(result, name)[0, vehicle] == pytest.approx(getattr(expected, name)[0, vehicle], rel=1e-3)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.errors import CoopenvError, suggest
+from coopenv.errors import CoopenvError
 from coopenv.observers.contract import Message
 from coopenv.observers.recording import Recording
 
@@ -173,17 +173,6 @@ FAULTS = {
     ),
 }
 """By the name of the variant."""
-
-
-def find_fault(name: str) -> Fault:
-    """Return a fault by name.
-
-    Raises:
-        CoopenvError: there is none of that name.
-    """
-    if name not in FAULTS:
-        raise CoopenvError(f"unknown variant '{name}'{suggest(name, list(FAULTS))}; known: {', '.join(FAULTS)}")
-    return FAULTS[name]
 
 
 def _generator(seed: int, stream: int) -> np.random.Generator:

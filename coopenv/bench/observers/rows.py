@@ -82,9 +82,6 @@ class Row:
 
 NOWHERE = Interval(float("nan"), float("nan"))
 
-MEASURED = ("us_per_update",)
-"""Columns that differ between two runs of the same command."""
-
 
 def rows_of(environment: str, samples: Sequence[Sample]) -> list[Row]:
     """Sum up samples over seeds, in the order of variants and observers in which they come."""

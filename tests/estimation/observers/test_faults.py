@@ -14,7 +14,6 @@ import coopenv
 from coopenv.bench.observers.faults import (
     FAULTS,
     Lie,
-    find_fault,
     liar,
     with_delay,
     with_loss,
@@ -160,9 +159,3 @@ def test_nobody_to_lie_to() -> None:
     lonely = replace(made(), setups=tuple(replace(s, targets=np.arange(3)) for s in made().setups))
     with pytest.raises(CoopenvError, match="none can lie"):
         liar(lonely)
-
-
-def test_unknown_fault() -> None:
-    assert find_fault("v2x_loss") is FAULTS["v2x_loss"]
-    with pytest.raises(CoopenvError, match="did you mean 'v2x_loss'"):
-        find_fault("v2x_los")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coopenv.bench.observers.faults import Lie, find_fault
+from coopenv.bench.observers.faults import FAULTS, Lie
 from coopenv.bench.observers.initial_estimates import random_start
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
@@ -74,7 +74,7 @@ def test_messages_are_as_small_as_promised(name, most):
 @pytest.mark.parametrize("fault", ["v2x_loss", "v2x_delay", "wrong_association", "lying_neighbour", "landmarks_lost"])
 @BOTH
 def test_faults_do_not_mislead(name, fault):
-    record, lie = find_fault(fault).applied(small_errors(12.0), 0)
+    record, lie = FAULTS[fault].applied(small_errors(12.0), 0)
     result = run(name, record, lie)
     assert not result.failure
     assert (result.position_error[-1] < 0.6).all()
@@ -101,7 +101,7 @@ def test_a_joint_liar_is_as_sure_in_every_entry():
 
 
 def test_a_liar_is_found_out_and_tracked_all_the_same():
-    record, lie = find_fault("lying_neighbour").applied(small_errors(12.0), 0)
+    record, lie = FAULTS["lying_neighbour"].applied(small_errors(12.0), 0)
     seen = {}
 
     class Watched(Robust):
