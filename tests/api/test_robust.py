@@ -17,7 +17,7 @@ import coopenv.observers.registry as registry
 from coopenv.api.engine import Engine
 from coopenv.observers import register
 from coopenv.observers.robust.plugin import Robust
-from tests.backends import mrclam_files
+from tests.helpers import mrclam_files
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "the paper's start": ("busy_intersection", {"horizon": 3.0}),

@@ -21,8 +21,8 @@ from coopenv.backends.mrclam.recording import recording_of
 from coopenv.cli import main
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Truth
-from tests.backends import mrclam_files
-from tests.backends.recordings import differences, simulated
+from tests.helpers import mrclam_files
+from tests.helpers.recordings import differences, simulated
 
 pytest.importorskip("mcap", reason="needs the extra 'log'")
 

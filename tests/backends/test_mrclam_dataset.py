@@ -15,7 +15,7 @@ from coopenv.backends.mrclam.files import read_recording
 from coopenv.backends.mrclam.odometry import MAX_HOLD_S, HeldCommands
 from coopenv.backends.mrclam.variants import check_variant, frames_of
 from coopenv.errors import DataError, DataWarning
-from tests.backends.mrclam_files import LANDMARKS, write
+from tests.helpers.mrclam_files import LANDMARKS, write
 
 
 @pytest.fixture(scope="module")

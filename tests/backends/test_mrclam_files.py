@@ -9,7 +9,7 @@ import pytest
 
 from coopenv.backends.mrclam.files import find_folder, read_recording
 from coopenv.errors import DataError
-from tests.backends.mrclam_files import BARCODES, LANDMARKS, ORIGIN, command, pose, write
+from tests.helpers.mrclam_files import BARCODES, LANDMARKS, ORIGIN, command, pose, write
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from coopenv.backends.mrclam.recording import DRIFT_STD, MESSAGE_PERIOD_TICKS, S
 from coopenv.errors import DataError
 from coopenv.observers.planar.plugin import PlanarEkf, PlanarRobust
 from coopenv.observers.runner import run
-from tests.backends.mrclam_files import LANDMARKS, pose, real_folder, write
+from tests.helpers.mrclam_files import LANDMARKS, pose, real_folder, write
 
 REAL = real_folder()
 ORIGIN_S = 0.1  # of the synthetic files: the first odometry sample

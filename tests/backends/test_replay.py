@@ -26,8 +26,8 @@ from coopenv.backends.mrclam import load_dataset
 from coopenv.backends.mrclam.recording import recording_of
 from coopenv.backends.replay import Replay
 from coopenv.observers import Recording, run
-from tests.backends import mrclam_files
-from tests.backends.recordings import simulated
+from tests.helpers import mrclam_files
+from tests.helpers.recordings import simulated
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "plain": ("busy_intersection", {}),

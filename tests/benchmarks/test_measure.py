@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.speed.measure import Result, measure, units_of_work
 from benchmarks.speed.workers import WorkerError, Workers
-from tests.benchmarks.fake_library import FAKE, SHARE, STEP, fake_case
+from tests.helpers.fake_library import FAKE, SHARE, STEP, fake_case
 
 
 @pytest.fixture

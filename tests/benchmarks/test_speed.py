@@ -12,7 +12,7 @@ from jsonschema import validate
 from benchmarks.speed import peer_cases, run
 from benchmarks.speed.__main__ import command, main, parser
 from benchmarks.speed.report import BUSY
-from tests.benchmarks.fake_library import FAKE, SHARE, fake_case
+from tests.helpers.fake_library import FAKE, SHARE, fake_case
 
 NUMBER = {"type": "number", "exclusiveMinimum": 0}
 COUNT = {"type": "integer", "minimum": 1}

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.stats import ortho_group
 
-from tests.world.calls import DTYPES, EPSILON, call
+from tests.helpers.warp_calls import DTYPES, EPSILON, call
 
 SPECTRA = {
     "random": np.random.default_rng(0).uniform(0.1, 10.0, (60, 6)),

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from coopenv.estimation import metrics
 from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.trajectory import Trajectory
-from tests.synthetic import INITIAL_ERROR, RATE, make_trajectory
+from tests.helpers.synthetic import INITIAL_ERROR, RATE, make_trajectory
 
 unit_vectors = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 1e-2)
 angles_deg = st.one_of(

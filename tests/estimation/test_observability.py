@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.trajectory import Sight, Trajectory
-from tests.synthetic import LANDMARKS, NEIGHBOURS, START, VELOCITY, make_trajectory
+from tests.helpers.synthetic import LANDMARKS, NEIGHBOURS, START, VELOCITY, make_trajectory
 
 YAW_RATE = 0.7
 

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import quad_vec
 from scipy.spatial.transform import Rotation
 
-from tests.world.calls import DTYPES, EPSILON, call
+from tests.helpers.warp_calls import DTYPES, EPSILON, call
 
 ANGLES = np.concatenate(
     [

@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 
 from coopenv.errors import ScenarioError, ScenarioWarning
 from coopenv.scenario import Scenario, checks, parse_scenario
-from tests.world import builders
-from tests.world.builders import errors, landmark, run, start, vehicle
+from tests.helpers import builders
+from tests.helpers.builders import errors, landmark, run, start, vehicle
 
 
 def fleet(*neighbours: list[str] | None, **sections: Any) -> Scenario:

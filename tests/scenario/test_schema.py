@@ -9,7 +9,7 @@ import pytest
 
 from coopenv.errors import ScenarioError
 from coopenv.scenario import Scenario, load_scenario, parse_scenario
-from tests.world import builders
+from tests.helpers import builders
 
 
 def complete() -> dict[str, Any]:

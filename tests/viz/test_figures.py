@@ -34,7 +34,7 @@ from coopenv.viz.labels import place_names
 from coopenv.viz.observability import observability_figure
 from coopenv.viz.topology import topology_figure
 from coopenv.viz.trajectories import trajectory_figure_2d, trajectory_figure_3d
-from tests.synthetic import make_trajectory
+from tests.helpers.synthetic import make_trajectory
 
 NAMES = list(FIGURE_NAMES)
 
@@ -121,7 +121,7 @@ def test_global_state_of_matplotlib_is_left_alone() -> None:
     code = (
         "import tempfile, matplotlib as mpl, matplotlib._pylab_helpers\n"
         "before = dict(mpl.rcParams)\n"
-        "from tests.synthetic import make_trajectory\n"
+        "from tests.helpers.synthetic import make_trajectory\n"
         "from coopenv.viz.figures import save_figures\n"
         "save_figures(make_trajectory(ticks=20), tempfile.mkdtemp())\n"
         "assert dict(mpl.rcParams) == before\n"

@@ -1,1 +1,1 @@
-"""Tests of the simulated world, and what they share: scenario builders and callers of Warp functions."""
+"""Tests of the simulated world."""

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.errors import ScenarioError
 from coopenv.estimation.trajectory import Sight
+from tests.helpers.builders import landmark, quaternion_wxyz, run, scenario, start, vehicle
+from tests.helpers.warp_calls import DTYPES, call
 from tests.oracles import geometry, philox
-from tests.world.builders import landmark, quaternion_wxyz, run, scenario, start, vehicle
-from tests.world.calls import DTYPES, call
 
 PIXY = {"fx": 213.161906, "fy": 213.521038, "cx": 154.841998, "cy": 114.98398}
 SIZE = {"width": 316, "height": 208}

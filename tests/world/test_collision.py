@@ -10,8 +10,8 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.trajectory import Outcome
-from tests.world.builders import command, constant, landmark, reset, run, scenario, start, vehicle
-from tests.world.calls import DTYPES, call
+from tests.helpers.builders import command, constant, landmark, reset, run, scenario, start, vehicle
+from tests.helpers.warp_calls import DTYPES, call
 
 
 def overlap(ca: np.ndarray, Ra: np.ndarray, ha: np.ndarray, cb: np.ndarray, Rb: np.ndarray, hb: np.ndarray) -> float:

@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from tests.world.builders import constant, landmark, run, scenario, start, vehicle
-from tests.world.calls import DTYPES
+from tests.helpers.builders import constant, landmark, run, scenario, start, vehicle
+from tests.helpers.warp_calls import DTYPES
 
 SEGMENTS = [
     {"duration": 0.5, "linear": [1.0, 0.0, 0.0]},

@@ -10,10 +10,10 @@ from numpy.testing import assert_allclose
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from tests.helpers.builders import command, constant, run, scenario, start, vehicle
+from tests.helpers.warp_calls import DTYPES
 from tests.oracles.continuous import left_jacobian
 from tests.oracles.philox import philox4x32
-from tests.world.builders import command, constant, run, scenario, start, vehicle
-from tests.world.calls import DTYPES
 
 NOISE = {"velocity": 0.3, "angular_velocity": 0.2}
 SEGMENTS = {

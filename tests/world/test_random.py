@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from tests.helpers.warp_calls import DTYPES, call
 from tests.oracles import philox
-from tests.world.calls import DTYPES, call
 
 LARGEST = 2**32 - 1
 

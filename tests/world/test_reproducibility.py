@@ -8,8 +8,8 @@ import pytest
 from coopenv.errors import DeviceError
 from coopenv.scenario import Scenario
 from coopenv.world.world import World
-from tests.world.builders import command, constant, reset, same_bits, scenario, start, vehicle
-from tests.world.calls import DTYPES
+from tests.helpers.builders import command, constant, reset, same_bits, scenario, start, vehicle
+from tests.helpers.warp_calls import DTYPES
 
 State = dict[str, np.ndarray]
 

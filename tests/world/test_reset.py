@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from tests.world.builders import errors, estimated_position, quaternion_wxyz, scenario, start, vehicle
-from tests.world.calls import DTYPES
+from tests.helpers.builders import errors, estimated_position, quaternion_wxyz, scenario, start, vehicle
+from tests.helpers.warp_calls import DTYPES
 
 WORLDS = 4000
 

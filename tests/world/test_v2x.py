@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from tests.world.builders import LANDMARKS, constant, estimated_position, landmark, run, scenario, start, vehicle
+from tests.helpers.builders import LANDMARKS, constant, estimated_position, landmark, run, scenario, start, vehicle
 
 State = dict[str, np.ndarray]
 ESTIMATE = {"position_offset": [0.5, -0.4, 0.2], "orientation_offset_wxyz": [0.98, 0.0, 0.0, 0.198997487]}

@@ -19,7 +19,7 @@ import coopenv
 
 pytestmark = pytest.mark.train
 torch.set_num_threads(1)
-EXAMPLE = Path(__file__).parents[2] / "examples" / "train_ppo.py"
+EXAMPLE = Path(__file__).parents[3] / "examples" / "train_ppo.py"
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,7 @@ from coopenv.observers import (
 from coopenv.observers.group import Group
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
-from tests.estimation.observers.batch import small_errors
+from tests.oracles.batch import small_errors
 
 
 @cache
@@ -347,7 +347,7 @@ def test_the_example_is_better_than_odometry(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(registry, "_registered", {})
-    runpy.run_path(str(Path(__file__).parents[3] / "examples" / "own_observer.py"))
+    runpy.run_path(str(Path(__file__).parents[2] / "examples" / "own_observer.py"))
     rows = {line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines()[1:]}
     own, odometry = (np.array(rows[name][:5], float) for name in ("complementary", "dead_reckoning"))
     assert (own < odometry).all() and own[0] < 0.5

@@ -13,7 +13,7 @@ from coopenv.observers.contract import Received
 from coopenv.observers.robust.plugin import Robust, RobustJoint
 from coopenv.observers.robust.reference.belief import Belief, Member
 from coopenv.observers.robust.reference.eviction import FORGET_TIME, room_for
-from tests.estimation.observers.robust.scenes import crowd, small_errors
+from tests.helpers.robust_scenes import crowd, small_errors
 
 VEHICLES = 12
 

@@ -13,8 +13,8 @@ from coopenv.observers import Coordinates, Estimate, SensorNoise, run
 from coopenv.observers.left_invariant import InvariantError, LeftInvariant
 from coopenv.observers.mekf import LeftError, Mekf
 from coopenv.observers.ukf import SPREAD, Ukf, sigma_points
-from tests.estimation.observers.batch import small_record, solve
-from tests.estimation.observers.test_filters import QUIET, pose, spd, tick
+from tests.observers.test_filters import QUIET, pose, spd, tick
+from tests.oracles.batch import small_record, solve
 
 LARGE = np.array([1.1, -0.7, 0.9, 3.0, -2.0, 5.0])
 

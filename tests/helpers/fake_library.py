@@ -8,7 +8,7 @@ from functools import cache
 
 from benchmarks.speed.cases import Built, Case, Library
 
-FAKE = Library("fake", "json", "tests.benchmarks.fake_library:build", ("pytest",))
+FAKE = Library("fake", "json", "tests.helpers.fake_library:build", ("pytest",))
 STEP = 0.002
 """Wall time of a step, s."""
 SHARE = 0.25

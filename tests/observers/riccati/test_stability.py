@@ -7,7 +7,7 @@ import pytest
 
 from coopenv.scenario import Scenario
 from coopenv.world.world import World
-from tests.world.builders import LANDMARKS, constant, landmark, scenario, start, vehicle
+from tests.helpers.builders import LANDMARKS, constant, landmark, scenario, start, vehicle
 
 NOISE = {
     "velocity": 0.05,

@@ -12,7 +12,7 @@ from coopenv.api.engine import Engine
 from coopenv.observers import run
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
-from tests.estimation.observers.batch import small_errors
+from tests.oracles.batch import small_errors
 
 CASES: dict[str, dict[str, Any]] = {
     "the paper's start": {"horizon": 8.0},

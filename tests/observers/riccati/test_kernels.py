@@ -11,8 +11,7 @@ from numpy.testing import assert_allclose
 
 from coopenv.scenario import load_scenario
 from coopenv.world.world import World
-from tests.oracles import continuous, splitting
-from tests.world.builders import (
+from tests.helpers.builders import (
     constant,
     errors,
     estimated_position,
@@ -23,6 +22,7 @@ from tests.world.builders import (
     start,
     vehicle,
 )
+from tests.oracles import continuous, splitting
 
 LEVER = (0.3, -0.1, 0.2)
 

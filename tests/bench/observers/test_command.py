@@ -21,8 +21,8 @@ from coopenv.bench.observers.faults import FAULTS
 from coopenv.bench.observers.rows import Row
 from coopenv.cli import main
 from coopenv.observers import registry
-from tests.backends import mrclam_files
-from tests.bench.leaderboard.test_compare import Raises
+from tests.bench.observers.test_compare import Raises
+from tests.helpers import mrclam_files
 
 REQUIRED = {
     *("environment", "variant", "observer", "vehicle", "position_rmse_m", "orientation_rmse_deg", "bound_m", "anees"),

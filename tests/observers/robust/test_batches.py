@@ -7,8 +7,8 @@ import pytest
 
 from coopenv.scenario import Scenario
 from coopenv.world.world import World
-from tests.world.builders import constant, reset, same_bits, scenario, start, vehicle
-from tests.world.calls import DTYPES
+from tests.helpers.builders import constant, reset, same_bits, scenario, start, vehicle
+from tests.helpers.warp_calls import DTYPES
 
 State = dict[str, np.ndarray]
 LOST = {"position_radius": 4.0, "orientation_angle": "uniform"}

@@ -288,7 +288,7 @@ def _geometry(p: Precision, module: wp.Module) -> dict[str, Any]:
 def _kernels(dtype: str) -> dict[str, wp.Kernel]:
     found: dict[str, Any] = {}
     for group in (_rotations, _matrices, _observer, _numbers, _geometry):
-        module = wp.get_module(f"tests.world.calls{group.__name__}.{dtype}")
+        module = wp.get_module(f"tests.helpers.warp_calls{group.__name__}.{dtype}")
         module.options["enable_backward"] = False
         found |= group(precision(dtype), module)
     return {name: value for name, value in found.items() if isinstance(value, wp.Kernel)}

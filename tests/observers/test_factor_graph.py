@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from coopenv.errors import CoopenvError
 from coopenv.observers import Coordinates, run
 from coopenv.observers.registry import NEEDS, available_names, find, observer_names
-from tests.estimation.observers.batch import small_record
+from tests.oracles.batch import small_record
 
 
 def test_a_missing_module_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:

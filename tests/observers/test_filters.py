@@ -16,7 +16,7 @@ from coopenv.observers.mekf import LeftError, innovation, kalman, transition
 from coopenv.observers.right_invariant import RightError, from_left
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
-from tests.estimation.observers.batch import small_record, solve
+from tests.oracles.batch import small_record, solve
 
 STATES = {Coordinates.LEFT: LeftError, Coordinates.RIGHT: RightError}
 

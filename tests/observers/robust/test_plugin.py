@@ -12,7 +12,7 @@ from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.planar.plugin import PlanarRobust
 from coopenv.observers.registry import find
 from coopenv.observers.robust.plugin import Robust, RobustJoint
-from tests.estimation.observers.robust.scenes import everybody_sees_everybody, noise_free, shifted, small_errors
+from tests.helpers.robust_scenes import everybody_sees_everybody, noise_free, shifted, small_errors
 
 BOTH = pytest.mark.parametrize("name", ["robust", "robust_joint"])
 

@@ -20,9 +20,9 @@ from coopenv.observers.robust.reference.search import PATIENCE
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from coopenv.world.world import World
-from tests.estimation.observers.robust.scenes import crowd
-from tests.world.builders import constant, scenario, vehicle
-from tests.world.replays import Played, replayed
+from tests.helpers.builders import constant, scenario, vehicle
+from tests.helpers.replays import Played, replayed
+from tests.helpers.robust_scenes import crowd
 
 ISOTROPIC = {"noise.bearing.model": "isotropic", "noise.bearing.scale": 0.0029}
 LOSSY = {"v2x.delay": 6, "v2x.loss": 0.3}

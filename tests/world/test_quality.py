@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import metrics
-from tests.world.calls import DTYPES, call
+from tests.helpers.warp_calls import DTYPES, call
 
 COUNT = 300
 

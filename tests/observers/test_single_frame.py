@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from coopenv.observers import Message, Received, Tick, run
 from coopenv.observers.mekf import LeftError
 from coopenv.observers.single_frame import PerspectivePoints
-from tests.estimation.observers.batch import small_record
-from tests.estimation.observers.test_filters import QUIET, tick
+from tests.observers.test_filters import QUIET, tick
+from tests.oracles.batch import small_record
 
 SIGMA = 2e-3
 POINTS = np.array([[8.0, 0.0, 1.0], [0.0, 9.0, -2.0], [-7.0, -3.0, 4.0], [2.0, -8.0, -1.0], [5.0, 6.0, 5.0]])

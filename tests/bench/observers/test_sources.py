@@ -15,7 +15,7 @@ from coopenv.bench.observers.sources import variants_of
 from coopenv.errors import CoopenvError
 from coopenv.observers import run
 from coopenv.runs.recorder import record
-from tests.backends import mrclam_files
+from tests.helpers import mrclam_files
 
 
 def test_a_log_file_gives_the_rows_of_what_it_recorded(tmp_path: Path) -> None:

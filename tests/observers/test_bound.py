@@ -12,7 +12,7 @@ from coopenv.observers.bound import ancestors, cramer_rao, cramer_rao_ancestors,
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
-from tests.estimation.observers.batch import small_errors, small_record, solve
+from tests.oracles.batch import small_errors, small_record, solve
 
 
 def test_joint_bound_is_the_batch_solution_s_covariance() -> None:

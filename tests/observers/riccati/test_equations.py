@@ -12,9 +12,9 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from tests.helpers.warp_calls import call
 from tests.oracles import splitting
 from tests.oracles.continuous import skew
-from tests.world.calls import call
 
 GAINS = (0.51, 0.6, 1.0, 2.5, 5.0, 80.0, 1000.0)
 
