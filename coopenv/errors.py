@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+MAX_MESSAGE = 600
+"""Characters of an error, which is to be one line that can be read."""
+
 
 class CoopenvError(ValueError):
-    """Base of all errors that name a mistake in the input."""
+    """Base of all errors that name a mistake in the input: one line, in which control characters are escaped."""
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(shortened(printable(" ".join(message.split())), MAX_MESSAGE))
 
 
 class UnknownEnvironmentError(CoopenvError):
@@ -56,7 +63,43 @@ def checked_seed(seed: object) -> int:
     return int(number)
 
 
+def check_memory(size: float, what: str, available: int | None = None) -> None:
+    """Refuse what would not fit into memory, before it is allocated.
+
+    Args:
+        size: bytes that are needed.
+        what: what needs them, to begin the error with.
+        available: bytes there are; None: of this machine.
+
+    Raises:
+        CoopenvError: it needs more.
+    """
+    if available is None:
+        available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2**34
+    if size > available:
+        raise CoopenvError(f"{what} would need {size / 2**30:.3g} GiB of memory, there are {available / 2**30:.3g}")
+
+
+def printable(text: str) -> str:
+    """Return a text whose control characters, which a terminal would obey, are escaped."""
+    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
+def shortened(text: str, length: int = 60) -> str:
+    """Return a text of at most that many characters, what is too much left out of its middle."""
+    half = (length - 3) // 2
+    return text if len(text) <= length else f"{text[:half]}...{text[-half:]}"
+
+
+def shown(value: object) -> str:
+    """Return a value as an error quotes it: as Python writes it, but short."""
+    try:
+        return shortened(repr(value))
+    except Exception:  # numbers of thousands of digits, and anybody's classes
+        return f"a {type(value).__name__}"
+
+
 def suggest(word: str, valid: Iterable[str]) -> str:
     """Return ` (did you mean 'x'?)` for the nearest valid word, else the empty string."""
-    near = get_close_matches(word, list(valid), n=1, cutoff=0.5)
+    near = get_close_matches(word[:MAX_MESSAGE], list(valid), n=1, cutoff=0.5)
     return f" (did you mean '{near[0]}'?)" if near else ""

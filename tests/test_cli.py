@@ -134,7 +134,7 @@ def test_results_that_cannot_be_written_are_found_before_the_run(
     "options",
     [
         ["urban_crossing", "--set", "observer.name=dead_reckoning", "--policy", "give_way"],
-        ["busy_intersection", "--set", "observer.q=1e30", "--dtype", "float32"],
+        ["busy_intersection", "--set", "observer.q=1e9", "--dtype", "float32"],
     ],
 )
 def test_lost_observers_have_tables_and_figures(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -21,11 +21,15 @@ def _unit_quaternion(q: tuple[float, float, float, float]) -> tuple[float, float
     return (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
 
 
-Vector2 = tuple[float, float]
-Vector3 = tuple[float, float, float]
-QuaternionWxyz = Annotated[tuple[float, float, float, float], AfterValidator(_unit_quaternion)]
-Positive = Annotated[float, Field(gt=0.0)]
-NonNegative = Annotated[float, Field(ge=0.0)]
+LARGEST = 1e9
+"""Of any quantity, in its own unit: products of four such numbers still fit into single precision."""
+
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Vector2 = tuple[Number, Number]
+Vector3 = tuple[Number, Number, Number]
+QuaternionWxyz = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_unit_quaternion)]
+Positive = Annotated[float, Field(gt=0.0, le=LARGEST)]
+NonNegative = Annotated[float, Field(ge=0.0, le=LARGEST)]
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Loss = Annotated[float, Field(ge=0.0, lt=1.0)]
 Rate = Annotated[float, Field(ge=1e-3, le=1e5)]

@@ -10,6 +10,7 @@ from pydantic import Field, field_validator, model_validator
 from coopenv.scenario.base import (
     NonNegative,
     NonNegativeVector3,
+    Number,
     Part,
     Positive,
     PositiveVector3,
@@ -36,7 +37,7 @@ class Obstacle(Part):
     """Centre in the coordinates of this file, m."""
     size: PositiveVector3
     """Length, width and height, m."""
-    yaw: float = 0.0
+    yaw: Number = 0.0
     """Rotation about z, rad."""
 
 
@@ -114,7 +115,7 @@ class DrivenMotion(Part):
     """Driven by the agent's actions through the kinematic bicycle of `[dynamics]`."""
 
     kind: Literal["driven"] = "driven"
-    initial_speed: float = 0.0
+    initial_speed: Number = 0.0
     """m/s"""
 
 
@@ -130,7 +131,7 @@ class InitialPose(Part):
 
     position: Vector3
     """In the coordinates of this file, m."""
-    yaw: float | None = None
+    yaw: Number | None = None
     """Rotation about z, rad (0 when neither yaw nor a quaternion is given)."""
     quaternion_wxyz: QuaternionWxyz | None = None
     """Full orientation, body to map."""
@@ -159,7 +160,7 @@ class InitialEstimate(Part):
     """Rhat(0) = R(0) Rot(offset)."""
     orientation_angle: NonNegative | Literal["uniform"] = 0.0
     """A further turn about a random axis by an angle drawn from [0, this] rad; `uniform`: over SO(3)."""
-    yaw: float | None = None
+    yaw: Number | None = None
     """Absolute believed yaw, rad; replaces R(0) above."""
     quaternion_wxyz: QuaternionWxyz | None = None
     """Absolute believed orientation; replaces R(0) above."""
@@ -193,7 +194,7 @@ class Landmark(Part):
     name: str = Field(min_length=1, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
     position: Vector3
     """Position (of its origin, at t = 0) in the coordinates of this file, m."""
-    yaw: float = 0.0
+    yaw: Number = 0.0
     """Orientation of a moving landmark's body at t = 0, rad."""
     motion: LandmarkMotion = StaticMotion()
     body: Body | None = None

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from coopenv.scenario.base import NonNegative, Part, Positive
+from coopenv.scenario.base import NonNegative, Number, Part, Positive
 
 ObservationGroup = Literal["estimate", "quality", "bearings", "odometry", "messages", "goal"]
 OBSERVATION_GROUPS: tuple[ObservationGroup, ...] = (
@@ -68,25 +68,25 @@ class Action(Part):
 class RewardWeights(Part):
     """Weights of the named terms of the reward, per decision step; the reward is their weighted sum."""
 
-    progress: float = 0.0
+    progress: Number = 0.0
     """Decrease of the true distance to the goal, m (privileged)."""
-    arrival: float = 0.0
+    arrival: Number = 0.0
     """1 in the step of arrival."""
-    collision: float = 0.0
+    collision: Number = 0.0
     """-1 in the step of a collision."""
-    control: float = 0.0
+    control: Number = 0.0
     """-|action|^2"""
-    time: float = 0.0
+    time: Number = 0.0
     """-1 per second"""
-    position_error: float = 0.0
+    position_error: Number = 0.0
     """-|position error|, m (privileged)."""
-    orientation_error: float = 0.0
+    orientation_error: Number = 0.0
     """-orientation error, rad (privileged)."""
-    uncertainty: float = 0.0
+    uncertainty: Number = 0.0
     """-log det P / 6: minus the mean log variance."""
-    observability: float = 0.0
+    observability: Number = 0.0
     """log10 of the smallest eigenvalue of the sliding Gramian (floor 1e-9)."""
-    visibility: float = 0.0
+    visibility: Number = 0.0
     """Share of its possible targets that the vehicle has in view."""
 
 

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from coopenv.scenario.base import (
     Loss,
     NonNegative,
+    Number,
     Part,
     Positive,
     PositiveVector2,
@@ -39,7 +40,7 @@ class Camera(Part):
     """fx and fy, pixels."""
     principal_point: Vector2 = (154.841998, 114.98398)
     """cx and cy, pixels."""
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[Number, Number, Number, Number, Number] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """k1, k2, p1, p2, k3 of the plumb-bob model."""
     undistort: bool = True
     """Whether bearings are computed from undistorted pixels."""

@@ -1,121 +1,133 @@
-"""What a recording says once, as plain data: who is there, gains, noise, starts, and the scenario it came from."""
+"""What a recording says once: who is there, gains, noise, starts, and the scenario it came from (`recording.json`)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from dataclasses import fields, is_dataclass
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, Field, ValidationError
 
+from coopenv.errors import DataError
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Recording
+from coopenv.scenario.base import Number, Part, Vector3
 from coopenv.scenario.files import parse_scenario
+from coopenv.scenario.validation import one_line
+
+Index = Annotated[int, Field(ge=0, lt=2**31)]
+
+Vector6 = tuple[Number, Number, Number, Number, Number, Number]
+Matrix3 = tuple[Vector3, Vector3, Vector3]
+Matrix6 = tuple[Vector6, Vector6, Vector6, Vector6, Vector6, Vector6]
 
 
-def facts_of(recording: Recording) -> dict[str, Any]:
-    """Return everything of a recording that does not change from tick to tick."""
-    return {
-        "ticks": recording.ticks,
-        "dt": recording.dt,
-        "order": list(recording.order),
-        "period": recording.period,
-        "staleness": None if math.isinf(recording.staleness) else recording.staleness,
-        "setups": [_setup_facts(setup) for setup in recording.setups],
-        "start_rotation": recording.start_rotation.tolist(),
-        "start_position": recording.start_position.tolist(),
-        "start_covariance": recording.start_covariance.tolist(),
-        "scenario": None if recording.scenario is None else recording.scenario.model_dump(mode="json"),
+class NoiseHeader(Part):
+    """A `SensorNoise`."""
+
+    velocity: Number
+    angular_velocity: Number
+    odometry_period: Number
+    bearing: Number
+    image_axis: Vector3 | None
+
+
+class GainsHeader(Part):
+    """The `Gains` of one vehicle."""
+
+    k: Number
+    q: tuple[Number, ...]
+    V: tuple[Number, Number]
+    P0: tuple[Number, Number]
+    max_turn: Number
+
+
+class SetupHeader(Part):
+    """The `Setup` of one vehicle."""
+
+    vehicle: Index
+    name: str
+    target_names: tuple[str, ...]
+    landmarks: Index
+    targets: tuple[Index, ...]
+    lever_arm: Vector3
+    marker: Vector3
+    planar: bool
+    noise: NoiseHeader
+    gains: GainsHeader
+
+
+class Header(Part):
+    """Everything of a `Recording` that does not change from tick to tick; `check_recording` knows what makes sense."""
+
+    ticks: int = Field(ge=1)
+    dt: Number
+    order: tuple[Index, ...]
+    period: int
+    staleness: Number | None
+    """s; none: messages are used for ever."""
+    setups: tuple[SetupHeader, ...] = Field(min_length=1)
+    start_rotation: tuple[Matrix3, ...]
+    start_position: tuple[Vector3, ...]
+    start_covariance: tuple[Matrix6, ...]
+    scenario: dict[str, Any] | None
+
+    @classmethod
+    def of(cls, recording: Recording) -> Header:
+        """Return the header of a recording."""
+        return cls.model_validate({name: _plain(getattr(recording, name)) for name in cls.model_fields})
+
+    @classmethod
+    def read(cls, text: bytes, where: str) -> Header:
+        """Return a header from its JSON.
+
+        Raises:
+            DataError: it is no header; `where` begins the line.
+        """
+        try:
+            return cls.model_validate_json(text, strict=True)
+        except ValidationError as error:
+            raise DataError(one_line(error, where, cls)) from None
+
+    def constants(self, where: str) -> dict[str, Any]:
+        """Return the arguments of a `Recording` that the header gives.
+
+        Raises:
+            ScenarioError: its scenario describes no possible world.
+        """
+        return {
+            "setups": tuple(_setup(setup) for setup in self.setups),
+            "order": self.order,
+            "dt": self.dt,
+            "period": self.period,
+            "staleness": math.inf if self.staleness is None else self.staleness,
+            "start_rotation": np.array(self.start_rotation),
+            "start_position": np.array(self.start_position),
+            "start_covariance": np.array(self.start_covariance),
+            "scenario": None if self.scenario is None else parse_scenario(self.scenario, where),
+        }
+
+
+def _plain(value: Any) -> Any:
+    """Return plain data of what a recording holds."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, tuple):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if is_dataclass(value):
+        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
+    return None if value == math.inf else value
+
+
+def _setup(header: SetupHeader) -> Setup:
+    arrays = {
+        "targets": np.array(header.targets, np.int64),
+        "lever_arm": np.array(header.lever_arm),
+        "marker": np.array(header.marker),
+        "noise": SensorNoise(**dict(header.noise)),
+        "gains": Gains(**{**dict(header.gains), "q": np.array(header.gains.q)}),
     }
-
-
-def _setup_facts(setup: Setup) -> dict[str, Any]:
-    noise, gains = setup.noise, setup.gains
-    return {
-        "vehicle": setup.vehicle,
-        "name": setup.name,
-        "target_names": list(setup.target_names),
-        "landmarks": setup.landmarks,
-        "targets": setup.targets.tolist(),
-        "lever_arm": setup.lever_arm.tolist(),
-        "marker": setup.marker.tolist(),
-        "planar": setup.planar,
-        "noise": {
-            "velocity": noise.velocity,
-            "angular_velocity": noise.angular_velocity,
-            "odometry_period": noise.odometry_period,
-            "bearing": noise.bearing,
-            "image_axis": None if noise.image_axis is None else list(noise.image_axis),
-        },
-        "gains": {
-            "k": gains.k,
-            "q": gains.q.tolist(),
-            "V": list(gains.V),
-            "P0": list(gains.P0),
-            "max_turn": gains.max_turn,
-        },
-    }
-
-
-def _noise(facts: Mapping[str, Any]) -> SensorNoise:
-    axis = facts["image_axis"]
-    x, y, z = (0.0, 0.0, 0.0) if axis is None else _array(axis, 3).tolist()
-    return SensorNoise(
-        velocity=float(facts["velocity"]),
-        angular_velocity=float(facts["angular_velocity"]),
-        odometry_period=float(facts["odometry_period"]),
-        bearing=float(facts["bearing"]),
-        image_axis=None if axis is None else (x, y, z),
-    )
-
-
-def setup_from(facts: Mapping[str, Any]) -> Setup:
-    """Return a setup from its plain data."""
-    gains = facts["gains"]
-    return Setup(
-        vehicle=int(facts["vehicle"]),
-        name=str(facts["name"]),
-        target_names=tuple(facts["target_names"]),
-        landmarks=int(facts["landmarks"]),
-        targets=np.array(facts["targets"], np.int64),
-        lever_arm=_array(facts["lever_arm"], 3),
-        marker=_array(facts["marker"], 3),
-        noise=_noise(facts["noise"]),
-        gains=Gains(
-            k=float(gains["k"]),
-            q=_array(gains["q"], len(facts["target_names"])),
-            V=_pair(gains["V"]),
-            P0=_pair(gains["P0"]),
-            max_turn=float(gains["max_turn"]),
-        ),
-        planar=bool(facts["planar"]),
-    )
-
-
-def constants_from(facts: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return the arguments of a `Recording` that its facts give.
-
-    Raises:
-        KeyError, TypeError, ValueError: facts are missing or malformed (a `ScenarioError` is a ValueError).
-    """
-    N = len(facts["setups"])
-    return {
-        "setups": tuple(setup_from(setup) for setup in facts["setups"]),
-        "order": tuple(int(i) for i in facts["order"]),
-        "dt": float(facts["dt"]),
-        "period": int(facts["period"]),
-        "staleness": math.inf if facts["staleness"] is None else float(facts["staleness"]),
-        "start_rotation": _array(facts["start_rotation"], N, 3, 3),
-        "start_position": _array(facts["start_position"], N, 3),
-        "start_covariance": _array(facts["start_covariance"], N, 6, 6),
-        "scenario": None if facts["scenario"] is None else parse_scenario(facts["scenario"], where),
-    }
-
-
-def _array(values: Any, *shape: int) -> np.ndarray:
-    return np.array(values, dtype=np.float64).reshape(shape)
-
-
-def _pair(values: Any) -> tuple[float, float]:
-    first, second = values
-    return float(first), float(second)
+    return Setup(**{**dict(header), **arrays})

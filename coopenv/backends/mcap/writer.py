@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.mcap.header import facts_of
+from coopenv.backends.mcap.header import Header
 from coopenv.backends.mcap.messages import ATTACHMENT, EXACT, FORMAT, LANDMARKS, LANDMARKS_TYPE, SHOWN, codec, topic
 from coopenv.errors import OutputError
 from coopenv.observers.recording import Recording
+from coopenv.observers.recording_checks import check_recording
 from coopenv.shipped import version
 
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
@@ -28,10 +28,12 @@ def write_recording(recording: Recording, path: str | Path) -> None:
 
     Raises:
         CoopenvError: the extra `log` is not installed.
+        DataError: it is a recording that nobody could read back.
         OutputError: the file cannot be written.
     """
     codec()  # before the file is touched
     path = Path(path)
+    check_recording(recording, "recording")
     unfinished = path.with_name(path.name + ".part")
     try:
         with unfinished.open("wb") as stream:
@@ -73,10 +75,10 @@ class _Log:
     def write(self) -> None:
         """Write everything."""
         r = self.recording
-        facts = json.dumps(facts_of(r), allow_nan=False).encode()
-        about = {"format": FORMAT, "version": version(), "sha256": hashlib.sha256(facts).hexdigest()}
+        header = Header.of(r).model_dump_json().encode()
+        about = {"format": FORMAT, "version": version(), "sha256": hashlib.sha256(header).hexdigest()}
         self.writer.add_metadata("coopenv", about)
-        self.writer.add_attachment(0, 0, ATTACHMENT, "application/json", facts)
+        self.writer.add_attachment(0, 0, ATTACHMENT, "application/json", header)
         for i, setup in enumerate(r.setups):  # so that topics are there even if nothing is ever known
             for name, kind in {**EXACT, **SHOWN}.items():
                 self._channel(topic(setup.name, name), kind)

@@ -20,6 +20,7 @@ from coopenv.backends.mrclam.variants import Variant, check_variant, frames_of
 from coopenv.errors import DataError
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Recording, Truth
+from coopenv.observers.recording_checks import check_recording
 
 TICK_S = 0.05
 MESSAGE_PERIOD_TICKS = 2  # 10 Hz, as V2X radios send
@@ -42,7 +43,7 @@ def recording_of(dataset: Dataset, variant: Variant) -> Recording:
         variant: `landmarks` (no robot sees another), `landmarks+robots`, or `blind` (robots 3 to 5 see robots only).
 
     Raises:
-        DataError: unknown variant, or motion capture never sees a robot.
+        DataError: unknown variant, motion capture never sees a robot, or its data make no sense.
     """
     check_variant(variant)
     subjects = [*sorted(dataset.landmarks), *ROBOTS]
@@ -68,7 +69,7 @@ def recording_of(dataset: Dataset, variant: Variant) -> Recording:
     start_rotation, landmarks = _yaw(start[:, 2]), np.broadcast_to(points, (K, L, 3))
     for array in (rotation, translation, velocity, angular_velocity, bearings, visible, start_rotation):
         array.setflags(write=False)  # observers get views
-    return Recording(
+    recording = Recording(
         setups=_setups(subjects, L),
         order=tuple(range(N)),
         dt=TICK_S,
@@ -88,6 +89,8 @@ def recording_of(dataset: Dataset, variant: Variant) -> Recording:
         start_covariance=covariance,
         truth=truth,
     )
+    check_recording(recording, dataset.name)
+    return recording
 
 
 def _setups(subjects: list[int], landmarks: int) -> tuple[Setup, ...]:

@@ -13,6 +13,7 @@ from coopenv.backends.replay.device_recording import upload
 from coopenv.backends.replay.kernels import redeliver_kernel, replay_kernel, resense_kernel, rewind_kernel
 from coopenv.backends.replay.scenario import scenario_of
 from coopenv.observers.recording import Briefing, Recording, Sensed
+from coopenv.observers.recording_checks import check_recording
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import ROBUST, Kernels
 from coopenv.world.launch import PerWorld
@@ -23,7 +24,8 @@ class Replay:
     """A recording as a backend. Actions change nothing; every episode is the recording again."""
 
     def __init__(self, recording: Recording, name: str, overrides: Mapping[str, Any] | None = None) -> None:
-        """Find the recording's scenario; arguments and errors as for `scenario_of`."""
+        """Find the recording's scenario; arguments and errors as for `check_recording` and `scenario_of`."""
+        check_recording(recording, name)
         self.recording = recording
         self.scenario = scenario_of(recording, name, overrides or {})
 

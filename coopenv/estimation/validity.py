@@ -1,0 +1,68 @@
+"""Which entries of arrays are numbers, unit vectors, rotations or covariances at all: for what comes from outside."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coopenv.estimation.arrays import Array
+from coopenv.scenario.base import LARGEST
+
+Mask = NDArray[np.bool_]
+
+MAX_BEND = 1e-6
+"""By how much entries of R^T R may differ from those of I, and the squared length of a direction from 1."""
+MAX_ASYMMETRY = 1e-6
+"""By how much entries of a covariance may differ from its transpose, relative to the standard deviations."""
+
+
+def are_numbers(values: Array) -> Mask:
+    """Return where values are finite and not beyond any quantity."""
+    return np.asarray(np.abs(values) <= LARGEST)
+
+
+def everywhere(mask: Mask, *axes: int) -> Mask:
+    """Return where a mask holds all along some axes."""
+    return np.asarray(mask.all(axis=axes))
+
+
+def are_unit_vectors(vectors: Array, tolerance: float = MAX_BEND) -> Mask:
+    """Return (...) which vectors (..., 3) have length 1."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(np.abs(np.square(vectors).sum(axis=-1) - 1.0) <= tolerance)
+
+
+def are_rotations(matrices: Array, tolerance: float = MAX_BEND) -> Mask:
+    """Return (...) which matrices (..., 3, 3) are rotations."""
+    bounded = everywhere(np.abs(matrices) <= 2.0, -1, -2)
+    R = np.where(bounded[..., None, None], matrices, 0.0)
+    bend = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2), initial=0.0)
+    first, second, third = (R[..., :, axis] for axis in range(3))
+    handedness = (np.cross(first, second) * third).sum(axis=-1)
+    return np.asarray(bounded & (bend <= tolerance) & (handedness > 0.0))
+
+
+def are_covariances(matrices: Array, least: float) -> Mask:
+    """Return (...) which matrices (..., n, n) are symmetric and definite enough.
+
+    Args:
+        matrices: variances up to the square of the largest number.
+        least: smallest eigenvalue that their correlations may have; below 0 for those that are singular or rounded.
+    """
+    P = np.asarray(matrices, dtype=np.float64)
+    bounded = everywhere(np.abs(P) <= LARGEST**2, -1, -2)
+    P = np.where(bounded[..., None, None], P, 0.0)
+    variances = np.diagonal(P, axis1=-2, axis2=-1)
+    std = np.sqrt(np.where(variances > 0.0, variances, 1.0))
+    correlation = P / (std[..., :, None] * std[..., None, :])
+    skew = np.abs(correlation - np.swapaxes(correlation, -1, -2)).max(axis=(-1, -2), initial=0.0)
+    return np.asarray(bounded & (skew <= MAX_ASYMMETRY) & _eigenvalues_exceed(correlation, least))
+
+
+def _eigenvalues_exceed(matrices: Array, least: float) -> Mask:
+    """Return (...) which symmetric matrices have no eigenvalue below one; a Cholesky factor of all is soonest made."""
+    try:
+        np.linalg.cholesky(matrices - least * np.eye(matrices.shape[-1]))
+    except np.linalg.LinAlgError:
+        return np.asarray(np.linalg.eigvalsh(matrices)[..., 0] > least)
+    return np.ones(matrices.shape[:-2], dtype=bool)
