@@ -20,6 +20,8 @@ from coopenv.backends.base import Backend
 from coopenv.backends.simulated import Simulated
 from coopenv.backends.sources import open_backend
 from coopenv.errors import CoopenvError, ScenarioError, checked_seed, suggest
+from coopenv.observers.contract import Factory
+from coopenv.observers.registry import named
 from coopenv.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -231,7 +233,7 @@ def parallel_env(
     name_or_path: str | Path,
     *,
     render_mode: str | None = None,
-    observer: str | None = None,
+    observer: str | Factory | None = None,
     backend: str | None = None,
     observation: Literal["flat", "dict"] = "flat",
     device: str = "cpu",
@@ -247,8 +249,8 @@ def parallel_env(
     Args:
         name_or_path: for example "busy_intersection"; "mrclam_6" or "drive.mcap" replay what was recorded.
         render_mode: None, "rgb_array" or "human".
-        observer: estimator that every vehicle runs, embedded or a plug-in (`coopenv.observers.register`);
-            None: as the scenario says.
+        observer: estimator that every vehicle runs, embedded or a plug-in: a name, a class, or where one stands
+            (`mine.py:Mine`, `package.module:Mine`); None: as the scenario says.
         backend: where measurements come from, "simulated" or "replay"; None: as the name says.
         observation: "flat" Box or one-level "dict".
         device: "cpu" or a CUDA device.
@@ -266,7 +268,7 @@ def parallel_env(
         raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
     merged = dict(overrides or {})
     if observer is not None:
-        merged["observer.name"] = observer
+        merged["observer.name"] = named(observer)
     return CooperativeLocalisationEnv(
         open_backend(name_or_path, backend, merged, data, variant),
         Path(str(name_or_path)).stem,

@@ -1,6 +1,7 @@
 """Observers by name: the zoo, those registered in the program, and those of installed packages.
 
-A package offers its own under the entry point group `coopenv.observers`.
+A package offers its own under the entry point group `coopenv.observers`. What is in a file or module of the user's own
+is named by its place: `mine.py:Mine` or `package.module:Mine`.
 """
 
 from __future__ import annotations
@@ -9,9 +10,12 @@ import re
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
+from pathlib import Path
+from typing import cast
 
 from coopenv.errors import CoopenvError, suggest
 from coopenv.observers.contract import Factory
+from coopenv.user_code import absolute, is_reference, load, one_line
 
 GROUP = "coopenv.observers"
 
@@ -46,6 +50,8 @@ do not exist (`robust_joint` is `robust` there)."""
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
 
 _registered: dict[str, Factory] = {}
+_places: dict[str, str] = {}
+"""Where those of `_registered` stand that are named by their place."""
 
 
 def register(name: str, factory: Factory) -> None:
@@ -65,6 +71,48 @@ def register(name: str, factory: Factory) -> None:
     if name in ZOO or _registered.get(name, factory) is not factory:
         raise CoopenvError(f"an observer named '{name}' exists already")
     _registered[name] = factory
+
+
+def named(observer: str | Factory) -> str:
+    """Return the name of an observer; a class or a place in code becomes known by the name of the class.
+
+    Where another observer has that name, the name of its file or module is put before it: `mine.Riccati`.
+
+    Args:
+        observer: name, which is returned as it is, `file.py:Class`, `package.module:Class`, or a class or function of
+            a setup.
+
+    Raises:
+        CoopenvError: there is none at that place, it is no observer or has no name, or its names are taken.
+    """
+    if isinstance(observer, str) and not is_reference(observer):
+        return observer
+    place, factory = (absolute(observer), find(observer)) if isinstance(observer, str) else ("", observer)
+    name = place.rpartition(":")[2] or getattr(factory, "__name__", "")
+    if not callable(factory) or not NAME.fullmatch(name):
+        raise CoopenvError(f"observer {factory!r:.60}: expected a name, or a class or function that has one")
+    module = Path(place.rpartition(":")[0]).stem if place else str(factory.__module__)
+    full = f"{module.rpartition('.')[2]}.{name}"
+    for short in (name, full):
+        if _registered.get(short) is factory:
+            return short
+        replaced = _registered.get(short)
+        again = replaced is not None and _origin(replaced) == _origin(factory)  # edited and loaded once more
+        if again or short not in observer_names():
+            _registered.pop(short, None)
+            register(short, factory)
+            _places[short] = place
+            return short
+    raise CoopenvError(f"observers named '{name}' and '{full}' exist already: rename the class")
+
+
+def _origin(factory: Factory) -> tuple[object, object]:
+    return getattr(factory, "__module__", None), getattr(factory, "__qualname__", factory)
+
+
+def portable(name: str) -> str | Factory:
+    """Return what `find` takes in another process, which does not know what was registered in this one."""
+    return _places.get(name) or _registered.get(name, name)
 
 
 def _installed() -> dict[str, EntryPoint]:
@@ -104,12 +152,19 @@ def available_names(planar: bool | None = None) -> list[str]:
     return [name for name in observer_names() if name not in strangers and not obstacle(name)]
 
 
-def find(name: str) -> Factory:
-    """Return the factory of a name.
+def find(name: str | Factory) -> Factory:
+    """Return the factory of a name or of a place in code; a factory itself as it is.
 
     Raises:
-        CoopenvError: unknown name, or what it needs is not installed, or a package's observer cannot be loaded.
+        CoopenvError: unknown name, or what it needs is not installed, or it cannot be loaded, or is no factory.
     """
+    if not isinstance(name, str):
+        return name
+    if is_reference(name):
+        factory = load(name)
+        if not callable(factory):
+            raise CoopenvError(f"observer '{name}': expected a class or function, got {factory!r:.60}")
+        return cast(Factory, factory)
     if missing(name):
         raise CoopenvError(f"observer '{name}' {obstacle(name)}")
     if name in ZOO:
@@ -124,8 +179,7 @@ def find(name: str) -> Factory:
     try:
         return point.load()
     except (Exception, SystemExit) as error:  # anybody's code
-        what = " ".join(f"{type(error).__name__}: {error}".split())  # on one line
-        raise CoopenvError(f"observer '{name}' ({point.value}) cannot be loaded: {what}") from error
+        raise CoopenvError(f"observer '{name}' ({point.value}) cannot be loaded: {one_line(error)}") from error
 
 
 def is_joint(factory: Factory) -> bool:

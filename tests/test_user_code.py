@@ -1,0 +1,87 @@
+"""Classes of the user's own, by file and by module."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from coopenv.errors import CoopenvError
+from coopenv.user_code import absolute, is_reference, load
+
+SOURCE = """
+from dataclasses import dataclass
+from helper_beside import VALUE
+
+@dataclass
+class Mine:
+    value: int = VALUE
+"""
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "mine.py").write_text(SOURCE)
+    (tmp_path / "helper_beside.py").write_text("VALUE = 7\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "helper_beside", raising=False)
+    return tmp_path
+
+
+def test_a_class_in_a_file_is_loaded_once_and_imports_its_neighbours(folder: Path) -> None:
+    path = list(sys.path)
+    mine = load("mine.py:Mine")
+    assert dataclasses.is_dataclass(mine) and mine().value == 7
+    assert load(f"{folder}/mine.py:Mine") is mine and load(absolute("mine.py:Mine")) is mine
+    assert sys.path == path and "mine" not in sys.modules
+
+
+def test_a_changed_file_is_loaded_again(folder: Path) -> None:
+    before = load("mine.py:Mine")
+    (folder / "mine.py").write_text(SOURCE.replace("VALUE\n\n", "VALUE\n\nVALUE = 9\n\n"))
+    os.utime("mine.py", ns=(0, 10**18))
+    after = load("mine.py:Mine")
+    assert after is not before and after().value == 9
+
+
+def test_files_of_one_name_are_two_modules(folder: Path) -> None:
+    (folder / "other").mkdir()
+    (folder / "other/mine.py").write_text("class Mine: value = 8")
+    assert (load("mine.py:Mine")().value, load("other/mine.py:Mine").value) == (7, 8)
+
+
+def test_modules_are_found_from_here(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert load("os.path:join") is os.path.join
+    (folder / "module_found_from_here.py").write_text("class Mine: pass")
+    assert load("module_found_from_here:Mine").__module__ == "module_found_from_here"
+    monkeypatch.delitem(sys.modules, "module_found_from_here")
+
+
+@pytest.mark.parametrize(
+    ("reference", "message"),
+    [
+        ("mine.py:Mien", r"no 'Mien' in mine\.py \(did you mean 'Mine'\?\)"),
+        ("yours.py:Mine", r"no such file: .*yours\.py"),
+        ("mine.py:", "expected file.py:Name"),
+        (":Mine", "expected file.py:Name"),
+        ("mine.py:a b", "expected file.py:Name"),
+        ("no.such.module:Mine", "cannot be loaded: ModuleNotFoundError"),
+        ("raises.py:Mine", "cannot be loaded: ZeroDivisionError: division by zero$"),
+        ("leaves.py:Mine", "cannot be loaded: SystemExit: 3$"),
+        ("broken.py:Mine", "cannot be loaded: SyntaxError"),
+    ],
+)
+def test_mistakes_are_one_line(folder: Path, reference: str, message: str) -> None:
+    (folder / "raises.py").write_text("1 / 0")
+    (folder / "leaves.py").write_text("raise SystemExit(3)")
+    (folder / "broken.py").write_text("class Mine(")
+    with pytest.raises(CoopenvError, match=message) as caught:
+        load(reference)
+    assert "\n" not in str(caught.value)
+
+
+def test_names_are_no_references() -> None:
+    assert is_reference("mine.py:Mine") and not is_reference("riccati")
