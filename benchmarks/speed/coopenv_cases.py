@@ -7,6 +7,7 @@ from itertools import cycle
 from typing import Any
 
 import numpy as np
+import warp as wp
 
 from benchmarks.speed.cases import COOPENV, Built, Case, parallel_step
 from benchmarks.speed.growth import growth_scenario
@@ -99,6 +100,7 @@ def _batch_step(env: CooperativeVectorEnv) -> Callable[[], int]:
 def array_bytes(engine: Engine) -> int:
     """Return the size of every array that has the world as leading axis."""
     world = engine.world
-    records = [engine.report, world.state, *([] if world.memory is None else [world.memory])]
-    arrays = [getattr(record, name) for record in records for name in record._cls.vars]
+    records = [engine.report, world.state, world.memory]
+    fields = [getattr(record, name) for record in records for name in record._cls.vars]
+    arrays = [field for field in fields if isinstance(field, wp.array)]
     return sum(a.capacity for a in [*arrays, world.actions, world.mask])

@@ -16,6 +16,7 @@ from coopenv.api.rewards import reward_weights
 from coopenv.backends.base import Backend
 from coopenv.backends.simulated import Simulated
 from coopenv.scenario import Scenario
+from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
 from coopenv.world.state import check_fit, overwrite, state_fields
 
@@ -49,8 +50,12 @@ class Engine:
         backend = backend or Simulated(scenario)
         self.world = backend.world(worlds, dtype, device, threads)
         name = scenario.observer.name
-        self.plugins = None if self.world.estimates else PlugIns(name, self.world, backend.senses(self.world))
+        self.plugins = (
+            None if self.world.observer is not HOST else PlugIns(name, self.world, backend.senses(self.world))
+        )
         """The observers that run on the host; None where the embedded one estimates."""
+        if self.world.observer is HOST:
+            self.plugins = PlugIns(scenario.observer.name, self.world, backend.senses(self.world))
         self.layout = observation_layout(scenario)
         device = self.world.device
         self.report = allocate_report(self.world.model, worlds, layout_size(self.layout), self.world.precision, device)

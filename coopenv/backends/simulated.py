@@ -7,7 +7,8 @@ import math
 import numpy as np
 
 from coopenv.estimation.trajectory import Sight
-from coopenv.observers.briefing import briefing_of
+from coopenv.observers.briefing import briefing_of, start_covariances
+from coopenv.observers.embedded import find_embedded
 from coopenv.observers.recording import Briefing, Sensed
 from coopenv.scenario import Scenario
 from coopenv.world.world import World
@@ -21,7 +22,8 @@ class Simulated:
 
     def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> World:
         """Return the world."""
-        return World(self.scenario, worlds, dtype, device, threads)
+        observer = find_embedded(self.scenario.observer.name)
+        return World(self.scenario, worlds, dtype, device, threads, observer, start_covariances(self.scenario))
 
     def senses(self, world: World) -> SimulatedSenses:
         """Return the reader of its ticks."""

@@ -73,6 +73,11 @@ def start_covariance(scenario: Scenario, vehicle: int) -> Array:
     return np.diag(np.repeat(variances, 3))
 
 
+def start_covariances(scenario: Scenario) -> Array:
+    """Return the covariances (N, 6, 6) of all initial estimates, see `start_covariance`."""
+    return np.array([start_covariance(scenario, i) for i in range(len(scenario.vehicles))])
+
+
 def briefing_of(scenario: Scenario, model: Any) -> Briefing:
     """Return what the observers of a simulated world are told."""
     return Briefing(
@@ -82,5 +87,5 @@ def briefing_of(scenario: Scenario, model: Any) -> Briefing:
         period=scenario.v2x.period,
         staleness=math.inf if scenario.v2x.staleness is None else scenario.v2x.staleness,
         flight=max(scenario.v2x.delay, 1),
-        start_covariance=np.array([start_covariance(scenario, i) for i in range(len(scenario.vehicles))]),
+        start_covariance=start_covariances(scenario),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,6 @@ ROTATION_OF_CAMERA = {
 }
 """Camera to body: columns are the optical frame's x (right), y (down), z (forward)."""
 
-
-EMBEDDED = ("riccati", "dead_reckoning", "robust")
-"""Values of `observer.name` that run in the kernels; any other is a plug-in's (coopenv/api/plugins.py)."""
 
 NUMPY_OF = {wp.int32: np.int32, wp.float64: np.float64}
 
@@ -61,6 +59,7 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     model.odometry_rate = scenario.rates.odometry
     model.camera_period = 1.0 / scenario.rates.camera
     model.odometry_period = 1.0 / scenario.rates.odometry
+    model.samples_per_tick = math.ceil(scenario.rates.odometry / scenario.rates.camera - 1e-9) + 1
     model.ticks_per_decision = scenario.ticks_per_decision
     model.horizon_ticks = scenario.horizon_ticks
     _fill_topology(model, scenario, fill)
@@ -241,7 +240,6 @@ def _fill_radio(radio: Any, scenario: Scenario) -> None:
 def _fill_observer(observer: Any, scenario: Scenario, fill: _Filler) -> None:
     o = scenario.observer
     count = len(scenario.vehicles)
-    observer.corrects = int(o.name != "dead_reckoning")
     observer.k = fill.array(o.k if isinstance(o.k, tuple) else [o.k] * count, fill.p.scalar)
     q = o.q
     weights = [q.get(name, 10.0) if isinstance(q, dict) else q for name in scenario.target_names]

@@ -1,27 +1,109 @@
-"""Which kernels advance and reset the worlds of an embedded observer."""
+"""What the world is handed: an observer, and a source of ticks, each as a few Warp functions.
+
+The world knows neither; `coopenv.world.step` fuses what it is given into one loop over the ticks of a decision.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
-from coopenv.world.step import advance_kernel, reset_kernel
+import numpy as np
+import warp as wp
 
-ROBUST = "robust"
-"""Value of `observer.name` whose observer remembers more than the state holds."""
-
-
-class Kernels(NamedTuple):
-    """Arguments: model, state, the observer's memory if it has one, then those of `advance_kernel`, `reset_kernel`."""
-
-    advance: Callable[..., None]
-    reset: Callable[..., None]
+from coopenv.world.camera import observe
+from coopenv.world.collision import referee
+from coopenv.world.motion import move
+from coopenv.world.odometry import measure_odometry
+from coopenv.world.reset import reset_world
+from coopenv.world.v2x import deliver
 
 
-def kernels_of(memory: Any) -> Kernels:
-    """Return the kernels of worlds whose observer has a memory, or (None) has not."""
-    if memory is None:
-        return Kernels(advance_kernel, reset_kernel)
-    from coopenv.observers.robust.kernels import advance_robust_kernel, reset_robust_kernel
+@wp.struct
+class Nothing:
+    """The memory of an observer that has none, and the record of a source that needs none."""
 
-    return Kernels(advance_robust_kernel, reset_robust_kernel)
+    unused: wp.int32
+
+
+@dataclass(frozen=True)
+class Embedded:
+    """An observer that runs in the world's kernels.
+
+    Its functions read what a vehicle senses and hears from `state`, write its estimate there (`estimate_rotation`,
+    `estimate_position`, `covariance`, `corrected_tick`), and keep whatever else they need in `memory`, a Warp struct
+    whose arrays have the world as leading axis. `model` and `state` are those of `coopenv.world`.
+    """
+
+    name: str
+    estimate: Any
+    """(model, state, memory, world, vehicle, tick): take one camera tick; messages have been delivered."""
+    start: Any
+    """(model, state, memory, world): begin an episode in a world whose initial estimates have been drawn."""
+    send: Any
+    """(model, state, memory, world, vehicle, tick): put on the air what the V2X pose estimate does not carry."""
+    allocate: Callable[[Any, int, np.ndarray, str], Any] = lambda model, worlds, start_covariance, device: Nothing()
+    """(model, worlds, start_covariance (N, 6, 6), device): return the memory."""
+    options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """Options of the Warp module that it is compiled in."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the ticks of a world come from."""
+
+    name: str
+    begin: Any
+    """(model, state, record, world): go to the start of an episode."""
+    sense: Any
+    """(model, state, record, actions, world, tick): write everything that is sensed at a tick, and the truth."""
+    deliver: Any
+    """(model, state, record, world, vehicle, tick): write the messages that a vehicle receives at a tick."""
+
+
+@wp.func
+def start_nothing(model: Any, state: Any, memory: Any, world: int):
+    """Begin an episode of an observer without a memory."""
+
+
+@wp.func
+def estimate_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: int):
+    """Leave the estimate as it is: somebody else writes it."""
+
+
+@wp.func
+def send_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: int):
+    """Add nothing to the V2X pose estimate."""
+
+
+HOST = Embedded("host", estimate_nothing, start_nothing, send_nothing)
+"""In place of an observer that runs on the host (`coopenv.api.plugins`)."""
+
+
+@wp.func
+def begin_simulation(model: Any, state: Any, record: Any, world: int):
+    """Draw the start of an episode."""
+    reset_world(model, state, world)
+
+
+@wp.func
+def sense_simulation(model: Any, state: Any, record: Any, actions: Any, world: int, tick: int):
+    """Move the truth of one world to a tick and measure it."""
+    move(model, state, actions, world, tick)
+    for vehicle in range(model.vehicles):
+        measure_odometry(model, state, world, vehicle, tick)
+    for vehicle in range(model.vehicles):
+        referee(model, state, world, vehicle)
+    for vehicle in range(model.vehicles):
+        observe(model, state, world, vehicle, tick)
+
+
+@wp.func
+def deliver_simulation(model: Any, state: Any, record: Any, world: int, vehicle: int, tick: int):
+    """Receive what the radio lets through."""
+    deliver(model, state, world, vehicle, tick)
+
+
+SIMULATED = Source("simulated", begin_simulation, sense_simulation, deliver_simulation)
+"""Ticks that are computed."""

@@ -47,11 +47,12 @@ def start_warp() -> None:
 def kernel(function: Callable[..., None], precision_name: str, differentiable: bool = False) -> wp.Kernel:
     """Return a plain Python function as a Warp kernel whose module serves one precision only.
 
-    Options that its file sets with `wp.set_module_options` hold for it.
+    Options in its attribute `options` hold for it, besides those that its file sets with `wp.set_module_options`.
     """
     kind = ".differentiable" if differentiable else ""
     module = wp.get_module(f"{function.__module__}.{function.__name__}.{precision_name}{kind}")
     module.options.update(wp.get_module(function.__module__).options)
+    module.options.update(getattr(function, "options", {}))
     module.options["enable_backward"] = differentiable
     return wp.Kernel(func=function, key=function.__name__, module=module)
 
@@ -82,7 +83,8 @@ class PerWorld:
             return self.value[start:stop]
         part = type(self.value)()
         for name in self.value._cls.vars:
-            setattr(part, name, getattr(self.value, name)[start:stop])
+            value = getattr(self.value, name)
+            setattr(part, name, value[start:stop] if isinstance(value, wp.array) else value)
         return part
 
 

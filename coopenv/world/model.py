@@ -126,7 +126,6 @@ def model_struct(p: Precision) -> Any:
     class Observer:
         """Gains of the Riccati observer."""
 
-        corrects: wp.int32  # 0: dead reckoning
         k: wp.array(dtype=scalar)  # (N,)
         q: wp.array(dtype=scalar)  # (A,)
         v1: scalar
@@ -152,6 +151,7 @@ def model_struct(p: Precision) -> Any:
         odometry_rate: wp.float64  # Hz
         camera_period: wp.float64  # s
         odometry_period: wp.float64  # s
+        samples_per_tick: wp.int32  # odometry samples that may fall into one camera tick
         ticks_per_decision: wp.int32
         horizon_ticks: wp.int32
         targets: wp.array2d(dtype=wp.int32)  # (N, A) agents that may be measured and heard, ascending, then -1

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.so3 import identity3, increment
-from coopenv.world.dynamics import drive, segment_at
+from coopenv.world.dynamics import segment_at
 from coopenv.world.model import DRIVEN
 from coopenv.world.random import ODOMETRY_FIRST, ODOMETRY_SECOND, draw, gaussian_vectors
 
@@ -29,13 +29,24 @@ def noisy_sample(model: Any, state: Any, world: int, vehicle: int, sample: int, 
 
 
 @wp.func
-def measure_motion(model: Any, state: Any, world: int, vehicle: int, command: Any, tick: int):
-    """Move a driven vehicle through one camera tick and take the odometry samples that fall into it.
-
-    Sample m is taken at m / odometry_rate; those in (t_{tick-1}, t_tick] belong to this tick.
-    """
+def true_twist(model: Any, state: Any, world: int, vehicle: int, taken: int, t: wp.float64):
+    """Return the true (v, omega) at the tick's sample number `taken`, which is due at time t."""
     agent = model.landmarks + vehicle
-    driven = model.motion.kind[agent] == DRIVEN
+    v = state.velocity[world, agent]
+    w = state.angular_velocity[world, agent]
+    if model.motion.kind[agent] == DRIVEN:
+        v = state.sampled_velocity[world, vehicle, taken]
+        w = state.sampled_angular_velocity[world, vehicle, taken]
+    else:
+        segment = segment_at(model, agent, t)
+        v = model.motion.linear[segment]
+        w = model.motion.angular[segment]
+    return v, w
+
+
+@wp.func
+def measure_odometry(model: Any, state: Any, world: int, vehicle: int, tick: int):
+    """Take the odometry samples of one camera tick, whose motion is over, and sum them up to its increment."""
     tick_end = wp.float64(tick) * model.camera_period
     now = wp.float64(tick - 1) * model.camera_period
     v = state.odometry_velocity[world, vehicle]
@@ -43,25 +54,18 @@ def measure_motion(model: Any, state: Any, world: int, vehicle: int, command: An
     sample = state.odometry_samples[world, vehicle]
     rotation = identity3(v)
     translation = v - v
+    taken = int(0)
     due = wp.float64(sample) * model.odometry_period
     while due <= tick_end + wp.float64(1.0e-9):
         duration = wp.max(due - now, wp.float64(0.0))
-        if driven:
-            drive(model, state, world, vehicle, command, duration)
         rotation, translation = increment(rotation, translation, v, w, v.dtype(duration))
-        true_v = state.velocity[world, agent]
-        true_w = state.angular_velocity[world, agent]
-        if not driven:
-            segment = segment_at(model, agent, due)
-            true_v = model.motion.linear[segment]
-            true_w = model.motion.angular[segment]
+        true_v, true_w = true_twist(model, state, world, vehicle, taken, due)
         v, w = noisy_sample(model, state, world, vehicle, sample, true_v, true_w)
         now = due
+        taken += 1
         sample += 1
         due = wp.float64(sample) * model.odometry_period
     duration = wp.max(tick_end - now, wp.float64(0.0))
-    if driven:
-        drive(model, state, world, vehicle, command, duration)
     rotation, translation = increment(rotation, translation, v, w, v.dtype(duration))
     state.odometry_velocity[world, vehicle] = v
     state.odometry_angular_velocity[world, vehicle] = w

@@ -76,6 +76,9 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
     state.increment_rotation[world, vehicle] = identity3(o)
     state.increment_translation[world, vehicle] = o
     state.corrected_tick[world, vehicle] = 0
+    for sample in range(model.samples_per_tick):
+        state.sampled_velocity[world, vehicle, sample] = o
+        state.sampled_angular_velocity[world, vehicle, sample] = o
     for target in range(model.agents):
         state.bearing[world, vehicle, target] = o
         state.bearing_tick[world, vehicle, target] = -1

@@ -1,6 +1,7 @@
 """The changing side of a world: one record of arrays with leading axes (world, agent or vehicle).
 
-W worlds, A agents (landmarks first), N vehicles, S slots of the radio's outbox, B blocks of the sliding Gramian.
+W worlds, A agents (landmarks first), N vehicles, M odometry samples a tick, S slots of the
+radio's outbox, B blocks of the sliding Gramian.
 """
 
 from collections.abc import Mapping
@@ -37,6 +38,9 @@ def state_struct(p: Precision) -> Any:
         command: wp.array2d(dtype=vec2)  # (W, N) action in force
         ended: wp.array2d(dtype=wp.int32)  # (W, N) values of `Outcome`
         collided: wp.array2d(dtype=wp.int32)  # (W, N) touching something now
+
+        sampled_velocity: wp.array3d(dtype=vec3)  # (W, N, M) truth at the odometry samples of the last tick, m/s, body
+        sampled_angular_velocity: wp.array3d(dtype=vec3)  # (W, N, M) likewise, rad/s; of driven vehicles
 
         odometry_velocity: wp.array2d(dtype=vec3)  # (W, N) last sample, m/s
         odometry_angular_velocity: wp.array2d(dtype=vec3)  # (W, N) last sample, rad/s
@@ -75,6 +79,7 @@ def allocate_state(model: Any, worlds: int, p: Precision, device: str) -> Any:
         "seed": (worlds,),
         "episode": (worlds,),
         "tick": (worlds,),
+        **dict.fromkeys(("sampled_velocity", "sampled_angular_velocity"), (worlds, N, model.samples_per_tick)),
         **dict.fromkeys(("bearing", "bearing_tick", "sight"), (worlds, N, A)),
         **dict.fromkeys(("outbox_rotation", "outbox_position", "outbox_tick"), (worlds, N, model.radio.slots)),
         **dict.fromkeys(("inbox_rotation", "inbox_position", "inbox_tick"), (worlds, N, N)),

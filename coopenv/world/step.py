@@ -1,63 +1,23 @@
-"""The pipeline of one camera tick, and the kernels that run it for every world."""
+"""The pipeline of one camera tick, fused into kernels for a given source of ticks and a given observer.
+
+Each kernel is a closure over the Warp functions that it is made of. Its Warp module is named after the source and the
+observer, so that a pair is compiled once per precision and machine.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import warp as wp
 
-from coopenv.observers.riccati.kernels import estimate
-from coopenv.world.camera import observe
-from coopenv.world.collision import referee
-from coopenv.world.dynamics import prescribe
-from coopenv.world.model import PRESCRIBED
-from coopenv.world.odometry import measure_motion
-from coopenv.world.reset import reset_world
-from coopenv.world.v2x import broadcast, deliver
+from coopenv.world.embedded import Embedded, Source
+from coopenv.world.gramian import sample_gramian
+from coopenv.world.motion import sanitised
+from coopenv.world.v2x import broadcast
 
-
-@wp.func
-def sound(action: Any):
-    """Return an action clipped to [-1, 1], zero where it is not finite."""
-    one = action.dtype(1.0)
-    result = action - action
-    for axis in range(2):
-        if wp.isfinite(action[axis]):
-            result[axis] = wp.clamp(action[axis], -one, one)
-        else:
-            result[axis] = one - one
-    return result
-
-
-@wp.func
-def command_in_force(model: Any, state: Any, world: int, vehicle: int, action: Any, tick: int):
-    """Return what the actuators follow during a tick: after a decision, the last command for the dead time."""
-    if (tick - 1) % model.ticks_per_decision < model.dynamics.latency_ticks:
-        return state.command[world, vehicle]
-    return action
-
-
-@wp.func
-def move(model: Any, state: Any, actions: Any, world: int, tick: int):
-    """Carry all truth of one world to the tick's end and sample odometry on the way."""
-    t = wp.float64(tick) * model.camera_period
-    for agent in range(model.agents):
-        if model.motion.kind[agent] == PRESCRIBED:
-            prescribe(model, state, world, agent, t)
-    for vehicle in range(model.vehicles):
-        action = sound(actions[world, vehicle])
-        command = command_in_force(model, state, world, vehicle, action, tick)
-        measure_motion(model, state, world, vehicle, command, tick)
-
-
-@wp.func
-def sense(model: Any, state: Any, actions: Any, world: int, tick: int):
-    """Move the truth of one world to a tick and measure it: everything that does not depend on any estimate."""
-    move(model, state, actions, world, tick)
-    for vehicle in range(model.vehicles):
-        referee(model, state, world, vehicle)
-    for vehicle in range(model.vehicles):
-        observe(model, state, world, vehicle, tick)
+Kernel = Callable[..., None]
 
 
 @wp.func
@@ -65,37 +25,104 @@ def finish(model: Any, state: Any, actions: Any, world: int, tick: int):
     """Put a decision that is over on record, and count the tick."""
     if tick % model.ticks_per_decision == 0 or tick == model.horizon_ticks:
         for vehicle in range(model.vehicles):
-            state.command[world, vehicle] = sound(actions[world, vehicle])
+            state.command[world, vehicle] = sanitised(actions[world, vehicle])
     state.tick[world] = tick
 
 
-@wp.func
-def tick_world(model: Any, state: Any, actions: Any, world: int):
-    """Run one camera tick of one world: truth -> camera -> V2X -> observer -> V2X, leaders before followers."""
-    tick = state.tick[world] + 1
-    sense(model, state, actions, world, tick)
-    for place in range(model.vehicles):
-        vehicle = model.order[place]
-        deliver(model, state, world, vehicle, tick)
-        estimate(model, state, world, vehicle, tick)
+def _named(kernel: Kernel, *parts: str, **options: Any) -> Kernel:
+    """Name a kernel after what it is made of, and keep the options of its module (see `launch.kernel`)."""
+    kernel.__name__ = "_".join((kernel.__name__, *parts))
+    kernel.options = options  # type: ignore[attr-defined]
+    return kernel
+
+
+@cache
+def advance_kernel(source: Source, observer: Embedded) -> Kernel:
+    """Return the kernel that runs whole ticks: sense -> receive -> estimate -> send, leaders before followers."""
+    sense, deliver, estimate, send = source.sense, source.deliver, observer.estimate, observer.send
+
+    def advance(
+        model: Any,
+        state: Any,
+        memory: Any,
+        record: Any,
+        actions: wp.array2d(dtype=Any),
+        hold: wp.array(dtype=wp.int32),
+        ticks: int,
+    ):
+        """Advance by up to `ticks` camera ticks, not beyond the horizon; worlds marked in `hold` stay as they are."""
+        world = wp.tid()
+        count = wp.where(hold[world] == 0, wp.min(ticks, model.horizon_ticks - state.tick[world]), 0)
+        for _ in range(count):
+            tick = state.tick[world] + 1
+            sense(model, state, record, actions, world, tick)
+            for place in range(model.vehicles):
+                vehicle = model.order[place]
+                deliver(model, state, record, world, vehicle, tick)
+                estimate(model, state, memory, world, vehicle, tick)
+                sample_gramian(model, state, world, vehicle, tick)
+                broadcast(model, state, world, vehicle, tick)
+                send(model, state, memory, world, vehicle, tick)
+            finish(model, state, actions, world, tick)
+
+    return _named(advance, source.name, observer.name, **observer.options)
+
+
+@cache
+def restart_kernel(source: Source, observer: Embedded) -> Kernel:
+    """Return the kernel that starts the next episode."""
+    begin, start = source.begin, observer.start
+
+    def restart(model: Any, state: Any, memory: Any, record: Any, mask: wp.array(dtype=wp.int32)):
+        """Start the next episode in every world whose mask is set."""
+        world = wp.tid()
+        if mask[world] != 0:
+            state.episode[world] = state.episode[world] + wp.uint32(1)
+            begin(model, state, record, world)
+            start(model, state, memory, world)
+
+    return _named(restart, source.name, observer.name, **observer.options)
+
+
+@cache
+def sense_kernel(source: Source) -> Kernel:
+    """Return the kernel of the first stage alone. The stages' `active` (W,) marks the worlds that take part."""
+    sense_tick = source.sense
+
+    def sense(model: Any, state: Any, record: Any, active: wp.array(dtype=wp.int32), actions: wp.array2d(dtype=Any)):
+        """Move and measure. One thread per world; the tick has its number from the start."""
+        world = wp.tid()
+        if active[world] != 0:
+            sense_tick(model, state, record, actions, world, state.tick[world] + 1)
+
+    return _named(sense, source.name)
+
+
+@cache
+def deliver_kernel(source: Source) -> Kernel:
+    """Return the kernel that lets one vehicle receive."""
+    deliver_messages = source.deliver
+
+    def deliver(model: Any, state: Any, record: Any, active: wp.array(dtype=wp.int32), vehicle: int):
+        """Receive. One thread per world."""
+        world = wp.tid()
+        if active[world] != 0:
+            deliver_messages(model, state, record, world, vehicle, state.tick[world] + 1)
+
+    return _named(deliver, source.name)
+
+
+def broadcast_kernel(model: Any, state: Any, active: wp.array(dtype=wp.int32), vehicle: int):
+    """Take what has been written as the vehicle's estimate, and send it. One thread per world."""
+    world = wp.tid()
+    if active[world] != 0:
+        tick = state.tick[world] + 1
+        sample_gramian(model, state, world, vehicle, tick)
         broadcast(model, state, world, vehicle, tick)
-    finish(model, state, actions, world, tick)
 
 
-def advance_kernel(model: Any, state: Any, actions: wp.array2d(dtype=Any), hold: wp.array(dtype=wp.int32), ticks: int):
-    """Advance every world by up to `ticks` camera ticks, not beyond the horizon. One thread per world.
-
-    Worlds marked in `hold` stay as they are.
-    """
+def finish_kernel(model: Any, state: Any, active: wp.array(dtype=wp.int32), actions: wp.array2d(dtype=Any)):
+    """End the tick. One thread per world."""
     world = wp.tid()
-    count = wp.where(hold[world] == 0, wp.min(ticks, model.horizon_ticks - state.tick[world]), 0)
-    for _ in range(count):
-        tick_world(model, state, actions, world)
-
-
-def reset_kernel(model: Any, state: Any, mask: wp.array(dtype=wp.int32)):
-    """Start the next episode in every world whose mask is set. One thread per world."""
-    world = wp.tid()
-    if mask[world] != 0:
-        state.episode[world] = state.episode[world] + wp.uint32(1)
-        reset_world(model, state, world)
+    if active[world] != 0:
+        finish(model, state, actions, world, state.tick[world] + 1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,12 +10,19 @@ import warp as wp
 
 from coopenv.errors import CoopenvError
 from coopenv.scenario import Scenario
-from coopenv.world.build import EMBEDDED, build_model
-from coopenv.world.embedded import ROBUST, Kernels, kernels_of
+from coopenv.world.build import build_model
+from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
 from coopenv.world.launch import Launcher, PerWorld, default_threads
 from coopenv.world.precision import check_device, precision
-from coopenv.world.stages import broadcast_kernel, deliver_kernel, finish_kernel, sense_kernel
 from coopenv.world.state import allocate_state, check_fit, overwrite, state_fields
+from coopenv.world.step import (
+    advance_kernel,
+    broadcast_kernel,
+    deliver_kernel,
+    finish_kernel,
+    restart_kernel,
+    sense_kernel,
+)
 
 
 class World:
@@ -26,6 +32,9 @@ class World:
     single world seeded with s + w (on the same device).
     """
 
+    source: Source = SIMULATED
+    """Where its ticks come from."""
+
     def __init__(
         self,
         scenario: Scenario,
@@ -33,6 +42,8 @@ class World:
         dtype: str = "float32",
         device: str = "cpu",
         threads: int | None = None,
+        observer: Embedded = HOST,
+        start_covariance: np.ndarray | None = None,
     ) -> None:
         """Build the arrays; call `reset` before `advance`.
 
@@ -43,6 +54,8 @@ class World:
             device: "cpu", "cuda", "cuda:0", ...
             threads: shares into which the batch is split on the CPU; None: by its size and the cores. Results do not
                 depend on it.
+            observer: what estimates in the kernels (none by default: the estimates are written from outside).
+            start_covariance: (N, 6, 6) of the initial estimates, for the observer; LEFT coordinates, rad and m.
 
         Raises:
             DeviceError: unknown precision or device.
@@ -58,11 +71,16 @@ class World:
         self.threads = default_threads(worlds, self.device) if threads is None else min(threads, worlds)
         if self.device != "cpu":
             self.threads = 1
+        self.observer = observer
+        """What estimates in the kernels; `HOST` where estimates are written from outside, see `PlugIns`."""
         self.model = self._build_model()
         self.state = allocate_state(self.model, worlds, self.precision, self.device)
-        self.memory: Any = self._allocate_memory()
-        """What the embedded observer remembers besides the state; None where it needs no more."""
-        self.actions = wp.zeros((worlds, self.model.vehicles), dtype=self.precision.vec2, device=self.device)
+        N = self.model.vehicles
+        covariance = np.zeros((N, 6, 6)) if start_covariance is None else start_covariance
+        self.memory = observer.allocate(self.model, worlds, covariance, self.device)
+        """What the embedded observer remembers besides the state."""
+        self._record = self._build_record()
+        self.actions = wp.zeros((worlds, N), dtype=self.precision.vec2, device=self.device)
         self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         """(W,) worlds that `restart` resets and that `advance` leaves alone; zero between calls."""
         self.launch = Launcher(worlds, self.device, dtype, self.threads)
@@ -71,30 +89,9 @@ class World:
     def _build_model(self) -> Any:
         return build_model(self.scenario, self.precision, self.device)
 
-    @property
-    def estimates(self) -> bool:
-        """Whether the scenario's observer is embedded; others run on the host, see `PlugIns`."""
-        return self.scenario.observer.name in EMBEDDED
-
-    def _allocate_memory(self) -> Any:
-        if not self.estimates or self.scenario.observer.name != ROBUST:
-            return None
-        from coopenv.observers.robust.state import allocate_robust
-
-        return allocate_robust(self.model, self.worlds, self._start_covariance(), self.device)
-
-    def _start_covariance(self) -> np.ndarray:
-        """Return the covariances (N, 6, 6) of the initial estimates, left errors."""
-        from coopenv.observers.briefing import start_covariance
-
-        return np.array([start_covariance(self.scenario, i) for i in range(self.model.vehicles)])
-
-    @cached_property
-    def _kernels(self) -> Kernels:
-        return kernels_of(self.memory)
-
-    def _changing(self) -> list[PerWorld]:
-        return [PerWorld(record) for record in (self.state, self.memory) if record is not None]
+    def _build_record(self) -> Any:
+        """Return what the source of ticks reads."""
+        return Nothing()
 
     def reset(self, seeds: Sequence[int] | np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
         """Start a new episode in the worlds of `mask` (all by default).
@@ -115,33 +112,39 @@ class World:
 
     def restart(self) -> None:
         """Start the next episode in the worlds of `self.mask`, on the device."""
-        self.launch("restart", self._kernels.reset, [self.model, *self._changing(), PerWorld(self.mask)])
+        kernel = restart_kernel(self.source, self.observer)
+        self.launch("restart", kernel, [*self._everything(), PerWorld(self.mask)])
 
     def advance(self, ticks: int) -> None:
         """Run camera ticks under `self.actions`, stopping each world at its horizon."""
-        moving = [*self._changing(), PerWorld(self.actions), PerWorld(self.mask), ticks]
-        self.launch(("advance", ticks), self._kernels.advance, [self.model, *moving])
+        kernel = advance_kernel(self.source, self.observer)
+        moving = [PerWorld(self.actions), PerWorld(self.mask), ticks]
+        self.launch(("advance", ticks), kernel, [*self._everything(), *moving])
+
+    def _everything(self) -> list[Any]:
+        return [self.model, PerWorld(self.state), PerWorld(self.memory), self._record]
 
     # One tick in stages, for estimators on the host: sense, then per vehicle deliver and broadcast, then finish.
 
     def sense(self, active: Any) -> None:
         """Move the truth of the active worlds (W,) to the next tick and measure it."""
-        self.launch("sense", sense_kernel, [self.model, *self._arguments(active), PerWorld(self.actions)])
+        moving = [PerWorld(active), PerWorld(self.actions)]
+        self.launch("sense", sense_kernel(self.source), [self.model, PerWorld(self.state), self._record, *moving])
 
     def deliver(self, active: Any, vehicle: int) -> None:
         """Let a vehicle of the active worlds receive what arrives at this tick."""
-        self.launch(("deliver", vehicle), deliver_kernel, [self.model, *self._arguments(active), vehicle])
+        arguments = [self.model, PerWorld(self.state), self._record, PerWorld(active), vehicle]
+        self.launch(("deliver", vehicle), deliver_kernel(self.source), arguments)
 
     def broadcast(self, active: Any, vehicle: int) -> None:
         """Let a vehicle of the active worlds, whose estimate has been written, send it."""
-        self.launch(("broadcast", vehicle), broadcast_kernel, [self.model, *self._arguments(active), vehicle])
+        arguments = [self.model, PerWorld(self.state), PerWorld(active), vehicle]
+        self.launch(("broadcast", vehicle), broadcast_kernel, arguments)
 
     def finish(self, active: Any) -> None:
         """End the tick of the active worlds."""
-        self.launch("finish", finish_kernel, [self.model, *self._arguments(active), PerWorld(self.actions)])
-
-    def _arguments(self, active: Any) -> list[PerWorld]:
-        return [PerWorld(self.state), PerWorld(active)]
+        arguments = [self.model, PerWorld(self.state), PerWorld(active), PerWorld(self.actions)]
+        self.launch("finish", finish_kernel, arguments)
 
     def view(self, name: str) -> np.ndarray:
         """Return a field of the state on the host, without a copy on the CPU."""
@@ -168,6 +171,6 @@ class World:
     def state_arrays(self) -> dict[str, Any]:
         """Return every array that `set_state` writes, by name."""
         fields = {name: getattr(self.state, name) for name in state_fields(self.precision)}
-        remembered = [] if self.memory is None else list(self.memory._cls.vars)
-        own = {f"observer_{name}": getattr(self.memory, name) for name in remembered}
+        remembered = {name: getattr(self.memory, name) for name in self.memory._cls.vars}
+        own = {f"observer_{name}": array for name, array in remembered.items() if isinstance(array, wp.array)}
         return {**fields, **own, "actions": self.actions}

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from coopenv.backends.simulated import Simulated
 from coopenv.errors import ScenarioWarning
 from coopenv.scenario import Scenario, parse_scenario
 from coopenv.world.world import World
@@ -47,10 +48,15 @@ def scenario(vehicles: Sequence[dict[str, Any]] | None = None, **sections: Any) 
         return parse_scenario(raw(vehicles, **sections), "test")
 
 
+def simulate(description: Scenario, worlds: int, dtype: str = "float64", threads: int | None = None) -> World:
+    """Return worlds with the observer that the scenario names."""
+    return Simulated(description).world(worlds, dtype, "cpu", threads)
+
+
 def start(description: Scenario, seeds: Sequence[int] | int = 0, dtype: str = "float64") -> World:
     """Return a world per seed, reset."""
     seeds = [seeds] if isinstance(seeds, int) else list(seeds)
-    world = World(description, len(seeds), dtype)
+    world = simulate(description, len(seeds), dtype)
     reset(world, seeds)
     return world
 

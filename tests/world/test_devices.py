@@ -9,8 +9,8 @@ import pytest
 import warp as wp
 
 import coopenv
+from coopenv.backends.simulated import Simulated
 from coopenv.world.launch import start_warp
-from coopenv.world.world import World
 
 start_warp()
 CUDA = pytest.param("cuda:0", marks=pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device"))
@@ -21,7 +21,7 @@ OVERRIDES: dict[str, Any] = {"horizon": 3.0}
 @pytest.mark.parametrize("name", ["busy_intersection", "urban_crossing"])
 def test_worlds_agree_with_the_cpu(name: str, device: str) -> None:
     scenario = coopenv.load_scenario(name, OVERRIDES)
-    worlds = [World(scenario, 5, "float64", where) for where in ("cpu", device)]
+    worlds = [Simulated(scenario).world(5, "float64", where, None) for where in ("cpu", device)]
     actions = np.random.default_rng(0).uniform(-1, 1, (5, len(scenario.vehicles), 2))
     for world in worlds:
         world.reset(range(5))

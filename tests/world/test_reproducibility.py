@@ -8,7 +8,7 @@ import pytest
 from coopenv.errors import DeviceError
 from coopenv.scenario import Scenario
 from coopenv.world.world import World
-from tests.helpers.builders import command, constant, reset, same_bits, scenario, start, vehicle
+from tests.helpers.builders import command, constant, reset, same_bits, scenario, simulate, start, vehicle
 from tests.helpers.warp_calls import DTYPES
 
 State = dict[str, np.ndarray]
@@ -185,7 +185,7 @@ def test_what_cannot_be_built() -> None:
 
 
 def test_a_world_that_was_reset_advances() -> None:
-    world = World(noisy(), 2, "float64")
+    world = simulate(noisy(), 2, "float64")
     world.reset([1, 2])
     world.advance(3)
     assert world.get_state()["tick"].tolist() == [3, 3]
@@ -195,7 +195,7 @@ def test_a_world_that_was_reset_advances() -> None:
 def test_threads_change_nothing(dtype: str) -> None:
     found = []
     for threads in (1, 2, 5):
-        world = World(noisy(), 11, dtype, threads=threads)
+        world = simulate(noisy(), 11, dtype, threads=threads)
         reset(world, range(11))
         found.append(played(world, 60))
     assert_same(found[0], found[1])

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from coopenv.backends.replay.device_recording import upload
-from coopenv.backends.replay.kernels import redeliver_kernel, replay_kernel, resense_kernel, rewind_kernel
+from coopenv.backends.replay.kernels import RECORDED
 from coopenv.backends.replay.scenario import scenario_of
+from coopenv.observers.embedded import find_embedded
 from coopenv.observers.recording import Briefing, Recording, Sensed
 from coopenv.observers.recording_checks import check_recording
 from coopenv.scenario import Scenario
-from coopenv.world.embedded import ROBUST, Kernels
-from coopenv.world.launch import PerWorld
 from coopenv.world.world import World
 
 
@@ -31,7 +29,10 @@ class Replay:
 
     def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> World:
         """Return the world that goes through the recording."""
-        return ReplayWorld(self.recording, self.scenario, worlds, dtype, device, threads)
+        planar = any(setup.planar for setup in self.recording.setups)
+        observer = find_embedded(self.scenario.observer.name, planar)
+        covariance = self.recording.start_covariance
+        return ReplayWorld(self.recording, self.scenario, worlds, dtype, device, threads, observer, covariance)
 
     def senses(self, world: World) -> RecordedSenses:
         """Return the recorded ticks."""
@@ -57,36 +58,12 @@ class RecordedSenses:
 class ReplayWorld(World):
     """A world whose truth, measurements and deliveries are recorded."""
 
-    def __init__(
-        self,
-        recording: Recording,
-        scenario: Scenario,
-        worlds: int = 1,
-        dtype: str = "float32",
-        device: str = "cpu",
-        threads: int | None = None,
-    ) -> None:
-        """Build the arrays; arguments and errors as for `World`."""
+    source = RECORDED
+
+    def __init__(self, recording: Recording, scenario: Scenario, *arguments: Any) -> None:
+        """Build the arrays; further arguments and errors as for `World`."""
         self._recording = recording
-        super().__init__(scenario, worlds, dtype, device, threads)
-        self._record = upload(recording, scenario.rates.odometry, self.precision, self.device)
-
-    @property
-    def estimates(self) -> bool:
-        """Whether the observer is embedded; `robust` has no embedded form for robots on a plane."""
-        planar = any(setup.planar for setup in self._recording.setups)
-        return super().estimates and not (planar and self.scenario.observer.name == ROBUST)
-
-    def _start_covariance(self) -> np.ndarray:
-        return self._recording.start_covariance
-
-    @cached_property
-    def _kernels(self) -> Kernels:
-        if self.memory is None:
-            return Kernels(replay_kernel, rewind_kernel)
-        from coopenv.backends.replay.robust_kernels import replay_robust_kernel, rewind_robust_kernel
-
-        return Kernels(replay_robust_kernel, rewind_robust_kernel)
+        super().__init__(scenario, *arguments)
 
     def _build_model(self) -> Any:
         model = super()._build_model()
@@ -96,22 +73,5 @@ class ReplayWorld(World):
         model.radio.slots = max(self._recording.flight, 1) + 1
         return model
 
-    def restart(self) -> None:
-        """Go back to the recording's start in the worlds of `self.mask`."""
-        self.launch("restart", self._kernels.reset, [self.model, *self._changing(), self._record, PerWorld(self.mask)])
-
-    def advance(self, ticks: int) -> None:
-        """Run recorded ticks with the embedded observer."""
-        moving = [*self._changing(), self._record, PerWorld(self.actions), PerWorld(self.mask), ticks]
-        self.launch(("advance", ticks), self._kernels.advance, [self.model, *moving])
-
-    def sense(self, active: Any) -> None:
-        """Recall the next tick."""
-        self.launch("sense", resense_kernel, [*self._recorded(), PerWorld(active)])
-
-    def deliver(self, active: Any, vehicle: int) -> None:
-        """Let a vehicle receive what arrived at this tick."""
-        self.launch(("deliver", vehicle), redeliver_kernel, [*self._recorded(), PerWorld(active), vehicle])
-
-    def _recorded(self) -> list[Any]:
-        return [self.model, PerWorld(self.state), self._record]
+    def _build_record(self) -> Any:
+        return upload(self._recording, self.scenario.rates.odometry, self.precision, self.device)

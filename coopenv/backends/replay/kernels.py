@@ -6,11 +6,10 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.observers.riccati.kernels import estimate
 from coopenv.world.camera import NOT_A_NEIGHBOUR, OUT_OF_VIEW, VISIBLE
 from coopenv.world.collision import referee, touches_anything
+from coopenv.world.embedded import Source
 from coopenv.world.reset import believe, place_agent, place_vehicle
-from coopenv.world.step import finish
 from coopenv.world.v2x import broadcast
 
 
@@ -55,48 +54,16 @@ def redeliver(model: Any, state: Any, record: Any, world: int, receiver: int, ti
 
 
 @wp.func
-def resense(model: Any, state: Any, record: Any, world: int, tick: int):
+def resense(model: Any, state: Any, record: Any, actions: Any, world: int, tick: int):
     """Recall a tick and judge contacts and arrivals by its truth."""
     recall(model, state, record, world, tick)
     for vehicle in range(model.vehicles):
         referee(model, state, world, vehicle)
 
 
-def replay_kernel(
-    model: Any, state: Any, record: Any, actions: wp.array2d(dtype=Any), hold: wp.array(dtype=wp.int32), ticks: int
-):
-    """Advance as `advance_kernel` does, through recorded ticks. One thread per world."""
-    world = wp.tid()
-    count = wp.where(hold[world] == 0, wp.min(ticks, model.horizon_ticks - state.tick[world]), 0)
-    for _ in range(count):
-        tick = state.tick[world] + 1
-        resense(model, state, record, world, tick)
-        for place in range(model.vehicles):
-            vehicle = model.order[place]
-            redeliver(model, state, record, world, vehicle, tick)
-            estimate(model, state, world, vehicle, tick)
-            broadcast(model, state, world, vehicle, tick)
-        finish(model, state, actions, world, tick)
-
-
-def resense_kernel(model: Any, state: Any, record: Any, active: wp.array(dtype=wp.int32)):
-    """Sense the next tick. One thread per world."""
-    world = wp.tid()
-    if active[world] != 0:
-        resense(model, state, record, world, state.tick[world] + 1)
-
-
-def redeliver_kernel(model: Any, state: Any, record: Any, active: wp.array(dtype=wp.int32), vehicle: int):
-    """Receive. One thread per world."""
-    world = wp.tid()
-    if active[world] != 0:
-        redeliver(model, state, record, world, vehicle, state.tick[world] + 1)
-
-
 @wp.func
 def rewind(model: Any, state: Any, record: Any, world: int):
     """Go to the start of the recording in one world."""
-    state.episode[world] = state.episode[world] + wp.uint32(1)
     state.tick[world] = 0
     for agent in range(model.agents):
         place_agent(model, state, world, agent)
@@ -115,8 +82,5 @@ def rewind(model: Any, state: Any, record: Any, world: int):
         broadcast(model, state, world, vehicle, 0)
 
 
-def rewind_kernel(model: Any, state: Any, record: Any, mask: wp.array(dtype=wp.int32)):
-    """Go to the start of the recording in every world whose mask is set. One thread per world."""
-    world = wp.tid()
-    if mask[world] != 0:
-        rewind(model, state, record, world)
+RECORDED = Source("recorded", rewind, resense, redeliver)
+"""Ticks of a recording."""

@@ -148,7 +148,7 @@ class DifferentiableWorld:
         return truth, held, belief
 
     def _command(self, decisions: list[Any], tick: int) -> Any:
-        """Return the command in force during a tick, see `command_in_force` in `step.py`."""
+        """Return the command in force during a tick, see `command_in_force` in `motion.py`."""
         decision, elapsed = divmod(tick - 1, self.scenario.ticks_per_decision)
         if elapsed >= self._world.model.dynamics.latency_ticks:
             return decisions[decision]

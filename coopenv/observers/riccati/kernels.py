@@ -1,4 +1,4 @@
-"""Stage 5, the embedded observer: the paper's Riccati observer on the measurements of one vehicle.
+"""The paper's Riccati observer on the measurements of one vehicle.
 
 It reads bearings, odometry increments and received messages only; truth enters through landmarks alone, whose
 positions are known to everybody.
@@ -21,7 +21,9 @@ from coopenv.observers.riccati.equations import (
     predict_covariance,
     predict_pose,
 )
-from coopenv.world.gramian import known_position, sample_gramian, usable
+from coopenv.world.embedded import Embedded, send_nothing, start_nothing
+from coopenv.world.gramian import known_position, usable
+from coopenv.world.rates import correction_due
 
 MOST_SUBSTEPS = wp.constant(200)
 """Re-linearisations per tick; the last one takes what remains of the tick."""
@@ -132,19 +134,26 @@ def correct(model: Any, state: Any, world: int, vehicle: int, tick: int, duratio
 
 
 @wp.func
-def estimate(model: Any, state: Any, world: int, vehicle: int, tick: int):
+def dead_reckon(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: int):
+    """Run one tick without correction: the estimate follows odometry, P grows."""
+    predict(model, state, world, vehicle, type(model.observer.max_turn)(model.camera_period))
+    if correction_due(model, tick):
+        state.corrected_tick[world, vehicle] = tick
+    # Products of rotations drift by rounding; once per tick is enough to keep Rhat a rotation.
+    state.estimate_rotation[world, vehicle] = orthonormalise(state.estimate_rotation[world, vehicle])
+
+
+@wp.func
+def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: int):
     """Run one tick of the observer of one vehicle: predict, and correct when its rate says so."""
     dt = type(model.observer.max_turn)(model.camera_period)
     predict(model, state, world, vehicle, dt)
-    ratio = model.observer.rate * model.camera_period
-    due_before = wp.floor(wp.float64(tick - 1) * ratio + wp.float64(1.0e-9))
-    due_now = wp.floor(wp.float64(tick) * ratio + wp.float64(1.0e-9))
-    last = state.corrected_tick[world, vehicle]
-    if due_now > due_before:
-        if model.observer.corrects == 1:
-            correct(model, state, world, vehicle, tick, dt * type(dt)(tick - last))
-        last = tick
-    state.corrected_tick[world, vehicle] = last
-    # Products of rotations drift by rounding; once per tick is enough to keep Rhat a rotation.
+    if correction_due(model, tick):
+        duration = dt * type(dt)(tick - state.corrected_tick[world, vehicle])
+        correct(model, state, world, vehicle, tick, duration)
+        state.corrected_tick[world, vehicle] = tick
     state.estimate_rotation[world, vehicle] = orthonormalise(state.estimate_rotation[world, vehicle])
-    sample_gramian(model, state, world, vehicle, tick)
+
+
+RICCATI = Embedded("riccati", estimate, start_nothing, send_nothing)
+DEAD_RECKONING = Embedded("dead_reckoning", dead_reckon, start_nothing, send_nothing)

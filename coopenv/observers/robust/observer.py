@@ -17,7 +17,7 @@ from coopenv.observers.robust.tracklets import collect, hear, may_lean_on, meet
 from coopenv.observers.robust.types import lower_blocks, wide_matrix, wide_vector
 from coopenv.observers.robust.update import drop_anchor, look
 from coopenv.world.camera import VISIBLE
-from coopenv.world.gramian import sample_gramian
+from coopenv.world.rates import correction_due
 from coopenv.world.v2x import fresh
 
 
@@ -118,14 +118,6 @@ def write(state: Any, mind: Any, world: int, i: int):
 
 
 @wp.func
-def is_due(model: Any, tick: int) -> bool:
-    """Return whether the scenario's observer rate asks for a correction at a tick."""
-    ratio = model.observer.rate * model.camera_period
-    before = wp.floor(wp.float64(tick - 1) * ratio + wp.float64(1.0e-9))
-    return wp.floor(wp.float64(tick) * ratio + wp.float64(1.0e-9)) > before
-
-
-@wp.func
 def update(model: Any, state: Any, mind: Any, world: int, i: int, tick: int):
     """Take one camera tick of one vehicle, whose messages have been delivered."""
     collect(model, state, mind, world, i)
@@ -135,7 +127,7 @@ def update(model: Any, state: Any, mind: Any, world: int, i: int, tick: int):
     mind.odometry_rotation[world, i] = orthonormalise(R * dR)
     mind.odometry_position[world, i] = mind.odometry_position[world, i] + R * dp
     rotation, translation = odometry_variances(model, model.camera_period)
-    due = is_due(model, tick)
+    due = correction_due(model, tick)
     if mind.searching[world, i] == 1:
         move_search(mind, world, i, dR, dp, rotation, translation)
         if due:
@@ -148,4 +140,3 @@ def update(model: Any, state: Any, mind: Any, world: int, i: int, tick: int):
     write(state, mind, world, i)
     if due:
         state.corrected_tick[world, i] = tick
-    sample_gramian(model, state, world, i, tick)

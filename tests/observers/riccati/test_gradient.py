@@ -10,7 +10,7 @@ import pytest
 import coopenv
 from coopenv.observers.riccati.gradient import DifferentiableWorld, check_differentiable, tick_intervals
 from coopenv.scenario import Scenario
-from coopenv.world.world import World
+from tests.helpers.builders import simulate
 
 SMOOTH: dict[str, Any] = {
     "noise.enabled": False,
@@ -37,7 +37,7 @@ def commands(seed: int = 0) -> np.ndarray:
 
 def test_forward_equals_the_world(made: Scenario) -> None:
     rollout = DifferentiableWorld(made, WORLDS).rollout(commands(), SEED)
-    world = World(made, WORLDS, "float64")
+    world = simulate(made, WORLDS)
     world.reset([SEED, SEED + 1])
     for command in commands():
         world.actions.assign(command)

@@ -1,0 +1,96 @@
+"""An observer with kernels and a memory of its own comes from outside the package: functions, a struct, one call."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+import coopenv
+from coopenv.api.engine import Engine
+from coopenv.backends.replay import Replay
+from coopenv.errors import CoopenvError
+from coopenv.observers.embedded import find_embedded, register_embedded
+from coopenv.runs import record
+from coopenv.scenario.topology import neighbour_sets
+from coopenv.world.embedded import HOST, Embedded, send_nothing
+
+
+@wp.struct
+class Counter:
+    """What the toy remembers, (W, N)."""
+
+    ticks: wp.array2d(dtype=wp.int32)
+    heard: wp.array2d(dtype=wp.int32)
+
+
+def allocate(model: Any, worlds: int, start_covariance: np.ndarray, device: str) -> Any:
+    memory = Counter()
+    memory.ticks = wp.zeros((worlds, model.vehicles), dtype=wp.int32, device=device)
+    memory.heard = wp.zeros((worlds, model.vehicles), dtype=wp.int32, device=device)
+    return memory
+
+
+@wp.func
+def start(model: Any, state: Any, memory: Any, world: int):
+    for vehicle in range(model.vehicles):
+        memory.ticks[world, vehicle] = 0
+        memory.heard[world, vehicle] = 0
+
+
+@wp.func
+def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: int):
+    """Count, and put the count where the position estimate stands."""
+    memory.ticks[world, vehicle] = memory.ticks[world, vehicle] + 1
+    for sender in range(model.vehicles):
+        if state.inbox_tick[world, vehicle, sender] == tick:
+            memory.heard[world, vehicle] = memory.heard[world, vehicle] + 1
+    p = state.estimate_position[world, vehicle]
+    p[0] = p.dtype(memory.ticks[world, vehicle])
+    p[1] = p.dtype(memory.heard[world, vehicle])
+    state.estimate_position[world, vehicle] = p
+
+
+COUNTER = Embedded("toy_counter", estimate, start, send_nothing, allocate)
+register_embedded(COUNTER)
+
+
+def test_it_runs_in_every_face() -> None:
+    env = coopenv.parallel_env("busy_intersection", observer="toy_counter", dtype="float64")
+    env.reset(seed=0)
+    env.step({agent: np.zeros(2) for agent in env.agents})
+    memory = env.engine.world.memory
+    ticks = env.engine.world.model.ticks_per_decision
+    assert memory.ticks.numpy().tolist() == [[ticks] * 5]
+    leaders = [sum(target >= 3 for target in targets) for targets in neighbour_sets(env.scenario)]
+    assert memory.heard.numpy()[0].tolist() == [ticks * count for count in leaders]
+    assert env.engine.view("estimate_position")[0, :, 0].tolist() == [ticks] * 5
+    env.reset(seed=0)
+    assert not memory.ticks.numpy().any()
+
+
+def test_batch_replay_and_saved_states_keep_its_memory() -> None:
+    rows = coopenv.make_vec("busy_intersection", num_worlds=3, overrides={"observer.name": "toy_counter"})
+    rows.reset(seed=0)
+    rows.step(rows.action_space.sample())
+    assert (rows.engine.world.memory.ticks.numpy() == rows.engine.world.model.ticks_per_decision).all()
+    state = rows.engine.get_state()
+    rows.step(rows.action_space.sample())
+    rows.engine.set_state(state)
+    assert np.array_equal(rows.engine.get_state()["observer_ticks"], state["observer_ticks"])
+    recording = record(coopenv.load_scenario("busy_intersection", {"horizon": 1.0}), seed=0)
+    replay = Replay(recording, "second", {"observer.name": "toy_counter"})
+    engine = Engine(replay.scenario, dtype="float64", backend=replay)
+    engine.reset()
+    engine.step(ticks=7)
+    assert engine.world.memory.ticks.numpy().tolist() == [[7] * 5]
+
+
+def test_names_are_taken_once() -> None:
+    register_embedded(COUNTER)
+    for name in ("robust", "toy_counter"):
+        with pytest.raises(CoopenvError, match=f"'{name}' exists already"):
+            register_embedded(Embedded(name, estimate, start, send_nothing))
+    assert find_embedded("toy_counter") is COUNTER and find_embedded("mekf") is HOST
