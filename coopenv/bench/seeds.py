@@ -10,7 +10,7 @@ from rich.table import Table
 
 from coopenv.api.engine import Engine
 from coopenv.bench.tables import number_table
-from coopenv.estimation.metrics import settling_time
+from coopenv.estimation.metrics import SETTLED, settling_time
 from coopenv.scenario import Scenario
 
 
@@ -27,7 +27,7 @@ class SeedStudy:
     orientation_rmse: np.ndarray
     """(S, N) deg"""
     settle_time: np.ndarray
-    """(S, N) s after which the error stays below 0.5 m and 5 deg; NaN: never."""
+    """(S, N) s after which the errors stay within SETTLED; NaN: never."""
     final_position_error: np.ndarray
     """(S, N) m"""
     final_orientation_error: np.ndarray
@@ -69,7 +69,7 @@ def study_seeds(
         steady_from=steady_from,
         position_rmse=np.sqrt((position[steady] ** 2).mean(axis=0)),
         orientation_rmse=np.sqrt((orientation[steady] ** 2).mean(axis=0)),
-        settle_time=settling_time(t, position, orientation, 0.5, 5.0),
+        settle_time=settling_time(t, position, orientation, SETTLED),
         final_position_error=position[-1],
         final_orientation_error=orientation[-1],
     )

@@ -49,7 +49,7 @@ def bench_seeds(
     """Run many seeds at once: who settles, and the steady errors."""
     scenario = load(environment, parse_overrides(overrides))
     from coopenv.bench.seeds import seed_table, study_seeds
-    from coopenv.estimation.metrics import steady_start
+    from coopenv.estimation.metrics import SETTLED, steady_start
     from coopenv.runs.console import Progress
 
     start = steady_start(steady_from, scenario.horizon)
@@ -57,7 +57,7 @@ def bench_seeds(
         study = study_seeds(scenario, range(first, first + seeds), start, on_progress=progress.update)
     out = console()
     out.print(seed_table(study))
-    out.print(f"Steady: after {start:g} s. Settled: below 0.5 m and 5 deg until the end.")
+    out.print(f"Steady: after {start:g} s. Settled: below {SETTLED.text} until the end.")
 
 
 @bench.command("observers")

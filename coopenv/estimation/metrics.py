@@ -27,8 +27,27 @@ STEADY_SHARE = 0.7
 MIRROR_ANGLE_DEG = 150.0
 """An orientation error above this at the end of a run is the mirrored solution, not a slow one."""
 
-SETTLED_POSITION_M = 0.1
-SETTLED_ORIENTATION_DEG = 1.0
+
+class SettlingTolerance(NamedTuple):
+    """Errors below which an estimate counts as, for example, converged, if it stays there."""
+
+    name: str
+    position_m: float
+    orientation_deg: float
+
+    @property
+    def text(self) -> str:
+        """The tolerance in words, e.g. `0.1 m and 1 deg`."""
+        return f"{self.position_m:g} m and {self.orientation_deg:g} deg"
+
+    def contains(self, position_error: np.ndarray, orientation_error: np.ndarray) -> np.ndarray:
+        """Return whether both errors (m, deg) lie below the tolerance."""
+        return (position_error < self.position_m) & (orientation_error < self.orientation_deg)
+
+
+SETTLED = SettlingTolerance("settled", 0.5, 5.0)
+"""What an estimate can keep under measurement noise."""
+CONVERGED = SettlingTolerance("converged", 0.1, 1.0)
 
 _NOT_CONVERGED = "did not converge, no rate to fit"
 _FIT_SAMPLES = 400  # Theil-Sen looks at every pair: 80 000 slopes
@@ -165,22 +184,20 @@ def settling_time(
     t: np.ndarray,
     position_error: np.ndarray,
     orientation_error: np.ndarray,
-    position_tolerance: float = SETTLED_POSITION_M,
-    orientation_tolerance: float = SETTLED_ORIENTATION_DEG,
+    tolerance: SettlingTolerance = CONVERGED,
 ) -> np.ndarray:
-    """Return the first time from which both errors stay below their tolerance until the end of the record.
+    """Return the first time from which both errors stay below a tolerance until the end of the record.
 
     Args:
         t: (K,) s.
         position_error: (K, ...) m.
         orientation_error: (K, ...) deg.
-        position_tolerance: m.
-        orientation_tolerance: deg.
+        tolerance: what both errors stay below.
 
     Returns:
         (...) s; NaN where the last tick is not below both, so that a passing visit does not count as settled.
     """
-    below = (position_error < position_tolerance) & (orientation_error < orientation_tolerance)
+    below = tolerance.contains(position_error, orientation_error)
     settled = np.logical_and.accumulate(below[::-1], axis=0)[::-1]
     return np.where(settled[-1], np.asarray(t, float)[np.argmax(settled, axis=0)], np.nan)
 
@@ -188,19 +205,17 @@ def settling_time(
 def settling_times(
     trajectory: Trajectory,
     ends: Sequence[float] | None = None,
-    position_tolerance: float = SETTLED_POSITION_M,
-    orientation_tolerance: float = SETTLED_ORIENTATION_DEG,
+    tolerance: SettlingTolerance = CONVERGED,
 ) -> np.ndarray:
     """Return the settling time (N,) s of every vehicle, judged up to its end; see `settling_time`, `live_ticks`."""
     count = len(trajectory.vehicles)
-    tolerances = position_tolerance, orientation_tolerance
     return np.array(
         [
             settling_time(
                 trajectory.t[:ticks],
                 trajectory.position_error[:ticks, vehicle],
                 trajectory.orientation_error[:ticks, vehicle],
-                *tolerances,
+                tolerance,
             )
             for vehicle, ticks in enumerate(live_ticks(trajectory.t, count, ends))
         ]
@@ -297,7 +312,8 @@ def summarise(trajectory: Trajectory, steady_from: float, ends: Sequence[float] 
         steady_from: s; steady RMSE and mean NEES are over the ticks after it.
         ends: s, when each vehicle was parked, after which nothing counts; see `live_ticks`.
     """
-    settled = settling_times(trajectory, ends)
+    settled = settling_times(trajectory, ends, SETTLED)
+    converged = settling_times(trajectory, ends, CONVERGED)
     rows = []
     for vehicle, ticks in enumerate(live_ticks(trajectory.t, len(trajectory.vehicles), ends)):
         t = trajectory.t[:ticks]
@@ -312,6 +328,7 @@ def summarise(trajectory: Trajectory, steady_from: float, ends: Sequence[float] 
                 "initial_position_error_m": float(position[0]),
                 "initial_orientation_error_deg": float(orientation[0]),
                 "settle_time_s": float(settled[vehicle]),
+                "convergence_time_s": float(converged[vehicle]),
                 "steady_position_rmse_m": float(steady_rmse(t, position, steady_from)),
                 "steady_orientation_rmse_deg": float(steady_rmse(t, orientation, steady_from)),
                 "mean_targets_in_view": float(mean_targets_in_view(trajectory.visible[:ticks, vehicle])),

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 from rich.console import Console
-from rich.padding import Padding
 
 from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import Observability, analyse_observability
@@ -15,7 +15,7 @@ from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.metrics import outcome_line, run_metrics, vehicle_metrics
 from coopenv.runs.output import METRICS_FILE, TRAJECTORY_FILE, prepare_folder, write_results
 from coopenv.runs.rollouts import Rollout
-from coopenv.runs.table import metrics_table, remarks
+from coopenv.runs.table import legend, metrics_table, remarks
 from coopenv.runs.video import Film, GifFilm, film_name, frame_stride, open_film
 from coopenv.scenario import Scenario
 
@@ -132,16 +132,13 @@ def report(request: RunRequest, metrics: dict[str, Any], paths: list[Path], out:
         soft_wrap=True,
     )
     out.print()
-    out.print(metrics_table(metrics["vehicles"], request.scenario.noise.enabled))
+    out.print(metrics_table(metrics["vehicles"]))
     out.print()
-    steady_from, end = metrics["steady_from_s"], metrics["simulated_time_s"]
-    if steady_from < end:
-        out.print(f"Steady RMSE and NEES: after {steady_from:g} s. NEES of a consistent estimate: 6.")
-    else:
-        out.print(f"No steady state: it would begin at {steady_from:g} s (see --steady-from).")
-    for line in remarks(metrics["vehicles"]):
+    explained = legend(metrics["steady_from_s"], metrics["simulated_time_s"])
+    for line in (*explained, *remarks(metrics["vehicles"])):
         out.print(line)
     factor = metrics["real_time_factor"]
     out.print(f"Outcome: {metrics['outcome']}. Simulated at {factor:.3g} times real time.")
     out.print(f"Files in {request.folder}:", soft_wrap=True)
-    out.print(Padding(", ".join(path.name for path in paths), (0, 0, 0, 2)))
+    names = ", ".join(path.name for path in paths)
+    out.print(fill(names, out.width, initial_indent="  ", subsequent_indent="  "))

@@ -12,6 +12,7 @@ from rich.text import Text
 
 from coopenv.api.layout import layout_size, observation_layout
 from coopenv.api.registration import environment_id
+from coopenv.format import number
 from coopenv.runs import scenario_text as words
 from coopenv.scenario.schema import Scenario
 from coopenv.scenario.sensing import Camera
@@ -116,7 +117,7 @@ def obstacle_table(scenario: Scenario) -> Table:
     table = _table("building", "centre", "size", "yaw", title="Buildings (m)")
     for obstacle in scenario.obstacles:
         yaw = words.orientation(obstacle.yaw, None) or ""
-        size = " x ".join(words.number(edge) for edge in obstacle.size)
+        size = " x ".join(number(edge) for edge in obstacle.size)
         table.add_row(obstacle.name, words.vector(obstacle.center), size, yaw.removeprefix("yaw "))
     return table
 
@@ -154,7 +155,7 @@ def observation_table(scenario: Scenario) -> Table:
         column.no_wrap = True
     for name, field in layout.items():
         shape = "x".join(str(n) for n in field.shape)
-        scale = words.number(field.scale)
+        scale = number(field.scale)
         table.add_row(name, f"{field.start}:{field.stop}", shape, field.unit, scale, field.meaning)
     return table
 

@@ -9,15 +9,11 @@ from typing import Any
 import numpy as np
 import warp
 
-from coopenv.estimation.metrics import observability_of, settling_times, summarise
+from coopenv.estimation.metrics import observability_of, summarise
 from coopenv.estimation.observability import Observability
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.rollouts import ARRIVED, COLLIDED, UNDER_WAY, Ending, Rollout
 from coopenv.shipped import version
-
-COARSE_POSITION_M = 0.5
-COARSE_ORIENTATION_DEG = 5.0
-"""Wider settling tolerances, which an estimate under measurement noise can meet."""
 
 
 def vehicle_metrics(
@@ -28,11 +24,9 @@ def vehicle_metrics(
     What a vehicle did after it had arrived or collided, parked, does not count.
     """
     ends = [ending.time for ending in endings]
-    coarse = settling_times(trajectory, ends, COARSE_POSITION_M, COARSE_ORIENTATION_DEG)
     return [
         {
             **summary,
-            "coarse_settle_time_s": float(coarse[i]),
             "outcome": endings[i].outcome,
             "ended_at_s": np.nan if endings[i].outcome == UNDER_WAY else endings[i].time,
             "observability": observability_metrics(observability_of(observability, i, ends[i])),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from coopenv.format import number
 from coopenv.scenario.bodies import (
     Body,
     ConstantMotion,
@@ -24,11 +25,6 @@ from coopenv.scenario.topology import neighbour_sets
 
 MANY_LANDMARKS = 4
 """From this number on, `all landmarks` stands for their names."""
-
-
-def number(value: float) -> str:
-    """Return a number with four significant digits and without minus zero."""
-    return f"{value + 0.0:.4g}"
 
 
 def vector(values: Sequence[float]) -> str:

@@ -13,8 +13,7 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
 from coopenv.estimation.metrics import (
-    SETTLED_ORIENTATION_DEG,
-    SETTLED_POSITION_M,
+    CONVERGED,
     error_rotation,
     live_ticks,
     roll_pitch_yaw_deg,
@@ -89,7 +88,7 @@ def error_figure(trajectory: Trajectory, ends: Sequence[float] | None = None) ->
         wspace=_GAP,
         hspace=0.14,
     )
-    settled = settling_times(trajectory, ends)
+    converged = settling_times(trajectory, ends)
     live = live_ticks(trajectory.t, count, ends)
     shaded = [_moving_seen(trajectory, vehicle, ticks) for vehicle, ticks in enumerate(live)]
     for vehicle, ticks in enumerate(live):
@@ -101,16 +100,18 @@ def error_figure(trajectory: Trajectory, ends: Sequence[float] | None = None) ->
                 time_axis(ax, trajectory.t, labelled=ax is log and vehicle == count - 1)
                 shade(ax, shaded[vehicle])
                 shade_ended(ax, trajectory.t, ticks)
-                if np.isfinite(settled[vehicle]):
-                    ax.axvline(float(settled[vehicle]), color=INK, linewidth=0.8, linestyle=_DASHED)
-            _draw_components(linear, trajectory.t[:ticks], quantity, float(settled[vehicle]))
-            _draw_magnitude(log, trajectory.t[:ticks], quantity, float(settled[vehicle]))
+                if np.isfinite(converged[vehicle]):
+                    ax.axvline(float(converged[vehicle]), color=INK, linewidth=0.8, linestyle=_DASHED)
+            _draw_components(linear, trajectory.t[:ticks], quantity, float(converged[vehicle]))
+            _draw_magnitude(log, trajectory.t[:ticks], quantity, float(converged[vehicle]))
             for ax in (linear, log):
                 ax.yaxis.set_label_coords(_LABEL_X, 0.5)
             if column == 0:
                 name = vehicle_label(trajectory.vehicles[vehicle])
                 linear.text(-0.245, 0.15, name, transform=linear.transAxes, fontsize=13, color=INK)
-    _add_legends(figure, height, _marks(bool(np.isfinite(settled).any()), any(shaded), live.min() < len(trajectory.t)))
+    _add_legends(
+        figure, height, _marks(bool(np.isfinite(converged).any()), any(shaded), live.min() < len(trajectory.t))
+    )
     return figure
 
 
@@ -131,7 +132,7 @@ def _quantities(trajectory: Trajectory, vehicle: int, ticks: int) -> tuple[_Quan
             unit="m",
             label="position error\n[m]",
             magnitude_label="norm\n[m]",
-            tolerance=SETTLED_POSITION_M,
+            tolerance=CONVERGED.position_m,
         ),
         _Quantity(
             components=drawable(roll_pitch_yaw_deg(tilde)),
@@ -139,12 +140,12 @@ def _quantities(trajectory: Trajectory, vehicle: int, ticks: int) -> tuple[_Quan
             unit="deg",
             label="orientation error\n[deg]",
             magnitude_label="angle\n[deg]",
-            tolerance=SETTLED_ORIENTATION_DEG,
+            tolerance=CONVERGED.orientation_deg,
         ),
     )
 
 
-def _draw_components(ax: Axes, t: np.ndarray, quantity: _Quantity, settled: float) -> None:
+def _draw_components(ax: Axes, t: np.ndarray, quantity: _Quantity, converged: float) -> None:
     keep = thinned(len(t))
     ax.axhline(0.0, color=GREY, linewidth=0.6, zorder=1)
     low, high = _limits(quantity.components)
@@ -161,7 +162,7 @@ def _draw_components(ax: Axes, t: np.ndarray, quantity: _Quantity, settled: floa
         y, align = (0.04, "bottom") if np.nanmax(-start) > np.nanmax(start) else (0.96, "top")
         note = f"starts at {values} {quantity.unit}"
         begin, end = ax.get_xlim()
-        line = (settled - begin) / (end - begin)
+        line = (converged - begin) / (end - begin)
         x = line + 0.015 if 0.02 < line < 0.4 else 0.02  # beside the dashed line
         box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.0}
         ax.text(x, y, note, transform=ax.transAxes, va=align, fontsize=SMALL, color=INK, bbox=box)
@@ -185,15 +186,15 @@ def _range(values: np.ndarray) -> tuple[float, float]:
     return float(values.min()), float(values.max())
 
 
-def _draw_magnitude(ax: Axes, t: np.ndarray, quantity: _Quantity, settled: float) -> None:
+def _draw_magnitude(ax: Axes, t: np.ndarray, quantity: _Quantity, converged: float) -> None:
     keep = thinned(len(t))
     ax.set_yscale("log")
     ax.plot(t[keep], quantity.magnitude[keep], color=INK, linewidth=0.8)
     ax.axhline(quantity.tolerance, color=GREY, linewidth=0.9, linestyle=_DOTTED)
     ax.plot([t[0]], [quantity.magnitude[0]], "o", markersize=_DOT, color=INK, clip_on=False, zorder=4)
     show_decades(ax)
-    text = f"settled at {settled:.1f} s" if np.isfinite(settled) else "not settled"
-    right, top = _quiet_corner(ax, t, quantity, settled)
+    text = f"converged at {converged:.1f} s" if np.isfinite(converged) else "not converged"
+    right, top = _quiet_corner(ax, t, quantity, converged)
     ax.text(
         0.99 if right else 0.02,
         0.95 if top else 0.07,
@@ -207,11 +208,11 @@ def _draw_magnitude(ax: Axes, t: np.ndarray, quantity: _Quantity, settled: float
     )
 
 
-def _quiet_corner(ax: Axes, t: np.ndarray, quantity: _Quantity, settled: float) -> tuple[bool, bool]:
+def _quiet_corner(ax: Axes, t: np.ndarray, quantity: _Quantity, converged: float) -> tuple[bool, bool]:
     """Return the corner (right, top) of a logarithmic panel where a note covers the least."""
     bottom, top = np.log(ax.get_ylim())
     begin, end = time_span(np.array(ax.get_xlim()))
-    x, line = (t - begin) / (end - begin), (settled - begin) / (end - begin)
+    x, line = (t - begin) / (end - begin), (converged - begin) / (end - begin)
     y, tolerance = ((np.log(v) - bottom) / (top - bottom) for v in (quantity.magnitude, quantity.tolerance))
     width, height = _NOTE
     costs = {}
@@ -231,14 +232,15 @@ def _without_wraps(angle: np.ndarray) -> np.ndarray:
     return np.where(jump, np.nan, angle)
 
 
-def _marks(settled: bool, shaded: bool, ended: bool) -> list[Line2D | Patch]:
+def _marks(converged: bool, shaded: bool, ended: bool) -> list[Line2D | Patch]:
     """Return what the legend explains of all that is in the figure."""
+    tolerance = f"{CONVERGED.position_m:g} m, {CONVERGED.orientation_deg:g} deg"
     marks: list[Line2D | Patch] = [
         Line2D([], [], color=INK, linestyle="none", marker="o", markersize=_DOT, label="at t = 0"),
-        Line2D([], [], color=GREY, linestyle=_DOTTED, linewidth=0.9, label="settling tolerance"),
+        Line2D([], [], color=GREY, linestyle=_DOTTED, linewidth=0.9, label=tolerance),
     ]
-    if settled:
-        marks.append(Line2D([], [], color=INK, linestyle=_DASHED, linewidth=0.8, label="settling time"))
+    if converged:
+        marks.append(Line2D([], [], color=INK, linestyle=_DASHED, linewidth=0.8, label="below both from here on"))
     if shaded:
         marks.append(Patch(facecolor=SHADE, label="moving target detected"))
     if ended:

@@ -9,6 +9,7 @@ from matplotlib.colors import to_rgba_array
 from matplotlib.patheffects import withStroke
 
 from coopenv.estimation.trajectory import Outcome, Sight
+from coopenv.format import fixed
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Body, Landmark, Vehicle
 from coopenv.viz.style import DARK_BLUE, INK, NORMAL, vehicle_colour
@@ -247,7 +248,7 @@ class TopView:
         for i, row in enumerate(self._rows):
             error, angle = view["position_error"][i], view["orientation_error"][i]
             row.set_text(
-                f"{vehicle_mark(i):<4}{_short(error):>7}{angle:>7.1f}{_short(sigma[i]):>7}"
+                f"{vehicle_mark(i):<4}{fixed(error, 3):>7}{angle:>7.1f}{fixed(sigma[i], 3):>7}"
                 f"{f'{seen[i]}/{possible[i]}':>6}"
             )
 
@@ -257,8 +258,3 @@ def _faded(rgba: np.ndarray, alpha: np.ndarray | float) -> np.ndarray:
     faded = rgba.copy()
     faded[:, 3] = alpha
     return faded
-
-
-def _short(value: float) -> str:
-    """Return a length with three or so figures."""
-    return f"{value:.3f}" if value < 10 else f"{value:.1f}" if value < 1e4 else f"{value:.0e}"

@@ -19,7 +19,7 @@ from coopenv.estimation.trajectory import Sight, Trajectory
 from coopenv.runs import Rollout, rollout
 from coopenv.runs.metrics import outcome_line, run_metrics, vehicle_metrics
 from coopenv.runs.output import prepare_folder, write_results
-from coopenv.runs.table import figure, metrics_table, percent, remarks, seconds
+from coopenv.runs.table import legend, metrics_table, remarks
 from coopenv.runs.video import GIF_SIZE, GifFilm, frame_stride
 
 CASES: list[tuple[str, dict[str, Any]]] = [
@@ -175,7 +175,7 @@ def test_metrics_file_is_strict_json_with_figures_of_every_vehicle(tmp_path: Pat
     assert first["observability"]["share_observable"] == 1.0
     assert 0.0 < last["observability"]["share_observable"] < 1.0
     assert last["observability"]["not_observable_s"][0][0] == 0.0
-    assert first["coarse_settle_time_s"] <= first["settle_time_s"]
+    assert first["settle_time_s"] <= first["convergence_time_s"]
 
 
 def test_a_record_shorter_than_any_window_still_has_metrics() -> None:
@@ -257,15 +257,16 @@ def test_figures_of_a_vehicle_end_with_it() -> None:
     assert "arrived at" in next(remarks(vehicles))
 
 
-def test_small_scenes_have_no_wider_tolerance_and_say_why_there_is_no_rate() -> None:
+def test_the_table_has_a_row_per_vehicle_and_a_legend() -> None:
     _, vehicles = vehicles_of("crossing_path", horizon=20.0)
     assert math.isnan(vehicles[0]["ended_at_s"])
     assert vehicles[0]["rate_remark"] == "error fell below half within 1 tick, no rate to fit"
-    assert list(remarks(vehicles)) == [f"vehicle_1: {vehicles[0]['rate_remark']}"]
-    assert not any("0.5 m" in str(column.header) for column in metrics_table(vehicles, True).columns)
-    vehicles[0]["initial_position_error_m"] = 9.0
-    assert any("0.5 m" in str(column.header) for column in metrics_table(vehicles, True).columns)
-    assert not any("0.5 m" in str(column.header) for column in metrics_table(vehicles, False).columns)
+    assert list(remarks(vehicles)) == []
+    table = metrics_table(vehicles)
+    assert table.row_count == len(vehicles)
+    assert [str(column.header).split()[0] for column in table.columns][3:5] == ["settles", "converges"]
+    assert not any("-" in str(column.header) for column in table.columns)
+    assert next(legend(5.0, 20.0)).endswith("Converges: stays below 0.1 m and 1 deg.")
 
 
 def test_a_mirrored_estimate_did_not_converge() -> None:
@@ -274,9 +275,3 @@ def test_a_mirrored_estimate_did_not_converge() -> None:
     assert vehicles[0]["rate_remark"] == "did not converge, no rate to fit"
     lines = [line for line in remarks(vehicles) if line.startswith("vehicle_1: ")]
     assert len(lines) == 1 and "mirrored solution" in lines[0]
-
-
-def test_figures_of_the_table() -> None:
-    assert [figure(x) for x in (math.nan, 0.0, 12.34, 3e-5, 0.5)] == ["-", "0", "12.3", "3.0e-05", "0.5"]
-    assert [seconds(x) for x in (math.nan, 2.9333)] == ["never", "2.93 s"]
-    assert [percent(x) for x in (math.nan, 1.0, 0.99999, 0.00001, 0.0)] == ["-", "100", "99.9", "0.1", "0"]

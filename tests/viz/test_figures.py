@@ -154,8 +154,8 @@ def test_error_figure_shows_the_errors_and_marks_settling_and_moving_targets(run
 
 def test_a_run_that_does_not_settle_says_so(run: Trajectory) -> None:
     figure = error_figure(dataclasses.replace(run, position_error=run.position_error + 1.0))
-    assert "not settled" in texts(figure)
-    assert not any(text.startswith("settled at") for text in texts(figure))
+    assert "not converged" in texts(figure)
+    assert not any(text.startswith("converged at") for text in texts(figure))
 
 
 def test_topology_bars_are_the_stretches_of_each_sight(run: Trajectory) -> None:
@@ -311,12 +311,12 @@ def test_the_settling_time_is_not_written_across_its_line(run: Trajectory) -> No
     figure = error_figure(dataclasses.replace(run, position_error=wide))
     figure.canvas.draw()
     for ax in figure.axes:
-        notes = [text for text in ax.texts if text.get_text().startswith("settled at 45.0")]
+        notes = [text for text in ax.texts if text.get_text().startswith("converged at 45.0")]
         for note in notes:
             line = ax.transData.transform((45.0, 1.0))[0]
             box = note.get_window_extent()
             assert not box.x0 <= line <= box.x1
-    assert any(text.startswith("settled at 45.0") for text in texts(figure))
+    assert any(text.startswith("converged at 45.0") for text in texts(figure))
 
 
 def test_space_shows_estimates_below_the_ground(run: Trajectory) -> None:

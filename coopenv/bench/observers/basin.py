@@ -13,12 +13,11 @@ import numpy as np
 
 from coopenv.bench.observers.executors import Engine
 from coopenv.bench.observers.initial_estimates import random_start
-from coopenv.bench.observers.judge import CONVERGED_ORIENTATION, CONVERGED_POSITION
 from coopenv.bench.observers.sources import Source
 from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.consistency import Interval, wilson_interval
-from coopenv.estimation.metrics import settling_time
+from coopenv.estimation.metrics import CONVERGED, settling_time
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import find
 from coopenv.observers.runner import run
@@ -45,15 +44,15 @@ class Draw:
     vehicles: tuple[str, ...]
     initial_angle: Array  # deg
     initial_distance: Array  # m
-    settle_time: Array  # s from which on the errors stay below 0.1 m and 1 deg; NaN where they do not
+    convergence_time: Array  # s from which on the errors stay within CONVERGED; NaN where they do not
     end_position: Array  # m
     end_orientation: Array  # deg
     failure: str
 
     @property
     def converged(self) -> np.ndarray:
-        """(N,) whether the vehicle ends below 0.1 m and 1 deg."""
-        return (self.end_position < CONVERGED_POSITION) & (self.end_orientation < CONVERGED_ORIENTATION)
+        """(N,) whether the vehicle ends within CONVERGED."""
+        return CONVERGED.contains(self.end_position, self.end_orientation)
 
 
 @dataclass(frozen=True)
@@ -68,8 +67,8 @@ class Basin:
     interval: Interval
     """95 %, Wilson."""
     by_vehicle: tuple[float, ...]
-    settle_time_s: float
-    """Median over the draws that converge of the time at which the last vehicle has settled."""
+    convergence_time_s: float
+    """Median over the draws that converge of the time at which the last vehicle has converged."""
     failed: int
     """Draws in which the observer failed; they count as not converged."""
     failure: str
@@ -91,12 +90,8 @@ def draw_starts(task: BasinTask) -> list[Draw]:
                     vehicles=tuple(setup.name for setup in recording.setups),
                     initial_angle=result.orientation_error[0],
                     initial_distance=result.position_error[0],
-                    settle_time=settling_time(
-                        result.t,
-                        result.position_error,
-                        result.orientation_error,
-                        CONVERGED_POSITION,
-                        CONVERGED_ORIENTATION,
+                    convergence_time=settling_time(
+                        result.t, result.position_error, result.orientation_error, CONVERGED
                     ),
                     end_position=result.position_error[-1],
                     end_orientation=result.orientation_error[-1],
@@ -152,7 +147,7 @@ def basins_of(environment: str, draws: Sequence[Draw]) -> list[Basin]:
         converged = np.array([draw.converged for draw in own])
         everybody = converged.all(axis=1)
         failures = [draw.failure for draw in own if draw.failure]
-        last = np.array([draw.settle_time.max() for draw in own])[everybody]
+        last = np.array([draw.convergence_time.max() for draw in own])[everybody]
         basins.append(
             Basin(
                 environment=environment,
@@ -161,7 +156,7 @@ def basins_of(environment: str, draws: Sequence[Draw]) -> list[Basin]:
                 converged_fraction=float(everybody.mean()),
                 interval=wilson_interval(int(everybody.sum()), len(own)),
                 by_vehicle=tuple(converged.mean(axis=0).tolist()),
-                settle_time_s=float(np.median(last)) if len(last) else float("nan"),
+                convergence_time_s=float(np.median(last)) if len(last) else float("nan"),
                 failed=len(failures),
                 failure=failures[0] if failures else "",
             )
@@ -196,7 +191,7 @@ def plain_draws(draws: Sequence[Draw]) -> list[dict[str, Any]]:
             "initial_orientation_error_deg": float(draw.initial_angle[i]),
             "initial_position_error_m": float(draw.initial_distance[i]),
             "converged": bool(draw.converged[i]),
-            "settle_time_s": float(draw.settle_time[i]),
+            "convergence_time_s": float(draw.convergence_time[i]),
             "final_position_error_m": float(draw.end_position[i]),
             "final_orientation_error_deg": float(draw.end_orientation[i]),
             "failure": draw.failure,

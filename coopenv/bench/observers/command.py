@@ -190,17 +190,19 @@ def print_tables(rows: Sequence[Row], basins: Sequence[Basin], printed: Console)
 
 
 def _basin_table(basins: Sequence[Basin]) -> Table:
-    table = number_table(["basin"], ["draws", "failed", "all vehicles\nconverge", "95 %", "settled [s]\nmedian"], gap=0)
+    table = number_table(
+        ["basin"], ["draws", "failed", "all vehicles\nconverge", "95 %", "converged [s]\nmedian"], gap=0
+    )
     for basin in basins:
         low, high = (100 * end for end in basin.interval)
-        settled = basin.settle_time_s
+        last = basin.convergence_time_s
         table.add_row(
             basin.observer,
             str(basin.draws),
             str(basin.failed),
             f"{100 * basin.converged_fraction:.1f} %",
             f"{low:.1f}..{high:.1f} %",
-            f"{settled:.1f}" if settled == settled else "-",
+            f"{last:.1f}" if last == last else "-",
         )
     return table
 

@@ -84,7 +84,7 @@ def basin_table(basins: Sequence[Basin]) -> str:
                 f"{100 * b.converged_fraction:.1f} %",
                 f"{100 * b.interval.low:.1f}–{100 * b.interval.high:.1f} %",
                 f"{', '.join(f'{100 * share:.0f}' for share in b.by_vehicle)} %",
-                _cell(b.settle_time_s),
+                _cell(b.convergence_time_s),
             ]
         )
         for b in basins
@@ -97,7 +97,7 @@ def basin_table(basins: Sequence[Basin]) -> str:
             "all vehicles converge",
             "95 % interval",
             "by vehicle",
-            "last one settles, median [s]",
+            "last one converges, median [s]",
         ],
         lines,
     )

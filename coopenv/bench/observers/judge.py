@@ -11,19 +11,13 @@ import numpy as np
 from coopenv.bench.observers.sources import Source
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.consistency import diverged, position_std
-from coopenv.estimation.metrics import fit_exponential_rate, settling_time
+from coopenv.estimation.metrics import CONVERGED, SETTLED, SettlingTolerance, fit_exponential_rate, settling_time
 from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.trajectory_error import absolute_error, relative_error
 from coopenv.observers.bound import Bound, cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Factory
 from coopenv.observers.recording import Recording
 from coopenv.observers.runner import Run, run
-
-SETTLED_POSITION, SETTLED_ORIENTATION = 0.5, 5.0
-"""m and deg below which a vehicle counts as settled under noise."""
-
-CONVERGED_POSITION, CONVERGED_ORIENTATION = 0.1, 1.0
-"""m and deg below which it counts as converged."""
 
 RELATIVE_DELTA = 1.0
 """s between the poses of a pair of the relative trajectory error."""
@@ -182,8 +176,8 @@ def sample_of(variant: str, observer: str, scene: Scene, recording: Recording, r
         anees=result.mean(result.nees, steady) / result.nees_dof,
         nis=np.where(told > 0, result.nis, 0.0).sum(axis=0),
         nis_dof=told.sum(axis=0).astype(float),
-        settle_time=_settling(result, SETTLED_POSITION, SETTLED_ORIENTATION),
-        converge_time=_settling(result, CONVERGED_POSITION, CONVERGED_ORIENTATION),
+        settle_time=_settling(result, SETTLED),
+        converge_time=_settling(result, CONVERGED),
         rate=np.array([_rate(result, i) for i in range(N)]),
         diverged=diverged(*ends),
         ate=np.array([absolute_error(recording.truth.position[:, i], result.position[:, i]) for i in range(N)]),
@@ -223,13 +217,13 @@ def _relative(recording: Recording, result: Run) -> Array:
     ).T
 
 
-def _settling(result: Run, position: float, orientation: float) -> Array:
+def _settling(result: Run, tolerance: SettlingTolerance) -> Array:
     """Return (N,) s, judged where the truth is known."""
     times = np.full(result.judged.shape[1], np.nan)
     for i, judged in enumerate(result.judged.T):
         if judged.any():
             t, errors = result.t[judged], (result.position_error[judged, i], result.orientation_error[judged, i])
-            times[i] = settling_time(t, *errors, position, orientation)
+            times[i] = settling_time(t, *errors, tolerance)
     return times
 
 

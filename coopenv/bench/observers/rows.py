@@ -9,15 +9,9 @@ from typing import Any
 import numpy as np
 
 from coopenv.bench.observers.faults import NOMINAL
-from coopenv.bench.observers.judge import (
-    CONVERGED_ORIENTATION,
-    CONVERGED_POSITION,
-    RELATIVE_DELTA,
-    SETTLED_ORIENTATION,
-    SETTLED_POSITION,
-    Sample,
-)
+from coopenv.bench.observers.judge import RELATIVE_DELTA, Sample
 from coopenv.estimation.consistency import DIVERGED_ORIENTATION, DIVERGED_POSITION, LEVEL, Interval, mean_bounds
+from coopenv.estimation.metrics import CONVERGED, SETTLED
 
 
 def _column(meaning: str) -> Any:
@@ -37,9 +31,7 @@ class Row:
     orientation_rmse_deg: float = _column("the same of the geodesic angle between true and estimated orientation, deg")
     bound_m: float = _column("posterior Cramér-Rao bound of the position, joint over all vehicles, m")
     anees: float = _column("mean NEES in the steady state divided by its dimension; 1 for an honest covariance")
-    settled_fraction: float = _column(
-        f"share of seeds whose errors stay below {SETTLED_POSITION:g} m and {SETTLED_ORIENTATION:g} deg to the end"
-    )
+    settled_fraction: float = _column(f"share of seeds whose errors stay below {SETTLED.text} to the end")
     settle_time_s: float = _column("median over these seeds of the time from which on they do, s")
     bytes_per_s: float = _column("payload that the vehicle broadcasts, bytes per second")
     us_per_update: float = _column("median time of an update with its message, microseconds; depends on the machine")
@@ -51,9 +43,7 @@ class Row:
     degradation: float = _column("position_rmse_m over that of the nominal variant")
     position_rmse_median_m: float = _column("median over seeds of each run's RMSE, m")
     position_rmse_p90_m: float = _column("90 % quantile over seeds of each run's RMSE, m")
-    converged_fraction: float = _column(
-        f"share of seeds whose errors stay below {CONVERGED_POSITION:g} m and {CONVERGED_ORIENTATION:g} deg to the end"
-    )
+    converged_fraction: float = _column(f"share of seeds whose errors stay below {CONVERGED.text} to the end")
     convergence_time_s: float = _column("median over these seeds of the time from which on they do, s")
     convergence_rate_per_s: float = _column(
         "median over seeds of the Theil-Sen slope of -log of the error's descent, 1/s"

@@ -27,7 +27,7 @@ from coopenv.observers import Estimate, Tick, find
 from coopenv.observers.dead_reckoning import DeadReckoning
 
 
-def draw(number: int, angles: list[float], ends: list[float], settled: float) -> Draw:
+def draw(number: int, angles: list[float], ends: list[float], converged: float) -> Draw:
     n = len(angles)
     return Draw(
         draw=number,
@@ -35,7 +35,7 @@ def draw(number: int, angles: list[float], ends: list[float], settled: float) ->
         vehicles=tuple(f"vehicle_{i + 1}" for i in range(n)),
         initial_angle=np.array(angles),
         initial_distance=np.full(n, 3.0),
-        settle_time=np.full(n, settled),
+        convergence_time=np.full(n, converged),
         end_position=np.array(ends),
         end_orientation=np.full(n, 0.5),
         failure="",
@@ -45,7 +45,7 @@ def draw(number: int, angles: list[float], ends: list[float], settled: float) ->
 def test_a_draw_converges_when_every_vehicle_does() -> None:
     draws = [draw(0, [10, 100], [0.01, 0.02], 4.0), draw(1, [20, 179], [0.01, 0.2], np.nan)]
     (basin,) = basins_of("here", draws)
-    assert (basin.converged_fraction, basin.by_vehicle, basin.settle_time_s) == (0.5, (1.0, 0.5), 4.0)
+    assert (basin.converged_fraction, basin.by_vehicle, basin.convergence_time_s) == (0.5, (1.0, 0.5), 4.0)
     assert basin.interval.low < 0.5 < basin.interval.high
     assert by_angle(draws) == [(2, 2), (0, 0), (0, 0), (1, 1), (0, 0), (0, 1)]
     assert [line["converged"] for line in plain_draws(draws)] == [True, True, True, False]
@@ -53,7 +53,7 @@ def test_a_draw_converges_when_every_vehicle_does() -> None:
 
 def test_a_failed_run_does_not_converge() -> None:
     (basin,) = basins_of("here", [draw(0, [10, 10], [np.nan, np.nan], np.nan)])
-    assert basin.converged_fraction == 0.0 and np.isnan(basin.settle_time_s)
+    assert basin.converged_fraction == 0.0 and np.isnan(basin.convergence_time_s)
 
 
 class RaisesUpsideDown(DeadReckoning):

@@ -1,0 +1,47 @@
+"""Numbers for people, in tables and pictures; `-` where there is none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+NONE = "-"
+MOST_DECIMALS = 5
+
+
+def number(value: float, digits: int = 4) -> str:
+    """Return a number with so many significant digits, and no decimals where these do not reach them."""
+    if math.isnan(value):
+        return NONE
+    if 10**digits <= abs(value) < 1e6:
+        return f"{value:.0f}"
+    return f"{value + 0.0:.{digits}g}"  # + 0.0: no minus zero
+
+
+def fixed(value: float, decimals: int) -> str:
+    """Return a number whose decimals align with those of others below 10; fewer where it is large."""
+    if math.isnan(value):
+        return NONE
+    return f"{value:.{decimals}f}" if value < 10 else f"{value:.1f}" if value < 1e4 else f"{value:.0e}"
+
+
+def column(values: Sequence[float]) -> list[str]:
+    """Return the numbers of a column with equal decimals: two digits of the smallest, three of the largest."""
+    sizes = [abs(value) for value in values if math.isfinite(value) and 10.0**-MOST_DECIMALS <= abs(value) < 1e6]
+    decimals = 0
+    if sizes:
+        wanted = max(1 - math.floor(math.log10(min(sizes))), 2 - math.floor(math.log10(max(sizes))))
+        decimals = min(max(wanted, 0), MOST_DECIMALS)
+    return [_aligned(value, decimals) for value in values]
+
+
+def _aligned(value: float, decimals: int) -> str:
+    if math.isnan(value):
+        return NONE
+    lost = value != 0.0 and abs(value) < 0.5 * 10.0**-decimals
+    return f"{value:.0e}" if lost or abs(value) >= 1e6 else f"{value + 0.0:.{decimals}f}"
+
+
+def seconds(values: Sequence[float]) -> list[str]:
+    """Return a column of times, s, to a hundredth of a second; `never` for NaN."""
+    return ["never" if math.isnan(value) else f"{value:.2f}" for value in values]

@@ -1,0 +1,56 @@
+"""Numbers for people."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from coopenv.format import column, fixed, number, seconds
+
+NAN = math.nan
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "text"),
+    [
+        (0.0, 4, "0"),
+        (-0.0, 4, "0"),
+        (1 / 3, 4, "0.3333"),
+        (12345.6, 4, "12346"),
+        (12345.6, 3, "12346"),
+        (2.5e6, 3, "2.5e+06"),
+        (-0.5, 3, "-0.5"),
+        (1e-5, 3, "1e-05"),
+        (NAN, 3, "-"),
+        (math.inf, 3, "inf"),
+    ],
+)
+def test_numbers(value: float, digits: int, text: str) -> None:
+    assert number(value, digits) == text
+
+
+@pytest.mark.parametrize(
+    ("values", "texts"),
+    [
+        ([11.5, 90.0, 7.25], ["11.5", "90.0", "7.2"]),
+        ([0.0042, 0.0135, 0.1], ["0.0042", "0.0135", "0.1000"]),
+        ([6.8e-4, 0.04, NAN], ["0.00068", "0.04000", "-"]),
+        ([1e-12, 0.5, 0.0], ["1e-12", "0.500", "0.000"]),
+        ([123.0, 4567.0], ["123", "4567"]),
+        ([3.0, 2e7, math.inf], ["3.00", "2e+07", "inf"]),
+        ([0.0, 0.0], ["0", "0"]),
+        ([NAN], ["-"]),
+        ([], []),
+    ],
+)
+def test_a_column_has_equal_decimals(values: list[float], texts: list[str]) -> None:
+    assert column(values) == texts
+
+
+def test_lengths_align_below_ten() -> None:
+    assert [fixed(value, 3) for value in (0.01, 9.5, 12.34, 54321.0, NAN)] == ["0.010", "9.500", "12.3", "5e+04", "-"]
+
+
+def test_times() -> None:
+    assert seconds([2.934, NAN]) == ["2.93", "never"]
