@@ -5,16 +5,13 @@ from __future__ import annotations
 import re
 import warnings
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from coopenv.errors import ScenarioWarning, suggest
+from coopenv.scenario.fields import ScenarioFields
 from coopenv.scenario.starts import check_room
 from coopenv.scenario.topology import neighbour_sets, processing_order
-
-if TYPE_CHECKING:
-    from coopenv.scenario.schema import Scenario
 
 MOST_TICKS = 1e8
 """Camera frames or odometry samples of one episode; counters are 32 bits wide."""
@@ -32,7 +29,7 @@ def landmark_names(names: Sequence[str]) -> None:
             raise ValueError(f"landmark name '{name}' is reserved for vehicles")
 
 
-def everything(scenario: Scenario) -> None:
+def everything(scenario: ScenarioFields) -> None:
     """Run all checks on a parsed scenario.
 
     Raises:
@@ -46,7 +43,7 @@ def everything(scenario: Scenario) -> None:
     observability(scenario)
 
 
-def gains(scenario: Scenario) -> None:
+def gains(scenario: ScenarioFields) -> None:
     """Check per-vehicle and per-target gains against the names that exist."""
     k = scenario.observer.k
     if isinstance(k, tuple) and len(k) != len(scenario.vehicles):
@@ -58,7 +55,7 @@ def gains(scenario: Scenario) -> None:
                 raise ValueError(f"observer.q: unknown target '{name}'{suggest(name, targets)}")
 
 
-def limits(scenario: Scenario) -> None:
+def limits(scenario: ScenarioFields) -> None:
     """Check quantities of one section against those of another."""
     for name, rate in (("camera", scenario.rates.camera), ("odometry", scenario.rates.odometry)):
         if scenario.horizon * rate > MOST_TICKS:
@@ -83,7 +80,7 @@ def limits(scenario: Scenario) -> None:
         )
 
 
-def observability(scenario: Scenario) -> None:
+def observability(scenario: ScenarioFields) -> None:
     """Warn where the paper's conditions for convergence are not met by construction."""
     count = len(scenario.landmarks)
     if count < 3:

@@ -2,48 +2,15 @@
 
 from __future__ import annotations
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import field_validator, model_validator
 
-from coopenv.errors import suggest
 from coopenv.scenario import checks
-from coopenv.scenario.base import Part, Positive, Vector3
-from coopenv.scenario.bodies import Landmark, Obstacle, Road, Vehicle
-from coopenv.scenario.learning import Action, Dynamics, Observation, Reward, Termination
-from coopenv.scenario.sensing import Camera, Noise, Observer, Rates, Topology, V2x
+from coopenv.scenario.bodies import Landmark
+from coopenv.scenario.fields import ScenarioFields
 
 
-class Map(Part):
-    """The frame in which vehicles know the landmarks."""
-
-    origin: Vector3 = (0.0, 0.0, 0.0)
-    """Point of this file's coordinates at which the map frame has its origin; keep it inside the scene."""
-
-
-class Scenario(Part):
+class Scenario(ScenarioFields):
     """One environment. Units: m, s, rad; frames: x east, y north, z up; body x forward, y left, z up."""
-
-    title: str
-    description: str = ""
-    source: str = ""
-    """Where the figures come from."""
-    horizon: Positive
-    """Length of an episode, s."""
-    map: Map = Map()
-    roads: tuple[Road, ...] = ()
-    obstacles: tuple[Obstacle, ...] = ()
-    landmarks: tuple[Landmark, ...]
-    vehicles: tuple[Vehicle, ...] = Field(min_length=1)
-    camera: Camera = Camera()
-    rates: Rates = Rates()
-    noise: Noise = Noise()
-    topology: Topology = Topology()
-    v2x: V2x = V2x()
-    observer: Observer = Observer()
-    dynamics: Dynamics = Dynamics()
-    observation: Observation = Observation()
-    action: Action = Action()
-    reward: Reward = Reward()
-    termination: Termination = Termination()
 
     @field_validator("landmarks")
     @classmethod
@@ -55,39 +22,3 @@ class Scenario(Part):
     def _is_possible(self) -> Scenario:
         checks.everything(self)
         return self
-
-    @property
-    def vehicle_names(self) -> list[str]:
-        """`vehicle_1`, `vehicle_2`, ... in file order."""
-        return [f"vehicle_{i + 1}" for i in range(len(self.vehicles))]
-
-    @property
-    def target_names(self) -> list[str]:
-        """Landmarks first, then vehicles: the order of the paper's agents and of every target axis."""
-        return [landmark.name for landmark in self.landmarks] + self.vehicle_names
-
-    @property
-    def driven(self) -> bool:
-        """Whether any vehicle is driven by actions."""
-        return any(vehicle.motion.kind == "driven" for vehicle in self.vehicles)
-
-    @property
-    def ticks_per_decision(self) -> int:
-        """Camera ticks between two decisions of the policy."""
-        return round(self.rates.camera / self.rates.decision)
-
-    @property
-    def horizon_ticks(self) -> int:
-        """Camera ticks of an episode."""
-        return max(1, round(self.horizon * self.rates.camera))
-
-    def target_index(self, name: str) -> int:
-        """Return the index of a target.
-
-        Raises:
-            ValueError: no landmark or vehicle has this name.
-        """
-        names = self.target_names
-        if name not in names:
-            raise ValueError(f"unknown target '{name}'{suggest(name, names)}; known: {', '.join(names)}")
-        return names.index(name)

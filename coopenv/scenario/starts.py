@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import warnings
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coopenv.errors import ScenarioWarning
 from coopenv.scenario.bodies import Body, Landmark, Vehicle
+from coopenv.scenario.fields import ScenarioFields
 from coopenv.scenario.motion import path_heading
-
-if TYPE_CHECKING:
-    from coopenv.scenario.schema import Scenario
 
 Box = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Centre (3,) m, rotation (3, 3), half size (3,) m."""
@@ -39,7 +37,7 @@ def start_of(agent: Landmark | Vehicle) -> tuple[np.ndarray, np.ndarray]:
     return np.array(pose.position), rotation_of(pose.yaw, pose.quaternion_wxyz)
 
 
-def agent_starts(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+def agent_starts(scenario: ScenarioFields) -> tuple[np.ndarray, np.ndarray]:
     """Return nominal start positions (A, 3) in the map frame and rotations (A, 3, 3), landmarks first."""
     agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
     starts = [start_of(agent) for agent in agents]
@@ -74,7 +72,7 @@ def possible_boxes(vehicle: Vehicle) -> list[Box]:
     return boxes
 
 
-def check_room(scenario: Scenario) -> None:
+def check_room(scenario: ScenarioFields) -> None:
     """Refuse vehicles that may start inside a building or in one another's place; warn of boxes that overlap.
 
     Raises:

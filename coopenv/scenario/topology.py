@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from graphlib import CycleError, TopologicalSorter
-from typing import TYPE_CHECKING
 
 from coopenv.errors import suggest
-
-if TYPE_CHECKING:
-    from coopenv.scenario.schema import Scenario
+from coopenv.scenario.fields import ScenarioFields
 
 
-def neighbour_sets(scenario: Scenario) -> list[list[int]]:
+def neighbour_sets(scenario: ScenarioFields) -> list[list[int]]:
     """Return, per vehicle, the indices of the targets that it may measure.
 
     Without an explicit list these are all landmarks and, under the acyclic restriction, the vehicles before it
@@ -37,7 +34,7 @@ def neighbour_sets(scenario: Scenario) -> list[list[int]]:
     return result
 
 
-def processing_order(scenario: Scenario) -> list[int]:
+def processing_order(scenario: ScenarioFields) -> list[int]:
     """Return vehicle indices so that leaders come before their followers.
 
     Raises:
