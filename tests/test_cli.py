@@ -174,7 +174,7 @@ def test_scenarios_from_a_path_and_their_warnings(capsys: pytest.CaptureFixture[
     assert Path("out/mine/metrics.json").is_file()
 
 
-def test_an_interrupt_keeps_the_record_and_exits_with_130(
+def test_an_interrupted_run_leaves_the_earlier_result(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from coopenv.runs.rollouts import Rollout
@@ -186,11 +186,13 @@ def test_an_interrupt_keeps_the_record_and_exits_with_130(
             raise KeyboardInterrupt
         take(self)
 
+    assert main(["run", "overtaking", "--steps", "3", "--out", "cut"]) == 0
+    before = {path.name: path.read_bytes() for path in Path("cut").iterdir()}
+    capsys.readouterr()
     monkeypatch.setattr(Rollout, "_take", interrupted)
-    assert main(["run", "busy_intersection", "--out", "cut"]) == 130
-    assert "interrupted at 0.5 s" in capsys.readouterr().out
-    assert len(Trajectory.load(Path("cut/trajectory.npz")).t) == 31
-    assert {path.name for path in Path("cut").iterdir()} == {"metrics.json", "trajectory.npz"}
+    assert main(["run", "overtaking", "--seed", "1", "--out", "cut"]) == 130
+    assert capsys.readouterr().out == ""
+    assert {path.name: path.read_bytes() for path in Path("cut").iterdir()} == before
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -19,21 +20,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from benchmarks.speed.run import measured
     from coopenv.cli.options import load, parse_overrides
     from coopenv.errors import CoopenvError
-    from coopenv.runs.output import prepare_folder
+    from coopenv.files import replacing_folder
 
     out = Console(markup=False, highlight=False, emoji=False)
     try:
-        if asked.out is not None:
-            prepare_folder(asked.out, FILES)
         overrides = parse_overrides(asked.set)
-        report = measured(
-            command(asked), asked.environment, load(asked.environment, overrides), overrides,
-            seconds=asked.seconds or (0.15 if asked.quick else 0.5), rounds=asked.repeats or (3 if asked.quick else 5),
-            peers=not asked.no_peers, growth=asked.growth, quick=asked.quick, log=Console(stderr=True),
-        )  # fmt: skip
-        show(report, out)
-        if asked.out is not None:
-            files = write(report, asked.out)
+        scenario = load(asked.environment, overrides)
+        with nullcontext() if asked.out is None else replacing_folder(asked.out, FILES) as folder:
+            report = measured(
+                command(asked), asked.environment, scenario, overrides, seconds=asked.seconds or (0.15 if asked.quick
+                else 0.5), rounds=asked.repeats or (3 if asked.quick else 5), peers=not asked.no_peers,
+                growth=asked.growth, quick=asked.quick, log=Console(stderr=True),
+            )  # fmt: skip
+            show(report, out)
+            files = [] if folder is None else write(report, folder)
+        if files:
             out.print(f"Files in {asked.out}: {', '.join(path.name for path in files)}", soft_wrap=True)
     except CoopenvError as error:
         print(f"error: {error}", file=sys.stderr)

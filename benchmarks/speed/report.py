@@ -15,7 +15,7 @@ from benchmarks.speed.growth import Growth
 from benchmarks.speed.measure import Result
 from benchmarks.speed.startup import Startup
 from benchmarks.speed.tables import growth_table, memory_table, ratio_table, ratios, speed_table, startup_table
-from coopenv.runs.output import writing
+from coopenv.files import replacing_file
 
 JSON_FILE, SPEED_FILE, GROWTH_FILE = "speed.json", "speed.png", "growth.png"
 FILES = (JSON_FILE, SPEED_FILE, GROWTH_FILE)
@@ -120,12 +120,9 @@ def write(report: Report, folder: Path) -> list[Path]:
     from benchmarks.speed.figures import draw_growth, draw_speed
 
     paths = [folder / JSON_FILE, folder / SPEED_FILE]
-    with writing(paths[0]):
-        paths[0].write_text(json.dumps(report.document(), indent=2, default=str) + "\n", encoding="utf-8")
-    with writing(paths[1]):
-        draw_speed(report.results, paths[1])
+    with replacing_file(paths[0]) as new:
+        new.write_text(json.dumps(report.document(), indent=2, default=str) + "\n", encoding="utf-8")
+    draw_speed(report.results, paths[1])
     if report.growth:
-        paths.append(folder / GROWTH_FILE)
-        with writing(paths[-1]):
-            draw_growth(report.growth, paths[-1])
+        paths.append(draw_growth(report.growth, folder / GROWTH_FILE))
     return paths

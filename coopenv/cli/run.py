@@ -9,7 +9,6 @@ import typer
 
 from coopenv.cli import complete
 from coopenv.cli.options import (
-    INTERRUPTED,
     DataFolder,
     Environment,
     Overrides,
@@ -55,8 +54,7 @@ def run(
         steady_from=steady_from,
         video=video,
     )
-    if not execute(request, console(), console(stderr=True)):
-        raise typer.Exit(INTERRUPTED)
+    execute(request, console(), console(stderr=True))
 
 
 def record_command(

@@ -32,11 +32,11 @@ def schema(
     out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None,
 ) -> None:
     """Write the JSON schema of scenario files, for editors."""
-    from coopenv.runs.output import writing
+    from coopenv.files import replacing_file
     from coopenv.scenario.json_schema import schema_text
 
     if out is None:
         print(schema_text(), end="")
         return
-    with writing(out):
-        out.write_text(schema_text(), encoding="utf-8")
+    with replacing_file(out) as new:
+        new.write_text(schema_text(), encoding="utf-8")

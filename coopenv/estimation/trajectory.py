@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from coopenv.errors import DataError
+from coopenv.files import replacing_file
 
 
 class Sight(IntEnum):
@@ -62,8 +63,13 @@ class Trajectory:
     target_moving: np.ndarray  # (T,) bool: vehicles and moving landmarks
 
     def save(self, path: Path) -> None:
-        """Write every array into a compressed `.npz` under its field name."""
-        np.savez_compressed(path, **{f.name: getattr(self, f.name) for f in fields(self)})
+        """Write every array into a compressed `.npz` under its field name.
+
+        Raises:
+            OutputError: it cannot be written; an older file is untouched.
+        """
+        with replacing_file(path) as new, new.open("wb") as stream:
+            np.savez_compressed(stream, **{f.name: getattr(self, f.name) for f in fields(self)})
 
     @classmethod
     def load(cls, path: Path) -> Trajectory:

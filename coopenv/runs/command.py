@@ -11,12 +11,13 @@ from rich.console import Console
 
 from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import Observability, analyse_observability
+from coopenv.files import replacing_folder
 from coopenv.runs.console import Progress, compile_notice
-from coopenv.runs.metrics import outcome_line, run_metrics, vehicle_metrics
-from coopenv.runs.output import METRICS_FILE, TRAJECTORY_FILE, prepare_folder, write_results
+from coopenv.runs.metrics import run_metrics, vehicle_metrics
+from coopenv.runs.output import result_names, write_results
 from coopenv.runs.rollouts import Rollout
 from coopenv.runs.table import legend, metrics_table, remarks
-from coopenv.runs.video import Film, GifFilm, film_name, frame_stride, open_film
+from coopenv.runs.video import Film, GifFilm, frame_stride, open_film
 from coopenv.scenario import Scenario
 
 
@@ -37,8 +38,8 @@ class RunRequest:
     video: bool = False
 
 
-def execute(request: RunRequest, out: Console, log: Console) -> bool:
-    """Run, write and print; return False when the user interrupted the run, of which what exists is written.
+def execute(request: RunRequest, out: Console, log: Console) -> None:
+    """Run, write and print; a run that does not reach its end writes nothing.
 
     Raises:
         CoopenvError: an argument is not valid, or the results cannot be written.
@@ -49,55 +50,40 @@ def execute(request: RunRequest, out: Console, log: Console) -> bool:
         log.print("note: all motion here is prescribed, the policy has no effect", soft_wrap=True)
     end = recording.ticks_planned / scenario.rates.camera
     steady_from = steady_start(request.steady_from, scenario.horizon, end)
-    prepare_folder(request.folder, _files(request))
-    with compile_notice(log):
-        recording.warm_up()
-    film = open_film(request.folder, _fps(scenario)) if request.video else None
-    finished = _simulate(recording, film, log)
-    trajectory = recording.trajectory()
-    observability = analyse_observability(trajectory)
-    vehicles = vehicle_metrics(trajectory, observability, recording.endings(), steady_from)
-    outcome = outcome_line(recording, interrupted=not finished)
-    metrics = run_metrics(request.name, request.overrides, recording, vehicles, steady_from, outcome)
-    paths = write_results(request.folder, trajectory, metrics)
-    if finished:
-        paths += _draw(request.folder, recording, observability, steady_from, log)
-    if film is not None:
-        paths.append(_finish(film, log))
+    with replacing_folder(request.folder, result_names()) as folder:
+        with compile_notice(log):
+            recording.warm_up()
+        film = open_film(folder, _fps(scenario)) if request.video else None
+        _simulate(recording, film, log)
+        trajectory = recording.trajectory()
+        observability = analyse_observability(trajectory)
+        vehicles = vehicle_metrics(trajectory, observability, recording.endings(), steady_from)
+        metrics = run_metrics(request.name, request.overrides, recording, vehicles, steady_from)
+        paths = write_results(folder, trajectory, metrics)
+        paths += _draw(folder, recording, observability, steady_from, log)
+        if film is not None:
+            paths.append(_finish(film, log))
     report(request, metrics, paths, out)
-    return finished
-
-
-def _files(request: RunRequest) -> list[str]:
-    from coopenv.viz.figures import FIGURE_NAMES
-
-    return [METRICS_FILE, TRAJECTORY_FILE, *FIGURE_NAMES, *([film_name()] if request.video else [])]
 
 
 def _fps(scenario: Scenario) -> float:
     return scenario.rates.camera / frame_stride(scenario)
 
 
-def _simulate(recording: Rollout, film: Film | None, log: Console) -> bool:
-    """Play the recording to its end; return False if the user interrupted it after it had begun."""
+def _simulate(recording: Rollout, film: Film | None, log: Console) -> None:
+    """Play the recording to its end."""
     view = None
     if film is not None:
         from coopenv.viz.topview import TopView
 
         view = TopView(recording.scenario)
     stride = frame_stride(recording.scenario)
-    try:
-        with Progress(log, "simulating", recording.ticks_planned) as progress:
-            for tick in recording.play():
-                if tick % stride == 0:
-                    if film is not None and view is not None:
-                        film.add(view.draw(recording.engine))
-                    progress.update(tick)
-    except KeyboardInterrupt:
-        if recording.ticks_recorded < 1:
-            raise
-        return False
-    return True
+    with Progress(log, "simulating", recording.ticks_planned) as progress:
+        for tick in recording.play():
+            if tick % stride == 0:
+                if film is not None and view is not None:
+                    film.add(view.draw(recording.engine))
+                progress.update(tick)
 
 
 def _draw(

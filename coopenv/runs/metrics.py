@@ -56,16 +56,14 @@ def observability_metrics(observability: Observability) -> dict[str, Any]:
     }
 
 
-def outcome_line(recording: Rollout, interrupted: bool = False) -> str:
+def outcome_line(recording: Rollout) -> str:
     """Return how the run ended, in words."""
     endings = recording.endings()
     scenario = recording.scenario
     count = {word: sum(ending.outcome == word for ending in endings) for word in (ARRIVED, COLLIDED)}
     parts = [f"{number} {word}" for word, number in count.items() if number]
     time = recording.ticks_recorded / scenario.rates.camera
-    if interrupted:
-        end = f"interrupted at {time:g} s"
-    elif all(ending.outcome != UNDER_WAY for ending in endings):
+    if all(ending.outcome != UNDER_WAY for ending in endings):
         end = f"all vehicles had ended by {max(ending.time for ending in endings):.4g} s"
     elif recording.ticks_recorded >= scenario.horizon_ticks:
         end = f"horizon reached at {time:g} s"
@@ -80,7 +78,6 @@ def run_metrics(
     recording: Rollout,
     vehicles: list[dict[str, Any]],
     steady_from: float,
-    outcome: str,
 ) -> dict[str, Any]:
     """Return the contents of `metrics.json`."""
     simulated = recording.ticks_recorded / recording.scenario.rates.camera
@@ -99,7 +96,7 @@ def run_metrics(
             "numpy": np.__version__,
             "python": platform.python_version(),
         },
-        "outcome": outcome,
+        "outcome": outcome_line(recording),
         "simulated_time_s": simulated,
         "wall_time_s": recording.wall_time,
         "real_time_factor": simulated / recording.wall_time,

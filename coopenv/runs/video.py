@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from PIL import Image
 
-from coopenv.runs.output import writing
+from coopenv.files import writing
 from coopenv.scenario import Scenario
 
 MAX_FPS = 20.0

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from coopenv.errors import OutputError
 from coopenv.estimation.observability import Observability, analyse_observability
 from coopenv.estimation.trajectory import Trajectory
+from coopenv.files import writing
 from coopenv.scenario import Scenario
 from coopenv.viz.consistency import consistency_figure
 from coopenv.viz.error_figure import error_figure
@@ -63,8 +63,6 @@ def save_figures(
         "consistency.png": lambda: consistency_figure(trajectory, ends, steady_from),
         "observability.png": lambda: observability_figure(seen, ends),
     }
-    try:
+    with writing(directory):
         directory.mkdir(parents=True, exist_ok=True)
-        return [save(draw[name](), directory / name) for name in FIGURE_NAMES]
-    except OSError as error:
-        raise OutputError(f"{directory}: cannot write figures ({error.strerror or error})") from None
+    return [save(draw[name](), directory / name) for name in FIGURE_NAMES]

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from coopenv.estimation.trajectory import Trajectory
+from coopenv.files import replacing_file
 
 # Okabe and Ito (2008), without the yellow that vanishes on white.
 BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
@@ -40,8 +41,13 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a PNG and return its path."""
-    figure.savefig(path, dpi=DPI, format="png")
+    """Write a PNG and return its path.
+
+    Raises:
+        OutputError: it cannot be written; an older file is untouched.
+    """
+    with replacing_file(path) as new:
+        figure.savefig(new, dpi=DPI, format="png")
     return path
 
 

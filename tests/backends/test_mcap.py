@@ -237,7 +237,7 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.Mon
 
 
 def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="cannot be written"):
+    with pytest.raises(OutputError, match="none does not exist"):
         write_recording(simulated(), tmp_path / "none" / "a.mcap")
 
 

@@ -12,13 +12,13 @@ import pytest
 from PIL import Image
 
 import coopenv
-from coopenv.errors import CoopenvError, DeviceError, OutputError
+from coopenv.errors import CoopenvError, DeviceError
 from coopenv.estimation.metrics import settling_time
 from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.trajectory import Sight, Trajectory
 from coopenv.runs import Rollout, rollout
 from coopenv.runs.metrics import outcome_line, run_metrics, vehicle_metrics
-from coopenv.runs.output import prepare_folder, write_results
+from coopenv.runs.output import write_results
 from coopenv.runs.table import legend, metrics_table, remarks
 from coopenv.runs.video import GIF_SIZE, GifFilm, frame_stride
 
@@ -148,7 +148,7 @@ def test_an_interrupted_run_keeps_what_was_recorded(tmp_path: Path) -> None:
             break
     trajectory = recording.trajectory()
     assert len(trajectory.t) == 101
-    assert outcome_line(recording, interrupted=True) == "interrupted at 1.66667 s"
+    assert outcome_line(recording) == "stopped after the steps asked for, at 1.66667 s"
     trajectory.save(tmp_path / "run.npz")
     assert np.array_equal(Trajectory.load(tmp_path / "run.npz").position, trajectory.position)
 
@@ -159,7 +159,7 @@ def test_metrics_file_is_strict_json_with_figures_of_every_vehicle(tmp_path: Pat
         pass
     trajectory = recording.trajectory()
     vehicles = vehicle_metrics(trajectory, analyse_observability(trajectory), recording.endings(), 35.0)
-    metrics = run_metrics("busy_intersection", {"a.b": [1]}, recording, vehicles, 35.0, "stopped")
+    metrics = run_metrics("busy_intersection", {"a.b": [1]}, recording, vehicles, 35.0)
     write_results(tmp_path, trajectory, metrics)
     text = (tmp_path / "metrics.json").read_text()
     assert "NaN" not in text
@@ -186,20 +186,6 @@ def test_a_record_shorter_than_any_window_still_has_metrics() -> None:
     assert math.isnan(vehicles[0]["observability"]["share_observable"])
 
 
-def test_folders_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    (tmp_path / "run" / "metrics.json").mkdir(parents=True)
-    for folder in ("file", "file/below", "run"):
-        with pytest.raises(OutputError, match="cannot write to"):
-            prepare_folder(tmp_path / folder)
-    prepare_folder(tmp_path / "run", ["trajectory.npz"])
-    (tmp_path / "run" / "trajectory.npz").write_text("kept")
-    prepare_folder(tmp_path / "run", ["trajectory.npz"])
-    assert (tmp_path / "run" / "trajectory.npz").read_text() == "kept"
-    prepare_folder(tmp_path / "new" / "folder")
-    assert list((tmp_path / "new" / "folder").iterdir()) == []
-
-
 def test_films_play_in_real_time(tmp_path: Path) -> None:
     scenario = coopenv.load_scenario("busy_intersection")
     assert frame_stride(scenario) == 6
@@ -215,20 +201,6 @@ def test_films_play_in_real_time(tmp_path: Path) -> None:
             image.seek(frame)
             duration += image.info["duration"]
     assert duration == 1000
-
-
-def test_a_file_that_may_not_be_replaced_is_found_beforehand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "errors.png").write_text("")
-    open_file = Path.open
-
-    def guarded(self: Path, mode: str = "r", *arguments: Any, **options: Any) -> Any:
-        if self.name == "errors.png":
-            raise PermissionError(13, "Permission denied")
-        return open_file(self, mode, *arguments, **options)
-
-    monkeypatch.setattr(Path, "open", guarded)
-    with pytest.raises(OutputError, match=r"errors\.png: Permission denied"):
-        prepare_folder(tmp_path, ["errors.png"])
 
 
 def vehicles_of(name: str, policy: str = "zero", **overrides: Any) -> tuple[Rollout, list[dict[str, Any]]]:

@@ -113,7 +113,7 @@ def test_an_observer_that_is_lost_from_the_start_is_drawn(value: float, tmp_path
 
 def test_a_place_that_cannot_be_written_is_one_clear_error(run: Trajectory, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot write figures"):
+    with pytest.raises(OutputError, match="cannot write to"):
         save_figures(run, tmp_path / "file" / "folder")
 
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from coopenv.backends.mcap.header import Header
 from coopenv.backends.mcap.messages import ATTACHMENT, EXACT, FORMAT, LANDMARKS, LANDMARKS_TYPE, SHOWN, codec, topic
 from coopenv.errors import OutputError
+from coopenv.files import check_file, replacing_file
 from coopenv.observers.recording import Recording
 from coopenv.observers.recording_checks import check_recording
 from coopenv.shipped import version
@@ -24,24 +25,17 @@ def write_recording(recording: Recording, path: str | Path) -> None:
 
     Args:
         recording: from any source.
-        path: of the file, which is overwritten.
+        path: of the file, which is replaced.
 
     Raises:
         CoopenvError: the extra `log` is not installed.
         DataError: it is a recording that nobody could read back.
-        OutputError: the file cannot be written.
+        OutputError: the file cannot be written; an older one is untouched.
     """
     codec()  # before the file is touched
-    path = Path(path)
     check_recording(recording, "recording")
-    unfinished = path.with_name(path.name + ".part")
-    try:
-        with unfinished.open("wb") as stream:
-            _Log(stream, recording).write()
-        unfinished.replace(path)
-    except OSError as error:
-        unfinished.unlink(missing_ok=True)
-        raise OutputError(f"{path}: cannot be written ({error.strerror or error})") from None
+    with replacing_file(path) as new, new.open("wb") as stream:
+        _Log(stream, recording).write()
 
 
 def check_target(path: str | Path) -> None:
@@ -49,14 +43,13 @@ def check_target(path: str | Path) -> None:
 
     Raises:
         CoopenvError: the extra `log` is not installed.
-        OutputError: the name does not end in .mcap, or its folder does not exist.
+        OutputError: the name does not end in .mcap, or the file cannot be written.
     """
     codec()
     path = Path(path)
     if path.suffix != ".mcap":
         raise OutputError(f"{path}: the name must end in .mcap")
-    if not path.parent.is_dir():
-        raise OutputError(f"{path}: folder {path.parent} does not exist")
+    check_file(path)
 
 
 class _Log:

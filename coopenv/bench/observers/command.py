@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -36,11 +37,20 @@ from coopenv.bench.observers.tables import (
 )
 from coopenv.bench.tables import number_table
 from coopenv.estimation.metrics import json_ready
+from coopenv.files import replacing_folder
 from coopenv.observers.registry import available_names, find, observer_names, obstacle
 from coopenv.runs.console import Progress
-from coopenv.runs.output import prepare_folder
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a comparison has found."""
+
+    outcome: Outcome
+    draws: list[Draw]
+    basins: list[Basin]
 
 
 @dataclass(frozen=True)
@@ -132,9 +142,21 @@ def perform(request: Request, engine: Engine, out: Path | None, printed: Console
     Raises:
         CoopenvError: something that was asked for does not exist, or cannot be written.
     """
-    names = (*files.FILES, files.BASIN_FILE) if request.basin else files.FILES
+    found = None
+    try:
+        with nullcontext() if out is None else replacing_folder(out, (*files.FILES, files.BASIN_FILE)) as folder:
+            found = _compare(request, engine, log)
+            if folder is not None:
+                write_files(request, found, folder)
+                names = sorted(path.name for path in folder.iterdir())
+    finally:  # hours of work are told even if they cannot be written
+        if found is not None:
+            print_tables(found.outcome.rows, found.basins, printed)
     if out is not None:
-        prepare_folder(out, names)  # before the work, not after it
+        printed.print(f"Files in {out}: {', '.join(names)}", soft_wrap=True)
+
+
+def _compare(request: Request, engine: Engine, log: Console) -> Found:
     for name, reason in request.left_out.items():
         log.print(f"left out: {name} ({reason})", soft_wrap=True, markup=False)
     outcome = _with_progress(
@@ -157,11 +179,7 @@ def perform(request: Request, engine: Engine, out: Path | None, printed: Console
             f"{len(request.observers)} observers, {request.basin} initial estimates",
             lambda update: study_basin(request.source, request.observers, request.basin, engine, update),
         )
-    basins = basins_of(request.source.name, draws)
-    print_tables(outcome.rows, basins, printed)
-    if out is not None:
-        write_files(request, outcome, draws, basins, out)
-        printed.print(f"Files in {out}: {', '.join(names)}", soft_wrap=True)
+    return Found(outcome, draws, basins_of(request.source.name, draws))
 
 
 def print_tables(rows: Sequence[Row], basins: Sequence[Basin], printed: Console) -> None:
@@ -207,7 +225,7 @@ def _basin_table(basins: Sequence[Basin]) -> Table:
     return table
 
 
-def write_files(request: Request, outcome: Outcome, draws: Sequence[Draw], basins: Sequence[Basin], out: Path) -> None:
+def write_files(request: Request, found: Found, out: Path) -> None:
     """Write the leaderboard as JSON and CSV, the draws as CSV, and the report.
 
     Raises:
@@ -215,6 +233,7 @@ def write_files(request: Request, outcome: Outcome, draws: Sequence[Draw], basin
     """
     from coopenv.bench.observers.report import Report, write_report
 
+    outcome, draws, basins = found.outcome, found.draws, found.basins
     more = {"basin": [asdict(basin) for basin in basins]} if basins else {}
     seeds = request.seeds if request.source.seeded else 1
     content = files.document(outcome.rows, request.command, seeds, **more)

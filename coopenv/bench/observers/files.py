@@ -11,8 +11,8 @@ from typing import Any
 
 from coopenv.bench.observers.rows import Row
 from coopenv.estimation.metrics import json_ready
+from coopenv.files import replacing_file
 from coopenv.machine import versions
-from coopenv.runs.output import writing
 
 JSON_FILE, CSV_FILE, REPORT_FILE = "leaderboard.json", "leaderboard.csv", "report.html"
 BASIN_FILE = "basin.csv"
@@ -37,9 +37,8 @@ def write_json(content: Mapping[str, Any], path: Path) -> None:
     Raises:
         OutputError: it cannot be written.
     """
-    with writing(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    with replacing_file(path) as new:
+        new.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def write_rows(rows: Sequence[Row], path: Path) -> None:
@@ -57,7 +56,7 @@ def write_csv(table: Sequence[Mapping[str, Any]], columns: Sequence[str], path: 
     Raises:
         OutputError: it cannot be written.
     """
-    with writing(path), path.open("w", newline="", encoding="utf-8") as file:
+    with replacing_file(path) as new, new.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=columns)
         writer.writeheader()
         writer.writerows(table)

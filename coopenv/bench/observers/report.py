@@ -23,7 +23,7 @@ from coopenv.bench.observers.judge import Sample
 from coopenv.bench.observers.rows import Row
 from coopenv.bench.observers.score_figures import cost_figure, variant_figure
 from coopenv.bench.observers.tables import failures, honest_line
-from coopenv.runs.output import writing
+from coopenv.files import replacing_file
 from coopenv.viz.style import DPI
 
 _PAGE = Template("""<!DOCTYPE html>
@@ -113,8 +113,8 @@ def write_report(report: Report, path: Path) -> None:
         contents="".join(f'<a href="#s{n}">{escape(s.heading)}</a>' for n, s in enumerate(sections)),
         body="\n".join(f'<h2 id="s{n}">{escape(s.heading)}</h2>\n{s.body}' for n, s in enumerate(sections)),
     )
-    with writing(path):
-        path.write_text(text, encoding="utf-8")
+    with replacing_file(path) as new:
+        new.write_text(text, encoding="utf-8")
 
 
 def _results(report: Report) -> list[Section]:

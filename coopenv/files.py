@@ -1,0 +1,315 @@
+"""Results that are replaced as a whole: a file, or a folder of files.
+
+What is new is written into a hidden folder beside its place, synced to the disk, and then put in place by one operation
+of the file system. Whoever reads, at whatever instant, after `kill -9` and on a full disk, finds the whole old result
+or the whole new one. Two folders change places by Linux's renameat2(RENAME_EXCHANGE); where a system or a file system
+lacks it, by two renames, between which the place is empty: a run that is killed there is put right by the next one.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import secrets
+import shutil
+import stat
+import sys
+import threading
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager, suppress
+from glob import escape
+from pathlib import Path
+
+from coopenv.errors import OutputError
+
+try:
+    import fcntl
+except ImportError:  # no POSIX: nobody can tell whether a hidden folder is still in use, so all of them stay
+    fcntl = None  # type: ignore[assignment]
+
+PART, OLD = ".part", ".old"
+"""Suffixes of hidden folders: what is being written, and what has made room for it."""
+PROBE_BYTES = 1 << 16
+"""Written before the work begins, to find a disk that is full already."""
+AT_FDCWD, RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
+
+_replacing = threading.Lock()
+_under_way: dict[Path, str | Path] = {}
+_written: list[str | Path] = []
+
+
+@contextmanager
+def writing(path: str | Path) -> Iterator[None]:
+    """Turn the system's refusal to write `path` into an `OutputError`."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(f"cannot write to {path}: {error.strerror or error}") from None
+
+
+@contextmanager
+def replacing_file(path: str | Path) -> Iterator[Path]:
+    """Yield a path to write to; what stands there at the end takes the place of the file `path`.
+
+    Raises:
+        OutputError: it cannot be written; the old file is untouched.
+    """
+    with _staging(path, _check_file) as (place, part):
+        new = part / place.name
+        with writing(path):
+            yield new
+            _sync(new)
+            _copy_owner(place, new)
+            with _replacing:
+                new.replace(place)
+                if place.parent not in _under_way:
+                    _written.append(path)
+            _sync(place.parent)
+
+
+@contextmanager
+def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Path]:
+    """Yield a new folder to write to; at the end it takes the place of `folder`, which is made if need be.
+
+    Args:
+        folder: may hold an older result, which goes as a whole, and other files and folders, which are kept.
+        names: of all files that such a result can have.
+
+    Raises:
+        OutputError: it cannot be written or replaced, which is found before anything is yielded where it can be known;
+            the old folder is untouched.
+    """
+
+    def check(path: str | Path, place: Path) -> None:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        _heal(place, names)
+        if os.path.lexists(place):
+            _check_folder(path, place, names)
+
+    with _staging(folder, check) as (place, part):
+        try:
+            yield part
+        except OutputError as error:
+            raise OutputError(str(error).replace(str(part), str(folder))) from None
+        with writing(folder):
+            for path in part.rglob("*"):
+                _sync(path)
+            _sync(part)
+        with _replacing:
+            _replace_folder(folder, place, part, names)
+            _written.append(folder)
+        _sync(place.parent)
+
+
+def check_file(path: str | Path) -> None:
+    """Find out before any work whether a file can be written.
+
+    Raises:
+        OutputError: it cannot.
+    """
+    with _staging(path, _check_file):
+        pass
+
+
+def committing() -> bool:
+    """Return whether a result is being put in place just now."""
+    return _replacing.locked()
+
+
+def abandon(patience: float) -> None:
+    """Remove what is unfinished before this process ends the hard way; nothing is put in place any more.
+
+    Args:
+        patience: s, to wait for a result that is being put in place just now.
+    """
+    if _replacing.acquire(timeout=patience):
+        for part in list(_under_way):
+            shutil.rmtree(part, ignore_errors=True)
+
+
+def what_was_kept() -> str:
+    """Return for people what a command that ends early has written, or left as it was."""
+    if _written:
+        return f"written: {', '.join(map(str, _written))}"
+    kept = [str(path) for path in _under_way.values() if os.path.lexists(path)]
+    return f"kept: {', '.join(kept)} of an earlier run" if kept else "nothing written"
+
+
+def _check_file(path: str | Path, place: Path) -> None:
+    if not place.parent.is_dir():
+        raise OutputError(f"cannot write to {path}: folder {Path(path).parent} does not exist")
+    if place.is_dir():
+        raise OutputError(f"cannot write to {path}: it is a folder")
+    if os.path.lexists(place) and not place.is_file():
+        raise OutputError(f"cannot write to {path}: it is no plain file")
+    if place.exists() and not os.access(place, os.W_OK):
+        raise OutputError(f"cannot write to {path}: it is read-only")
+
+
+def _check_folder(folder: str | Path, place: Path, names: Collection[str]) -> None:
+    if not place.is_dir():
+        raise OutputError(f"cannot write to {folder}: it is not a folder")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise OutputError(f"cannot write to {folder}: it is read-only")
+    folders = [entry for entry in place.iterdir() if entry.is_dir() and not entry.is_symlink()]
+    for entry in folders:
+        if entry.name in names:
+            raise OutputError(f"cannot write to {Path(folder) / entry.name}: it is a folder")
+    fixed = [entry.name for entry in folders if os.path.ismount(entry) or not os.access(entry, os.W_OK)]
+    reason = ""
+    if place.samefile(os.curdir):
+        reason = "it is the current folder"
+    elif os.path.ismount(place):
+        reason = "it is a mount point"
+    elif fixed:
+        reason = f"the folder {fixed[0]} in it cannot be moved"
+    elif folders and not any((place / name).exists() for name in names):
+        reason = f"it holds other folders (such as {folders[0].name}) and no earlier result"
+    if reason:
+        raise OutputError(f"cannot replace {folder}: {reason}; name a folder within it")
+
+
+@contextmanager
+def _staging(path: str | Path, check: Callable[[str | Path, Path], None]) -> Iterator[tuple[Path, Path]]:
+    """Yield the place behind `path`, its symbolic links followed, and a hidden folder beside it, removed at the end.
+
+    The folder is locked for as long as this process lives: others that nobody holds are of runs that were killed.
+    """
+    with writing(path):
+        place = Path(os.path.realpath(path))
+        check(path, place)
+        for left in _abandoned(place, PART):
+            shutil.rmtree(left, ignore_errors=True)
+        part, lock = _new_part(place)
+    _under_way[part] = path
+    try:
+        with writing(path):
+            probe = part / "probe"
+            probe.write_bytes(bytes(PROBE_BYTES))
+            _sync(probe)
+            probe.unlink()
+        yield place, part
+    finally:
+        del _under_way[part]
+        shutil.rmtree(part, ignore_errors=True)
+        if lock is not None:
+            os.close(lock)
+
+
+def _new_part(place: Path) -> tuple[Path, int | None]:
+    """Return a new hidden folder beside a place, and the descriptor that holds it, if there are locks."""
+    while True:
+        part = place.with_name(f".{place.name}.{secrets.token_hex(4)}{PART}")
+        part.mkdir()
+        with suppress(FileNotFoundError):
+            lock = _lock(part, wait=True)
+            if part.exists():  # not taken for abandoned before it was locked
+                return part, lock
+            if lock is not None:
+                os.close(lock)
+
+
+def _replace_folder(folder: str | Path, place: Path, part: Path, names: Collection[str]) -> None:
+    """Put `part` in its place, together with what is there and not of `names`."""
+    try:
+        if not place.exists():
+            part.rename(place)
+            return
+        _copy_owner(place, part)
+        for entry in place.iterdir():
+            if entry.name not in names and (entry.is_symlink() or not entry.is_dir()):
+                with suppress(OSError):  # a file system without links: moved over afterwards, like folders
+                    os.link(entry, part / entry.name, follow_symlinks=False)
+        old = part.with_suffix(OLD)
+        _exchange(part, place, old)
+    except OSError as error:
+        rescued = place.with_name(part.stem.removeprefix("."))
+        with writing(folder):
+            part.rename(rescued)
+        raise OutputError(f"cannot replace {folder}: {error.strerror}; the new result is in {rescued}") from None
+    _clear(old, place, names)
+
+
+def _exchange(part: Path, place: Path, old: Path) -> None:
+    """Let `part` and the folder at `place` change places; the latter is then called `old`."""
+    part.rename(old)  # from now on nobody removes it unseen
+    rename = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
+    paths = os.fsencode(old), os.fsencode(place)
+    if rename is not None and rename(AT_FDCWD, paths[0], AT_FDCWD, paths[1], RENAME_EXCHANGE) == 0:
+        return
+    old.rename(part)
+    place.rename(old)
+    try:
+        part.rename(place)
+    except OSError:
+        old.rename(place)
+        raise
+
+
+def _heal(place: Path, names: Collection[str]) -> None:
+    """Finish what a run that was killed had begun."""
+    for old in _abandoned(place, OLD):
+        if os.path.lexists(place):
+            _clear(old, place, names)
+        else:
+            old.rename(place)
+
+
+def _clear(old: Path, place: Path, names: Collection[str]) -> None:
+    """Remove an old folder but for what is not of `names`, which goes to `place`.
+
+    Where `place` has something else under the same name, both stay where they are.
+    """
+    for entry in old.iterdir():
+        with suppress(OSError):
+            kept = place / entry.name
+            if entry.name in names or (os.path.lexists(kept) and os.path.samestat(entry.lstat(), kept.lstat())):
+                entry.unlink()
+            elif not os.path.lexists(kept):
+                entry.rename(kept)
+    with suppress(OSError):
+        old.rmdir()
+
+
+def _abandoned(place: Path, suffix: str) -> Iterator[Path]:
+    """Yield the hidden folders of a place that belong to no living process."""
+    for path in place.parent.glob(f".{escape(place.name)}.{'[0-9a-f]' * 8}{suffix}"):
+        lock = _lock(path)
+        if lock is not None:
+            try:
+                yield path
+            finally:
+                os.close(lock)
+
+
+def _lock(folder: Path, wait: bool = False) -> int | None:
+    """Return a descriptor that holds a folder until it is closed, or None: held by others, or there are no locks."""
+    if fcntl is None:
+        return None
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        return None
+    return descriptor
+
+
+def _copy_owner(old: Path, new: Path) -> None:
+    """Give what is new the mode and, where allowed, the owner of what it replaces."""
+    if os.name == "posix":
+        with suppress(OSError):
+            info = old.stat()
+            new.chmod(stat.S_IMODE(info.st_mode))
+            os.chown(new, info.st_uid, info.st_gid)
+
+
+def _sync(path: Path) -> None:
+    """Wait until a file, or a folder's list of names, is on the disk."""
+    if os.name != "posix" and path.is_dir():
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,131 @@
+"""Commands that are killed at random instants while they replace an earlier result."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from coopenv.backends.mcap import read_recording
+from coopenv.estimation.trajectory import Trajectory
+from coopenv.runs.output import result_names
+
+SHORT = ["overtaking", "--set", "horizon=0.5"]
+
+
+def start(arguments: list[str], folder: Path, within: Sequence[str] = ()) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*within, sys.executable, "-m", "coopenv.cli", *arguments],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "COLUMNS": "80"},
+        start_new_session=True,
+    )
+
+
+def seed_of_run(folder: Path) -> int:
+    """Return the seed of a whole result of `coopenv run`: every figure is of that size, the arrays of that seed."""
+    metrics = json.loads((folder / "metrics.json").read_text())
+    run = Trajectory.load(folder / "trajectory.npz")
+    final = [vehicle["final_position_error_m"] for vehicle in metrics["vehicles"]]
+    assert np.array_equal(run.position_error[-1], final)
+    names = {path.name for path in folder.iterdir()}
+    assert len(names) == 8 + ("notes.txt" in names)
+    pictures = {name: folder.joinpath(name).stat().st_mtime_ns for name in names if name.endswith(".png")}
+    assert len(pictures) == 6
+    for name in pictures:
+        with Image.open(folder / name) as image:
+            image.load()
+    written = (folder / "metrics.json").stat().st_mtime_ns
+    assert all(0 <= time - written < 60e9 for time in pictures.values()), "figures of another run"
+    return int(metrics["seed"])
+
+
+def seed_of_log(path: Path) -> int:
+    """Return the seed of a whole MCAP file, which its scenario's title carries here."""
+    return int(read_recording(path).scenario.title)
+
+
+def seed_of_board(folder: Path) -> int:
+    """Return the number of seeds of a whole leaderboard."""
+    board = json.loads((folder / "leaderboard.json").read_text())
+    lines = (folder / "leaderboard.csv").read_text().splitlines()
+    assert len(lines) == 1 + len(board["rows"])
+    report = (folder / "report.html").read_text()
+    assert report.rstrip().endswith("</html>")
+    assert f"--seeds {len(board['seeds'])}" in report
+    return len(board["seeds"])
+
+
+def run(seed: int) -> list[str]:
+    return ["run", *SHORT, "--seed", str(seed), "--out", "result"]
+
+
+def record(seed: int) -> list[str]:
+    return ["record", *SHORT, "--set", f'title="{seed}"', "--force", "--out", "result.mcap"]
+
+
+def board(seeds: int) -> list[str]:
+    observers = ["--observers", "riccati", "--variants", "nominal", "--seeds", str(seeds), "--jobs", "1"]
+    return ["bench", "observers", *SHORT, *observers, "--out", "result"]
+
+
+COMMANDS: dict[str, tuple[Callable[[int], list[str]], str, Callable[[Path], int]]] = {
+    "run": (run, "result", seed_of_run),
+    "record": (record, "result.mcap", seed_of_log),
+    "bench observers": (board, "result", seed_of_board),
+}
+
+
+def kill_at_random(command: str, kills: int, folder: Path) -> None:
+    """Kill a command again and again while it replaces an earlier result."""
+    arguments, name, read = COMMANDS[command]
+    begin = time.monotonic()
+    assert start(arguments(1), folder).wait(120) == 0
+    duration = time.monotonic() - begin
+    assert read(folder / name) == 1
+    draw, before, survived = random.Random(7), 1, 0
+    for _ in range(kills):
+        process = start(arguments(3 - before), folder)
+        time.sleep(duration * draw.uniform(0.0, 1.05))
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+        after = read(folder / name)
+        survived += after == before
+        before = after
+    assert survived > 0, "never killed before the end"
+    assert start(arguments(2), folder).wait(120) == 0
+    assert read(folder / name) == 2
+    assert [path.name for path in folder.iterdir()] == [name]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("command", "kills"), [("run", 50), ("record", 20), ("bench observers", 20)])
+def test_killed_commands_leave_a_whole_result(command: str, kills: int, tmp_path: Path) -> None:
+    kill_at_random(command, kills, tmp_path)
+
+
+def test_a_full_disk_is_one_line_and_keeps_the_earlier_result(tmp_path: Path) -> None:
+    earlier = {name: f"earlier {name}" for name in (*result_names(), "notes.txt")}
+    (tmp_path / "result").mkdir()
+    for name, text in earlier.items():
+        (tmp_path / "result" / name).write_text(text)
+    limited = ["bash", "-c", 'ulimit -f 64; exec "$@"', "bash"]  # 64 kB
+    process = start(run(2), tmp_path, limited)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert errors.count("\n") == 1 and "error: cannot write to result/" in errors and "File too large" in errors
+    assert {path.name: path.read_text() for path in (tmp_path / "result").iterdir()} == earlier
+    assert [path.name for path in tmp_path.iterdir()] == ["result"]

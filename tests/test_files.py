@@ -1,0 +1,360 @@
+"""Results that are replaced as a whole, by processes that are killed and on disks that are full."""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from coopenv import files
+from coopenv.errors import OutputError
+from coopenv.files import check_file, replacing_file, replacing_folder, writing
+
+NAMES = ("a.txt", "b.txt", "c.txt", "sometimes.txt")
+
+WRITER = """
+import sys
+from coopenv.files import replacing_file, replacing_folder
+from tests.test_files import write
+for generation in range(int(sys.argv[1]), 10**9):
+    write("result", generation)
+    with replacing_file("single.txt") as new:
+        new.write_text(str(generation) * 200_000)
+    print(generation, flush=True)
+"""
+
+
+def write(folder: str | Path, generation: int) -> None:
+    """Write a result whose files all name their generation; every other one has a further file."""
+    with replacing_folder(folder, NAMES) as new:
+        for name in NAMES[: 3 + generation % 2]:
+            with writing(new / name):
+                (new / name).write_text(str(generation) * 20_000)
+
+
+def generation_of(folder: Path) -> int:
+    """Return the one generation that all files of a whole result name."""
+    found = {path.name: path.read_text() for path in folder.iterdir() if path.name in NAMES}
+    generations = {text[: len(text) // 20_000] for text in found.values()}
+    assert len(generations) == 1, {name: text[:20] for name, text in found.items()}
+    generation = generations.pop()
+    assert sorted(found) == sorted(NAMES[: 3 + int(generation) % 2])
+    assert all(text == generation * 20_000 for text in found.values())
+    return int(generation)
+
+
+def hidden(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir() if path.name.startswith("."))
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A current folder with a result, beside which a user keeps a file and a folder."""
+    monkeypatch.chdir(tmp_path)
+    write("result", 0)
+    (tmp_path / "result" / "notes.txt").write_text("mine")
+    (tmp_path / "result" / "mine").mkdir()
+    (tmp_path / "result" / "mine" / "deep.txt").write_text("mine too")
+    return tmp_path
+
+
+def kill_writers(place: Path, kills: int) -> None:
+    """Kill processes that replace results at random instants; whatever is read then is whole."""
+    (place / "single.txt").write_text("0" * 200_000)
+    draw, least = random.Random(3), 0
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    for _ in range(kills):
+        writer = subprocess.Popen(
+            [sys.executable, "-c", WRITER, str(least + 1)],
+            cwd=place,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
+        assert writer.stdout is not None
+        least = int(writer.stdout.readline())
+        time.sleep(draw.uniform(0.0, 0.1))
+        writer.kill()
+        output, errors = writer.communicate()
+        assert errors == ""
+        finished = [least, *(int(line) for line in output.split())]
+        least = generation_of(place / "result")
+        assert least in (finished[-1], finished[-1] + 1)
+        single = (place / "single.txt").read_text()
+        assert single in (str(finished[-1]) * 200_000, str(finished[-1] + 1) * 200_000)
+        assert (place / "result" / "notes.txt").read_text() == "mine"
+    write("result", 10**6)
+    with replacing_file("single.txt") as new:
+        new.write_text("end")
+    assert generation_of(place / "result") == 10**6
+    assert (place / "result" / "mine" / "deep.txt").read_text() == "mine too"
+    assert hidden(place) == []
+
+
+def test_killed_writers_leave_a_whole_result(place: Path) -> None:
+    kill_writers(place, 5)
+
+
+@pytest.mark.slow
+def test_fifty_killed_writers_leave_a_whole_result(place: Path) -> None:
+    kill_writers(place, 50)
+
+
+def test_readers_find_a_whole_result_at_every_instant(place: Path) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    writer = subprocess.Popen(
+        [sys.executable, "-c", WRITER, "1"], cwd=place, stdout=subprocess.DEVNULL, env=environment
+    )
+    seen = set()
+    try:
+        while len(seen) < 20:
+            text = (place / "result" / "a.txt").read_text()
+            assert text == text[: len(text) // 20_000] * 20_000
+            seen.add(text)
+            assert (place / "result" / "notes.txt").read_text() == "mine"
+    finally:
+        writer.kill()
+        writer.wait()
+
+
+@pytest.mark.parametrize("step", ["link", "_exchange", "_clear", "rmdir"])
+def test_a_run_killed_at_any_step_is_put_right_by_the_next(
+    step: str, place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Killed(BaseException):
+        pass
+
+    def killed(*_: object, **__: object) -> None:
+        raise Killed
+
+    with monkeypatch.context() as patched:
+        patched.setattr({"link": os, "rmdir": Path}.get(step, files), step, killed)
+        patched.setattr(files.shutil, "rmtree", lambda *_, **__: None)  # a dead process does not clean up
+        with pytest.raises(Killed):
+            write("result", 7)
+    assert generation_of(place / "result") == (7 if step in ("_clear", "rmdir") else 0)
+    assert hidden(place) != []
+    write("result", 8)
+    assert generation_of(place / "result") == 8
+    assert (place / "result" / "notes.txt").read_text() == "mine"
+    assert (place / "result" / "mine" / "deep.txt").read_text() == "mine too"
+    assert hidden(place) == []
+
+
+@pytest.fixture
+def without_exchange(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "RENAME_EXCHANGE", 1 << 20)  # a flag that no system knows
+
+
+@pytest.mark.usefixtures("without_exchange")
+def test_without_an_exchange_two_renames_do(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write("result", 1)
+    assert generation_of(place / "result") == 1
+    assert (place / "result" / "mine" / "deep.txt").read_text() == "mine too"
+    assert hidden(place) == []
+    Path("result").rename(".result.0123abcd.old")  # killed between the two
+    write("result", 2)
+    assert generation_of(place / "result") == 2
+    assert (place / "result" / "notes.txt").read_text() == "mine"
+    assert hidden(place) == []
+
+
+@pytest.mark.usefixtures("without_exchange")
+def test_what_cannot_be_put_in_place_is_not_lost(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rename = Path.rename
+
+    def guarded(self: Path, target: Path) -> Path:
+        if self.name == "result":
+            raise OSError(16, "Device or resource busy")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", guarded)
+    with pytest.raises(
+        OutputError, match=r"cannot replace result: Device or resource busy; the new result is in "
+    ) as e:
+        write("result", 3)
+    assert generation_of(Path(str(e.value).rpartition(" ")[2])) == 3
+    assert generation_of(place / "result") == 0
+
+
+def test_what_the_user_has_is_kept_and_what_is_stale_goes(place: Path) -> None:
+    (place / "result").chmod(0o750)
+    (place / "result" / "link").symlink_to("nowhere")
+    write("result", 1)
+    os.link(place / "result" / "notes.txt", place / "other.txt")
+    write("result", 2)
+    names = {path.name for path in (place / "result").iterdir()}
+    assert names == {"a.txt", "b.txt", "c.txt", "notes.txt", "mine", "link"}
+    assert (place / "result").stat().st_mode & 0o777 == 0o750
+    assert (place / "other.txt").samefile(place / "result" / "notes.txt")
+
+
+def test_a_result_that_fails_leaves_the_old_one(place: Path) -> None:
+    with pytest.raises(ZeroDivisionError), replacing_folder("result", NAMES) as new:
+        (new / "a.txt").write_text("new")
+        raise ZeroDivisionError
+    with pytest.raises(ZeroDivisionError), replacing_file("result/a.txt") as new:
+        new.write_text("new")
+        raise ZeroDivisionError
+    assert generation_of(place / "result") == 0
+    assert hidden(place) == hidden(place / "result") == []
+
+
+def test_links_stay_links_and_modes_stay_modes(place: Path) -> None:
+    (place / "to_folder").symlink_to("result")
+    (place / "to_file").symlink_to("result/a.txt")
+    write("to_folder", 1)
+    assert generation_of(place / "result") == 1
+    (place / "result" / "a.txt").chmod(0o604)
+    with replacing_file("to_file") as new:
+        new.write_text("through")
+    assert (place / "result" / "a.txt").read_text() == "through"
+    assert (place / "result" / "a.txt").stat().st_mode & 0o777 == 0o604
+    assert (place / "to_folder").is_symlink() and (place / "to_file").is_symlink()
+
+
+def test_two_at_once_do_not_meet(place: Path) -> None:
+    with replacing_folder("result", NAMES) as first:
+        (first / "a.txt").write_text("1" * 20_000)
+        write("result", 4)
+        assert first.is_dir()
+        for name in NAMES[1:]:
+            (first / name).write_text("1" * 20_000)
+    assert generation_of(place / "result") == 1
+
+
+@pytest.mark.parametrize(
+    ("folder", "reason"),
+    [
+        ("", "current folder"),
+        (".", "current folder"),
+        ("result/notes.txt", "it is not a folder"),
+        ("result/notes.txt/below", "File exists"),
+        ("/proc", "/proc"),
+        ("home", r"other folders \(such as x\)"),
+        ("x" * 300, "File name too long"),
+        ("x" * 250, "File name too long"),
+        ("loop", "not a folder"),
+        ("/dev/null", "it is not a folder"),
+        ("taken", "taken/a.txt: it is a folder"),
+    ],
+)
+def test_impossible_folders_are_refused_before_the_work(folder: str, reason: str, place: Path) -> None:
+    (place / "home" / "x").mkdir(parents=True)
+    (place / "taken" / "a.txt").mkdir(parents=True)
+    (place / "loop").symlink_to("loop")
+    with pytest.raises(OutputError, match=reason) as error, replacing_folder(folder, NAMES):
+        pytest.fail("began")
+    assert "\n" not in str(error.value)
+    assert hidden(place) == []
+
+
+@pytest.mark.parametrize(
+    ("path", "reason"),
+    [
+        ("", "it is a folder"),
+        ("result", "it is a folder"),
+        ("none/file", "folder none does not exist"),
+        ("/dev/null", "no plain file"),
+        ("result/notes.txt/below", "folder result/notes.txt does not exist"),
+        ("x" * 300, "File name too long"),
+        ("loop", "no plain file"),
+        ("/proc/file", "cannot write to /proc/file"),
+    ],
+)
+def test_impossible_files_are_refused_before_the_work(path: str, reason: str, place: Path) -> None:
+    (place / "loop").symlink_to("loop")
+    with pytest.raises(OutputError, match=reason):
+        check_file(path)
+    with pytest.raises(OutputError, match=reason), replacing_file(path):
+        pytest.fail("began")
+    assert hidden(place) == []
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_what_is_read_only_is_refused_before_the_work(place: Path) -> None:
+    (place / "result" / "a.txt").chmod(0o444)
+    with pytest.raises(OutputError, match="read-only"):
+        check_file("result/a.txt")
+    (place / "result").chmod(0o555)
+    with pytest.raises(OutputError, match="read-only"):
+        write("result", 1)
+    place.chmod(0o555)
+    with pytest.raises(OutputError, match="Permission denied"):
+        write("new", 1)
+    place.chmod(0o755)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A disk of 400 kB."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    try:
+        done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", disk], capture_output=True)
+    except OSError:
+        pytest.skip("no mount")
+    if done.returncode != 0:
+        pytest.skip("needs the right to mount")
+    yield disk
+    subprocess.run(["umount", disk], check=True)
+
+
+def test_a_full_disk_keeps_the_old_result(small_disk: Path) -> None:
+    write(small_disk / "result", 0)
+    with replacing_file(small_disk / "single.txt") as new:
+        new.write_text("old")
+    with (
+        pytest.raises(OutputError, match=r"result/.*: No space left"),
+        replacing_folder(small_disk / "result", NAMES) as folder,
+        replacing_file(folder / "a.txt") as new,
+    ):
+        new.write_bytes(bytes(1_000_000))
+    with pytest.raises(OutputError, match="No space left"), replacing_file(small_disk / "single.txt") as new:
+        new.write_bytes(bytes(1_000_000))
+    assert generation_of(small_disk / "result") == 0
+    assert (small_disk / "single.txt").read_text() == "old"
+    assert hidden(small_disk) == hidden(small_disk / "result") == []
+    with (small_disk / "filler").open("wb", buffering=0) as stream, pytest.raises(OSError, match="No space"):
+        while True:
+            stream.write(bytes(4096))
+    for write_one in (lambda: write(small_disk / "result", 1), lambda: check_file(small_disk / "single.txt")):
+        with pytest.raises(OutputError, match="No space left"):
+            write_one()
+    assert generation_of(small_disk / "result") == 0
+    with pytest.raises(OutputError, match="mount point"):
+        write(small_disk, 1)
+
+
+def test_a_read_only_disk_is_found_before_the_work(small_disk: Path) -> None:
+    write(small_disk / "result", 0)
+    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
+    for place in ("result", "new", "new/below"):
+        with pytest.raises(OutputError, match=f"cannot write to .*{place}: .*[rR]ead-only"):
+            write(small_disk / place, 1)
+    with pytest.raises(OutputError, match="ead-only"):
+        check_file(small_disk / "single.txt")
+    assert generation_of(small_disk / "result") == 0
+
+
+def test_a_limit_on_the_size_of_files_keeps_the_old_result(place: Path) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    kept = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with pytest.raises(OutputError, match="File too large"):
+            write("result", 123456)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        signal.signal(signal.SIGXFSZ, kept)
+    assert generation_of(place / "result") == 0
+    assert hidden(place) == []
