@@ -4,14 +4,14 @@ Run: python examples/drive.py
 """
 
 import coopenv
-from coopenv.policies import load_agent
+from coopenv.policies import act, load_agent
 
 env = coopenv.parallel_env("urban_crossing")
-driver = load_agent("give_way", env.observation_layout)
+driver = load_agent("give_way", env.scenario)
 observations, infos = env.reset(seed=1)
 total = dict.fromkeys(env.possible_agents, 0.0)
 while env.agents:
-    actions = {agent: driver.act(observations[agent]) for agent in env.agents}
+    actions = act(driver, {agent: observations[agent] for agent in env.agents})
     observations, rewards, terminated, truncated, infos = env.step(actions)
     for agent, reward in rewards.items():
         total[agent] += reward

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.bench.tables import number_table
-from coopenv.policies.base import Policy
+from coopenv.policies import Policy, act
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,7 @@ def play(env: CooperativeLocalisationEnv, policy: Policy, seed: int) -> tuple[fl
     observations, infos = env.reset(seed=seed)
     total, errors, last = 0.0, [], dict(infos)
     while env.agents:
-        actions = {agent: policy.act(observations[agent]) for agent in env.agents}
-        observations, rewards, _, _, infos = env.step(actions)
+        observations, rewards, _, _, infos = env.step(act(policy, {agent: observations[agent] for agent in env.agents}))
         total += sum(rewards.values())
         last.update(infos)
         errors += [info["position_error"] for info in infos.values()]
@@ -65,8 +64,9 @@ def score(episodes: Iterator[tuple[float, list[str], list[float]]]) -> Score:
 
 def score_table(rows: Iterable[tuple[str, str, Score]]) -> Table:
     """Return one row per (driver, environment, score)."""
-    outcomes = ("arri-\nved", "colli-\nded", "out of\ntime")
-    table = number_table(("agent", "environment"), ("runs", *outcomes, "return", "median\nerror", "95 %\nerror"))
+    outcomes = ("arrived", "collided", "out of\ntime")
+    errors = ("error [m]\nmedian", "\n95 %")
+    table = number_table(("agent", "environment"), ("runs", *outcomes, "return of\nall vehicles", *errors), gap=0)
     for agent, environment, s in rows:
         table.add_row(
             agent,

@@ -32,7 +32,7 @@ def bench_agents(
     for agent in agents or list_agents():
         for name in read_card(agent).environments:
             env = parallel_env(name)
-            policy = load_agent(agent, env.observation_layout)
+            policy = load_agent(agent, env.scenario)
             with Progress(console(stderr=True), f"{agent} in {name}") as progress:
                 rows.append((agent, name, score(play(env, policy, seed) for seed in progress.track(range(seeds)))))
     console().print(score_table(rows))

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
-from coopenv.api.layout import Field
+from coopenv.api.layout import observation_layout
+from coopenv.scenario import Scenario
 
 
 class GiveWay:
     """Pure pursuit of the goal in the vehicle's own estimated frame; stops where driving on would come too close.
 
     In the leader-follower order a vehicle hears its leaders only, so giving way to whomever one hears cannot
-    deadlock. Written for `action.longitudinal = "speed"`.
+    deadlock. Needs `action.longitudinal = "speed"`.
     """
 
     def __init__(
         self,
-        layout: Mapping[str, Field],
+        scenario: Scenario,
         *,
-        max_speed: float = 1.0,
         cruise: float = 0.6,
         clearance: float = 0.9,
         foresight: float = 6.0,
@@ -30,20 +28,24 @@ class GiveWay:
         """Choose the manner of driving.
 
         Args:
-            layout: `env.observation_layout`; needs the groups goal and messages.
-            max_speed: speed at action 1, m/s.
+            scenario: of the environment; its observation needs the groups goal and messages.
             cruise: speed when nothing is in the way, m/s; also what others are expected to drive.
             clearance: distance to keep between reference points, m.
             foresight: how far ahead to look, s.
             look_ahead: distance over which the heading to the goal is closed, m.
             steering_gain: steering share per rad of heading error.
         """
+        if scenario.action.longitudinal != "speed":
+            raise ValueError("it chooses speeds, so it needs action.longitudinal = 'speed'")
+        layout = observation_layout(scenario)
         needed = ("goal", "message_position", "message_forward", "message_mask")
         missing = [name for name in needed if name not in layout]
         if missing:
             raise ValueError(f"the observation lacks {', '.join(missing)}")
         self._layout = layout
-        self._full, self._cruise, self._clearance = max_speed, cruise, clearance
+        full = scenario.dynamics.max_speed
+        self._slowest, self._fastest = (-full if scenario.dynamics.reverse else 0.0), full
+        self._cruise, self._clearance = cruise, clearance
         self._times = np.linspace(0.0, foresight, 31)
         self._look_ahead, self._gain = look_ahead, steering_gain
 
@@ -57,8 +59,11 @@ class GiveWay:
         path = position[None] + self._times[:, None, None] * relative[None]
         return float(np.linalg.norm(path, axis=-1).min(initial=np.inf))
 
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return (speed, steering)."""
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        """Return the actions (speed, steering), (N, 2), for observations (N, D)."""
+        return np.stack([self._act(observation) for observation in observations])
+
+    def _act(self, observation: np.ndarray) -> np.ndarray:
         goal = self._read(observation, "goal")
         heading = float(np.arctan2(goal[1], max(goal[0], self._look_ahead)))
         heard = self._read(observation, "message_mask") > 0.5
@@ -66,5 +71,6 @@ class GiveWay:
         velocity = self._cruise * self._read(observation, "message_forward")[heard, :2]
         going, waiting = (self._closest(position, velocity, speed) for speed in (self._cruise, 0.0))
         go = going >= self._clearance or going > waiting
-        level = 2.0 * self._cruise / self._full - 1.0 if go else -1.0
+        speed = self._cruise if go else 0.0
+        level = 2.0 * (speed - self._slowest) / (self._fastest - self._slowest) - 1.0
         return np.array([level, np.clip(self._gain * heading, -1.0, 1.0)], dtype=np.float32)

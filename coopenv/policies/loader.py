@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from coopenv.api.layout import Field
 from coopenv.errors import CoopenvError, suggest
 from coopenv.policies.base import Policy
+from coopenv.policies.plain import PLAIN
+from coopenv.scenario import Scenario
 from coopenv.shipped import data_directory, list_agents
 
 
@@ -24,7 +24,7 @@ class AgentCard(BaseModel):
     title: str
     description: str
     entry: str
-    """`package.module:Class` within coopenv; called with the observation layout and the options."""
+    """`package.module:Class` within coopenv; called with the scenario and the options."""
     environments: tuple[str, ...]
     """Environments that it was made for."""
     options: dict[str, Any] = {}
@@ -61,8 +61,8 @@ def read_card(name_or_path: str | Path) -> AgentCard:
         raise CoopenvError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
-def load_agent(name_or_path: str | Path, layout: Mapping[str, Field]) -> Policy:
-    """Return a driver that reads observations of a layout (`env.observation_layout`).
+def load_agent(name_or_path: str | Path, scenario: Scenario) -> Policy:
+    """Return a driver for an environment's vehicles (`env.scenario`).
 
     Raises:
         CoopenvError: no such agent, its entry lies outside coopenv, or it cannot drive this environment.
@@ -73,7 +73,26 @@ def load_agent(name_or_path: str | Path, layout: Mapping[str, Field]) -> Policy:
         raise CoopenvError(f"agent '{name_or_path}': entry must be 'coopenv.module:Class', got '{card.entry}'")
     try:
         factory = getattr(import_module(module), attribute)
-        policy: Policy = factory(layout, **card.options)
+        policy: Policy = factory(scenario, **card.options)
     except (ImportError, AttributeError, TypeError, ValueError, KeyError) as error:
         raise CoopenvError(f"agent '{name_or_path}' cannot be built: {error}") from None
     return policy
+
+
+def load_policy(name: str, scenario: Scenario, seed: int) -> Policy:
+    """Return a policy by name: `zero`, `random`, or an agent.
+
+    Args:
+        name: what `--policy` takes.
+        scenario: whose vehicles it drives.
+        seed: of the policy `random`.
+
+    Raises:
+        CoopenvError: there is no such policy, or the agent cannot drive in this scenario.
+    """
+    if name in PLAIN:
+        return PLAIN[name](seed)
+    if name not in list_agents():
+        known = [*PLAIN, *list_agents()]
+        raise CoopenvError(f"unknown policy '{name}'{suggest(name, known)}; known: {', '.join(known)}")
+    return load_agent(name, scenario)

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.api.layout import observation_layout
 from coopenv.errors import CoopenvError
 from coopenv.observers.recording import Recording
-from coopenv.runs.policies import make_policy
+from coopenv.policies import load_policy
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario
 
@@ -28,7 +27,7 @@ def simulate(scenario: Scenario, seed: int, policy: str) -> Recording:
     Raises:
         CoopenvError: unknown policy or observer.
     """
-    decide = make_policy(policy, seed, observation_layout(scenario))
+    decide = load_policy(policy, scenario, seed)
 
     def act(engine: Engine) -> np.ndarray[Any, Any]:
         actions = np.asarray(decide(engine.view("observation")[0].copy()), dtype=np.float64)

@@ -12,7 +12,7 @@ from coopenv.api.engine import Engine
 from coopenv.api.infos import OUTCOMES
 from coopenv.errors import CoopenvError
 from coopenv.estimation.trajectory import Sight, Trajectory
-from coopenv.runs.policies import Policy, make_policy
+from coopenv.policies import Policy, load_policy
 from coopenv.scenario import Scenario
 
 RECORDED = (
@@ -59,7 +59,7 @@ class Rollout:
         self.scenario = scenario
         self.seed = seed
         self.engine = Engine(scenario, 1, dtype, device)
-        self.policy = make_policy(policy, seed, self.engine.layout) if isinstance(policy, str) else policy
+        self.policy = load_policy(policy, scenario, seed) if isinstance(policy, str) else policy
         self.policy_name = policy if isinstance(policy, str) else getattr(policy, "__name__", "custom")
         self.ticks_planned = scenario.horizon_ticks
         if steps is not None:
