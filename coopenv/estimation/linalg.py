@@ -122,25 +122,26 @@ def eigen_symmetric6(M: Any, identity: Any):
             scale += A[i, i] * A[i, i]
             for j in range(i):
                 off += A[i, j] * A[i, j]
-        if off > scale * rounding:
-            for p in range(5):
-                for q in range(p + 1, 6):
-                    if A[p, q] * A[p, q] > wp.abs(A[p, p] * A[q, q]) * rounding:
-                        c, s = jacobi_rotation(A[p, p], A[q, q], A[p, q])
-                        for k in range(6):
-                            akp = A[k, p]
-                            akq = A[k, q]
-                            A[k, p] = c * akp - s * akq
-                            A[k, q] = s * akp + c * akq
-                            ukp = U[k, p]
-                            ukq = U[k, q]
-                            U[k, p] = c * ukp - s * ukq
-                            U[k, q] = s * ukp + c * ukq
-                        for k in range(6):
-                            apk = A[p, k]
-                            aqk = A[q, k]
-                            A[p, k] = c * apk - s * aqk
-                            A[q, k] = s * apk + c * aqk
+        if off <= scale * rounding:
+            break
+        for p in range(5):
+            for q in range(p + 1, 6):
+                if A[p, q] * A[p, q] > wp.abs(A[p, p] * A[q, q]) * rounding:
+                    c, s = jacobi_rotation(A[p, p], A[q, q], A[p, q])
+                    for k in range(6):
+                        akp = A[k, p]
+                        akq = A[k, q]
+                        A[k, p] = c * akp - s * akq
+                        A[k, q] = s * akp + c * akq
+                        ukp = U[k, p]
+                        ukq = U[k, q]
+                        U[k, p] = c * ukp - s * ukq
+                        U[k, q] = s * ukp + c * ukq
+                    for k in range(6):
+                        apk = A[p, k]
+                        aqk = A[q, k]
+                        A[p, k] = c * apk - s * aqk
+                        A[q, k] = s * apk + c * aqk
     return A, U
 
 

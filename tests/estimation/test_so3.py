@@ -10,7 +10,8 @@ from numpy.testing import assert_allclose
 from scipy.integrate import quad_vec
 from scipy.spatial.transform import Rotation
 
-from tests.helpers.warp_calls import DTYPES, EPSILON, call
+from coopenv.estimation import so3
+from tests.helpers.warp_calls import DTYPES, EPSILON, ZERO3, call
 
 ANGLES = np.concatenate(
     [
@@ -46,13 +47,13 @@ def test_exponential_is_scipys(dtype: str) -> None:
     w, _ = turns(np.concatenate([ANGLES, LARGE]))
     w = w.astype(dtype).astype(float)
     tolerance = 8 * EPSILON[dtype] * np.maximum(1.0, np.linalg.norm(w, axis=1))
-    error = np.abs(call("exp_so3", dtype, w) - Rotation.from_rotvec(w).as_matrix()).max(axis=(1, 2))
+    error = np.abs(call(so3.exp_so3, dtype, w) - Rotation.from_rotvec(w).as_matrix()).max(axis=(1, 2))
     assert (error <= tolerance).all()
 
 
 def test_small_turns_keep_their_relative_accuracy() -> None:
     w = np.array([[1e-9, -2e-9, 3e-9]])
-    R = call("exp_so3", "float64", w)[0]
+    R = call(so3.exp_so3, "float64", w)[0]
     assert_allclose((R - R.T)[[2, 0, 1], [1, 2, 0]] / 2, w[0], rtol=1e-14)
 
 
@@ -60,34 +61,34 @@ def test_small_turns_keep_their_relative_accuracy() -> None:
 @settings(max_examples=100, deadline=None)
 def test_left_jacobian_is_the_mean_rotation(w: np.ndarray) -> None:
     mean, _ = quad_vec(lambda s: Rotation.from_rotvec(s * w).as_matrix(), 0.0, 1.0, epsabs=1e-13, epsrel=1e-13)
-    assert_allclose(call("left_jacobian", "float64", w[None])[0], mean, atol=3e-13)
+    assert_allclose(call(so3.left_jacobian, "float64", w[None])[0], mean, atol=3e-13)
 
 
 def test_left_jacobian_in_float32_follows_float64() -> None:
     w = turns(np.concatenate([ANGLES, LARGE]))[0].astype(np.float32)
-    assert_allclose(call("left_jacobian", "float32", w), call("left_jacobian", "float64", w), atol=1e-6)
+    assert_allclose(call(so3.left_jacobian, "float32", w), call(so3.left_jacobian, "float64", w), atol=1e-6)
 
 
 @given(rotation_vectors, rotation_vectors)
 @settings(max_examples=100, deadline=None)
 def test_left_jacobian_composes(w: np.ndarray, v: np.ndarray) -> None:
     """Two halves of a held twist are the whole: J(w) v = J(w/2) v/2 + Exp(w/2) J(w/2) v/2."""
-    whole = call("left_jacobian", "float64", w[None])[0] @ v
-    half = call("left_jacobian", "float64", w[None] / 2)[0] @ v / 2
-    turn = call("exp_so3", "float64", w[None] / 2)[0]
+    whole = call(so3.left_jacobian, "float64", w[None])[0] @ v
+    half = call(so3.left_jacobian, "float64", w[None] / 2)[0] @ v / 2
+    turn = call(so3.exp_so3, "float64", w[None] / 2)[0]
     assert_allclose(half + turn @ half, whole, atol=1e-13 + 1e-13 * np.linalg.norm(v))
 
 
 def test_angle_to_a_picoradian_everywhere() -> None:
     w, angle = turns(ANGLES)
     R = Rotation.from_rotvec(w).as_matrix()
-    assert_allclose(call("rotation_angle", "float64", R), angle, atol=1e-12, rtol=0)
+    assert_allclose(call(so3.rotation_angle, "float64", R, ZERO3), angle, atol=1e-12, rtol=0)
 
 
 def test_angle_in_float32() -> None:
     w, angle = turns(ANGLES)
     R = Rotation.from_rotvec(w).as_matrix()
-    assert_allclose(call("rotation_angle", "float32", R), angle, atol=1e-6, rtol=0)
+    assert_allclose(call(so3.rotation_angle, "float32", R, ZERO3), angle, atol=1e-6, rtol=0)
 
 
 def test_angle_between_near_rotations() -> None:
@@ -95,7 +96,7 @@ def test_angle_between_near_rotations() -> None:
     base = Rotation.random(200, np.random.default_rng(1)).as_matrix()
     for angle in (1e-10, 1e-6, np.pi - 1e-10, np.pi - 1e-6):
         other = base @ Rotation.from_rotvec(angle * axes(174)[:200]).as_matrix()
-        between = call("rotation_angle", "float64", np.swapaxes(base, 1, 2) @ other)
+        between = call(so3.rotation_angle, "float64", np.swapaxes(base, 1, 2) @ other, ZERO3)
         assert_allclose(between, angle, atol=1e-14 if angle < 1 else 1e-12, rtol=1e-5)
 
 
@@ -104,7 +105,7 @@ def test_quaternion_vector_near_half_turns(dtype: str) -> None:
     angles = np.concatenate([ANGLES, 2 * np.arccos([0.1 + 1e-9, 0.1 - 1e-9, 0.09, 0.11])])
     w, angle = turns(angles)
     expected = np.sin(angle / 2)[:, None] * w / np.where(angle > 0, angle, 1.0)[:, None]
-    lam = call("quaternion_vector", dtype, Rotation.from_rotvec(w).as_matrix())
+    lam = call(so3.quaternion_vector, dtype, Rotation.from_rotvec(w).as_matrix(), ZERO3)
     sign = np.ones(len(w))
     tiny = angle > np.pi - 20 * EPSILON[dtype]  # the two signs are one rotation there
     sign[tiny] = np.where((lam * expected).sum(axis=1)[tiny] < 0, -1.0, 1.0)
@@ -118,7 +119,7 @@ def test_quaternion_vector_is_scipys(q: tuple[float, float, float, float]) -> No
     if np.linalg.norm(q) < 1e-3:
         return
     rotation = Rotation.from_quat(q)
-    lam = call("quaternion_vector", "float64", rotation.as_matrix()[None])[0]
+    lam = call(so3.quaternion_vector, "float64", rotation.as_matrix()[None], ZERO3)[0]
     scalar, *vector = rotation.as_quat(canonical=True, scalar_first=True)
     near = min(np.abs(lam - vector).max(), np.abs(lam + vector).max() + (np.inf if scalar > 1e-15 else 0.0))
     assert near < 1e-14
@@ -129,7 +130,7 @@ def test_orthonormalise_removes_the_first_order(dtype: str) -> None:
     rng = np.random.default_rng(2)
     R = Rotation.random(100, rng).as_matrix()
     dent = 1e-4 * rng.uniform(-1, 1, (100, 3, 3))
-    mended = call("orthonormalise", dtype, R + dent)
+    mended = call(so3.orthonormalise, dtype, R + dent)
     gram = np.swapaxes(mended, 1, 2) @ mended - np.eye(3)
     assert np.abs(gram).max() < 5e-7
     u, _, vt = np.linalg.svd(R + dent)

@@ -7,12 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 from numpy.testing import assert_allclose
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from coopenv.errors import ScenarioError
 from coopenv.estimation.trajectory import Sight
+from coopenv.world import camera
+from coopenv.world.model import model_struct
+from coopenv.world.precision import precision
 from tests.helpers.builders import landmark, quaternion_wxyz, run, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES, call
 from tests.oracles import geometry, philox
@@ -161,7 +165,7 @@ def test_segment_against_box(dtype: str) -> None:
     R[:4000] = np.eye(3)
     depth = geometry.depth_by_enumeration(a, b, c, R, half)
     clear = np.abs(depth) > (1e-9 if dtype == "float64" else 1e-5)
-    hits = call("segment_hits_box", dtype, a, b, R, c, half) == 1
+    hits = call(camera.segment_hits_box, dtype, a, b - a, 1.0 / np.sum((b - a) ** 2, axis=1), R, c, half)
     assert (hits == (depth > 0))[clear].all()
     assert 0.1 < hits.mean() < 0.9
     assert clear.mean() > 0.99
@@ -267,10 +271,31 @@ def test_quantised_and_distorted() -> None:
     assert np.abs(uv - geometry.project(point[visible], **PIXY, distortion=PLUMB_BOB)).max() < 0.501
 
 
+@wp.kernel(enable_backward=False, module="unique")
+def there_and_back(lens: Any, xy: wp.array(dtype=Any), out: wp.array(dtype=Any), back: wp.array(dtype=Any)):
+    i = wp.tid()
+    x, y = camera.distort(lens, xy[i][0], xy[i][1])
+    out[i] = type(xy[i])(x, y)
+    x, y = camera.undistort(lens, x, y)
+    back[i] = type(xy[i])(x, y)
+
+
+def through_lens(dtype: str, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return image coordinates (K, 2) distorted by the kernels, and these undistorted again."""
+    types = precision(dtype)
+    lens = model_struct(types).vars["camera"].type()
+    lens.k1, lens.k2, lens.p1, lens.p2, lens.k3 = PLUMB_BOB
+    given = wp.array(xy, dtype=types.vec2, device="cpu")
+    results = [wp.zeros_like(given), wp.zeros_like(given)]
+    wp.launch(there_and_back, dim=len(xy), inputs=[lens, given, *results], device="cpu")
+    distorted, back = (result.numpy().astype(float) for result in results)
+    return distorted, back
+
+
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-7), ("float32", 2e-6)])
 def test_distortion_and_back(dtype: str, tolerance: float) -> None:
     xy = np.random.default_rng(3).uniform(-1, 1, (500, 2)) * [0.75, 0.55]
-    distorted, back = call("distort", dtype, [PLUMB_BOB], xy)
+    distorted, back = through_lens(dtype, xy)
     assert_allclose(distorted, geometry.distort_plumb_bob(xy, PLUMB_BOB), atol=1e-6 if dtype == "float32" else 1e-14)
     assert_allclose(back, xy, atol=tolerance)
 

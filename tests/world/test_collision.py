@@ -10,6 +10,7 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.trajectory import Outcome
+from coopenv.world import collision
 from tests.helpers.builders import command, constant, landmark, reset, run, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES, call
 
@@ -36,8 +37,8 @@ def test_upright_boxes_against_a_linear_programme(dtype: str) -> None:
     Ra, Rb = (Rotation.from_euler("z", y[:, None]).as_matrix() for y in yaw)
     ha, hb = rng.uniform(0.05, 1.2, (2, count, 3))
     depth = np.array([overlap(*x) for x in zip(ca, Ra, ha, cb, Rb, hb, strict=True)])
-    touching = call("boxes_touch", dtype, ca, Ra, ha, cb, Rb, hb) == 1
-    swapped = call("boxes_touch", dtype, cb, Rb, hb, ca, Ra, ha) == 1
+    touching = call(collision.boxes_touch, dtype, ca, Ra, ha, cb, Rb, hb)
+    swapped = call(collision.boxes_touch, dtype, cb, Rb, hb, ca, Ra, ha)
     clear = np.abs(depth) > 1e-5
     np.testing.assert_array_equal(touching[clear], (depth > 0)[clear])
     np.testing.assert_array_equal(swapped, touching)

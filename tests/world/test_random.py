@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from scipy import stats
 
-from tests.helpers.warp_calls import DTYPES, call
+from coopenv.world import random
+from tests.helpers.warp_calls import DTYPES, ZERO3, call
 from tests.oracles import philox
 
 LARGEST = 2**32 - 1
 
 
+ONE = [1.0]
 ROUNDS = 7
 SEVEN_ROUNDS = (
     (0x5F6FB709, 0x0D893F64, 0x4F121F81, 0x4F730A48),
@@ -21,28 +24,36 @@ SEVEN_ROUNDS = (
 """Random123's known answers of philox4x32-7, for the counters and keys of `philox.KNOWN_ANSWERS`."""
 
 
+def draws(counters: ArrayLike, keys: ArrayLike) -> np.ndarray:
+    key0, key1 = np.asarray(keys, np.uint32).T
+    return call(random.philox, "float64", np.asarray(counters, np.uint32), key0, key1)
+
+
+def gaussian_pairs(dtype: str, words: np.ndarray) -> np.ndarray:
+    return np.column_stack(call(random.gaussian_pair, dtype, *words.astype(np.uint32).T, ONE))
+
+
 def test_known_answers() -> None:
     counters, keys, _ = zip(*philox.KNOWN_ANSWERS, strict=True)
-    np.testing.assert_array_equal(call("philox", "float64", counters, keys), np.array(SEVEN_ROUNDS, dtype=np.uint32))
+    np.testing.assert_array_equal(draws(counters, keys), np.array(SEVEN_ROUNDS, dtype=np.uint32))
 
 
 def test_random_counters() -> None:
     rng = np.random.default_rng(0)
     counters = rng.integers(0, 2**32, (2000, 4), dtype=np.uint64)
     keys = rng.integers(0, 2**32, (2000, 2), dtype=np.uint64)
-    np.testing.assert_array_equal(
-        call("philox", "float32", counters, keys), philox.philox4x32_array(counters, keys, ROUNDS)
-    )
+    np.testing.assert_array_equal(draws(counters, keys), philox.philox4x32_array(counters, keys, ROUNDS))
 
 
 def test_draw_packs_what_it_depends_on() -> None:
     seed = np.array([0, 5, 2**63 + 12345, 2**64 - 1], dtype=np.uint64)
     episode, index = np.array([0, 1, 7, LARGEST]), np.array([0, 1, 36000, 2**31 - 1])
     subject, stream = np.array([0, 3, 65536 * 4 + 7, 1]), np.array([1, 2, 3, 7])
+    given = ((episode, "u4"), (index, "i4"), (subject, "i4"), (stream, "u4"))
     counters = np.column_stack([index, subject, stream, episode])
     keys = np.column_stack([seed & np.uint64(LARGEST), seed >> np.uint64(32)])
     np.testing.assert_array_equal(
-        call("draw", "float64", seed, episode, index, subject, stream),
+        call(random.draw, "float64", seed, *(x.astype(t) for x, t in given)),
         philox.philox4x32_array(counters, keys, ROUNDS),
     )
 
@@ -57,21 +68,21 @@ def words(count: int, columns: int = 4) -> np.ndarray:
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_uniform_stays_inside_the_open_interval(dtype: str) -> None:
     edges = np.array([0, 1, 2, 2**31, LARGEST - 200, LARGEST - 128, LARGEST - 1, LARGEST])
-    u = call("uniform", dtype, edges)
+    u = call(random.uniform, dtype, edges.astype(np.uint32), ONE)
     assert (u > 0.0).all()
     assert (u < 1.0).all()
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_uniform_is_uniform(dtype: str) -> None:
-    u = call("uniform", dtype, words(50000).ravel())
+    u = call(random.uniform, dtype, words(50000).ravel().astype(np.uint32), ONE)
     assert stats.kstest(u, "uniform").pvalue > 1e-3
     assert abs(np.corrcoef(u[:-1], u[1:])[0, 1]) < 0.01
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_gaussian_pairs_are_independent_standard_normals(dtype: str) -> None:
-    pairs = call("gaussian_pair", dtype, words(100000, 2))[:, :2]
+    pairs = gaussian_pairs(dtype, words(100000, 2))
     for column in pairs.T:
         assert stats.kstest(column, "norm").pvalue > 1e-3
         assert abs(stats.kurtosis(column)) < 0.05
@@ -85,12 +96,12 @@ def test_gaussian_pairs_are_independent_standard_normals(dtype: str) -> None:
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_gaussian_is_finite_at_the_extremes(dtype: str) -> None:
     ends = np.array([[a, b] for a in (0, 1, LARGEST - 1, LARGEST) for b in (0, 1, 2, 3, LARGEST)])
-    assert np.isfinite(call("gaussian_pair", dtype, ends)).all()
+    assert np.isfinite(gaussian_pairs(dtype, ends)).all()
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_directions_are_uniform_on_the_sphere(dtype: str) -> None:
-    u = call("unit_vector", dtype, words(50000, 2))
+    u = call(random.unit_vector, dtype, *words(50000, 2).T.astype(np.uint32), ZERO3)
     np.testing.assert_allclose(np.linalg.norm(u, axis=1), 1.0, atol=1e-6)
     for axis in ([1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.0, 0.8]):  # Archimedes: each height is uniform
         assert stats.kstest((u @ axis + 1) / 2, "uniform").pvalue > 1e-3
