@@ -45,6 +45,8 @@ class Embedded:
     """(model, state, memory, world, vehicle, tick): put on the air what the V2X pose estimate does not carry."""
     allocate: Callable[[Any, int, np.ndarray, str], Any] = lambda model, worlds, start_covariance, device: Nothing()
     """(model, worlds, start_covariance (N, 6, 6), device): return the memory."""
+    fit: Callable[[Any], Embedded] | None = None
+    """(model): return the variant to compile for a model; None: this one."""
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """Options of the Warp module that it is compiled in."""
 

@@ -43,7 +43,7 @@ def drive_through(model: Any, state: Any, world: int, vehicle: int, command: Any
     sample = state.odometry_samples[world, vehicle]
     taken = int(0)
     due = wp.float64(sample) * model.odometry_period
-    while due <= tick_end + wp.float64(1.0e-9):
+    while due <= tick_end + wp.float64(1.0e-9) and taken < model.samples_per_tick:
         drive(model, state, world, vehicle, command, wp.max(due - now, wp.float64(0.0)))
         state.sampled_velocity[world, vehicle, taken] = state.velocity[world, agent]
         state.sampled_angular_velocity[world, vehicle, taken] = state.angular_velocity[world, agent]

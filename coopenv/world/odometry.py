@@ -56,17 +56,17 @@ def measure_odometry(model: Any, state: Any, world: int, vehicle: int, tick: int
     translation = v - v
     taken = int(0)
     due = wp.float64(sample) * model.odometry_period
-    while due <= tick_end + wp.float64(1.0e-9):
-        duration = wp.max(due - now, wp.float64(0.0))
-        rotation, translation = increment(rotation, translation, v, w, v.dtype(duration))
+    while due <= tick_end + wp.float64(1.0e-9) and taken < model.samples_per_tick:
+        if due > now:
+            rotation, translation = increment(rotation, translation, v, w, v.dtype(due - now))
         true_v, true_w = true_twist(model, state, world, vehicle, taken, due)
         v, w = noisy_sample(model, state, world, vehicle, sample, true_v, true_w)
         now = due
         taken += 1
         sample += 1
         due = wp.float64(sample) * model.odometry_period
-    duration = wp.max(tick_end - now, wp.float64(0.0))
-    rotation, translation = increment(rotation, translation, v, w, v.dtype(duration))
+    if tick_end > now:  # not so where the last sample falls on the frame
+        rotation, translation = increment(rotation, translation, v, w, v.dtype(tick_end - now))
     state.odometry_velocity[world, vehicle] = v
     state.odometry_angular_velocity[world, vehicle] = w
     state.odometry_samples[world, vehicle] = sample

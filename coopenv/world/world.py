@@ -71,9 +71,9 @@ class World:
         self.threads = default_threads(worlds, self.device) if threads is None else min(threads, worlds)
         if self.device != "cpu":
             self.threads = 1
-        self.observer = observer
-        """What estimates in the kernels; `HOST` where estimates are written from outside, see `PlugIns`."""
         self.model = self._build_model()
+        self.observer = observer if observer.fit is None else observer.fit(self.model)
+        """What estimates in the kernels; `HOST` where estimates are written from outside, see `PlugIns`."""
         self.state = allocate_state(self.model, worlds, self.precision, self.device)
         N = self.model.vehicles
         covariance = np.zeros((N, 6, 6)) if start_covariance is None else start_covariance

@@ -81,59 +81,6 @@ def shrink(turn: Any, limit: Any):
 
 
 @wp.func
-def correct(model: Any, state: Any, world: int, vehicle: int, tick: int, duration: Any):
-    """Let the bearings act for `duration`, re-linearising whenever the attitude has turned by max_turn."""
-    R = state.estimate_rotation[world, vehicle]
-    p = state.estimate_position[world, vehicle]
-    P = state.covariance[world, vehicle]
-    k = model.observer.k[vehicle]
-    limit = model.observer.max_turn
-    one = type(duration)(1.0)
-    zero6 = P - P
-    A = block3(P, 0, 0, R - R)
-    B = block3(P, 0, 3, R - R)
-    D = block3(P, 3, 3, R - R)
-    remaining = duration
-    substeps = int(0)
-    while remaining > duration * type(duration)(1.0e-9):
-        M11, M12, M22, r1, r2 = information(model, state, world, vehicle, tick, R, p)
-        L11, L21, L22, _, _ = cholesky6(A, B, D)
-        h = remaining
-        substeps += 1
-        if k == one:
-            dx1, dx2, A1, B1, D1 = correct_kalman(h, M11, M12, M22, L11, L21, L22, r1, r2)
-            turn = wp.length(dx1)
-            while turn > limit and substeps < MOST_SUBSTEPS:
-                h = h * shrink(turn, limit)
-                dx1, dx2, A1, B1, D1 = correct_kalman(h, M11, M12, M22, L11, L21, L22, r1, r2)
-                turn = wp.length(dx1)
-        else:
-            identity6 = join6(identity3(p), R - R, R - R, identity3(p), zero6)
-            T, spectrum = correction_modes(M11, M12, M22, L11, L21, L22, zero6, identity6)
-            dx1, dx2 = correct_modes(k, h, T, spectrum, r1, r2)
-            turn = wp.length(dx1)
-            while turn > limit and substeps < MOST_SUBSTEPS:
-                h = h * shrink(turn, limit)
-                dx1, dx2 = correct_modes(k, h, T, spectrum, r1, r2)
-                turn = wp.length(dx1)
-            P1 = covariance_modes(h, T, spectrum)
-            A1 = block3(P1, 0, 0, R - R)
-            B1 = block3(P1, 0, 3, R - R)
-            D1 = block3(P1, 3, 3, R - R)
-        R = R * exp_so3(dx1)
-        p = p + dx2
-        A = A1
-        B = B1
-        D = D1
-        remaining = remaining - h
-    # A correction that overflows the precision (float32 far from the origin, absurd gains) is left out.
-    if wp.isfinite(wp.dot(p, p) + wp.trace(A) + wp.trace(D) + wp.trace(R)):
-        state.estimate_rotation[world, vehicle] = R
-        state.estimate_position[world, vehicle] = p
-        state.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D, zero6)
-
-
-@wp.func
 def dead_reckon(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: int):
     """Run one tick without correction: the estimate follows odometry, P grows."""
     predict(model, state, world, vehicle, type(model.observer.max_turn)(model.camera_period))
@@ -144,16 +91,108 @@ def dead_reckon(model: Any, state: Any, memory: Any, world: int, vehicle: int, t
 
 
 @wp.func
-def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: int):
-    """Run one tick of the observer of one vehicle: predict, and correct when its rate says so."""
-    dt = type(model.observer.max_turn)(model.camera_period)
-    predict(model, state, world, vehicle, dt)
-    if correction_due(model, tick):
-        duration = dt * type(dt)(tick - state.corrected_tick[world, vehicle])
-        correct(model, state, world, vehicle, tick, duration)
-        state.corrected_tick[world, vehicle] = tick
-    state.estimate_rotation[world, vehicle] = orthonormalise(state.estimate_rotation[world, vehicle])
+def kalman_step(
+    k: Any, h: Any, limit: Any, last: bool, M11: Any, M12: Any, M22: Any, L11: Any, L21: Any, L22: Any, r1: Any, r2: Any
+):
+    """Return (h, dx1, dx2, A, B, D) of one sub-step for k = 1, P = L L^T.
+
+    h is shortened until the attitude turns by no more than `limit`, but not in the `last` sub-step.
+    """
+    taken = h
+    dx1, dx2, A, B, D = correct_kalman(taken, M11, M12, M22, L11, L21, L22, r1, r2)
+    turn = wp.length(dx1)
+    while turn > limit and not last:
+        taken = taken * shrink(turn, limit)
+        dx1, dx2, A, B, D = correct_kalman(taken, M11, M12, M22, L11, L21, L22, r1, r2)
+        turn = wp.length(dx1)
+    return taken, dx1, dx2, A, B, D
 
 
-RICCATI = Embedded("riccati", estimate, start_nothing, send_nothing)
+@wp.func
+def modal_step(
+    k: Any, h: Any, limit: Any, last: bool, M11: Any, M12: Any, M22: Any, L11: Any, L21: Any, L22: Any, r1: Any, r2: Any
+):
+    """Return what `kalman_step` does for any gain k, through the modes of L^T M L."""
+    o = M11 - M11
+    one3 = identity3(r1)
+    zero6 = join6(o, o, o, o, wp.matrix(dtype=M11.dtype, shape=(6, 6)))
+    taken = h
+    T, spectrum = correction_modes(M11, M12, M22, L11, L21, L22, zero6, join6(one3, o, o, one3, zero6))
+    dx1, dx2 = correct_modes(k, taken, T, spectrum, r1, r2)
+    turn = wp.length(dx1)
+    while turn > limit and not last:
+        taken = taken * shrink(turn, limit)
+        dx1, dx2 = correct_modes(k, taken, T, spectrum, r1, r2)
+        turn = wp.length(dx1)
+    P = covariance_modes(taken, T, spectrum)
+    return taken, dx1, dx2, block3(P, 0, 0, o), block3(P, 0, 3, o), block3(P, 3, 3, o)
+
+
+@wp.func
+def gain_step(
+    k: Any, h: Any, limit: Any, last: bool, M11: Any, M12: Any, M22: Any, L11: Any, L21: Any, L22: Any, r1: Any, r2: Any
+):
+    """Return what `kalman_step` does, by the shorter way where k = 1."""
+    if k == type(k)(1.0):
+        taken, dx1, dx2, A, B, D = kalman_step(k, h, limit, last, M11, M12, M22, L11, L21, L22, r1, r2)
+    else:
+        taken, dx1, dx2, A, B, D = modal_step(k, h, limit, last, M11, M12, M22, L11, L21, L22, r1, r2)
+    return taken, dx1, dx2, A, B, D
+
+
+def make_estimate(step: Any) -> Any:
+    """Return the Warp function of one tick of the observer, whose corrections are made of `step`s."""
+
+    @wp.func
+    def correct(model: Any, state: Any, world: int, vehicle: int, tick: int, duration: Any):
+        """Let the bearings act for `duration`, re-linearising whenever the attitude has turned by max_turn."""
+        R = state.estimate_rotation[world, vehicle]
+        p = state.estimate_position[world, vehicle]
+        P = state.covariance[world, vehicle]
+        A = block3(P, 0, 0, R - R)
+        B = block3(P, 0, 3, R - R)
+        D = block3(P, 3, 3, R - R)
+        remaining = duration
+        substeps = int(0)
+        while remaining > duration * type(duration)(1.0e-9):
+            M11, M12, M22, r1, r2 = information(model, state, world, vehicle, tick, R, p)
+            L11, L21, L22, _, _ = cholesky6(A, B, D)
+            substeps += 1
+            last = substeps >= MOST_SUBSTEPS
+            limit = model.observer.max_turn
+            k = model.observer.k[vehicle]
+            h, dx1, dx2, A, B, D = step(k, remaining, limit, last, M11, M12, M22, L11, L21, L22, r1, r2)
+            R = R * exp_so3(dx1)
+            p = p + dx2
+            remaining = remaining - h
+        # A correction that overflows the precision (float32 far from the origin, absurd gains) is left out.
+        if wp.isfinite(wp.dot(p, p) + wp.trace(A) + wp.trace(D) + wp.trace(R)):
+            state.estimate_rotation[world, vehicle] = R
+            state.estimate_position[world, vehicle] = p
+            state.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D, P - P)
+
+    @wp.func
+    def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: int):
+        """Run one tick of the observer of one vehicle: predict, and correct when its rate says so."""
+        dt = type(model.observer.max_turn)(model.camera_period)
+        predict(model, state, world, vehicle, dt)
+        if correction_due(model, tick):
+            duration = dt * type(dt)(tick - state.corrected_tick[world, vehicle])
+            correct(model, state, world, vehicle, tick, duration)
+            state.corrected_tick[world, vehicle] = tick
+        state.estimate_rotation[world, vehicle] = orthonormalise(state.estimate_rotation[world, vehicle])
+
+    return estimate
+
+
+KALMAN = Embedded("riccati_kalman", make_estimate(kalman_step), start_nothing, send_nothing)
+"""Where every gain k is 1: the eigenvalues that other gains need are not even compiled."""
+
+
+def fitted(model: Any) -> Embedded:
+    """Return the variant that the gains of a model need."""
+    return KALMAN if (model.observer.k.numpy() == 1.0).all() else RICCATI
+
+
+RICCATI = Embedded("riccati", make_estimate(gain_step), start_nothing, send_nothing, fit=fitted)
 DEAD_RECKONING = Embedded("dead_reckoning", dead_reckon, start_nothing, send_nothing)

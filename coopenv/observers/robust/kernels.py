@@ -20,4 +20,4 @@ def send(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: in
 
 
 # Without max_unroll = 1 there is long straight code, which takes long to compile.
-ROBUST = Embedded("robust", update, start_world, send, allocate_robust, {"max_unroll": 1})
+ROBUST = Embedded("robust", update, start_world, send, allocate_robust, options={"max_unroll": 1})
