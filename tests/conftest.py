@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+import pytest
 from hypothesis import settings
 
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -16,3 +17,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 # The same examples at every run: a failure is then a change of the code, not of the luck.
 settings.register_profile("repeatable", derandomize=True, deadline=None)
 settings.load_profile("repeatable")
+
+
+@pytest.fixture(autouse=True)
+def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a slow machine write no more than a fast one."""
+    monkeypatch.setattr("coopenv.runs.console.LINE_PERIOD", 3600.0)
+    monkeypatch.setattr("coopenv.runs.console.COMPILE_NOTICE_AFTER", 3600.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -217,7 +218,8 @@ def test_the_installed_module_runs_in_a_process_of_its_own(tmp_path: Path) -> No
     command = [sys.executable, "-m", "coopenv.cli"]
     good = subprocess.run([*command, "run", "overtaking", "--steps", "5"], capture_output=True, text=True)
     assert good.returncode == 0
-    assert good.stderr == ""
+    progress = r"[a-z ]+: \d+ (s|%.*)|compiling kernels .*"  # where the machine is slow, or new
+    assert all(re.fullmatch(progress, line) for line in good.stderr.splitlines())
     assert "Overtaking: seed 0" in good.stdout
     bad = subprocess.run([*command, "run", "overtaking", "--dtype", "half"], capture_output=True, text=True)
     assert bad.returncode == 2

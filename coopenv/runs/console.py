@@ -39,20 +39,22 @@ class Progress:
         self._completed = 0.0
         self._over = threading.Event()
         columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
-        self._bar = Bar(*columns, console=log, transient=True, disable=not log.is_terminal)
+        self._bar = Bar(*columns, console=log, transient=True)
         self._task = self._bar.add_task(description, total=total)
         self._lines = threading.Thread(target=self._write_lines, daemon=True)
 
     def __enter__(self) -> Self:
         self._begin = monotonic()
-        self._bar.start()
-        if not self._log.is_terminal:
+        if self._log.is_terminal:
+            self._bar.start()
+        else:
             self._lines.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
         self._over.set()
-        self._bar.stop()
+        if self._log.is_terminal:
+            self._bar.stop()
 
     def update(self, completed: float, description: str | None = None) -> None:
         """Say how much is done, and what is being done now."""
