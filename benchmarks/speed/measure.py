@@ -27,7 +27,8 @@ class Result:
     """Why there are no figures."""
 
     def _per_second(self, amount: Callable[[dict[str, Any]], float]) -> float:
-        return median(amount(r) / r["wall_s"] for r in self.rounds)
+        result: float = median(amount(r) / r["wall_s"] for r in self.rounds)
+        return result
 
     @property
     def env_steps_per_s(self) -> float:

@@ -80,7 +80,8 @@ def build_highway(case: Case) -> Built:
         ticks = substeps * len(world.road.vehicles)
         if terminated or truncated:
             env.reset()
-        return ticks
+        result: int = ticks
+        return result
 
     return Built(step)
 

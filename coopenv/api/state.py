@@ -33,4 +33,5 @@ def state_vector(engine: Engine) -> np.ndarray:
     estimate = np.hstack([position_hat, R_hat[:, :, 0], R_hat[:, :, 1]])
     share = engine.view("tick")[:1] / engine.world.model.horizon_ticks
     whole = np.concatenate([truth.ravel(), estimate.ravel(), share]).astype(np.float32)
-    return np.nan_to_num(whole.clip(-LIMIT, LIMIT), nan=0.0)
+    result: np.ndarray = np.nan_to_num(whole.clip(-LIMIT, LIMIT), nan=0.0)
+    return result

@@ -100,12 +100,14 @@ def live_ticks(t: np.ndarray, vehicles: int, ends: Sequence[float] | None = None
 
 def position_error(position: np.ndarray, position_estimate: np.ndarray) -> np.ndarray:
     """Return |pbar - pbarhat| in m, of positions (..., 3) in the map frame."""
-    return np.linalg.norm(np.asarray(position, float) - np.asarray(position_estimate, float), axis=-1)
+    result: np.ndarray = np.linalg.norm(np.asarray(position, float) - np.asarray(position_estimate, float), axis=-1)
+    return result
 
 
 def error_rotation(rotation: np.ndarray, rotation_estimate: np.ndarray) -> np.ndarray:
     """Return Rtilde = Rhat^T R of rotations (..., 3, 3) that map body to map frame."""
-    return np.swapaxes(np.asarray(rotation_estimate, float), -1, -2) @ np.asarray(rotation, float)
+    result: np.ndarray = np.swapaxes(np.asarray(rotation_estimate, float), -1, -2) @ np.asarray(rotation, float)
+    return result
 
 
 def quaternion_wxyz(rotation: np.ndarray) -> np.ndarray:
@@ -128,7 +130,8 @@ def quaternion_wxyz(rotation: np.ndarray) -> np.ndarray:
     best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
     q = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[..., :1] < 0, -q, q)
+    result: np.ndarray = np.where(q[..., :1] < 0, -q, q)
+    return result
 
 
 def orientation_error_deg(rotation: np.ndarray, rotation_estimate: np.ndarray) -> np.ndarray:
@@ -138,7 +141,8 @@ def orientation_error_deg(rotation: np.ndarray, rotation_estimate: np.ndarray) -
     deg is told from zero, and a half turn is 180 deg exactly.
     """
     q = quaternion_wxyz(error_rotation(rotation, rotation_estimate))
-    return np.degrees(2 * np.arctan2(np.linalg.norm(q[..., 1:], axis=-1), q[..., 0]))
+    result: np.ndarray = np.degrees(2 * np.arctan2(np.linalg.norm(q[..., 1:], axis=-1), q[..., 0]))
+    return result
 
 
 def roll_pitch_yaw_deg(rotation: np.ndarray) -> np.ndarray:
@@ -147,7 +151,8 @@ def roll_pitch_yaw_deg(rotation: np.ndarray) -> np.ndarray:
     roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
     pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 0, 0], R[..., 1, 0]))
     yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
-    return np.degrees(np.stack([roll, pitch, yaw], axis=-1))
+    result: np.ndarray = np.degrees(np.stack([roll, pitch, yaw], axis=-1))
+    return result
 
 
 def error_coordinates(
@@ -230,7 +235,8 @@ def steady_mean(t: np.ndarray, values: np.ndarray, steady_from: float) -> np.nda
 def steady_rmse(t: np.ndarray, error: np.ndarray, steady_from: float) -> np.ndarray:
     """Return the root mean square of errors (K, ...) over the ticks with t > steady_from; NaN if none."""
     with np.errstate(over="ignore"):  # of an observer that has diverged
-        return np.sqrt(steady_mean(t, np.square(np.asarray(error, float)), steady_from))
+        result: np.ndarray = np.sqrt(steady_mean(t, np.square(np.asarray(error, float)), steady_from))
+        return result
 
 
 def mean_targets_in_view(visible: np.ndarray) -> np.ndarray:
@@ -240,7 +246,8 @@ def mean_targets_in_view(visible: np.ndarray) -> np.ndarray:
 
 def mirrored(orientation_error: np.ndarray) -> np.ndarray:
     """Return whether a run (K, ...) ends with an orientation error above `MIRROR_ANGLE_DEG`."""
-    return np.asarray(orientation_error)[-1] > MIRROR_ANGLE_DEG
+    result: np.ndarray = np.asarray(orientation_error)[-1] > MIRROR_ANGLE_DEG
+    return result
 
 
 def fit_exponential_rate(t: np.ndarray, error: np.ndarray, noise_floor: float | None = None) -> RateFit:

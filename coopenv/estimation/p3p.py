@@ -90,7 +90,8 @@ def _distances(a: Array, cosines: Array) -> Array:
     along = (roots @ np.swapaxes(planes, -1, -2)).reshape(-1, 4, 3)
     along *= np.sign(along.sum(-1, keepdims=True))
     squared = _misfit(along, 2.0 * (1.0 - cosines)[:, None], np.zeros(3)).sum(-1)
-    return along * np.sqrt(a.sum(-1)[:, None] / squared)[..., None]
+    result: Array = along * np.sqrt(a.sum(-1)[:, None] / squared)[..., None]
+    return result
 
 
 def _plane_pair(D1: Array, D2: Array) -> tuple[Array, Array]:
@@ -166,7 +167,8 @@ def _axes(points: Array) -> Array:
 def _doubled_area(points: Array) -> Array:
     """Return (B,) twice the areas of triangles (B, 3, 3)."""
     n = _cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
-    return np.sqrt((n * n).sum(-1))
+    result: Array = np.sqrt((n * n).sum(-1))
+    return result
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -176,9 +178,11 @@ def _cross(a: Array, b: Array) -> Array:
 
 def _unit(D: Array) -> Array:
     """Return matrices (..., 3, 3) of Frobenius norm 1."""
-    return D / np.sqrt((D * D).sum((-1, -2), keepdims=True))
+    result: Array = D / np.sqrt((D * D).sum((-1, -2), keepdims=True))
+    return result
 
 
 def _unit_rows(v: Array) -> Array:
     """Return vectors (..., 3) of length 1."""
-    return v / np.sqrt((v * v).sum(-1, keepdims=True))
+    result: Array = v / np.sqrt((v * v).sum(-1, keepdims=True))
+    return result

@@ -18,12 +18,14 @@ ONES = np.ones(3)
 def skew(v: Array) -> Array:
     """Return S(v) (..., 3, 3) with S(v) y = v x y."""
     v = np.asarray(v, dtype=np.float64)
-    return v.dot(GENERATORS).reshape(*v.shape, 3)
+    result: Array = v.dot(GENERATORS).reshape(*v.shape, 3)
+    return result
 
 
 def lengths(v: Array) -> Array:
     """Return the lengths (m,) of vectors (m, 3)."""
-    return np.sqrt((v * v).dot(ONES))
+    result: Array = np.sqrt((v * v).dot(ONES))
+    return result
 
 
 def exp_so3(w: Array) -> Array:
@@ -52,14 +54,16 @@ def log_so3(R: Array) -> Array:
     x, y, z = 0.5 * (zy - yz), 0.5 * (xz - zx), 0.5 * (yx - xy)
     sine, cosine = math.sqrt(x * x + y * y + z * z), 0.5 * (xx + yy + zz - 1.0)
     if cosine <= -0.9:  # near half a turn the vector part has no direction to speak of
-        return Rotation.from_matrix(R).as_rotvec()
+        result: Array = Rotation.from_matrix(R).as_rotvec()
+        return result
     scale = math.atan2(sine, cosine) / sine if sine > 1e-9 else 1.0
     return np.array([scale * x, scale * y, scale * z])
 
 
 def orthonormalise(R: Array) -> Array:
     """Return the rotation nearest to an almost orthogonal R, by one Newton step of the polar factor."""
-    return 1.5 * R - (0.5 * R).dot(R.T.dot(R))
+    result: Array = 1.5 * R - (0.5 * R).dot(R.T.dot(R))
+    return result
 
 
 def tangent_basis(b: Array) -> Array:

@@ -17,7 +17,8 @@ def solve(A: Array, b: Array) -> Array:
     _, _, x, failed = dgesv(A, b)
     if failed:
         raise np.linalg.LinAlgError("singular matrix")
-    return x
+    result: Array = x
+    return result
 
 
 def cholesky(A: Array) -> Array:
@@ -29,7 +30,8 @@ def cholesky(A: Array) -> Array:
     factor, failed = dpotrf(A, lower=True)
     if failed:
         raise np.linalg.LinAlgError("not positive definite")
-    return factor
+    result: Array = factor
+    return result
 
 
 def solve_positive(A: Array, b: Array) -> Array:
@@ -41,7 +43,8 @@ def solve_positive(A: Array, b: Array) -> Array:
     _, x, failed = dposv(A, b)
     if failed:
         raise np.linalg.LinAlgError("not positive definite")
-    return x
+    result: Array = x
+    return result
 
 
 def invert_positive(A: Array) -> Array:

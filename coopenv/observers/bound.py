@@ -38,7 +38,8 @@ class Bound:
 
     def position_rms(self, after: float = 0.0) -> Array:
         """Return (N,) the root mean square of the position's bound from a time on, m."""
-        return np.sqrt(np.mean(self.position[self.t >= after] ** 2, axis=0))
+        result: Array = np.sqrt(np.mean(self.position[self.t >= after] ** 2, axis=0))
+        return result
 
 
 def cramer_rao(recording: Recording, joint: bool = True) -> Bound:

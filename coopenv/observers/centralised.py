@@ -88,9 +88,11 @@ class Centralised:
     def place(self, target: int, tick: Tick) -> Array:
         """Return (3,) where a target is, or is believed to be, map frame, m."""
         if target < self.landmarks:
-            return tick.landmarks[target]
+            landmark: Array = tick.landmarks[target]
+            return landmark
         R, p = self.poses[target - self.landmarks]
-        return p + R.dot(self.markers[target - self.landmarks])
+        marker: Array = p + R.dot(self.markers[target - self.landmarks])
+        return marker
 
     def move(self, dx: Array) -> None:
         """Move every pose by its part of the error."""

@@ -66,7 +66,8 @@ class LeftError:
         J = np.empty((3, 6))
         J[:, :3] = self.R.dot(skew(-marker))
         J[:, 3:] = self.R
-        return J.dot(self.P).dot(J.T)
+        result: Array = J.dot(self.P).dot(J.T)
+        return result
 
     def estimate(self, nis: float | None = None, nis_dof: int = 0) -> Estimate:
         """Return the pose with its covariance, and the normalised innovation squared of its correction."""

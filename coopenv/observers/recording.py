@@ -82,7 +82,10 @@ class Truth:
     @property
     def known(self) -> NDArray[np.bool_]:
         """(K, N) where the whole pose is known."""
-        return np.isfinite(np.concatenate([self.rotation, self.position[..., None]], axis=-1)).all(axis=(-1, -2))
+        result: NDArray[np.bool_] = np.isfinite(np.concatenate([self.rotation, self.position[..., None]], axis=-1)).all(
+            axis=(-1, -2)
+        )
+        return result
 
 
 @dataclass(frozen=True)
@@ -158,4 +161,5 @@ class Recording:
 def due_ticks(ticks: int, ratio: float) -> NDArray[np.bool_]:
     """Return (K,) at which ticks a correction at `ratio` times the camera's rate is due."""
     counts = np.floor(np.arange(ticks) * ratio + 1e-9)
-    return np.diff(counts, prepend=counts[:1]) > 0
+    result: NDArray[np.bool_] = np.diff(counts, prepend=counts[:1]) > 0
+    return result

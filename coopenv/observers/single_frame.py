@@ -134,18 +134,21 @@ def normalised(residual: Array, N: Array) -> Array:
     """Return (m,) r^T N^-1 r of residuals (m, 2)."""
     x, y = residual.T
     a, b, d = N[:, 0, 0], N[:, 0, 1], N[:, 1, 1]
-    return (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
+    result: Array = (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
+    return result
 
 
 def inverses(N: Array) -> Array:
     """Return the inverses of symmetric matrices (m, 2, 2)."""
     a, b, d = N[:, 0, 0], N[:, 0, 1], N[:, 1, 1]
-    return N[:, ::-1, ::-1] * ADJUGATE / (a * d - b * b)[:, None, None]
+    result: Array = N[:, ::-1, ::-1] * ADJUGATE / (a * d - b * b)[:, None, None]
+    return result
 
 
 def ahead(pose: LeftError, tick: Tick, data: Bearings) -> NDArray[np.bool_]:
     """Return (m,) whether the points are where the bearings point, and not opposite."""
-    return (((data[1] - pose.p).dot(pose.R) - tick.lever_arm) * data[0]).sum(1) > 0.0
+    result: NDArray[np.bool_] = (((data[1] - pose.p).dot(pose.R) - tick.lever_arm) * data[0]).sum(1) > 0.0
+    return result
 
 
 def refined(start: LeftError, tick: Tick, data: Bearings) -> LeftError | None:

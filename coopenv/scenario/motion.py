@@ -38,7 +38,8 @@ def left_jacobian(w: np.ndarray) -> np.ndarray:
     S = np.cross(np.eye(3), w)
     if angle < 1e-4:
         return np.eye(3) + S / 2 + S @ S / 6
-    return np.eye(3) + (1 - np.cos(angle)) / angle**2 * S + (angle - np.sin(angle)) / angle**3 * S @ S
+    result: np.ndarray = np.eye(3) + (1 - np.cos(angle)) / angle**2 * S + (angle - np.sin(angle)) / angle**3 * S @ S
+    return result
 
 
 def twist_table(start: list[float], linear: np.ndarray, angular: np.ndarray) -> TwistTable:

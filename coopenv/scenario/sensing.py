@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from coopenv.scenario.base import (
@@ -22,6 +23,12 @@ from coopenv.scenario.base import (
 )
 
 Pixels = Annotated[int, Field(ge=1, le=65_535)]
+
+ROTATION_OF_CAMERA = {
+    "forward": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
+    "body": np.eye(3),
+}
+"""Camera to body: columns are the optical frame's x (right), y (down), z (forward)."""
 
 
 class Camera(Part):

@@ -21,8 +21,10 @@ Box = tuple[np.ndarray, np.ndarray, np.ndarray]
 def rotation_of(yaw: float | None, quaternion_wxyz: Any) -> np.ndarray:
     """Return the rotation (3, 3) that a file gives as a quaternion or a yaw."""
     if quaternion_wxyz is not None:
-        return Rotation.from_quat(quaternion_wxyz, scalar_first=True).as_matrix()
-    return Rotation.from_euler("z", yaw or 0.0).as_matrix()
+        rotation = Rotation.from_quat(quaternion_wxyz, scalar_first=True)
+    else:
+        rotation = Rotation.from_euler("z", yaw or 0.0)
+    return np.asarray(rotation.as_matrix())
 
 
 def start_of(agent: Landmark | Vehicle) -> tuple[np.ndarray, np.ndarray]:

@@ -98,7 +98,8 @@ def runs(t: np.ndarray, mask: np.ndarray, gap: float = 0.0) -> list[tuple[float,
 
 def moving_target_seen(trajectory: Trajectory, vehicle: int) -> np.ndarray:
     """Return (K,) whether a vehicle's camera detects a vehicle or a moving landmark."""
-    return np.any(trajectory.visible[:, vehicle] & trajectory.target_moving, axis=-1)
+    result: np.ndarray = np.any(trajectory.visible[:, vehicle] & trajectory.target_moving, axis=-1)
+    return result
 
 
 def shade(ax: Axes, stretches: Sequence[tuple[float, float]], colour: str = SHADE) -> None:

@@ -202,7 +202,10 @@ class TopView:
         """Return points (N, 2), those too far for the renderer drawn nearer in their direction."""
         middle = (self._low + self._high) / 2
         away = np.linalg.norm(points - middle, axis=-1, keepdims=True)
-        return middle + (points - middle) * np.minimum(1.0, _FARTHEST * self._side / np.maximum(away, 1e-9))
+        result: np.ndarray = middle + (points - middle) * np.minimum(
+            1.0, _FARTHEST * self._side / np.maximum(away, 1e-9)
+        )
+        return result
 
     def _point_outside(self, pointing: Any, origin: np.ndarray, point: np.ndarray) -> None:
         """Point from the border to what lies outside the picture."""

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Obstacle, Vehicle
 from coopenv.scenario.motion import TwistTable, compile_motion, left_jacobian
-from coopenv.scenario.sensing import Camera
-from coopenv.world.build import ROTATION_OF_CAMERA, agent_starts
+from coopenv.scenario.sensing import ROTATION_OF_CAMERA, Camera
+from coopenv.scenario.starts import agent_starts
 
 SIGMAS = 3.0
 _CIRCLE = np.linspace(0.0, 2 * np.pi, 97)
@@ -37,7 +37,8 @@ def position_covariance(rotation: np.ndarray, position: np.ndarray, covariance: 
     J[..., :3] = np.cross(p[..., None, :], np.eye(3))  # row i: phat x e_i, which is row i of -S(phat)
     J[..., 3:] = np.eye(3)
     J = np.asarray(rotation, float) @ J
-    return J @ np.asarray(covariance, float) @ np.swapaxes(J, -1, -2)
+    result: np.ndarray = J @ np.asarray(covariance, float) @ np.swapaxes(J, -1, -2)
+    return result
 
 
 def ellipses(center: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -58,14 +59,16 @@ def ellipses(center: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np
 def outlines(rotation: np.ndarray, position: np.ndarray, shape: np.ndarray) -> np.ndarray:
     """Return body-fixed outlines (N, K, 2) in plan, of rotations (N, 3, 3), places (N, 2), `shape` (N, K, 2)."""
     turned: np.ndarray = shape @ np.swapaxes(rotation[:, :2, :2], 1, 2)
-    return position[:, None] + turned
+    result: np.ndarray = position[:, None] + turned
+    return result
 
 
 def box_shape(size: tuple[float, ...], center: tuple[float, ...], shortest: float) -> np.ndarray:
     """Return a box's four corners (4, 2) in the body frame, enlarged to at least `shortest` m long."""
     half = np.array(size[:2]) / 2
     corners = np.array(center[:2]) + half * [(-1, -1), (1, -1), (1, 1), (-1, 1)]
-    return corners * max(1.0, shortest / (2 * half.max()))
+    result: np.ndarray = corners * max(1.0, shortest / (2 * half.max()))
+    return result
 
 
 def nose_shape(corners: np.ndarray) -> np.ndarray:
@@ -82,14 +85,16 @@ def camera_fan(camera: Camera) -> np.ndarray:
     left, right = (float(np.arctan(_undistorted(float(edge), camera))) for edge in edges)
     x = np.linspace(left, right, _FAN_RAYS)
     rays = np.stack([np.sin(x), np.zeros_like(x), np.cos(x)], axis=-1)
-    return rays @ camera_rotation(camera).T
+    result: np.ndarray = rays @ camera_rotation(camera).T
+    return result
 
 
 def camera_rotation(camera: Camera) -> np.ndarray:
     """Return the rotation (3, 3) from the camera to the body."""
     if isinstance(camera.orientation, str):
         return ROTATION_OF_CAMERA[camera.orientation]
-    return Rotation.from_quat(camera.orientation, scalar_first=True).as_matrix()
+    result: np.ndarray = Rotation.from_quat(camera.orientation, scalar_first=True).as_matrix()
+    return result
 
 
 def free_lengths(

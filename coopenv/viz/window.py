@@ -45,7 +45,7 @@ class Window:
         """Open a window; return False where there is no display or no interactive backend."""
         try:
             from matplotlib import pyplot as plt
-            from matplotlib.backends import BackendFilter, backend_registry
+            from matplotlib.backends.registry import BackendFilter, backend_registry
 
             interactive = backend_registry.list_builtin(BackendFilter.INTERACTIVE)
             if plt.get_backend().lower() not in interactive:

@@ -9,19 +9,14 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from coopenv.scenario import Scenario, checks
+from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Body, Landmark, Vehicle
 from coopenv.scenario.motion import TwistTable, compile_motion
+from coopenv.scenario.sensing import ROTATION_OF_CAMERA
 from coopenv.scenario.starts import agent_starts, rotation_of
+from coopenv.scenario.topology import neighbour_sets, processing_order
 from coopenv.world.model import DRIVEN, PRESCRIBED, STATIC, model_struct
 from coopenv.world.precision import Precision
-
-ROTATION_OF_CAMERA = {
-    "forward": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
-    "body": np.eye(3),
-}
-"""Camera to body: columns are the optical frame's x (right), y (down), z (forward)."""
-
 
 NUMPY_OF = {wp.int32: np.int32, wp.float64: np.float64}
 
@@ -38,7 +33,7 @@ class _Filler:
     def __init__(self, p: Precision, device: str) -> None:
         self.p, self.device = p, device
 
-    def array(self, values: Any, dtype: Any) -> wp.array:
+    def array(self, values: Any, dtype: Any) -> Any:
         data = np.ascontiguousarray(values, dtype=NUMPY_OF.get(dtype, self.p.numpy))
         shape = getattr(dtype, "_shape_", ())
         if data.size == 0:
@@ -75,11 +70,11 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
 
 
 def _fill_topology(model: Any, scenario: Scenario, fill: _Filler) -> None:
-    sets = checks.neighbour_sets(scenario)
+    sets = neighbour_sets(scenario)
     table = np.full((model.vehicles, model.agents), -1, dtype=np.int32)
     for i, targets in enumerate(sets):
         table[i, : len(targets)] = targets
-    order = checks.processing_order(scenario)
+    order = processing_order(scenario)
     model.targets = wp.array(table, dtype=wp.int32, ndim=2, device=fill.device)
     model.target_count = fill.array([len(targets) for targets in sets], wp.int32)
     model.order = fill.array(order, wp.int32)

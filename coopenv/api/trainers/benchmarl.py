@@ -48,15 +48,18 @@ class CooperativeTask(TaskClass):
     def max_steps(self, env: EnvBase) -> int:
         """Return the decision steps to the horizon."""
         scenario = env.unwrapped.scenario
-        return round(scenario.horizon * scenario.rates.decision)
+        result: int = round(scenario.horizon * scenario.rates.decision)
+        return result
 
     def has_render(self, env: EnvBase) -> bool:
         """Return whether the world was built to be drawn."""
-        return env.unwrapped.render_mode == "rgb_array"
+        result: bool = env.unwrapped.render_mode == "rgb_array"
+        return result
 
     def group_map(self, env: EnvBase) -> dict[str, list[str]]:
         """Return {"vehicle": all}."""
-        return env.group_map
+        result: dict[str, list[str]] = env.group_map
+        return result
 
     def observation_spec(self, env: EnvBase) -> Composite:
         """Return the spec of what the vehicles see."""

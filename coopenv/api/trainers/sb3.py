@@ -102,7 +102,8 @@ class CooperativeSB3VecEnv(VecEnv):
         Raises:
             CoopenvError: not a whole number, or negative.
         """
-        return super().seed(None if seed is None else checked_seed(seed))
+        result: Sequence[int | None] = super().seed(None if seed is None else checked_seed(seed))
+        return result
 
     def close(self) -> None:
         """Close the renderer and end the threads."""

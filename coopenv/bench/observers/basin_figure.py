@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -48,7 +49,7 @@ def basin_figure(draws: Sequence[Draw]) -> Figure:
     return figure
 
 
-def _draw_cloud(ax, draws: Sequence[Draw], first: bool) -> None:
+def _draw_cloud(ax: Axes, draws: Sequence[Draw], first: bool) -> None:
     tidy(ax, y_label="distance [m]" if first else "")
     angle = np.concatenate([draw.initial_angle for draw in draws])
     distance = np.concatenate([draw.initial_distance for draw in draws])
@@ -59,7 +60,7 @@ def _draw_cloud(ax, draws: Sequence[Draw], first: bool) -> None:
     ax.tick_params(labelbottom=False)
 
 
-def _draw_shares(ax, draws: Sequence[Draw], first: bool) -> None:
+def _draw_shares(ax: Axes, draws: Sequence[Draw], first: bool) -> None:
     tidy(ax, x_label="initial orientation error [deg]", y_label="converged" if first else "")
     ax.xaxis.label.set_fontsize(NORMAL - 1)
     for (converged, count), start, end in zip(by_angle(draws), ANGLE_BINS, ANGLE_BINS[1:], strict=False):

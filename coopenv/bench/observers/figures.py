@@ -147,7 +147,10 @@ def _time(ax: Axes, t: np.ndarray) -> None:
 
 def _chosen(vehicles: int) -> list[int]:
     """Return which vehicles are drawn: all, or some from first to last."""
-    return np.unique(np.linspace(0, vehicles - 1, min(vehicles, MOST_VEHICLES)).round().astype(int)).tolist()
+    result: list[int] = np.unique(
+        np.linspace(0, vehicles - 1, min(vehicles, MOST_VEHICLES)).round().astype(int)
+    ).tolist()
+    return result
 
 
 def _grid(rows: int, columns: int, height: float, left: float, between: float = 0.14) -> tuple[Figure, np.ndarray]:
@@ -200,7 +203,7 @@ def _outer_labels(axes: np.ndarray, titles: Sequence[str]) -> None:
                 ax.set_title(titles[x], fontsize=NORMAL + 2, color=INK, pad=4)
 
 
-def _legend(figure: Figure, handles: list) -> None:
+def _legend(figure: Figure, handles: list[Any]) -> None:
     height = figure.get_size_inches()[1]
     figure.legend(
         handles=handles,

@@ -144,7 +144,8 @@ class _Geometry:
 def _markers(recording: Recording) -> Array:
     """Return (K, N, 3) the points of the vehicles that cameras see."""
     marker = np.array([setup.marker for setup in recording.setups])
-    return recording.truth.position + (recording.truth.rotation @ marker[..., None])[..., 0]
+    result: Array = recording.truth.position + (recording.truth.rotation @ marker[..., None])[..., 0]
+    return result
 
 
 def sample_of(variant: str, observer: str, scene: Scene, recording: Recording, result: Run) -> Sample:
@@ -238,7 +239,8 @@ def _last(error: Array) -> Array:
     """Return (N,) the last error that is known."""
     known = np.isfinite(error)
     last = len(error) - 1 - np.argmax(known[::-1], axis=0)
-    return error[last, np.arange(error.shape[1])]
+    result: Array = error[last, np.arange(error.shape[1])]
+    return result
 
 
 def _kept(recording: Recording) -> np.ndarray:

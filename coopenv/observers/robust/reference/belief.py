@@ -49,7 +49,8 @@ class Member:
         """Return (3,) how far it comes in its body frame at the last known twist in a time, m."""
         if age <= 0.0 or self.v is None or self.w is None:
             return np.zeros(3)
-        return exp_so3(self.w * (age / 2)).dot(self.v) * age
+        result: Array = exp_so3(self.w * (age / 2)).dot(self.v) * age
+        return result
 
 
 class Sight(NamedTuple):
@@ -66,7 +67,8 @@ class Sight(NamedTuple):
         S = H.reshape(-1, len(P)).dot(P).reshape(H.shape) @ H.transpose(0, 2, 1)
         a, b, c = S[:, 0, 0] + noise, S[:, 0, 1], S[:, 1, 1] + noise
         x, y = self.residual[:, 0], self.residual[:, 1]
-        return (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
+        result: Array = (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
+        return result
 
 
 class View(NamedTuple):

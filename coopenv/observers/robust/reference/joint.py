@@ -129,4 +129,5 @@ def _joint_covariance(message: Message) -> Array:
     n = 6 * (1 + len(message.extra["vehicles"]))
     L = np.zeros((n, n))
     L[_triangle(n)] = message.extra["factor"]
-    return L.dot(L.T)
+    result: Array = L.dot(L.T)
+    return result

@@ -186,7 +186,8 @@ class Search:
 def is_known(P: Array) -> bool:
     """Return whether a pose of covariance P (6, 6) is certain enough to linearise about and to tell others."""
     variances = P.diagonal().tolist()
-    return max(variances[:3]) < KNOWN_ANGLE**2 and max(variances[3:]) < KNOWN_POSITION**2
+    result: bool = max(variances[:3]) < KNOWN_ANGLE**2 and max(variances[3:]) < KNOWN_POSITION**2
+    return result
 
 
 def _spread(sightings: list[Sighting], three: tuple[int, ...]) -> float:

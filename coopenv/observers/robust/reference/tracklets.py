@@ -64,7 +64,8 @@ class Tracklet:
     def about(self, members: list[Member]) -> Array:
         """Return the vector (6m,) for errors about other poses."""
         offset = np.concatenate([left_error(R, p, m.R, m.p) for R, p, m in zip(self.R, self.p, members, strict=True)])
-        return self.vector - self.information.dot(offset)
+        result: Array = self.vector - self.information.dot(offset)
+        return result
 
 
 def tracklet(last: Report, new: Report, noise: SensorNoise) -> Tracklet | None:
