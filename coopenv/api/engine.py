@@ -18,7 +18,8 @@ from coopenv.backends.simulated import Simulated
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
-from coopenv.world.state import check_fit, overwrite, state_fields
+from coopenv.world.saved_state import has_begun
+from coopenv.world.state import overwrite, state_fields
 
 
 class Engine:
@@ -165,12 +166,17 @@ class Engine:
         """Restore what `get_state` returned.
 
         Raises:
-            ValueError: a field is missing or has another shape.
+            CoopenvError: a field is missing, or does not hold what it may; nothing has changed then.
         """
         memory = {name: getattr(self.report, name) for name in MEMORY}
-        check_fit({**memory, **self.world.state_arrays()}, values)
+        checked = self.world.checked_state(values, memory, MEMORY)
         if self.plugins is not None:
             self.plugins.set_state(values.get("observers"))
-        self.world.set_state(values)
+        overwrite(self.world.state_arrays(), checked)
         self.refresh()
-        overwrite(memory, values)
+        overwrite(memory, checked)
+
+    @property
+    def begun(self) -> bool:
+        """Whether every world has been reset, or restored from one that had."""
+        return bool(has_begun(self.view("start_rotation")).all())

@@ -19,7 +19,7 @@ from coopenv.api.state import state_space, state_vector
 from coopenv.backends.base import Backend
 from coopenv.backends.simulated import Simulated
 from coopenv.backends.sources import open_backend
-from coopenv.errors import CoopenvError, ScenarioError, checked_seed, suggest
+from coopenv.errors import CoopenvError, ScenarioError, checked_seed, shown, suggest
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import named
 from coopenv.scenario import Scenario
@@ -192,14 +192,17 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
 
     def get_state(self) -> dict[str, Any]:
         """Return everything that the next step depends on, random streams included; see `set_state`."""
-        own = {"agents": list(self.agents), "seeded": self._seeded, "scenario": self.scenario}
+        own = {"agents": list(self.agents), "scenario": self.scenario}
         return {**own, **self.engine.get_state()}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Go back to a state that `get_state` returned, of this or an equal environment.
 
+        A state is data but for plug-in observers, which are objects: one of somebody else's, kept on disk by pickle, is
+        as dangerous as any pickle.
+
         Raises:
-            CoopenvError: the state belongs to another kind of environment.
+            CoopenvError: it is of another kind of environment, or does not hold what it may; nothing has changed then.
         """
         where = f"this state does not fit {self.metadata['name']}"
         if not isinstance(state, Mapping):
@@ -207,13 +210,15 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         if state.get("scenario") != self.scenario:
             raise CoopenvError(f"{where}: it is of another scenario")
         agents = state.get("agents")
-        if not isinstance(agents, list) or not set(agents) <= set(self.possible_agents):
-            raise CoopenvError(f"{where}: its agents are {agents!r}")
+        if not isinstance(agents, list) or not all(isinstance(agent, str) for agent in agents):
+            raise CoopenvError(f"{where}: its agents are {shown(agents)}")
+        if agents != [agent for agent in self.possible_agents if agent in agents]:
+            raise CoopenvError(f"{where}: its agents are {shown(agents)}, not some of {shown(self.possible_agents)}")
         try:
             self.engine.set_state(state)
-        except ValueError as error:
+        except CoopenvError as error:
             raise CoopenvError(f"{where}: {error}") from None
-        self.agents, self._seeded = list(agents), bool(state.get("seeded"))
+        self.agents, self._seeded = list(agents), self.engine.begun
 
     def __getstate__(self) -> dict[str, Any]:
         return {"arguments": self._arguments, "state": self.get_state()}

@@ -124,10 +124,11 @@ class PlugIns:
         """Go back to what `get_state` returned.
 
         Raises:
-            ValueError: it is of other observers.
+            CoopenvError: it is of other observers; nothing has changed then.
         """
         if not isinstance(states, list) or len(states) != len(self.groups):
-            raise ValueError(f"state: no observers '{self.name}' in it")
-        for group, state in zip(self.groups, states, strict=True):
+            raise CoopenvError(f"state: no observers '{self.name}' in it")
+        copies = [group.checked_state(state) for group, state in zip(self.groups, states, strict=True)]
+        for group, state in zip(self.groups, copies, strict=True):
             group.set_state(state)
         self._failures.clear()

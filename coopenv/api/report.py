@@ -8,6 +8,7 @@ import warp as wp
 from coopenv.api.observation import write_observation
 from coopenv.api.rewards import TERMS, weigh, write_terms
 from coopenv.estimation.so3 import rotation_angle
+from coopenv.estimation.trajectory import Outcome
 from coopenv.world.collision import UNDER_WAY, goal_distance
 from coopenv.world.precision import Precision
 from coopenv.world.quality import (
@@ -18,6 +19,7 @@ from coopenv.world.quality import (
     observer_error,
     targets_in_view,
 )
+from coopenv.world.saved_state import FLAG, NUMBER, whole
 
 DEGREES = wp.constant(57.29577951308232)
 
@@ -51,8 +53,13 @@ def report_struct(p: Precision) -> Any:
     return Report
 
 
-MEMORY = ("last_goal_distance", "last_ended", "last_tick", "over")
-"""Fields that carry over from one report to the next."""
+MEMORY = {
+    "last_goal_distance": NUMBER._replace(of_truth=True),
+    "last_ended": whole(min(Outcome), max(Outcome)),
+    "last_tick": whole(0, "tick"),
+    "over": FLAG,
+}
+"""Fields that carry over from one report to the next, and what a saved state may hold of them."""
 
 
 def allocate_report(model: Any, worlds: int, size: int, p: Precision, device: str) -> Any:

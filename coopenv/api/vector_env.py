@@ -235,19 +235,19 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return {"scenario": self.scenario, **self.engine.get_state()}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Go back to what `get_state` returned.
+        """Go back to what `get_state` returned; of states of others see `CooperativeLocalisationEnv.set_state`.
 
         Raises:
-            CoopenvError: the state belongs to another kind of environment.
+            CoopenvError: it is of another kind of environment, or does not hold what it may; nothing has changed then.
         """
         where = f"this state does not fit {self.metadata['name']}"
         if not isinstance(state, Mapping) or state.get("scenario") != self.scenario:
             raise CoopenvError(f"{where}: it is of another scenario")
         try:
             self.engine.set_state(state)
-        except ValueError as error:
+        except CoopenvError as error:
             raise CoopenvError(f"{where}: {error}") from None
-        self._seeded = True
+        self._seeded = self.engine.begun
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the renderer and end the threads."""

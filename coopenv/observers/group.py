@@ -152,21 +152,57 @@ class Group:
         return ObserverError(f"{whose}at {k * self.briefing.dt:.3f} s: {_told(error)}")
 
     def get_state(self) -> dict[str, Any]:
-        """Return a deep copy of the observers and of all messages.
+        """Return a deep copy of the observers and of all messages; empty before the start.
 
         Raises:
             CoopenvError: an observer cannot be copied.
         """
+        if not hasattr(self, "mail"):
+            return {}
+        observers = self.whole if self.joint else self.observers
         try:
-            return copy.deepcopy({name: value for name, value in vars(self).items() if name not in _FIXED})
+            return copy.deepcopy(
+                {"observers": observers, "coordinates": self.coordinates, "mail": self.mail.get_state()}
+            )
         except Exception as error:
             raise CoopenvError(f"the observers' state cannot be copied: {_told(error)}") from error
 
+    def checked_state(self, state: Any) -> dict[str, Any]:
+        """Return a deep copy of what `get_state` of such a group returned.
+
+        The observers in it are trusted to be what they seem: whoever made the state could run any code in them.
+
+        Raises:
+            CoopenvError: it is of another group.
+        """
+        try:
+            copied = copy.deepcopy(state)
+            if copied == {}:
+                return {}
+            observers, coordinates, mail = (copied[name] for name in ("observers", "coordinates", "mail"))
+            fit = isinstance(observers, JointObserver) if self.joint else _are_observers(observers, self.briefing)
+            if len(copied) != 3 or not fit or not (coordinates is None or isinstance(coordinates, Coordinates)):
+                raise CoopenvError("not one observer per vehicle, or not with their coordinates")
+            Mailbox(self.briefing).set_state(mail)
+        except Exception as error:  # of anything that is no state
+            raise CoopenvError(f"state: the observers do not fit: {_told(error)}") from error
+        return dict(copied)
+
     def set_state(self, state: dict[str, Any]) -> None:
-        """Go back to what `get_state` returned; that stays unchanged."""
-        vars(self).update(copy.deepcopy(state))
-        self.mail.seal()
+        """Go back to what `checked_state` returned."""
+        if not state:
+            return
+        self.coordinates, self.mail = state["coordinates"], Mailbox(self.briefing)
+        self.mail.set_state(state["mail"])
+        if self.joint:
+            self.whole = state["observers"]
+        else:
+            self.observers = state["observers"]
 
 
-_FIXED = ("factory", "briefing", "tamper", "joint")
-"""Attributes of a group that no tick changes."""
+def _are_observers(observers: Any, briefing: Briefing) -> bool:
+    return (
+        isinstance(observers, list)
+        and len(observers) == len(briefing.setups)
+        and all(isinstance(observer, Observer) for observer in observers)
+    )

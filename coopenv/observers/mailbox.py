@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from operator import index
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 
+from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
+from coopenv.observers.checks import check_message
 from coopenv.observers.contract import Message, Received
 from coopenv.observers.recording import Briefing
 
@@ -60,14 +65,31 @@ class Mailbox:
                 received[target] = Received(heard[sender][1], age)
         return received
 
-    def seal(self) -> None:
-        """Keep receivers from writing to messages: all hear the same arrays, and copies of arrays are writable."""
-        for sent in self.sent:
-            for message in sent.values():
-                _sealed(message)
-        for heard in self.heard:
-            for _, message in heard.values():
-                _sealed(message)
+    def get_state(self) -> dict[str, Any]:
+        """Return what has been sent and heard."""
+        return {"sent": self.sent, "heard": self.heard, "bytes": self.bytes}
+
+    def set_state(self, state: Any) -> None:
+        """Take over what a `get_state` returned; nobody can change the messages any more.
+
+        Raises:
+            Exception: it is something else; which one depends on what it is.
+        """
+        senders = range(len(self.briefing.setups))
+        sent, heard, count = state["sent"], state["heard"], np.asarray(state["bytes"], np.float64)
+        if not (len(sent) == len(heard) == len(senders) == len(count)) or not np.isfinite(count).all():
+            raise CoopenvError("not one mailbox per vehicle")
+        self.sent = [{index(k): _checked(message) for k, message in of_sender.items()} for of_sender in sent]
+        self.heard = [
+            {senders[j]: (index(k), _checked(message)) for j, (k, message) in of_receiver.items()}
+            for of_receiver in heard
+        ]
+        self.bytes = count
+
+
+def _checked(message: Message) -> Message:
+    check_message(message)
+    return _sealed(message)
 
 
 def _copied(message: Message) -> Message:

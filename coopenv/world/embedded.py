@@ -17,6 +17,7 @@ from coopenv.world.collision import referee
 from coopenv.world.motion import move
 from coopenv.world.odometry import measure_odometry
 from coopenv.world.reset import reset_world
+from coopenv.world.saved_state import Rule
 from coopenv.world.v2x import deliver
 
 
@@ -47,6 +48,9 @@ class Embedded:
     """(model, worlds, start_covariance (N, 6, 6), device): return the memory."""
     fit: Callable[[Any], Embedded] | None = None
     """(model): return the variant to compile for a model; None: this one."""
+    valid: Mapping[str, Rule] = field(default_factory=dict, hash=False)
+    """What a saved memory may hold, by field. Without a rule numbers have to be finite and whole ones may be any: give
+    one to every index and count."""
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """Options of the Warp module that it is compiled in."""
 
@@ -62,6 +66,8 @@ class Source:
     """(model, state, record, actions, world, tick): write everything that is sensed at a tick, and the truth."""
     deliver: Any
     """(model, state, record, world, vehicle, tick): write the messages that a vehicle receives at a tick."""
+    knows_truth: bool = True
+    """Whether the truth is always there; otherwise it may be NaN."""
 
 
 @wp.func

@@ -11,7 +11,22 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from coopenv.estimation.trajectory import Outcome, Sight
+from coopenv.scenario.base import LARGEST
 from coopenv.world.precision import Precision
+from coopenv.world.saved_state import (
+    ANYTHING,
+    COVARIANCE,
+    DIRECTION,
+    FLAG,
+    NUMBER,
+    ODOMETRY_SAMPLES,
+    ROTATION,
+    TICK,
+    Rule,
+    numbers,
+    whole,
+)
 
 
 @cache
@@ -72,6 +87,37 @@ def state_struct(p: Precision) -> Any:
     return State
 
 
+VALID: dict[str, Rule] = {
+    "seed": ANYTHING,
+    "episode": ANYTHING,
+    "tick": whole(0, "horizon_ticks"),
+    "start_rotation": ROTATION,
+    "rotation": ROTATION._replace(of_truth=True),
+    "position": NUMBER._replace(of_truth=True),
+    "velocity": NUMBER._replace(of_truth=True),
+    "angular_velocity": NUMBER._replace(of_truth=True),
+    "steering": numbers(1.6),
+    "command": numbers(1.001),
+    "ended": whole(min(Outcome), max(Outcome)),
+    "collided": FLAG,
+    "odometry_samples": ODOMETRY_SAMPLES,
+    "increment_rotation": ROTATION,
+    "bearing": DIRECTION,
+    "bearing_tick": TICK,
+    "sight": whole(min(Sight), max(Sight)),
+    "outbox_rotation": ROTATION,
+    "outbox_tick": TICK,
+    "inbox_rotation": ROTATION,
+    "inbox_tick": TICK,
+    "estimate_rotation": ROTATION,
+    "covariance": COVARIANCE,
+    "corrected_tick": whole(0, "tick"),
+    **dict.fromkeys(("gramian_11", "gramian_12", "gramian_22"), numbers(LARGEST**3)),
+    "actions": ANYTHING,
+}
+"""What a saved state may hold; numbers that are not in it have to be finite."""
+
+
 def allocate_state(model: Any, worlds: int, p: Precision, device: str) -> Any:
     """Return a zeroed `State` for `worlds` worlds of a model."""
     N, A = model.vehicles, model.agents
@@ -100,21 +146,7 @@ def state_fields(p: Precision) -> dict[str, Any]:
     return {name: var.type for name, var in state_struct(p).vars.items()}
 
 
-def check_fit(arrays: Mapping[str, Any], values: Mapping[str, np.ndarray]) -> None:
-    """Check that values can overwrite device arrays by name.
-
-    Raises:
-        ValueError: a field is missing, or has another shape.
-    """
-    for name, target in arrays.items():
-        if name not in values:
-            raise ValueError(f"state: field '{name}' is missing")
-        expected, got = target.numpy().shape, np.shape(values[name])
-        if got != expected:
-            raise ValueError(f"state: field '{name}' has shape {got}, expected {expected}")
-
-
 def overwrite(arrays: Mapping[str, Any], values: Mapping[str, np.ndarray]) -> None:
-    """Overwrite device arrays by name."""
+    """Overwrite device arrays by name, with values that `checked_state` has returned."""
     for name, target in arrays.items():
-        target.assign(np.ascontiguousarray(values[name], dtype=target.numpy().dtype))
+        target.assign(values[name])

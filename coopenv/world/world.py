@@ -14,7 +14,8 @@ from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
 from coopenv.world.launch import Launcher, PerWorld, default_threads
 from coopenv.world.precision import check_device, precision
-from coopenv.world.state import allocate_state, check_fit, overwrite, state_fields
+from coopenv.world.saved_state import Rule, checked_state
+from coopenv.world.state import VALID, allocate_state, overwrite, state_fields
 from coopenv.world.step import (
     advance_kernel,
     broadcast_kernel,
@@ -163,10 +164,24 @@ class World:
         """Restore what `get_state` returned.
 
         Raises:
-            ValueError: a field is missing or has another shape.
+            CoopenvError: a field is missing, or does not hold what it may; nothing has changed then.
         """
-        check_fit(self.state_arrays(), values)
-        overwrite(self.state_arrays(), values)
+        overwrite(self.state_arrays(), self.checked_state(values, {}, {}))
+
+    def checked_state(
+        self, values: Mapping[str, Any], more: Mapping[str, Any], rules: Mapping[str, Rule]
+    ) -> dict[str, np.ndarray]:
+        """Return copies of a state's fields that fit into `state_arrays`, and into more arrays with rules of their own.
+
+        Raises:
+            CoopenvError: a field is missing, or does not hold what it may.
+        """
+        arrays = {**self.state_arrays(), **more}
+        return checked_state(values, arrays, {**self.state_rules(), **rules}, self.model, self.source.knows_truth)
+
+    def state_rules(self) -> dict[str, Rule]:
+        """Return what the fields of a saved state may hold, by name."""
+        return {**VALID, **{f"observer_{name}": rule for name, rule in self.observer.valid.items()}}
 
     def state_arrays(self) -> dict[str, Any]:
         """Return every array that `set_state` writes, by name."""

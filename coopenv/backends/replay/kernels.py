@@ -82,5 +82,5 @@ def rewind(model: Any, state: Any, record: Any, world: int):
         broadcast(model, state, world, vehicle, 0)
 
 
-RECORDED = Source("recorded", rewind, resense, redeliver)
+RECORDED = Source("recorded", rewind, resense, redeliver, knows_truth=False)
 """Ticks of a recording."""

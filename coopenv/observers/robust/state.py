@@ -8,6 +8,8 @@ import warp as wp
 from coopenv.observers.robust.reference.observer import Robust
 from coopenv.observers.robust.reference.search import MOST_HYPOTHESES
 from coopenv.observers.robust.types import mat26d, mat33d, mat62d, mat66d, mat66f, vec2d, vec3d, vec6d
+from coopenv.scenario.base import LARGEST
+from coopenv.world.saved_state import COVARIANCE, FLAG, JOINT_COVARIANCE, ROTATION, TICK, Rule, numbers, whole
 
 MOST_MEMBERS = wp.constant(Robust.most_members)
 MOST_SUPPOSED = wp.constant(MOST_HYPOTHESES)
@@ -106,6 +108,49 @@ class RobustState:
     before_position: wp.array2d(dtype=vec3d)  # (W, M)
     before_covariance: wp.array3d(dtype=mat66d)  # (W, M, M)
 
+
+def _where(used: str, **rules: Rule) -> dict[str, Rule]:
+    """Return rules that count where a field of the whole state says so."""
+    return {name: rule._replace(used=f"observer_{used}") for name, rule in rules.items()}
+
+
+def _others(rule: Rule) -> Rule:
+    """Return the rule of what is kept of the other members, not of the vehicle itself."""
+    return rule._replace(holds=lambda v, *rest: np.insert(rule.holds(v[:, :, 1:], *rest), 0, True, axis=2))
+
+
+_LARGE = numbers(LARGEST**3)
+_MESSAGE = {"rotation": ROTATION, "covariance": COVARIANCE, "odometry_rotation": ROTATION}
+
+VALID: dict[str, Rule] = {
+    "start_covariance": COVARIANCE,
+    "odometry_rotation": ROTATION,
+    "members": whole(1, int(MOST_MEMBERS)),
+    "P": JOINT_COVARIANCE,
+    "seen_tick": TICK,
+    "report_tick": TICK,
+    "anchor_rotation": ROTATION,
+    "anchor_covariance": COVARIANCE,
+    "anchor_odometry_rotation": ROTATION,
+    "anchor_tick": TICK,
+    "searching": FLAG,
+    "hypotheses": whole(0, int(MOST_SUPPOSED)),
+    "attempts": whole(0, 10**9),
+    "bearings": whole(0, 10**9),
+    "outbox_says": FLAG,
+    "inbox_says": FLAG,
+    "inbox_tick": TICK,
+    **dict.fromkeys(("twists", "distrusted", "line_fits"), FLAG),
+    "line_place": whole(-1, int(MOST_MEMBERS) - 1),
+    **_where("members", R=ROTATION, vehicle=whole(0, "vehicles")),
+    **_where("members", **{f"report_{name}": _others(rule) for name, rule in _MESSAGE.items()}),
+    **_where("searching", prior_rotation=ROTATION, prior_covariance=COVARIANCE),
+    **_where("hypotheses", bank_rotation=ROTATION, bank_covariance=COVARIANCE),
+    **_where("outbox_says", **{f"outbox_{name}": rule for name, rule in _MESSAGE.items()}),
+    **_where("inbox_says", **{f"inbox_{name}": rule for name, rule in _MESSAGE.items()}),
+    **dict.fromkeys(("paid", "surprise", "line_spread", "line_noise", "column", "narrow", "before_covariance"), _LARGE),
+}
+"""What a saved state may hold; numbers that are not in it have to be finite."""
 
 PER_MEMBER = ("vehicle", "R", "p", "P", "twists", "v", "w", "seen_tick", "distrusted", "agreed")
 PER_HYPOTHESIS = ("bank_rotation", "bank_position", "bank_covariance", "paid", "surprise", "bearings")

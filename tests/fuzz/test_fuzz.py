@@ -1,0 +1,39 @@
+"""All kinds of hostile input: some of it here, and as much as it takes marked as slow."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.fuzz.harness import run_cases
+
+COUNTS = {"states": (60, 1000)}
+"""How many cases of a kind: quick, and all."""
+
+
+def check(kind: str, first: int, last: int) -> None:
+    outcome = run_cases(f"tests.fuzz.{kind}", range(first, last))
+    print(dict(outcome.taken), f"longest {outcome.longest_s:.2f} s")  # with pytest -s
+    assert not outcome.failures, "\n".join(f"{kind} {n}: {why}" for n, why in sorted(outcome.failures.items())[:5])
+    assert sum(outcome.taken.values()) == last - first
+    for word in ("accepted", "refused"):  # or the cases would show nothing
+        assert outcome.taken[word] > (last - first) // 20
+
+
+@pytest.mark.parametrize("kind", COUNTS)
+def test_some(kind: str) -> None:
+    check(kind, 0, COUNTS[kind][0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", COUNTS)
+def test_all(kind: str) -> None:
+    check(kind, *COUNTS[kind])
+
+
+def test_a_crash_a_hang_and_an_error_are_failures_of_their_cases(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.fuzz.harness.HANG_S", 2.0)
+    outcome = run_cases("tests.fuzz.misbehaving", range(6))
+    assert outcome.taken == {"accepted": 3}
+    assert outcome.failures.keys() == {1, 2, 4}
+    assert "ended the process (-11)" in outcome.failures[1]
+    assert "hangs" in outcome.failures[2] and "ZeroDivisionError" in outcome.failures[4]
