@@ -26,6 +26,7 @@ from coopenv.shipped import list_envs
 if TYPE_CHECKING:
     from coopenv.api.parallel_env import CooperativeLocalisationEnv, parallel_env
     from coopenv.api.vector_env import CooperativeVectorEnv, make_vec
+    from coopenv.bench.observers.comparison import Comparison, compare
     from coopenv.scenario import Scenario, load_scenario
 
     __version__: str
@@ -33,7 +34,9 @@ else:
     _HOMES = {
         "CooperativeLocalisationEnv": "coopenv.api.parallel_env",
         "CooperativeVectorEnv": "coopenv.api.vector_env",
+        "Comparison": "coopenv.bench.observers.comparison",
         "Scenario": "coopenv.scenario",
+        "compare": "coopenv.bench.observers.comparison",
         "load_scenario": "coopenv.scenario",
         "make_vec": "coopenv.api.vector_env",
         "parallel_env": "coopenv.api.parallel_env",
@@ -58,6 +61,7 @@ else:
 
 __all__ = [
     "ActionError",
+    "Comparison",
     "CoopenvError",
     "CooperativeLocalisationEnv",
     "CooperativeVectorEnv",
@@ -67,6 +71,7 @@ __all__ = [
     "Scenario",
     "ScenarioError",
     "UnknownEnvironmentError",
+    "compare",
     "list_envs",
     "load_scenario",
     "make_vec",

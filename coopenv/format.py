@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 NONE = "-"
 MOST_DECIMALS = 5
+FINEST_ERROR = 1e-3
+"""Share of its number below which a standard error is no longer told by its first digit."""
 
 
 def number(value: float, digits: int = 4) -> str:
@@ -45,3 +47,23 @@ def _aligned(value: float, decimals: int) -> str:
 def seconds(values: Sequence[float]) -> list[str]:
     """Return a column of times, s, to a hundredth of a second; `never` for NaN."""
     return ["never" if math.isnan(value) else f"{value:.2f}" for value in values]
+
+
+def with_error(value: float, error: float) -> tuple[str, str]:
+    """Return a number and its standard error to the same decimal, the first digit of the error; no error for NaN."""
+    if not (math.isfinite(value) and math.isfinite(error)):
+        return number(value, 3), ""
+    places = [_place(max(error, FINEST_ERROR * abs(value)))] + ([_place(value)] if value else [])
+    decimals = max(0, -min(places))
+    return f"{value:.{decimals}f}", f"{error:.{decimals}f}"
+
+
+def in_parentheses(value: float, error: float) -> str:
+    """Return a number with its standard error in units of the last digit: 0.0123(4) for 0.0123 and 0.0004."""
+    shown, spread = with_error(value, error)
+    return f"{shown}({spread.replace('.', '').lstrip('0') or 0})" if spread else shown
+
+
+def _place(value: float) -> int:
+    """Return the power of ten of the first digit of a number, rounded to that digit."""
+    return int(f"{value:.0e}".partition("e")[2]) if value else 0

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from coopenv.format import column, fixed, number, seconds
+from coopenv.format import column, fixed, in_parentheses, number, seconds, with_error
 
 NAN = math.nan
 
@@ -54,3 +54,26 @@ def test_lengths_align_below_ten() -> None:
 
 def test_times() -> None:
     assert seconds([2.934, NAN]) == ["2.93", "never"]
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "text"),
+    [
+        (0.01234, 0.00042, "0.0123(4)"),
+        (0.01234, 0.00096, "0.012(1)"),
+        (12.34, 3.2, "12(3)"),
+        (123.4, 27.0, "123(27)"),
+        (0.5, 2.0, "0.5(20)"),
+        (1.0, 0.0, "1.000(0)"),
+        (0.0, 0.0, "0(0)"),
+        (0.01234, NAN, "0.0123"),
+        (NAN, 0.1, "-"),
+    ],
+)
+def test_standard_errors_in_parentheses(value: float, error: float, text: str) -> None:
+    assert in_parentheses(value, error) == text
+
+
+def test_a_number_and_its_error_have_the_same_decimals() -> None:
+    assert with_error(0.01234, 0.00042) == ("0.0123", "0.0004")
+    assert with_error(0.01234, NAN) == ("0.0123", "")

@@ -73,7 +73,9 @@ def bench_observers(
     observers: Annotated[
         str | None,
         typer.Option(
-            help="Names of observers with commas between (default: all that suit).", autocompletion=complete.observers
+            help="Names of observers with commas between, or where classes stand, mine.py:Mine or package.module:Mine "
+            "(default: all that suit).",
+            autocompletion=complete.observers,
         ),
     ] = None,
     variants: Annotated[
@@ -82,7 +84,8 @@ def bench_observers(
             help="Names of variants with commas between, or `all`: faults of an environment, what recorded robots see."
         ),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds: 0, 1, ...")] = 5,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 5,
+    first: Annotated[int, typer.Option(min=0, help="The first seed.")] = 0,
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None,
     engine: Annotated[str, typer.Option(help="Where to compute: `local`, or `ray` (an existing cluster).")] = "local",
     address: Annotated[str | None, typer.Option(help="Address of the Ray cluster, HOST:PORT (default: auto).")] = None,
@@ -91,6 +94,9 @@ def bench_observers(
     overrides: Overrides = None,
     steady_from: SteadyFrom = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the leaderboard and the report.")] = None,
+    figures: Annotated[
+        str | None, typer.Option("--format", help="Also write figures as files to the folder: png, pdf or svg.")
+    ] = None,
 ) -> None:
     """Compare observers on the same data and with their bound."""
     from coopenv.bench.observers.command import perform, request_of
@@ -98,8 +104,7 @@ def bench_observers(
 
     printed, log = console(), console(stderr=True)
     with warned():
-        request = request_of(
-            source, observers, variants, seeds, steady_from, basin, data, parse_overrides(overrides), overrides or ()
-        )
+        changes, numbers = parse_overrides(overrides), range(first, first + seeds)
+        request = request_of(source, observers, variants, numbers, steady_from, basin, data, changes, overrides or ())
         request.source.check()
-    perform(request, find_engine(engine, jobs, address), out, printed, log)
+    perform(request, find_engine(engine, jobs, address), out, figures, printed, log)

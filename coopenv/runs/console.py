@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable, Iterator, Sized
 from contextlib import contextmanager
+from math import isnan, nan
 from time import monotonic
 from typing import Self, TypeVar
 
@@ -16,12 +17,16 @@ T = TypeVar("T")
 
 LINE_PERIOD = 10.0
 """s between lines of progress where there is no terminal."""
+HINT_FROM = 20.0
+"""s of work left after the first piece of it, from which on there is a line at once."""
 COMPILE_NOTICE_AFTER = 1.5
 """s; kernels in the cache load well within it, compiling takes longer."""
 
 
 class Progress:
     """Shows how far a piece of work is: a bar that vanishes on a terminal, elsewhere a line every 10 s.
+
+    Where there is much to do, the first line comes as soon as it can say how long that will take.
 
     with Progress(log, "simulating", total=300) as progress:
         progress.update(30)
@@ -58,8 +63,11 @@ class Progress:
 
     def update(self, completed: float, description: str | None = None) -> None:
         """Say how much is done, and what is being done now."""
+        first = self._completed == 0.0
         self._completed, self._description = completed, description or self._description
         self._bar.update(self._task, completed=completed, description=self._description)
+        if first and self._left() > HINT_FROM and not self._log.is_terminal:
+            self._log.print(self.line(), soft_wrap=True)
 
     def advance(self, description: str | None = None) -> None:
         """Say that one more unit is done."""
@@ -76,12 +84,16 @@ class Progress:
 
     def line(self) -> str:
         """Return how far the work is, e.g. `simulating: 40 % after 20 s, about 30 s left`."""
-        elapsed = monotonic() - self._begin
-        share = self._completed / self._total if self._total else 0.0
-        if not 0.0 < share <= 1.0:
+        elapsed, left = monotonic() - self._begin, self._left()
+        if isnan(left):
             return f"{self._description}: {elapsed:.0f} s"
-        left = elapsed * (1.0 - share) / share
+        share = self._completed / (self._total or nan)
         return f"{self._description}: {100 * share:.0f} % after {elapsed:.0f} s, about {left:.0f} s left"
+
+    def _left(self) -> float:
+        """Return the time that the rest will take at the pace so far, s; NaN where that is not known."""
+        share = self._completed / self._total if self._total else 0.0
+        return (monotonic() - self._begin) * (1.0 - share) / share if 0.0 < share <= 1.0 else nan
 
     def _write_lines(self) -> None:
         while not self._over.wait(LINE_PERIOD):

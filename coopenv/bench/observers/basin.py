@@ -10,16 +10,19 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from rich.table import Table
 
 from coopenv.bench.observers.executors import Engine
 from coopenv.bench.observers.initial_estimates import random_start
 from coopenv.bench.observers.sources import Source
+from coopenv.bench.tables import number_table
 from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.consistency import Interval, wilson_interval
 from coopenv.estimation.metrics import CONVERGED, settling_time
+from coopenv.format import fixed
 from coopenv.observers.contract import Factory
-from coopenv.observers.registry import find
+from coopenv.observers.registry import find, portable
 from coopenv.observers.runner import run
 
 RADIUS = 15.0  # m
@@ -32,7 +35,7 @@ class BasinTask:
 
     source: Source
     draws: Sequence[int]
-    observers: Mapping[str, Factory]
+    observers: Mapping[str, str | Factory]
 
 
 @dataclass(frozen=True)
@@ -131,10 +134,12 @@ def study_basin(
         CoopenvError: an unknown observer, or a source whose geometry is not the question.
     """
     check_source(source)
-    factories = {name: find(name) for name in observers}
-    tasks = [BasinTask(source, (draw,), factories) for draw in range(draws)]
+    for name in observers:
+        find(name)
+    sent = {name: portable(name) for name in observers}
+    tasks = [BasinTask(source, (draw,), sent) for draw in range(draws)]
     found = engine.map(draw_starts, tasks, lambda done: on_progress(done / draws))
-    return [draw for name in factories for part in found for draw in part if draw.observer == name]
+    return [draw for name in observers for part in found for draw in part if draw.observer == name]
 
 
 def basins_of(environment: str, draws: Sequence[Draw]) -> list[Basin]:
@@ -162,6 +167,23 @@ def basins_of(environment: str, draws: Sequence[Draw]) -> list[Basin]:
             )
         )
     return basins
+
+
+def basin_table(basins: Sequence[Basin]) -> Table:
+    """Return how many draws converge, one line per observer."""
+    numbers = ["draws", "failed", "all vehicles\nconverge", "95 %", "converged [s]\nmedian"]
+    table = number_table(["basin"], numbers, gap=0)
+    for basin in basins:
+        low, high = (100 * end for end in basin.interval)
+        table.add_row(
+            basin.observer,
+            str(basin.draws),
+            str(basin.failed),
+            f"{100 * basin.converged_fraction:.1f} %",
+            f"{low:.1f}..{high:.1f} %",
+            fixed(basin.convergence_time_s, 1),
+        )
+    return table
 
 
 def basin_failures(basins: Sequence[Basin]) -> list[str]:

@@ -10,43 +10,41 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from coopenv.bench.observers.basin import ANGLE_BINS, RADIUS, Draw, basins_of, by_angle
-from coopenv.bench.observers.figures import WIDTH
+from coopenv.bench.observers.canvas import PAGE, canvas, fitting, legend
 from coopenv.estimation.consistency import wilson_interval
-from coopenv.viz.style import BLUE, INK, NORMAL, SMALL, VERMILION, new_figure, tidy
+from coopenv.viz.style import BLUE, INK, NORMAL, SMALL, VERMILION, tidy
 
-_MOST_COLUMNS = 3
-_PANEL, _HEAD = 2.9, 0.35  # inches
+_PANEL, _FRAME = 2.6, 0.6  # inches
 
 
-def basin_figure(draws: Sequence[Draw]) -> Figure:
+def basin_figure(environment: str, draws: Sequence[Draw], width: float | None = None) -> Figure:
     """Draw, per observer, every vehicle of every draw at its initial errors, and the share by angle below."""
-    basins = basins_of("", draws)
-    columns = min(_MOST_COLUMNS, len(basins))
-    rows, step = -(-len(basins) // columns), 0.96 / columns
-    height = _HEAD + _PANEL * rows
-    figure = new_figure(WIDTH, height)
-    for n, basin in enumerate(basins):
+    basins = basins_of(environment, draws)
+    columns = fitting(width or PAGE, 3.0, min(3, len(basins)))
+    rows = -(-len(basins) // columns)
+    figure, _ = canvas(width, _FRAME + _PANEL * rows, f"{environment}, {basins[0].draws} initial estimates")
+    for n, ((cloud, bars), basin) in enumerate(zip(_pairs(figure, rows, columns, len(basins)), basins, strict=True)):
         own = [draw for draw in draws if draw.observer == basin.observer]
-        left = 0.06 + (n % columns) * step
-        bottom = 1 - (_HEAD + _PANEL * (n // columns + 1)) / height
-        cloud = figure.add_axes((left, bottom + 1.3 / height, step - 0.05, 1.2 / height))
-        bars = figure.add_axes((left, bottom + 0.5 / height, step - 0.05, 0.65 / height), sharex=cloud)
         _draw_cloud(cloud, own, first=n % columns == 0)
         _draw_shares(bars, own, first=n % columns == 0)
         low, high = (100 * end for end in basin.interval)
         share = f"all vehicles: {100 * basin.converged_fraction:.1f} %  [{low:.1f}, {high:.1f}]"
         cloud.set_title(f"{basin.observer}\n{share}", fontsize=SMALL + 0.5, color=INK, pad=3)
-    figure.legend(
-        handles=[
-            Line2D([], [], ls="", marker="o", ms=4, color=BLUE, label="a vehicle that ends below 0.1 m and 1 deg"),
-            Line2D([], [], ls="", marker="x", ms=4, color=VERMILION, label="one that does not"),
-        ],
-        loc="upper center",
-        ncols=2,
-        fontsize=SMALL + 0.5,
-        frameon=False,
-    )
+    handles = [
+        Line2D([], [], ls="", marker="o", ms=4, color=BLUE, label="a vehicle that ends below 0.1 m and 1 deg"),
+        Line2D([], [], ls="", marker="x", ms=4, color=VERMILION, label="one that does not"),
+    ]
+    legend(figure, handles)
     return figure
+
+
+def _pairs(figure: Figure, rows: int, columns: int, count: int) -> list[tuple[Axes, Axes]]:
+    """Return the two axes of every panel, one above the other."""
+    grid = figure.add_gridspec(2 * rows, columns, height_ratios=[2, 1] * rows)
+    places = [divmod(n, columns) for n in range(count)]
+    clouds = [figure.add_subplot(grid[2 * y, x]) for y, x in places]
+    bars = [figure.add_subplot(grid[2 * y + 1, x], sharex=clouds[n]) for n, (y, x) in enumerate(places)]
+    return list(zip(clouds, bars, strict=True))
 
 
 def _draw_cloud(ax: Axes, draws: Sequence[Draw], first: bool) -> None:

@@ -10,47 +10,29 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rich.console import Console
-from rich.table import Table
 
-from coopenv.bench.observers import files
+from coopenv.bench.observers import exports
 from coopenv.bench.observers.basin import (
     Basin,
     Draw,
     basin_failures,
+    basin_table,
     basins_of,
     check_source,
     plain_draws,
     study_basin,
 )
-from coopenv.bench.observers.compare import Outcome, compare
+from coopenv.bench.observers.comparison import Comparison, observers_of, run_comparison, work_of
 from coopenv.bench.observers.executors import Engine
-from coopenv.bench.observers.faults import FAULTS, NOMINAL
-from coopenv.bench.observers.rows import Row
 from coopenv.bench.observers.sources import ALL, Source, find_source, variants_of
-from coopenv.bench.observers.tables import (
-    degradation_table,
-    error_table,
-    failures,
-    honest_line,
-    quality_table,
-    variant_table,
-)
-from coopenv.bench.tables import number_table
-from coopenv.estimation.metrics import json_ready
+from coopenv.errors import CoopenvError
 from coopenv.files import replacing_folder
-from coopenv.observers.registry import available_names, find, observer_names, obstacle
+from coopenv.observers.registry import observer_names, obstacle
 from coopenv.runs.console import Progress
 
 T = TypeVar("T")
 
-
-@dataclass(frozen=True)
-class Found:
-    """What a comparison has found."""
-
-    outcome: Outcome
-    draws: list[Draw]
-    basins: list[Basin]
+JSON_FILE, CSV_FILE, REPORT_FILE, BASIN_FILE = "leaderboard.json", "leaderboard.csv", "report.html", "basin.csv"
 
 
 @dataclass(frozen=True)
@@ -60,9 +42,10 @@ class Request:
     source: Source
     source_text: str
     """As the user named it."""
-    observers: tuple[str, ...]
+    observers: Mapping[str, str]
+    """By name, as the user named them."""
     variants: tuple[str, ...]
-    seeds: int
+    seeds: range
     steady_from: float | None = None
     basin: int = 0
     """Draws of initial estimates; 0: no study of basins."""
@@ -74,8 +57,9 @@ class Request:
     @property
     def command(self) -> str:
         """The command that gives the same table again."""
-        words = ["coopenv", "bench", "observers", self.source_text, "--observers", ",".join(self.observers)]
-        words += ["--variants", ",".join(self.variants), "--seeds", str(self.seeds)]
+        words = ["coopenv", "bench", "observers", self.source_text, "--observers", ",".join(self.observers.values())]
+        words += ["--variants", ",".join(self.variants), "--seeds", str(len(self.seeds))]
+        words += ["--first", str(self.seeds[0])] if self.seeds[0] else []
         words += [] if self.steady_from is None else ["--steady-from", f"{self.steady_from:g}"]
         words += ["--basin", str(self.basin)] if self.basin else []
         return shlex.join([*words, *self.options])
@@ -85,7 +69,7 @@ def request_of(
     text: str,
     observers: str | None,
     variants: str | None,
-    seeds: int,
+    seeds: range,
     steady_from: float | None,
     basin: int,
     data: Path | None,
@@ -96,9 +80,9 @@ def request_of(
 
     Args:
         text: environment, dataset or log file.
-        observers: names with commas between; None: all that are meant for such vehicles.
-        variants: the same, or `all`; None: the usual ones of the source.
-        seeds: how many.
+        observers: names, or where classes stand, with commas between; None: all that are meant for such vehicles.
+        variants: names with commas between, or `all`; None: the usual ones of the source.
+        seeds: which.
         steady_from: s; None: the source's own.
         basin: draws.
         data: folder of recorded data.
@@ -109,9 +93,8 @@ def request_of(
         CoopenvError: something of it does not exist.
     """
     source = find_source(text, overrides, data)
-    names = names_of(observers) if observers else tuple(available_names(source.planar))
-    for name in names:
-        find(name)
+    given = list(dict.fromkeys(word.strip() for word in observers.split(","))) if observers else None
+    names = observers_of(given, source)
     left_out = {} if observers else {name: obstacle(name) for name in observer_names()}
     if basin:
         check_source(source)
@@ -121,37 +104,49 @@ def request_of(
     if variants is not None and variants.strip() == ALL:
         left_out |= {name: source.obstacle(name) for name in source.variants}
     told = {name: reason for name, reason in left_out.items() if reason}
-    return Request(source, text, names, wanted, seeds, steady_from, basin, tuple(options), told)
+    written = dict(zip(names, given or names, strict=True))
+    return Request(source, text, written, wanted, seeds, steady_from, basin, tuple(options), told)
 
 
-def names_of(text: str) -> tuple[str, ...]:
-    """Return names with commas between, each once."""
-    return tuple(dict.fromkeys(name.strip() for name in text.split(",")))
+@dataclass(frozen=True)
+class Found:
+    """What came of a request."""
+
+    comparison: Comparison
+    draws: list[Draw]
+    basins: list[Basin]
 
 
-def perform(request: Request, engine: Engine, out: Path | None, printed: Console, log: Console) -> None:
+def perform(
+    request: Request, engine: Engine, out: Path | None, figures: str | None, printed: Console, log: Console
+) -> None:
     """Compare, print the tables and write the files.
 
     Args:
         request: what is to be compared.
         engine: where the work is done.
         out: folder for the files; None: no files.
+        figures: format of figures as files of their own; None: the report alone has them.
         printed: for the tables.
         log: for the progress.
 
     Raises:
         CoopenvError: something that was asked for does not exist, or cannot be written.
     """
-    found = None
+    wanted = figure_files(request.variants, figures)
+    if wanted and out is None:
+        raise CoopenvError(f"--format {figures}: figures need a folder, --out DIR")
+    found, names = None, [JSON_FILE, CSV_FILE, REPORT_FILE, BASIN_FILE]
+    names += [name for form in exports.FORMATS for name in figure_files(tuple(request.source.variants), form)]
     try:
-        with nullcontext() if out is None else replacing_folder(out, (*files.FILES, files.BASIN_FILE)) as folder:
+        with nullcontext() if out is None else replacing_folder(out, names) as folder:
             found = _compare(request, engine, log)
             if folder is not None:
-                write_files(request, found, folder)
+                write_files(found, request.command, folder, wanted)
                 names = sorted(path.name for path in folder.iterdir())
     finally:  # hours of work are told even if they cannot be written
         if found is not None:
-            print_tables(found.outcome.rows, found.basins, printed)
+            print_tables(found, printed)
     if out is not None:
         printed.print(f"Files in {out}: {', '.join(names)}", soft_wrap=True)
 
@@ -159,92 +154,69 @@ def perform(request: Request, engine: Engine, out: Path | None, printed: Console
 def _compare(request: Request, engine: Engine, log: Console) -> Found:
     for name, reason in request.left_out.items():
         log.print(f"left out: {name} ({reason})", soft_wrap=True, markup=False)
-    outcome = _with_progress(
+    observers = tuple(request.observers)
+    comparison = _with_progress(
         log,
-        f"{len(request.observers)} observers, {len(request.variants)} variants, {request.seeds} seeds",
-        lambda update: compare(
-            request.source,
-            request.observers,
-            request.seeds,
-            request.variants,
-            request.steady_from,
-            engine,
-            update,
+        work_of(observers, request.variants, request.seeds),
+        lambda update: run_comparison(
+            request.source, observers, request.seeds, request.variants, request.steady_from, engine, update
         ),
     )
     draws: list[Draw] = []
     if request.basin:
         draws = _with_progress(
             log,
-            f"{len(request.observers)} observers, {request.basin} initial estimates",
-            lambda update: study_basin(request.source, request.observers, request.basin, engine, update),
+            f"{len(observers)} observers, {request.basin} initial estimates",
+            lambda update: study_basin(request.source, observers, request.basin, engine, update),
         )
-    return Found(outcome, draws, basins_of(request.source.name, draws))
+    return Found(comparison, draws, basins_of(request.source.name, draws))
 
 
-def print_tables(rows: Sequence[Row], basins: Sequence[Basin], printed: Console) -> None:
-    """Print errors and quality, faults as one table, basins, and who failed."""
-    variants = list(dict.fromkeys(row.variant for row in rows))
-    in_full = variants[:1] if all(name in FAULTS for name in variants) else variants
-    for variant in in_full:
-        own = [row for row in rows if row.variant == variant]
-        printed.print(f"\n{own[0].environment}, {variant}")
-        printed.print(error_table(own))
+def print_tables(found: Found, printed: Console) -> None:
+    """Print the tables of the comparison and of the basins, and who failed."""
+    printed.print(found.comparison)
+    if found.basins:
         printed.print()
-        printed.print(quality_table(own))
-        if line := honest_line(own):
-            printed.print(line, soft_wrap=True)
-    if len(variants) > 1:
-        printed.print()
-        printed.print(variant_table(rows))
-        if NOMINAL in variants:
-            printed.print()
-            printed.print(degradation_table(rows))
-    if basins:
-        printed.print()
-        printed.print(_basin_table(basins))
-    for line in (*failures(rows), *basin_failures(basins)):
+        printed.print(basin_table(found.basins))
+    for line in basin_failures(found.basins):
         printed.print(line, soft_wrap=True)
 
 
-def _basin_table(basins: Sequence[Basin]) -> Table:
-    table = number_table(
-        ["basin"], ["draws", "failed", "all vehicles\nconverge", "95 %", "converged [s]\nmedian"], gap=0
-    )
-    for basin in basins:
-        low, high = (100 * end for end in basin.interval)
-        last = basin.convergence_time_s
-        table.add_row(
-            basin.observer,
-            str(basin.draws),
-            str(basin.failed),
-            f"{100 * basin.converged_fraction:.1f} %",
-            f"{low:.1f}..{high:.1f} %",
-            f"{last:.1f}" if last == last else "-",
-        )
-    return table
+def figure_files(variants: Sequence[str], form: str | None) -> dict[str, tuple[str, str]]:
+    """Return the names of figures as files, each with its kind and variant.
+
+    Raises:
+        CoopenvError: no such format.
+    """
+    if form is None:
+        return {}
+    if form not in exports.FORMATS:
+        raise CoopenvError(f"--format {form}: known are {', '.join(exports.FORMATS)}")
+    drawn = {f"{kind}-{v}.{form}": (kind, v) for v in variants for kind in ("errors", "consistency")}
+    return drawn | {f"{kind}.{form}": (kind, variants[0]) for kind in ("cost", "variants")}
 
 
-def write_files(request: Request, found: Found, out: Path) -> None:
-    """Write the leaderboard as JSON and CSV, the draws as CSV, and the report.
+def write_files(found: Found, command: str, out: Path, figures: Mapping[str, tuple[str, str]]) -> None:
+    """Write the leaderboard as JSON and CSV, the draws as CSV, the report, and figures by name, kind and variant.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    from coopenv.bench.observers.report import Report, write_report
+    from coopenv.bench.observers.figures import KINDS, save
+    from coopenv.bench.observers.report import report_text
 
-    outcome, draws, basins = found.outcome, found.draws, found.basins
+    comparison, draws, basins = found.comparison, found.draws, found.basins
     more = {"basin": [asdict(basin) for basin in basins]} if basins else {}
-    seeds = request.seeds if request.source.seeded else 1
-    content = files.document(outcome.rows, request.command, seeds, **more)
-    files.write_json(content, out / files.JSON_FILE)
-    files.write_rows(outcome.rows, out / files.CSV_FILE)
-    if draws:
-        table = json_ready(plain_draws(draws))
-        files.write_csv(table, list(table[0]), out / files.BASIN_FILE)
-    title = f"Observers in {request.source.name}"
-    report = Report(title, content, outcome.rows, outcome.samples, request.source.variants, draws, basins)
-    write_report(report, out / files.REPORT_FILE)
+    content = exports.document(comparison, command, **more)
+    texts = {JSON_FILE: exports.json_text(content), CSV_FILE: exports.csv_text(comparison.rows)}
+    texts |= {BASIN_FILE: exports.csv_text(plain_draws(draws))} if draws else {}
+    texts[REPORT_FILE] = report_text(comparison, content, draws, basins)
+    for name, text in texts.items():
+        exports.text_to(out / name, text)
+    for name, (kind, variant) in figures.items():
+        figure = KINDS[kind](comparison, variant, None)
+        if figure is not None:
+            save(figure, out / name)
 
 
 def _with_progress(log: Console, description: str, work: Callable[[Callable[[float], None]], T]) -> T:

@@ -33,7 +33,8 @@ class Task:
     source: Source
     variant: str
     seed: int
-    observers: Mapping[str, Factory]
+    observers: Mapping[str, str | Factory]
+    """By name, as `registry.find` takes them in another process."""
     steady_from: float | None
 
 
@@ -50,6 +51,7 @@ class Scene:
     steady_from: float  # s
     t: Array  # (S,) s
     bound: Array  # (S, N) m, joint
+    paper_noise: bool  # bearings are noisy on the image plane, and so less than the bound assumes off the optical axis
 
 
 class Series(NamedTuple):
@@ -127,6 +129,7 @@ def scene_of(recording: Recording, steady_from: float) -> Scene:
         steady_from=steady_from,
         t=recording.t[kept],
         bound=bounds[0].position[kept] if bounds else np.full((len(kept), N), np.nan),
+        paper_noise=any(setup.noise.image_axis is not None for setup in recording.setups),
     )
 
 

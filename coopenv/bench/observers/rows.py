@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.judge import RELATIVE_DELTA, Sample
+from coopenv.bench.observers.standard_errors import UNKNOWN, Measured, mean_root, ratio
+from coopenv.estimation.arrays import Array
 from coopenv.estimation.consistency import DIVERGED_ORIENTATION, DIVERGED_POSITION, LEVEL, Interval, mean_bounds
 from coopenv.estimation.metrics import CONVERGED, SETTLED
 
@@ -28,7 +30,9 @@ class Row:
     observer: str = _column("name of the observer")
     vehicle: str = _column("name of the vehicle")
     position_rmse_m: float = _column("root of the mean over seeds of the squared position error in the steady state, m")
+    position_rmse_se_m: float = _column("standard error of position_rmse_m over the seeds, m")
     orientation_rmse_deg: float = _column("the same of the geodesic angle between true and estimated orientation, deg")
+    orientation_rmse_se_deg: float = _column("standard error of orientation_rmse_deg over the seeds, deg")
     bound_m: float = _column("posterior Cramér-Rao bound of the position, joint over all vehicles, m")
     anees: float = _column("mean NEES in the steady state divided by its dimension; 1 for an honest covariance")
     settled_fraction: float = _column(f"share of seeds whose errors stay below {SETTLED.text} to the end")
@@ -39,8 +43,11 @@ class Row:
     bound_ancestors_m: float = _column("the bound joint over the vehicle and all whose messages can reach it, m")
     bound_single_m: float = _column("the bound of the vehicle alone, as if its neighbours' poses were known, m")
     ratio_to_bound: float = _column("position_rmse_m / bound_m")
+    ratio_to_bound_se: float = _column("standard error of ratio_to_bound, the bound taken as exact")
     ratio_to_bound_ancestors: float = _column("position_rmse_m / bound_ancestors_m")
+    ratio_to_bound_ancestors_se: float = _column("standard error of ratio_to_bound_ancestors, the bound taken as exact")
     degradation: float = _column("position_rmse_m over that of the nominal variant")
+    degradation_se: float = _column("standard error of degradation, seed against seed")
     position_rmse_median_m: float = _column("median over seeds of each run's RMSE, m")
     position_rmse_p90_m: float = _column("90 % quantile over seeds of each run's RMSE, m")
     converged_fraction: float = _column(f"share of seeds whose errors stay below {CONVERGED.text} to the end")
@@ -73,27 +80,63 @@ class Row:
 NOWHERE = Interval(float("nan"), float("nan"))
 
 
-def rows_of(environment: str, samples: Sequence[Sample]) -> list[Row]:
-    """Sum up samples over seeds, in the order of variants and observers in which they come."""
+@dataclass(frozen=True)
+class Total:
+    """One observer in one variant, over all vehicles and seeds; NaN where a run failed."""
+
+    variant: str
+    observer: str
+    rmse: Measured
+    """Mean over the vehicles of the position RMSE, m."""
+    degradation: Measured
+    """`rmse` over that of the nominal variant; NaN without one."""
+
+
+def grouped(samples: Sequence[Sample]) -> dict[tuple[str, str], list[Sample]]:
+    """Return the samples by variant and observer, in the order in which they come."""
     groups: dict[tuple[str, str], list[Sample]] = {}
     for sample in samples:
         groups.setdefault((sample.variant, sample.observer), []).append(sample)
-    rows = []
-    for (variant, observer), own in groups.items():
-        for i, vehicle in enumerate(own[0].scene.vehicles):
-            rows.append(_row(environment, variant, observer, vehicle, i, own))
-    return _with_degradation(rows)
+    return groups
 
 
-def _row(environment: str, variant: str, observer: str, vehicle: str, i: int, own: Sequence[Sample]) -> Row:
-    def over_seeds(name: str) -> np.ndarray:
+def rows_of(environment: str, samples: Sequence[Sample]) -> list[Row]:
+    """Sum up samples over seeds, in the order of variants and observers in which they come."""
+    groups = grouped(samples)
+    return [
+        _row(environment, i, own, groups.get((NOMINAL, observer), []))
+        for (_, observer), own in groups.items()
+        for i in range(len(own[0].scene.vehicles))
+    ]
+
+
+def totals_of(samples: Sequence[Sample]) -> list[Total]:
+    """Sum up samples over seeds and vehicles, in the order in which they come."""
+    groups = grouped(samples)
+    return [
+        Total(variant, observer, *_position(own, groups.get((NOMINAL, observer), [])))
+        for (variant, observer), own in groups.items()
+    ]
+
+
+def _position(
+    own: Sequence[Sample], nominal: Sequence[Sample], vehicles: slice = slice(None)
+) -> tuple[Measured, Measured]:
+    """Return the position RMSE (m), mean over some vehicles, and its ratio to that of the nominal variant."""
+    squares, reference = (np.array([s.position_mse[vehicles] for s in samples]) for samples in (own, nominal))
+    return mean_root(squares), ratio(squares, reference) if nominal else UNKNOWN
+
+
+def _row(environment: str, i: int, own: Sequence[Sample], nominal: Sequence[Sample]) -> Row:
+    def over_seeds(name: str) -> Array:
         return np.array([getattr(sample, name)[i] for sample in own], float)
 
     def bound(name: str) -> float:
-        return _root_mean([getattr(sample.scene, name)[i] for sample in own])
+        return float(np.sqrt(np.mean([getattr(sample.scene, name)[i] for sample in own])))
 
-    rmse, dof = _root_mean(over_seeds("position_mse")), over_seeds("nis_dof").sum()
-    each = np.sqrt(over_seeds("position_mse"))
+    position, degradation = _position(own, nominal, slice(i, i + 1))
+    orientation = mean_root(over_seeds("orientation_mse")[:, None])
+    each, dof = np.sqrt(over_seeds("position_mse")), over_seeds("nis_dof").sum()
     settle, converge = over_seeds("settle_time"), over_seeds("converge_time")
     joint, family = bound("bound_mse"), bound("bound_ancestors_mse")
     anees = over_seeds("anees")
@@ -101,11 +144,13 @@ def _row(environment: str, variant: str, observer: str, vehicle: str, i: int, ow
     consistent = mean_bounds(int(dof)) if dof > 0 else NOWHERE
     return Row(
         environment=environment,
-        variant=variant,
-        observer=observer,
-        vehicle=vehicle,
-        position_rmse_m=rmse,
-        orientation_rmse_deg=_root_mean(over_seeds("orientation_mse")),
+        variant=own[0].variant,
+        observer=own[0].observer,
+        vehicle=own[0].scene.vehicles[i],
+        position_rmse_m=position.value,
+        position_rmse_se_m=position.error,
+        orientation_rmse_deg=orientation.value,
+        orientation_rmse_se_deg=orientation.error,
         bound_m=joint,
         anees=float(np.mean(anees)),
         settled_fraction=float(np.mean(np.isfinite(settle))),
@@ -115,18 +160,21 @@ def _row(environment: str, variant: str, observer: str, vehicle: str, i: int, ow
         failure=next((sample.failure for sample in own if sample.failure), ""),
         bound_ancestors_m=family,
         bound_single_m=bound("bound_single_mse"),
-        ratio_to_bound=rmse / joint,
-        ratio_to_bound_ancestors=rmse / family,
-        degradation=float("nan"),
+        ratio_to_bound=position.value / joint,
+        ratio_to_bound_se=position.error / joint,
+        ratio_to_bound_ancestors=position.value / family,
+        ratio_to_bound_ancestors_se=position.error / family,
+        degradation=degradation.value,
+        degradation_se=degradation.error,
         position_rmse_median_m=float(np.quantile(each, 0.5)),
         position_rmse_p90_m=float(np.quantile(each, 0.9)),
         converged_fraction=float(np.mean(np.isfinite(converge))),
         convergence_time_s=_median(converge),
         convergence_rate_per_s=_median(over_seeds("rate")),
         diverged_fraction=float(np.mean(over_seeds("diverged"))),
-        ate_m=_root_mean(over_seeds("ate") ** 2),
-        rpe_m=_root_mean(over_seeds("rpe") ** 2),
-        rpe_deg=_root_mean(over_seeds("rpe_orientation") ** 2),
+        ate_m=float(np.sqrt(np.mean(over_seeds("ate") ** 2))),
+        rpe_m=float(np.sqrt(np.mean(over_seeds("rpe") ** 2))),
+        rpe_deg=float(np.sqrt(np.mean(over_seeds("rpe_orientation") ** 2))),
         nis=float(over_seeds("nis").sum() / dof) if dof > 0 else float("nan"),
         anees_low=honest.low,
         anees_high=honest.high,
@@ -137,19 +185,7 @@ def _row(environment: str, variant: str, observer: str, vehicle: str, i: int, ow
     )
 
 
-def _with_degradation(rows: Sequence[Row]) -> list[Row]:
-    nominal = {(row.observer, row.vehicle): row.position_rmse_m for row in rows if row.variant == NOMINAL}
-    nan = float("nan")
-    return [
-        replace(row, degradation=row.position_rmse_m / nominal.get((row.observer, row.vehicle), nan)) for row in rows
-    ]
-
-
-def _root_mean(squares: Sequence[float] | np.ndarray) -> float:
-    return float(np.sqrt(np.mean(squares)))
-
-
-def _median(values: np.ndarray) -> float:
+def _median(values: Array) -> float:
     """Return the median of what is finite, NaN where nothing is."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else float("nan")

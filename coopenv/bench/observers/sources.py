@@ -263,7 +263,7 @@ def variants_of(source: Source, asked: str | None) -> tuple[str, ...]:
         asked: names with commas between, `all` that there can be, or None for the usual ones.
 
     Raises:
-        CoopenvError: there is none of that name.
+        CoopenvError: there is none of that name, or the source cannot have it.
     """
     if asked is None:
         return source.usual
@@ -274,4 +274,6 @@ def variants_of(source: Source, asked: str | None) -> tuple[str, ...]:
         if name not in source.variants:
             known = ", ".join((*source.variants, ALL))
             raise CoopenvError(f"unknown variant '{name}'{suggest(name, list(source.variants))}; known: {known}")
+        if reason := source.obstacle(name):
+            raise CoopenvError(f"variant '{name}': {reason}")
     return names

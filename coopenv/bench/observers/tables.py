@@ -2,124 +2,137 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from rich.table import Table
 
-from coopenv.bench.observers.faults import NOMINAL
+from coopenv.bench.observers.faults import FAULTS, NOMINAL
+from coopenv.bench.observers.leaderboard import Leaderboard
 from coopenv.bench.observers.rows import Row
 from coopenv.bench.tables import number_table
+from coopenv.format import in_parentheses, number
 
-MOST_COLUMNS = 6
+WIDTH = 80
+MOST_COLUMNS = 5
 """Vehicles shown one by one; more are summed up as mean and worst."""
+FAILED = "failed"
+SPREAD_NOTE = "0.0123(4): 0.0123 with a standard error of 0.0004 over the seeds"
 
 _LONG = 9  # characters of a word in a heading
+_NAMED = 16  # characters of an observer's name on one line
 BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", "bound_single_m": "bound (alone)"}
 """Column to its line in the table of errors."""
 
 
-def by_observer(rows: Iterable[Row]) -> dict[str, list[Row]]:
-    """Return the rows of every observer."""
-    found: dict[str, list[Row]] = {}
-    for row in rows:
-        found.setdefault(row.observer, []).append(row)
-    return found
+def everything(board: Leaderboard) -> Iterator[Table | str]:
+    """Yield errors, ratios to the bounds and quality of each variant, of faults one only; variants; who failed."""
+    variants = list(board.variants)
+    for variant in variants[:1] if all(name in FAULTS for name in variants) else variants:
+        yield f"\n{board.title}, {variant}"
+        yield error_table(board, variant)
+        if len(board.seeds) > 1:
+            yield f"{SPREAD_NOTE}."
+        if bounded(board, variant):
+            yield ""
+            yield ratio_table(board, variant)
+        yield ""
+        yield quality_table(board, variant)
+        if line := honest_line(board.rows):
+            yield line
+    if len(variants) > 1:
+        yield ""
+        yield variant_table(board)
+        if NOMINAL in variants:
+            yield ""
+            yield degradation_table(board)
+    yield from failures(board.rows)
 
 
-def error_table(rows: Sequence[Row]) -> Table:
-    """Return position RMSE in m of one variant per vehicle, the bounds first, with the worst ratios to them."""
-    first = next(iter(by_observer(rows).values()))
-    few = len(first) <= MOST_COLUMNS
-    headings = [f"f{i + 1}" for i in range(len(first))] if few else ["mean", "worst"]
-    bounded = {column: line for column, line in BOUNDS.items() if np.isfinite(getattr(first[0], column))}
-    ratios = ["x joint\nworst", "x anc.\nworst"] if bounded else []
-    table = number_table(["position RMSE [m]"], [*headings, *([] if bounded or not few else ["mean"]), *ratios], gap=0)
-    for column, line in bounded.items():
-        table.add_row(line, *_errors([getattr(row, column) for row in first], few))
-    for name, own in by_observer(rows).items():
-        if any(row.failure for row in own):
-            table.add_row(name, *["failed"] * len(headings))
-            continue
-        errors = [row.position_rmse_m for row in own]
-        cells = _errors(errors, few)
-        if bounded:
-            cells += [_number(max(row.ratio_to_bound for row in own), 3)]
-            cells += [_number(max(row.ratio_to_bound_ancestors for row in own), 3)]
-        elif few:
-            cells += _errors([float(np.mean(errors))], True)
-        table.add_row(name, *cells)
+def bounded(board: Leaderboard, variant: str) -> dict[str, list[float]]:
+    """Return the bounds that are known of each vehicle in a variant, by column."""
+    first = board.rows_in(variant, board.observers[0])
+    found = {column: [float(getattr(row, column)) for row in first] for column in BOUNDS}
+    return {column: values for column, values in found.items() if np.isfinite(values).all()}
+
+
+def error_table(board: Leaderboard, variant: str) -> Table:
+    """Return position RMSE in m of one variant per vehicle, and their mean, the bounds first."""
+    bounds, few = bounded(board, variant), _few(board)
+    table = number_table(["position RMSE [m]"], _headings(board, "mean"), gap=0)
+    for column, values in bounds.items():
+        average = sum(values) / len(values)
+        shown = [*values, average] if few else [average, max(values)]
+        table.add_row(BOUNDS[column], *(number(value, 3) for value in shown))
+    for name in board.ranked:
+        own = board.rows_in(variant, name)
+        mean = in_parentheses(*board.totals[variant, name].rmse)
+        cells = [in_parentheses(row.position_rmse_m, row.position_rmse_se_m) for row in (own if few else [_worst(own)])]
+        _add(table, name, own, [*cells, mean] if few else [mean, *cells])
+    return table
+
+
+def ratio_table(board: Leaderboard, variant: str) -> Table:
+    """Return position RMSE over the ancestors' bound per vehicle, and the worst one over the joint bound."""
+    few = _few(board)
+    table = number_table(["RMSE / bound\n(ancestors)"], _headings(board, "x joint\nworst"), gap=0)
+    for name in board.ranked:
+        own = board.rows_in(variant, name)
+        worst = _worst(own, "ratio_to_bound")
+        shown = own if few else [_worst(own, "ratio_to_bound_ancestors")]
+        cells = [in_parentheses(row.ratio_to_bound_ancestors, row.ratio_to_bound_ancestors_se) for row in shown]
+        if not few:
+            cells.insert(0, number(float(np.mean([row.ratio_to_bound_ancestors for row in own])), 3))
+        _add(table, name, own, [*cells, in_parentheses(worst.ratio_to_bound, worst.ratio_to_bound_se)])
     return table
 
 
 def honest_line(rows: Sequence[Row]) -> str:
     """Return where the ANEES of an honest filter lies, empty where nobody states a covariance."""
-    bounds = [(row.anees_low, row.anees_high) for row in rows if np.isfinite(row.anees_low)]
-    return (
-        f"ANEES of an honest filter: 1 ({bounds[0][0]:.2f} to {bounds[0][1]:.2f} at 95 % of instants)" if bounds else ""
-    )
+    for row in rows:
+        if np.isfinite(row.anees_low):
+            return f"ANEES of an honest filter: 1 ({row.anees_low:.2f} to {row.anees_high:.2f} at 95 % of instants)."
+    return ""
 
 
-def quality_table(rows: Sequence[Row]) -> Table:
+def quality_table(board: Leaderboard, variant: str) -> Table:
     """Return, of one variant over all vehicles: who settles, consistency (1 is honest) and costs."""
     headings = ["set-\ntled", "con-\nverged", "di-\nverged", "ANEES\nbest", "ANEES\nworst", "NIS", "sent\nB/s", "us"]
     table = number_table(["observer"], headings, gap=0)
-    for name, own in by_observer(rows).items():
-        if any(row.failure for row in own):
-            continue
+    for name in board.ranked:
+        own = board.rows_in(variant, name)
         anees, nis = _finite(row.anees for row in own), _finite(row.nis for row in own)
+        cells = [
+            f"{100 * np.mean([getattr(row, column) for row in own]):.0f}%"
+            for column in ("settled_fraction", "converged_fraction", "diverged_fraction")
+        ]
+        cells += [number(min(anees), 2), number(max(anees), 2)] if anees else ["-", "-"]
+        cells += [number(float(np.mean(nis)), 2) if nis else "-"]
+        cells += [
+            f"{np.mean([getattr(row, column) for row in own]):.0f}" for column in ("bytes_per_s", "us_per_update")
+        ]
+        _add(table, name, own, cells)
+    return table
+
+
+def variant_table(board: Leaderboard) -> Table:
+    """Return position RMSE in m, mean over the vehicles, of every observer in every variant."""
+    table = number_table(["mean RMSE [m]"], [_heading(name) for name in board.variants], gap=0)
+    for name in board.ranked:
+        rmse = [board.totals[variant, name].rmse for variant in board.variants]
+        table.add_row(short_name(name), *(in_parentheses(*one) if np.isfinite(one.value) else FAILED for one in rmse))
+    return table
+
+
+def degradation_table(board: Leaderboard) -> Table:
+    """Return how much worse than the nominal one every observer is in every other variant."""
+    variants = [name for name in board.variants if name != NOMINAL]
+    table = number_table(["RMSE / nominal"], [_heading(name) for name in variants], gap=0)
+    for name in board.ranked:
         table.add_row(
-            name,
-            *(
-                f"{100 * np.mean([getattr(row, column) for row in own]):.0f}%"
-                for column in ("settled_fraction", "converged_fraction", "diverged_fraction")
-            ),
-            *((f"{min(anees):.2g}", f"{max(anees):.2g}") if anees else ("-", "-")),
-            _number(float(np.mean(nis)), 2) if nis else "-",
-            f"{np.mean([row.bytes_per_s for row in own]):.0f}",
-            f"{np.mean([row.us_per_update for row in own]):.0f}",
+            short_name(name), *(in_parentheses(*board.totals[variant, name].degradation) for variant in variants)
         )
     return table
-
-
-def variant_table(rows: Sequence[Row]) -> Table:
-    """Return position RMSE in m, mean over the vehicles, of every observer in every variant."""
-    variants = list(dict.fromkeys(row.variant for row in rows))
-    table = number_table(["mean RMSE [m]"], [_heading(name) for name in variants], gap=0)
-    for name, own in by_observer(rows).items():
-        cells = []
-        for variant in variants:
-            part = [row for row in own if row.variant == variant]
-            failed = any(row.failure for row in part)
-            cells.append("failed" if failed else _errors([mean_rmse(part)], True)[0])
-        table.add_row(name, *cells)
-    return table
-
-
-def degradation_table(rows: Sequence[Row]) -> Table:
-    """Return how much worse than the nominal one every observer is in every other variant."""
-    variants = [name for name in dict.fromkeys(row.variant for row in rows) if name != NOMINAL]
-    table = number_table(["RMSE / nominal"], [_heading(name) for name in variants], gap=0)
-    for name, own in by_observer(rows).items():
-        table.add_row(name, *(_number(degradation(own, variant), 3) for variant in variants))
-    return table
-
-
-def degradation(rows: Sequence[Row], variant: str) -> float:
-    """Return the mean RMSE of one observer's rows in a variant over that in the nominal one; NaN without one."""
-    errors = {name: mean_rmse([row for row in rows if row.variant == name]) for name in (variant, NOMINAL)}
-    return errors[variant] / errors[NOMINAL]
-
-
-def _heading(variant: str) -> str:
-    """Return a name on lines of few characters."""
-    words = variant.replace("+", "_+").split("_")
-    return "\n".join(word if len(word) <= _LONG else f"{word[:6]}-\n{word[6:]}" for word in words)
-
-
-def mean_rmse(rows: Sequence[Row]) -> float:
-    """Return the mean over vehicles of the position RMSE, m; NaN without any."""
-    return float(np.mean([row.position_rmse_m for row in rows])) if rows else float("nan")
 
 
 def failures(rows: Sequence[Row]) -> list[str]:
@@ -131,16 +144,36 @@ def failures(rows: Sequence[Row]) -> list[str]:
     return [f"{observer} ({', '.join(variants)}): failed {why}" for (observer, why), variants in failed.items()]
 
 
-def _errors(values: Sequence[float], few: bool) -> list[str]:
-    shown = list(values) if few else [float(np.mean(values)), float(np.max(values))]
-    return [f"{value:.4f}" if value < 1.0 else _number(value, 3) for value in shown]
+def short_name(name: str) -> str:
+    """Return an observer's name, on two lines if it is long."""
+    cut = name.rfind("_", 0, _NAMED) + 1 if len(name) > _NAMED else 0
+    return f"{name[:cut]}\n{name[cut:]}" if cut else name
 
 
-def _number(value: float, digits: int) -> str:
-    """Return at most five characters."""
-    if not np.isfinite(value):
-        return "-"
-    return f"{value:.{digits}g}" if value < 10**digits else f"{value:.0f}" if value < 1e5 else f"{value:.0e}"
+def _few(board: Leaderboard) -> bool:
+    return len(board.samples[0].scene.vehicles) <= MOST_COLUMNS
+
+
+def _headings(board: Leaderboard, last: str) -> list[str]:
+    """Return one heading per vehicle and another one, or those of what sums up many vehicles."""
+    if not _few(board):
+        return ["mean", "worst"] if last == "mean" else ["mean", "worst", last]
+    return [*(f"f{i + 1}" for i in range(len(board.samples[0].scene.vehicles))), last]
+
+
+def _heading(variant: str) -> str:
+    """Return a name on lines of few characters."""
+    words = variant.replace("+", "_+").split("_")
+    return "\n".join(word if len(word) <= _LONG else f"{word[:6]}-\n{word[6:]}" for word in words)
+
+
+def _add(table: Table, name: str, rows: Sequence[Row], cells: Sequence[str]) -> None:
+    failed = any(row.failure for row in rows)
+    table.add_row(short_name(name), *([FAILED] * len(cells) if failed else cells))
+
+
+def _worst(rows: Sequence[Row], column: str = "position_rmse_m") -> Row:
+    return max(rows, key=lambda row: getattr(row, column))
 
 
 def _finite(values: Iterable[float]) -> list[float]:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import json
 import re
 from dataclasses import fields, replace
 from html.parser import HTMLParser
 from importlib.metadata import EntryPoint
-from io import StringIO
 from pathlib import Path
 
+import numpy as np
 import pytest
-from rich.console import Console
 
-from coopenv.bench.observers import compare, find_source
-from coopenv.bench.observers.command import print_tables
-from coopenv.bench.observers.faults import FAULTS
+from coopenv.bench.observers import compare
+from coopenv.bench.observers.command import figure_files
+from coopenv.bench.observers.judge import _JUDGED
 from coopenv.bench.observers.rows import Row
 from coopenv.cli import main
 from coopenv.observers import registry
@@ -102,26 +100,24 @@ def test_report(folder: Path) -> None:
     text = (folder / "report.html").read_text()
     page = Page(text)
     assert not page.open
-    assert page.anchors == page.places
-    assert page.sources and all(source.startswith("data:image/png;base64,") for source in page.sources)
-    for source in page.sources:
-        assert base64.b64decode(source.split(",", 1)[1]).startswith(b"\x89PNG")
-    assert "url(" not in text and "http" not in re.sub(r"base64,[^\"]*", "", text)
-    for wanted in ("--seeds 2", "numpy", "Seeds 0 to 1", "Basin of attraction", "Cost against accuracy", "Consistency"):
+    headings = [place for place in page.places if f'<h2 id="{place[1:]}"' in text]
+    assert [anchor for anchor in page.anchors if anchor in headings] == headings and len(headings) == 8
+    assert not page.sources and text.count("<svg") == 7  # of two variants each two, map, cost, basin
+    # What figures refer to is on the page, and the names of formats are no addresses that anybody opens.
+    assert {*re.findall(r"url\(([^)]*)\)", text)} <= {*page.places}
+    assert not re.search(r"(?:src|href)=.?http|@import", text)
+    for wanted in ("--seeds 2", "numpy", "seeds 0 to 1", "Basin of attraction", "Cost against accuracy", "viewport"):
         assert wanted in text
-    assert "no landmark is seen for 10 s" in text and "ANEES of an honest filter: 1 (" in text and "× " in text
+    assert "no landmark is seen for 10 s" in text and "ANEES of an honest filter: 1 (" in text and "×" in text
+    assert "standard error over\nthe 2 seeds" in text
     for name in (f.name for f in fields(Row)):
         assert f"<dt>{name}</dt>" in text
 
 
 def test_tables_fit_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(registry, "_registered", {})
-    registry.register("raises", Raises)
-    source = find_source("busy_intersection", {"horizon": 1.0})
-    rows = compare(source, ["covariance_intersection", "raises"], 1, tuple(FAULTS)).rows
-    printed = StringIO()
-    print_tables(rows, [], Console(file=printed, width=80))
-    text = printed.getvalue()
+    observers = ["covariance_intersection", Raises]
+    text = str(compare(observers, "busy_intersection", 2, variants="all", overrides={"horizon": 1.0}))
     assert text.count("by design") == 1  # the same in every variant
     assert "failed" in text and "…" not in text and "bound (ancestors)" in text and "landmarks" in text
     assert max(len(line) for line in text.splitlines() if "by design" not in line) <= 80
@@ -129,13 +125,18 @@ def test_tables_fit_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_large_numbers_fit_as_well() -> None:
     """Those of an observer that diverges and sends a lot."""
-    rows = compare(find_source("overtaking", {"horizon": 0.5}), ["covariance_intersection"], 1, None, 0.2).rows
-    worst = {"anees": 1.3e-11, "nis": 2814.3, "bytes_per_s": 123456.7, "us_per_update": 12345.6}
-    far = {"position_rmse_m": 12345.6, "ratio_to_bound": 1e7, "ratio_to_bound_ancestors": 1e7, "diverged_fraction": 1.0}
-    row = replace(rows[0], **worst, **far, settled_fraction=1.0, converged_fraction=1.0)
-    printed = StringIO()
-    print_tables([row] * 5, [], Console(file=printed, width=80))
-    assert "…" not in printed.getvalue() and max(len(line) for line in printed.getvalue().splitlines()) <= 80
+    comparison = compare(["covariance_intersection"], "overtaking", 1, overrides={"horizon": 0.5}, steady_from=0.2)
+    (sample,) = comparison.samples
+    wild = {"position_mse": 12345.6**2, "anees": 1.3e-11, "nis": 2814.3e3, "nis_dof": 1e3, "bytes_per_s": 123456.7}
+    far = {name: np.full(5, value) for name, value in (wild | {"us_per_update": 12345.6, "diverged": 1.0}).items()}
+    scene = replace(sample.scene, vehicles=("a",) * 5, **{name: np.full(5, 1e-3) for name in PER_VEHICLE})
+    rest = {name: np.zeros(5) for name in _JUDGED if name not in far}
+    samples = [replace(sample, scene=scene, **{**rest, **far}), replace(sample, scene=scene, **{**rest, **far})]
+    text = str(replace(comparison, samples=samples, seeds=(0, 1)))
+    assert "12346" in text and "…" not in text and max(len(line) for line in text.splitlines()) <= 80
+
+
+PER_VEHICLE = ("bound_mse", "bound_ancestors_mse", "bound_single_mse", "gramian", "gramian_local")
 
 
 @pytest.mark.parametrize(
@@ -155,8 +156,14 @@ def test_large_numbers_fit_as_well() -> None:
         (["overtaking", "--data", "."], "not one of the recorded robots"),
         (["overtaking", "--variants", "blind"], "known: nominal"),
         (["overtaking", "--seeds", "0"], "'--seeds'"),
+        (["overtaking", "--format", "pdf"], "figures need a folder"),
+        (["overtaking", "--format", "gif", "--out", "x"], "known are png, pdf, svg"),
+        (["overtaking", "--observers", "nowhere.py:Mine"], "no such file"),
         (["overtaking", "--observers", "mekf", "--steady-from", "1000"], "not within the run"),
-        (["crossing_path", "--observers", "mekf", "--variants", "lying_neighbour"], "none can lie to another"),
+        (
+            ["crossing_path", "--observers", "mekf", "--variants", "lying_neighbour"],
+            "no vehicle has another one as its neighbour",
+        ),
     ],
 )
 def test_mistakes_have_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -204,3 +211,36 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(
     (tmp_path / "file").write_text("")
     assert main(["bench", "observers", "overtaking", "--seeds", "1000", "--out", str(tmp_path / "file")]) == 2
     assert "file" in capsys.readouterr().err
+
+
+SOURCE = """
+from coopenv.observers.dead_reckoning import DeadReckoning
+
+class Mine(DeadReckoning):
+    pass
+"""
+
+
+def test_an_observer_in_a_file_and_figures_as_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In processes of their own, which load the file themselves; figures of another format go."""
+    monkeypatch.setattr(registry, "_registered", {})
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(SOURCE)
+    words = ["bench", "observers", "overtaking", "--observers", "mine.py:Mine,dead_reckoning", "--seeds", "2"]
+    words += ["--first", "7", "--set", "horizon=0.5", "--out", "board"]
+    for form, start, jobs in (("pdf", b"%PDF", "1"), ("svg", b"<?xml", "2")):
+        assert main([*words, "--format", form, "--jobs", jobs]) == 0
+        figures = {path.name for path in Path("board").iterdir()} - {
+            "leaderboard.json",
+            "leaderboard.csv",
+            "report.html",
+        }
+        assert figures == {*figure_files(["nominal"], form)} - {f"variants.{form}"}
+        assert all((Path("board") / name).read_bytes().startswith(start) for name in figures)
+    board = json.loads(Path("board/leaderboard.json").read_text())
+    assert board["seeds"] == [7, 8] and "--observers mine.py:Mine,dead_reckoning" in board["command"]
+    mine, other = (
+        [row["position_rmse_m"] for row in board["rows"] if row["observer"] == name]
+        for name in ("Mine", "dead_reckoning")
+    )
+    assert mine == other and len(mine) == 2

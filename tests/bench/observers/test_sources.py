@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,10 +25,11 @@ def test_a_log_file_gives_the_rows_of_what_it_recorded(tmp_path: Path) -> None:
     from coopenv.backends.mcap import write_recording
 
     write_recording(record(coopenv.load_scenario("overtaking", {"horizon": 1.0}), 0), tmp_path / "drive.mcap")
-    source = find_source(str(tmp_path / "drive.mcap"))
-    replayed = compare(source, ["mekf"], 3, ["nominal", "v2x_delay"], 0.5).rows
-    simulated = compare(find_source("overtaking", {"horizon": 1.0}), ["mekf"], 1, ["nominal", "v2x_delay"], 0.5).rows
-    assert source.name == "drive"
+    options: dict[str, Any] = {"variants": ["nominal", "v2x_delay"], "steady_from": 0.5}
+    replay = compare(["mekf"], tmp_path / "drive.mcap", 3, **options)
+    replayed = replay.rows
+    simulated = compare(["mekf"], "overtaking", 1, overrides={"horizon": 1.0}, **options).rows
+    assert (replay.environment, replay.seeds) == ("drive", (0,))
     assert [r.position_rmse_m for r in replayed] == [r.position_rmse_m for r in simulated]
     assert [r.bound_m for r in replayed] == [r.bound_m for r in simulated]
 
@@ -47,7 +49,7 @@ def test_observers_are_compared_where_they_are_meant_to_be() -> None:
     """Unless they are asked for by name."""
 
     def names(source: str, observers: str | None = None) -> tuple[str, ...]:
-        return request_of(source, observers, None, 1, None, 0, None, {}, ()).observers
+        return tuple(request_of(source, observers, None, range(1), None, 0, None, {}, ()).observers)
 
     space, plane = names("overtaking"), names("mrclam_6")
     assert "planar_ekf" not in space and {"p3p", "robust", "robust_joint"} <= {*space}
@@ -67,7 +69,7 @@ def test_what_is_recorded_has_no_scenario() -> None:
 def test_recorded_robots_have_rows_without_a_bound(tmp_path: Path) -> None:
     mrclam_files.write(tmp_path, seconds=15.0)
     source = find_source("mrclam_6", data=tmp_path)
-    rows = compare(source, ["dead_reckoning", "mekf"], 4, ["landmarks", "blind"]).rows
+    rows = compare(["dead_reckoning", "mekf"], "mrclam_6", 4, data=tmp_path, variants=["landmarks", "blind"]).rows
     assert len(rows) == 2 * 2 * 5 and all(np.isnan(row.bound_m) and not row.failure for row in rows)
     assert all(np.isfinite([row.position_rmse_m, row.orientation_rmse_deg, row.ate_m]).all() for row in rows)
     # One record, judged from the start on: nothing was averaged over seeds, and nothing left out but the start itself.

@@ -1,0 +1,235 @@
+"""Observers compared on the same records: Monte Carlo over seeds and variants."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from io import StringIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+
+from coopenv.bench.observers import exports, tables
+from coopenv.bench.observers.executors import Engine, Local
+from coopenv.bench.observers.judge import Sample, Task, judge
+from coopenv.bench.observers.leaderboard import Leaderboard
+from coopenv.bench.observers.sources import Source, find_source, variants_of
+from coopenv.errors import CoopenvError, checked_seed, suggest
+from coopenv.observers.contract import Factory
+from coopenv.observers.registry import available_names, find, named, portable
+from coopenv.runs.console import Progress
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+
+class Comparison(Leaderboard):
+    """How observers did on the same records, as tables, files and figures. Printed, it is its tables."""
+
+    def table(self, variant: str | None = None) -> Table:
+        """Return the position RMSE of every observer and vehicle beside the bounds, m, as a table for a terminal.
+
+        0.0123(4) stands for 0.0123 with a standard error of 0.0004 over the seeds.
+
+        Args:
+            variant: None: the first one.
+
+        Raises:
+            CoopenvError: it was not run.
+        """
+        return tables.error_table(self, self._checked(variant))
+
+    def to_pandas(self) -> DataFrame:
+        """Return the rows with all columns.
+
+        Raises:
+            CoopenvError: pandas is not installed.
+        """
+        return exports.data_frame(self.rows)
+
+    def to_csv(self, path: str | Path | None = None) -> str:
+        """Return the rows with all columns as CSV, and write them where a path is given.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        return exports.text_to(path, exports.csv_text(self.rows))
+
+    def to_latex(self, path: str | Path | None = None, variant: str | None = None) -> str:
+        """Return the position RMSE with standard errors as a LaTeX table (package booktabs); write it to a path.
+
+        Args:
+            path: None: no file.
+            variant: None: the first one.
+
+        Raises:
+            CoopenvError: the variant was not run, or the file cannot be written.
+        """
+        return exports.text_to(path, exports.latex(self, self._checked(variant)))
+
+    def figure(
+        self,
+        kind: str = "errors",
+        *,
+        variant: str | None = None,
+        width: float | None = None,
+        path: str | Path | None = None,
+        format: str | None = None,
+    ) -> Figure:
+        """Draw a figure, and write it where a path is given.
+
+        Args:
+            kind: "errors" or "consistency" over time, "variants" (a map of errors) or "cost" (error against time).
+            variant: of errors, consistency and cost; None: the first one.
+            width: inches, 3.5 for one column of a journal; None: a page's.
+            path: file to write.
+            format: "png", "pdf" or "svg"; None: as the path ends.
+
+        Raises:
+            CoopenvError: no such kind or variant, nothing to draw, or the file cannot be written.
+        """
+        from coopenv.bench.observers.figures import KINDS, save
+
+        if kind not in KINDS:
+            raise CoopenvError(f"unknown figure '{kind}'{suggest(kind, KINDS)}; known: {', '.join(KINDS)}")
+        drawn = KINDS[kind](self, self._checked(variant), width)
+        if drawn is None:
+            raise CoopenvError(f"figure '{kind}': there is nothing to draw")
+        if path is not None:
+            save(drawn, Path(path), format)
+        return drawn
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        return tables.everything(self)
+
+    def __str__(self) -> str:
+        text = StringIO()
+        Console(file=text, width=tables.WIDTH, markup=False, highlight=False).print(self)
+        return text.getvalue()
+
+    def _checked(self, variant: str | None) -> str:
+        if variant is None:
+            return next(iter(self.variants))
+        if variant not in self.variants:
+            raise CoopenvError(f"variant '{variant}' was not run; there are {', '.join(self.variants)}")
+        return variant
+
+
+def compare(
+    observers: Iterable[str | Factory] | None,
+    environment: str | Path,
+    seeds: int | Iterable[int] = 5,
+    *,
+    variants: str | Sequence[str] | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    steady_from: float | None = None,
+    data: str | Path | None = None,
+    jobs: int = 1,
+) -> Comparison:
+    """Compare observers on the same records.
+
+    For example `coopenv.compare(["riccati", Mine], "busy_intersection_tracking", seeds=20)`.
+
+    Args:
+        observers: names, classes, or where they stand (`mine.py:Mine`, `package.module:Mine`); None: all that suit.
+        environment: name, TOML file, recorded robots (`mrclam_1` to `mrclam_9`) or MCAP file.
+        seeds: how many (0, 1, ...), or which; what is recorded has one record whatever they are.
+        variants: names, or "all": faults of an environment, what recorded robots see; None: the usual ones.
+        overrides: dotted scenario keys, for example {"noise.enabled": False}.
+        steady_from: start of the steady state, s; None: after 70 % of the run.
+        data: folder of recorded data sets; None: what COOPENV_DATA says.
+        jobs: processes. More than one need a script whose own work stands below `if __name__ == "__main__":`, and
+            classes that a module or file holds.
+
+    Raises:
+        CoopenvError: an argument is not valid, or names what does not exist.
+    """
+    source = find_source(str(environment), overrides, None if data is None else Path(data))
+    source.check()
+    names = observers_of(observers, source)
+    wanted = variants if variants is None or isinstance(variants, str) else ",".join(variants)
+    chosen, numbers = variants_of(source, wanted), seeds_of(seeds)
+    with Progress(Console(stderr=True), work_of(names, chosen, numbers), total=1.0) as progress:
+        return run_comparison(source, names, numbers, chosen, steady_from, Local(jobs), progress.update)
+
+
+def observers_of(observers: Iterable[str | Factory] | None, source: Source) -> tuple[str, ...]:
+    """Return the names of observers, each once; None: of all that are meant for the vehicles of a source.
+
+    Raises:
+        CoopenvError: one does not exist, or two have one name.
+    """
+    if observers is None:
+        return tuple(available_names(source.planar))
+    if isinstance(observers, str):
+        raise CoopenvError(f"observers: expected a list such as ['{observers}']")
+    given = list(dict.fromkeys(observers))
+    names = [named(observer) for observer in given]
+    for observer, name in zip(given, names, strict=True):
+        if find(observer) is not find(name):
+            raise CoopenvError(f"two observers are named '{name}': register them under names of their own")
+    return tuple(dict.fromkeys(names))
+
+
+def seeds_of(seeds: int | Iterable[int]) -> tuple[int, ...]:
+    """Return the seeds that were asked for, as a number or one by one.
+
+    Raises:
+        CoopenvError: there are none, or one of them is no seed.
+    """
+    given = seeds if isinstance(seeds, Iterable) else range(checked_seed(seeds))
+    numbers = tuple(dict.fromkeys(map(checked_seed, given)))
+    if not numbers:
+        raise CoopenvError("seeds: expected at least one")
+    return numbers
+
+
+def work_of(observers: Sequence[str], variants: Sequence[str], seeds: Sequence[int]) -> str:
+    """Return what there is to do, for people who wait."""
+    return ", ".join(
+        f"{len(things)} {word}{'s' if len(things) > 1 else ''}"
+        for things, word in ((observers, "observer"), (variants, "variant"), (seeds, "seed"))
+    )
+
+
+def run_comparison(
+    source: Source,
+    observers: Sequence[str],
+    seeds: Sequence[int],
+    variants: Sequence[str],
+    steady_from: float | None = None,
+    engine: Engine | None = None,
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> Comparison:
+    """Judge observers on the records of a source; the result does not depend on the engine.
+
+    Args:
+        source: of the records.
+        observers: names.
+        seeds: of a simulated source; a recorded one has one record only.
+        variants: of the source.
+        steady_from: s; None: the source's own.
+        engine: where the work is done; None: this process.
+        on_progress: called with the share that is done.
+
+    Raises:
+        CoopenvError: an unknown observer, a record that cannot be made, or a start of the steady state beyond it.
+    """
+    source.steady_from(steady_from)
+    for name in observers:
+        find(name)
+    sent = {name: portable(name) for name in observers}
+    # One record serves all observers. Recorded robots are few records and long ones: their observers are shared out.
+    groups = [sent] if source.seeded else [{name: observer} for name, observer in sent.items()]
+    used = tuple(seeds) if source.seeded else (0,)
+    tasks = [
+        Task(source, variant, seed, group, steady_from) for variant in variants for seed in used for group in groups
+    ]
+    judged = (engine or Local(1)).map(judge, tasks, lambda done: on_progress(done / len(tasks)))
+    order: dict[tuple[str, str], list[Sample]] = {(variant, name): [] for variant in variants for name in observers}
+    for sample in (sample for samples in judged for sample in samples):
+        order[sample.variant, sample.observer].append(sample)
+    told = {variant: source.variants[variant] for variant in variants}
+    return Comparison(source.name, tuple(observers), told, used, [s for own in order.values() for s in own])

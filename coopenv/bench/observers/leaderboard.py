@@ -1,0 +1,58 @@
+"""What a comparison of observers holds: the samples, and what comes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from coopenv.bench.observers.judge import Sample
+from coopenv.bench.observers.rows import Row, Total, rows_of, totals_of
+
+
+@dataclass(frozen=True)
+class Leaderboard:
+    """How observers did on the same records, summed up over seeds."""
+
+    environment: str
+    """Name of the environment, dataset or log file."""
+    observers: tuple[str, ...]
+    variants: Mapping[str, str]
+    """Those that were run, each with what it is."""
+    seeds: tuple[int, ...]
+    samples: Sequence[Sample] = field(repr=False)
+    """One observer on one record each, by variant, observer, seed."""
+
+    @cached_property
+    def rows(self) -> list[Row]:
+        """One per variant, observer and vehicle."""
+        return rows_of(self.environment, self.samples)
+
+    @cached_property
+    def totals(self) -> dict[tuple[str, str], Total]:
+        """Over all vehicles, by variant and observer."""
+        return {(total.variant, total.observer): total for total in totals_of(self.samples)}
+
+    @cached_property
+    def ranked(self) -> list[str]:
+        """The observers by their error in the first variant, those that failed there last."""
+        first = next(iter(self.variants))
+        error = {name: self.totals[first, name].rmse.value for name in self.observers}
+        return sorted(self.observers, key=lambda name: (error[name] != error[name], error[name]))
+
+    @property
+    def title(self) -> str:
+        """What was compared, on one line."""
+        first, last = self.seeds[0], self.seeds[-1]
+        whole = len(self.seeds) > 1 and self.seeds == tuple(range(first, last + 1))
+        seeds = f"{first} to {last}" if whole else ", ".join(map(str, self.seeds))
+        return f"{self.environment}, seed{'s' if len(self.seeds) > 1 else ''} {seeds}"
+
+    def rows_in(self, variant: str, observer: str) -> list[Row]:
+        """Return the rows of one observer in one variant, a vehicle each."""
+        return [row for row in self.rows if (row.variant, row.observer) == (variant, observer)]
+
+    def samples_in(self, variant: str) -> dict[str, list[Sample]]:
+        """Return the samples of one variant of every observer that did not fail, the best first."""
+        own = {name: [s for s in self.samples if (s.variant, s.observer) == (variant, name)] for name in self.ranked}
+        return {name: samples for name, samples in own.items() if not any(sample.failure for sample in samples)}

@@ -1,0 +1,178 @@
+"""What `coopenv.compare` takes and gives: tables, figures, files."""
+
+from __future__ import annotations
+
+import csv
+import sys
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+import coopenv
+from coopenv.bench.observers.report import report_text
+from coopenv.bench.observers.rows import Row
+from coopenv.errors import CoopenvError
+from coopenv.format import in_parentheses, with_error
+from coopenv.observers import Estimate, Setup, Tick, registry
+from coopenv.observers.dead_reckoning import DeadReckoning
+
+
+class Mine(DeadReckoning):
+    """An observer of one's own."""
+
+
+class Fails(DeadReckoning):
+    """Fails at its first update."""
+
+    def update(self, tick: Tick) -> Estimate:
+        raise ZeroDivisionError
+
+
+@pytest.fixture(scope="module")
+def comparison() -> coopenv.Comparison:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(registry, "_registered", {})
+        short: dict[str, Any] = {"overrides": {"horizon": 1.0}, "steady_from": 0.5}
+        return coopenv.compare(
+            [Fails, Mine, "riccati"], "overtaking", [3, 8], variants=["nominal", "v2x_loss"], **short
+        )
+
+
+def test_what_was_compared(comparison: coopenv.Comparison) -> None:
+    assert comparison.observers == ("Fails", "Mine", "riccati")
+    assert comparison.seeds == (3, 8) and list(comparison.variants) == ["nominal", "v2x_loss"]
+    assert comparison.title == "overtaking, seeds 3, 8"
+    assert comparison.ranked == ["riccati", "Mine", "Fails"]
+    assert len(comparison.rows) == 2 * 3 * 2 and all(isinstance(row, Row) for row in comparison.rows)
+
+
+def test_tables(comparison: coopenv.Comparison) -> None:
+    text = str(comparison)
+    lines = [line.split()[0] for line in text.splitlines() if line.startswith(("riccati", "Mine", "Fails"))]
+    assert lines[:3] == ["riccati", "Mine", "Fails"]
+    assert "ratio" not in text and "bound (ancestors)" in text and "0.0123(4): 0.0123 with a standard error" in text
+    printed = StringIO()
+    Console(file=printed, width=80).print(comparison.table("v2x_loss"))
+    row = comparison.rows_in("v2x_loss", "riccati")[0]
+    assert in_parentheses(row.position_rmse_m, row.position_rmse_se_m) in printed.getvalue()
+
+
+def test_csv_and_latex(comparison: coopenv.Comparison, tmp_path: Path) -> None:
+    table = list(csv.DictReader(StringIO(comparison.to_csv(tmp_path / "rows.csv"))))
+    assert (tmp_path / "rows.csv").read_text() == comparison.to_csv()
+    assert [line["observer"] for line in table[:6]] == ["Fails"] * 2 + ["Mine"] * 2 + ["riccati"] * 2
+    assert table[0]["position_rmse_m"] == "" and float(table[4]["position_rmse_se_m"]) > 0
+    text = comparison.to_latex(tmp_path / "rows.tex")
+    assert (tmp_path / "rows.tex").read_text() == text
+    assert r"vehicle\_1" in text and r"\pm" in text and text.count(r"\\") == 1 + 3 + 3
+    body = [line for line in text.splitlines() if "&" in line]
+    assert [line.count("&") for line in body] == [2] * len(body)
+    assert r"Fails & failed & failed \\" in text
+
+
+def test_pandas_is_given_every_column(comparison: coopenv.Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(CoopenvError, match="pip install pandas"):
+        comparison.to_pandas()
+    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=lambda rows, columns: (rows, columns)))
+    rows, columns = comparison.to_pandas()  # type: ignore[misc]
+    assert [list(row) for row in rows] == [columns] * 12
+
+
+@pytest.mark.parametrize("kind", ["errors", "consistency", "variants", "cost"])
+@pytest.mark.parametrize("width", [None, 3.5])
+def test_figures_say_what_they_show(comparison: coopenv.Comparison, kind: str, width: float | None) -> None:
+    figure = comparison.figure(kind, width=width)
+    assert figure.get_figwidth() == (width or 10.5)
+    shown = figure.get_supxlabel()
+    assert "overtaking, seeds 3, 8" in shown and ("nominal" in shown) == (kind != "variants")
+    figure.draw_without_rendering()
+    words = [
+        text.get_text() for ax in figure.axes for text in (*ax.texts, ax.title, ax.yaxis.label, *ax.get_yticklabels())
+    ]
+    assert "riccati" in words and ("Fails" in words) == (kind == "variants")
+    if kind == "variants":
+        assert {"better", "worse"} <= {figure.axes[1].get_xlabel(), figure.axes[1].get_title()}
+
+
+@pytest.mark.parametrize(("form", "start"), [("png", b"\x89PNG"), ("pdf", b"%PDF"), ("svg", b"<?xml")])
+def test_figures_as_files(comparison: coopenv.Comparison, tmp_path: Path, form: str, start: bytes) -> None:
+    for path, options in ((tmp_path / f"figure.{form}", {}), (tmp_path / "figure", {"format": form})):
+        comparison.figure("errors", variant="v2x_loss", path=path, **options)
+        assert path.read_bytes().startswith(start)
+    first = (tmp_path / f"figure.{form}").read_bytes()
+    comparison.figure("errors", variant="v2x_loss", path=tmp_path / f"figure.{form}")
+    assert form == "svg" or (tmp_path / f"figure.{form}").read_bytes() == first
+
+
+def test_mistakes(comparison: coopenv.Comparison, tmp_path: Path) -> None:
+    for options, message in (
+        ({"kind": "error"}, "did you mean 'errors'"),
+        ({"variant": "v2x_delay"}, "was not run; there are nominal, v2x_loss"),
+        ({"path": tmp_path / "figure.gif"}, "unknown format 'gif'"),
+        ({"width": 0.1}, "expected 2 to 50 inches"),
+    ):
+        with pytest.raises(CoopenvError, match=message):
+            comparison.figure(**options)
+    with pytest.raises(CoopenvError, match="was not run"):
+        comparison.table("v2x_delay")
+
+
+def makes(offset: float) -> type:
+    class Moved(DeadReckoning):
+        def __init__(self, setup: Setup) -> None:
+            super().__init__(setup)
+            self.offset = offset
+
+    return Moved
+
+
+@pytest.mark.parametrize(
+    ("observers", "options", "message"),
+    [
+        (["ricati"], {}, "did you mean 'riccati'"),
+        ("riccati", {}, r"expected a list such as \['riccati'\]"),
+        ([makes(1.0), makes(2.0)], {}, "two observers are named 'Moved'"),
+        ([3], {}, "expected a name"),
+        (["riccati"], {"seeds": 0}, "at least one"),
+        (["riccati"], {"seeds": [1, -1]}, "must not be negative"),
+        (["riccati"], {"seeds": 2.5}, "whole number"),
+        (["riccati"], {"steady_from": 60.0}, "not within the run"),
+        (["riccati"], {"variants": "v2x_los"}, "did you mean 'v2x_loss'"),
+        (["riccati"], {"overrides": {"horzon": 1.0}}, "did you mean 'horizon'"),
+    ],
+)
+def test_mistakes_are_told_before_the_work(
+    monkeypatch: pytest.MonkeyPatch, observers: Any, options: dict[str, Any], message: str
+) -> None:
+    monkeypatch.setattr(registry, "_registered", {})
+    with pytest.raises(CoopenvError, match=message):
+        coopenv.compare(observers, "overtaking", **options)
+
+
+@pytest.mark.parametrize("model", ["paper", "isotropic"])
+def test_the_note_on_the_papers_noise_stands_where_the_noise_is_the_papers(model: str) -> None:
+    found = coopenv.compare(["riccati"], "overtaking", 1, overrides={"horizon": 0.2, "noise.bearing.model": model})
+    text = report_text(found, {"command": "", "versions": {}})
+    assert ("The paper's bearing noise is smaller" in text) == (model == "paper")
+
+
+def test_the_report_is_sorted_and_has_errors_beside_its_figures(comparison: coopenv.Comparison) -> None:
+    text = report_text(comparison, {"command": "<command>", "versions": {"numpy": "2"}})
+    places = [text.index(f'<td class="name">{name}</td>') for name in comparison.ranked]
+    assert places == sorted(places)
+    assert "&lt;command&gt;" in text and "<command>" not in text
+    row = comparison.rows_in("nominal", "riccati")[0]
+    value, error = with_error(row.position_rmse_m, row.position_rmse_se_m)
+    assert f'{value}<span class="se"> ±&#8239;{error}</span>' in text
+    assert "ZeroDivisionError" in text
+
+
+def test_seeds_are_named_as_a_range_where_they_are_one(comparison: coopenv.Comparison) -> None:
+    assert replace(comparison, seeds=(4, 5, 6)).title == "overtaking, seeds 4 to 6"
+    assert replace(comparison, seeds=(4,)).title == "overtaking, seed 4"
