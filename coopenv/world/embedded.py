@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from coopenv.world.camera import observe
@@ -33,19 +32,25 @@ class Embedded:
     """An observer that runs in the world's kernels.
 
     Its functions read what a vehicle senses and hears from `state`, write its estimate there (`estimate_rotation`,
-    `estimate_position`, `covariance`, `corrected_tick`), and keep whatever else they need in `memory`, a Warp struct
-    whose arrays have the world as leading axis. `model` and `state` are those of `coopenv.world`.
+    `estimate_position`, `covariance`, `corrected_tick`), and keep whatever else they need in `memory`. `model` and
+    `state` are those of `coopenv.world`; of truth they may read where landmarks are, and nothing else.
     """
 
     name: str
     estimate: Any
-    """(model, state, memory, world, vehicle, tick): take one camera tick; messages have been delivered."""
+    """(model, state, memory, world, vehicle, now): take one camera tick, `now` being a `coopenv.world.rates.Now`;
+    messages have been delivered."""
     start: Any
-    """(model, state, memory, world): begin an episode in a world whose initial estimates have been drawn."""
+    """(model, state, memory, world, vehicle): begin an episode at the initial estimate, which stands in the state, its
+    covariance in `model.start.covariance` (LEFT coordinates); vehicles come leaders first."""
     send: Any
-    """(model, state, memory, world, vehicle, tick): put on the air what the V2X pose estimate does not carry."""
-    allocate: Callable[[Any, int, np.ndarray, str], Any] = lambda model, worlds, start_covariance, device: Nothing()
-    """(model, worlds, start_covariance (N, 6, 6), device): return the memory."""
+    """(model, state, memory, world, vehicle, tick): put on the air what the V2X pose estimate does not carry; called
+    at every tick, after `start` as well."""
+    memory: Any = Nothing
+    """A Warp struct whose arrays are declared with `coopenv.world.records.array`, the axes W (worlds) and N (vehicles)
+    first."""
+    sizes: Mapping[str, int] = field(default_factory=dict, hash=False)
+    """Lengths of axes by letter, besides those of the state (`coopenv.world.state.state_sizes`)."""
     fit: Callable[[Any], Embedded] | None = None
     """(model): return the variant to compile for a model; None: this one."""
     valid: Mapping[str, Rule] = field(default_factory=dict, hash=False)
@@ -71,12 +76,12 @@ class Source:
 
 
 @wp.func
-def start_nothing(model: Any, state: Any, memory: Any, world: int):
+def start_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int):
     """Begin an episode of an observer without a memory."""
 
 
 @wp.func
-def estimate_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: int):
+def estimate_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
     """Leave the estimate as it is: somebody else writes it."""
 
 

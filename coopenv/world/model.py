@@ -16,6 +16,9 @@ DRIVEN = wp.constant(2)
 """Values of `Model.motion.kind`."""
 
 
+mat66d: Any = wp.types.matrix((6, 6), wp.float64)
+
+
 @cache
 def model_struct(p: Precision) -> Any:
     """Return the Warp struct of the model in one precision."""
@@ -36,6 +39,7 @@ def model_struct(p: Precision) -> Any:
         orientation_fixed: wp.array(dtype=wp.int32)  # (N,) 0: estimate_rotation multiplies R(0)
         estimate_rotation: wp.array(dtype=mat33)  # (N,)
         orientation_angle: wp.array(dtype=scalar)  # (N,) largest random turn; negative: uniform over SO(3)
+        covariance: wp.array(dtype=mat66d)  # (N,) of the initial estimate, for observers: left error, rad and m
 
     @wp.struct
     class Motion:

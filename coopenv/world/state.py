@@ -1,7 +1,7 @@
 """The changing side of a world: one record of arrays with leading axes (world, agent or vehicle).
 
-W worlds, A agents (landmarks first), N vehicles, M odometry samples a tick, S slots of the
-radio's outbox, B blocks of the sliding Gramian.
+W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders), M odometry samples a tick, S slots of
+the radio's outbox, B blocks of the sliding Gramian.
 """
 
 from collections.abc import Mapping
@@ -14,6 +14,7 @@ import warp as wp
 from coopenv.estimation.trajectory import Outcome, Sight
 from coopenv.scenario.base import LARGEST
 from coopenv.world.precision import Precision
+from coopenv.world.records import allocate, array, fields
 from coopenv.world.saved_state import (
     ANYTHING,
     COVARIANCE,
@@ -38,51 +39,51 @@ def state_struct(p: Precision) -> Any:
     class State:
         """Everything that changes. Lengths in m, angles in rad, map and body frames as named."""
 
-        seed: wp.array(dtype=wp.uint64)  # (W,)
-        episode: wp.array(dtype=wp.uint32)  # (W,)
-        tick: wp.array(dtype=wp.int32)  # (W,) camera ticks since the reset
+        seed: array("W", wp.uint64)
+        episode: array("W", wp.uint32)
+        tick: array("W", wp.int32)  # camera ticks since the reset
 
-        start_rotation: wp.array2d(dtype=mat33)  # (W, A)
-        start_position: wp.array2d(dtype=vec3)  # (W, A) map
-        rotation: wp.array2d(dtype=mat33)  # (W, A) truth, body to map
-        position: wp.array2d(dtype=vec3)  # (W, A) truth, map
-        velocity: wp.array2d(dtype=vec3)  # (W, A) truth, body, m/s
-        angular_velocity: wp.array2d(dtype=vec3)  # (W, A) truth, body, rad/s
-        speed: wp.array2d(dtype=scalar)  # (W, N) of the bicycle, m/s
-        steering: wp.array2d(dtype=scalar)  # (W, N) rad
-        command: wp.array2d(dtype=vec2)  # (W, N) action in force
-        ended: wp.array2d(dtype=wp.int32)  # (W, N) values of `Outcome`
-        collided: wp.array2d(dtype=wp.int32)  # (W, N) touching something now
+        start_rotation: array("WA", mat33)
+        start_position: array("WA", vec3)  # map
+        rotation: array("WA", mat33)  # truth, body to map
+        position: array("WA", vec3)  # truth, map
+        velocity: array("WA", vec3)  # truth, body, m/s
+        angular_velocity: array("WA", vec3)  # truth, body, rad/s
+        speed: array("WN", scalar)  # of the bicycle, m/s
+        steering: array("WN", scalar)  # rad
+        command: array("WN", vec2)  # action in force
+        ended: array("WN", wp.int32)  # values of `Outcome`
+        collided: array("WN", wp.int32)  # touching something now
 
-        sampled_velocity: wp.array3d(dtype=vec3)  # (W, N, M) truth at the odometry samples of the last tick, m/s, body
-        sampled_angular_velocity: wp.array3d(dtype=vec3)  # (W, N, M) likewise, rad/s; of driven vehicles
+        sampled_velocity: array("WNM", vec3)  # truth at the odometry samples of the last tick, m/s, body
+        sampled_angular_velocity: array("WNM", vec3)  # likewise, rad/s; of driven vehicles
 
-        odometry_velocity: wp.array2d(dtype=vec3)  # (W, N) last sample, m/s
-        odometry_angular_velocity: wp.array2d(dtype=vec3)  # (W, N) last sample, rad/s
-        odometry_samples: wp.array2d(dtype=wp.int32)  # (W, N) samples taken; sample m is at m / rate
-        increment_rotation: wp.array2d(dtype=mat33)  # (W, N) odometry over the last tick
-        increment_translation: wp.array2d(dtype=vec3)  # (W, N) m, in the body frame at the tick's start
+        odometry_velocity: array("WN", vec3)  # last sample, m/s
+        odometry_angular_velocity: array("WN", vec3)  # last sample, rad/s
+        odometry_samples: array("WN", wp.int32)  # samples taken; sample m is at m / rate
+        increment_rotation: array("WN", mat33)  # odometry over the last tick
+        increment_translation: array("WN", vec3)  # m, in the body frame at the tick's start
 
-        bearing: wp.array3d(dtype=vec3)  # (W, N, A) camera to target, camera frame, last measured
-        bearing_tick: wp.array3d(dtype=wp.int32)  # (W, N, A) tick of that bearing; -1: never
-        sight: wp.array3d(dtype=wp.uint8)  # (W, N, A) values of `Sight`
+        bearing: array("WNA", vec3)  # camera to target, camera frame, last measured
+        bearing_tick: array("WNA", wp.int32)  # tick of that bearing; -1: never
+        sight: array("WNA", wp.uint8)  # values of `Sight`
 
-        outbox_rotation: wp.array3d(dtype=mat33)  # (W, N, S) Rhat as sent
-        outbox_position: wp.array3d(dtype=vec3)  # (W, N, S) Rhat phat as sent, map
-        outbox_tick: wp.array3d(dtype=wp.int32)  # (W, N, S) -1: nothing sent in this slot
-        inbox_rotation: wp.array3d(dtype=mat33)  # (W, N receiver, N sender)
-        inbox_position: wp.array3d(dtype=vec3)  # (W, N, N) map
-        inbox_tick: wp.array3d(dtype=wp.int32)  # (W, N, N) tick of sending; -1: never heard
+        outbox_rotation: array("WNS", mat33)  # Rhat as sent
+        outbox_position: array("WNS", vec3)  # Rhat phat as sent, map
+        outbox_tick: array("WNS", wp.int32)  # -1: nothing sent in this slot
+        inbox_rotation: array("WNN", mat33)  # per receiver and sender
+        inbox_position: array("WNN", vec3)  # map
+        inbox_tick: array("WNN", wp.int32)  # tick of sending; -1: never heard
 
-        estimate_rotation: wp.array2d(dtype=mat33)  # (W, N) Rhat
-        estimate_position: wp.array2d(dtype=vec3)  # (W, N) phat, in the body frame
-        covariance: wp.array2d(dtype=mat66)  # (W, N) P over (2 lambda, p)
-        corrected_tick: wp.array2d(dtype=wp.int32)  # (W, N) tick of the observer's last correction
+        estimate_rotation: array("WN", mat33)  # Rhat
+        estimate_position: array("WN", vec3)  # phat, in the body frame
+        covariance: array("WN", mat66)  # P over (2 lambda, p)
+        corrected_tick: array("WN", wp.int32)  # tick of the observer's last correction
 
-        gramian_11: wp.array3d(dtype=mat33)  # (W, N, B) block sums of int C^T C dt, map axes
-        gramian_12: wp.array3d(dtype=mat33)  # (W, N, B)
-        gramian_22: wp.array3d(dtype=mat33)  # (W, N, B)
-        gramian_time: wp.array3d(dtype=scalar)  # (W, N, B) s
+        gramian_11: array("WNB", mat33)  # block sums of int C^T C dt, map axes
+        gramian_12: array("WNB", mat33)
+        gramian_22: array("WNB", mat33)
+        gramian_time: array("WNB", scalar)  # s
 
     return State
 
@@ -118,32 +119,26 @@ VALID: dict[str, Rule] = {
 """What a saved state may hold; numbers that are not in it have to be finite."""
 
 
-def allocate_state(model: Any, worlds: int, p: Precision, device: str) -> Any:
-    """Return a zeroed `State` for `worlds` worlds of a model."""
-    N, A = model.vehicles, model.agents
-    shapes = {
-        "seed": (worlds,),
-        "episode": (worlds,),
-        "tick": (worlds,),
-        **dict.fromkeys(("sampled_velocity", "sampled_angular_velocity"), (worlds, N, model.samples_per_tick)),
-        **dict.fromkeys(("bearing", "bearing_tick", "sight"), (worlds, N, A)),
-        **dict.fromkeys(("outbox_rotation", "outbox_position", "outbox_tick"), (worlds, N, model.radio.slots)),
-        **dict.fromkeys(("inbox_rotation", "inbox_position", "inbox_tick"), (worlds, N, N)),
-        **dict.fromkeys(("gramian_11", "gramian_12", "gramian_22", "gramian_time"), (worlds, N, model.observer.blocks)),
-        **dict.fromkeys(
-            ("start_rotation", "start_position", "rotation", "position", "velocity", "angular_velocity"),
-            (worlds, A),
-        ),
+def state_sizes(model: Any, worlds: int) -> dict[str, int]:
+    """Return the length of every axis of the state, and of an observer's memory, by its letter."""
+    return {
+        "W": worlds,
+        "A": model.agents,
+        "N": model.vehicles,
+        "M": model.samples_per_tick,
+        "S": model.radio.slots,
+        "B": model.observer.blocks,
     }
-    state = state_struct(p)()
-    for name, field in state_fields(p).items():
-        setattr(state, name, wp.zeros(shapes.get(name, (worlds, N)), dtype=field.dtype, device=device))
-    return state
+
+
+def allocate_state(model: Any, worlds: int, p: Precision, device: str, shared: str = "") -> Any:
+    """Return a zeroed `State` for `worlds` worlds of a model; `shared` as for `records.allocate`."""
+    return allocate(state_struct(p), state_sizes(model, worlds), device, shared)
 
 
 def state_fields(p: Precision) -> dict[str, Any]:
     """Return the state's fields: name to Warp array type."""
-    return {name: var.type for name, var in state_struct(p).vars.items()}
+    return fields(state_struct(p))
 
 
 def overwrite(arrays: Mapping[str, Any], values: Mapping[str, np.ndarray]) -> None:

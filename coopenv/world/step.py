@@ -15,6 +15,7 @@ import warp as wp
 from coopenv.world.embedded import Embedded, Source
 from coopenv.world.gramian import sample_gramian
 from coopenv.world.motion import sanitised
+from coopenv.world.rates import regular_tick
 from coopenv.world.v2x import broadcast
 
 Kernel = Callable[..., None]
@@ -55,11 +56,12 @@ def advance_kernel(source: Source, observer: Embedded) -> Kernel:
         count = wp.where(hold[world] == 0, wp.min(ticks, model.horizon_ticks - state.tick[world]), 0)
         for _ in range(count):
             tick = state.tick[world] + 1
+            now = regular_tick(model, tick)
             sense(model, state, record, actions, world, tick)
             for place in range(model.vehicles):
                 vehicle = model.order[place]
                 deliver(model, state, record, world, vehicle, tick)
-                estimate(model, state, memory, world, vehicle, tick)
+                estimate(model, state, memory, world, vehicle, now)
                 sample_gramian(model, state, world, vehicle, tick)
                 broadcast(model, state, world, vehicle, tick)
                 send(model, state, memory, world, vehicle, tick)
@@ -71,7 +73,7 @@ def advance_kernel(source: Source, observer: Embedded) -> Kernel:
 @cache
 def restart_kernel(source: Source, observer: Embedded) -> Kernel:
     """Return the kernel that starts the next episode."""
-    begin, start = source.begin, observer.start
+    begin, start, send = source.begin, observer.start, observer.send
 
     def restart(model: Any, state: Any, memory: Any, record: Any, mask: wp.array(dtype=wp.int32)):
         """Start the next episode in every world whose mask is set."""
@@ -79,7 +81,10 @@ def restart_kernel(source: Source, observer: Embedded) -> Kernel:
         if mask[world] != 0:
             state.episode[world] = state.episode[world] + wp.uint32(1)
             begin(model, state, record, world)
-            start(model, state, memory, world)
+            for place in range(model.vehicles):
+                vehicle = model.order[place]
+                start(model, state, memory, world, vehicle)
+                send(model, state, memory, world, vehicle, 0)
 
     return _named(restart, source.name, observer.name, **observer.options)
 

@@ -13,9 +13,11 @@ from coopenv.scenario import Scenario
 from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
 from coopenv.world.launch import Launcher, PerWorld, default_threads
+from coopenv.world.model import mat66d
 from coopenv.world.precision import check_device, precision
+from coopenv.world.records import allocate, fields
 from coopenv.world.saved_state import Rule, checked_state
-from coopenv.world.state import VALID, allocate_state, overwrite, state_fields
+from coopenv.world.state import VALID, allocate_state, overwrite, state_fields, state_sizes
 from coopenv.world.step import (
     advance_kernel,
     broadcast_kernel,
@@ -77,8 +79,10 @@ class World:
         """What estimates in the kernels; `HOST` where estimates are written from outside, see `PlugIns`."""
         self.state = allocate_state(self.model, worlds, self.precision, self.device)
         N = self.model.vehicles
-        covariance = np.zeros((N, 6, 6)) if start_covariance is None else start_covariance
-        self.memory = observer.allocate(self.model, worlds, covariance, self.device)
+        covariance = np.zeros((N, 6, 6)) if start_covariance is None else np.ascontiguousarray(start_covariance)
+        self.model.start.covariance = wp.array(covariance, dtype=mat66d, device=self.device)
+        sizes = {**state_sizes(self.model, worlds), **self.observer.sizes}
+        self.memory = allocate(self.observer.memory, sizes, self.device)
         """What the embedded observer remembers besides the state."""
         self._record = self._build_record()
         self.actions = wp.zeros((worlds, N), dtype=self.precision.vec2, device=self.device)
@@ -185,7 +189,6 @@ class World:
 
     def state_arrays(self) -> dict[str, Any]:
         """Return every array that `set_state` writes, by name."""
-        fields = {name: getattr(self.state, name) for name in state_fields(self.precision)}
-        remembered = {name: getattr(self.memory, name) for name in self.memory._cls.vars}
-        own = {f"observer_{name}": array for name, array in remembered.items() if isinstance(array, wp.array)}
-        return {**fields, **own, "actions": self.actions}
+        known = {name: getattr(self.state, name) for name in state_fields(self.precision)}
+        own = {f"observer_{name}": getattr(self.memory, name) for name in fields(self.observer.memory)}
+        return {**known, **own, "actions": self.actions}

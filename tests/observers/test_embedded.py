@@ -16,36 +16,29 @@ from coopenv.observers.embedded import find_embedded, register_embedded
 from coopenv.runs import record
 from coopenv.scenario.topology import neighbour_sets
 from coopenv.world.embedded import HOST, Embedded, send_nothing
+from coopenv.world.records import array
 
 
 @wp.struct
 class Counter:
-    """What the toy remembers, (W, N)."""
+    """What the toy remembers."""
 
-    ticks: wp.array2d(dtype=wp.int32)
-    heard: wp.array2d(dtype=wp.int32)
-
-
-def allocate(model: Any, worlds: int, start_covariance: np.ndarray, device: str) -> Any:
-    memory = Counter()
-    memory.ticks = wp.zeros((worlds, model.vehicles), dtype=wp.int32, device=device)
-    memory.heard = wp.zeros((worlds, model.vehicles), dtype=wp.int32, device=device)
-    return memory
+    ticks: array("WN", wp.int32)
+    heard: array("WN", wp.int32)
 
 
 @wp.func
-def start(model: Any, state: Any, memory: Any, world: int):
-    for vehicle in range(model.vehicles):
-        memory.ticks[world, vehicle] = 0
-        memory.heard[world, vehicle] = 0
+def start(model: Any, state: Any, memory: Any, world: int, vehicle: int):
+    memory.ticks[world, vehicle] = 0
+    memory.heard[world, vehicle] = 0
 
 
 @wp.func
-def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: int):
+def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
     """Count, and put the count where the position estimate stands."""
     memory.ticks[world, vehicle] = memory.ticks[world, vehicle] + 1
     for sender in range(model.vehicles):
-        if state.inbox_tick[world, vehicle, sender] == tick:
+        if state.inbox_tick[world, vehicle, sender] == now.tick:
             memory.heard[world, vehicle] = memory.heard[world, vehicle] + 1
     p = state.estimate_position[world, vehicle]
     p[0] = p.dtype(memory.ticks[world, vehicle])
@@ -53,7 +46,7 @@ def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick
     state.estimate_position[world, vehicle] = p
 
 
-COUNTER = Embedded("toy_counter", estimate, start, send_nothing, allocate)
+COUNTER = Embedded("toy_counter", estimate, start, send_nothing, Counter)
 register_embedded(COUNTER)
 
 

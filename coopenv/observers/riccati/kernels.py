@@ -23,7 +23,6 @@ from coopenv.observers.riccati.equations import (
 )
 from coopenv.world.embedded import Embedded, send_nothing, start_nothing
 from coopenv.world.gramian import known_position, usable
-from coopenv.world.rates import correction_due
 
 MOST_SUBSTEPS = wp.constant(200)
 """Re-linearisations per tick; the last one takes what remains of the tick."""
@@ -81,11 +80,11 @@ def shrink(turn: Any, limit: Any):
 
 
 @wp.func
-def dead_reckon(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: int):
+def dead_reckon(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
     """Run one tick without correction: the estimate follows odometry, P grows."""
-    predict(model, state, world, vehicle, type(model.observer.max_turn)(model.camera_period))
-    if correction_due(model, tick):
-        state.corrected_tick[world, vehicle] = tick
+    predict(model, state, world, vehicle, type(model.observer.max_turn)(now.period))
+    if now.due:
+        state.corrected_tick[world, vehicle] = now.tick
     # Products of rotations drift by rounding; once per tick is enough to keep Rhat a rotation.
     state.estimate_rotation[world, vehicle] = orthonormalise(state.estimate_rotation[world, vehicle])
 
@@ -172,14 +171,14 @@ def make_estimate(step: Any) -> Any:
             state.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D, P - P)
 
     @wp.func
-    def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: int):
+    def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
         """Run one tick of the observer of one vehicle: predict, and correct when its rate says so."""
-        dt = type(model.observer.max_turn)(model.camera_period)
-        predict(model, state, world, vehicle, dt)
-        if correction_due(model, tick):
-            duration = dt * type(dt)(tick - state.corrected_tick[world, vehicle])
-            correct(model, state, world, vehicle, tick, duration)
-            state.corrected_tick[world, vehicle] = tick
+        predict(model, state, world, vehicle, type(model.observer.max_turn)(now.period))
+        if now.due:
+            unit = type(model.observer.max_turn)(model.camera_period)
+            duration = unit * type(unit)(now.tick - state.corrected_tick[world, vehicle])
+            correct(model, state, world, vehicle, now.tick, duration)
+            state.corrected_tick[world, vehicle] = now.tick
         state.estimate_rotation[world, vehicle] = orthonormalise(state.estimate_rotation[world, vehicle])
 
     return estimate

@@ -9,7 +9,6 @@ import warp as wp
 from coopenv.observers.robust.belief import place_of
 from coopenv.observers.robust.reference.belief import AT_ONCE
 from coopenv.observers.robust.reference.eviction import FORGET_TIME
-from coopenv.observers.robust.state import MOST_MEMBERS
 from coopenv.world.camera import VISIBLE
 
 LONGEST_UNSEEN = wp.constant(FORGET_TIME + AT_ONCE)
@@ -76,7 +75,7 @@ def drop(mind: Any, world: int, i: int, n: int):
 @wp.func
 def make_room(model: Any, mind: Any, world: int, i: int, tick: int) -> bool:
     """Return whether there is room for one more, for which the member unseen for longest may have to go."""
-    if mind.members[world, i] < MOST_MEMBERS:
+    if mind.members[world, i] < mind.vehicle.shape[2]:
         return True
     n = longest_unseen(model, mind, world, i, tick)
     if n == 0:

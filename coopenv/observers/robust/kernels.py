@@ -7,8 +7,8 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust.observer import update
-from coopenv.observers.robust.start import start_world
-from coopenv.observers.robust.state import VALID, allocate_robust
+from coopenv.observers.robust.start import start
+from coopenv.observers.robust.state import SIZES, VALID, RobustState
 from coopenv.observers.robust.tracklets import tell
 from coopenv.world.embedded import Embedded
 
@@ -20,4 +20,4 @@ def send(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: in
 
 
 # Without max_unroll = 1 there is long straight code, which takes long to compile.
-ROBUST = Embedded("robust", update, start_world, send, allocate_robust, valid=VALID, options={"max_unroll": 1})
+ROBUST = Embedded("robust", update, start, send, RobustState, SIZES, valid=VALID, options={"max_unroll": 1})

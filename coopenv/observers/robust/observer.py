@@ -17,7 +17,6 @@ from coopenv.observers.robust.tracklets import collect, hear, may_lean_on, meet
 from coopenv.observers.robust.types import lower_blocks, wide_matrix, wide_vector
 from coopenv.observers.robust.update import drop_anchor, look
 from coopenv.world.camera import VISIBLE
-from coopenv.world.rates import correction_due
 from coopenv.world.v2x import fresh
 
 
@@ -26,7 +25,7 @@ def start_vehicle(model: Any, state: Any, mind: Any, world: int, i: int):
     """Start at the initial estimate; one that is too uncertain to linearise about is only a hint for the search."""
     R = orthonormalise(wide_matrix(state.estimate_rotation[world, i]))
     p = R * wide_vector(state.estimate_position[world, i])
-    P = mind.start_covariance[world, i]
+    P = model.start.covariance[i]
     begin(mind, world, i, R, p, P)
     mind.odometry_rotation[world, i] = wp.identity(3, wp.float64)
     mind.leans_on[world, i] = may_lean_on(model, i)
@@ -61,19 +60,19 @@ def believe(model: Any, state: Any, mind: Any, world: int, i: int, tick: int, R:
 
 
 @wp.func
-def search(model: Any, state: Any, mind: Any, world: int, i: int, tick: int):
+def search(model: Any, state: Any, mind: Any, world: int, i: int, now: Any):
     """Look for the pose; once only one is possible, go on with the prior, or with what this frame alone says."""
-    if not look_around(model, state, mind, world, i, tick):
+    if not look_around(model, state, mind, world, i, now):
         return
     if confirms_prior(mind, world, i):
         P = mind.prior_covariance[world, i]
-        believe(model, state, mind, world, i, tick, mind.prior_rotation[world, i], mind.prior_position[world, i], P)
+        believe(model, state, mind, world, i, now.tick, mind.prior_rotation[world, i], mind.prior_position[world, i], P)
         mind.searching[world, i] = 0
-        look(model, state, mind, world, i, tick)
+        look(model, state, mind, world, i, now)
         return
     P = mind.bank_covariance[world, i, 0]
-    believe(model, state, mind, world, i, tick, mind.bank_rotation[world, i, 0], mind.bank_position[world, i, 0], P)
-    if resect(model, state, mind, world, i, tick) and is_known(mind.P[world, i, 0, 0]):
+    believe(model, state, mind, world, i, now.tick, mind.bank_rotation[world, i, 0], mind.bank_position[world, i, 0], P)
+    if resect(model, state, mind, world, i, now.tick) and is_known(mind.P[world, i, 0, 0]):
         mind.searching[world, i] = 0
 
 
@@ -118,7 +117,7 @@ def write(state: Any, mind: Any, world: int, i: int):
 
 
 @wp.func
-def update(model: Any, state: Any, mind: Any, world: int, i: int, tick: int):
+def update(model: Any, state: Any, mind: Any, world: int, i: int, now: Any):
     """Take one camera tick of one vehicle, whose messages have been delivered."""
     collect(model, state, mind, world, i)
     dR = orthonormalise(wide_matrix(state.increment_rotation[world, i]))
@@ -126,17 +125,16 @@ def update(model: Any, state: Any, mind: Any, world: int, i: int, tick: int):
     R = mind.odometry_rotation[world, i]
     mind.odometry_rotation[world, i] = orthonormalise(R * dR)
     mind.odometry_position[world, i] = mind.odometry_position[world, i] + R * dp
-    rotation, translation = odometry_variances(model, model.camera_period)
-    due = correction_due(model, tick)
+    rotation, translation = odometry_variances(model, now.period)
     if mind.searching[world, i] == 1:
         move_search(mind, world, i, dR, dp, rotation, translation)
-        if due:
-            search(model, state, mind, world, i, tick)
+        if now.due:
+            search(model, state, mind, world, i, now)
     else:
         move(mind, world, i, 0, dR, dp, rotation, translation)
-        listen(model, state, mind, world, i, tick)
-        if due:
-            look(model, state, mind, world, i, tick)
+        listen(model, state, mind, world, i, now.tick)
+        if now.due:
+            look(model, state, mind, world, i, now)
     write(state, mind, world, i)
-    if due:
-        state.corrected_tick[world, i] = tick
+    if now.due:
+        state.corrected_tick[world, i] = now.tick

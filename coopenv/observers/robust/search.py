@@ -149,7 +149,7 @@ def chosen_triple(model: Any, mind: Any, world: int, i: int, seen: int):
 
 
 @wp.func
-def solve_frame(model: Any, mind: Any, world: int, i: int, seen: int):
+def solve_frame(model: Any, mind: Any, world: int, i: int, seen: int, period: Any):
     """Follow a known prior at first; then a frame's solutions, too, if for a while all were well determined."""
     if mind.attempts[world, i] == 0 and is_known(mind.prior_covariance[world, i]):
         suppose_prior(model, mind, world, i)
@@ -157,8 +157,8 @@ def solve_frame(model: Any, mind: Any, world: int, i: int, seen: int):
         mind.age[world, i] = wp.float64(0.0)
         return
     lines = chosen_triple(model, mind, world, i, seen)
-    waited = mind.waited[world, i] + model.camera_period
-    clear = mind.clear[world, i] + model.camera_period
+    waited = mind.waited[world, i] + period
+    clear = mind.clear[world, i] + period
     patient = waited < wp.float64(MOST_PATIENCE)
     following = not patient or clear >= wp.float64(LEAST_CLEAR)
     if not explain(model, mind, world, i, lines, patient, following):
@@ -179,14 +179,14 @@ def solve_frame(model: Any, mind: Any, world: int, i: int, seen: int):
 
 
 @wp.func
-def look_around(model: Any, state: Any, mind: Any, world: int, i: int, tick: int) -> bool:
+def look_around(model: Any, state: Any, mind: Any, world: int, i: int, now: Any) -> bool:
     """Take a frame's sightings; return whether one hypothesis alone is left after some frames."""
-    seen = aim_at_sightings(model, state, mind, world, i, tick)
+    seen = aim_at_sightings(model, state, mind, world, i, now.tick)
     if mind.hypotheses[world, i] == 0:
         if seen >= 3:
-            solve_frame(model, mind, world, i, seen)
+            solve_frame(model, mind, world, i, seen, now.period)
         return False
-    mind.age[world, i] = mind.age[world, i] + model.camera_period
+    mind.age[world, i] = mind.age[world, i] + now.period
     for h in range(mind.hypotheses[world, i]):
         follow(model, mind, world, i, h, wp.vec3i(-1, -1, -1))
     prune(mind, world, i)

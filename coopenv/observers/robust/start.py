@@ -1,4 +1,4 @@
-"""Start the observers of a world anew: nothing of an earlier episode stays."""
+"""Start an observer anew: nothing of an earlier episode stays."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust.observer import collect, start_vehicle
-from coopenv.observers.robust.state import BANK_PLACES, MOST_MEMBERS
-from coopenv.observers.robust.tracklets import tell
+from coopenv.observers.robust.state import BANK_PLACES
 from coopenv.observers.robust.types import (
     mat26d,
     mat33d,
@@ -27,11 +26,12 @@ def forget_members(mind: Any, world: int, i: int):
     mind.odometry_position[world, i] = vec3d()
     mind.missed[world, i] = wp.float64(0.0)
     mind.healthy[world, i] = wp.float64(0.0)
-    for n in range(MOST_MEMBERS):
+    most = mind.vehicle.shape[2]
+    for n in range(most):
         mind.vehicle[world, i, n] = 0
         mind.R[world, i, n] = mat33d()
         mind.p[world, i, n] = vec3d()
-        for k in range(MOST_MEMBERS):
+        for k in range(most):
             mind.P[world, i, n, k] = mat66d()
         mind.twists[world, i, n] = 0
         mind.v[world, i, n] = vec3d()
@@ -105,27 +105,24 @@ def clear_scratch(model: Any, mind: Any, world: int):
         mind.line_noise[world, n] = wp.float64(0.0)
         mind.line_distance[world, n] = wp.float64(0.0)
         mind.line_residual[world, n] = vec2d()
-    for n in range(MOST_MEMBERS):
+    most = mind.column.shape[1]
+    for n in range(most):
         mind.column[world, n] = mat66d()
         mind.narrow[world, n] = mat62d()
         mind.dx[world, n] = vec6d()
         mind.last[world, n] = vec6d()
         mind.before_rotation[world, n] = mat33d()
         mind.before_position[world, n] = vec3d()
-        for k in range(MOST_MEMBERS):
+        for k in range(most):
             mind.before_covariance[world, n, k] = mat66d()
 
 
 @wp.func
-def start_world(model: Any, state: Any, mind: Any, world: int):
-    """Start all observers of a world that has just been reset, and send their first messages."""
+def start(model: Any, state: Any, mind: Any, world: int, i: int):
+    """Start the observer of a vehicle anew, and take what its leaders have sent."""
     clear_scratch(model, mind, world)
-    for i in range(model.vehicles):
-        forget_members(mind, world, i)
-        forget_search(mind, world, i)
-        forget_messages(model, mind, world, i)
-        start_vehicle(model, state, mind, world, i)
-    for place in range(model.vehicles):
-        i = model.order[place]
-        collect(model, state, mind, world, i)
-        tell(model, mind, world, i, 0)
+    forget_members(mind, world, i)
+    forget_search(mind, world, i)
+    forget_messages(model, mind, world, i)
+    start_vehicle(model, state, mind, world, i)
+    collect(model, state, mind, world, i)

@@ -1,7 +1,5 @@
 """What every vehicle's observer remembers: one record of arrays with leading axes (world, vehicle)."""
 
-from typing import Any
-
 import numpy as np
 import warp as wp
 
@@ -9,104 +7,104 @@ from coopenv.observers.robust.reference.observer import Robust
 from coopenv.observers.robust.reference.search import MOST_HYPOTHESES
 from coopenv.observers.robust.types import mat26d, mat33d, mat62d, mat66d, mat66f, vec2d, vec3d, vec6d
 from coopenv.scenario.base import LARGEST
+from coopenv.world.records import array
 from coopenv.world.saved_state import COVARIANCE, FLAG, JOINT_COVARIANCE, ROTATION, TICK, Rule, numbers, whole
 
-MOST_MEMBERS = wp.constant(Robust.most_members)
 MOST_SUPPOSED = wp.constant(MOST_HYPOTHESES)
 """Hypotheses that one frame gives, or that are followed."""
 SPARE_PLACE = wp.constant(MOST_HYPOTHESES + 1)
 BANK_PLACES = wp.constant(MOST_HYPOTHESES + 2)
 """What one frame gives, the prior, and a spare place."""
+SIZES = {"K": Robust.most_members, "H": MOST_HYPOTHESES + 2}
 
 
 @wp.struct
 class RobustState:
-    """W worlds, N vehicles, M members of a belief (the vehicle itself first), H hypotheses, S slots of the radio.
+    """K members of a belief (the vehicle itself first), H hypotheses; other axes as in `coopenv.world.state`.
 
     Left errors (theta, rho) in rad and m; positions in the map frame; float64 in worlds of any precision.
     """
 
-    start_covariance: wp.array2d(dtype=mat66d)  # (W, N) of the initial estimate
-    odometry_rotation: wp.array2d(dtype=mat33d)  # (W, N) pose by dead reckoning, in a frame of its own
-    odometry_position: wp.array2d(dtype=vec3d)  # (W, N)
+    odometry_rotation: array("WN", mat33d)  # pose by dead reckoning, in a frame of its own
+    odometry_position: array("WN", vec3d)
 
-    members: wp.array2d(dtype=wp.int32)  # (W, N) how many are in the belief
-    vehicle: wp.array3d(dtype=wp.int32)  # (W, N, M)
-    R: wp.array3d(dtype=mat33d)  # (W, N, M)
-    p: wp.array3d(dtype=vec3d)  # (W, N, M)
-    P: wp.array4d(dtype=mat66d)  # (W, N, M, M) blocks of the joint covariance
-    twists: wp.array3d(dtype=wp.int32)  # (W, N, M) whether a twist is known
-    v: wp.array3d(dtype=vec3d)  # (W, N, M) m/s, body
-    w: wp.array3d(dtype=vec3d)  # (W, N, M) rad/s, body
-    seen_tick: wp.array3d(dtype=wp.int32)  # (W, N, M) when a member was last in view
-    report_tick: wp.array3d(dtype=wp.int32)  # (W, N, M) last report of a member: when it was sent
-    report_rotation: wp.array3d(dtype=mat33d)  # (W, N, M)
-    report_position: wp.array3d(dtype=vec3d)  # (W, N, M)
-    report_covariance: wp.array3d(dtype=mat66d)  # (W, N, M)
-    report_odometry_rotation: wp.array3d(dtype=mat33d)  # (W, N, M)
-    report_odometry_position: wp.array3d(dtype=vec3d)  # (W, N, M)
-    report_leans_on: wp.array3d(dtype=wp.uint64)  # (W, N, M)
-    distrusted: wp.array3d(dtype=wp.int32)  # (W, N, M)
-    agreed: wp.array3d(dtype=wp.float64)  # (W, N, M) s since which a distrusted sender has agreed
-    leans_on: wp.array2d(dtype=wp.uint64)  # (W, N) bits of vehicles
-    missed: wp.array2d(dtype=wp.float64)  # (W, N) mean share of bearings that do not fit
-    healthy: wp.array2d(dtype=wp.float64)  # (W, N) s since which it has been low
-    anchor_rotation: wp.array2d(dtype=mat33d)  # (W, N) where the vehicle was then
-    anchor_position: wp.array2d(dtype=vec3d)  # (W, N)
-    anchor_covariance: wp.array2d(dtype=mat66d)  # (W, N)
-    anchor_odometry_rotation: wp.array2d(dtype=mat33d)  # (W, N)
-    anchor_odometry_position: wp.array2d(dtype=vec3d)  # (W, N)
-    anchor_tick: wp.array2d(dtype=wp.int32)  # (W, N)
+    members: array("WN", wp.int32)  # how many are in the belief
+    vehicle: array("WNK", wp.int32)
+    R: array("WNK", mat33d)
+    p: array("WNK", vec3d)
+    P: array("WNKK", mat66d)  # blocks of the joint covariance
+    twists: array("WNK", wp.int32)  # whether a twist is known
+    v: array("WNK", vec3d)  # m/s, body
+    w: array("WNK", vec3d)  # rad/s, body
+    seen_tick: array("WNK", wp.int32)  # when a member was last in view
+    report_tick: array("WNK", wp.int32)  # last report of a member: when it was sent
+    report_rotation: array("WNK", mat33d)
+    report_position: array("WNK", vec3d)
+    report_covariance: array("WNK", mat66d)
+    report_odometry_rotation: array("WNK", mat33d)
+    report_odometry_position: array("WNK", vec3d)
+    report_leans_on: array("WNK", wp.uint64)
+    distrusted: array("WNK", wp.int32)
+    agreed: array("WNK", wp.float64)  # s since which a distrusted sender has agreed
+    leans_on: array("WN", wp.uint64)  # bits of vehicles
+    missed: array("WN", wp.float64)  # mean share of bearings that do not fit
+    healthy: array("WN", wp.float64)  # s since which it has been low
+    anchor_rotation: array("WN", mat33d)  # where the vehicle was then
+    anchor_position: array("WN", vec3d)
+    anchor_covariance: array("WN", mat66d)
+    anchor_odometry_rotation: array("WN", mat33d)
+    anchor_odometry_position: array("WN", vec3d)
+    anchor_tick: array("WN", wp.int32)
 
-    searching: wp.array2d(dtype=wp.int32)  # (W, N)
-    prior_rotation: wp.array2d(dtype=mat33d)  # (W, N)
-    prior_position: wp.array2d(dtype=vec3d)  # (W, N)
-    prior_covariance: wp.array2d(dtype=mat66d)  # (W, N)
-    hypotheses: wp.array2d(dtype=wp.int32)  # (W, N) how many
-    bank_rotation: wp.array3d(dtype=mat33d)  # (W, N, H)
-    bank_position: wp.array3d(dtype=vec3d)  # (W, N, H)
-    bank_covariance: wp.array3d(dtype=mat66d)  # (W, N, H)
-    paid: wp.array3d(dtype=wp.float64)  # (W, N, H)
-    surprise: wp.array3d(dtype=wp.float64)  # (W, N, H) squared distance from the prior
-    bearings: wp.array3d(dtype=wp.int32)  # (W, N, H) for which it has paid
-    age: wp.array2d(dtype=wp.float64)  # (W, N) s, for which hypotheses have been followed
-    waited: wp.array2d(dtype=wp.float64)  # (W, N) s, for which there were none
-    clear: wp.array2d(dtype=wp.float64)  # (W, N) s, for which the last frames' solutions have been well determined
-    attempts: wp.array2d(dtype=wp.int32)  # (W, N)
+    searching: array("WN", wp.int32)
+    prior_rotation: array("WN", mat33d)
+    prior_position: array("WN", vec3d)
+    prior_covariance: array("WN", mat66d)
+    hypotheses: array("WN", wp.int32)  # how many
+    bank_rotation: array("WNH", mat33d)
+    bank_position: array("WNH", vec3d)
+    bank_covariance: array("WNH", mat66d)
+    paid: array("WNH", wp.float64)
+    surprise: array("WNH", wp.float64)  # squared distance from the prior
+    bearings: array("WNH", wp.int32)  # for which it has paid
+    age: array("WN", wp.float64)  # s, for which hypotheses have been followed
+    waited: array("WN", wp.float64)  # s, for which there were none
+    clear: array("WN", wp.float64)  # s, for which the last frames' solutions have been well determined
+    attempts: array("WN", wp.int32)
 
-    outbox_says: wp.array3d(dtype=wp.int32)  # (W, N, S) 0: an empty message
-    outbox_rotation: wp.array3d(dtype=mat33d)  # (W, N, S)
-    outbox_position: wp.array3d(dtype=vec3d)  # (W, N, S) of the marker
-    outbox_covariance: wp.array3d(dtype=mat66f)  # (W, N, S)
-    outbox_odometry_rotation: wp.array3d(dtype=mat33d)  # (W, N, S)
-    outbox_odometry_position: wp.array3d(dtype=vec3d)  # (W, N, S) of the marker
-    outbox_leans_on: wp.array3d(dtype=wp.uint64)  # (W, N, S)
-    inbox_tick: wp.array3d(dtype=wp.int32)  # (W, N receiver, N sender) of sending; -1: never heard
-    inbox_says: wp.array3d(dtype=wp.int32)  # (W, N, N)
-    inbox_rotation: wp.array3d(dtype=mat33d)  # (W, N, N)
-    inbox_position: wp.array3d(dtype=vec3d)  # (W, N, N)
-    inbox_covariance: wp.array3d(dtype=mat66f)  # (W, N, N)
-    inbox_odometry_rotation: wp.array3d(dtype=mat33d)  # (W, N, N)
-    inbox_odometry_position: wp.array3d(dtype=vec3d)  # (W, N, N)
-    inbox_leans_on: wp.array3d(dtype=wp.uint64)  # (W, N, N)
+    outbox_says: array("WNS", wp.int32)  # 0: an empty message
+    outbox_rotation: array("WNS", mat33d)
+    outbox_position: array("WNS", vec3d)  # of the marker
+    outbox_covariance: array("WNS", mat66f)
+    outbox_odometry_rotation: array("WNS", mat33d)
+    outbox_odometry_position: array("WNS", vec3d)  # of the marker
+    outbox_leans_on: array("WNS", wp.uint64)
+    inbox_tick: array("WNN", wp.int32)  # of sending; -1: never heard
+    inbox_says: array("WNN", wp.int32)
+    inbox_rotation: array("WNN", mat33d)
+    inbox_position: array("WNN", vec3d)
+    inbox_covariance: array("WNN", mat66f)
+    inbox_odometry_rotation: array("WNN", mat33d)
+    inbox_odometry_position: array("WNN", vec3d)
+    inbox_leans_on: array("WNN", wp.uint64)
 
-    line_place: wp.array2d(dtype=wp.int32)  # (W, A) scratch, per bearing of a frame, see lines.py
-    line_bearing: wp.array2d(dtype=vec3d)  # (W, A) body frame
-    line_point: wp.array2d(dtype=vec3d)  # (W, A) m
-    line_spread: wp.array2d(dtype=wp.float64)  # (W, A) m^2
-    line_fits: wp.array2d(dtype=wp.int32)  # (W, A)
-    line_own: wp.array2d(dtype=mat26d)  # (W, A) H of the vehicle's own error
-    line_other: wp.array2d(dtype=mat26d)  # (W, A) H of the member's error
-    line_noise: wp.array2d(dtype=wp.float64)  # (W, A) variance per axis
-    line_distance: wp.array2d(dtype=wp.float64)  # (W, A) m
-    line_residual: wp.array2d(dtype=vec2d)  # (W, A)
-    column: wp.array2d(dtype=mat66d)  # (W, M) scratch: a column of blocks
-    narrow: wp.array2d(dtype=mat62d)  # (W, M) scratch: P H^T
-    dx: wp.array2d(dtype=vec6d)  # (W, M) scratch: the correction of the members
-    last: wp.array2d(dtype=vec6d)  # (W, M) scratch: the correction where the lines were drawn
-    before_rotation: wp.array2d(dtype=mat33d)  # (W, M) scratch: the belief before a correction
-    before_position: wp.array2d(dtype=vec3d)  # (W, M)
-    before_covariance: wp.array3d(dtype=mat66d)  # (W, M, M)
+    line_place: array("WA", wp.int32)  # scratch, per bearing of a frame, see lines.py
+    line_bearing: array("WA", vec3d)  # body frame
+    line_point: array("WA", vec3d)  # m
+    line_spread: array("WA", wp.float64)  # m^2
+    line_fits: array("WA", wp.int32)
+    line_own: array("WA", mat26d)  # H of the vehicle's own error
+    line_other: array("WA", mat26d)  # H of the member's error
+    line_noise: array("WA", wp.float64)  # variance per axis
+    line_distance: array("WA", wp.float64)  # m
+    line_residual: array("WA", vec2d)
+    column: array("WK", mat66d)  # scratch: a column of blocks
+    narrow: array("WK", mat62d)  # scratch: P H^T
+    dx: array("WK", vec6d)  # scratch: the correction of the members
+    last: array("WK", vec6d)  # scratch: the correction where the lines were drawn
+    before_rotation: array("WK", mat33d)  # scratch: the belief before a correction
+    before_position: array("WK", vec3d)
+    before_covariance: array("WKK", mat66d)
 
 
 def _where(used: str, **rules: Rule) -> dict[str, Rule]:
@@ -123,9 +121,8 @@ _LARGE = numbers(LARGEST**3)
 _MESSAGE = {"rotation": ROTATION, "covariance": COVARIANCE, "odometry_rotation": ROTATION}
 
 VALID: dict[str, Rule] = {
-    "start_covariance": COVARIANCE,
     "odometry_rotation": ROTATION,
-    "members": whole(1, int(MOST_MEMBERS)),
+    "members": whole(1, Robust.most_members),
     "P": JOINT_COVARIANCE,
     "seen_tick": TICK,
     "report_tick": TICK,
@@ -141,7 +138,7 @@ VALID: dict[str, Rule] = {
     "inbox_says": FLAG,
     "inbox_tick": TICK,
     **dict.fromkeys(("twists", "distrusted", "line_fits"), FLAG),
-    "line_place": whole(-1, int(MOST_MEMBERS) - 1),
+    "line_place": whole(-1, Robust.most_members - 1),
     **_where("members", R=ROTATION, vehicle=whole(0, "vehicles")),
     **_where("members", **{f"report_{name}": _others(rule) for name, rule in _MESSAGE.items()}),
     **_where("searching", prior_rotation=ROTATION, prior_covariance=COVARIANCE),
@@ -151,33 +148,3 @@ VALID: dict[str, Rule] = {
     **dict.fromkeys(("paid", "surprise", "line_spread", "line_noise", "column", "narrow", "before_covariance"), _LARGE),
 }
 """What a saved state may hold; numbers that are not in it have to be finite."""
-
-PER_MEMBER = ("vehicle", "R", "p", "P", "twists", "v", "w", "seen_tick", "distrusted", "agreed")
-PER_HYPOTHESIS = ("bank_rotation", "bank_position", "bank_covariance", "paid", "surprise", "bearings")
-
-
-def allocate_robust(model: Any, worlds: int, start_covariance: np.ndarray, device: str) -> Any:
-    """Return the record for `worlds` worlds, with the covariances (N, 6, 6) of the initial estimates in it."""
-    N = model.vehicles
-    state = RobustState()
-    for name, var in RobustState.vars.items():
-        shape = _shape(name, worlds, N, model.agents, model.radio.slots)
-        setattr(state, name, wp.zeros(shape, dtype=var.type.dtype, device=device))
-    state.start_covariance.assign(np.broadcast_to(start_covariance, (worlds, N, 6, 6)).copy())
-    return state
-
-
-def _shape(name: str, worlds: int, vehicles: int, agents: int, slots: int) -> tuple[int, ...]:
-    if name.startswith("line_"):
-        return worlds, agents
-    if name in ("column", "narrow", "dx", "last") or name.startswith("before_"):
-        return (worlds, *(MOST_MEMBERS,) * (2 if name == "before_covariance" else 1))
-    if name.startswith("outbox_"):
-        return worlds, vehicles, slots
-    if name.startswith("inbox_"):
-        return worlds, vehicles, vehicles
-    if name in PER_HYPOTHESIS:
-        return worlds, vehicles, BANK_PLACES
-    if name in PER_MEMBER or name.startswith("report_"):
-        return (worlds, vehicles, *(MOST_MEMBERS,) * (2 if name == "P" else 1))
-    return worlds, vehicles

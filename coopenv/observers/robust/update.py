@@ -116,23 +116,23 @@ def lose(model: Any, mind: Any, world: int, i: int, tick: int):
 
 
 @wp.func
-def look(model: Any, state: Any, mind: Any, world: int, i: int, tick: int):
+def look(model: Any, state: Any, mind: Any, world: int, i: int, now: Any):
     """Correct the belief by every bearing that fits it; search anew when most do not."""
-    aim_at_belief(model, state, mind, world, i, tick)
+    aim_at_belief(model, state, mind, world, i, now.tick)
     share = examine(model, mind, world, i)
     if any_fits(mind, world, model.target_count[i]):
         settle(model, mind, world, i)
     if share < wp.float64(0.0):
         return
-    memory = wp.min(wp.float64(1.0), model.camera_period / wp.float64(LOST_MEMORY))
+    memory = wp.min(wp.float64(1.0), now.period / wp.float64(LOST_MEMORY))
     missed = mind.missed[world, i] + (share - mind.missed[world, i]) * memory
-    healthy = mind.healthy[world, i] + model.camera_period
+    healthy = mind.healthy[world, i] + now.period
     if missed >= wp.float64(MOST_AILING):
         healthy = wp.float64(0.0)
     mind.missed[world, i] = missed
     mind.healthy[world, i] = healthy
     if missed > wp.float64(MOST_LOST):
-        lose(model, mind, world, i, tick)
+        lose(model, mind, world, i, now.tick)
     elif healthy > wp.float64(LEAST_HEALTHY):
         P = wp.float64(4.0) * mind.P[world, i, 0, 0]
-        drop_anchor(mind, world, i, with_noise(P, wp.float64(SLACK_ANGLE), wp.float64(SLACK_POSITION)), tick)
+        drop_anchor(mind, world, i, with_noise(P, wp.float64(SLACK_ANGLE), wp.float64(SLACK_POSITION)), now.tick)

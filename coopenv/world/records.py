@@ -1,0 +1,49 @@
+"""Records of arrays: every field states its axes once, a letter each, and is allocated by them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import warp as wp
+
+
+def array(axes: str, dtype: Any) -> Any:
+    """Return the annotation of a struct's field: an array with these axes.
+
+    Args:
+        axes: a letter per axis, for example "WN".
+        dtype: Warp type of an entry.
+    """
+    annotation: Any = wp.array(dtype=dtype, ndim=len(axes))
+    annotation.axes = axes
+    return annotation
+
+
+def fields(record: Any) -> dict[str, Any]:
+    """Return the arrays that a record's struct declares with `array`, by name: annotations with `axes` and `dtype`."""
+    return {name: var.type for name, var in record.vars.items() if hasattr(var.type, "axes")}
+
+
+def allocate(record: Any, sizes: Mapping[str, int], device: str, shared: str = "") -> Any:
+    """Return a record of zeros.
+
+    Args:
+        record: struct whose fields are declared with `array`.
+        sizes: length of every axis by its letter.
+        device: where the arrays are.
+        shared: axis of which, where it comes second, all indices stand for one and the same row: whoever needs the rows
+            of one vehicle alone can then index them by the vehicle without room for the others'.
+    """
+    result = record()
+    for name, field in fields(record).items():
+        shape = [sizes[axis] for axis in field.axes]
+        if shared and field.axes[1:2] == shared:
+            row = wp.zeros([shape[0], 1, *shape[2:]], dtype=field.dtype, device=device)
+            strides = (row.strides[0], 0, *row.strides[2:])
+            rows: Any = wp.array(ptr=row.ptr, shape=tuple(shape), strides=strides, dtype=field.dtype, device=device)
+            rows.row = row  # owns the memory
+            setattr(result, name, rows)
+        else:
+            setattr(result, name, wp.zeros(shape, dtype=field.dtype, device=device))
+    return result
