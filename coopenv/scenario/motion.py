@@ -15,7 +15,10 @@ from scipy.spatial.transform import Rotation
 from coopenv.scenario.bodies import ConstantMotion, SegmentMotion, WaypointMotion
 
 SPLINE_STEP = 0.02
-"""s between the poses at which a waypoint spline is met exactly."""
+"""s between the poses at which a waypoint spline is met exactly ..."""
+MOST_ROWS = 200
+"""... but at most so many from one waypoint to the next, so that the table grows with the waypoints and not with time.
+From pose to pose the path is an arc, which strays from the cubic by less than half of its length."""
 
 STANDING = 1e-3
 """m/s below which a spline's heading is held."""
@@ -33,16 +36,16 @@ class TwistTable:
 
 
 def left_jacobian(w: np.ndarray) -> np.ndarray:
-    """Return J_l(w) = int_0^1 Exp(s w) ds, (3, 3), for a rotation vector w in rad."""
-    angle = float(np.linalg.norm(w))
-    S = np.cross(np.eye(3), w)
-    if angle < 1e-4:
-        return np.eye(3) + S / 2 + S @ S / 6
-    result: np.ndarray = np.eye(3) + (1 - np.cos(angle)) / angle**2 * S + (angle - np.sin(angle)) / angle**3 * S @ S
-    return result
+    """Return J_l(w) = int_0^1 Exp(s w) ds, (..., 3, 3), for rotation vectors w (..., 3) in rad."""
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    S = np.cross(np.eye(3), w[..., None, :])
+    small, safe = angle < 1e-4, np.maximum(angle, 1e-4)
+    first = np.where(small, 1 / 2, (1 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1 / 6, (safe - np.sin(safe)) / safe**3)
+    return np.asarray(np.eye(3) + first * S + second * S @ S)
 
 
-def twist_table(start: list[float], linear: np.ndarray, angular: np.ndarray) -> TwistTable:
+def twist_table(start: np.ndarray, linear: np.ndarray, angular: np.ndarray) -> TwistTable:
     """Chain held twists; segment i lasts from start[i] to start[i + 1], the last for ever."""
     count = len(start)
     rotation = np.tile(np.eye(3), (count, 1, 1))
@@ -51,41 +54,56 @@ def twist_table(start: list[float], linear: np.ndarray, angular: np.ndarray) -> 
         h = start[i + 1] - start[i]
         position[i + 1] = position[i] + rotation[i] @ left_jacobian(angular[i] * h) @ linear[i] * h
         rotation[i + 1] = rotation[i] @ Rotation.from_rotvec(angular[i] * h).as_matrix()
-    return TwistTable(np.asarray(start, dtype=float), linear, angular, rotation, position)
+    return TwistTable(start, linear, angular, rotation, position)
 
 
 def standing() -> TwistTable:
     """Return the table of an agent that does not move by itself."""
-    return twist_table([0.0], np.zeros((1, 3)), np.zeros((1, 3)))
+    return twist_table(np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))
 
 
-def compile_motion(motion: object, initial_rotation: np.ndarray) -> TwistTable:
-    """Return the twist table of a motion; static and driven agents stand still in it."""
+def compile_motion(motion: object, initial_rotation: np.ndarray, until: float) -> TwistTable:
+    """Return the twist table of a motion; static and driven agents stand still in it.
+
+    Args:
+        motion: one of those in `coopenv.scenario.bodies`.
+        initial_rotation: (3, 3) of the agent at its start, body to map.
+        until: s; what comes later is left out.
+    """
     if isinstance(motion, ConstantMotion):
-        return twist_table([0.0], np.array([motion.linear]), np.array([motion.angular]))
+        return twist_table(np.zeros(1), np.array([motion.linear]), np.array([motion.angular]))
     if isinstance(motion, SegmentMotion):
-        durations = [segment.duration for segment in motion.segments]
-        start = [0.0, *np.cumsum(durations).tolist()]
+        start = np.array([0.0, *np.cumsum([segment.duration for segment in motion.segments])])
         linear = np.array([segment.linear for segment in motion.segments] + [(0.0, 0.0, 0.0)])
         angular = np.array([segment.angular for segment in motion.segments] + [(0.0, 0.0, 0.0)])
-        return twist_table(start, linear, angular)
+        begun = start <= until
+        return twist_table(start[begun], linear[begun], angular[begun])
     if isinstance(motion, WaypointMotion):
-        return _spline_table(motion, initial_rotation)
+        return _spline_table(motion, initial_rotation, until)
     return standing()
 
 
 def path_heading(motion: WaypointMotion) -> float:
     """Return the heading at which a waypoint motion sets off, rad."""
-    _, _, heading = _sample_spline(motion)
+    _, _, heading = _sample_spline(motion, np.inf)
     return float(heading[0])
 
 
-def _sample_spline(motion: WaypointMotion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _sample_times(times: np.ndarray, until: float) -> np.ndarray:
+    """Return the times (S,) of the waypoints that count and between them, s."""
+    times = np.minimum(times[: np.searchsorted(times, until) + 1], until)
+    gaps = np.diff(times)
+    counts = np.clip(np.ceil(gaps / SPLINE_STEP), 1, MOST_ROWS).astype(int)
+    steps = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    return np.append(np.repeat(times[:-1], counts) + steps * np.repeat(gaps / counts, counts), times[-1])
+
+
+def _sample_spline(motion: WaypointMotion, until: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times (S,), positions (S, 3) and continuous headings (S,) along the spline."""
     times = np.array([w.time for w in motion.waypoints])
     # Shape preserving: between two equal waypoints the agent stands still instead of swinging.
     spline = PchipInterpolator(times, np.array([w.position for w in motion.waypoints]))
-    t = np.linspace(0.0, times[-1], max(2, round(times[-1] / SPLINE_STEP) + 1))
+    t = _sample_times(times, until)
     velocity = spline(t, 1)[:, :2]
     moving = np.linalg.norm(velocity, axis=1) > STANDING
     if not moving.any():
@@ -95,15 +113,14 @@ def _sample_spline(motion: WaypointMotion) -> tuple[np.ndarray, np.ndarray, np.n
     return t, spline(t), heading[nearest]
 
 
-def _spline_table(motion: WaypointMotion, initial_rotation: np.ndarray) -> TwistTable:
-    t, position, heading = _sample_spline(motion)
-    if motion.heading == "path":
-        rotations = Rotation.from_rotvec(np.outer(heading, [0.0, 0.0, 1.0]))
-    else:
-        rotations = Rotation.from_matrix(np.tile(initial_rotation, (len(t), 1, 1)))
-    h = np.diff(t)
-    turn = (rotations[:-1].inv() * rotations[1:]).as_rotvec()
-    step = rotations[:-1].inv().apply(np.diff(position, axis=0))
-    linear = np.array([np.linalg.solve(left_jacobian(w), s) for w, s in zip(turn, step, strict=True)])
+def _spline_table(motion: WaypointMotion, initial_rotation: np.ndarray, until: float) -> TwistTable:
+    t, position, heading = _sample_spline(motion, until)
+    angle = heading - heading[0] if motion.heading == "path" else np.zeros(len(t))
+    rotation = Rotation.from_rotvec(np.outer(angle, [0.0, 0.0, 1.0])).as_matrix()
+    relative = (position - position[0]) @ initial_rotation
+    h = np.diff(t)[:, None]
+    turn = np.outer(np.diff(angle), [0.0, 0.0, 1.0])
+    step = np.diff(relative, axis=0)[:, None] @ rotation[:-1]
+    linear = np.linalg.solve(left_jacobian(turn), np.swapaxes(step, 1, 2))[..., 0]
     rest = np.zeros((1, 3))
-    return twist_table(t.tolist(), np.vstack([linear / h[:, None], rest]), np.vstack([turn / h[:, None], rest]))
+    return TwistTable(t, np.vstack([linear / h, rest]), np.vstack([turn / h, rest]), rotation, relative)

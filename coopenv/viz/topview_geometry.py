@@ -164,7 +164,7 @@ def _paths(scenario: Scenario) -> list[np.ndarray]:
     paths = []
     for motion, position, rotation in zip(motions, positions, rotations, strict=True):
         still = motion.kind in ("static", "driven")
-        relative = _positions(compile_motion(motion, rotation), t[:1] if still else t)
+        relative = _positions(compile_motion(motion, rotation, scenario.horizon), t[:1] if still else t)
         paths.append((position + relative @ rotation.T)[:, :2])
     return paths
 
@@ -172,11 +172,9 @@ def _paths(scenario: Scenario) -> list[np.ndarray]:
 def _positions(table: TwistTable, t: np.ndarray) -> np.ndarray:
     """Return positions (K, 3) relative to the start at times (K,) s."""
     segment = np.searchsorted(table.start, t, side="right") - 1
-    positions = []
-    for i, h in zip(segment, t - table.start[segment], strict=True):
-        step = left_jacobian(table.angular[i] * h) @ table.linear[i] * h
-        positions.append(table.position[i] + table.rotation[i] @ step)
-    return np.array(positions)
+    h = (t - table.start[segment])[:, None]
+    step = left_jacobian(table.angular[segment] * h) @ (table.linear[segment] * h)[..., None]
+    return np.asarray(table.position[segment] + (table.rotation[segment] @ step)[..., 0])
 
 
 def road_corners(start: tuple[float, float], end: tuple[float, float], width: float) -> np.ndarray:

@@ -124,7 +124,8 @@ def _fill_motion(motion: Any, scenario: Scenario, fill: _Filler) -> None:
     p = fill.p
     _, rotations = agent_starts(scenario)
     motions = [a.motion for a in scenario.landmarks] + [v.motion for v in scenario.vehicles]
-    tables: list[TwistTable] = [compile_motion(m, R) for m, R in zip(motions, rotations, strict=True)]
+    until = scenario.horizon + 1.0 / scenario.rates.camera
+    tables: list[TwistTable] = [compile_motion(m, R, until) for m, R in zip(motions, rotations, strict=True)]
     kinds = {"static": STATIC, "driven": DRIVEN}
     motion.kind = fill.array([kinds.get(m.kind, PRESCRIBED) for m in motions], wp.int32)
     motion.first = fill.array(np.cumsum([0] + [len(t.start) for t in tables]), wp.int32)

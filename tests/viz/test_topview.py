@@ -212,12 +212,12 @@ def test_estimates_outside_change_no_limits_and_are_pointed_at(start: Any) -> No
     inside = start.render()
     axes = start._view._axes
     before = (*axes.get_xlim(), *axes.get_ylim())
-    state = start.engine.get_state()
-    state["estimate_rotation"][0, 0] = np.eye(3)
+    engine = start.engine
+    engine.view("estimate_rotation")[0, 0] = np.eye(3)
     for far in (60.0, 1e12, np.nan):
-        state["estimate_position"][0, 0] = [far, -16.0, 2.5]
-        state["covariance"][0] *= 1e6
-        start.engine.set_state(state)
+        engine.view("estimate_position")[0, 0] = [far, -16.0, 2.5]
+        engine.view("covariance")[0] *= 1e6
+        engine.refresh()
         picture = start.render()
         assert (*axes.get_xlim(), *axes.get_ylim()) == before
         edge = picture[:, int(axes.get_window_extent().x1) - 16 : int(axes.get_window_extent().x1) - 2]
