@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-train test-all lint format bench schema clean
+.PHONY: help demo test test-train test-all test-matrix lint format bench schema clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -41,6 +41,13 @@ test-train: $(VENV)/.train ## the tests that train policies (installs torch)
 
 test-all: lint ## every test whose tools are installed
 	@$(BIN)/python -m pytest -n 2 --dist loadfile
+
+$(VENV)/.uv: $(VENV)/.dev
+	@$(PIP) uv
+	@touch $@
+
+test-matrix: $(VENV)/.uv ## the tests under other Pythons, versions and processors; CELLS="lowest newest" for some of them
+	@$(BIN)/python -m tests.matrix $(CELLS)
 
 lint: $(VENV)/.dev ## ruff and mypy
 	@$(BIN)/ruff check .

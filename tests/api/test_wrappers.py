@@ -193,6 +193,7 @@ def test_partial_reset_under_statistics() -> None:
     assert (env.episode_lengths == np.where(mask, 0, 5)).all()
 
 
+@pytest.mark.skipif(not hasattr(wrappers, "RecordVideo"), reason="this Gymnasium records no batches")
 def test_record_video_of_a_batch(tmp_path: Path) -> None:
     pytest.importorskip("moviepy", reason="RecordVideo needs moviepy")
     env = wrappers.RecordVideo(batch(render_mode="rgb_array"), str(tmp_path), video_length=3)

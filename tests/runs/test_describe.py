@@ -136,7 +136,19 @@ def test_motions_in_words() -> None:
 
 
 def test_the_published_schema_is_up_to_date() -> None:
-    assert DOCUMENT.read_text() == schema_text(), "run: coopenv schema --out docs/scenario.schema.json"
+    published, current = (plain_schema(json.loads(text)) for text in (DOCUMENT.read_text(), schema_text()))
+    assert published == current, "run: coopenv schema --out docs/scenario.schema.json"
+
+
+def plain_schema(part: Any) -> Any:
+    """Return a schema without what some versions of pydantic say twice: lists of one, and an enum beside its const."""
+    if isinstance(part, list):
+        return [plain_schema(item) for item in part]
+    if not isinstance(part, dict):
+        return part
+    if len(part.get("allOf", ())) == 1:
+        part = {**part.pop("allOf")[0], **part}
+    return {key: plain_schema(value) for key, value in part.items() if not (key == "enum" and "const" in part)}
 
 
 def test_schema_to_standard_output_and_to_a_file(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

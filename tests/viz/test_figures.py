@@ -5,8 +5,7 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -42,13 +41,6 @@ NAMES = list(FIGURE_NAMES)
 @pytest.fixture(scope="module")
 def run() -> Trajectory:
     return make_trajectory(noise=0.02)
-
-
-@pytest.fixture(autouse=True)
-def no_warnings() -> Iterator[None]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        yield
 
 
 def spans(ax: Axes, colour: str) -> list[tuple[float, float]]:
