@@ -21,6 +21,7 @@ from glob import escape
 from pathlib import Path
 
 from coopenv.errors import OutputError
+from coopenv.interrupts import before_a_hard_end, held, note
 
 try:
     import fcntl
@@ -31,11 +32,12 @@ PART, OLD = ".part", ".old"
 """Suffixes of hidden folders: what is being written, and what has made room for it."""
 PROBE_BYTES = 1 << 16
 """Written before the work begins, to find a disk that is full already."""
+LAST_WAIT = 0.5
+"""s to wait for a result that is being put in place, before the process is ended."""
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 
 _replacing = threading.Lock()
-_under_way: dict[Path, str | Path] = {}
-_written: list[str | Path] = []
+_under_way: list[Path] = []
 
 
 @contextmanager
@@ -60,10 +62,9 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
             yield new
             _sync(new)
             _copy_owner(place, new)
-            with _replacing:
+            with held(), _replacing:
                 new.replace(place)
-                if place.parent not in _under_way:
-                    _written.append(path)
+                _written(path, place)
             _sync(place.parent)
 
 
@@ -95,9 +96,9 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
             for path in part.rglob("*"):
                 _sync(path)
             _sync(part)
-        with _replacing:
+        with held(), _replacing:
             _replace_folder(folder, place, part, names)
-            _written.append(folder)
+            _written(folder, place)
         _sync(place.parent)
 
 
@@ -111,28 +112,19 @@ def check_file(path: str | Path) -> None:
         pass
 
 
-def committing() -> bool:
-    """Return whether a result is being put in place just now."""
-    return _replacing.locked()
-
-
-def abandon(patience: float) -> None:
-    """Remove what is unfinished before this process ends the hard way; nothing is put in place any more.
-
-    Args:
-        patience: s, to wait for a result that is being put in place just now.
-    """
-    if _replacing.acquire(timeout=patience):
+def _abandon() -> None:
+    """Remove what is unfinished; nothing is put in place any more."""
+    if _replacing.acquire(timeout=LAST_WAIT):
         for part in list(_under_way):
             shutil.rmtree(part, ignore_errors=True)
 
 
-def what_was_kept() -> str:
-    """Return for people what a command that ends early has written, or left as it was."""
-    if _written:
-        return f"written: {', '.join(map(str, _written))}"
-    kept = [str(path) for path in _under_way.values() if os.path.lexists(path)]
-    return f"kept: {', '.join(kept)} of an earlier run" if kept else "nothing written"
+before_a_hard_end(_abandon)
+
+
+def _written(path: str | Path, place: Path) -> None:
+    if place.parent not in _under_way:  # otherwise it is a part of a result
+        note(f"written: {path}")
 
 
 def _check_file(path: str | Path, place: Path) -> None:
@@ -180,20 +172,25 @@ def _staging(path: str | Path, check: Callable[[str | Path, Path], None]) -> Ite
         check(path, place)
         for left in _abandoned(place, PART):
             shutil.rmtree(left, ignore_errors=True)
-        part, lock = _new_part(place)
-    _under_way[part] = path
+    if place.parent not in _under_way:
+        note(f"kept: {path} of an earlier run" if os.path.lexists(place) else "nothing written")
+    part = None
     try:
         with writing(path):
+            with held():
+                part, lock = _new_part(place)
+                _under_way.append(part)
             probe = part / "probe"
             probe.write_bytes(bytes(PROBE_BYTES))
             _sync(probe)
             probe.unlink()
         yield place, part
     finally:
-        del _under_way[part]
-        shutil.rmtree(part, ignore_errors=True)
-        if lock is not None:
-            os.close(lock)
+        if part is not None:
+            _under_way.remove(part)
+            shutil.rmtree(part, ignore_errors=True)
+            if lock is not None:
+                os.close(lock)
 
 
 def _new_part(place: Path) -> tuple[Path, int | None]:

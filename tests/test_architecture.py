@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "coopenv"
 
 ROOMS = (
-    ("errors", "shipped", "machine", "files", "format", "user_code"),
+    ("errors", "shipped", "machine", "files", "interrupts", "format", "user_code"),
     ("scenario",),
     ("estimation",),
     ("world",),
@@ -23,6 +23,7 @@ ROOMS = (
     ("runs",),
     ("bench",),
     ("cli", "__init__"),
+    ("__main__",),
 )
 """From the ground up: a room imports from those below it and from itself. `docs/architecture.md` shows the same."""
 

@@ -215,7 +215,7 @@ def test_values_are_toml_or_else_strings(text: str, value: object) -> None:
 
 
 def test_the_installed_module_runs_in_a_process_of_its_own(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "coopenv.cli"]
+    command = [sys.executable, "-m", "coopenv"]
     good = subprocess.run([*command, "run", "overtaking", "--steps", "5"], capture_output=True, text=True)
     assert good.returncode == 0
     progress = r"[a-z ]+: \d+ (s|%.*)|compiling kernels .*"  # where the machine is slow, or new

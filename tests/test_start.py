@@ -14,7 +14,7 @@ import coopenv
 from coopenv.cli import complete
 
 HEAVY = {"warp", "scipy", "matplotlib", "PIL", "pandas", "mcap", "torch", "joblib", "jinja2"}
-LIGHT = {"errors", "shipped", "api", "api.registration"}
+LIGHT = {"errors", "shipped", "interrupts", "api", "api.registration"}
 LIGHT |= {"cli", *(f"cli.{name}" for name in ("bench", "complete", "options", "run", "show"))}
 
 

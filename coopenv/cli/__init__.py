@@ -5,21 +5,25 @@ Commands import what they need when they run, so that `--help` and completion ar
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
 
+from coopenv import interrupts
 from coopenv.cli import show
 from coopenv.cli.bench import bench
-from coopenv.cli.options import INTERRUPTED
 from coopenv.cli.run import record_command, run
 from coopenv.errors import CoopenvError
 from coopenv.shipped import version as installed_version
 
 UsageError: Any = typer.BadParameter.__base__
 """What typer raises for every mistake in the options; it has no public name."""
+INTERRUPTED, PIPE_CLOSED = 130, 141
+"""Exit statuses, 128 plus the number of the signal."""
 
 app = typer.Typer(
     name="coopenv",
@@ -37,17 +41,52 @@ app.add_typer(bench, name="bench")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit status: 0, 2 after a mistake in the input, 130 after Ctrl-C."""
+    """Run the command line and return the exit status.
+
+    It is 0, or 2 after a mistake in the input or a result that cannot be written, 141 where nobody reads the output any
+    more, 130 after Ctrl-C and 143 after SIGTERM.
+    """
     try:
         status = app(args=arguments, standalone_mode=False)
-    except (CoopenvError, UsageError) as error:
-        message = error.format_message() if isinstance(error, UsageError) else str(error)
-        print(f"error: {' '.join(message.split())}", file=sys.stderr)
-        return 2
-    except (KeyboardInterrupt, typer.Abort):
-        print("interrupted", file=sys.stderr)
-        return INTERRUPTED
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except BaseException as error:
+        status = failure_status(error)
+    if interrupts.received() or status == INTERRUPTED:
+        return interrupts.tell()
     return status if isinstance(status, int) else 0
+
+
+def failure_status(error: BaseException) -> int:
+    """Print one line for a failure that is the user's or the system's and return the exit status.
+
+    Raises:
+        BaseException: the error itself, which is a defect of the program.
+    """
+    if interrupts.received() or isinstance(error, KeyboardInterrupt | typer.Abort):
+        return INTERRUPTED
+    if isinstance(error, BrokenPipeError) or isinstance(error.__context__, BrokenPipeError):
+        drop_output()
+        return PIPE_CLOSED
+    if isinstance(error, UsageError):
+        message = error.format_message()
+    elif isinstance(error, CoopenvError):
+        message = str(error)
+    elif isinstance(error, OSError):
+        message = f"{error.filename or 'standard output'}: {error.strerror or error}"
+        drop_output()
+    else:
+        raise error
+    if sys.stderr is not None:
+        with suppress(OSError):
+            print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+def drop_output() -> None:
+    """Let nobody try again to write what could not be written."""
+    with suppress(OSError, ValueError, AttributeError), open(os.devnull, "wb") as nothing:  # noqa: PTH123
+        os.dup2(nothing.fileno(), sys.stdout.fileno())
 
 
 @app.callback(invoke_without_command=True)

@@ -18,8 +18,8 @@ from coopenv.errors import CoopenvError, DataWarning
 if TYPE_CHECKING:
     from rich.console import Console
 
-INTERRUPTED = 130
-"""Exit status after Ctrl-C."""
+DEFAULT_WIDTH = 80
+"""Columns of text where the terminal does not say."""
 
 Environment = Annotated[
     str,
@@ -61,7 +61,10 @@ def console(stderr: bool = False) -> Console:
     """Return a console that prints scenario texts as they are."""
     from rich.console import Console
 
-    return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
+    made = Console(stderr=stderr, markup=False, highlight=False, emoji=False)
+    if made.width < 1:  # COLUMNS=0
+        made.width = DEFAULT_WIDTH
+    return made
 
 
 def load(environment: str, overrides: dict[str, Any]) -> Any:

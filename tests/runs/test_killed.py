@@ -6,10 +6,8 @@ import json
 import os
 import random
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,20 +17,9 @@ from PIL import Image
 from coopenv.backends.mcap import read_recording
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.output import result_names
+from tests.helpers.processes import COOPENV, start
 
 SHORT = ["overtaking", "--set", "horizon=0.5"]
-
-
-def start(arguments: list[str], folder: Path, within: Sequence[str] = ()) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [*within, sys.executable, "-m", "coopenv.cli", *arguments],
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "COLUMNS": "80"},
-        start_new_session=True,
-    )
 
 
 def seed_of_run(folder: Path) -> int:
@@ -93,12 +80,12 @@ def kill_at_random(command: str, kills: int, folder: Path) -> None:
     """Kill a command again and again while it replaces an earlier result."""
     arguments, name, read = COMMANDS[command]
     begin = time.monotonic()
-    assert start(arguments(1), folder).wait(120) == 0
+    assert start((*COOPENV, *arguments(1)), folder).wait(120) == 0
     duration = time.monotonic() - begin
     assert read(folder / name) == 1
     draw, before, survived = random.Random(7), 1, 0
     for _ in range(kills):
-        process = start(arguments(3 - before), folder)
+        process = start((*COOPENV, *arguments(3 - before)), folder)
         time.sleep(duration * draw.uniform(0.0, 1.05))
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
@@ -106,7 +93,7 @@ def kill_at_random(command: str, kills: int, folder: Path) -> None:
         survived += after == before
         before = after
     assert survived > 0, "never killed before the end"
-    assert start(arguments(2), folder).wait(120) == 0
+    assert start((*COOPENV, *arguments(2)), folder).wait(120) == 0
     assert read(folder / name) == 2
     assert [path.name for path in folder.iterdir()] == [name]
 
@@ -123,7 +110,7 @@ def test_a_full_disk_is_one_line_and_keeps_the_earlier_result(tmp_path: Path) ->
     for name, text in earlier.items():
         (tmp_path / "result" / name).write_text(text)
     limited = ["bash", "-c", 'ulimit -f 64; exec "$@"', "bash"]  # 64 kB
-    process = start(run(2), tmp_path, limited)
+    process = start((*limited, *COOPENV, *run(2)), tmp_path)
     _, errors = process.communicate(timeout=120)
     assert process.returncode == 2
     assert errors.count("\n") == 1 and "error: cannot write to result/" in errors and "File too large" in errors

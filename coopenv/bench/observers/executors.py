@@ -8,15 +8,18 @@ from __future__ import annotations
 import multiprocessing
 import os
 import pickle
+import signal
 import socket
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
 from coopenv.errors import CoopenvError
+from coopenv.interrupts import end_with_parent, held
 from coopenv.machine import ONE_THREAD, available_cores, environment
 
 T = TypeVar("T")
@@ -86,21 +89,37 @@ class Local:
                 on_done(n + 1)
         else:
             _check_sendable(tasks[0])
+            others = multiprocessing.active_children()
             with (
                 environment(ONE_THREAD),  # matrices here are small: threads would only get in the way
-                ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool,
+                ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), end_with_parent) as pool,
             ):
-                work = {pool.submit(function, task): n for n, task in enumerate(tasks)}
                 try:
+                    with held(), _deaf_children():
+                        work = {pool.submit(function, task): n for n, task in enumerate(tasks)}
                     for done in as_completed(work):
                         results[work[done]] = done.result()
                         on_done(len(results))
                 except BrokenProcessPool:
                     raise CoopenvError("a process died: out of memory, or killed, or an observer ended it") from None
                 except BaseException:
-                    pool.shutdown(wait=False, cancel_futures=True)
+                    for worker in set(multiprocessing.active_children()).difference(others):
+                        worker.kill()
                     raise
         return [results[n] for n in range(len(tasks))]
+
+
+@contextmanager
+def _deaf_children() -> Iterator[None]:
+    """Let processes that are started meanwhile not hear Ctrl-C, which a terminal sends to all: the parent decides."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _check_sendable(task: object) -> None:

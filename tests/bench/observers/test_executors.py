@@ -76,7 +76,7 @@ quiet="--num-cpus 1 --disable-usage-stats"
 $ray start --head --port 6399 --include-dashboard=false --temp-dir "$PWD/ray" $quiet >head.log 2>&1
 $ray start --address 127.0.0.1:6399 $quiet >second.log 2>&1
 "$PYTHON" -c "import ray; ray.init('127.0.0.1:6399'); print(len(ray.nodes()))" 2>nodes.log
-run="$PYTHON -m coopenv.cli bench observers overtaking --observers riccati,mekf --variants nominal,v2x_loss"
+run="$PYTHON -m coopenv bench observers overtaking --observers riccati,mekf --variants nominal,v2x_loss"
 run="$run --seeds 3 --set horizon=1.0"
 $run --engine ray --address 127.0.0.1:6399 --out ray_board
 $run --jobs 2 --out local_board

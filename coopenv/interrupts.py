@@ -1,0 +1,128 @@
+"""SIGINT and SIGTERM end a command within two seconds, with one line that says what was written or kept."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import NoReturn
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+PATIENCE = 1.0
+"""s that a command has to end by itself. One that is within a long call of a library, such as a compiler, cannot."""
+HIDDEN_CURSOR_BACK = "\x1b[?25h"
+
+_received = 0
+_holds: list[None] = []
+_state = "nothing written"
+_ended = threading.Event()
+_last_steps: list[Callable[[], None]] = []
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal has asked the command to end."""
+
+
+def install() -> None:
+    """Catch the signals of this process, a command that ends with its work: they raise `Interrupted`.
+
+    They are not ignored in the background of a shell script, unlike what the shell asks for: `kill -INT` works there.
+    """
+    signals, waker = socket.socketpair()
+    waker.setblocking(False)
+    signal.set_wakeup_fd(waker.detach(), warn_on_full_buffer=False)
+    threading.Thread(target=_watch, args=(signals,), daemon=True).start()
+    for number in SIGNALS:
+        signal.signal(number, _handle)
+
+
+def received() -> bool:
+    """Return whether a signal has asked the command to end."""
+    return _received != 0
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """Put off the interruption of what must not be left half done."""
+    _holds.append(None)
+    try:
+        yield
+    finally:
+        _holds.pop()
+    if _received and not _holds and threading.current_thread() is threading.main_thread():
+        raise Interrupted
+
+
+def note(state: str) -> None:
+    """Set what is to be told of the results if the command is interrupted from now on."""
+    global _state
+    _state = state
+
+
+def before_a_hard_end(step: Callable[[], None]) -> None:
+    """Let a step be done, in another thread, before a command is ended that does not end by itself."""
+    _last_steps.append(step)
+
+
+def tell() -> int:
+    """Print what was kept and return the exit status, 130 or 143."""
+    _ended.set()
+    if sys.stderr is not None:
+        with suppress(OSError):
+            print(f"interrupted; {_state}", file=sys.stderr, flush=True)
+    return 128 + (_received or signal.SIGINT)
+
+
+def end(status: int) -> NoReturn:
+    """End the process without taking the interpreter apart, which takes long with large libraries."""
+    with suppress(OSError, AttributeError):
+        sys.stdout.flush()
+    atexit._run_exitfuncs()
+    os._exit(status)
+
+
+def end_with_parent() -> None:
+    """End this process, one that `multiprocessing` has started, as soon as its parent is gone, however that ended."""
+    from multiprocessing import parent_process
+    from multiprocessing.connection import wait
+
+    parent = parent_process()
+    if parent is not None:
+
+        def wait_and_end() -> None:
+            wait([parent.sentinel])
+            os._exit(1)
+
+        threading.Thread(target=wait_and_end, daemon=True).start()
+
+
+def _handle(number: int, _frame: object) -> None:
+    global _received
+    _received = number
+    for each in SIGNALS:
+        signal.signal(each, signal.SIG_IGN)
+    sys.unraisablehook = lambda _: None  # where nobody can catch what is raised below, it says nothing; see _watch
+    if not _holds:
+        raise Interrupted
+
+
+def _watch(signals: socket.socket) -> None:
+    """End the process if it does not do so by itself; runs also while the main thread is in a library's call."""
+    number = 0
+    while number not in SIGNALS:
+        number = signals.recv(1)[0]
+    if _ended.wait(PATIENCE):
+        time.sleep(PATIENCE / 2)  # for what libraries do at the end
+    else:
+        for step in _last_steps:
+            step()
+        shown = HIDDEN_CURSOR_BACK if os.isatty(2) else ""
+        with suppress(OSError):
+            os.write(2, f"{shown}interrupted; {_state}\n".encode())
+    os._exit(128 + number)

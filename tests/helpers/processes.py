@@ -1,0 +1,54 @@
+"""Commands in processes of their own."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+COOPENV = (sys.executable, "-m", "coopenv")
+DEADLOCK = 60.0
+"""s after which a test gives up."""
+
+
+def start(command: Sequence[str], folder: Path, **options: Any) -> subprocess.Popen[str]:
+    """Start a command that leads a process group of its own."""
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **options}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "80"}
+    return subprocess.Popen(command, cwd=folder, text=True, env=environment, start_new_session=True, **options)
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    """Wait for a condition to hold.
+
+    Raises:
+        TimeoutError: it does not come true.
+    """
+    give_up = time.monotonic() + DEADLOCK
+    while not condition():
+        if time.monotonic() > give_up:
+            raise TimeoutError
+        time.sleep(0.01)
+
+
+def group_of(leader: int) -> list[str]:
+    """Return the command lines of the living processes of a process group but its leader (Linux)."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            state, _, group = (path / "stat").read_text().rpartition(")")[2].split()[:3]
+            if int(group) == leader and int(path.name) != leader and state != "Z":
+                found.append((path / "cmdline").read_text().replace("\0", " "))
+        except OSError:  # gone meanwhile
+            continue
+    return found
+
+
+def workers_of(leader: int) -> list[str]:
+    """Return those that `multiprocessing` has started to work."""
+    return [line for line in group_of(leader) if "spawn_main" in line]
