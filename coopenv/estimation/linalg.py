@@ -214,7 +214,8 @@ def smallest_eigenvalue6(M: Any):
         H = G * G - r / p
         root = wp.sqrt(wp.max(M.dtype(5.0) * (M.dtype(6.0) * H - G * G), zero))
         step = M.dtype(6.0) / (root - G)
+        before = x
         x = x + step
-        if step <= x * M.dtype(1.0e-9):
+        if step <= x * M.dtype(1.0e-9) or x == before:  # the latter in single precision: it would stay there
             return wp.max(x, zero) * scale
     return wp.max(x, zero) * scale
