@@ -100,7 +100,7 @@ def _batch_step(env: CooperativeVectorEnv) -> Callable[[], int]:
 def array_bytes(engine: Engine) -> int:
     """Return the size of every array that has the world as leading axis."""
     world = engine.world
-    records = [engine.report, world.state, world.memory]
+    records = [engine.results, world.state, world.memory]
     fields = [getattr(record, name) for record in records for name in record._cls.vars]
     arrays = [field for field in fields if isinstance(field, wp.array)]
     return sum(a.capacity for a in [*arrays, world.actions, world.mask])

@@ -1,4 +1,4 @@
-"""The batched core under every face: worlds plus reports, with constant Python work per step."""
+"""The batched core under every face: worlds plus step results, with constant Python work per step."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.api.layout import layout_size, observation_layout
-from coopenv.api.observation import observation_plan
 from coopenv.api.plugins import PlugIns
-from coopenv.api.report import MEMORY, allocate_report, report_kernel
-from coopenv.api.rewards import reward_weights
+from coopenv.api.step_results import MEMORY, results_struct
+from coopenv.api.terms.binding import bound_terms
+from coopenv.api.terms.kernels import Plan, endings_kernel, results_kernel
+from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.base import Backend
 from coopenv.backends.simulated import Simulated
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
+from coopenv.world.records import allocate
 from coopenv.world.saved_state import has_begun
 from coopenv.world.state import overwrite, state_fields
 
@@ -25,7 +26,7 @@ from coopenv.world.state import overwrite, state_fields
 class Engine:
     """`worlds` worlds with their observations, rewards and judgements.
 
-    Host views: `view(name)` gives a field of the report or the state as a NumPy array, (W, N, ...) or (W, A, ...),
+    Host views: `view(name)` gives a field of the results or the state as a NumPy array (W, N, ...) or (W, A, ...),
     without a copy on the CPU; copy what must outlive the next step.
     """
 
@@ -51,17 +52,25 @@ class Engine:
         backend = backend or Simulated(scenario)
         self.world = backend.world(worlds, dtype, device, threads)
         name = scenario.observer.name
-        self.plugins = (
-            None if self.world.observer is not HOST else PlugIns(name, self.world, backend.senses(self.world))
-        )
+        hosted = self.world.observer is HOST
+        self.plugins = PlugIns(name, self.world, backend.senses(self.world)) if hosted else None
         """The observers that run on the host; None where the embedded one estimates."""
-        if self.world.observer is HOST:
-            self.plugins = PlugIns(scenario.observer.name, self.world, backend.senses(self.world))
         self.layout = observation_layout(scenario)
         device = self.world.device
-        self.report = allocate_report(self.world.model, worlds, layout_size(self.layout), self.world.precision, device)
-        self._plan = observation_plan(scenario, self.layout)
-        self._weights: Any = wp.array(reward_weights(scenario), dtype=wp.float32, device=device)
+        weights = scenario.reward.by_name
+        self.reward_terms = tuple(weights)
+        """Names of the reward terms, in the order of the field `terms`."""
+        p = self.world.precision
+        sizes = {"W": worlds, "N": self.world.model.vehicles, "D": self.layout.size, "K": len(weights)}
+        self.results = allocate(results_struct(p), sizes, device)
+        terms = bound_terms(scenario)
+        self._fill = results_kernel(terms, p)
+        self._end = endings_kernel(terms.conditions, p) if terms.conditions else None
+        fields = self.layout.values()
+        self._plan: Any = Plan()
+        self._plan.start = wp.array([field.start for field in fields], dtype=wp.int32, device=device)
+        self._plan.factor = wp.array([1.0 / field.scale for field in fields], dtype=wp.float32, device=device)
+        self._plan.weight = wp.array(list(weights.values()), dtype=wp.float32, device=device)
         self._everywhere: Any = wp.ones(worlds, dtype=wp.int32, device=device)
         self._nowhere: Any = wp.zeros(worlds, dtype=wp.int32, device=device)
         self._fresh: Any = wp.zeros(worlds, dtype=wp.int32, device=device)
@@ -69,12 +78,12 @@ class Engine:
         self._views: dict[str, np.ndarray] = {}
 
     def reset(self, seeds: Sequence[int] | np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
-        """Start new episodes, see `World.reset`; reports of the other worlds stay."""
+        """Start new episodes, see `World.reset`; the results of the other worlds stay."""
         self.world.reset(seeds, mask)
         chosen = np.ones(self.world.worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
         self._start_plugins(chosen)
         self._fresh.assign(chosen.astype(np.int32))
-        self._report("report fresh", self._fresh, self._fresh)
+        self._fill_results("results fresh", self._fresh, self._fresh)
 
     def _start_plugins(self, chosen: np.ndarray) -> None:
         if self.plugins is not None:
@@ -88,6 +97,7 @@ class Engine:
         if actions is not None:
             self.set_actions(actions)
         self._advance(self.world.model.ticks_per_decision if ticks is None else ticks)
+        self._end_episodes()
         self.refresh()
 
     def step_or_restart(self) -> None:
@@ -95,19 +105,20 @@ class Engine:
         if self.world.device == "cpu" and not self.view("over").any():  # a look costs nothing here, a launch does
             self.step()
             return
-        wp.copy(self.world.mask, self.report.over)
+        wp.copy(self.world.mask, self.results.over)
         self._advance(self.world.model.ticks_per_decision)
         self._restart()
-        self._report("report some fresh", self.world.mask, self._everywhere)
+        self._end_episodes()
+        self._fill_results("results some fresh", self.world.mask, self._everywhere)
         self.world.mask.zero_()
 
     def restart_finished(self) -> None:
-        """Restart the worlds that are over and report them anew; nothing leaves the device."""
-        wp.copy(self.world.mask, self.report.over)
-        wp.copy(self._fresh, self.report.over)
+        """Restart the worlds that are over and fill their results anew; nothing leaves the device."""
+        wp.copy(self.world.mask, self.results.over)
+        wp.copy(self._fresh, self.results.over)
         self._restart()
         self.world.mask.zero_()
-        self._report("report fresh", self._fresh, self._fresh)
+        self._fill_results("results fresh", self._fresh, self._fresh)
 
     def _restart(self) -> None:
         self.world.restart()
@@ -122,20 +133,25 @@ class Engine:
             self.world.actions.assign(np.ascontiguousarray(actions, dtype=self.world.precision.numpy))
 
     def refresh(self) -> None:
-        """Recompute the report of every world from the present state."""
-        self._report("report", self._nowhere, self._everywhere)
+        """Recompute the step results of every world from the present state."""
+        self._fill_results("results", self._nowhere, self._everywhere)
 
-    def _report(self, key: str, fresh: Any, chosen: Any) -> None:
+    def _end_episodes(self) -> None:
+        """End the episodes of vehicles that fulfil a condition of the scenario's own."""
+        if self._end is not None:
+            arguments = [self.world.model, PerWorld(self.world.state), PerWorld(self.results)]
+            self.world.launch("end", self._end, arguments, inner=(self.world.model.vehicles,))
+
+    def _fill_results(self, key: str, fresh: Any, chosen: Any) -> None:
         arguments = [
             self.world.model,
             PerWorld(self.world.state),
             self._plan,
-            self._weights,
-            PerWorld(self.report),
+            PerWorld(self.results),
             PerWorld(fresh),
             PerWorld(chosen),
         ]
-        self.world.launch(key, report_kernel, arguments, inner=(self.world.model.vehicles,))
+        self.world.launch(key, self._fill, arguments, inner=(self.world.model.vehicles,))
 
     def view(self, name: str) -> np.ndarray:
         """Return a field of the report, the state or the actions on the host."""
@@ -147,10 +163,10 @@ class Engine:
         return view
 
     def array(self, name: str) -> Any:
-        """Return the Warp array of a field of the report or the state, or the actions."""
+        """Return the Warp array of a field of the step results or the state, or the actions."""
         if name == "actions":
             return self.world.actions
-        return getattr(self.world.state if name in self._state_fields else self.report, name)
+        return getattr(self.world.state if name in self._state_fields else self.results, name)
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of everything that the next step depends on.
@@ -158,7 +174,7 @@ class Engine:
         Raises:
             CoopenvError: a plug-in observer cannot be copied.
         """
-        memory = {name: getattr(self.report, name).numpy().copy() for name in MEMORY}
+        memory = {name: getattr(self.results, name).numpy().copy() for name in MEMORY}
         own = {} if self.plugins is None else {"observers": self.plugins.get_state()}
         return {**self.world.get_state(), **memory, **own}
 
@@ -168,7 +184,7 @@ class Engine:
         Raises:
             CoopenvError: a field is missing, or does not hold what it may; nothing has changed then.
         """
-        memory = {name: getattr(self.report, name) for name in MEMORY}
+        memory = {name: getattr(self.results, name) for name in MEMORY}
         checked = self.world.checked_state(values, memory, MEMORY)
         if self.plugins is not None:
             self.plugins.set_state(values.get("observers"))

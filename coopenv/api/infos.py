@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.api.rewards import TERMS
 from coopenv.estimation.trajectory import Outcome, Sight
 from coopenv.scenario import Scenario
 
-OUTCOMES = tuple(outcome.words for outcome in Outcome)
-"""Words of `info["outcome"]`, in the order of the field `ended`."""
+
+def outcome_words(scenario: Scenario) -> tuple[str, ...]:
+    """Return the words of `info["outcome"]` by the values of the field `ended`."""
+    return (*(outcome.words for outcome in Outcome), *scenario.termination.own)
 
 
 class InfoWriter:
@@ -23,6 +24,7 @@ class InfoWriter:
         self._index = {agent: i for i, agent in enumerate(scenario.vehicle_names)}
         self._targets = scenario.target_names
         self._landmarks = len(scenario.landmarks)
+        self._outcomes = outcome_words(scenario)
         self._tick_length = 1.0 / scenario.rates.camera
 
     def __call__(self, agents: list[str]) -> dict[str, dict[str, Any]]:
@@ -61,8 +63,8 @@ class InfoWriter:
                 "nees": nees[i],
                 "log_determinant": log_determinant[i],
                 "gramian_min_eigenvalue": smallest[i],
-                "reward_terms": dict(zip(TERMS, terms[i], strict=True)),
+                "reward_terms": dict(zip(self._engine.reward_terms, terms[i], strict=True)),
                 "time": time,
-                "outcome": OUTCOMES[ended[i]],
+                "outcome": self._outcomes[ended[i]],
             }
         return infos

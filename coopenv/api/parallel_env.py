@@ -14,8 +14,8 @@ from pettingzoo import ParallelEnv
 from coopenv.api.actions import ActionReader
 from coopenv.api.engine import Engine
 from coopenv.api.infos import InfoWriter
-from coopenv.api.layout import Field, action_space, dict_space, flat_space
 from coopenv.api.state import state_space, state_vector
+from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
 from coopenv.backends.base import Backend
 from coopenv.backends.simulated import Simulated
 from coopenv.backends.sources import open_backend
@@ -98,9 +98,9 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         self._seeded = False
 
     @property
-    def observation_layout(self) -> dict[str, Field]:
+    def observation_layout(self) -> Layout:
         """Name, slice, unit and scale of every field of the flat observation."""
-        return dict(self.engine.layout)
+        return self.engine.layout.copy()
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Return the agent's observation space, the same object at every call."""

@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 
 from coopenv.api.array_io import ArrayKind, Exchange
 from coopenv.api.engine import Engine
-from coopenv.api.layout import Field, action_space, flat_space
+from coopenv.api.terms.layout import Layout, action_space, flat_space
 from coopenv.backends.replay.source import is_recorded
 from coopenv.errors import CoopenvError, checked_seed, suggest
 from coopenv.scenario import Scenario, load_scenario
@@ -100,9 +100,9 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return batch_space(self.single_action_space, self.num_envs)
 
     @property
-    def observation_layout(self) -> dict[str, Field]:
+    def observation_layout(self) -> Layout:
         """Name, slice, unit and scale of every field of an observation row."""
-        return dict(self.engine.layout)
+        return self.engine.layout.copy()
 
     def world_major(self, rows: Any) -> Any:
         """Return rows (num_envs, ...) as (num_worlds, vehicles, ...), without a copy."""

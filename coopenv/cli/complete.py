@@ -39,7 +39,7 @@ def override_keys(incomplete: str) -> list[str]:
 
 
 def dotted_keys(model: type[Any]) -> Iterator[str]:
-    """Yield the dotted key of every setting below a pydantic model; `*` stands for any entry of a list."""
+    """Yield the dotted key of every setting below a pydantic model; `*` stands for any entry."""
     for name, info in model.model_fields.items():
         parts = list(_models_in(info.annotation))
         if not parts:
@@ -53,7 +53,7 @@ def _models_in(annotation: Any, in_list: bool = False) -> Iterator[tuple[type[An
     if hasattr(annotation, "model_fields"):
         yield annotation, in_list
     for argument in get_args(annotation):
-        yield from _models_in(argument, in_list or getattr(annotation, "__origin__", None) in (list, tuple))
+        yield from _models_in(argument, in_list or getattr(annotation, "__origin__", None) in (list, tuple, dict))
 
 
 def _matching(names: Iterable[str], incomplete: str) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from coopenv.api.layout import observation_layout
+from coopenv.api.terms.layout import observation_layout
 from coopenv.scenario import Scenario
 
 
@@ -43,8 +43,7 @@ class GiveWay:
         if missing:
             raise ValueError(f"the observation lacks {', '.join(missing)}")
         self._layout = layout
-        full = scenario.dynamics.max_speed
-        self._slowest, self._fastest = (-full if scenario.dynamics.reverse else 0.0), full
+        self._speed = layout.action[0]
         self._cruise, self._clearance = cruise, clearance
         self._times = np.linspace(0.0, foresight, 31)
         self._look_ahead, self._gain = look_ahead, steering_gain
@@ -72,5 +71,5 @@ class GiveWay:
         going, waiting = (self._closest(position, velocity, speed) for speed in (self._cruise, 0.0))
         go = going >= self._clearance or going > waiting
         speed = self._cruise if go else 0.0
-        level = 2.0 * (speed - self._slowest) / (self._fastest - self._slowest) - 1.0
+        level = self._speed.level(speed)
         return np.array([level, np.clip(self._gain * heading, -1.0, 1.0)], dtype=np.float32)

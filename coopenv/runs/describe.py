@@ -10,8 +10,8 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from coopenv.api.layout import layout_size, observation_layout
 from coopenv.api.registration import environment_id
+from coopenv.api.terms.layout import observation_layout
 from coopenv.format import number
 from coopenv.runs import scenario_text as words
 from coopenv.scenario.schema import Scenario
@@ -149,7 +149,7 @@ def section_table(name: str, part: BaseModel, key_width: int) -> Table:
 def observation_table(scenario: Scenario) -> Table:
     """Return one row per field of the flat observation."""
     layout = observation_layout(scenario)
-    title = f"Observation: {layout_size(layout)} entries per vehicle, each value / scale, clipped"
+    title = f"Observation: {layout.size} entries per vehicle, each value / scale, clipped"
     table = _table("field", "slice", "shape", "unit", "scale", "meaning", title=title)
     for column in table.columns[:-1]:
         column.no_wrap = True

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import warp
 
+from coopenv.api.infos import outcome_words
 from coopenv.estimation.metrics import observability_of, summarise
 from coopenv.estimation.observability import Observability
-from coopenv.estimation.trajectory import Trajectory
-from coopenv.runs.rollouts import ARRIVED, COLLIDED, UNDER_WAY, Ending, Rollout
+from coopenv.estimation.trajectory import Outcome, Trajectory
+from coopenv.runs.rollouts import Ending, Rollout
 from coopenv.shipped import version
 
 
@@ -28,7 +29,7 @@ def vehicle_metrics(
         {
             **summary,
             "outcome": endings[i].outcome,
-            "ended_at_s": np.nan if endings[i].outcome == UNDER_WAY else endings[i].time,
+            "ended_at_s": np.nan if endings[i].outcome == Outcome.UNDER_WAY.words else endings[i].time,
             "observability": observability_metrics(observability_of(observability, i, ends[i])),
         }
         for i, summary in enumerate(summarise(trajectory, steady_from, ends))
@@ -60,10 +61,10 @@ def outcome_line(recording: Rollout) -> str:
     """Return how the run ended, in words."""
     endings = recording.endings()
     scenario = recording.scenario
-    count = {word: sum(ending.outcome == word for ending in endings) for word in (ARRIVED, COLLIDED)}
+    count = {word: sum(ending.outcome == word for ending in endings) for word in outcome_words(scenario)[1:]}
     parts = [f"{number} {word}" for word, number in count.items() if number]
     time = recording.ticks_recorded / scenario.rates.camera
-    if all(ending.outcome != UNDER_WAY for ending in endings):
+    if all(ending.outcome != Outcome.UNDER_WAY.words for ending in endings):
         end = f"all vehicles had ended by {max(ending.time for ending in endings):.4g} s"
     elif recording.ticks_recorded >= scenario.horizon_ticks:
         end = f"horizon reached at {time:g} s"

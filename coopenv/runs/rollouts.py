@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.api.infos import OUTCOMES
+from coopenv.api.infos import outcome_words
 from coopenv.errors import CoopenvError
 from coopenv.estimation.trajectory import Sight, Trajectory
 from coopenv.policies import Policy, load_policy
@@ -31,11 +31,9 @@ RECORDED = (
 )
 """Views of the engine that are kept of every camera tick."""
 
-UNDER_WAY, ARRIVED, COLLIDED = OUTCOMES
-
 
 class Ending(NamedTuple):
-    """How a vehicle's run ended: a value of `OUTCOMES`, and when, s (`under way`: the end of the record)."""
+    """How a vehicle's run ended: in the words of infos, and when, s (`under way`: the end of the record)."""
 
     outcome: str
     time: float
@@ -150,8 +148,9 @@ class Rollout:
         ended = self._recorded("ended")
         first = np.where(ended.any(axis=0), np.argmax(ended != 0, axis=0), len(ended) - 1)
         rate = self.scenario.rates.camera
+        words = outcome_words(self.scenario)
         return [
-            Ending(OUTCOMES[outcome], tick / rate)
+            Ending(words[outcome], tick / rate)
             for outcome, tick in zip(ended[-1].tolist(), first.tolist(), strict=True)
         ]
 

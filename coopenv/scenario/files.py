@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from coopenv.errors import ScenarioError, UnknownEnvironmentError, suggest
+from coopenv.scenario.own_terms import located
 from coopenv.scenario.schema import Scenario
 from coopenv.scenario.validation import one_line
 from coopenv.shipped import data_directory, list_envs
@@ -59,8 +60,10 @@ def load_scenario(name_or_path: str | Path, overrides: Mapping[str, Any] | None 
         raise ScenarioError(f"{path.name}: cannot be read ({error})") from None
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"{path.name}: not valid TOML: {error}") from None
+    raw = located(raw, path.parent)
     for key, value in (overrides or {}).items():
         override(raw, str(key), value)
+    raw = located(raw, Path.cwd())  # those of overrides
     return parse_scenario(apply_vehicle_defaults(raw, path.name), path.name)
 
 

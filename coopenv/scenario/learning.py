@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Iterable
+from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, create_model, model_validator
 
+from coopenv.errors import suggest
 from coopenv.scenario.base import NonNegative, Number, Part, Positive
+from coopenv.scenario.term_tables import GROUPS, OBSERVATION_FIELDS, REWARD_TERMS, TERMINATION_CONDITIONS
+from coopenv.scenario.terms import ObservationField, RewardTerm, TerminationCondition
 
-ObservationGroup = Literal["estimate", "quality", "bearings", "odometry", "messages", "goal"]
-OBSERVATION_GROUPS: tuple[ObservationGroup, ...] = (
-    "estimate",
-    "quality",
-    "bearings",
-    "odometry",
-    "messages",
-    "goal",
-)
+
+def _list_groups(schema: dict[str, Any]) -> None:
+    """List the groups of coopenv for editors."""
+    schema["items"] = {"anyOf": [{"enum": list(GROUPS)}, {"type": "string"}]}
 
 
 class Observation(Part):
     """Contents and scales of the observation; every entry is divided by its scale and clipped to [-1, 1]."""
 
-    include: tuple[ObservationGroup, ...] = Field(default=OBSERVATION_GROUPS, min_length=1)
+    include: tuple[str, ...] = Field(default=GROUPS, min_length=1, json_schema_extra=_list_groups)
+    """Groups of coopenv's fields, and names of registered and custom fields."""
     position_scale: Positive = 50.0
     """m"""
     velocity_scale: Positive = 5.0
@@ -31,6 +31,19 @@ class Observation(Part):
     """rad/s"""
     age_scale: Positive = 1.0
     """s; older measurements read 1"""
+    custom: dict[str, ObservationField] = Field(default={})
+    """Fields of one's own by name: where their functions stand, see docs/terms.md."""
+
+    @model_validator(mode="after")
+    def _fields_exist(self) -> Observation:
+        OBSERVATION_FIELDS.check_names(self.custom)
+        known = OBSERVATION_FIELDS.known(self.custom)
+        groups = {row.group or name for name, row in known.items()}
+        for name in self.include:
+            if name not in groups:
+                near = suggest(name, groups) or f"; known: {', '.join(sorted(groups))}"
+                raise ValueError(f"include: unknown group or field '{name}'{near}")
+        return self
 
 
 class Dynamics(Part):
@@ -65,54 +78,100 @@ class Action(Part):
     """Steering angle at action 1, rad (none: max_steering)."""
 
 
-class RewardWeights(Part):
-    """Weights of the named terms of the reward, per decision step; the reward is their weighted sum."""
-
-    progress: Number = 0.0
-    """Decrease of the true distance to the goal, m (privileged)."""
-    arrival: Number = 0.0
-    """1 in the step of arrival."""
-    collision: Number = 0.0
-    """-1 in the step of a collision."""
-    control: Number = 0.0
-    """-|action|^2"""
-    time: Number = 0.0
-    """-1 per second"""
-    position_error: Number = 0.0
-    """-|position error|, m (privileged)."""
-    orientation_error: Number = 0.0
-    """-orientation error, rad (privileged)."""
-    uncertainty: Number = 0.0
-    """-log det P / 6: minus the mean log variance."""
-    observability: Number = 0.0
-    """log10 of the smallest eigenvalue of the sliding Gramian (floor 1e-9)."""
-    visibility: Number = 0.0
-    """Share of its possible targets that the vehicle has in view."""
+_built_in: dict[str, Any] = {
+    name: (Number, Field(0.0, description=row.described)) for name, row in REWARD_TERMS.built_in.items()
+}
 
 
-PRIVILEGED_TERMS = ("progress", "position_error", "orientation_error")
-"""Terms that use truth beyond collision and arrival: they exist in simulation only."""
+class RewardWeights(create_model("_BuiltInWeights", __base__=Part, **_built_in)):  # type: ignore[misc]
+    """Weights of the named terms of the reward, per decision step; the reward is their weighted sum.
+
+    One number per name: coopenv's, and any that is registered or stands in `reward.custom`.
+    """
+
+    model_config = ConfigDict(extra="allow")
+    __pydantic_extra__: dict[str, Number] = Field(init=False)
+
+
+def _only_those_of_coopenv(names: Iterable[str], table: str = "") -> Any:
+    """Return the rule, for editors, that a table has these keys only where there is no table `custom` beside it."""
+    keys: dict[str, Any] = {"propertyNames": {"enum": list(names)}}
+    return {
+        "if": {"not": {"required": ["custom"]}},
+        "then": {"properties": {table: keys}} if table else keys,
+    }
 
 
 class Reward(Part):
     """The reward of one decision step."""
 
+    model_config = ConfigDict(json_schema_extra=_only_those_of_coopenv(REWARD_TERMS.built_in, "weights"))
+
     weights: RewardWeights = RewardWeights()
+    custom: dict[str, RewardTerm] = Field(default={})
+    """Terms of one's own by name: where their functions stand, see docs/terms.md."""
     privileged: bool = False
     """Must be true when a weighted term uses the truth."""
 
+    @property
+    def by_name(self) -> dict[str, float]:
+        """The weight of every term that is computed: coopenv's, custom ones, and those weighed, in this order."""
+        named: dict[str, float] = self.weights.model_dump()
+        return {**dict.fromkeys((*REWARD_TERMS.built_in, *self.custom), 0.0), **named}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _terms_exist(cls, given: Any) -> Any:
+        if isinstance(given, dict) and isinstance(given.get("weights"), dict):
+            REWARD_TERMS.check_known(given["weights"], given.get("custom"), "weights.")
+        return given
+
     @model_validator(mode="after")
     def _privilege_is_declared(self) -> Reward:
-        used = [name for name in PRIVILEGED_TERMS if getattr(self.weights, name) != 0.0]
-        if used and not self.privileged:
-            raise ValueError(f"privileged: must be true, because the weighted term '{used[0]}' uses the truth")
+        REWARD_TERMS.check_names(self.custom)
+        known = REWARD_TERMS.known(self.custom)
+        for name, weight in self.by_name.items():
+            if weight != 0.0 and known[name].privileged and not self.privileged:
+                raise ValueError(f"privileged: must be true, because the weighted term '{name}' uses the truth")
         return self
 
 
 class Termination(Part):
-    """What ends an agent's episode before the horizon."""
+    """What ends an agent's episode before the horizon: a switch for every condition, its own and those of coopenv."""
+
+    model_config = ConfigDict(
+        extra="allow",
+        json_schema_extra=_only_those_of_coopenv([*TERMINATION_CONDITIONS.built_in, "privileged"]),
+    )
+    __pydantic_extra__: dict[str, bool] = Field(init=False)
 
     collision: bool = True
     """Touching a building or another body ends the vehicle's episode."""
     arrival: bool = True
     """Reaching its goal ends the vehicle's episode."""
+    custom: dict[str, TerminationCondition] = Field(default={})
+    """Conditions of one's own by name: where their functions stand, see docs/terms.md."""
+    privileged: bool = False
+    """Must be true when a condition of one's own that is switched on uses the truth."""
+
+    @property
+    def own(self) -> tuple[str, ...]:
+        """The conditions that are switched on and not coopenv's."""
+        return tuple(name for name, on in self.__pydantic_extra__.items() if on)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _conditions_exist(cls, given: Any) -> Any:
+        if isinstance(given, dict):
+            names = [name for name in given if name not in cls.model_fields]
+            TERMINATION_CONDITIONS.check_known(names, given.get("custom"))
+        return given
+
+    @model_validator(mode="after")
+    def _privilege_is_declared(self) -> Termination:
+        TERMINATION_CONDITIONS.check_names(self.custom)
+        known = TERMINATION_CONDITIONS.known(self.custom)
+        for name in self.own:
+            if known[name].privileged and not self.privileged:
+                raise ValueError(f"privileged: must be true, because the condition '{name}' uses the truth")
+        return self

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from coopenv.estimation.trajectory import Outcome
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Body, Landmark, Vehicle
 from coopenv.scenario.motion import TwistTable, compile_motion
@@ -57,6 +58,7 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     model.samples_per_tick = math.ceil(scenario.rates.odometry / scenario.rates.camera - 1e-9) + 1
     model.ticks_per_decision = scenario.ticks_per_decision
     model.horizon_ticks = scenario.horizon_ticks
+    model.last_outcome = max(Outcome) + len(scenario.termination.own)
     _fill_topology(model, scenario, fill)
     _fill_start(model.start, scenario, fill)
     _fill_motion(model.motion, scenario, fill)

@@ -77,16 +77,22 @@ def goal_distance(model: Any, state: Any, world: int, vehicle: int):
 
 
 @wp.func
+def reaches_goal(model: Any, state: Any, world: int, vehicle: int) -> bool:
+    """Return whether a vehicle has a goal and is within its radius."""
+    radius = model.scene.goal_radius[vehicle]
+    return radius > radius.dtype(0.0) and goal_distance(model, state, world, vehicle) < radius
+
+
+@wp.func
 def referee(model: Any, state: Any, world: int, vehicle: int):
     """Mark contact, and end the vehicle's episode on a collision or an arrival that counts."""
     touching = touches_anything(model, state, world, vehicle)
     ended = state.ended[world, vehicle]
     if ended == UNDER_WAY:
-        radius = model.scene.goal_radius[vehicle]
         if touching == 1 and model.scene.end_on_collision == 1:
             ended = COLLIDED
-        elif model.scene.end_on_arrival == 1 and radius > radius - radius:
-            if goal_distance(model, state, world, vehicle) < radius:
+        elif model.scene.end_on_arrival == 1:
+            if reaches_goal(model, state, world, vehicle):
                 ended = ARRIVED
     state.collided[world, vehicle] = touching
     state.ended[world, vehicle] = ended

@@ -44,11 +44,14 @@ def start_warp() -> None:
 
 
 @cache
-def kernel(function: Callable[..., None], precision_name: str, differentiable: bool = False) -> wp.Kernel:
+def kernel(function: Callable[..., None] | wp.Kernel, precision_name: str, differentiable: bool = False) -> wp.Kernel:
     """Return a plain Python function as a Warp kernel whose module serves one precision only.
 
     Options in its attribute `options` hold for it, besides those that its file sets with `wp.set_module_options`.
+    What is a kernel already stays as it is.
     """
+    if isinstance(function, wp.Kernel):
+        return function
     kind = ".differentiable" if differentiable else ""
     module = wp.get_module(f"{function.__module__}.{function.__name__}.{precision_name}{kind}")
     module.options.update(wp.get_module(function.__module__).options)
@@ -105,7 +108,11 @@ class Launcher:
         self._pool_owner = 0
 
     def __call__(
-        self, key: Hashable, function: Callable[..., None], arguments: list[Any], inner: tuple[int, ...] = ()
+        self,
+        key: Hashable,
+        function: Callable[..., None] | wp.Kernel,
+        arguments: list[Any],
+        inner: tuple[int, ...] = (),
     ) -> None:
         """Run a kernel over the grid (worlds, *inner)."""
         commands = self._recorded.get(key)

@@ -158,6 +158,7 @@ def model_struct(p: Precision) -> Any:
         samples_per_tick: wp.int32  # odometry samples that may fall into one camera tick
         ticks_per_decision: wp.int32
         horizon_ticks: wp.int32
+        last_outcome: wp.int32  # largest value of `ended`
         targets: wp.array2d(dtype=wp.int32)  # (N, A) agents that may be measured and heard, ascending, then -1
         target_count: wp.array(dtype=wp.int32)  # (N,)
         order: wp.array(dtype=wp.int32)  # (N,) leaders first

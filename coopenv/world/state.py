@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.estimation.trajectory import Outcome, Sight
+from coopenv.estimation.trajectory import Sight
 from coopenv.scenario.base import LARGEST
 from coopenv.world.precision import Precision
 from coopenv.world.records import allocate, array, fields
@@ -52,7 +52,7 @@ def state_struct(p: Precision) -> Any:
         speed: array("WN", scalar)  # of the bicycle, m/s
         steering: array("WN", scalar)  # rad
         command: array("WN", vec2)  # action in force
-        ended: array("WN", wp.int32)  # values of `Outcome`
+        ended: array("WN", wp.int32)  # values of `Outcome`, then one per condition of the scenario's own
         collided: array("WN", wp.int32)  # touching something now
 
         sampled_velocity: array("WNM", vec3)  # truth at the odometry samples of the last tick, m/s, body
@@ -99,7 +99,7 @@ VALID: dict[str, Rule] = {
     "angular_velocity": NUMBER._replace(of_truth=True),
     "steering": numbers(1.6),
     "command": numbers(1.001),
-    "ended": whole(min(Outcome), max(Outcome)),
+    "ended": whole(0, "last_outcome"),
     "collided": FLAG,
     "odometry_samples": ODOMETRY_SAMPLES,
     "increment_rotation": ROTATION,

@@ -12,7 +12,6 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import coopenv
-from coopenv.api.layout import layout_size
 
 ENVS = coopenv.list_envs()
 CRASH = {"urban_crossing": np.array([1.0, 1.0])}
@@ -193,7 +192,7 @@ def test_observations_are_in_their_space(name: str) -> None:
     env = coopenv.make_vec(name, num_worlds=3)
     observation, _ = env.reset(seed=0)
     rng = np.random.default_rng(0)
-    assert observation.shape == (env.num_envs, layout_size(env.observation_layout))
+    assert observation.shape == (env.num_envs, env.observation_layout.size)
     for _ in range(50):
         assert env.observation_space.contains(observation)
         observation, reward, terminated, truncated, _ = env.step(actions_for(env, rng))

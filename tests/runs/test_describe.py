@@ -14,7 +14,7 @@ import pytest
 from rich.console import Console
 
 import coopenv
-from coopenv.api.layout import observation_layout
+from coopenv.api.terms.layout import observation_layout
 from coopenv.cli import main
 from coopenv.runs import scenario_text as words
 from coopenv.runs.describe import describe_scenario, settings
@@ -189,13 +189,14 @@ def test_every_environment_satisfies_the_schema(name: str, validator: Any) -> No
         ("landmarks", 0),
         ("obstacles", 0),
         ("reward", "weights"),
+        ("termination",),
     ],
 )
 def test_the_schema_refuses_unknown_keys_as_the_loader_does(path: tuple[Any, ...], validator: Any) -> None:
     document = raw("urban_crossing")
     node: Any = document
     for part in path:
-        node = node[part]
+        node = node.setdefault(part, {}) if isinstance(part, str) else node[part]
     node["misspelt"] = 1
     assert not validator.is_valid(document)
     with pytest.raises(coopenv.ScenarioError, match="misspelt"):

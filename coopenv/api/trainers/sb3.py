@@ -10,7 +10,7 @@ import numpy as np
 
 from coopenv.api.array_io import host_actions
 from coopenv.api.engine import Engine
-from coopenv.api.layout import Field, action_space, flat_space
+from coopenv.api.terms.layout import Layout, action_space, flat_space
 from coopenv.errors import CoopenvError, checked_seed
 from coopenv.scenario import Scenario, load_scenario
 
@@ -48,9 +48,9 @@ class CooperativeSB3VecEnv(VecEnv):
         super().__init__(num_worlds * self.vehicles, flat_space(self.engine.layout), action_space())
 
     @property
-    def observation_layout(self) -> dict[str, Field]:
+    def observation_layout(self) -> Layout:
         """Name, slice, unit and scale of every field of an observation row."""
-        return dict(self.engine.layout)
+        return self.engine.layout.copy()
 
     def _rows(self, name: str) -> np.ndarray:
         view = self.engine.view(name)

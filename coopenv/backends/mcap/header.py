@@ -14,6 +14,7 @@ from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Recording
 from coopenv.scenario.base import Number, Part, Vector3
 from coopenv.scenario.files import parse_scenario
+from coopenv.scenario.own_terms import without_own_terms
 from coopenv.scenario.validation import one_line
 
 Index = Annotated[int, Field(ge=0, lt=2**31)]
@@ -76,7 +77,10 @@ class Header(Part):
     @classmethod
     def of(cls, recording: Recording) -> Header:
         """Return the header of a recording."""
-        return cls.model_validate({name: _plain(getattr(recording, name)) for name in cls.model_fields})
+        values = {name: _plain(getattr(recording, name)) for name in cls.model_fields}
+        if values["scenario"] is not None:
+            values["scenario"] = without_own_terms(values["scenario"])
+        return cls.model_validate(values)
 
     @classmethod
     def read(cls, text: bytes, where: str) -> Header:
@@ -105,7 +109,7 @@ class Header(Part):
             "start_rotation": np.array(self.start_rotation),
             "start_position": np.array(self.start_position),
             "start_covariance": np.array(self.start_covariance),
-            "scenario": None if self.scenario is None else parse_scenario(self.scenario, where),
+            "scenario": None if self.scenario is None else parse_scenario(without_own_terms(self.scenario), where),
         }
 
 

@@ -12,8 +12,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import coopenv
-from coopenv.api.rewards import TERMS
 from coopenv.api.trainers.sb3 import make_sb3_vec_env
+from coopenv.scenario.term_tables import REWARD_TERMS
 
 pytestmark = pytest.mark.train
 torch.set_num_threads(1)  # small networks: torch's threads and the batch's would only wait for one another
@@ -32,7 +32,7 @@ def test_time_limit_is_not_learnt_as_a_death() -> None:
     """Reward 1 per step for ever, cut off after 10 steps: the value is that of going on, 1 / (1 - gamma) = 20."""
     overrides = {
         "horizon": 1.0,
-        "reward.weights": {**dict.fromkeys(TERMS, 0.0), "time": -10.0},
+        "reward.weights": {**dict.fromkeys(REWARD_TERMS.built_in, 0.0), "time": -10.0},
         "reward.privileged": False,
         "observation.include": ["odometry"],  # nothing that tells the time left
         "termination": {"collision": False, "arrival": False},

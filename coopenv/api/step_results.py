@@ -1,0 +1,121 @@
+"""What the faces of a world read after each decision: how good estimates are, rewards, flags that end episodes."""
+
+from functools import cache
+from typing import Any
+
+import warp as wp
+
+from coopenv.estimation.so3 import rotation_angle
+from coopenv.world.collision import UNDER_WAY, goal_distance
+from coopenv.world.precision import Precision
+from coopenv.world.quality import (
+    cholesky_of,
+    gramian_smallest_eigenvalue,
+    log_determinant,
+    normalised_error_squared,
+    observer_error,
+    targets_in_view,
+)
+from coopenv.world.records import array
+from coopenv.world.saved_state import FLAG, NUMBER, whole
+
+DEGREES = wp.constant(57.29577951308232)
+
+
+@cache
+def results_struct(p: Precision) -> Any:
+    """Return the Warp struct of step results in one precision."""
+    scalar = p.scalar
+
+    @wp.struct
+    class StepResults:
+        """W worlds, N vehicles, D observation entries, K reward terms."""
+
+        observation: array("WND", wp.float32)
+        terms: array("WNK", wp.float32)
+        reward: array("WN", wp.float32)  # 0 for vehicles that had ended before, and right after a reset
+        alive: array("WN", wp.bool)  # had not ended before this step
+        terminated: array("WN", wp.bool)  # ended in this step
+        truncated: array("WN", wp.bool)  # the world is over and this vehicle has not just terminated
+        over: array("W", wp.int32)  # 1: at the horizon, or every vehicle has ended
+        position_error: array("WN", scalar)  # m
+        orientation_error: array("WN", scalar)  # deg
+        nees: array("WN", scalar)
+        log_determinant: array("WN", scalar)  # of P
+        gramian_min_eigenvalue: array("WN", scalar)
+        targets_in_view: array("WN", wp.int32)
+        last_goal_distance: array("WN", scalar)  # m, at the last step
+        last_ended: array("WN", wp.int32)  # at the last step
+        last_tick: array("WN", wp.int32)  # of the last step
+
+    return StepResults
+
+
+MEMORY = {
+    "last_goal_distance": NUMBER._replace(of_truth=True),
+    "last_ended": whole(0, "last_outcome"),
+    "last_tick": whole(0, "tick"),
+    "over": FLAG,
+}
+"""Fields that carry over from one step to the next, and what a saved state may hold of them."""
+
+
+@wp.func
+def forget(model: Any, state: Any, results: Any, world: int, vehicle: int):
+    """Start the memory of a new episode."""
+    results.last_goal_distance[world, vehicle] = goal_distance(model, state, world, vehicle)
+    results.last_ended[world, vehicle] = UNDER_WAY
+    results.last_tick[world, vehicle] = 0
+
+
+@wp.func
+def remember(model: Any, state: Any, results: Any, world: int, vehicle: int):
+    """Keep what the next step compares with."""
+    results.last_goal_distance[world, vehicle] = goal_distance(model, state, world, vehicle)
+    results.last_ended[world, vehicle] = state.ended[world, vehicle]
+    results.last_tick[world, vehicle] = state.tick[world]
+
+
+@wp.func
+def assess(model: Any, state: Any, results: Any, world: int, vehicle: int):
+    """Compare the estimate with the truth and with what it believes of itself."""
+    agent = model.landmarks + vehicle
+    R = state.rotation[world, agent]
+    position = state.position[world, agent]
+    R_hat = state.estimate_rotation[world, vehicle]
+    p_hat = state.estimate_position[world, vehicle]
+    angle = rotation_angle(wp.transpose(R_hat) * R, p_hat)
+    results.position_error[world, vehicle] = wp.length(position - R_hat * p_hat)
+    results.orientation_error[world, vehicle] = angle * type(angle)(DEGREES)
+    I11, L21, I22 = cholesky_of(state.covariance[world, vehicle], R - R)
+    e1, e2 = observer_error(R, position, R_hat, p_hat)
+    results.nees[world, vehicle] = normalised_error_squared(I11, L21, I22, e1, e2)
+    results.log_determinant[world, vehicle] = log_determinant(I11, I22)
+    results.gramian_min_eigenvalue[world, vehicle] = gramian_smallest_eigenvalue(model, state, world, vehicle)
+    results.targets_in_view[world, vehicle] = targets_in_view(model, state, world, vehicle)
+
+
+@wp.func
+def is_over(model: Any, state: Any, world: int) -> bool:
+    """Return whether a world is at its horizon or has no vehicle under way."""
+    if state.tick[world] >= model.horizon_ticks:
+        return True
+    for vehicle in range(model.vehicles):
+        if state.ended[world, vehicle] == UNDER_WAY:
+            return False
+    return True
+
+
+@wp.func
+def set_flags(model: Any, state: Any, results: Any, world: int, vehicle: int):
+    """Write who is under way, who has just ended, and whether the world is over."""
+    # Over since the last step: nothing more is earned before a reset (each vehicle reads its own memory only).
+    waiting = results.last_tick[world, vehicle] >= model.horizon_ticks
+    alive = results.last_ended[world, vehicle] == UNDER_WAY and not waiting
+    terminated = alive and state.ended[world, vehicle] != UNDER_WAY
+    over = is_over(model, state, world)
+    results.alive[world, vehicle] = alive
+    results.terminated[world, vehicle] = terminated
+    results.truncated[world, vehicle] = over and not terminated
+    if vehicle == 0:
+        results.over[world] = wp.where(over, 1, 0)

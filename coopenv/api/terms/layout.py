@@ -1,0 +1,127 @@
+"""Which entry of an observation or action means what: the published tables, and the spaces built from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from gymnasium import spaces
+
+from coopenv.scenario import Scenario
+from coopenv.scenario.term_tables import OBSERVATION_FIELDS
+from coopenv.scenario.terms import ObservationField
+
+
+@dataclass(frozen=True)
+class Field:
+    """One named part of the flat observation; every entry is (value / scale), clipped to [low, 1]."""
+
+    start: int
+    stop: int
+    shape: tuple[int, ...]
+    group: str
+    unit: str
+    scale: float
+    low: float
+    meaning: str
+
+    @property
+    def slice(self) -> slice:
+        """The field's place in the flat vector."""
+        return slice(self.start, self.stop)
+
+
+@dataclass(frozen=True)
+class ActionField:
+    """One entry of an action, which spans [low, high] as it goes from -1 to 1."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+
+    def level(self, value: float) -> float:
+        """Return the entry of an action that asks for a value in the field's unit; beyond [-1, 1] if out of reach."""
+        return 2.0 * (value - self.low) / (self.high - self.low) - 1.0
+
+
+class Layout(dict[str, Field]):
+    """The fields of the flat observation by name, in their order, and those of the action in `action`."""
+
+    def __init__(self, fields: Mapping[str, Field], action: tuple[ActionField, ...]) -> None:
+        super().__init__(fields)
+        self.action = action
+
+    @property
+    def size(self) -> int:
+        """Length of the flat observation."""
+        return max(field.stop for field in self.values())
+
+    def copy(self) -> Layout:
+        """Return another one that may be changed."""
+        return Layout(self, self.action)
+
+
+def included_fields(scenario: Scenario) -> dict[str, ObservationField]:
+    """Return the rows of the fields that a scenario's observation holds: coopenv's, then others as they are listed."""
+    wanted = scenario.observation.include
+    known = OBSERVATION_FIELDS.known(scenario.observation.custom)
+    rows = {name: row for name, row in known.items() if (row.group or name) in wanted}
+    others = [name for name in rows if name not in OBSERVATION_FIELDS.built_in]
+    others.sort(key=lambda name: wanted.index(rows[name].group or name))
+    names = [name for name in OBSERVATION_FIELDS.built_in if name in rows] + others
+    return {name: rows[name] for name in names}
+
+
+def observation_layout(scenario: Scenario) -> Layout:
+    """Return the fields in their order in the flat observation, the same for every vehicle.
+
+    Other vehicles are listed in ascending order without the vehicle itself; targets are all landmarks, then all
+    vehicles, the vehicle itself included (always masked).
+    """
+    counts = {"target": len(scenario.target_names), "neighbour": len(scenario.vehicles) - 1}
+    layout, start = {}, 0
+    for name, row in included_fields(scenario).items():
+        each = () if row.size == 1 and row.per != "vehicle" else (row.size,)
+        shape = each if row.per == "vehicle" else (counts[row.per], *each)
+        stop = start + int(np.prod(shape))
+        group, low = row.group or name, float(row.low)
+        layout[name] = Field(start, stop, shape, group, row.unit, _scale(row, scenario), low, row.meaning)
+        start = stop
+    return Layout(layout, action_fields(scenario))
+
+
+def _scale(row: ObservationField, scenario: Scenario) -> float:
+    if row.scale == "targets":
+        return float(len(scenario.target_names))
+    return float(getattr(scenario.observation, row.scale) if isinstance(row.scale, str) else row.scale)
+
+
+def action_fields(scenario: Scenario) -> tuple[ActionField, ...]:
+    """Return what the two entries of an action mean: speed or acceleration, and steering (positive turns left)."""
+    limits = scenario.dynamics
+    steering = scenario.action.steering or limits.max_steering
+    if scenario.action.longitudinal == "acceleration":
+        first = ActionField("acceleration", "m/s^2", -limits.max_acceleration, limits.max_acceleration)
+    else:
+        first = ActionField("speed", "m/s", -limits.max_speed if limits.reverse else 0.0, limits.max_speed)
+    return first, ActionField("steering", "rad", -steering, steering)
+
+
+def flat_space(layout: Mapping[str, Field]) -> spaces.Box:
+    """Return the flat float32 Box."""
+    low = np.concatenate([np.full(f.stop - f.start, f.low, dtype=np.float32) for f in layout.values()])
+    return spaces.Box(low, np.ones_like(low), dtype=np.float32)
+
+
+def dict_space(layout: Mapping[str, Field]) -> spaces.Dict:
+    """Return a one-level Dict of one-dimensional boxes, one per field."""
+    return spaces.Dict(
+        {name: spaces.Box(f.low, 1.0, shape=(f.stop - f.start,), dtype=np.float32) for name, f in layout.items()}
+    )
+
+
+def action_space() -> spaces.Box:
+    """Return the action: (speed or acceleration, steering; positive turns left), each in [-1, 1]."""
+    return spaces.Box(-1.0, 1.0, shape=(2,), dtype=np.float32)
