@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-train test-all test-matrix lint format bench schema clean
+.PHONY: help demo test test-train test-all test-matrix lint format bench stages schema clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -60,6 +60,9 @@ format: $(VENV)/.dev ## let ruff rewrite what it can
 
 bench: $(VENV)/.base ## measure steps per second
 	@$(BIN)/python -m benchmarks.speed
+
+stages: $(VENV)/.base ## measure what a vehicle tick costs, stage by stage
+	@$(BIN)/python -m benchmarks.stages
 
 schema: $(VENV)/.base ## write the JSON schema of scenario files, which editors complete from
 	@$(BIN)/coopenv schema --out docs/scenario.schema.json

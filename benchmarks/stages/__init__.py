@@ -1,0 +1,1 @@
+"""What a vehicle tick costs, stage by stage, and against another checkout: `python -m benchmarks.stages`."""

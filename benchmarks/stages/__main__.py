@@ -1,0 +1,137 @@
+"""`python -m benchmarks.stages`: what a vehicle tick costs on one core, stage by stage."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.machine import machine
+from benchmarks.stages.against import HERE, Case, Side, compile_seconds
+from benchmarks.stages.peeled import Setting, peeling, stepper
+from benchmarks.stages.rounds import alternate, ratio
+from coopenv.api.engine import Engine
+from coopenv.bench.tables import number_table
+from coopenv.cli.options import load, parse_overrides
+from coopenv.errors import CoopenvError
+from coopenv.runs.console import Progress
+
+SENSED = {"topology.mode": "sensed"}
+ROBUST = {"observer.name": "robust"}
+TOTALS: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("busy_intersection", SENSED),
+    ("urban_crossing", {}),
+    ("busy_intersection", SENSED | ROBUST),
+    ("urban_crossing", ROBUST),
+)
+"""Environments and overrides whose whole ticks are measured."""
+WARM_UP = 20
+"""Decisions after a start that do not count: estimates settle, and with them the number of re-linearisations."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure and print; return the exit status: 0, or 2 after a mistake in the input."""
+    asked = parser().parse_args(arguments)
+    out, log = Console(markup=False, highlight=False), Console(stderr=True)
+    place = machine()
+    try:
+        overrides = parse_overrides(asked.set)
+        out.print(
+            f"ns of CPU time per vehicle tick, {asked.worlds} worlds, {asked.dtype}, one thread; medians of "
+            f"{asked.rounds} alternating rounds of {asked.decisions} decisions. {place['processor']}, "
+            f"{place['cores_available']} cores, load {place['load_average_at_start']:.1f}.\n"
+        )
+        out.print(whole_table(asked, overrides, log))
+        out.print()
+        if asked.against is None:
+            out.print(stage_table(asked, SENSED | overrides, log))
+        elif asked.compiles:
+            out.print(compile_table(asked, log))
+    except CoopenvError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    found = argparse.ArgumentParser(prog="python -m benchmarks.stages", description=__doc__)
+    found.add_argument("environment", nargs="?", default="busy_intersection", metavar="ENV")
+    found.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override a scenario key")
+    found.add_argument("--worlds", type=int, default=512)
+    found.add_argument("--dtype", default="float32", choices=("float32", "float64"))
+    found.add_argument("--rounds", type=int, default=9, help="of which the median counts (default: 9)")
+    found.add_argument("--decisions", type=int, default=10, help="per round (default: 10)")
+    found.add_argument("--against", type=Path, metavar="DIR", help="another checkout: whole ticks of both, in turn")
+    found.add_argument("--compiles", type=int, default=1, help="of each kind, from an empty cache (default: 1)")
+    return found
+
+
+def whole_table(asked: argparse.Namespace, extra: dict[str, Any], log: Console) -> Table:
+    """Return the cost of steps of `make_vec` in some environments, of this checkout or of another one and this."""
+    cases = [Case(name, asked.worlds, asked.dtype, {**overrides, **extra}) for name, overrides in TOTALS]
+    checkouts = {"other": asked.against.resolve(), "this": HERE} if asked.against else {"this": HERE}
+    more = ["this / other", "middle half\nof rounds"] if asked.against else []
+    table = number_table(["make_vec"], [*checkouts, *more])
+    with ExitStack() as stack:
+        sides = [stack.enter_context(Side(checkout, cases)) for checkout in checkouts.values()]
+        with Progress(log, "building"):
+            for side in sides:
+                side.wait()
+        with Progress(log, "measuring", total=len(cases)) as progress:
+            for n, case in enumerate(progress.track(cases)):
+                times = 1e9 * alternate([partial(side.step, n, asked.decisions) for side in sides], asked.rounds)
+                cells = [f"{value:.0f}" for value in np.median(times, axis=0)]
+                if asked.against:
+                    share, low, high = ratio(times[:, 1], times[:, 0])
+                    cells += [f"{share:.3f}", f"{low:.3f}..{high:.3f}"]
+                table.add_row(case.name, *cells)
+    return table
+
+
+def stage_table(asked: argparse.Namespace, overrides: dict[str, Any], log: Console) -> Table:
+    """Return what the tick of an environment costs with stages switched off, each on top of those before it."""
+    peeled = list(peeling())
+    names = ["report and observation", *(name for name, _ in peeled)]
+    with Progress(log, "building", total=len(names) + 1) as progress:
+        engine = Engine(load(asked.environment, overrides), asked.worlds, asked.dtype, "cpu", 1)
+        engine.reset(range(asked.worlds))
+        steps = [stepper(engine.world, WARM_UP, lambda ticks: engine.step(ticks=ticks))]
+        for name, setting in zip(names, (Setting(), *(setting for _, setting in peeled)), strict=True):
+            progress.advance(f"building without {name}")
+            world = setting.world(asked.environment, overrides, asked.worlds, asked.dtype)
+            steps.append(stepper(world, WARM_UP))
+    with Progress(log, "measuring"):
+        times = 1e9 * alternate([partial(step, asked.decisions) for step in steps], asked.rounds)
+    table = number_table([f"stage ({asked.environment})"], ["cost", "middle half\nof rounds", "left\nwithout it"])
+    table.add_row("whole tick", "", "", f"{np.median(times[:, 0]):.0f}")
+    for name, before, after in zip(names, times.T, times.T[1:], strict=False):
+        low, high = np.quantile(before - after, (0.25, 0.75))
+        table.add_row(name, f"{np.median(before - after):.0f}", f"{low:.0f}..{high:.0f}", f"{np.median(after):.0f}")
+    return table
+
+
+def compile_table(asked: argparse.Namespace, log: Console) -> Table:
+    """Return the time of the first step with an empty kernel cache, of both checkouts, in turn."""
+    kinds: list[tuple[str, dict[str, Any]]] = [("float32", {}), ("float64", {}), ("float32", ROBUST)]
+    cases = [Case("busy_intersection", 1, dtype, overrides) for dtype, overrides in kinds]
+    table = number_table(["first step, empty cache"], ["other [s]", "this [s]", "this / other"])
+    with Progress(log, "compiling", total=len(cases)) as progress:
+        for case in progress.track(cases):
+            sides = [partial(compile_seconds, checkout, case) for checkout in (asked.against.resolve(), HERE)]
+            times = alternate(sides, asked.compiles)
+            other, this = np.median(times, axis=0)
+            table.add_row(f"{case.name}, {case.dtype}", f"{other:.1f}", f"{this:.1f}", f"{this / other:.2f}")
+    return table
+
+
+if __name__ == "__main__":
+    sys.exit(main())

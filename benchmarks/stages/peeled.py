@@ -1,0 +1,141 @@
+"""A tick with stages switched off, one after the other, through what the world is handed and flags of its model."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from coopenv.observers.briefing import start_covariances
+from coopenv.observers.embedded import find_embedded
+from coopenv.observers.riccati.kernels import DEAD_RECKONING
+from coopenv.scenario import load_scenario
+from coopenv.world.collision import referee
+from coopenv.world.embedded import HOST, SIMULATED, Embedded, Source, sense_simulation
+from coopenv.world.motion import move
+from coopenv.world.odometry import measure_odometry
+from coopenv.world.world import World
+
+NEVER = 1 << 30
+"""Ticks between what then does not happen."""
+
+
+@wp.func
+def without_camera(model: Any, state: Any, record: Any, actions: Any, world: int, tick: int) -> None:
+    """Move, measure odometry and look for contact."""
+    move(model, state, actions, world, tick)
+    for vehicle in range(model.vehicles):
+        measure_odometry(model, state, world, vehicle, tick)
+    for vehicle in range(model.vehicles):
+        referee(model, state, world, vehicle)
+
+
+@wp.func
+def without_odometry(model: Any, state: Any, record: Any, actions: Any, world: int, tick: int) -> None:
+    """Move and look for contact."""
+    move(model, state, actions, world, tick)
+    for vehicle in range(model.vehicles):
+        referee(model, state, world, vehicle)
+
+
+@wp.func
+def without_contact(model: Any, state: Any, record: Any, actions: Any, world: int, tick: int) -> None:
+    """Move."""
+    move(model, state, actions, world, tick)
+
+
+@wp.func
+def without_motion(model: Any, state: Any, record: Any, actions: Any, world: int, tick: int) -> None:
+    """Do nothing."""
+
+
+@wp.func
+def deliver_nothing(model: Any, state: Any, record: Any, world: int, vehicle: int, tick: int) -> None:
+    """Receive nothing."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A tick with some of its stages."""
+
+    observer: Embedded | None = None
+    """What estimates; None: the scenario's observer."""
+    sense: Any = sense_simulation
+    deliver: Any = SIMULATED.deliver
+    overrides: Mapping[str, Any] | None = None
+    """Changes of the scenario."""
+    visibility: bool = True
+    sending: bool = True
+    gramian: bool = True
+
+    def world(self, environment: str, overrides: Mapping[str, Any], worlds: int, dtype: str) -> World:
+        """Return worlds with these stages, on one thread, reset."""
+        scenario = load_scenario(environment, {**overrides, **(self.overrides or {})})
+        observer = self.observer or find_embedded(scenario.observer.name)
+        world = World(scenario, worlds, dtype, "cpu", 1, observer, start_covariances(scenario))
+        name = "simulated" if self.deliver is SIMULATED.deliver else "simulated_without_radio"
+        suffix = "" if self.sense is sense_simulation else f"_{self.sense.key}"
+        world.source = Source(name + suffix, SIMULATED.begin, self.sense, self.deliver)
+        if not self.visibility:
+            world.model.sensed = 0
+        if not self.sending:
+            world.model.radio.period = NEVER
+        if not self.gramian:
+            world.model.observer.gramian_stride = NEVER
+        world.reset(range(worlds))
+        return world
+
+
+def peeling() -> Iterator[tuple[str, Setting]]:
+    """Yield the stages in the order in which they are switched off, each with what is left then."""
+    setting = Setting()
+    for stage, change in STAGES:
+        setting = replace(setting, **change)
+        yield stage, setting
+
+
+STAGES: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("correction of the estimate", {"observer": DEAD_RECKONING}),
+    ("noise and initial errors", {"overrides": {"noise.enabled": False}}),
+    ("visibility (view, occlusion)", {"visibility": False}),
+    ("bearings", {"sense": without_camera}),
+    ("radio", {"deliver": deliver_nothing, "sending": False}),
+    ("Gramian", {"gramian": False}),
+    ("prediction of the estimate", {"observer": HOST}),
+    ("odometry", {"sense": without_odometry}),
+    ("contact and arrival", {"sense": without_contact}),
+    ("motion", {"sense": without_motion}),
+)
+
+
+def stepper(world: World, warm_up: int, advance: Callable[[int], None] | None = None) -> Callable[[int], float]:
+    """Return a function that runs decisions and returns the CPU time in s per vehicle tick.
+
+    Worlds start anew where the next decisions would reach the horizon, and then run for a while before time counts.
+
+    Args:
+        world: what is stepped.
+        warm_up: decisions after a start that do not count.
+        advance: runs the camera ticks of one decision; None: `world.advance`.
+    """
+    ticks, (W, N) = int(world.model.ticks_per_decision), world.actions.shape
+    world.actions.assign(np.random.default_rng(0).uniform(-1, 1, (W, N, 2)).astype(world.precision.numpy))
+
+    def run(decisions: int) -> None:
+        for _ in range(decisions):
+            (advance or world.advance)(ticks)
+
+    def step(decisions: int) -> float:
+        if int(world.view("tick")[0]) + decisions * ticks >= world.model.horizon_ticks:
+            world.reset()
+            run(warm_up)
+        begin = time.process_time()
+        run(decisions)
+        return (time.process_time() - begin) / (decisions * ticks * int(W) * int(N))
+
+    run(warm_up)
+    return step
