@@ -6,14 +6,22 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import coopenv
+from coopenv.api.registration import environment_id
+from coopenv.backends.mcap import write_recording
 from coopenv.cli import main
 from coopenv.cli.options import parse_value
 from coopenv.estimation.trajectory import Trajectory
+from coopenv.observers.recording import Truth
+from coopenv.observers.registry import observer_names
+from coopenv.runs.recorder import record
+from coopenv.shipped import list_agents
 
 FIGURES = {
     "errors.png",
@@ -36,19 +44,62 @@ def files(tmp_path: Path) -> Path:
     """A folder with a plain file and a scenario that is no TOML."""
     (tmp_path / "occupied").write_text("")
     (tmp_path / "broken.toml").write_text("title = ")
+    (tmp_path / "picture.toml").write_bytes(bytes([137, 80, 200, 0]))
+    (tmp_path / "rosbag").mkdir()
+    (tmp_path / "rosbag" / "metadata.yaml").write_text("")
     return tmp_path
 
 
-def test_list_names_every_environment(capsys: pytest.CaptureFixture[str]) -> None:
+def test_list_names_every_environment_on_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list"]) == 0
-    out = capsys.readouterr().out
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[2:]] == coopenv.list_envs()
+    assert max(map(len, lines)) <= 80
+    assert lines[2].split() == ["busy_intersection", "5", "3", "prescribed", "50"]
+
+
+def test_list_of_observers_and_agents(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list", "observers"]) == 0
+    lines = capsys.readouterr().out.splitlines()[2:]
+    assert [line.split()[0] for line in lines] == observer_names()
+    assert all(len(line) <= 80 and len(line.split()) > 2 for line in lines)
+    assert main(["list", "agents"]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[2:]] == list_agents()
+
+
+@pytest.mark.parametrize(
+    ("line", "names"),
+    [("list", coopenv.list_envs()), ("list observers", observer_names()), ("list agents", list_agents())],
+)
+def test_list_as_json(line: str, names: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*line.split(), "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in rows] == names
+    assert line != "list" or {row["id"] for row in rows} == {environment_id(name) for name in names}
+
+
+def test_describe_says_what_matters_on_one_screen(capsys: pytest.CaptureFixture[str]) -> None:
     for name in coopenv.list_envs():
-        assert any(line.startswith(f"{name} ") for line in out.splitlines())
-        assert coopenv.load_scenario(name).title in out
-    assert "coopenv/BusyIntersection-v0" in out
-    assert max(len(line) for line in out.splitlines()) <= 80
-    row = next(line.split() for line in out.splitlines() if line.startswith("busy_intersection "))
-    assert row == ["busy_intersection", "5", "3", "prescribed", "50", "s"]
+        assert main(["describe", name]) == 0
+        out = capsys.readouterr().out
+        assert len(out.splitlines()) <= 24
+        assert max(len(line.rstrip()) for line in out.splitlines()) <= 80
+        size = coopenv.parallel_env(name).observation_space("vehicle_1").shape[0]
+        assert f"Observation  {size} numbers per vehicle" in out
+        assert environment_id(name) in out
+    assert "4 driven by actions, up to 1 m/s; 4 with a goal" in out
+    assert "Action       2 numbers in [-1, 1]: speed 0 to 1 m/s, steering" in out
+
+
+def test_describe_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["describe", "urban_crossing", "--set", "v2x.loss=0.25", "--json"]) == 0
+    described = json.loads(capsys.readouterr().out)
+    env = coopenv.parallel_env("urban_crossing")
+    assert described["observation_size"] == env.observation_space("vehicle_1").shape[0]
+    assert list(described["observation"]) == list(env.observation_layout)
+    assert described["scenario"]["v2x"]["loss"] == 0.25
+    assert described["id"] == "coopenv/UrbanCrossing-v0"
+    assert [entry["name"] for entry in described["action"]] == ["speed", "steering"]
 
 
 def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
@@ -83,6 +134,14 @@ def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
         ("run busy_intersection --out occupied/below", "cannot write to"),
         ("schema --out missing/schema.json", "cannot write to"),
         ("describe", "ENV"),
+        ("list things", "things"),
+        ("run occupied.db3", "occupied.db3: a ROS bag, which coopenv does not read"),
+        ("run ./rosbag", "rosbag: a ROS bag"),
+        ("describe picture.toml", "picture.toml: not a text file"),
+        ("run busy_intersection --figures gif", "--figures"),
+        ("run nowhere.mcap", "nowhere.mcap"),
+        ("run nowhere.mcap --seed 1", "--seed: is for a simulation, nowhere.mcap is recorded"),
+        ("run busy_intersection --variant blind", "is for recorded data"),
         ("run busy_intersection --bogus", "--bogus"),
         ("frobnicate", "frobnicate"),
     ],
@@ -96,7 +155,7 @@ def test_mistakes_end_with_one_line_and_status_2(
     assert captured.err.startswith("error: ")
     assert captured.err.count("\n") == 1
     assert message in captured.err
-    assert {path.name for path in files.iterdir()} <= {"occupied", "broken.toml", "out"}
+    assert {path.name for path in files.iterdir()} <= {"occupied", "broken.toml", "picture.toml", "rosbag", "out"}
 
 
 def test_run_writes_its_files_and_prints_its_table(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -117,6 +176,51 @@ def test_run_writes_its_files_and_prints_its_table(capsys: pytest.CaptureFixture
     assert "stopped after the steps asked for, at 12 s" in out
     assert "Files in out/busy_intersection:" in out
     assert max(len(line) for line in out.splitlines()) <= 80
+
+
+def test_run_as_json_prints_nothing_else(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["run", "overtaking", "--steps", "10", "--no-figures", "--json", "--policy", "random"]) == 0
+    captured = capsys.readouterr()
+    printed = json.loads(captured.out)
+    assert "the policy has no effect" in captured.err
+    assert printed["files"] == ["out/overtaking/metrics.json", "out/overtaking/trajectory.npz"]
+    folder = tmp_path / "out" / "overtaking"
+    assert sorted(path.name for path in folder.iterdir()) == ["metrics.json", "trajectory.npz"]
+    assert json.loads((folder / "metrics.json").read_text()) == {k: v for k, v in printed.items() if k != "files"}
+
+
+def test_figures_in_another_format_replace_the_older_ones(tmp_path: Path) -> None:
+    for option in ("--figures=png", "--figures=svg"):
+        assert main(["run", "overtaking", "--steps", "5", "--out", "here", option]) == 0
+    names = {name.replace(".png", ".svg") for name in FIGURES}
+    assert {path.name for path in (tmp_path / "here").iterdir()} == names | {"metrics.json", "trajectory.npz"}
+    assert "<svg" in (tmp_path / "here" / "errors.svg").read_text()
+
+
+def test_a_log_file_runs_and_is_described_like_an_environment(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["record", "overtaking", "--set", "horizon=2.0", "--out", "drive.mcap"]) == 0
+    assert main(["run", "drive.mcap", "--no-figures", "--steady-from", "1"]) == 0
+    assert main(["run", "overtaking", "--set", "horizon=2.0", "--no-figures", "--steady-from", "1"]) == 0
+    tables = [line for line in capsys.readouterr().out.splitlines() if line.startswith("vehicle_")]
+    assert len(tables) == 4 and tables[:2] == tables[2:]
+    assert main(["describe", "drive.mcap"]) == 0
+    assert "Recorded: every episode is the recording" in capsys.readouterr().out
+
+
+def test_a_log_file_is_judged_where_the_truth_is_known(capsys: pytest.CaptureFixture[str]) -> None:
+    recording = record(coopenv.load_scenario("overtaking", {"horizon": 2.0}))
+    for name, unknown in (("part.mcap", slice(0, 30)), ("blind.mcap", slice(None))):
+        rotation, position = recording.truth.rotation.copy(), recording.truth.position.copy()
+        rotation[unknown], position[unknown] = np.nan, np.nan
+        write_recording(replace(recording, truth=Truth(rotation, position)), Path(name))
+    assert main(["run", "part.mcap", "--steady-from", "1"]) == 0
+    metrics = json.loads(Path("out/part/metrics.json").read_text())
+    assert all(np.isfinite(vehicle["steady_position_rmse_m"]) for vehicle in metrics["vehicles"])
+    assert metrics["simulated_time_s"] == 2.0
+    assert len(Trajectory.load(Path("out/part/trajectory.npz")).t) == 121
+    assert main(["run", "blind.mcap"]) == 2
+    assert "no true poses are known" in capsys.readouterr().err
+    assert not Path("out/blind").exists()
 
 
 @pytest.mark.parametrize("name", ["metrics.json", "trajectory.npz", *sorted(FIGURES), "video.gif"])
@@ -158,7 +262,7 @@ def test_video_without_the_extra_is_a_gif(capsys: pytest.CaptureFixture[str], mo
     monkeypatch.setattr("coopenv.runs.video.find_spec", lambda name: None)
     assert main(["run", "urban_crossing", "--steps", "3", "--video", "--policy", "random", "--out", "film"]) == 0
     assert Path("film/video.gif").read_bytes()[:3] == b"GIF"
-    assert "pip install 'coopenv[video]'" in capsys.readouterr().err
+    assert "pip install '.[video]'" in capsys.readouterr().err
 
 
 def test_scenarios_from_a_path_and_their_warnings(capsys: pytest.CaptureFixture[str]) -> None:

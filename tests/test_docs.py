@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from coopenv.observers import run
 from coopenv.observers.registry import find
@@ -15,8 +18,21 @@ from coopenv.scenario import load_scenario
 DOCS = Path(__file__).parents[1] / "docs"
 
 
+def python_blocks(page: Path) -> list[str]:
+    return re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+
+
+@pytest.mark.parametrize("page", [DOCS.parent / "README.md", *sorted(DOCS.glob("*.md"))], ids=lambda page: page.name)
+def test_blocks_are_whole_programs(page: Path, tmp_path: Path) -> None:
+    for number, block in enumerate(python_blocks(page)):
+        (tmp_path / f"block_{number}.py").write_text(block, encoding="utf-8")
+    command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select=E9,F", "--no-cache", str(tmp_path)]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
 def test_the_tutorials_observer_runs() -> None:
-    blocks = re.findall(r"```python\n(.*?)```", (DOCS / "observers.md").read_text(encoding="utf-8"), re.DOTALL)
+    blocks = python_blocks(DOCS / "observers.md")
     assert blocks
     for block in blocks:
         exec(compile(block, "observers.md", "exec"), {})

@@ -34,7 +34,7 @@ class Exchange:
         if self.kind not in ("numpy", "torch"):
             raise CoopenvError(f"unknown arrays '{kind}'; known: numpy, torch")
         if self.kind == "torch" and find_spec("torch") is None:
-            raise CoopenvError("arrays='torch' needs torch: pip install 'coopenv[train]'")
+            raise CoopenvError("arrays='torch' needs torch: pip install '.[train]'")
         worlds, vehicles = engine.world.worlds, engine.world.model.vehicles
         self._rows = worlds * vehicles
         self._shape = (worlds, vehicles, 2)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 from rich.table import Table
@@ -62,11 +63,16 @@ def score(episodes: Iterator[tuple[float, list[str], list[float]]]) -> Score:
     )
 
 
+def score_document(rows: Iterable[tuple[str, str, Score]]) -> list[dict[str, Any]]:
+    """Return what `bench agents --json` prints of (driver, environment, score)."""
+    return [{"agent": agent, "environment": environment, **asdict(s)} for agent, environment, s in rows]
+
+
 def score_table(rows: Iterable[tuple[str, str, Score]]) -> Table:
     """Return one row per (driver, environment, score)."""
     outcomes = ("arrived", "collided", "out of\ntime")
-    errors = ("error [m]\nmedian", "\n95 %")
-    table = number_table(("agent", "environment"), ("runs", *outcomes, "return of\nall vehicles", *errors), gap=0)
+    errors = ("median\nerror", "95 %\nerror")
+    table = number_table(("agent", "environment"), ("runs", *outcomes, "return", *errors), gap=0)
     for agent, environment, s in rows:
         table.add_row(
             agent,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from rich.table import Table
@@ -32,6 +33,27 @@ class SeedStudy:
     """(S, N) m"""
     final_orientation_error: np.ndarray
     """(S, N) deg"""
+
+    def document(self, environment: str) -> dict[str, Any]:
+        """Return what `bench seeds --json` prints: per vehicle, one figure per seed."""
+        names = {
+            "position_rmse_m": self.position_rmse,
+            "orientation_rmse_deg": self.orientation_rmse,
+            "settle_time_s": self.settle_time,
+            "final_position_error_m": self.final_position_error,
+            "final_orientation_error_deg": self.final_orientation_error,
+        }
+        rows = [
+            {"vehicle": vehicle, **{name: values[:, i] for name, values in names.items()}}
+            for i, vehicle in enumerate(self.vehicles)
+        ]
+        return {
+            "environment": environment,
+            "seeds": self.seeds,
+            "steady_from_s": self.steady_from,
+            "settled_below": SETTLED._asdict(),
+            "vehicles": rows,
+        }
 
 
 def study_seeds(

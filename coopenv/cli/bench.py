@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from coopenv.cli import complete
-from coopenv.cli.options import DataFolder, Environment, Overrides, SteadyFrom, console, load, parse_overrides, warned
+from coopenv.cli.options import (
+    AsJson,
+    DataFolder,
+    Environment,
+    Overrides,
+    Source,
+    SteadyFrom,
+    console,
+    load,
+    parse_overrides,
+    warned,
+)
 
 bench = typer.Typer(help="Compare observers, study seeds, score drivers.", no_args_is_help=True)
 
@@ -20,10 +32,12 @@ def bench_agents(
         typer.Argument(metavar="[AGENT]...", help="Names of agents (default: all).", autocompletion=complete.agents),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Number of episodes, with the seeds 0, 1, ...")] = 20,
+    as_json: AsJson = False,
 ) -> None:
     """Score drivers: who arrives, who collides, who knows its pose."""
     from coopenv.api.parallel_env import parallel_env
-    from coopenv.bench.drivers import play, score, score_table
+    from coopenv.bench.drivers import play, score, score_document, score_table
+    from coopenv.jsonable import json_text
     from coopenv.policies import load_agent, read_card
     from coopenv.runs.console import Progress
     from coopenv.shipped import list_agents
@@ -35,7 +49,12 @@ def bench_agents(
             policy = load_agent(agent, env.scenario)
             with Progress(console(stderr=True), f"{agent} in {name}") as progress:
                 rows.append((agent, name, score(play(env, policy, seed) for seed in progress.track(range(seeds)))))
-    console().print(score_table(rows))
+    if as_json:
+        sys.stdout.write(json_text(score_document(rows)))
+        return
+    out = console()
+    out.print(score_table(rows))
+    out.print("Return: sum over the vehicles of an episode, mean ± standard deviation. Errors in m.")
 
 
 @bench.command("seeds")
@@ -45,16 +64,21 @@ def bench_seeds(
     first: Annotated[int, typer.Option(min=0, help="The first seed.")] = 0,
     overrides: Overrides = None,
     steady_from: SteadyFrom = None,
+    as_json: AsJson = False,
 ) -> None:
     """Run many seeds at once: who settles, and the steady errors."""
     scenario = load(environment, parse_overrides(overrides))
     from coopenv.bench.seeds import seed_table, study_seeds
     from coopenv.estimation.metrics import SETTLED, steady_start
+    from coopenv.jsonable import json_text
     from coopenv.runs.console import Progress
 
     start = steady_start(steady_from, scenario.horizon)
     with Progress(console(stderr=True), f"{seeds} seeds", total=1.0) as progress:
         study = study_seeds(scenario, range(first, first + seeds), start, on_progress=progress.update)
+    if as_json:
+        sys.stdout.write(json_text(study.document(Path(environment).stem)))
+        return
     out = console()
     out.print(seed_table(study))
     out.print(f"Steady: after {start:g} s. Settled: below {SETTLED.text} until the end.")
@@ -62,14 +86,7 @@ def bench_seeds(
 
 @bench.command("observers")
 def bench_observers(
-    source: Annotated[
-        str,
-        typer.Argument(
-            metavar="ENV|DATASET|FILE.mcap",
-            help="Environment (name or TOML file), recorded robots (mrclam_1 .. mrclam_9) or a log file.",
-            autocompletion=complete.environments,
-        ),
-    ],
+    source: Source,
     observers: Annotated[
         str | None,
         typer.Option(
@@ -95,8 +112,9 @@ def bench_observers(
     steady_from: SteadyFrom = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the leaderboard and the report.")] = None,
     figures: Annotated[
-        str | None, typer.Option("--format", help="Also write figures as files to the folder: png, pdf or svg.")
+        str | None, typer.Option("--figures", help="Also write figures as files to the folder: png, pdf or svg.")
     ] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Compare observers on the same data and with their bound."""
     from coopenv.bench.observers.command import perform, request_of
@@ -107,4 +125,4 @@ def bench_observers(
         changes, numbers = parse_overrides(overrides), range(first, first + seeds)
         request = request_of(source, observers, variants, numbers, steady_from, basin, data, changes, overrides or ())
         request.source.check()
-    perform(request, find_engine(engine, jobs, address), out, figures, printed, log)
+    perform(request, find_engine(engine, jobs, address), out, figures, printed, log, as_json)

@@ -18,6 +18,8 @@ from coopenv.errors import CoopenvError, DataWarning
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from coopenv.backends.base import Backend
+
 DEFAULT_WIDTH = 80
 """Columns of text where the terminal does not say."""
 
@@ -26,6 +28,14 @@ Environment = Annotated[
     typer.Argument(
         metavar="ENV",
         help="Name of an environment (see `coopenv list`) or path of a TOML file.",
+        autocompletion=complete.environments,
+    ),
+]
+Source = Annotated[
+    str,
+    typer.Argument(
+        metavar="ENV|DATASET|FILE.mcap",
+        help="Environment (name or TOML file), recorded robots (mrclam_1 .. mrclam_9) or a log file.",
         autocompletion=complete.environments,
     ),
 ]
@@ -51,6 +61,10 @@ PolicyName = Annotated[
 DataFolder = Annotated[
     Path | None, typer.Option("--data", help="Folder of recorded data sets (default: the variable COOPENV_DATA).")
 ]
+Variant = Annotated[
+    str | None, typer.Option("--variant", help="Variant of a data set: landmarks, landmarks+robots or blind.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 SteadyFrom = Annotated[
     float | None,
     typer.Option(help="Start of the steady state in s (default: 70 % of the horizon).", show_default=False),
@@ -73,6 +87,14 @@ def load(environment: str, overrides: dict[str, Any]) -> Any:
 
     with warned():
         return load_scenario(environment, overrides)
+
+
+def open_source(environment: str, overrides: dict[str, Any], data: Path | None, variant: str | None) -> Backend:
+    """Return where the ticks of an environment or a recording come from, warnings printed as one line each."""
+    from coopenv.backends.sources import open_backend
+
+    with warned():
+        return open_backend(environment, None, overrides, data, variant)
 
 
 @contextmanager

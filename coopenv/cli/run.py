@@ -2,29 +2,41 @@
 
 from __future__ import annotations
 
+import sys
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from coopenv.cli import complete
 from coopenv.cli.options import (
+    AsJson,
     DataFolder,
-    Environment,
     Overrides,
     PolicyName,
     Seed,
+    Source,
     SteadyFrom,
+    Variant,
     console,
     load,
+    open_source,
     parse_overrides,
     warned,
 )
 from coopenv.errors import CoopenvError, OutputError
 
 
+class FigureFormat(StrEnum):
+    """Formats of figures."""
+
+    PNG = "png"
+    PDF = "pdf"
+    SVG = "svg"
+
+
 def run(
-    environment: Environment,
+    environment: Source,
     seed: Seed = 0,
     overrides: Overrides = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Decisions to run (default: up to the horizon).")] = None,
@@ -33,17 +45,23 @@ def run(
     dtype: Annotated[str, typer.Option(help="Precision: float32 or float64.")] = "float64",
     policy: PolicyName = "zero",
     steady_from: SteadyFrom = None,
+    figures: Annotated[FigureFormat, typer.Option(help="Format of the figures.")] = FigureFormat.PNG,
+    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
     video: Annotated[bool, typer.Option("--video", help="Also write a video of the top view.")] = False,
+    as_json: AsJson = False,
+    data: DataFolder = None,
+    variant: Variant = None,
 ) -> None:
     """Run an environment; write metrics, arrays and figures."""
-    parsed = parse_overrides(overrides)
-    scenario = load(environment, parsed)
-    from coopenv.runs.command import RunRequest, execute
+    from coopenv.jsonable import json_text
+    from coopenv.runs.command import RunRequest, execute, report
 
+    parsed = parse_overrides(overrides)
+    refuse_for_recordings(environment, seed=seed, policy=policy)
     name = Path(environment).stem
     request = RunRequest(
         name=name,
-        scenario=scenario,
+        backend=open_source(environment, parsed, data, variant),
         folder=out if out is not None else Path("out") / name,
         overrides=parsed,
         seed=seed,
@@ -52,26 +70,37 @@ def run(
         dtype=dtype,
         policy=policy,
         steady_from=steady_from,
+        figures=None if no_figures else figures.value,
         video=video,
     )
-    execute(request, console(), console(stderr=True))
+    result = execute(request, console(stderr=True))
+    if as_json:
+        sys.stdout.write(json_text(result.document()))
+    else:
+        report(request, result, console())
+
+
+def refuse_for_recordings(environment: str, seed: int, policy: str) -> None:
+    """Refuse options that only a simulation knows.
+
+    Raises:
+        CoopenvError: one was given for a recording.
+    """
+    from coopenv.backends.replay import is_recorded
+
+    for option, value in (("--seed", seed), ("--policy", policy)):
+        if is_recorded(environment) and value not in (0, "zero"):
+            raise CoopenvError(f"{option}: is for a simulation, {environment} is recorded")
 
 
 def record_command(
-    environment: Annotated[
-        str,
-        typer.Argument(
-            metavar="ENV|DATASET",
-            help="Environment, TOML file, or a data set such as mrclam_6.",
-            autocompletion=complete.environments,
-        ),
-    ],
+    environment: Source,
     out: Annotated[Path, typer.Option(help="MCAP file to write.")],
     seed: Seed = 0,
     policy: PolicyName = "zero",
     overrides: Overrides = None,
     data: DataFolder = None,
-    variant: Annotated[str | None, typer.Option(help="Variant of a data set, e.g. landmarks or blind.")] = None,
+    variant: Variant = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
 ) -> None:
     """Write what vehicles sense to an MCAP file.
@@ -79,24 +108,24 @@ def record_command(
     The file holds every tick; Foxglove opens it and coopenv replays it.
     """
     from coopenv.backends.mcap import check_target, write_recording
-    from coopenv.backends.replay import is_recorded
-    from coopenv.runs.log import read_recorded, simulate
+    from coopenv.backends.replay import is_recorded, open_recording
+    from coopenv.runs.recorder import record
 
     check_target(out)
     if out.exists() and not force:
         raise OutputError(f"{out}: exists already; --force replaces it")
     parsed = parse_overrides(overrides)
     if is_recorded(environment):
-        asked = {"--set": parsed, "--seed": seed, "--policy": policy if policy != "zero" else None}
+        refuse_for_recordings(environment, seed, policy)
+        if parsed:
+            raise CoopenvError(f"--set: is for a simulation, {environment} is recorded")
         with warned():
-            recording = read_recorded(
-                environment, data, variant, {name: value for name, value in asked.items() if value}
-            )
+            recording = open_recording(environment, data, variant)
     else:
         for option, value in (("--data", data), ("--variant", variant)):
             if value is not None:
                 raise CoopenvError(f"{option} {value}: is for recorded data, {environment} is simulated")
-        recording = simulate(load(environment, parsed), seed, policy)
+        recording = record(load(environment, parsed), seed, policy)
     write_recording(recording, out)
     console().print(
         f"{out}: {len(recording.setups)} vehicles, {recording.ticks} ticks, {recording.t[-1]:g} s", soft_wrap=True

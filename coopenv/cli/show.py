@@ -2,30 +2,77 @@
 
 from __future__ import annotations
 
+import sys
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from coopenv.cli.options import Environment, Overrides, console, load, parse_overrides
+from coopenv.cli.options import (
+    AsJson,
+    DataFolder,
+    Overrides,
+    Source,
+    Variant,
+    console,
+    load,
+    open_source,
+    parse_overrides,
+)
 
 
-def list_command() -> None:
-    """List the environments that ship with coopenv."""
-    from coopenv.runs.describe import environment_table
+class Kind(StrEnum):
+    """What `coopenv list` lists."""
+
+    ENVS = "envs"
+    OBSERVERS = "observers"
+    AGENTS = "agents"
+
+
+def list_command(
+    kind: Annotated[Kind, typer.Argument(help="What to list.")] = Kind.ENVS, as_json: AsJson = False
+) -> None:
+    """List environments, observers or agents."""
+    from coopenv.jsonable import json_text
+    from coopenv.runs import listing
     from coopenv.shipped import list_envs
 
-    out = console()
-    out.print(environment_table({name: load(name, {}) for name in list_envs()}))
+    if kind is Kind.ENVS:
+        rows = listing.environment_rows({name: load(name, {}) for name in list_envs()})
+    else:
+        rows = listing.observer_rows() if kind is Kind.OBSERVERS else listing.agent_rows()
+    if as_json:
+        sys.stdout.write(json_text(rows))
+    else:
+        console().print(listing.list_table(rows, listing.COLUMNS[kind]))
 
 
-def describe(environment: Environment, overrides: Overrides = None) -> None:
+def describe(
+    environment: Source,
+    overrides: Overrides = None,
+    everything: Annotated[bool, typer.Option("--all", help="Also every vehicle, setting and field.")] = False,
+    as_json: AsJson = False,
+    data: DataFolder = None,
+    variant: Variant = None,
+) -> None:
     """Say what an environment is: vehicles, sensors, observer."""
+    from coopenv.backends.simulated import Simulated
+    from coopenv.jsonable import json_text
     from coopenv.runs.describe import describe_scenario
+    from coopenv.runs.summary import document, summary
 
+    name = Path(environment).stem
+    backend = open_source(environment, parse_overrides(overrides), data, variant)
+    scenario, recorded = backend.scenario, not isinstance(backend, Simulated)
+    if as_json:
+        sys.stdout.write(json_text(document(name, scenario)))
+        return
     out = console()
-    for part in describe_scenario(load(environment, parse_overrides(overrides))):
+    for part in describe_scenario(scenario) if everything else summary(name, scenario, recorded):
         out.print(part)
+    if not everything:
+        out.print("\nMore: --all (every vehicle, setting and field), --json (all of it as data).")
 
 
 def schema(
@@ -36,7 +83,7 @@ def schema(
     from coopenv.scenario.json_schema import schema_text
 
     if out is None:
-        print(schema_text(), end="")
+        sys.stdout.write(schema_text())
         return
     with replacing_file(out) as new:
         new.write_text(schema_text(), encoding="utf-8")

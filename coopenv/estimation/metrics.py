@@ -350,17 +350,6 @@ def summarise(trajectory: Trajectory, steady_from: float, ends: Sequence[float] 
     return rows
 
 
-def json_ready(value: Any) -> Any:
-    """Return `value` as plain Python, with None for the numbers that JSON lacks (NaN, inf)."""
-    if isinstance(value, dict):
-        return {key: json_ready(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [json_ready(item) for item in value]
-    if isinstance(value, np.ndarray | np.generic):
-        return json_ready(value.tolist())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def _mean(values: np.ndarray) -> np.ndarray:
     """Return the mean over the first axis, NaN when it is empty."""
     return np.mean(values, axis=0) if len(values) else np.full(values.shape[1:], np.nan)

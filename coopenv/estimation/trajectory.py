@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from pathlib import Path
 
@@ -61,6 +61,14 @@ class Trajectory:
     vehicles: np.ndarray  # (N,) names
     targets: np.ndarray  # (T,) names
     target_moving: np.ndarray  # (T,) bool: vehicles and moving landmarks
+
+    def where_truth_is_known(self) -> Trajectory:
+        """Return the ticks at which every vehicle's true pose is known, as it may not be in a recording."""
+        known = np.isfinite(self.position).all(axis=(1, 2)) & np.isfinite(self.rotation).all(axis=(1, 2, 3))
+        if known.all():
+            return self
+        constant = ("vehicles", "targets", "target_moving")
+        return replace(self, **{f.name: getattr(self, f.name)[known] for f in fields(self) if f.name not in constant})
 
     def save(self, path: Path) -> None:
         """Write every array into a compressed `.npz` under its field name.

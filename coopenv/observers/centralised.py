@@ -18,7 +18,10 @@ from coopenv.observers.mekf import LeftError, innovation, kalman, transition
 
 
 class Centralised:
-    """Has every measurement of every vehicle at once; loss and delay of messages do not touch it."""
+    """One filter over all vehicles and all measurements.
+
+    It reads no messages, so their loss and delay change nothing.
+    """
 
     joint = True
 

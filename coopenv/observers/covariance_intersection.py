@@ -22,8 +22,9 @@ LOWEST, HIGHEST = 0.02, 1.0 - 1e-6
 
 
 class CovarianceIntersection(Mekf):
-    """Landmarks by a Kalman update, then neighbours one at a time by covariance intersection.
+    """Kalman filter; neighbours by covariance intersection.
 
+    Landmarks come first, by a Kalman update, then neighbours one at a time.
     It tells the normalised innovation of the landmarks; an inflated one has no distribution.
     """
 

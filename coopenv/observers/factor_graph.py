@@ -39,7 +39,10 @@ class Residuals:
 
 
 class FactorGraph:
-    """Smooths at key frames, adds odometry between them; sends position and covariance."""
+    """Factor graph smoothed at key frames; sends covariances.
+
+    Between key frames it adds odometry.
+    """
 
     def __init__(self, setup: Setup) -> None:
         """Remember the marker, which is what others measure, and the camera's place."""

@@ -11,7 +11,7 @@ from coopenv.observers.riccati.plugin import Riccati
 
 
 class HamelSamson(Riccati):
-    """Uses no neighbour and sends nothing."""
+    """The paper's observer with landmarks alone."""
 
     landmarks_only = True
 

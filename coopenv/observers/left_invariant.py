@@ -43,7 +43,7 @@ class InvariantError(LeftError):
 
 
 class LeftInvariant(Mekf):
-    """Invariant filter; sends position and covariance."""
+    """Invariant filter, left error; sends covariances."""
 
     belief: ClassVar[type[LeftError]] = InvariantError
     sends_covariance = True

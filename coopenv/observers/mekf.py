@@ -95,7 +95,10 @@ def kalman(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array,
 
 
 class Mekf:
-    """Error-state filter; sends its position and trusts the positions that it hears."""
+    """Error-state filter; trusts the positions that it hears.
+
+    It sends its position alone.
+    """
 
     belief: ClassVar[type[LeftError]] = LeftError
     sends_covariance = False

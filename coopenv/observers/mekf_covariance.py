@@ -10,6 +10,9 @@ from coopenv.observers.mekf import Mekf
 
 
 class MekfCovariance(Mekf):
-    """Sends position and covariance, and adds the latter to the bearing's noise."""
+    """Error-state filter; weighs what it hears by covariance.
+
+    It sends position and covariance, and adds a sender's covariance to the bearing's noise.
+    """
 
     sends_covariance = True

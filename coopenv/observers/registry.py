@@ -133,7 +133,7 @@ def missing(name: str) -> str:
 def obstacle(name: str) -> str:
     """Return why a known observer cannot be used here, in one line; empty where it can."""
     if module := missing(name):
-        return f'needs {module}: pip install "coopenv[bench]"'
+        return f"needs {module}: pip install '.[bench]'"
     if name not in ZOO and name not in _registered:
         try:
             find(name)

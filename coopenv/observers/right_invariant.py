@@ -71,7 +71,7 @@ class RightError(LeftError):
 
 
 class RightInvariant(Mekf):
-    """Invariant filter; sends position and covariance."""
+    """Invariant filter, right error; sends covariances."""
 
     belief: ClassVar[type[LeftError]] = RightError
     sends_covariance = True

@@ -47,7 +47,10 @@ Bearings = tuple[Array, Array, Array]
 
 
 class PerspectivePoints:
-    """One pose a frame from three bearings or more, else dead reckoning; sends position and covariance."""
+    """A pose per frame from three bearings, no memory.
+
+    With fewer bearings it adds odometry. It sends position and covariance.
+    """
 
     def __init__(self, setup: Setup) -> None:
         """Remember the marker, which is what others measure."""

@@ -29,7 +29,7 @@ MEAN_WEIGHT = 2.0
 
 
 class Ukf(Mekf):
-    """Sigma-point filter; sends position and covariance."""
+    """Unscented (sigma-point) filter; sends covariances."""
 
     belief: ClassVar[type[LeftError]] = InvariantError
     sends_covariance = True

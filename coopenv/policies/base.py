@@ -7,6 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
+from coopenv.errors import CoopenvError
+
 
 class Policy(Protocol):
     """Maps what vehicles observe to their actions; a function, or an object that can be called."""
@@ -14,6 +16,18 @@ class Policy(Protocol):
     def __call__(self, observations: np.ndarray, /) -> np.ndarray:
         """Return the actions, (N, 2) in [-1, 1], for flat observations, (N, D), one row per vehicle."""
         ...
+
+
+def decide(policy: Policy, observations: np.ndarray) -> np.ndarray:
+    """Return the actions that a policy chooses, (N, 2) in float64, clipped to [-1, 1].
+
+    Raises:
+        CoopenvError: the policy returned something of another shape.
+    """
+    actions = np.asarray(policy(observations), dtype=np.float64)
+    if actions.shape != (len(observations), 2):
+        raise CoopenvError(f"the policy returned actions of shape {actions.shape}, expected {(len(observations), 2)}")
+    return np.clip(actions, -1.0, 1.0)
 
 
 def act(policy: Policy, observations: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

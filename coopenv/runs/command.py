@@ -5,12 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 from textwrap import fill
-from typing import Any
+from typing import Any, NamedTuple
 
 from rich.console import Console
 
+from coopenv.backends.base import Backend
+from coopenv.backends.simulated import Simulated
+from coopenv.errors import CoopenvError
 from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import Observability, analyse_observability
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.files import replacing_folder
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.metrics import run_metrics, vehicle_metrics
@@ -26,7 +30,7 @@ class RunRequest:
     """What `coopenv run` was asked for; see its help."""
 
     name: str
-    scenario: Scenario
+    backend: Backend
     folder: Path
     overrides: dict[str, Any] = field(default_factory=dict)
     seed: int = 0
@@ -35,17 +39,37 @@ class RunRequest:
     dtype: str = "float64"
     policy: str = "zero"
     steady_from: float | None = None
+    figures: str | None = "png"
+    """Format of the figures; None: no figures."""
     video: bool = False
 
+    @property
+    def scenario(self) -> Scenario:
+        """What is run."""
+        return self.backend.scenario
 
-def execute(request: RunRequest, out: Console, log: Console) -> None:
-    """Run, write and print; a run that does not reach its end writes nothing.
+
+class RunResult(NamedTuple):
+    """What a run came to, and the files that it wrote."""
+
+    metrics: dict[str, Any]
+    paths: list[Path]
+
+    def document(self) -> dict[str, Any]:
+        """Return what `run --json` prints."""
+        return {**self.metrics, "files": self.paths}
+
+
+def execute(request: RunRequest, log: Console) -> RunResult:
+    """Run and write; a run that does not reach its end writes nothing.
 
     Raises:
         CoopenvError: an argument is not valid, or the results cannot be written.
     """
     scenario = request.scenario
-    recording = Rollout(scenario, request.seed, request.steps, request.dtype, request.device, request.policy)
+    recording = Rollout(
+        scenario, request.seed, request.steps, request.dtype, request.device, request.policy, request.backend
+    )
     if request.policy != "zero" and not scenario.driven:
         log.print("note: all motion here is prescribed, the policy has no effect", soft_wrap=True)
     end = recording.ticks_planned / scenario.rates.camera
@@ -56,14 +80,18 @@ def execute(request: RunRequest, out: Console, log: Console) -> None:
         film = open_film(folder, _fps(scenario)) if request.video else None
         _simulate(recording, film, log)
         trajectory = recording.trajectory()
-        observability = analyse_observability(trajectory)
-        vehicles = vehicle_metrics(trajectory, observability, recording.endings(), steady_from)
+        judged = trajectory.where_truth_is_known()
+        if len(judged.t) < 2:
+            raise CoopenvError(f"{request.name}: no true poses are known, so there are no errors to show")
+        observability = analyse_observability(judged)
+        vehicles = vehicle_metrics(judged, observability, recording.endings(), steady_from)
         metrics = run_metrics(request.name, request.overrides, recording, vehicles, steady_from)
         paths = write_results(folder, trajectory, metrics)
-        paths += _draw(folder, recording, observability, steady_from, log)
+        if request.figures is not None:
+            paths += _draw(folder, judged, recording, observability, steady_from, request.figures, log)
         if film is not None:
             paths.append(_finish(film, log))
-    report(request, metrics, paths, out)
+    return RunResult(metrics, [request.folder / path.name for path in paths])
 
 
 def _fps(scenario: Scenario) -> float:
@@ -87,18 +115,25 @@ def _simulate(recording: Rollout, film: Film | None, log: Console) -> None:
 
 
 def _draw(
-    folder: Path, recording: Rollout, observability: Observability, steady_from: float, log: Console
+    folder: Path,
+    judged: Trajectory,
+    recording: Rollout,
+    observability: Observability,
+    steady_from: float,
+    file_format: str,
+    log: Console,
 ) -> list[Path]:
     with Progress(log, "drawing figures"):
         from coopenv.viz.figures import save_figures
 
         return save_figures(
-            recording.trajectory(),
+            judged,
             folder,
             observability,
             scenario=recording.scenario,
             ends=[ending.time for ending in recording.endings()],
             steady_from=steady_from,
+            file_format=file_format,
         )
 
 
@@ -106,17 +141,17 @@ def _finish(film: Film, log: Console) -> Path:
     with Progress(log, f"finishing {film.path.name}"):
         film.close()
     if isinstance(film, GifFilm):
-        log.print("video: written as GIF; for MP4: pip install 'coopenv[video]'", soft_wrap=True)
+        log.print("video: written as GIF; for MP4: pip install '.[video]'", soft_wrap=True)
     return film.path
 
 
-def report(request: RunRequest, metrics: dict[str, Any], paths: list[Path], out: Console) -> None:
+def report(request: RunRequest, result: RunResult, out: Console) -> None:
     """Print the result for people."""
-    noise = "on" if request.scenario.noise.enabled else "off"
-    out.print(
-        f"{request.scenario.title}: seed {request.seed}, noise {noise}, {metrics['dtype']} on {metrics['device']}",
-        soft_wrap=True,
-    )
+    metrics, scenario = result.metrics, request.scenario
+    source = f"seed {request.seed}, noise {'on' if scenario.noise.enabled else 'off'}"
+    if not isinstance(request.backend, Simulated):
+        source = "recorded"
+    out.print(f"{scenario.title}: {source}, {metrics['dtype']} on {metrics['device']}", soft_wrap=True)
     out.print()
     out.print(metrics_table(metrics["vehicles"]))
     out.print()
@@ -126,5 +161,5 @@ def report(request: RunRequest, metrics: dict[str, Any], paths: list[Path], out:
     factor = metrics["real_time_factor"]
     out.print(f"Outcome: {metrics['outcome']}. Simulated at {factor:.3g} times real time.")
     out.print(f"Files in {request.folder}:", soft_wrap=True)
-    names = ", ".join(path.name for path in paths)
+    names = ", ".join(path.name for path in result.paths)
     out.print(fill(names, out.width, initial_indent="  ", subsequent_indent="  "))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 from pydantic import BaseModel
 from rich import box
@@ -10,7 +10,6 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from coopenv.api.registration import environment_id
 from coopenv.api.terms.layout import observation_layout
 from coopenv.format import number
 from coopenv.runs import scenario_text as words
@@ -25,25 +24,6 @@ VALUE_WIDTH = 17
 
 IMAGE_FIELDS = ("image_size", "focal_length", "principal_point", "distortion", "undistort", "quantise")
 """Settings of a camera that matter only where it has an image, as a pinhole camera does."""
-
-
-def environment_table(scenarios: Mapping[str, Scenario]) -> Table:
-    """Return one row per environment; title and registered id stand below its name."""
-    table = _table("environment", "vehicles", "landmarks", "motion", "horizon")
-    for column in (1, 2, 4):
-        table.columns[column].justify = "right"
-    for name, scenario in scenarios.items():
-        if table.row_count:
-            table.add_row()
-        cell = Text(f"{name}\n", "bold").append(f"{scenario.title}\n{environment_id(name)}", "not bold")
-        table.add_row(
-            cell,
-            str(len(scenario.vehicles)),
-            str(len(scenario.landmarks)),
-            "driven" if scenario.driven else "prescribed",
-            f"{scenario.horizon:g} s",
-        )
-    return table
 
 
 def describe_scenario(scenario: Scenario) -> Iterator[RenderableType]:

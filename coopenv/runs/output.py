@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
-from coopenv.estimation.metrics import json_ready
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.files import replacing_file
+from coopenv.jsonable import json_text
 
 METRICS_FILE = "metrics.json"
 TRAJECTORY_FILE = "trajectory.npz"
@@ -17,9 +16,10 @@ VIDEO_FILES = ("video.mp4", "video.gif")
 
 def result_names() -> list[str]:
     """Return the names of all files that a run can write."""
-    from coopenv.viz.figures import FIGURE_NAMES
+    from coopenv.viz.figures import FIGURE_NAMES, FORMATS
 
-    return [METRICS_FILE, TRAJECTORY_FILE, *FIGURE_NAMES, *VIDEO_FILES]
+    figures = [f"{name}.{file_format}" for name in FIGURE_NAMES for file_format in FORMATS]
+    return [METRICS_FILE, TRAJECTORY_FILE, *figures, *VIDEO_FILES]
 
 
 def write_results(folder: Path, trajectory: Trajectory, metrics: dict[str, Any]) -> list[Path]:
@@ -28,8 +28,7 @@ def write_results(folder: Path, trajectory: Trajectory, metrics: dict[str, Any])
     Raises:
         OutputError: a file cannot be written.
     """
-    text = json.dumps(json_ready(metrics), indent=2, default=str) + "\n"
     with replacing_file(folder / METRICS_FILE) as path:
-        path.write_text(text, encoding="utf-8")
+        path.write_text(json_text(metrics), encoding="utf-8")
     trajectory.save(folder / TRAJECTORY_FILE)
     return [folder / METRICS_FILE, folder / TRAJECTORY_FILE]

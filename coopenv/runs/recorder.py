@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from numpy.typing import NDArray
 
 from coopenv.api.engine import Engine
 from coopenv.backends.simulated import SimulatedSenses
 from coopenv.observers.briefing import briefing_of
 from coopenv.observers.recording import Recording, Truth, due_ticks
+from coopenv.policies import Policy, decide, load_policy
 from coopenv.scenario import Scenario
 
 
-def record(
-    scenario: Scenario, seed: int = 0, policy: Callable[[Engine], NDArray[np.float64]] | None = None
-) -> Recording:
+def record(scenario: Scenario, seed: int = 0, policy: str | Policy = "zero") -> Recording:
     """Run a world in float64 to its horizon and keep what is sensed.
 
     Args:
         scenario: what to run.
         seed: of the world.
-        policy: returns actions (1, N, 2) in [-1, 1] at every decision; None: zeros.
+        policy: of driven vehicles: "zero", "random", the name of an agent, or a function of the observations.
+
+    Raises:
+        CoopenvError: unknown policy or observer.
     """
+    driver = load_policy(policy, scenario, seed) if isinstance(policy, str) else policy
     engine = Engine(scenario, 1, "float64")
     engine.reset([seed])
     model, senses = engine.world.model, SimulatedSenses(scenario, engine.world)
@@ -36,8 +36,8 @@ def record(
     start_position = (start_rotation @ engine.view("estimate_position")[0][..., None])[..., 0]
     for k in range(K):
         if k > 0:
-            if policy is not None and (k - 1) % scenario.ticks_per_decision == 0:
-                engine.set_actions(policy(engine))
+            if scenario.driven and (k - 1) % scenario.ticks_per_decision == 0:
+                engine.set_actions(decide(driver, engine.view("observation")[0].copy())[None])
             engine.step(ticks=1)
         sensed = senses.read(0, k)
         for name in sensed_names:

@@ -10,9 +10,10 @@ import numpy as np
 
 from coopenv.api.engine import Engine
 from coopenv.api.infos import outcome_words
+from coopenv.backends.base import Backend
 from coopenv.errors import CoopenvError
 from coopenv.estimation.trajectory import Sight, Trajectory
-from coopenv.policies import Policy, load_policy
+from coopenv.policies import Policy, decide, load_policy
 from coopenv.scenario import Scenario
 
 RECORDED = (
@@ -50,13 +51,14 @@ class Rollout:
         dtype: str = "float64",
         device: str = "cpu",
         policy: str | Policy = "zero",
+        backend: Backend | None = None,
     ) -> None:
-        """Build the world; arguments as for `rollout`."""
+        """Build the world; arguments as for `rollout`, and where the scenario's ticks come from (None: simulated)."""
         if steps is not None and steps < 1:
             raise CoopenvError(f"steps must be at least 1, got {steps}")
         self.scenario = scenario
         self.seed = seed
-        self.engine = Engine(scenario, 1, dtype, device)
+        self.engine = Engine(scenario, 1, dtype, device, backend=backend)
         self.policy = load_policy(policy, scenario, seed) if isinstance(policy, str) else policy
         self.policy_name = policy if isinstance(policy, str) else getattr(policy, "__name__", "custom")
         self.ticks_planned = scenario.horizon_ticks
@@ -101,11 +103,7 @@ class Rollout:
                 self._decide()
 
     def _decide(self) -> None:
-        actions = np.asarray(self.policy(self.engine.view("observation")[0].copy()), dtype=np.float64)
-        expected = (len(self.scenario.vehicles), 2)
-        if actions.shape != expected:
-            raise CoopenvError(f"the policy returned actions of shape {actions.shape}, expected {expected}")
-        self.engine.set_actions(np.clip(actions, -1.0, 1.0)[None])
+        self.engine.set_actions(decide(self.policy, self.engine.view("observation")[0].copy())[None])
 
     def _take(self) -> None:
         for name, rows in self._rows.items():

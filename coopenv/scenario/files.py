@@ -21,6 +21,10 @@ DEFAULTS_KEY = "vehicle_defaults"
 """A table of the file whose entries every vehicle takes over unless it says otherwise."""
 
 
+BAGS = (".db3", ".bag")
+"""Suffixes of ROS bags, which are taken for log files by mistake."""
+
+
 def scenario_path(name_or_path: str | Path) -> Path:
     """Return the file behind an environment name or a path.
 
@@ -28,8 +32,12 @@ def scenario_path(name_or_path: str | Path) -> Path:
         UnknownEnvironmentError: there is no such environment or file.
     """
     text = str(name_or_path)
-    if text.endswith(".toml") or "/" in text or "\\" in text:
+    if text.endswith((".toml", *BAGS)) or "/" in text or "\\" in text:
         path = Path(text).expanduser()
+        if path.suffix in BAGS or (path / "metadata.yaml").is_file():
+            raise UnknownEnvironmentError(
+                f"{path}: a ROS bag, which coopenv does not read; it replays the MCAP files of `coopenv record`"
+            )
         if not path.is_file():
             raise UnknownEnvironmentError(f"no such scenario file: {path}")
         return path
@@ -56,7 +64,9 @@ def load_scenario(name_or_path: str | Path, overrides: Mapping[str, Any] | None 
         raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
     try:
         raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError:
+        raise ScenarioError(f"{path}: not a text file, expected a scenario in TOML") from None
+    except OSError as error:
         raise ScenarioError(f"{path.name}: cannot be read ({error})") from None
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"{path.name}: not valid TOML: {error}") from None

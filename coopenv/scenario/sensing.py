@@ -35,8 +35,8 @@ class Camera(Part):
     """The camera that every vehicle carries; optical frame: x right, y down, z forward."""
 
     model: Literal["pinhole", "omnidirectional"] = "omnidirectional"
-    """`omnidirectional` sees in every direction; `pinhole` is bounded by its image. Like range, distortion and
-    quantisation it counts in the topology `sensed` only; in `fixed` every neighbour is measured at every tick."""
+    """`omnidirectional` sees in every direction; `pinhole` is bounded by its image. The model, range, distortion
+    and quantisation matter only where `topology.mode` is `sensed`; with `fixed` every neighbour is always measured."""
     position: Vector3 = (0.0, 0.0, 0.0)
     """Optical centre in the body frame, m."""
     orientation: Literal["forward", "body"] | QuaternionWxyz = "forward"

@@ -1,4 +1,4 @@
-"""All figures of a run, written as PNG files under stable names."""
+"""All figures of a run, written under stable names."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from coopenv.viz.topology import topology_figure
 from coopenv.viz.trajectories import trajectory_figure_2d, trajectory_figure_3d
 
 FIGURE_NAMES = (
-    "errors.png",
-    "trajectories_2d.png",
-    "trajectories_3d.png",
-    "topology.png",
-    "consistency.png",
-    "observability.png",
+    "errors",
+    "trajectories_2d",
+    "trajectories_3d",
+    "topology",
+    "consistency",
+    "observability",
 )
+FORMATS = ("png", "pdf", "svg")
 
 
 def save_figures(
@@ -34,6 +35,7 @@ def save_figures(
     scenario: Scenario | None = None,
     ends: Sequence[float] | None = None,
     steady_from: float | None = None,
+    file_format: str = "png",
 ) -> list[Path]:
     """Write the figures of `FIGURE_NAMES` into `directory`, which is made if need be.
 
@@ -44,6 +46,7 @@ def save_figures(
         scenario: of the run, for the roads and buildings under its paths.
         ends: s, when each vehicle arrived or collided and was parked, where its lines stop (None: no vehicle was).
         steady_from: s, start of the steady state that mean NEES are over (None: at 70 % of the record).
+        file_format: one of `FORMATS`.
 
     Returns:
         The paths written.
@@ -56,13 +59,13 @@ def save_figures(
         observability = analyse_observability(trajectory)
     seen = observability
     draw = {
-        "errors.png": lambda: error_figure(trajectory, ends),
-        "trajectories_2d.png": lambda: trajectory_figure_2d(trajectory, ends, scenario),
-        "trajectories_3d.png": lambda: trajectory_figure_3d(trajectory, ends),
-        "topology.png": lambda: topology_figure(trajectory, ends),
-        "consistency.png": lambda: consistency_figure(trajectory, ends, steady_from),
-        "observability.png": lambda: observability_figure(seen, ends),
+        "errors": lambda: error_figure(trajectory, ends),
+        "trajectories_2d": lambda: trajectory_figure_2d(trajectory, ends, scenario),
+        "trajectories_3d": lambda: trajectory_figure_3d(trajectory, ends),
+        "topology": lambda: topology_figure(trajectory, ends),
+        "consistency": lambda: consistency_figure(trajectory, ends, steady_from),
+        "observability": lambda: observability_figure(seen, ends),
     }
     with writing(directory):
         directory.mkdir(parents=True, exist_ok=True)
-    return [save(draw[name](), directory / name) for name in FIGURE_NAMES]
+    return [save(draw[name](), directory / f"{name}.{file_format}") for name in FIGURE_NAMES]

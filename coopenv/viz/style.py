@@ -41,13 +41,13 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a PNG and return its path.
+    """Write a figure in the format that the path's suffix names, and return the path.
 
     Raises:
         OutputError: it cannot be written; an older file is untouched.
     """
     with replacing_file(path) as new:
-        figure.savefig(new, dpi=DPI, format="png")
+        figure.savefig(new, dpi=DPI, format=path.suffix.removeprefix("."))
     return path
 
 

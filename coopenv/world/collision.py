@@ -25,12 +25,10 @@ def separated_along(axis: Any, offset: Any, Ra: Any, ha: Any, Rb: Any, hb: Any) 
 
 @wp.func
 def boxes_touch(ca: Any, Ra: Any, ha: Any, cb: Any, Rb: Any, hb: Any) -> bool:
-    """Return whether two upright boxes overlap."""
+    """Return whether two upright boxes overlap; false where a pose is not known (NaN)."""
     offset = cb - ca
-    if wp.abs(offset[2]) > ha[2] + hb[2]:
-        return False
     reach = wp.length(ha) + wp.length(hb)
-    if wp.dot(offset, offset) > reach * reach:
+    if not (wp.abs(offset[2]) <= ha[2] + hb[2] and wp.dot(offset, offset) <= reach * reach):
         return False
     for k in range(2):
         if separated_along(type(ca)(Ra[0, k], Ra[1, k], ha[0] - ha[0]), offset, Ra, ha, Rb, hb):

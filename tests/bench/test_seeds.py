@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -38,3 +40,11 @@ def test_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert "vehicle_2" in printed and "2/2" in printed
     assert main(["bench", "seeds", "overtaking", "--steady-from", "99"]) == 2
     assert "--steady-from 99 is not within the run of 45 s" in capsys.readouterr().err
+
+
+def test_json_has_one_figure_per_seed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "seeds", "overtaking", "--seeds", "3", "--set", "horizon=1.0", "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["seeds"] == [0, 1, 2]
+    assert [vehicle["vehicle"] for vehicle in printed["vehicles"]] == ["vehicle_1", "vehicle_2"]
+    assert all(len(vehicle["position_rmse_m"]) == 3 for vehicle in printed["vehicles"])

@@ -100,7 +100,7 @@ def test_stages_of_prescribed_motions_are_shown() -> None:
 
 
 def test_overrides_are_described(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["describe", "busy_intersection", "--set", "v2x.loss=0.25"]) == 0
+    assert main(["describe", "busy_intersection", "--all", "--set", "v2x.loss=0.25"]) == 0
     assert any(line.split()[:3] == ["loss", "*", "0.25"] for line in capsys.readouterr().out.splitlines())
 
 

@@ -35,7 +35,7 @@ from coopenv.viz.topology import topology_figure
 from coopenv.viz.trajectories import trajectory_figure_2d, trajectory_figure_3d
 from tests.helpers.synthetic import make_trajectory
 
-NAMES = list(FIGURE_NAMES)
+NAMES = [f"{name}.png" for name in FIGURE_NAMES]
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ try:
     from torchrl.envs import EnvBase
     from torchrl.envs.libs.pettingzoo import PettingZooWrapper
 except ImportError as error:
-    raise ImportError("coopenv.api.trainers.benchmarl needs BenchMARL: pip install 'coopenv[benchmarl]'") from error
+    raise ImportError("coopenv.api.trainers.benchmarl needs BenchMARL: pip install '.[benchmarl]'") from error
 
 
 class CooperativeTask(TaskClass):

@@ -13,7 +13,7 @@ from coopenv.api.trainers.numeric_infos import PlainInfos
 try:
     from ray.rllib.env.multi_agent_env import MultiAgentEnv
 except ImportError as error:
-    raise ImportError("coopenv.api.trainers.rllib needs RLlib: pip install 'coopenv[rllib]'") from error
+    raise ImportError("coopenv.api.trainers.rllib needs RLlib: pip install '.[rllib]'") from error
 
 
 class CooperativeMultiAgentEnv(MultiAgentEnv):

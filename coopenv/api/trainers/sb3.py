@@ -18,7 +18,7 @@ try:
     from stable_baselines3.common.vec_env import VecEnv
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 except ImportError as error:
-    raise ImportError("coopenv.api.trainers.sb3 needs stable-baselines3: pip install 'coopenv[train]'") from error
+    raise ImportError("coopenv.api.trainers.sb3 needs stable-baselines3: pip install '.[train]'") from error
 
 from gymnasium.utils import seeding
 

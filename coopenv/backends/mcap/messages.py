@@ -72,7 +72,7 @@ def codec() -> Any:
         import mcap  # noqa: F401
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError:
-        raise CoopenvError("MCAP files need an extra: pip install 'coopenv[log]'") from None
+        raise CoopenvError("MCAP files need an extra: pip install '.[log]'") from None
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, text in DEFINITIONS.items():
         store.register(get_types_from_msg(text, name))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
@@ -27,6 +28,7 @@ from coopenv.bench.observers.executors import Engine
 from coopenv.bench.observers.sources import ALL, Source, find_source, variants_of
 from coopenv.errors import CoopenvError
 from coopenv.files import replacing_folder
+from coopenv.jsonable import json_text
 from coopenv.observers.registry import observer_names, obstacle
 from coopenv.runs.console import Progress
 
@@ -116,9 +118,20 @@ class Found:
     draws: list[Draw]
     basins: list[Basin]
 
+    def document(self, command: str) -> dict[str, Any]:
+        """Return what `leaderboard.json` holds."""
+        more = {"basin": [asdict(basin) for basin in self.basins]} if self.basins else {}
+        return exports.document(self.comparison, command, **more)
+
 
 def perform(
-    request: Request, engine: Engine, out: Path | None, figures: str | None, printed: Console, log: Console
+    request: Request,
+    engine: Engine,
+    out: Path | None,
+    figures: str | None,
+    printed: Console,
+    log: Console,
+    as_json: bool = False,
 ) -> None:
     """Compare, print the tables and write the files.
 
@@ -129,13 +142,14 @@ def perform(
         figures: format of figures as files of their own; None: the report alone has them.
         printed: for the tables.
         log: for the progress.
+        as_json: print what `leaderboard.json` holds, and nothing else.
 
     Raises:
         CoopenvError: something that was asked for does not exist, or cannot be written.
     """
     wanted = figure_files(request.variants, figures)
     if wanted and out is None:
-        raise CoopenvError(f"--format {figures}: figures need a folder, --out DIR")
+        raise CoopenvError(f"--figures {figures}: figures need a folder, --out DIR")
     found, names = None, [JSON_FILE, CSV_FILE, REPORT_FILE, BASIN_FILE]
     names += [name for form in exports.FORMATS for name in figure_files(tuple(request.source.variants), form)]
     try:
@@ -145,9 +159,11 @@ def perform(
                 write_files(found, request.command, folder, wanted)
                 names = sorted(path.name for path in folder.iterdir())
     finally:  # hours of work are told even if they cannot be written
-        if found is not None:
+        if found is not None and as_json:
+            sys.stdout.write(json_text(found.document(request.command)))
+        elif found is not None:
             print_tables(found, printed)
-    if out is not None:
+    if out is not None and not as_json:
         printed.print(f"Files in {out}: {', '.join(names)}", soft_wrap=True)
 
 
@@ -191,7 +207,7 @@ def figure_files(variants: Sequence[str], form: str | None) -> dict[str, tuple[s
     if form is None:
         return {}
     if form not in exports.FORMATS:
-        raise CoopenvError(f"--format {form}: known are {', '.join(exports.FORMATS)}")
+        raise CoopenvError(f"--figures {form}: known are {', '.join(exports.FORMATS)}")
     drawn = {f"{kind}-{v}.{form}": (kind, v) for v in variants for kind in ("errors", "consistency")}
     return drawn | {f"{kind}.{form}": (kind, variants[0]) for kind in ("cost", "variants")}
 
@@ -206,9 +222,8 @@ def write_files(found: Found, command: str, out: Path, figures: Mapping[str, tup
     from coopenv.bench.observers.report import report_text
 
     comparison, draws, basins = found.comparison, found.draws, found.basins
-    more = {"basin": [asdict(basin) for basin in basins]} if basins else {}
-    content = exports.document(comparison, command, **more)
-    texts = {JSON_FILE: exports.json_text(content), CSV_FILE: exports.csv_text(comparison.rows)}
+    content = found.document(command)
+    texts = {JSON_FILE: json_text(content), CSV_FILE: exports.csv_text(comparison.rows)}
     texts |= {BASIN_FILE: exports.csv_text(plain_draws(draws))} if draws else {}
     texts[REPORT_FILE] = report_text(comparison, content, draws, basins)
     for name, text in texts.items():

@@ -175,7 +175,7 @@ class Ray:
         try:
             import ray
         except ImportError:
-            raise CoopenvError("--engine ray needs Ray: pip install 'coopenv[ray]'") from None
+            raise CoopenvError("--engine ray needs Ray: pip install '.[ray]'") from None
         if not ray.is_initialized():
             # In a thread that may be left behind: something that accepts and never answers would hold up Ray for ever.
             failure: list[BaseException | None] = []

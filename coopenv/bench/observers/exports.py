@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
@@ -15,9 +14,9 @@ from coopenv.bench.observers.leaderboard import Leaderboard
 from coopenv.bench.observers.rows import Row
 from coopenv.bench.observers.tables import BOUNDS, bounded
 from coopenv.errors import CoopenvError
-from coopenv.estimation.metrics import json_ready
 from coopenv.files import replacing_file
 from coopenv.format import number, with_error
+from coopenv.jsonable import jsonable
 from coopenv.machine import versions
 
 if TYPE_CHECKING:
@@ -32,17 +31,12 @@ def document(board: Leaderboard, command: str, **more: Any) -> dict[str, Any]:
     packages = versions("coopenv", "numpy", "scipy", "warp-lang")
     rows = [asdict(row) for row in board.rows]
     content = {"command": command, "versions": packages, "seeds": list(board.seeds), "rows": rows, **more}
-    return dict(json_ready(content))
-
-
-def json_text(content: Mapping[str, Any]) -> str:
-    """Return plain data as JSON."""
-    return json.dumps(content, indent=1) + "\n"
+    return dict(jsonable(content))
 
 
 def csv_text(rows: Sequence[Row] | Sequence[Mapping[str, Any]]) -> str:
     """Return rows as CSV; figures that do not exist are empty."""
-    table = [json_ready(asdict(row) if isinstance(row, Row) else row) for row in rows]
+    table = [jsonable(asdict(row) if isinstance(row, Row) else row) for row in rows]
     text = StringIO()
     writer = csv.DictWriter(text, fieldnames=list(table[0]), lineterminator="\n")
     writer.writeheader()

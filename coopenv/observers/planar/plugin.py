@@ -53,8 +53,9 @@ CALIBRATING = Tuning(
 
 
 class PlanarEkf:
-    """Extended Kalman filter of x, y and heading that believes its odometry and its neighbours.
+    """Extended Kalman filter of x, y and heading.
 
+    It believes its odometry and its neighbours.
     A neighbour's covariance is added to the bearing's variance, as if its errors were independent (Roumeliotis, Bekey,
     "Distributed multirobot localization", IEEE Trans. Robotics and Automation 18(5), 2002, without its
     cross-correlations).

@@ -21,7 +21,10 @@ MOST_SUBSTEPS = 200
 
 
 class Riccati:
-    """R and p as in the paper: p is the position in the body frame. Gains and P(0) come from the scenario."""
+    """The paper's observer, with the scenario's gains.
+
+    R and p as in the paper: p is the position in the body frame.
+    """
 
     landmarks_only = False
 

@@ -7,12 +7,18 @@ from coopenv.observers.robust.reference.observer import Robust
 
 
 def robust(setup: Setup) -> Observer:
-    """Return the observer for a vehicle: a planar one where it moves on a plane and its odometry is its commands."""
+    """This project's observer: several hypotheses, gates.
+
+    Where a vehicle moves on a plane and its odometry is its commands, it is a planar one.
+    """
     return PlanarRobust(setup) if setup.planar else Robust(setup)
 
 
 def robust_joint(setup: Setup) -> Observer:
-    """Return the observer with larger messages; planar robots have one with small messages only."""
+    """The robust observer with larger, joint messages.
+
+    Planar robots have one with small messages only.
+    """
     return PlanarRobust(setup) if setup.planar else RobustJoint(setup)
 
 

@@ -156,8 +156,8 @@ PER_VEHICLE = ("bound_mse", "bound_ancestors_mse", "bound_single_mse", "gramian"
         (["overtaking", "--data", "."], "not one of the recorded robots"),
         (["overtaking", "--variants", "blind"], "known: nominal"),
         (["overtaking", "--seeds", "0"], "'--seeds'"),
-        (["overtaking", "--format", "pdf"], "figures need a folder"),
-        (["overtaking", "--format", "gif", "--out", "x"], "known are png, pdf, svg"),
+        (["overtaking", "--figures", "pdf"], "figures need a folder"),
+        (["overtaking", "--figures", "gif", "--out", "x"], "known are png, pdf, svg"),
         (["overtaking", "--observers", "nowhere.py:Mine"], "no such file"),
         (["overtaking", "--observers", "mekf", "--steady-from", "1000"], "not within the run"),
         (
@@ -229,7 +229,7 @@ def test_an_observer_in_a_file_and_figures_as_files(tmp_path: Path, monkeypatch:
     words = ["bench", "observers", "overtaking", "--observers", "mine.py:Mine,dead_reckoning", "--seeds", "2"]
     words += ["--first", "7", "--set", "horizon=0.5", "--out", "board"]
     for form, start, jobs in (("pdf", b"%PDF", "1"), ("svg", b"<?xml", "2")):
-        assert main([*words, "--format", form, "--jobs", jobs]) == 0
+        assert main([*words, "--figures", form, "--jobs", jobs]) == 0
         figures = {path.name for path in Path("board").iterdir()} - {
             "leaderboard.json",
             "leaderboard.csv",
@@ -244,3 +244,23 @@ def test_an_observer_in_a_file_and_figures_as_files(tmp_path: Path, monkeypatch:
         for name in ("Mine", "dead_reckoning")
     )
     assert mine == other and len(mine) == 2
+
+
+def test_json_on_standard_output_is_what_the_file_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = [
+        "bench",
+        "observers",
+        "overtaking",
+        "--observers",
+        "dead_reckoning",
+        "--seeds",
+        "1",
+        "--jobs",
+        "1",
+        "--json",
+    ]
+    words += ["--set", "horizon=2.0", "--steady-from", "1", "--out", str(tmp_path / "board"), "--json"]
+    assert main(words) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((tmp_path / "board" / "leaderboard.json").read_text(encoding="utf-8"))
+    assert [row["observer"] for row in printed["rows"]] == ["dead_reckoning"] * 2

@@ -67,7 +67,7 @@ def test_it_is_the_embedded_observer_where_sight_is_sensed_and_vehicles_are_driv
     actions = np.linspace(-0.3, 0.6, 2 * len(scenario.vehicles)).reshape(1, -1, 2)
     engine = Engine(scenario, 1, "float64")
     engine.reset([5])
-    recording = record(scenario, 5, lambda _: actions)
+    recording = record(scenario, 5, lambda _: actions[0])
     result = run("riccati", recording)
     assert not recording.visible.all()
     for k in range(1, scenario.horizon_ticks + 1):

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from itertools import count
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from coopenv.api.engine import Engine
 from coopenv.bench.observers.faults import FAULTS, Lie
 from coopenv.bench.observers.initial_estimates import random_start, with_start
 from coopenv.observers import Estimate, Recording, Tick, run
 from coopenv.observers.riccati_coordinates import riccati_covariance
 from coopenv.observers.robust.plugin import Robust
 from coopenv.observers.robust.reference.search import PATIENCE
+from coopenv.policies import Policy
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from coopenv.world.world import World
@@ -30,16 +31,17 @@ LOST = {"position_radius": 4.0, "orientation_angle": "uniform"}
 STALE = {"v2x.delay": 3, "v2x.loss": 0.4, "v2x.period": 2, "v2x.staleness": 0.2}
 
 
-def driven(engine: Engine) -> np.ndarray:
-    generator = np.random.default_rng(int(engine.view("tick")[0]))
-    return generator.uniform(-1, 1, (1, engine.world.model.vehicles, 2))
+def driven() -> Policy:
+    """Return a policy of random actions, one generator per decision."""
+    decisions = count()
+    return lambda observations: np.random.default_rng(6 * next(decisions)).uniform(-1, 1, (len(observations), 2))
 
 
 @cache
 def recorded(name: str = "busy_intersection", seed: int = 0, **overrides: Any) -> Recording:
     options = ISOTROPIC if name == "busy_intersection" else {}
     return record(
-        load_scenario(name, {**options, **{k.replace("__", "."): v for k, v in overrides.items()}}), seed, driven
+        load_scenario(name, {**options, **{k.replace("__", "."): v for k, v in overrides.items()}}), seed, driven()
     )
 
 
@@ -112,7 +114,7 @@ def test_it_does_so_when_patience_ends(seed: int) -> None:
     """Where two solutions nearly meet and the vehicle hardly moves, it goes on with badly determined ones at last."""
     slow = vehicle((-3.0, -2.0, 0.2), initial_estimate=LOST, motion=constant([0.005, 0, 0]))
     noise = {"velocity": 0.1, "angular_velocity": 0.05, "bearing": {"model": "isotropic", "scale": 0.003}}
-    recording = record(scenario([slow], horizon=PATIENCE + 3.0, noise=noise), seed, driven)
+    recording = record(scenario([slow], horizon=PATIENCE + 3.0, noise=noise), seed, driven())
     played = replayed(recording)
     check(recording, played)
     found = (~played.searching[:, 0]).argmax() * recording.dt

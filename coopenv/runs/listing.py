@@ -1,0 +1,81 @@
+"""`coopenv list`: environments, observers and agents, one line each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich import box
+from rich.table import Table
+
+from coopenv.api.registration import environment_id
+from coopenv.observers.registry import find, observer_names, obstacle
+from coopenv.policies import read_card
+from coopenv.scenario import Scenario
+from coopenv.shipped import list_agents
+
+COLUMNS = {
+    "envs": ("name", "vehicles", "landmarks", "motion", "horizon_s"),
+    "observers": ("name", "about"),
+    "agents": ("name", "environments", "about"),
+}
+"""What the tables show of the rows."""
+
+
+def environment_rows(scenarios: Mapping[str, Scenario]) -> list[dict[str, Any]]:
+    """Return what `list envs` says of every environment."""
+    return [
+        {
+            "name": name,
+            "title": scenario.title,
+            "id": environment_id(name),
+            "vehicles": len(scenario.vehicles),
+            "landmarks": len(scenario.landmarks),
+            "motion": "driven" if scenario.driven else "prescribed",
+            "horizon_s": scenario.horizon,
+        }
+        for name, scenario in scenarios.items()
+    ]
+
+
+def observer_rows() -> list[dict[str, Any]]:
+    """Return what `list observers` says of every observer."""
+    return [{"name": name, "about": _about(name)} for name in observer_names()]
+
+
+def _about(name: str) -> str:
+    """Return the first sentence of an observer's docstring, or why it cannot be used here."""
+    return obstacle(name) or _sentence(find(name).__doc__ or "")
+
+
+def agent_rows() -> list[dict[str, Any]]:
+    """Return what `list agents` says of every agent."""
+    cards = {name: read_card(name) for name in list_agents()}
+    return [
+        {"name": name, "environments": list(card.environments), "about": _sentence(card.description)}
+        for name, card in cards.items()
+    ]
+
+
+def _sentence(text: str) -> str:
+    return " ".join(text.split("\n\n")[0].split()).partition(". ")[0].rstrip(".")
+
+
+def list_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Table:
+    """Return one line per row; what does not fit into the width is cut off at the end of the last column."""
+    table = Table(box=box.HORIZONTALS, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
+    for key in columns:
+        cells = [_text(row[key]) for row in rows]
+        heading = key.removesuffix("_s") + (" [s]" if key.endswith("_s") else "")
+        number = bool(rows) and isinstance(rows[0][key], int | float)
+        width = None if key == columns[-1] else max(map(len, [heading, *cells]))
+        table.add_column(heading, justify="right" if number else "left", no_wrap=True, min_width=width)
+    for row in rows:
+        table.add_row(*(_text(row[key]) for key in columns))
+    return table
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list):
+        return ", ".join(value)
+    return f"{value:g}" if isinstance(value, float) else str(value)

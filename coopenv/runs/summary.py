@@ -1,0 +1,168 @@
+"""The first screen of `coopenv describe`: what matters about a scenario, and the same as data."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from textwrap import shorten
+from typing import Any
+
+from rich.console import RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from coopenv.api.registration import environment_id
+from coopenv.api.terms.layout import observation_layout
+from coopenv.format import number
+from coopenv.scenario import Scenario
+from coopenv.shipped import list_envs
+
+DESCRIPTION_LENGTH = 240
+"""Characters of a scenario's description on the first screen."""
+
+
+def summary(name: str, scenario: Scenario, recorded: bool = False) -> Iterator[RenderableType]:
+    """Yield the first screen, part by part.
+
+    Args:
+        name: of the environment or the recording.
+        scenario: what it is.
+        recorded: whether a recording is replayed.
+    """
+    registered = f" ({environment_id(name)})" if name in list_envs() else ""
+    yield Text(scenario.title, "bold").append(registered, "not bold")
+    if scenario.description:
+        yield shorten(scenario.description, DESCRIPTION_LENGTH, placeholder=" ...")
+    if recorded:
+        yield "Recorded: every episode is the recording, whatever the seed and the actions."
+    yield ""
+    yield fact_table(scenario)
+
+
+def fact_table(scenario: Scenario) -> Table:
+    """Return one line per fact: vehicles, sensors, radio, rates, observer, observation, action, reward, end."""
+    table = Table.grid(padding=(0, 2))
+    table.add_column(no_wrap=True)
+    table.add_column()
+    for name, fact in facts(scenario):
+        table.add_row(name, fact)
+    return table
+
+
+def facts(scenario: Scenario) -> Iterator[tuple[str, str]]:
+    """Yield (subject, what is to be said about it)."""
+    yield "Vehicles", _vehicles(scenario)
+    yield "Targets", _targets(scenario)
+    yield "Camera", _camera(scenario)
+    yield "Odometry", _odometry(scenario)
+    yield "V2X", _v2x(scenario)
+    yield "Observer", _observer(scenario)
+    yield "Rates", _rates(scenario)
+    yield "Observation", _observation(scenario)
+    if scenario.driven:
+        yield "Action", _action(scenario)
+    weights = [f"{number(w)} {name}" for name, w in scenario.reward.by_name.items() if w]
+    yield "Reward", " + ".join(weights).replace("+ -", "- ") or "none: every weight is 0"
+    yield "Ends", _end(scenario)
+
+
+def _vehicles(scenario: Scenario) -> str:
+    driven = sum(vehicle.motion.kind == "driven" for vehicle in scenario.vehicles)
+    goals = sum(vehicle.goal is not None for vehicle in scenario.vehicles)
+    parts = [f"{driven} driven by actions, up to {number(scenario.dynamics.max_speed)} m/s"] if driven else []
+    parts += [f"{len(scenario.vehicles) - driven} with prescribed motion"] if driven < len(scenario.vehicles) else []
+    return "; ".join([*parts, *([f"{goals} with a goal"] if goals else [])])
+
+
+def _targets(scenario: Scenario) -> str:
+    moving = sum(landmark.motion.kind != "static" for landmark in scenario.landmarks)
+    buildings = f", {len(scenario.obstacles)} buildings" if scenario.obstacles else ""
+    mode = {
+        "fixed": "fixed topology: every neighbour is measured in every frame",
+        "sensed": "sensed topology: what is in the field of view and not hidden is measured",
+    }[scenario.topology.mode]
+    also = f" ({moving} moving)" if moving else ""
+    return f"{len(scenario.landmarks)} landmarks{also}, other vehicles{buildings}; {mode}"
+
+
+def _camera(scenario: Scenario) -> str:
+    camera, noise = scenario.camera, scenario.noise.bearing
+    size = f", {camera.image_size[0]} x {camera.image_size[1]} pixels" if camera.model == "pinhole" else ""
+    reach = f", up to {number(camera.range)} m" if camera.range is not None else ""
+    misses = f", misses {number(100 * camera.miss_probability)} %" if camera.miss_probability else ""
+    unit = "rad" if noise.model == "isotropic" else "on the image plane"
+    spread = f", {noise.model} noise {number(noise.scale)} {unit}" if scenario.noise.enabled else ", no noise"
+    return f"{camera.model}{size}{reach}{misses}; bearings{spread}"
+
+
+def _odometry(scenario: Scenario) -> str:
+    noise = scenario.noise
+    if not noise.enabled:
+        return "linear and angular velocity, no noise"
+    return f"linear and angular velocity, noise {number(noise.velocity)} m/s and {number(noise.angular_velocity)} rad/s"
+
+
+def _v2x(scenario: Scenario) -> str:
+    radio = scenario.v2x
+    parts = [f"a message every {'frame' if radio.period == 1 else f'{radio.period} frames'}"]
+    parts.append(f"delay {radio.delay} frame{'' if radio.delay == 1 else 's'}, loss {number(100 * radio.loss)} %")
+    parts += [f"range {number(radio.range)} m"] if radio.range is not None else []
+    parts += [f"unused when older than {number(radio.staleness)} s"] if radio.staleness is not None else []
+    parts += ["leaders to followers only"] if scenario.topology.acyclic else []
+    return ", ".join(parts)
+
+
+def _observer(scenario: Scenario) -> str:
+    observer = scenario.observer
+    return f"{observer.name} (gains k = {_gain(observer.k)}, q = {_gain(observer.q)})"
+
+
+def _gain(value: float | tuple[float, ...] | dict[str, float]) -> str:
+    several = value.values() if isinstance(value, dict) else value if isinstance(value, tuple) else (value,)
+    low, high = min(several), max(several)
+    return number(low) if low == high else f"{number(low)} to {number(high)}"
+
+
+def _rates(scenario: Scenario) -> str:
+    rates = scenario.rates
+    corrections = "" if rates.observer is None else f", observer {number(rates.observer)}"
+    return (
+        f"camera {number(rates.camera)} Hz, odometry {number(rates.odometry)}{corrections}, "
+        f"decisions {number(rates.decision)}"
+    )
+
+
+def _observation(scenario: Scenario) -> str:
+    groups = Counter[str]()
+    for field in observation_layout(scenario).values():
+        groups[field.group] += field.stop - field.start
+    sizes = ", ".join(f"{group} {size}" for group, size in groups.items() if size)
+    return f"{groups.total()} numbers per vehicle: {sizes}"
+
+
+def _action(scenario: Scenario) -> str:
+    spans = [
+        f"{entry.name} {number(entry.low)} to {number(entry.high)} {entry.unit}"
+        for entry in observation_layout(scenario).action
+    ]
+    return f"{len(spans)} numbers in [-1, 1]: {', '.join(spans)}"
+
+
+def _end(scenario: Scenario) -> str:
+    steps = round(scenario.horizon * scenario.rates.decision)
+    causes = [word for word in ("collision", "arrival") if scenario.driven and getattr(scenario.termination, word)]
+    early = f"; for a vehicle at {' or '.join(causes)}" if causes else ""
+    return f"after {number(scenario.horizon)} s, {steps} decisions{early}"
+
+
+def document(name: str, scenario: Scenario) -> dict[str, Any]:
+    """Return what `describe --json` prints: the scenario, and the layout of observation and action."""
+    layout = observation_layout(scenario)
+    return {
+        "name": name,
+        "id": environment_id(name) if name in list_envs() else None,
+        "observation_size": layout.size,
+        "observation": {field: {**vars(entry), "shape": list(entry.shape)} for field, entry in layout.items()},
+        "action": [vars(entry) for entry in layout.action],
+        "scenario": scenario.model_dump(mode="json"),
+    }
