@@ -6,13 +6,14 @@ A source is small and picklable, so that a worker process makes the record itsel
 from __future__ import annotations
 
 import math
-import re
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
+from coopenv.backends.replay import is_recorded, open_recording
 from coopenv.bench.observers.faults import FAULTS, NOMINAL, Lie, followers
 from coopenv.errors import CoopenvError, DataWarning, suggest
 from coopenv.estimation.metrics import STEADY_SHARE, steady_start
@@ -24,69 +25,76 @@ from coopenv.scenario.topology import neighbour_sets
 ALL = "all"
 """Asks for every variant that the source can have."""
 NOBODY_FOLLOWS = "no vehicle has another one as its neighbour"
-LOG_SUFFIX = ".mcap"
-ROBOTS = re.compile(r"mrclam_\d+")
 
 
-class Source(Protocol):
-    """Records of one environment in several variants."""
+@dataclass(frozen=True)
+class Source(ABC):
+    """Records of one environment in several variants; by default with faults, and of vehicles in space."""
 
-    @property
-    def name(self) -> str:
-        """As it stands in the rows."""
-        ...
-
-    @property
-    def variants(self) -> Mapping[str, str]:
-        """All there are, each with what it is."""
-        ...
-
-    @property
-    def usual(self) -> tuple[str, ...]:
-        """Those that are run unless others are asked for."""
-        ...
-
-    @property
-    def seeded(self) -> bool:
-        """Whether another seed gives another record."""
-        ...
+    name: str
+    """As it stands in the rows."""
+    variants: ClassVar[Mapping[str, str]] = {name: fault.summary for name, fault in FAULTS.items()}
+    """All there are, each with what it is."""
+    usual: ClassVar[tuple[str, ...]] = (NOMINAL,)
+    """Those that are run unless others are asked for."""
+    seeded: ClassVar[bool] = False
+    """Whether another seed gives another record."""
 
     @property
     def planar(self) -> bool:
-        """Whether its vehicles are robots on a plane, which some observers are for and others are not."""
-        ...
+        """Whether its vehicles are robots on a plane, which some observers are for and others are not.
 
+        Raises:
+            CoopenvError: the data are not there or not well-formed.
+        """
+        return False
+
+    @abstractmethod
     def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
-        """Return a record, and the lie that somebody tells on it."""
-        ...
+        """Return a record, and the lie that somebody tells on it.
+
+        Raises:
+            CoopenvError: the data are not there or not well-formed.
+        """
 
     def obstacle(self, variant: str) -> str:
-        """Return why it cannot have one of the variants; empty where it can."""
-        ...
+        """Return why it cannot have one of the variants; empty where it can.
 
-    def check(self) -> None:
+        Raises:
+            CoopenvError: the data are not there or not well-formed.
+        """
+        return ""
+
+    def check(self) -> None:  # noqa: B027
         """Look at recorded data, so that errors and warnings come before the work.
 
         Raises:
             CoopenvError: they are not there or not well-formed.
         """
-        ...
 
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
-        """Return when the steady state starts, s; without a record only what is asked for is checked."""
-        ...
+        """Return when the steady state starts, s; without a record only what is asked for is checked.
+
+        Recorded robots are judged from the start on, where their poses are known.
+
+        Raises:
+            CoopenvError: what was asked for does not lie within the record.
+        """
+        if given is not None:
+            if not 0.0 <= given < math.inf:
+                raise CoopenvError(f"start of the steady state at {given:g} s: not within the run")
+            return given if recording is None else steady_start(given, float(recording.t[-1]))
+        if recording is None or _is_planar(recording):
+            return 0.0
+        return STEADY_SHARE * float(recording.t[-1])
 
 
 @dataclass(frozen=True)
-class Simulated:
+class Simulated(Source):
     """A scenario, once per seed, as it is and with faults."""
 
-    name: str
     scenario: Scenario
-    variants: ClassVar[Mapping[str, str]] = {name: fault.summary for name, fault in FAULTS.items()}
-    usual: ClassVar[tuple[str, ...]] = (NOMINAL,)
     seeded: ClassVar[bool] = True
-    planar: ClassVar[bool] = False
 
     def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
         """Return the world of a seed with a fault."""
@@ -98,9 +106,6 @@ class Simulated:
         followed = any(target >= L for targets in neighbour_sets(self.scenario) for target in targets)
         return NOBODY_FOLLOWS if FAULTS[variant].lies and not followed else ""
 
-    def check(self) -> None:
-        """Do nothing: the scenario has been checked."""
-
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
         """Return when the steady state starts, s.
 
@@ -111,10 +116,9 @@ class Simulated:
 
 
 @dataclass(frozen=True)
-class Robots:
-    """A sub-dataset of MR.CLAM. It is judged from the start on, where the robots' poses are known."""
+class Robots(Source):
+    """A sub-dataset of MR.CLAM."""
 
-    name: str
     data: Path | None
     """The folder with the data; None: as the environment variable COOPENV_DATA says."""
     variants: ClassVar[Mapping[str, str]] = {
@@ -123,112 +127,48 @@ class Robots:
         "blind": "robots 3 to 5 see no landmark",
     }
     usual: ClassVar[tuple[str, ...]] = tuple(variants)
-    seeded: ClassVar[bool] = False
-    planar: ClassVar[bool] = True
-
-    def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
-        """Return the robots' record.
-
-        Raises:
-            CoopenvError: the data are not there or not well-formed.
-        """
-        from coopenv.backends.mrclam import load_dataset
-        from coopenv.backends.mrclam.recording import recording_of
-        from coopenv.backends.mrclam.variants import VARIANTS
-
-        known = next(name for name in VARIANTS if name == variant)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DataWarning)  # `check` has told
-            return recording_of(load_dataset(self.name, self.data), known), None
-
-    def obstacle(self, variant: str) -> str:
-        """Return nothing: every sub-dataset has all variants."""
-        return ""
-
-    def check(self) -> None:
-        """Read the data once.
-
-        Raises:
-            CoopenvError: the data are not there or not well-formed.
-        """
-        from coopenv.backends.mrclam import load_dataset
-
-        load_dataset(self.name, self.data)
-
-    def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
-        """Return when judging starts, s: as given, or at the start.
-
-        Raises:
-            CoopenvError: what was asked for does not lie within the record.
-        """
-        return 0.0 if given is None else _within(given, recording)
-
-
-@dataclass(frozen=True)
-class LogFile:
-    """A record in a file, as it is and with faults."""
-
-    name: str
-    path: Path
-    variants: ClassVar[Mapping[str, str]] = {name: fault.summary for name, fault in FAULTS.items()}
-    usual: ClassVar[tuple[str, ...]] = (NOMINAL,)
-    seeded: ClassVar[bool] = False
 
     @property
     def planar(self) -> bool:
-        """Whether its vehicles are robots on a plane.
-
-        Raises:
-            CoopenvError: the file is no record.
-        """
-        return _is_planar(self.recording(NOMINAL, 0)[0])
+        """Its robots drive on a plane."""
+        return True
 
     def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
-        """Return the file's record with a fault.
-
-        Raises:
-            CoopenvError: the file is no such record.
-        """
-        from coopenv.backends.mcap import read_recording
-
-        return FAULTS[variant].applied(read_recording(self.path), seed)
-
-    def obstacle(self, variant: str) -> str:
-        """Return why no vehicle can lie to another, where that is so.
-
-        Raises:
-            CoopenvError: the file is no record.
-        """
-        if not FAULTS[variant].lies:
-            return ""
-        recording, _ = self.recording(NOMINAL, 0)
-        return "" if any(followers(recording, i) for i in recording.order) else NOBODY_FOLLOWS
+        """Return the robots' record."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # `check` has told
+            return open_recording(self.name, self.data, variant), None
 
     def check(self) -> None:
-        """Do nothing: `planar` has read the file."""
+        """Read the data once."""
+        open_recording(self.name, self.data)
 
-    def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
-        """Return when the steady state starts, s: recorded robots are judged from the start on.
 
-        Raises:
-            CoopenvError: what was asked for does not lie within the record.
-        """
-        if given is not None:
-            return _within(given, recording)
-        if recording is None or _is_planar(recording):
-            return 0.0
-        return STEADY_SHARE * float(recording.t[-1])
+@dataclass(frozen=True)
+class LogFile(Source):
+    """A record in a file, as it is and with faults."""
+
+    path: Path
+
+    @property
+    def planar(self) -> bool:
+        """Whether its vehicles are robots on a plane."""
+        return _is_planar(open_recording(self.path))
+
+    def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
+        """Return the file's record with a fault."""
+        return FAULTS[variant].applied(open_recording(self.path), seed)
+
+    def obstacle(self, variant: str) -> str:
+        """Return why no vehicle can lie to another, where that is so."""
+        if not FAULTS[variant].lies:
+            return ""
+        recording = open_recording(self.path)
+        return "" if any(followers(recording, i) for i in recording.order) else NOBODY_FOLLOWS
 
 
 def _is_planar(recording: Recording) -> bool:
     return all(setup.planar for setup in recording.setups)
-
-
-def _within(given: float, recording: Recording | None) -> float:
-    """Return a start of the steady state that lies within the record, as far as that is known."""
-    if not 0.0 <= given < math.inf:
-        raise CoopenvError(f"--steady-from {given:g} is not within the run")
-    return given if recording is None else steady_start(given, float(recording.t[-1]))
 
 
 def find_source(text: str, overrides: Mapping[str, Any] | None = None, data: Path | None = None) -> Source:
@@ -242,17 +182,19 @@ def find_source(text: str, overrides: Mapping[str, Any] | None = None, data: Pat
     Raises:
         CoopenvError: there is none of that name, or an option for what is no such source.
     """
-    if data is not None and not ROBOTS.fullmatch(text):
+    path = Path(text)
+    robots = is_recorded(text) and not path.suffix
+    if data is not None and not robots:
         raise CoopenvError(f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9")
-    if not (ROBOTS.fullmatch(text) or text.endswith(LOG_SUFFIX)):
-        return Simulated(Path(text).stem, load_scenario(text, overrides))
+    if not is_recorded(text):
+        return Simulated(path.stem, load_scenario(text, overrides))
     if overrides:
         raise CoopenvError(f"--set {next(iter(overrides))}: {text} is recorded, it has no scenario to change")
-    if text.endswith(LOG_SUFFIX):
-        if not Path(text).is_file():
-            raise CoopenvError(f"no such log file: {text}")
-        return LogFile(Path(text).stem, Path(text))
-    return Robots(text, data)
+    if robots:
+        return Robots(text, data)
+    if not path.is_file():
+        raise CoopenvError(f"no such log file: {text}")
+    return LogFile(path.stem, path)
 
 
 def variants_of(source: Source, asked: str | None) -> tuple[str, ...]:
