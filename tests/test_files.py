@@ -17,6 +17,7 @@ import pytest
 from coopenv import files
 from coopenv.errors import OutputError
 from coopenv.files import check_file, replacing_file, replacing_folder, writing
+from tests.helpers.processes import small_disk
 
 NAMES = ("a.txt", "b.txt", "c.txt", "sometimes.txt")
 
@@ -295,55 +296,46 @@ def test_what_is_read_only_is_refused_before_the_work(place: Path) -> None:
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of 400 kB."""
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    try:
-        done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", disk], capture_output=True)
-    except OSError:
-        pytest.skip("no mount")
-    if done.returncode != 0:
-        pytest.skip("needs the right to mount")
-    yield disk
-    subprocess.run(["umount", disk], check=True)
+def disk(tmp_path: Path) -> Iterator[Path]:
+    with small_disk(tmp_path / "disk", "400k") as place:
+        yield place
 
 
-def test_a_full_disk_keeps_the_old_result(small_disk: Path) -> None:
-    write(small_disk / "result", 0)
-    with replacing_file(small_disk / "single.txt") as new:
+def test_a_full_disk_keeps_the_old_result(disk: Path) -> None:
+    write(disk / "result", 0)
+    with replacing_file(disk / "single.txt") as new:
         new.write_text("old")
     with (
         pytest.raises(OutputError, match=r"result/.*: No space left"),
-        replacing_folder(small_disk / "result", NAMES) as folder,
+        replacing_folder(disk / "result", NAMES) as folder,
         replacing_file(folder / "a.txt") as new,
     ):
         new.write_bytes(bytes(1_000_000))
-    with pytest.raises(OutputError, match="No space left"), replacing_file(small_disk / "single.txt") as new:
+    with pytest.raises(OutputError, match="No space left"), replacing_file(disk / "single.txt") as new:
         new.write_bytes(bytes(1_000_000))
-    assert generation_of(small_disk / "result") == 0
-    assert (small_disk / "single.txt").read_text() == "old"
-    assert hidden(small_disk) == hidden(small_disk / "result") == []
-    with (small_disk / "filler").open("wb", buffering=0) as stream, pytest.raises(OSError, match="No space"):
+    assert generation_of(disk / "result") == 0
+    assert (disk / "single.txt").read_text() == "old"
+    assert hidden(disk) == hidden(disk / "result") == []
+    with (disk / "filler").open("wb", buffering=0) as stream, pytest.raises(OSError, match="No space"):
         while True:
             stream.write(bytes(4096))
-    for write_one in (lambda: write(small_disk / "result", 1), lambda: check_file(small_disk / "single.txt")):
+    for write_one in (lambda: write(disk / "result", 1), lambda: check_file(disk / "single.txt")):
         with pytest.raises(OutputError, match="No space left"):
             write_one()
-    assert generation_of(small_disk / "result") == 0
+    assert generation_of(disk / "result") == 0
     with pytest.raises(OutputError, match="mount point"):
-        write(small_disk, 1)
+        write(disk, 1)
 
 
-def test_a_read_only_disk_is_found_before_the_work(small_disk: Path) -> None:
-    write(small_disk / "result", 0)
-    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
+def test_a_read_only_disk_is_found_before_the_work(disk: Path) -> None:
+    write(disk / "result", 0)
+    subprocess.run(["mount", "-o", "remount,ro", disk], check=True)
     for place in ("result", "new", "new/below"):
         with pytest.raises(OutputError, match=f"cannot write to .*{place}: .*[rR]ead-only"):
-            write(small_disk / place, 1)
+            write(disk / place, 1)
     with pytest.raises(OutputError, match="ead-only"):
-        check_file(small_disk / "single.txt")
-    assert generation_of(small_disk / "result") == 0
+        check_file(disk / "single.txt")
+    assert generation_of(disk / "result") == 0
 
 
 def test_a_limit_on_the_size_of_files_keeps_the_old_result(place: Path) -> None:

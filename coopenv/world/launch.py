@@ -20,6 +20,7 @@ import warp as wp
 
 from coopenv.errors import CoopenvError
 from coopenv.machine import available_cores
+from coopenv.world import kernel_cache
 
 WORLDS_PER_THREAD = 32
 """Smaller shares are not worth the handing over between threads."""
@@ -27,17 +28,21 @@ WORLDS_PER_THREAD = 32
 
 @cache
 def start_warp() -> None:
-    """Initialise Warp without its banner, and without the notice that its library prints where no GPU driver is."""
+    """Initialise Warp without its banner, and without the notice that its library prints where no GPU driver is.
+
+    Raises:
+        KernelCacheError: compiled kernels cannot be kept.
+    """
     wp.config.log_level = wp.LOG_ERROR
     try:
         saved = os.dup(2)
     except OSError:  # no standard error: nothing to mute
-        wp.init()
+        kernel_cache.start()
         return
     with Path(os.devnull).open("wb") as nothing:
         os.dup2(nothing.fileno(), 2)
     try:
-        wp.init()
+        kernel_cache.start()
     finally:
         os.dup2(saved, 2)
         os.close(saved)
@@ -118,7 +123,7 @@ class Launcher:
         commands = self._recorded.get(key)
         if commands is None:
             commands = self._recorded[key] = [
-                wp.launch(
+                kernel_cache.launch(
                     kernel(function, self._precision),
                     dim=(stop - start, *inner),
                     inputs=[a.part(start, stop) if isinstance(a, PerWorld) else a for a in arguments],

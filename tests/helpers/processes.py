@@ -6,9 +6,12 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 ROOT = Path(__file__).parents[2]
 COOPENV = (sys.executable, "-m", "coopenv")
@@ -52,3 +55,19 @@ def group_of(leader: int) -> list[str]:
 def workers_of(leader: int) -> list[str]:
     """Return those that `multiprocessing` has started to work."""
     return [line for line in group_of(leader) if "spawn_main" in line]
+
+
+@contextmanager
+def small_disk(place: Path, size: str) -> Iterator[Path]:
+    """Mount a new disk of a size such as `400k`; skip the test where that is not allowed."""
+    place.mkdir()
+    try:
+        done = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", place], capture_output=True)
+    except OSError:
+        pytest.skip("there is no `mount`")
+    if done.returncode != 0:
+        pytest.skip("needs the right to mount")
+    try:
+        yield place
+    finally:
+        subprocess.run(["umount", place], check=True)

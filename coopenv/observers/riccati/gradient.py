@@ -32,6 +32,7 @@ from coopenv.observers.riccati.gradient_kernels import (
 )
 from coopenv.scenario import Scenario
 from coopenv.scenario.topology import processing_order
+from coopenv.world import kernel_cache
 from coopenv.world.dynamics import LONGEST_SUBSTEP
 from coopenv.world.launch import kernel
 from coopenv.world.world import World
@@ -169,7 +170,7 @@ class DifferentiableWorld:
 
     def _estimate(self, truth: Any, held: Any, belief: Any, tick: int, turn: Any) -> Any:
         world, rate = self._world, self.scenario.rates.camera
-        wp.launch(
+        kernel_cache.launch(
             kernel(show_kernel, "float64"),
             dim=(world.worlds, world.model.agents),
             inputs=[world.model, truth, world.state, wp.float64(tick / rate)],
@@ -189,7 +190,7 @@ class DifferentiableWorld:
     def _launch(self, function: Any, arguments: list[Any], dim: Any = None) -> None:
         grid = (self._world.worlds, self._world.model.vehicles) if dim is None else dim
         compiled = kernel(function, "float64", differentiable=True)
-        wp.launch(compiled, dim=grid, inputs=arguments, device=self._world.device)
+        kernel_cache.launch(compiled, dim=grid, inputs=arguments, device=self._world.device)
 
 
 def tick_intervals(tick: int, camera: float, odometry: float) -> list[tuple[float, bool]]:

@@ -1,0 +1,82 @@
+"""Warp's cache of compiled kernels on the disk: what is damaged is built again, what cannot be written is one line."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from glob import escape
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+from coopenv.errors import CoopenvError
+
+ATTEMPTS = 3
+"""Of loading a module. The second builds it anew; a third is for two processes that mend the same one."""
+PROBE_BYTES = 5 << 20
+"""As much as the source and the code of a large module have."""
+
+
+class KernelCacheError(CoopenvError):
+    """Compiled kernels cannot be kept where they should go."""
+
+
+def start() -> None:
+    """Initialise Warp, which makes the folder of the cache.
+
+    Raises:
+        KernelCacheError: it cannot.
+    """
+    try:
+        wp.init()
+    except OSError as error:
+        raise unwritable(error) from None
+
+
+def launch(kernel: wp.Kernel, **options: Any) -> Any:
+    """Do what `wp.launch` does with a kernel that is in memory, in the cache, damaged there, or not compiled yet.
+
+    Raises:
+        KernelCacheError: it has to be compiled, and the cache cannot be written.
+    """
+    for attempt in range(ATTEMPTS):
+        kept = list(cache_folder().glob(f"wp_{escape(kernel.module.name)}_{'[0-9a-f]' * 7}"))
+        if not kept:
+            probe()  # LLVM ends the process where it cannot write
+        try:
+            return wp.launch(kernel, **options)
+        except Exception:  # Warp raises what it has: OSError, ValueError, RuntimeError, Exception itself
+            for module in kept:
+                shutil.rmtree(module, ignore_errors=True)
+            probe()
+            if not kept or attempt == ATTEMPTS - 1:
+                raise
+            kernel.module.unload()  # forgets the failure
+    return None
+
+
+def cache_folder() -> Path:
+    """Return the folder of the cache of this version of Warp."""
+    return Path(wp.config.kernel_cache_dir or "")
+
+
+def probe() -> None:
+    """Make sure that the cache can be written.
+
+    Raises:
+        KernelCacheError: it cannot.
+    """
+    try:
+        with tempfile.TemporaryFile(dir=cache_folder()) as stream:
+            stream.write(bytes(PROBE_BYTES))
+    except OSError as error:
+        raise unwritable(error) from None
+
+
+def unwritable(error: OSError) -> KernelCacheError:
+    """Return the error that says where compiled kernels should have gone, and what to do."""
+    return KernelCacheError(
+        f"cannot keep compiled kernels in {cache_folder()}: {error.strerror or error}; set the variable "
+        "WARP_CACHE_PATH to a folder that can be written"
+    )

@@ -1,0 +1,99 @@
+"""The cache of compiled kernels: damaged, read-only, full, or in no place that can be."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.processes import COOPENV, ROOT, small_disk
+
+PROGRAM = """
+import sys
+from typing import Any
+import numpy as np
+import warp as wp
+from coopenv.errors import CoopenvError
+from coopenv.world.launch import Launcher, start_warp
+
+def twice(x: wp.array(dtype=Any)):
+    i = wp.tid()
+    x[i] = x[i] + x[i]
+
+try:
+    start_warp()
+    x = wp.array(np.arange(3.0), dtype=wp.float64, device="cpu")
+    Launcher(3, "cpu", "float64")("twice", twice, [x])
+    print(x.numpy().tolist())
+except CoopenvError as error:
+    print("error:", error)
+"""
+DONE = "[0.0, 2.0, 4.0]\n"
+"""What the program prints."""
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Path:
+    (tmp_path / "program.py").write_text(PROGRAM)
+    return tmp_path / "program.py"
+
+
+def run(*command: str | Path, **variables: str | Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), **{name: str(value) for name, value in variables.items()}}
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.mark.parametrize(("suffix", "left"), [(".o", 0.5), (".o", 0.0), (".meta", 0.5)])
+def test_what_is_damaged_is_built_again(suffix: str, left: float, program: Path, tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    assert run(sys.executable, program, WARP_CACHE_PATH=cache).stdout == DONE
+    (part,) = cache.glob(f"*/wp_*twice*/*{suffix}")
+    good = part.read_bytes()
+    part.write_bytes(good[: int(left * len(good))])
+    assert run(sys.executable, program, WARP_CACHE_PATH=cache).stdout == DONE
+    assert len(part.read_bytes()) == len(good)
+
+
+@pytest.mark.parametrize("place", ["/dev/null", "/proc/nowhere"])
+@pytest.mark.parametrize("variable", ["WARP_CACHE_PATH", "HOME"])
+def test_a_place_that_cannot_be_is_one_line(variable: str, place: str, tmp_path: Path) -> None:
+    unset = [word for name in {"WARP_CACHE_PATH", "XDG_CACHE_HOME"} - {variable} for word in ("-u", name)]
+    command = (*COOPENV, "run", "overtaking", "--steps", "1", "--out", tmp_path / "result")
+    done = run("env", *unset, *command, **{variable: place})
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert done.stderr.startswith(f"error: cannot keep compiled kernels in {place}/")
+    assert "WARP_CACHE_PATH" in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    with small_disk(tmp_path / "disk", "20m") as place:
+        yield place
+
+
+def test_a_read_only_cache_serves_what_it_has(program: Path, disk: Path) -> None:
+    remount = ["mount", "-o", "remount,ro", disk]
+    (disk / "1").mkdir()
+    subprocess.run(remount, check=True)
+    refused = f"error: cannot keep compiled kernels in {disk}/.*: Read-only"
+    assert re.match(refused, run(sys.executable, program, WARP_CACHE_PATH=disk).stdout)
+    subprocess.run(["mount", "-o", "remount,rw", disk], check=True)
+    assert run(sys.executable, program, WARP_CACHE_PATH=disk).stdout == DONE
+    subprocess.run(remount, check=True)
+    assert run(sys.executable, program, WARP_CACHE_PATH=disk).stdout == DONE
+
+
+def test_a_full_disk_is_told_before_the_compiler_meets_it(program: Path, disk: Path) -> None:
+    with (disk / "filler").open("wb", buffering=0) as stream:
+        while stream.write(bytes(1 << 16)) == 1 << 16:
+            if stream.tell() > 18 << 20:
+                break
+    done = run(sys.executable, program, WARP_CACHE_PATH=disk)
+    assert "No space left on device; set the variable WARP_CACHE_PATH" in done.stdout
+    assert done.stderr == ""
