@@ -19,7 +19,6 @@ MOST_COLUMNS = 5
 FAILED = "failed"
 SPREAD_NOTE = "0.0123(4): 0.0123 with a standard error of 0.0004 over the seeds"
 
-_LONG = 9  # characters of a word in a heading
 _NAMED = 16  # characters of an observer's name on one line
 BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", "bound_single_m": "bound (alone)"}
 """Column to its line in the table of errors."""
@@ -97,7 +96,7 @@ def honest_line(rows: Sequence[Row]) -> str:
 
 def quality_table(board: Leaderboard, variant: str) -> Table:
     """Return, of one variant over all vehicles: who settles, consistency (1 is honest) and costs."""
-    headings = ["set-\ntled", "con-\nverged", "di-\nverged", "ANEES\nbest", "ANEES\nworst", "NIS", "sent\nB/s", "us"]
+    headings = ["settled", "converged", "diverged", "ANEES\nbest", "ANEES\nworst", "NIS", "sent\nB/s", "us"]
     table = number_table(["observer"], headings, gap=0)
     for name in board.ranked:
         own = board.rows_in(variant, name)
@@ -162,9 +161,9 @@ def _headings(board: Leaderboard, last: str) -> list[str]:
 
 
 def _heading(variant: str) -> str:
-    """Return a name on lines of few characters."""
+    """Return a name with one word per line."""
     words = variant.replace("+", "_+").split("_")
-    return "\n".join(word if len(word) <= _LONG else f"{word[:6]}-\n{word[6:]}" for word in words)
+    return "\n".join(words)
 
 
 def _add(table: Table, name: str, rows: Sequence[Row], cells: Sequence[str]) -> None:
