@@ -25,9 +25,9 @@ NEVER = 1 << 30
 
 
 @wp.func
-def without_camera(model: Any, state: Any, record: Any, actions: Any, world: int, tick: int) -> None:
+def without_camera(model: Any, state: Any, record: Any, world: int, tick: int) -> None:
     """Move, measure odometry and look for contact."""
-    move(model, state, actions, world, tick)
+    move(model, state, world, tick)
     for vehicle in range(model.vehicles):
         measure_odometry(model, state, world, vehicle, tick)
     for vehicle in range(model.vehicles):
@@ -35,21 +35,21 @@ def without_camera(model: Any, state: Any, record: Any, actions: Any, world: int
 
 
 @wp.func
-def without_odometry(model: Any, state: Any, record: Any, actions: Any, world: int, tick: int) -> None:
+def without_odometry(model: Any, state: Any, record: Any, world: int, tick: int) -> None:
     """Move and look for contact."""
-    move(model, state, actions, world, tick)
+    move(model, state, world, tick)
     for vehicle in range(model.vehicles):
         referee(model, state, world, vehicle)
 
 
 @wp.func
-def without_contact(model: Any, state: Any, record: Any, actions: Any, world: int, tick: int) -> None:
+def without_contact(model: Any, state: Any, record: Any, world: int, tick: int) -> None:
     """Move."""
-    move(model, state, actions, world, tick)
+    move(model, state, world, tick)
 
 
 @wp.func
-def without_motion(model: Any, state: Any, record: Any, actions: Any, world: int, tick: int) -> None:
+def without_motion(model: Any, state: Any, record: Any, world: int, tick: int) -> None:
     """Do nothing."""
 
 

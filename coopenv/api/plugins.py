@@ -63,6 +63,7 @@ class PlugIns:
         Raises:
             CoopenvError: an observer failed; its world has to be reset.
         """
+        self._world.decide()
         for _ in range(ticks):
             active = (self._world.mask.numpy() == 0) & (self._world.view("tick") < self._world.model.horizon_ticks)
             if not active.any():

@@ -146,10 +146,11 @@ def _fill_dynamics(dynamics: Any, scenario: Scenario) -> None:
     dynamics.max_acceleration = d.max_acceleration
     dynamics.max_steering = d.max_steering
     dynamics.max_steering_rate = d.max_steering_rate
-    dynamics.speed_lag = d.speed_time_constant
+    accelerates = scenario.action.longitudinal == "acceleration"
+    dynamics.speed_lag = 0.0 if accelerates else d.speed_time_constant  # an acceleration acts at once
     dynamics.steering_lag = d.steering_time_constant
     dynamics.latency_ticks = round(d.latency * scenario.rates.camera)
-    dynamics.acceleration_mode = int(scenario.action.longitudinal == "acceleration")
+    dynamics.acceleration_mode = int(accelerates)
     dynamics.action_steering = scenario.action.steering or d.max_steering
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.so3 import exp_so3, left_jacobian, orthonormalise
+from coopenv.world.command import ACCELERATION, SPEED, STEERING
 
 LONGEST_SUBSTEP = wp.constant(wp.float64(0.0100001))
 """s; the bicycle's twist is held over no longer than this."""
@@ -59,16 +60,10 @@ def approach(value: Any, target: Any, dt: Any, lag: Any, rate: Any):
 
 @wp.func
 def actuate(model: Any, speed: Any, steering: Any, command: Any, dt: Any):
-    """Return (speed, steering) after dt under a command in [-1, 1]^2."""
+    """Return (speed, steering) after dt under a command, see `coopenv.world.command`."""
     d = model.dynamics
-    one = type(speed)(1.0)
-    if d.acceleration_mode == 1:
-        new_speed = speed + command[0] * d.max_acceleration * dt
-    else:
-        span = (d.max_speed - d.min_speed) * type(speed)(0.5)
-        target = d.min_speed + (command[0] + one) * span
-        new_speed = approach(speed, target, dt, d.speed_lag, d.max_acceleration)
-    angle = wp.clamp(command[1] * d.action_steering, -d.max_steering, d.max_steering)
+    new_speed = approach(speed, command[SPEED], dt, d.speed_lag, command[ACCELERATION])
+    angle = wp.clamp(command[STEERING], -d.max_steering, d.max_steering)
     new_steering = approach(steering, angle, dt, d.steering_lag, d.max_steering_rate)
     return wp.clamp(new_speed, d.min_speed, d.max_speed), new_steering
 

@@ -68,7 +68,7 @@ class Source:
     begin: Any
     """(model, state, record, world): go to the start of an episode."""
     sense: Any
-    """(model, state, record, actions, world, tick): write everything that is sensed at a tick, and the truth."""
+    """(model, state, record, world, tick): write everything that is sensed at a tick, and the truth."""
     deliver: Any
     """(model, state, record, world, vehicle, tick): write the messages that a vehicle receives at a tick."""
     knows_truth: bool = True
@@ -101,9 +101,9 @@ def begin_simulation(model: Any, state: Any, record: Any, world: int):
 
 
 @wp.func
-def sense_simulation(model: Any, state: Any, record: Any, actions: Any, world: int, tick: int):
+def sense_simulation(model: Any, state: Any, record: Any, world: int, tick: int):
     """Move the truth of one world to a tick and measure it."""
-    move(model, state, actions, world, tick)
+    move(model, state, world, tick)
     for vehicle in range(model.vehicles):
         measure_odometry(model, state, world, vehicle, tick)
     for vehicle in range(model.vehicles):

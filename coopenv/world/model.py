@@ -66,8 +66,8 @@ def model_struct(p: Precision) -> Any:
         speed_lag: scalar
         steering_lag: scalar
         latency_ticks: wp.int32
-        acceleration_mode: wp.int32
-        action_steering: scalar
+        acceleration_mode: wp.int32  # 1: the first entry of an action is an acceleration
+        action_steering: scalar  # of an action of 1
 
     @wp.struct
     class Scene:

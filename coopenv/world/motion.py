@@ -6,29 +6,9 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.world.command import command_in_force
 from coopenv.world.dynamics import drive, prescribe
 from coopenv.world.model import DRIVEN, PRESCRIBED
-
-
-@wp.func
-def sanitised(action: Any):
-    """Return an action clipped to [-1, 1], zero where it is not finite."""
-    one = action.dtype(1.0)
-    result = action - action
-    for axis in range(2):
-        if wp.isfinite(action[axis]):
-            result[axis] = wp.clamp(action[axis], -one, one)
-        else:
-            result[axis] = action.dtype(0.0)
-    return result
-
-
-@wp.func
-def command_in_force(model: Any, state: Any, world: int, vehicle: int, action: Any, tick: int):
-    """Return what the actuators follow during a tick: after a decision, the last command for the dead time."""
-    if (tick - 1) % model.ticks_per_decision < model.dynamics.latency_ticks:
-        return state.command[world, vehicle]
-    return action
 
 
 @wp.func
@@ -54,7 +34,7 @@ def drive_through(model: Any, state: Any, world: int, vehicle: int, command: Any
 
 
 @wp.func
-def move(model: Any, state: Any, actions: Any, world: int, tick: int):
+def move(model: Any, state: Any, world: int, tick: int):
     """Carry all truth of one world to the tick's end."""
     t = wp.float64(tick) * model.camera_period
     for agent in range(model.agents):
@@ -62,6 +42,5 @@ def move(model: Any, state: Any, actions: Any, world: int, tick: int):
             prescribe(model, state, world, agent, t)
     for vehicle in range(model.vehicles):
         if model.motion.kind[model.landmarks + vehicle] == DRIVEN:
-            action = sanitised(actions[world, vehicle])
-            command = command_in_force(model, state, world, vehicle, action, tick)
+            command = command_in_force(model, state, world, vehicle, tick)
             drive_through(model, state, world, vehicle, command, tick)

@@ -10,6 +10,7 @@ from coopenv.estimation.linalg import join6
 from coopenv.estimation.so3 import exp_so3, identity3, orthonormalise
 from coopenv.world.camera import NOT_A_NEIGHBOUR, observe
 from coopenv.world.collision import touches_anything
+from coopenv.world.command import command_of
 from coopenv.world.dynamics import prescribe
 from coopenv.world.model import DRIVEN, PRESCRIBED
 from coopenv.world.random import (
@@ -65,8 +66,11 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
     if model.dynamics.acceleration_mode == 0:
         span = model.dynamics.max_speed - model.dynamics.min_speed
         level = (speed - model.dynamics.min_speed) * o.dtype(2.0) / span - o.dtype(1.0)
-    command = state.command[world, vehicle]
-    state.command[world, vehicle] = type(command)(level, o[0])
+    action = wp.vector(level, o[0])
+    command = command_of(model, action)
+    state.action[world, vehicle] = action
+    state.command[world, vehicle] = command
+    state.last_command[world, vehicle] = command
     if model.motion.kind[agent] == DRIVEN:
         state.velocity[world, agent] = type(o)(speed, o[0], o[0])
     state.ended[world, vehicle] = 0

@@ -51,7 +51,9 @@ def state_struct(p: Precision) -> Any:
         angular_velocity: array("WA", vec3)  # truth, body, rad/s
         speed: array("WN", scalar)  # of the bicycle, m/s
         steering: array("WN", scalar)  # rad
-        command: array("WN", vec2)  # action in force
+        action: array("WN", vec2)  # of the decision under way, in [-1, 1]
+        command: array("WN", vec3)  # what it asks for: speed m/s, steering rad, acceleration m/s^2
+        last_command: array("WN", vec3)  # of the decision before, in force during the dead time
         ended: array("WN", wp.int32)  # values of `Outcome`, then one per condition of the scenario's own
         collided: array("WN", wp.int32)  # touching something now
 
@@ -98,7 +100,7 @@ VALID: dict[str, Rule] = {
     "velocity": NUMBER._replace(of_truth=True),
     "angular_velocity": NUMBER._replace(of_truth=True),
     "steering": numbers(1.6),
-    "command": numbers(1.001),
+    "action": numbers(1.001),
     "ended": whole(0, "last_outcome"),
     "collided": FLAG,
     "odometry_samples": ODOMETRY_SAMPLES,

@@ -12,9 +12,9 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.world.command import decide
 from coopenv.world.embedded import Embedded, Source
 from coopenv.world.gramian import sample_gramian
-from coopenv.world.motion import sanitised
 from coopenv.world.rates import regular_tick
 from coopenv.world.v2x import broadcast
 
@@ -22,11 +22,11 @@ Kernel = Callable[..., None]
 
 
 @wp.func
-def finish(model: Any, state: Any, actions: Any, world: int, tick: int):
+def finish(model: Any, state: Any, world: int, tick: int):
     """Put a decision that is over on record, and count the tick."""
     if tick % model.ticks_per_decision == 0 or tick == model.horizon_ticks:
         for vehicle in range(model.vehicles):
-            state.command[world, vehicle] = sanitised(actions[world, vehicle])
+            state.last_command[world, vehicle] = state.command[world, vehicle]
     state.tick[world] = tick
 
 
@@ -54,10 +54,12 @@ def advance_kernel(source: Source, observer: Embedded) -> Kernel:
         """Advance by up to `ticks` camera ticks, not beyond the horizon; worlds marked in `hold` stay as they are."""
         world = wp.tid()
         count = wp.where(hold[world] == 0, wp.min(ticks, model.horizon_ticks - state.tick[world]), 0)
+        if count > 0:
+            decide(model, state, actions, world)
         for _ in range(count):
             tick = state.tick[world] + 1
             now = regular_tick(model, tick)
-            sense(model, state, record, actions, world, tick)
+            sense(model, state, record, world, tick)
             for place in range(model.vehicles):
                 vehicle = model.order[place]
                 deliver(model, state, record, world, vehicle, tick)
@@ -65,7 +67,7 @@ def advance_kernel(source: Source, observer: Embedded) -> Kernel:
                 sample_gramian(model, state, world, vehicle, tick)
                 broadcast(model, state, world, vehicle, tick)
                 send(model, state, memory, world, vehicle, tick)
-            finish(model, state, actions, world, tick)
+            finish(model, state, world, tick)
 
     return _named(advance, source.name, observer.name, **observer.options)
 
@@ -89,16 +91,23 @@ def restart_kernel(source: Source, observer: Embedded) -> Kernel:
     return _named(restart, source.name, observer.name, **observer.options)
 
 
+def decide_kernel(model: Any, state: Any, actions: wp.array2d(dtype=Any), hold: wp.array(dtype=wp.int32)):
+    """Make commands of actions, where `advance` would. One thread per world."""
+    world = wp.tid()
+    if hold[world] == 0 and state.tick[world] < model.horizon_ticks:
+        decide(model, state, actions, world)
+
+
 @cache
 def sense_kernel(source: Source) -> Kernel:
     """Return the kernel of the first stage alone. The stages' `active` (W,) marks the worlds that take part."""
     sense_tick = source.sense
 
-    def sense(model: Any, state: Any, record: Any, active: wp.array(dtype=wp.int32), actions: wp.array2d(dtype=Any)):
+    def sense(model: Any, state: Any, record: Any, active: wp.array(dtype=wp.int32)):
         """Move and measure. One thread per world; the tick has its number from the start."""
         world = wp.tid()
         if active[world] != 0:
-            sense_tick(model, state, record, actions, world, state.tick[world] + 1)
+            sense_tick(model, state, record, world, state.tick[world] + 1)
 
     return _named(sense, source.name)
 
@@ -126,8 +135,8 @@ def broadcast_kernel(model: Any, state: Any, active: wp.array(dtype=wp.int32), v
         broadcast(model, state, world, vehicle, tick)
 
 
-def finish_kernel(model: Any, state: Any, active: wp.array(dtype=wp.int32), actions: wp.array2d(dtype=Any)):
+def finish_kernel(model: Any, state: Any, active: wp.array(dtype=wp.int32)):
     """End the tick. One thread per world."""
     world = wp.tid()
     if active[world] != 0:
-        finish(model, state, actions, world, state.tick[world] + 1)
+        finish(model, state, world, state.tick[world] + 1)

@@ -21,6 +21,7 @@ from coopenv.world.state import VALID, allocate_state, overwrite, state_fields, 
 from coopenv.world.step import (
     advance_kernel,
     broadcast_kernel,
+    decide_kernel,
     deliver_kernel,
     finish_kernel,
     restart_kernel,
@@ -129,12 +130,18 @@ class World:
     def _everything(self) -> list[Any]:
         return [self.model, PerWorld(self.state), PerWorld(self.memory), self._record]
 
-    # One tick in stages, for estimators on the host: sense, then per vehicle deliver and broadcast, then finish.
+    # A decision in stages, for estimators on the host: decide; then per tick sense, per vehicle deliver and broadcast,
+    # and finish.
+
+    def decide(self) -> None:
+        """Make commands of `self.actions` in the worlds that `advance` would move."""
+        moving = [PerWorld(self.actions), PerWorld(self.mask)]
+        self.launch("decide", decide_kernel, [self.model, PerWorld(self.state), *moving])
 
     def sense(self, active: Any) -> None:
         """Move the truth of the active worlds (W,) to the next tick and measure it."""
-        moving = [PerWorld(active), PerWorld(self.actions)]
-        self.launch("sense", sense_kernel(self.source), [self.model, PerWorld(self.state), self._record, *moving])
+        arguments = [self.model, PerWorld(self.state), self._record, PerWorld(active)]
+        self.launch("sense", sense_kernel(self.source), arguments)
 
     def deliver(self, active: Any, vehicle: int) -> None:
         """Let a vehicle of the active worlds receive what arrives at this tick."""
@@ -148,8 +155,7 @@ class World:
 
     def finish(self, active: Any) -> None:
         """End the tick of the active worlds."""
-        arguments = [self.model, PerWorld(self.state), PerWorld(active), PerWorld(self.actions)]
-        self.launch("finish", finish_kernel, arguments)
+        self.launch("finish", finish_kernel, [self.model, PerWorld(self.state), PerWorld(active)])
 
     def view(self, name: str) -> np.ndarray:
         """Return a field of the state on the host, without a copy on the CPU."""

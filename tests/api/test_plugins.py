@@ -99,7 +99,7 @@ def test_the_papers_observer_as_a_plugin_is_the_embedded_one(case: str) -> None:
             assert_allclose(plugin.view(field), embedded.view(field), rtol=1e-7, atol=1e-9, err_msg=field)
         for field in ("observation", "reward"):
             assert_allclose(plugin.view(field), embedded.view(field), atol=1e-6)
-        for field in ("bearing", "inbox_tick", "position", "odometry_velocity", "command", "tick", "ended"):
+        for field in ("bearing", "inbox_tick", "position", "odometry_velocity", "action", "command", "tick", "ended"):
             assert np.array_equal(plugin.view(field), embedded.view(field)), field
 
 

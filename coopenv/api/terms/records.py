@@ -49,7 +49,8 @@ def records(p: Precision) -> Records:
         velocity: vec3  # m/s, last odometry sample, body
         angular_velocity: vec3  # rad/s, last odometry sample, body
         odometry_age: wp.float64  # s
-        command: vec2  # action in force, [-1, 1]
+        action: vec2  # of this decision, [-1, 1]
+        command: vec3  # what it asked for: speed m/s, steering rad, acceleration m/s^2
         goal: vec3  # m, seen from the estimate, body; 0 without a goal
         outcome: wp.int32  # `Outcome` in the step of arrival or collision, else UNDER_WAY
 
@@ -141,6 +142,7 @@ def fill_ego(ego: Any, model: Any, state: Any, results: Any, world: int, vehicle
     ego.velocity = state.odometry_velocity[world, vehicle]
     ego.angular_velocity = state.odometry_angular_velocity[world, vehicle]
     ego.odometry_age = odometry_age(model, state, world, vehicle)
+    ego.action = state.action[world, vehicle]
     ego.command = state.command[world, vehicle]
     ego.goal = goal_seen(model, state, world, vehicle)
     ego.outcome = wp.where(results.alive[world, vehicle], state.ended[world, vehicle], UNDER_WAY)

@@ -32,7 +32,7 @@ def collision(ego: Any):
 
 @wp.func
 def control(ego: Any):
-    return -wp.float32(wp.dot(ego.command, ego.command))
+    return -wp.float32(wp.dot(ego.action, ego.action))
 
 
 @wp.func

@@ -54,7 +54,7 @@ def redeliver(model: Any, state: Any, record: Any, world: int, receiver: int, ti
 
 
 @wp.func
-def resense(model: Any, state: Any, record: Any, actions: Any, world: int, tick: int):
+def resense(model: Any, state: Any, record: Any, world: int, tick: int):
     """Recall a tick and judge contacts and arrivals by its truth."""
     recall(model, state, record, world, tick)
     for vehicle in range(model.vehicles):

@@ -1,4 +1,4 @@
-"""A differentiable rollout: from commands to the uncertainty of every vehicle, through Warp's tape.
+"""A differentiable rollout: from actions to the uncertainty of every vehicle, through Warp's tape.
 
 It covers what has a derivative: noise off, no losses and no delay, k = 1, and ticks in which one linearisation
 suffices. Whether a target is in view is taken as it falls out on the way forward. Contact and arrival end nothing here:
@@ -21,6 +21,7 @@ from coopenv.observers.riccati.gradient_kernels import (
     Held,
     Information,
     Truth,
+    command_kernel,
     correct_kernel,
     drive_kernel,
     inform_kernel,
@@ -29,6 +30,7 @@ from coopenv.observers.riccati.gradient_kernels import (
     show_kernel,
     trace_kernel,
     vec2,
+    vec3,
 )
 from coopenv.scenario import Scenario
 from coopenv.scenario.topology import processing_order
@@ -45,7 +47,7 @@ class Rollout:
     uncertainty: float
     """Sum over worlds and vehicles of trace P at the end (rad^2 + m^2)."""
     gradient: np.ndarray
-    """Its derivative with respect to the commands, same shape as they."""
+    """Its derivative with respect to the actions, same shape as they."""
     covariance: np.ndarray
     """P at the end, (W, N, 6, 6)."""
     position: np.ndarray
@@ -68,30 +70,31 @@ class DifferentiableWorld:
         self._world = World(scenario, worlds, "float64", device)
         self._order = processing_order(scenario)
 
-    def rollout(self, commands: np.ndarray, seed: int = 0) -> Rollout:
-        """Drive commands (T, W, N, 2) in (-1, 1), one per decision, and differentiate the final uncertainty.
+    def rollout(self, actions: np.ndarray, seed: int = 0) -> Rollout:
+        """Drive by actions (T, W, N, 2) in (-1, 1), one per decision, and differentiate the final uncertainty.
 
         Raises:
-            ActionError: the commands have another shape.
+            ActionError: the actions have another shape.
         """
         world = self._world
         expected = (world.worlds, world.model.vehicles, 2)
-        commands = np.asarray(commands)
-        numeric = commands.dtype.kind in "fiu"
-        if not numeric or commands.ndim != 4 or len(commands) == 0 or commands.shape[1:] != expected:
-            raise ActionError(f"commands have shape {commands.shape}, expected (decisions, W, N, 2) = (T, *{expected})")
-        if not np.isfinite(commands).all():
-            raise ActionError("commands are not finite")
-        if len(commands) * self.scenario.ticks_per_decision > self.scenario.horizon_ticks:
-            raise ActionError(f"{len(commands)} decisions reach beyond the horizon of {self.scenario.horizon:g} s")
+        actions = np.asarray(actions)
+        numeric = actions.dtype.kind in "fiu"
+        if not numeric or actions.ndim != 4 or len(actions) == 0 or actions.shape[1:] != expected:
+            raise ActionError(f"actions have shape {actions.shape}, expected (decisions, W, N, 2) = (T, *{expected})")
+        if not np.isfinite(actions).all():
+            raise ActionError("actions are not finite")
+        if len(actions) * self.scenario.ticks_per_decision > self.scenario.horizon_ticks:
+            raise ActionError(f"{len(actions)} decisions reach beyond the horizon of {self.scenario.horizon:g} s")
         world.reset([checked_seed(seed) + w for w in range(world.worlds)])
-        decisions = [self._array(c, vec2) for c in commands]
+        decisions = [self._array(action, vec2) for action in actions]
         total, turn = self._array(np.zeros(1), scalar), wp.zeros(1, dtype=scalar, device=world.device)
         truth, held, belief = self._start()
         tape = wp.Tape()
         with tape:
-            for tick in range(1, len(commands) * self.scenario.ticks_per_decision + 1):
-                command = self._command(decisions, tick)
+            commands = [self._command_of(action) for action in decisions]
+            for tick in range(1, len(actions) * self.scenario.ticks_per_decision + 1):
+                command = self._command(commands, tick)
                 truth, held = self._move(truth, held, command, tick)
                 belief = self._estimate(truth, held, belief, tick, turn)
                 held = self._make(Held, velocity=held.velocity, angular_velocity=held.angular_velocity)
@@ -106,7 +109,7 @@ class DifferentiableWorld:
         estimate = np.einsum("wnij,wnj->wni", belief.rotation.numpy(), belief.position.numpy())
         return Rollout(
             float(total.numpy()[0]),
-            np.stack([c.grad.numpy() for c in decisions]),
+            np.stack([action.grad.numpy() for action in decisions]),
             belief.covariance.numpy(),
             truth.position.numpy(),
             estimate,
@@ -148,12 +151,17 @@ class DifferentiableWorld:
         )
         return truth, held, belief
 
-    def _command(self, decisions: list[Any], tick: int) -> Any:
-        """Return the command in force during a tick, see `command_in_force` in `motion.py`."""
+    def _command_of(self, action: Any) -> Any:
+        command = self._array(np.zeros((*action.shape, 3)), vec3)
+        self._launch(command_kernel, [self._world.model, action, command])
+        return command
+
+    def _command(self, commands: list[Any], tick: int) -> Any:
+        """Return the command in force during a tick, see `coopenv.world.command.command_in_force`."""
         decision, elapsed = divmod(tick - 1, self.scenario.ticks_per_decision)
         if elapsed >= self._world.model.dynamics.latency_ticks:
-            return decisions[decision]
-        return decisions[decision - 1] if decision > 0 else self._world.state.command
+            return commands[decision]
+        return commands[decision - 1] if decision > 0 else self._world.state.last_command
 
     def _move(self, truth: Any, held: Any, command: Any, tick: int) -> tuple[Any, Any]:
         for duration, sample in tick_intervals(tick, self.scenario.rates.camera, self.scenario.rates.odometry):

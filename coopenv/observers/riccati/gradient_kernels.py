@@ -12,6 +12,7 @@ from coopenv.estimation.linalg import block3, cholesky6, join6
 from coopenv.estimation.so3 import exp_so3, increment, orthonormalise
 from coopenv.observers.riccati.equations import accumulate_information, correct_kalman, predict_covariance, predict_pose
 from coopenv.world.camera import VISIBLE, sight_of
+from coopenv.world.command import command_of
 from coopenv.world.dynamics import bicycle_step, prescribe, yaw_rate
 from coopenv.world.model import PRESCRIBED
 from coopenv.world.precision import precision
@@ -59,6 +60,12 @@ class Information:
     M22: wp.array2d(dtype=mat33)
     r1: wp.array2d(dtype=vec3)
     r2: wp.array2d(dtype=vec3)
+
+
+def command_kernel(model: Any, action: wp.array2d(dtype=Any), command: wp.array2d(dtype=Any)):
+    """Make every vehicle's command of its action."""
+    world, vehicle = wp.tid()
+    command[world, vehicle] = command_of(model, action[world, vehicle])
 
 
 def drive_kernel(
