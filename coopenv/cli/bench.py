@@ -118,11 +118,11 @@ def bench_observers(
 ) -> None:
     """Compare observers on the same data and with their bound."""
     from coopenv.bench.observers.command import perform, request_of
-    from coopenv.bench.observers.executors import find_engine
+    from coopenv.bench.observers.executors import find_executor
 
     printed, log = console(), console(stderr=True)
     with warned():
         changes, numbers = parse_overrides(overrides), range(first, first + seeds)
         request = request_of(source, observers, variants, numbers, steady_from, basin, data, changes, overrides or ())
         request.source.check()
-    perform(request, find_engine(engine, jobs, address), out, figures, printed, log, as_json)
+    perform(request, find_executor(engine, jobs, address), out, figures, printed, log, as_json)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from coopenv.bench.observers.executors import Engine
+from coopenv.bench.observers.executors import Executor
 from coopenv.bench.observers.initial_estimates import random_start
 from coopenv.bench.observers.sources import Source
 from coopenv.bench.tables import number_table
@@ -118,7 +118,7 @@ def study_basin(
     source: Source,
     observers: Sequence[str],
     draws: int,
-    engine: Engine,
+    executor: Executor,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> list[Draw]:
     """Return the draws 0, 1, ... of every observer, on the record of seed 0.
@@ -127,7 +127,7 @@ def study_basin(
         source: of the record.
         observers: names.
         draws: how many.
-        engine: where the work is done.
+        executor: where the work is done.
         on_progress: called with the share that is done.
 
     Raises:
@@ -138,7 +138,7 @@ def study_basin(
         find(name)
     sent = {name: portable(name) for name in observers}
     tasks = [BasinTask(source, (draw,), sent) for draw in range(draws)]
-    found = engine.map(draw_starts, tasks, lambda done: on_progress(done / draws))
+    found = executor.map(draw_starts, tasks, lambda done: on_progress(done / draws))
     return [draw for name in observers for part in found for draw in part if draw.observer == name]
 
 

@@ -24,7 +24,7 @@ from coopenv.bench.observers.basin import (
     study_basin,
 )
 from coopenv.bench.observers.comparison import Comparison, observers_of, run_comparison, work_of
-from coopenv.bench.observers.executors import Engine
+from coopenv.bench.observers.executors import Executor
 from coopenv.bench.observers.sources import ALL, Source, find_source, variants_of
 from coopenv.errors import CoopenvError
 from coopenv.files import replacing_folder
@@ -126,7 +126,7 @@ class Found:
 
 def perform(
     request: Request,
-    engine: Engine,
+    executor: Executor,
     out: Path | None,
     figures: str | None,
     printed: Console,
@@ -137,7 +137,7 @@ def perform(
 
     Args:
         request: what is to be compared.
-        engine: where the work is done.
+        executor: where the work is done.
         out: folder for the files; None: no files.
         figures: format of figures as files of their own; None: the report alone has them.
         printed: for the tables.
@@ -154,7 +154,7 @@ def perform(
     names += [name for form in exports.FORMATS for name in figure_files(tuple(request.source.variants), form)]
     try:
         with nullcontext() if out is None else replacing_folder(out, names) as folder:
-            found = _compare(request, engine, log)
+            found = _compare(request, executor, log)
             if folder is not None:
                 write_files(found, request.command, folder, wanted)
                 names = sorted(path.name for path in folder.iterdir())
@@ -167,7 +167,7 @@ def perform(
         printed.print(f"Files in {out}: {', '.join(names)}", soft_wrap=True)
 
 
-def _compare(request: Request, engine: Engine, log: Console) -> Found:
+def _compare(request: Request, executor: Executor, log: Console) -> Found:
     for name, reason in request.left_out.items():
         log.print(f"left out: {name} ({reason})", soft_wrap=True, markup=False)
     observers = tuple(request.observers)
@@ -175,7 +175,7 @@ def _compare(request: Request, engine: Engine, log: Console) -> Found:
         log,
         work_of(observers, request.variants, request.seeds),
         lambda update: run_comparison(
-            request.source, observers, request.seeds, request.variants, request.steady_from, engine, update
+            request.source, observers, request.seeds, request.variants, request.steady_from, executor, update
         ),
     )
     draws: list[Draw] = []
@@ -183,7 +183,7 @@ def _compare(request: Request, engine: Engine, log: Console) -> Found:
         draws = _with_progress(
             log,
             f"{len(observers)} observers, {request.basin} initial estimates",
-            lambda update: study_basin(request.source, observers, request.basin, engine, update),
+            lambda update: study_basin(request.source, observers, request.basin, executor, update),
         )
     return Found(comparison, draws, basins_of(request.source.name, draws))
 

@@ -11,7 +11,7 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
 from coopenv.bench.observers import exports, tables
-from coopenv.bench.observers.executors import Engine, Local
+from coopenv.bench.observers.executors import Executor, Local
 from coopenv.bench.observers.judge import Sample, Task, judge
 from coopenv.bench.observers.leaderboard import Leaderboard
 from coopenv.bench.observers.sources import Source, find_source, variants_of
@@ -200,10 +200,10 @@ def run_comparison(
     seeds: Sequence[int],
     variants: Sequence[str],
     steady_from: float | None = None,
-    engine: Engine | None = None,
+    executor: Executor | None = None,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> Comparison:
-    """Judge observers on the records of a source; the result does not depend on the engine.
+    """Judge observers on the records of a source; the result does not depend on the executor.
 
     Args:
         source: of the records.
@@ -211,7 +211,7 @@ def run_comparison(
         seeds: of a simulated source; a recorded one has one record only.
         variants: of the source.
         steady_from: s; None: the source's own.
-        engine: where the work is done; None: this process.
+        executor: where the work is done; None: this process.
         on_progress: called with the share that is done.
 
     Raises:
@@ -227,7 +227,7 @@ def run_comparison(
     tasks = [
         Task(source, variant, seed, group, steady_from) for variant in variants for seed in used for group in groups
     ]
-    judged = (engine or Local(1)).map(judge, tasks, lambda done: on_progress(done / len(tasks)))
+    judged = (executor or Local(1)).map(judge, tasks, lambda done: on_progress(done / len(tasks)))
     order: dict[tuple[str, str], list[Sample]] = {(variant, name): [] for variant in variants for name in observers}
     for sample in (sample for samples in judged for sample in samples):
         order[sample.variant, sample.observer].append(sample)

@@ -1,6 +1,6 @@
 """Where the work is done: in processes of this machine, or on an existing Ray cluster.
 
-An engine maps one function over tasks. What comes out does not depend on the engine, nor on how many workers there are.
+An executor maps one function over tasks. What comes out depends on neither the executor nor its number of workers.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 AUTO = "auto"
-ENGINES = ("local", "ray")
+EXECUTORS = ("local", "ray")
 PATIENCE = 30.0  # s, to reach a cluster
 
 
-class Engine(Protocol):
+class Executor(Protocol):
     """Runs tasks somewhere."""
 
     def check(self) -> None:
@@ -46,8 +46,8 @@ class Engine(Protocol):
         ...
 
 
-def find_engine(name: str, jobs: int | None = None, address: str | None = None) -> Engine:
-    """Return an engine that is ready.
+def find_executor(name: str, jobs: int | None = None, address: str | None = None) -> Executor:
+    """Return an executor that is ready.
 
     Args:
         name: `local` or `ray`.
@@ -55,19 +55,19 @@ def find_engine(name: str, jobs: int | None = None, address: str | None = None) 
         address: HOST:PORT of a running cluster, or `auto` for the one of this machine (None: the same).
 
     Raises:
-        CoopenvError: no such engine, an option of the other one, or it is not ready.
+        CoopenvError: no such executor, an option of the other one, or it is not ready.
     """
-    if name not in ENGINES:
-        raise CoopenvError(f"--engine {name}: known are {', '.join(ENGINES)}")
+    if name not in EXECUTORS:
+        raise CoopenvError(f"--engine {name}: known are {', '.join(EXECUTORS)}")
     if name == "local":
         if address is not None:
             raise CoopenvError(f"--address {address}: only --engine ray has an address")
         return Local(jobs or available_cores())
     if jobs is not None:
         raise CoopenvError(f"--jobs {jobs}: with --engine ray the cluster decides")
-    engine = Ray(address or AUTO)
-    engine.check()
-    return engine
+    executor = Ray(address or AUTO)
+    executor.check()
+    return executor
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Engines: order, single threads, a cluster that is not there, and a real one of two nodes."""
+"""Executors: order, single threads, a cluster that is not there, and a real one of two nodes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from coopenv.bench.observers.executors import Local, find_engine, reach
+from coopenv.bench.observers.executors import Local, find_executor, reach
 from coopenv.errors import CoopenvError
 from coopenv.machine import ONE_THREAD
 
@@ -62,8 +62,8 @@ def test_nobody_listens() -> None:
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is not None, reason="Ray is installed")
 def test_ray_is_not_installed() -> None:
-    with pytest.raises(CoopenvError, match=r"pip install 'coopenv\[ray\]'"):
-        find_engine("ray")
+    with pytest.raises(CoopenvError, match=r"pip install '\.\[ray\]'"):
+        find_executor("ray")
 
 
 CLUSTER = """
