@@ -65,7 +65,8 @@ def failure_status(error: BaseException) -> int:
     """
     if interrupts.received() or isinstance(error, KeyboardInterrupt | typer.Abort):
         return INTERRUPTED
-    if isinstance(error, BrokenPipeError) or isinstance(error.__context__, BrokenPipeError):
+    told = error.__context__ if isinstance(error, SystemExit) else error  # typer and rich exit by themselves
+    if isinstance(told, BrokenPipeError):
         drop_output()
         return PIPE_CLOSED
     if isinstance(error, UsageError):

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from PIL import Image
 
+from coopenv.errors import OutputError
 from coopenv.files import writing
 from coopenv.scenario import Scenario
 
@@ -52,26 +53,44 @@ class Mp4Film:
     def __init__(self, path: Path, fps: float) -> None:
         self.path = path
         self._fps = fps
+        self._frames = 0
         self._writer: Any = None
 
     def add(self, picture: np.ndarray) -> None:
         """Append a picture, cut to even width and height as the codec asks for."""
         height, width = picture.shape[0] // 2 * 2, picture.shape[1] // 2 * 2
-        with writing(self.path):
+        try:
             if self._writer is None:
                 import imageio_ffmpeg
 
                 self._writer = imageio_ffmpeg.write_frames(
-                    str(self.path), (width, height), fps=self._fps, macro_block_size=2, ffmpeg_log_level="error"
+                    str(self.path), (width, height), fps=self._fps, macro_block_size=2, ffmpeg_log_level="quiet"
                 )
                 self._writer.send(None)
             self._writer.send(np.ascontiguousarray(picture[:height, :width]))
+        except OSError:
+            raise self._failure() from None
+        self._frames += 1
 
     def close(self) -> None:
-        """Finish the file."""
+        """Finish the file, and read it back: ffmpeg's writer does not say that a disk was full.
+
+        Raises:
+            OutputError: not every picture is there.
+        """
         if self._writer is not None:
-            with writing(self.path):
+            from imageio_ffmpeg import count_frames_and_secs
+
+            try:
                 self._writer.close()
+                frames, _ = count_frames_and_secs(str(self.path))
+            except (OSError, RuntimeError):
+                raise self._failure() from None
+            if frames != self._frames:
+                raise self._failure()
+
+    def _failure(self) -> OutputError:
+        return OutputError(f"cannot write to {self.path}: ffmpeg could not finish it; the disk may be full")
 
 
 class GifFilm:
