@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.observers.briefing import start_covariances
-from coopenv.observers.embedded import find_embedded
+from coopenv.observers.registry import find_embedded
 from coopenv.observers.riccati.kernels import DEAD_RECKONING
 from coopenv.scenario import load_scenario
 from coopenv.world.collision import referee
@@ -75,7 +75,7 @@ class Setting:
     def world(self, environment: str, overrides: Mapping[str, Any], worlds: int, dtype: str) -> World:
         """Return worlds with these stages, on one thread, reset."""
         scenario = load_scenario(environment, {**overrides, **(self.overrides or {})})
-        observer = self.observer or find_embedded(scenario.observer.name)
+        observer = self.observer or find_embedded(scenario.observer.name) or HOST
         world = World(scenario, worlds, dtype, "cpu", 1, observer, start_covariances(scenario))
         name = "simulated" if self.deliver is SIMULATED.deliver else "simulated_without_radio"
         suffix = "" if self.sense is sense_simulation else f"_{self.sense.key}"

@@ -8,9 +8,10 @@ import numpy as np
 
 from coopenv.estimation.trajectory import Sight
 from coopenv.observers.briefing import briefing_of, start_covariances
-from coopenv.observers.embedded import find_embedded
 from coopenv.observers.recording import Briefing, Sensed
+from coopenv.observers.registry import find_embedded
 from coopenv.scenario import Scenario
+from coopenv.world.embedded import HOST
 from coopenv.world.world import World
 
 
@@ -22,7 +23,7 @@ class Simulated:
 
     def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> World:
         """Return the world."""
-        observer = find_embedded(self.scenario.observer.name)
+        observer = find_embedded(self.scenario.observer.name) or HOST
         return World(self.scenario, worlds, dtype, device, threads, observer, start_covariances(self.scenario))
 
     def senses(self, world: World) -> SimulatedSenses:

@@ -1,5 +1,7 @@
 """Observers by name: the zoo, those registered in the program, and those of installed packages.
 
+An observer is a class, or a function of a setup, that runs on the host (`contract.Observer`), or it has kernels
+(`coopenv.world.embedded.Embedded`), which run in worlds and, for one vehicle, on the host as well; or it has both.
 A package offers its own under the entry point group `coopenv.observers`. What is in a file or module of the user's own
 is named by its place: `mine.py:Mine` or `package.module:Mine`.
 """
@@ -11,66 +13,68 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 from coopenv.errors import CoopenvError, suggest
 from coopenv.observers.contract import Factory
+from coopenv.observers.zoo import ZOO
 from coopenv.user_code import absolute, is_reference, load, one_line
+
+if TYPE_CHECKING:
+    from coopenv.world.embedded import Embedded
 
 GROUP = "coopenv.observers"
 
-ZOO = {
-    "dead_reckoning": "dead_reckoning:DeadReckoning",
-    "p3p": "single_frame:PerspectivePoints",
-    "riccati": "riccati.plugin:Riccati",
-    "hamel_samson": "hamel_samson:HamelSamson",
-    "mekf": "mekf:Mekf",
-    "mekf_covariance": "mekf_covariance:MekfCovariance",
-    "covariance_intersection": "covariance_intersection:CovarianceIntersection",
-    "left_invariant": "left_invariant:LeftInvariant",
-    "right_invariant": "right_invariant:RightInvariant",
-    "ukf": "ukf:Ukf",
-    "factor_graph": "factor_graph:FactorGraph",
-    "planar_ekf": "planar.plugin:PlanarEkf",
-    "robust": "robust.plugin:robust",
-    "robust_joint": "robust.plugin:robust_joint",
-    "centralised": "centralised:Centralised",
-}
-"""Name to module and class in this package."""
-
-NEEDS = {"factor_graph": "gtsam"}
-"""Members of the zoo that need a module of the extra `bench`."""
-
-ON_A_PLANE = {"planar_ekf"}
-"""Members of the zoo for robots on a plane whose odometry is their commands (`Setup.planar`), and for no others."""
-IN_SPACE = {"p3p", "robust_joint"}
-"""Members that are for all others: on a plane bearings to three points say more than a pose needs, and joint messages
-do not exist (`robust_joint` is `robust` there)."""
-
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
 
-_registered: dict[str, Factory] = {}
+
+class Registered(NamedTuple):
+    """What a program has registered under a name, as a class or function, with kernels, or both."""
+
+    factory: Factory | None
+    embedded: Embedded | None
+
+
+_registered: dict[str, Registered] = {}
 _places: dict[str, str] = {}
 """Where those of `_registered` stand that are named by their place."""
 
 
-def register(name: str, factory: Factory) -> None:
+def register(name: str, factory: Factory | None = None, *, embedded: Embedded | None = None) -> None:
     """Make an observer known by name in this program.
 
     Args:
         name: letters, digits and `_.-`, a letter first, as scenarios and the command line take it.
-        factory: class, or function of a setup.
+        factory: class, or function of a setup; None: made of the kernels.
+        embedded: its kernels, for worlds that run it without leaving the device.
 
     Raises:
-        CoopenvError: it is no such name, taken by another observer, or the factory cannot be called.
+        CoopenvError: it is no such name, taken by another observer, or there is neither.
     """
     if not isinstance(name, str) or not NAME.fullmatch(name):
         raise CoopenvError(f"an observer's name is a letter and then letters, digits or any of _.-, got {name!r}")
-    if not callable(factory):
+    if factory is not None and not callable(factory):
         raise CoopenvError(f"observer '{name}': expected a class or function, got {factory!r:.60}")
-    if name in ZOO or _registered.get(name, factory) is not factory:
+    if (factory is None and embedded is None) or (embedded is not None and not _has_kernels(embedded)):
+        raise CoopenvError(f"observer '{name}': expected a class, a function or an Embedded, got {embedded!r:.60}")
+    row = Registered(factory, embedded)
+    if name in ZOO or _registered.get(name, row) != row:
         raise CoopenvError(f"an observer named '{name}' exists already")
-    _registered[name] = factory
+    _registered[name] = row
+
+
+def _has_kernels(observer: Any) -> bool:
+    """Return whether something is an observer with kernels."""
+    if observer is None or isinstance(observer, str) or callable(observer):  # so Warp is not loaded for nothing
+        return False
+    from coopenv.world.embedded import Embedded
+
+    return isinstance(observer, Embedded)
+
+
+def _row(observer: Any) -> Registered:
+    """Return something as what it would be registered as."""
+    return Registered(None, observer) if _has_kernels(observer) else Registered(observer, None)
 
 
 def named(observer: str | Factory) -> str:
@@ -79,40 +83,44 @@ def named(observer: str | Factory) -> str:
     Where another observer has that name, the name of its file or module is put before it: `mine.Riccati`.
 
     Args:
-        observer: name, which is returned as it is, `file.py:Class`, `package.module:Class`, or a class or function of
-            a setup.
+        observer: name, which is returned as it is, `file.py:Class`, `package.module:Class`, a class or function of a
+            setup, or an `Embedded`.
 
     Raises:
         CoopenvError: there is none at that place, it is no observer or has no name, or its names are taken.
     """
     if isinstance(observer, str) and not is_reference(observer):
         return observer
-    place, factory = (absolute(observer), find(observer)) if isinstance(observer, str) else ("", observer)
-    name = place.rpartition(":")[2] or getattr(factory, "__name__", "")
-    if not callable(factory) or not NAME.fullmatch(name):
-        raise CoopenvError(f"observer {factory!r:.60}: expected a name, or a class or function that has one")
-    module = Path(place.rpartition(":")[0]).stem if place else str(factory.__module__)
+    place, found = (absolute(observer), _loaded(observer)) if isinstance(observer, str) else ("", observer)
+    row = _row(found)
+    name = row.embedded.name if row.embedded is not None else place.rpartition(":")[2] or getattr(found, "__name__", "")
+    if not (row.embedded or callable(found)) or not NAME.fullmatch(name):
+        raise CoopenvError(f"observer {found!r:.60}: expected a name, or a class or function that has one")
+    module = Path(place.rpartition(":")[0]).stem if place else _origin(row)[0]
     full = f"{module.rpartition('.')[2]}.{name}"
     for short in (name, full):
-        if _registered.get(short) is factory:
-            return short
         replaced = _registered.get(short)
-        again = replaced is not None and _origin(replaced) == _origin(factory)  # edited and loaded once more
+        if replaced == row:
+            return short
+        again = replaced is not None and _origin(replaced) == _origin(row)  # edited and loaded once more
         if again or short not in observer_names():
             _registered.pop(short, None)
-            register(short, factory)
+            register(short, row.factory, embedded=row.embedded)
             _places[short] = place
             return short
     raise CoopenvError(f"observers named '{name}' and '{full}' exist already: rename the class")
 
 
-def _origin(factory: Factory) -> tuple[object, object]:
-    return getattr(factory, "__module__", None), getattr(factory, "__qualname__", factory)
+def _origin(row: Registered) -> tuple[str, object]:
+    """Return the module and name of what was registered."""
+    code = row.factory if row.embedded is None else row.embedded.estimate.func
+    return str(getattr(code, "__module__", "")), getattr(code, "__qualname__", code)
 
 
 def portable(name: str) -> str | Factory:
     """Return what `find` takes in another process, which does not know what was registered in this one."""
-    return _places.get(name) or _registered.get(name, name)
+    row = _registered.get(name)
+    return _places.get(name) or (name if row is None else row.factory or row.embedded)
 
 
 def _installed() -> dict[str, EntryPoint]:
@@ -126,7 +134,7 @@ def observer_names() -> list[str]:
 
 def missing(name: str) -> str:
     """Return the module that an observer of the zoo needs and that is not installed; empty where nothing is missing."""
-    module = NEEDS.get(name, "")
+    module = ZOO[name].needs if name in ZOO else ""
     return module if module and find_spec(module) is None else ""
 
 
@@ -148,38 +156,79 @@ def available_names(planar: bool | None = None) -> list[str]:
     Args:
         planar: only those that are meant for robots on a plane (True) or for vehicles in space (False).
     """
-    strangers: set[str] = set() if planar is None else IN_SPACE if planar else ON_A_PLANE
+    strangers: set[str] = set()
+    if planar is not None:
+        strangers = {name for name, entry in ZOO.items() if not (entry.on_a_plane if planar else entry.in_space)}
     return [name for name in observer_names() if name not in strangers and not obstacle(name)]
 
 
 def find(name: str | Factory) -> Factory:
-    """Return the factory of a name or of a place in code; a factory itself as it is.
+    """Return the factory of a name or of a place in code, a class or function as it is, and one made of kernels.
 
     Raises:
         CoopenvError: unknown name, or what it needs is not installed, or it cannot be loaded, or is no factory.
     """
-    if not isinstance(name, str):
-        return name
-    if is_reference(name):
-        factory = load(name)
-        if not callable(factory):
-            raise CoopenvError(f"observer '{name}': expected a class or function, got {factory!r:.60}")
-        return cast(Factory, factory)
-    if missing(name):
-        raise CoopenvError(f"observer '{name}' {obstacle(name)}")
-    if name in ZOO:
-        module, attribute = ZOO[name].split(":")
-        return getattr(import_module(f"{__package__}.{module}"), attribute)
-    if name in _registered:
-        return _registered[name]
-    point = _installed().get(name)
+    if isinstance(name, str) and name in ZOO:
+        if missing(name):
+            raise CoopenvError(f"observer '{name}' {obstacle(name)}")
+        return _attribute(ZOO[name].plugin)
+    row = _found(name)
+    if row.factory is not None:
+        return row.factory
+    return import_module(f"{__package__}.kernel_observer").KernelFactory(row.embedded)
+
+
+def find_embedded(name: str, planar: bool = False) -> Embedded | None:
+    """Return the kernels of an observer, by name; None where it has none.
+
+    Args:
+        name: known, or of a package.
+        planar: for robots on a plane whose odometry is their commands.
+
+    Raises:
+        CoopenvError: as for `find`.
+    """
+    if name not in ZOO:
+        return _found(name).embedded
+    entry = ZOO[name]
+    if not entry.kernels or (planar and not entry.kernels_on_a_plane):
+        return None
+    return cast("Embedded", _attribute(entry.kernels))
+
+
+def _attribute(place: str) -> Any:
+    module, attribute = place.split(":")
+    return getattr(import_module(f"{__package__}.{module}"), attribute)
+
+
+def _loaded(reference: str) -> Any:
+    """Return the observer at a place in code.
+
+    Raises:
+        CoopenvError: there is none.
+    """
+    found = load(reference)
+    if not (callable(found) or _has_kernels(found)):
+        raise CoopenvError(f"observer '{reference}': expected a class, a function or an Embedded, got {found!r:.60}")
+    return found
+
+
+def _found(observer: str | Factory) -> Registered:
+    """Return what stands behind a name that is not of the zoo, a place in code, or an observer itself."""
+    if not isinstance(observer, str):
+        return _row(observer)
+    if is_reference(observer):
+        return _row(_loaded(observer))
+    if observer in _registered:
+        return _registered[observer]
+    point = _installed().get(observer)
     if point is None:
         names = observer_names()
-        raise CoopenvError(f"unknown observer '{name}'{suggest(name, names)}; known: {', '.join(names)}")
+        raise CoopenvError(f"unknown observer '{observer}'{suggest(observer, names)}; known: {', '.join(names)}")
     try:
-        return point.load()
+        return _row(point.load())
     except (Exception, SystemExit) as error:  # anybody's code
-        raise CoopenvError(f"observer '{name}' ({point.value}) cannot be loaded: {one_line(error)}") from error
+        raise CoopenvError(f"observer '{observer}' ({point.value}) cannot be loaded: {one_line(error)}") from error
 
 
 def is_joint(factory: Factory) -> bool:

@@ -24,6 +24,14 @@ def riccati_jacobian(estimate: Estimate) -> Array:
     return J
 
 
+def left_covariance(position: Array, covariance: Array) -> Array:
+    """Return a covariance over (2 lambda, p) in LEFT coordinates, to first order; `position` is in the body, m."""
+    J = np.eye(6)
+    J[3:, :3] = -skew(position)
+    P = J @ covariance @ J.T
+    return np.asarray((P + P.T) / 2, dtype=np.float64)
+
+
 def riccati_covariance(estimate: Estimate) -> Array | None:
     """Return the stated covariance in RICCATI coordinates to first order; None where none is stated."""
     if estimate.covariance is None or estimate.coordinates is Coordinates.RICCATI:

@@ -81,7 +81,7 @@ def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = N
     Raises:
         CoopenvError: unknown name.
     """
-    factory = find(observer) if isinstance(observer, str) else observer
+    factory = find(observer)
     log = _Log(recording)
     group = Group(factory, recording.briefing, tamper)
     try:

@@ -11,6 +11,7 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.estimation.coordinates import Coordinates
 from coopenv.world.camera import observe
 from coopenv.world.collision import referee
 from coopenv.world.motion import move
@@ -25,6 +26,17 @@ class Nothing:
     """The memory of an observer that has none, and the record of a source that needs none."""
 
     unused: wp.int32
+
+
+@dataclass(frozen=True)
+class Messages:
+    """How what an embedded observer sends looks to observers on the host (`coopenv.observers.kernel_observer`)."""
+
+    write: Callable[[Any], Any]
+    """(KernelObserver): return the `Message` that `send` has put on the air."""
+    read: Callable[[Any, int, Any, int], None]
+    """(KernelObserver, sender, Message, sent): put a message where the observer finds what it has received; `sent` is
+    when, in the kernels' time. Raises ValueError or a CoopenvError where the message is malformed."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +68,10 @@ class Embedded:
     valid: Mapping[str, Rule] = field(default_factory=dict, hash=False)
     """What a saved memory may hold, by field. Without a rule numbers have to be finite and whole ones may be any: give
     one to every index and count."""
+    messages: Messages | None = None
+    """Its messages on the host; None: it sends the V2X pose estimate alone."""
+    coordinates: Coordinates = Coordinates.RICCATI
+    """In which it states its covariance on the host; in the state it is over (2 lambda, p)."""
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """Options of the Warp module that it is compiled in."""
 

@@ -40,10 +40,16 @@ def allocate(record: Any, sizes: Mapping[str, int], device: str, shared: str = "
         shape = [sizes[axis] for axis in field.axes]
         if shared and field.axes[1:2] == shared:
             row = wp.zeros([shape[0], 1, *shape[2:]], dtype=field.dtype, device=device)
-            strides = (row.strides[0], 0, *row.strides[2:])
-            rows: Any = wp.array(ptr=row.ptr, shape=tuple(shape), strides=strides, dtype=field.dtype, device=device)
-            rows.row = row  # owns the memory
-            setattr(result, name, rows)
+            setattr(result, name, repeated(row, 1, shape[1]))
         else:
             setattr(result, name, wp.zeros(shape, dtype=field.dtype, device=device))
+    return result
+
+
+def repeated(row: Any, axis: int, count: int) -> Any:
+    """Return an array that has one entry along an axis as one that seems to have it `count` times."""
+    shape, strides = list(row.shape), list(row.strides)
+    shape[axis], strides[axis] = count, 0
+    result: Any = wp.array(ptr=row.ptr, shape=tuple(shape), strides=tuple(strides), dtype=row.dtype, device=row.device)
+    result.row = row  # owns the memory
     return result

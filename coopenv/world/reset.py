@@ -80,6 +80,8 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
     state.increment_rotation[world, vehicle] = identity3(o)
     state.increment_translation[world, vehicle] = o
     state.corrected_tick[world, vehicle] = 0
+    state.nis[world, vehicle] = wp.float64(0.0)
+    state.nis_dof[world, vehicle] = 0
     for sample in range(model.samples_per_tick):
         state.sampled_velocity[world, vehicle, sample] = o
         state.sampled_angular_velocity[world, vehicle, sample] = o

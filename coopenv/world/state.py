@@ -81,6 +81,8 @@ def state_struct(p: Precision) -> Any:
         estimate_position: array("WN", vec3)  # phat, in the body frame
         covariance: array("WN", mat66)  # P over (2 lambda, p)
         corrected_tick: array("WN", wp.int32)  # tick of the observer's last correction
+        nis: array("WN", wp.float64)  # normalised innovation squared of its last tick, where it tells it
+        nis_dof: array("WN", wp.int32)  # degrees of freedom; 0: there was no correction, or it is not told
 
         gramian_11: array("WNB", mat33)  # block sums of int C^T C dt, map axes
         gramian_12: array("WNB", mat33)

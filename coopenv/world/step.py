@@ -15,7 +15,7 @@ import warp as wp
 from coopenv.world.command import decide
 from coopenv.world.embedded import Embedded, Source
 from coopenv.world.gramian import sample_gramian
-from coopenv.world.rates import regular_tick
+from coopenv.world.rates import Now, regular_tick
 from coopenv.world.v2x import broadcast
 
 Kernel = Callable[..., None]
@@ -124,6 +124,55 @@ def deliver_kernel(source: Source) -> Kernel:
             deliver_messages(model, state, record, world, vehicle, state.tick[world] + 1)
 
     return _named(deliver, source.name)
+
+
+@cache
+def start_kernel(observer: Embedded) -> Kernel:
+    """Return the kernel that starts one vehicle's observer. It and the next two serve the plug-in face."""
+    start_vehicle = observer.start
+
+    def start(model: Any, state: Any, memory: Any, vehicle: int):
+        """Start the observer. One thread per world."""
+        start_vehicle(model, state, memory, wp.tid(), vehicle)
+
+    return _named(start, observer.name, **observer.options)
+
+
+@cache
+def estimate_kernel(observer: Embedded) -> Kernel:
+    """Return the kernel that lets one vehicle estimate."""
+    estimate_pose = observer.estimate
+
+    def estimate(
+        model: Any,
+        state: Any,
+        memory: Any,
+        vehicle: int,
+        tick: wp.array(dtype=wp.int32),
+        period: wp.array(dtype=wp.float64),
+        due: wp.array(dtype=wp.int32),
+    ):
+        """Take a tick, see `Now`. One thread per world."""
+        world = wp.tid()
+        now = Now()
+        now.tick = tick[world]
+        now.period = period[world]
+        now.due = due[world] != 0
+        estimate_pose(model, state, memory, world, vehicle, now)
+
+    return _named(estimate, observer.name, **observer.options)
+
+
+@cache
+def send_kernel(observer: Embedded) -> Kernel:
+    """Return the kernel that lets one vehicle put a message on the air, whatever the tick."""
+    send_message = observer.send
+
+    def send(model: Any, state: Any, memory: Any, vehicle: int):
+        """Send. One thread per world."""
+        send_message(model, state, memory, wp.tid(), vehicle, 0)
+
+    return _named(send, observer.name, **observer.options)
 
 
 def broadcast_kernel(model: Any, state: Any, active: wp.array(dtype=wp.int32), vehicle: int):

@@ -16,7 +16,7 @@ import coopenv
 import coopenv.observers.registry as registry
 from coopenv.api.engine import Engine
 from coopenv.observers import register
-from coopenv.observers.robust.plugin import Robust
+from coopenv.observers.robust.reference.observer import Robust
 from tests.helpers import mrclam_files
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
+from numpy.testing import assert_allclose
 
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.backends.replay import Replay
 from coopenv.errors import CoopenvError
-from coopenv.observers.embedded import find_embedded, register_embedded
+from coopenv.observers import find, register, run
+from coopenv.observers.registry import find_embedded
 from coopenv.runs import record
 from coopenv.scenario.topology import neighbour_sets
-from coopenv.world.embedded import HOST, Embedded, send_nothing
+from coopenv.world.embedded import Embedded, send_nothing
 from coopenv.world.records import array
 
 
@@ -47,11 +51,12 @@ def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, now:
 
 
 COUNTER = Embedded("toy_counter", estimate, start, send_nothing, Counter)
-register_embedded(COUNTER)
+register(COUNTER.name, embedded=COUNTER)
 
 
-def test_it_runs_in_every_face() -> None:
-    env = coopenv.parallel_env("busy_intersection", observer="toy_counter", dtype="float64")
+@pytest.mark.parametrize("observer", ["toy_counter", COUNTER])
+def test_it_runs_in_an_environment(observer: str | Embedded) -> None:
+    env = coopenv.parallel_env("busy_intersection", observer=observer, dtype="float64")
     env.reset(seed=0)
     env.step({agent: np.zeros(2) for agent in env.agents})
     memory = env.engine.world.memory
@@ -81,9 +86,34 @@ def test_batch_replay_and_saved_states_keep_its_memory() -> None:
     assert engine.world.memory.ticks.numpy().tolist() == [[7] * 5]
 
 
+def test_it_is_compared_with_others() -> None:
+    recording = record(coopenv.load_scenario("busy_intersection", {"horizon": 1.0}), seed=0)
+    for observer in ("toy_counter", COUNTER):
+        result = run(observer, recording)
+        assert not result.failure
+        counted = np.einsum("knji,knj->kni", result.rotation, result.position)
+        assert (counted[1:, :, 0] == np.arange(1, recording.ticks)[:, None]).all()
+        leaders = [(setup.targets >= 3).sum() for setup in recording.setups]
+        assert_allclose(counted[1:, :, 1], np.arange(1, recording.ticks)[:, None] * leaders)
+        assert (result.bytes_per_second > 0).all()
+
+
+def test_a_saved_plug_in_goes_on() -> None:
+    recording = record(coopenv.load_scenario("busy_intersection", {"horizon": 1.0}), seed=0)
+    observer = find("toy_counter")(recording.setups[0])
+    observer.reset((np.eye(3), np.zeros(3)), np.eye(6))
+    for k in range(1, 10):
+        observer.update(recording.tick(k, 0, {}))
+    for copied in (copy.deepcopy(observer), pickle.loads(pickle.dumps(observer))):
+        assert copied.update(recording.tick(10, 0, {})).position[0] == 10.0
+    assert observer.update(recording.tick(10, 0, {})).position[0] == 10.0
+
+
 def test_names_are_taken_once() -> None:
-    register_embedded(COUNTER)
+    register("toy_counter", embedded=COUNTER)
     for name in ("robust", "toy_counter"):
         with pytest.raises(CoopenvError, match=f"'{name}' exists already"):
-            register_embedded(Embedded(name, estimate, start, send_nothing))
-    assert find_embedded("toy_counter") is COUNTER and find_embedded("mekf") is HOST
+            register(name, embedded=Embedded(name, estimate, start, send_nothing))
+    with pytest.raises(CoopenvError, match="expected a class, a function or an Embedded"):
+        register("nothing")
+    assert find_embedded("toy_counter") is COUNTER and find_embedded("mekf") is None

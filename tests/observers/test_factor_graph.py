@@ -10,12 +10,12 @@ from numpy.testing import assert_allclose
 
 from coopenv.errors import CoopenvError
 from coopenv.observers import Coordinates, run
-from coopenv.observers.registry import NEEDS, available_names, find, observer_names
+from coopenv.observers.registry import ZOO, available_names, find, observer_names
 from tests.oracles.batch import small_record
 
 
 def test_a_missing_module_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(NEEDS, "factor_graph", "no_such_module")
+    monkeypatch.setitem(ZOO, "factor_graph", replace(ZOO["factor_graph"], needs="no_such_module"))
     assert "factor_graph" in observer_names() and "factor_graph" not in available_names()
     with pytest.raises(CoopenvError, match=r"'factor_graph' needs no_such_module: pip install '.\[bench\]'"):
         find("factor_graph")

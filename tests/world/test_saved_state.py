@@ -9,7 +9,7 @@ import pytest
 
 import coopenv
 from coopenv import CoopenvError
-from coopenv.observers.embedded import find_embedded
+from coopenv.observers.registry import find_embedded
 from coopenv.world.world import World
 
 EYE, NAN = np.eye(3), np.nan

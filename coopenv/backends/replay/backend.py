@@ -11,10 +11,11 @@ import warp as wp
 from coopenv.backends.replay.device_recording import upload
 from coopenv.backends.replay.kernels import RECORDED
 from coopenv.backends.replay.scenario import scenario_of
-from coopenv.observers.embedded import find_embedded
 from coopenv.observers.recording import Briefing, Recording, Sensed
 from coopenv.observers.recording_checks import check_recording
+from coopenv.observers.registry import find_embedded
 from coopenv.scenario import Scenario
+from coopenv.world.embedded import HOST
 from coopenv.world.world import World
 
 
@@ -30,7 +31,7 @@ class Replay:
     def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> World:
         """Return the world that goes through the recording."""
         planar = any(setup.planar for setup in self.recording.setups)
-        observer = find_embedded(self.scenario.observer.name, planar)
+        observer = find_embedded(self.scenario.observer.name, planar) or HOST
         covariance = self.recording.start_covariance
         return ReplayWorld(self.recording, self.scenario, worlds, dtype, device, threads, observer, covariance)
 

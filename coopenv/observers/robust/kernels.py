@@ -6,6 +6,8 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.estimation.coordinates import Coordinates
+from coopenv.observers.robust.messages import MESSAGES
 from coopenv.observers.robust.observer import update
 from coopenv.observers.robust.start import start
 from coopenv.observers.robust.state import SIZES, VALID, RobustState
@@ -20,4 +22,15 @@ def send(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: in
 
 
 # Without max_unroll = 1 there is long straight code, which takes long to compile.
-ROBUST = Embedded("robust", update, start, send, RobustState, SIZES, valid=VALID, options={"max_unroll": 1})
+ROBUST = Embedded(
+    "robust",
+    update,
+    start,
+    send,
+    RobustState,
+    SIZES,
+    valid=VALID,
+    messages=MESSAGES,
+    coordinates=Coordinates.LEFT,
+    options={"max_unroll": 1},
+)

@@ -215,9 +215,9 @@ def settle(model: Any, mind: Any, world: int, i: int):
 
 
 @wp.func
-def any_fits(mind: Any, world: int, lines: int) -> bool:
-    """Return whether a line fits."""
+def fitting_lines(mind: Any, world: int, lines: int) -> int:
+    """Return how many lines fit."""
+    count = int(0)
     for n in range(lines):
-        if mind.line_fits[world, n] == 1:
-            return True
-    return False
+        count += mind.line_fits[world, n]
+    return count

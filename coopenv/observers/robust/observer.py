@@ -119,6 +119,8 @@ def write(state: Any, mind: Any, world: int, i: int):
 @wp.func
 def update(model: Any, state: Any, mind: Any, world: int, i: int, now: Any):
     """Take one camera tick of one vehicle, whose messages have been delivered."""
+    state.nis[world, i] = wp.float64(0.0)
+    state.nis_dof[world, i] = 0
     collect(model, state, mind, world, i)
     dR = orthonormalise(wide_matrix(state.increment_rotation[world, i]))
     dp = wide_vector(state.increment_translation[world, i])

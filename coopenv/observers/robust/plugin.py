@@ -1,9 +1,10 @@
 """This project's own observer; see reference/observer.py, and reference/joint.py for the one with larger messages."""
 
 from coopenv.observers.contract import Observer, Setup
+from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.planar.plugin import PlanarRobust
+from coopenv.observers.robust.kernels import ROBUST
 from coopenv.observers.robust.reference.joint import RobustJoint
-from coopenv.observers.robust.reference.observer import Robust
 
 
 def robust(setup: Setup) -> Observer:
@@ -11,7 +12,7 @@ def robust(setup: Setup) -> Observer:
 
     Where a vehicle moves on a plane and its odometry is its commands, it is a planar one.
     """
-    return PlanarRobust(setup) if setup.planar else Robust(setup)
+    return PlanarRobust(setup) if setup.planar else KernelObserver(ROBUST, setup)
 
 
 def robust_joint(setup: Setup) -> Observer:
@@ -20,6 +21,3 @@ def robust_joint(setup: Setup) -> Observer:
     Planar robots have one with small messages only.
     """
     return PlanarRobust(setup) if setup.planar else RobustJoint(setup)
-
-
-__all__ = ["Robust", "RobustJoint", "robust", "robust_joint"]

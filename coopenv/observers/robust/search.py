@@ -13,7 +13,7 @@ from coopenv.estimation.so3 import orthonormalise
 from coopenv.observers.robust.algebra import distance_squared, is_known, left_error, transition, with_noise
 from coopenv.observers.robust.belief import begin
 from coopenv.observers.robust.hypotheses import keep, prune, rank
-from coopenv.observers.robust.measurements import NOTHING, any_fits, draw, normalised, settle
+from coopenv.observers.robust.measurements import NOTHING, draw, fitting_lines, normalised, settle
 from coopenv.observers.robust.reference.search import (
     CLEAR_TIME,
     GATE,
@@ -89,7 +89,7 @@ def follow(model: Any, mind: Any, world: int, i: int, h: int, used: Any):
             mind.paid[world, i, h] = mind.paid[world, i, h] + price
             mind.bearings[world, i, h] = mind.bearings[world, i, h] + 1
         mind.line_fits[world, n] = fitting
-    if any_fits(mind, world, model.target_count[i]):
+    if fitting_lines(mind, world, model.target_count[i]) > 0:
         settle(model, mind, world, i)
         keep(mind, world, i, h)
 

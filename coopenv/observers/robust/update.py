@@ -9,7 +9,7 @@ import warp as wp
 from coopenv.estimation.so3 import exp_so3, orthonormalise
 from coopenv.observers.robust.algebra import odometry_variances, transition, with_noise
 from coopenv.observers.robust.belief import place_of
-from coopenv.observers.robust.measurements import NOTHING, aim, any_fits, draw, normalised, settle
+from coopenv.observers.robust.measurements import NOTHING, aim, draw, fitting_lines, normalised, settle
 from coopenv.observers.robust.reference.observer import (
     ACCELERATION,
     HEALTHY_SHARE,
@@ -68,26 +68,29 @@ def aim_at_belief(model: Any, state: Any, mind: Any, world: int, i: int, tick: i
 
 @wp.func
 def examine(model: Any, mind: Any, world: int, i: int):
-    """Draw the lines and mark those that fit; return the share of those that do not, -1 if none counts.
+    """Draw the lines and mark those that fit; return the share of those that do not, and the NIS of those that do.
 
-    Bearings to distrusted senders do not count in the share.
+    Bearings to distrusted senders do not count in the share; it is -1 if none counts.
     """
     counted = int(0)
     missed = int(0)
+    total = wp.float64(0.0)
     for n in range(model.target_count[i]):
         fitting = int(0)
         place = mind.line_place[world, n]
         if place != NOTHING:
-            ahead = draw(model, mind, world, i, n)
-            if ahead and normalised(mind, world, i, n) < wp.float64(FITTING):
-                fitting = 1
+            if draw(model, mind, world, i, n):
+                nis = normalised(mind, world, i, n)
+                if nis < wp.float64(FITTING):
+                    fitting = 1
+                    total += nis
             if place == 0 or mind.distrusted[world, i, place] == 0:
                 counted += 1
                 missed += 1 - fitting
         mind.line_fits[world, n] = fitting
     if counted == 0:
-        return wp.float64(-1.0)
-    return wp.float64(missed) / wp.float64(counted)
+        return wp.float64(-1.0), total
+    return wp.float64(missed) / wp.float64(counted), total
 
 
 @wp.func
@@ -119,8 +122,11 @@ def lose(model: Any, mind: Any, world: int, i: int, tick: int):
 def look(model: Any, state: Any, mind: Any, world: int, i: int, now: Any):
     """Correct the belief by every bearing that fits it; search anew when most do not."""
     aim_at_belief(model, state, mind, world, i, now.tick)
-    share = examine(model, mind, world, i)
-    if any_fits(mind, world, model.target_count[i]):
+    share, nis = examine(model, mind, world, i)
+    state.nis[world, i] = nis
+    fitting = fitting_lines(mind, world, model.target_count[i])
+    state.nis_dof[world, i] = 2 * fitting
+    if fitting > 0:
         settle(model, mind, world, i)
     if share < wp.float64(0.0):
         return

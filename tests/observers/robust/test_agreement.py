@@ -15,7 +15,7 @@ from coopenv.bench.observers.faults import FAULTS, Lie
 from coopenv.bench.observers.initial_estimates import random_start, with_start
 from coopenv.observers import Estimate, Recording, Tick, run
 from coopenv.observers.riccati_coordinates import riccati_covariance
-from coopenv.observers.robust.plugin import Robust
+from coopenv.observers.robust.reference.observer import Robust
 from coopenv.observers.robust.reference.search import PATIENCE
 from coopenv.policies import Policy
 from coopenv.runs.recorder import record
@@ -72,7 +72,7 @@ CASES: dict[str, Callable[[float], Recording]] = {
 
 
 def check(recording: Recording, played: Played, tamper: Lie | None = None) -> None:
-    result = run("robust", recording, tamper)
+    result = run(Robust, recording, tamper)
     assert not result.failure
     assert_allclose(played.position[1:], result.position[1:], rtol=0, atol=1e-9)
     assert_allclose(played.rotation[1:], result.rotation[1:], rtol=0, atol=1e-9)
@@ -89,6 +89,17 @@ def check(recording: Recording, played: Played, tamper: Lie | None = None) -> No
 def test_it_does_as_the_one_in_numpy(case: str) -> None:
     recording = CASES[case](4.0)
     check(recording, replayed(recording))
+
+
+@pytest.mark.parametrize("case", ["the paper's start", "any start", "stale radio", "slow corrections", "cyclic"])
+def test_its_plug_in_face_does_so_too(case: str) -> None:
+    recording = CASES[case](4.0)
+    expected, result = run(Robust, recording), run("robust", recording)
+    assert not result.failure
+    for name in ("position", "rotation", "nees", "nis"):
+        assert_allclose(getattr(result, name), getattr(expected, name), rtol=1e-7, atol=1e-9, err_msg=name)
+    assert (result.nis_dof == expected.nis_dof).all()
+    assert (result.bytes_per_second == expected.bytes_per_second).all()
 
 
 @pytest.mark.slow

@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.contract import Received
-from coopenv.observers.robust.plugin import Robust, RobustJoint
 from coopenv.observers.robust.reference.belief import Belief, Member
 from coopenv.observers.robust.reference.eviction import FORGET_TIME, room_for
+from coopenv.observers.robust.reference.joint import RobustJoint
+from coopenv.observers.robust.reference.observer import Robust
 from tests.helpers.robust_scenes import crowd, small_errors
 
 VEHICLES = 12

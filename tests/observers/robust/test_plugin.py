@@ -9,9 +9,11 @@ from coopenv.bench.observers.faults import FAULTS, Lie
 from coopenv.bench.observers.initial_estimates import random_start
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
+from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.planar.plugin import PlanarRobust
 from coopenv.observers.registry import find
-from coopenv.observers.robust.plugin import Robust, RobustJoint
+from coopenv.observers.robust.reference.joint import RobustJoint
+from coopenv.observers.robust.reference.observer import Robust
 from tests.helpers.robust_scenes import everybody_sees_everybody, noise_free, shifted, small_errors
 
 BOTH = pytest.mark.parametrize("name", ["robust", "robust_joint"])
@@ -153,7 +155,7 @@ def test_silence_keeps_a_follower_going():
 def test_planar_vehicles_get_the_planar_observer():
     setup = replace(small_errors(12.0).setups[0], planar=True)
     assert isinstance(find("robust")(setup), PlanarRobust)
-    assert isinstance(find("robust")(replace(setup, planar=False)), Robust)
+    assert isinstance(find("robust")(replace(setup, planar=False)), KernelObserver)
     assert isinstance(find("robust_joint")(replace(setup, planar=False)), RobustJoint)
 
 

@@ -1,0 +1,236 @@
+"""The plug-in face of an observer with kernels: one vehicle, fed with ticks on the host.
+
+The kernels get a world of their own, in which stands what this vehicle senses and hears. Where arrays have a row per
+vehicle, one row stands for all; truth is not a number.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from coopenv.errors import CoopenvError
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.coordinates import Coordinates
+from coopenv.estimation.trajectory import Sight
+from coopenv.observers.checks import check_message
+from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick
+from coopenv.observers.kernel_world import model_of, views_of
+from coopenv.observers.riccati_coordinates import left_covariance
+from coopenv.world.embedded import Embedded, Messages
+from coopenv.world.launch import Launcher
+from coopenv.world.precision import precision
+from coopenv.world.records import allocate, fields
+from coopenv.world.state import allocate_state, state_fields, state_sizes
+from coopenv.world.step import estimate_kernel, send_kernel, start_kernel
+
+PRECISION = "float64"
+UNITS_PER_TICK = 64
+"""The kernels' time is a whole number; here it counts 64ths of the first tick. So ticks may come at any time and
+messages be of any age, to 0.3 ms at 60 Hz; and, 64 being a power of two, regular ticks are as regular as in a world."""
+MOST_UNITS = 2**31 - 1
+_VISIBLE, _OUT_OF_VIEW = np.uint8(Sight.VISIBLE), np.uint8(Sight.OUT_OF_VIEW)
+
+
+class Heard(NamedTuple):
+    """The last message of a sender."""
+
+    message: Message
+    sent: int
+    """When, in the kernels' units."""
+    valid: bool
+    """Whether it was well-formed."""
+
+
+class KernelObserver:
+    """One vehicle's observer, computed in float64 by the kernels of an embedded one."""
+
+    def __init__(self, embedded: Embedded, setup: Setup) -> None:
+        """Allocate its world.
+
+        Args:
+            embedded: whose kernels.
+            setup: what the vehicle knows.
+        """
+        p = precision(PRECISION)
+        self.embedded, self.setup = embedded, setup
+        self._model = model_of(setup, p)
+        self._kernels = embedded if embedded.fit is None else embedded.fit(self._model)
+        self._messages = self._kernels.messages or POSE
+        sizes = {**state_sizes(self._model, 1), **self._kernels.sizes}
+        self._records = (
+            allocate_state(self._model, 1, p, "cpu", shared="N"),
+            allocate(self._kernels.memory, sizes, "cpu", shared="N"),
+        )
+        self.state = views_of(self._records[0], state_fields(p))
+        """The vehicle's part of the state by name: arrays without the axes W and N."""
+        self.memory = views_of(self._records[1], fields(self._kernels.memory))
+        """The same of the memory."""
+        self._now = [wp.zeros(1, dtype=kind, device="cpu") for kind in (wp.int32, wp.float64, wp.int32)]
+        self._now_views = [array.numpy() for array in self._now]
+        self._start_covariance = self._model.start.covariance.numpy()[setup.vehicle]
+        self._set_clock(None, setup.noise.odometry_period)
+        self._heard: dict[int, Heard] = {}
+        self.ignored_messages = 0
+        """Malformed ones since the start."""
+
+    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
+        """Start at a pose; its covariance is in LEFT coordinates."""
+        for view in self._all_views():
+            view[...] = 0
+        s, L, (R, p) = self.state, self.setup.landmarks, initial_pose
+        s.estimate_rotation[...], s.estimate_position[...] = R, np.asarray(R).T @ p
+        s.covariance[...] = np.diag(np.repeat(self.setup.gains.P0, 3))
+        s.rotation[:L], s.rotation[L:] = np.eye(3), np.nan
+        for truth in (s.position, s.velocity, s.angular_velocity):
+            truth[...] = np.nan
+        for never in (s.inbox_tick, s.outbox_tick, s.bearing_tick):
+            never[...] = -1
+        self._start_covariance[...] = initial_covariance
+        self._set_clock(None, self.setup.noise.odometry_period)
+        self._heard.clear()
+        self.ignored_messages = 0
+        self._run("start", start_kernel)
+
+    def update(self, tick: Tick) -> Estimate:
+        """Take one camera tick.
+
+        Raises:
+            CoopenvError: the first one takes no time, or this one is too long after it for the kernels to count.
+        """
+        if self._origin is None:
+            self._set_clock(tick.time - tick.dt, tick.dt)
+        now = self._units(tick.time - (self._origin or 0.0))
+        if not 0 <= now < MOST_UNITS:
+            raise CoopenvError(f"{tick.time:g} s is not within {MOST_UNITS * self._unit:.0f} s of the start")
+        for view, value in zip(self._now_views, (now, tick.dt, tick.due), strict=True):
+            view[0] = value
+        self._sense(tick, now)
+        self._receive(tick.messages, now)
+        self._run("estimate", estimate_kernel, *self._now)
+        return self._estimate()
+
+    def message(self) -> Message:
+        """Return what the kernels put on the air."""
+        self._run("send", send_kernel)
+        message: Message = self._messages.write(self)
+        return message
+
+    def _sense(self, tick: Tick, now: int) -> None:
+        """Write what the vehicle senses."""
+        s = self.state
+        s.increment_rotation[...], s.increment_translation[...] = tick.rotation, tick.translation
+        s.odometry_velocity[...], s.odometry_angular_velocity[...] = tick.velocity, tick.angular_velocity
+        s.position[: self.setup.landmarks] = tick.landmarks
+        s.sight[tick.targets] = np.where(tick.valid, _VISIBLE, _OUT_OF_VIEW)
+        seen = tick.targets[tick.valid]
+        s.bearing[seen], s.bearing_tick[seen] = tick.bearings[tick.valid], now
+
+    def _receive(self, messages: Mapping[int, Received], now: int) -> None:
+        """Write what the vehicle hears; a message that is malformed, or older than the start, is as none."""
+        s = self.state
+        s.inbox_tick[...] = -1
+        for target, received in messages.items():
+            sender, sent = target - self.setup.landmarks, now - self._units(received.age)
+            last = self._heard.get(sender)
+            if last is None or last.message is not received.message or abs(last.sent - sent) > 1:
+                valid = sent >= 0 and self._read(sender, received.message, sent)
+                last = self._heard[sender] = Heard(received.message, sent, valid)
+            if last.valid:
+                s.inbox_tick[sender] = last.sent
+
+    def _read(self, sender: int, message: Message, sent: int) -> bool:
+        """Hand a message to the kernels; return whether it is well-formed."""
+        try:
+            check_message(message)
+            self._messages.read(self, sender, message, sent)
+        except (CoopenvError, ValueError, TypeError, LookupError, ArithmeticError):
+            self.ignored_messages += 1
+            return False
+        return True
+
+    def _estimate(self) -> Estimate:
+        s, coordinates = self.state, self._kernels.coordinates
+        R, p, P = s.estimate_rotation.copy(), s.estimate_position.copy(), s.covariance.copy()
+        dof = int(s.nis_dof)
+        if coordinates is Coordinates.LEFT:
+            P = left_covariance(p, P)
+        return Estimate(R, R.dot(p), P, coordinates, float(s.nis) if dof else None, dof)
+
+    def _units(self, seconds: float) -> int:
+        """Return a time in the kernels' units."""
+        return round(min(max(seconds / self._unit, -MOST_UNITS), MOST_UNITS))
+
+    def _set_clock(self, origin: float | None, period: float) -> None:
+        """Let the kernels count from an origin on, s, by parts of a tick of a period, s."""
+        if not 0.0 < period < math.inf:
+            raise CoopenvError(f"a tick of {period} s")
+        self._origin, self._unit = origin, period / UNITS_PER_TICK
+        self._model.camera_period, self._model.camera_rate = self._unit, 1.0 / self._unit
+        self._launch = Launcher(1, "cpu", PRECISION)
+
+    def _run(self, key: str, factory: Callable[[Embedded], Any], *moving: Any) -> None:
+        self._launch(key, factory(self._kernels), [self._model, *self._records, self.setup.vehicle, *moving])
+
+    def _all_views(self) -> list[Any]:
+        """Return every array that changes."""
+        return [*vars(self.state).values(), *vars(self.memory).values(), self._start_covariance]
+
+    def __reduce__(self) -> Any:
+        """Travel, and be copied, as the name of the kernels and all that has changed since they began."""
+        arrays = [view.copy() for view in self._all_views()]
+        return _observer, (self.embedded.name, self.setup), (arrays, self._origin, self._unit, self._heard)
+
+    def __setstate__(self, state: Any) -> None:
+        """Go on where another one was."""
+        arrays, origin, unit, self._heard = state
+        for view, values in zip(self._all_views(), arrays, strict=True):
+            view[...] = values
+        self._set_clock(origin, unit * UNITS_PER_TICK)
+
+
+def _observer(name: str, setup: Setup) -> KernelObserver:
+    """Return an observer by the name of its kernels."""
+    from coopenv.observers.registry import find_embedded
+
+    embedded = find_embedded(name)
+    if embedded is None:
+        raise CoopenvError(f"observer '{name}' has no kernels in this program")
+    return KernelObserver(embedded, setup)
+
+
+@dataclass(frozen=True)
+class KernelFactory:
+    """Builds the plug-in observer of a vehicle from its setup."""
+
+    embedded: Embedded
+
+    def __call__(self, setup: Setup) -> KernelObserver:
+        """Return the observer of one vehicle."""
+        return KernelObserver(self.embedded, setup)
+
+
+def write_pose(observer: KernelObserver) -> Message:
+    """Return the pose estimate as a message, which is all that an observer sends that says nothing else."""
+    R = observer.state.estimate_rotation.copy()
+    return Message(position=R @ (observer.state.estimate_position + observer.setup.marker), rotation=R)
+
+
+def read_pose(observer: KernelObserver, sender: int, message: Message, sent: int) -> None:
+    """Put a pose estimate where the V2X stage puts it; the sender's marker takes the place of its origin.
+
+    Raises:
+        CoopenvError: the message holds no pose.
+    """
+    if message.position is None or message.rotation is None:
+        raise CoopenvError("no pose")
+    observer.state.inbox_rotation[sender] = message.rotation
+    observer.state.inbox_position[sender] = message.position
+
+
+POSE = Messages(write_pose, read_pose)

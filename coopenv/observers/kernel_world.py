@@ -1,0 +1,55 @@
+"""The world of one vehicle on the host: what it knows before it starts, and views of what changes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from coopenv.observers.contract import Setup
+from coopenv.world.model import mat66d, model_struct
+from coopenv.world.precision import Precision
+from coopenv.world.records import repeated
+
+
+def views_of(record: Any, declared: Mapping[str, Any]) -> SimpleNamespace:
+    """Return a vehicle's part of a record's arrays, which it shares."""
+    arrays = {name: getattr(record, name).numpy() for name in declared}
+    return SimpleNamespace(
+        **{name: array[(0, 0, ...) if declared[name].axes[1:2] == "N" else (0, ...)] for name, array in arrays.items()}
+    )
+
+
+def model_of(setup: Setup, p: Precision) -> Any:
+    """Return the model of the world that a vehicle knows of."""
+    L, T = setup.landmarks, len(setup.target_names)
+    N, model = T - L, model_struct(p)()
+    model.landmarks, model.vehicles, model.agents = L, N, T
+    model.samples_per_tick = model.observer.blocks = model.ticks_per_decision = 1
+    model.horizon_ticks = 2**31 - 1
+    model.odometry_period, model.odometry_rate = setup.noise.odometry_period, 1.0 / setup.noise.odometry_period
+    targets = np.full((1, T), -1, dtype=np.int32)
+    targets[0, : len(setup.targets)] = setup.targets
+    model.targets = repeated(wp.array(targets, dtype=wp.int32, device="cpu"), 0, N)
+    model.target_count = wp.full(N, len(setup.targets), dtype=wp.int32, device="cpu")
+    model.order = model.rank = wp.array(np.arange(N, dtype=np.int32), dtype=wp.int32, device="cpu")
+    model.start.covariance = wp.zeros(N, dtype=mat66d, device="cpu")
+    model.camera.rotation, model.camera.position = p.mat33(*np.eye(3).ravel()), p.vec3(*setup.lever_arm)
+    markers = np.zeros((T, 3))
+    markers[L + setup.vehicle] = setup.marker
+    model.scene.marker = wp.array(markers, dtype=p.vec3, device="cpu")
+    model.noise.velocity, model.noise.angular_velocity = setup.noise.velocity, setup.noise.angular_velocity
+    model.noise.bearing = setup.noise.bearing
+    model.radio.period = model.radio.slots = 1
+    model.radio.range = model.radio.staleness = math.inf
+    gains = setup.gains
+    model.observer.k = wp.full(N, gains.k, dtype=p.scalar, device="cpu")
+    model.observer.q = wp.array(gains.q, dtype=p.scalar, device="cpu")
+    model.observer.v1, model.observer.v2 = gains.V
+    model.observer.p1, model.observer.p2 = gains.P0
+    model.observer.max_turn = gains.max_turn
+    return model

@@ -1,0 +1,45 @@
+"""The observers of this package: one row each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Entry:
+    """Where an observer stands in this package; nothing is loaded before it is asked for."""
+
+    plugin: str
+    """Module and class, or function of a setup."""
+    kernels: str = ""
+    """Module and `Embedded`; empty: it runs on the host only."""
+    needs: str = ""
+    """Module of the extra `bench` without which it does not run."""
+    in_space: bool = True
+    """Whether it is meant for vehicles in space."""
+    on_a_plane: bool = True
+    """Whether it is meant for robots on a plane whose odometry is their commands (`Setup.planar`)."""
+    kernels_on_a_plane: bool = True
+    """Whether its kernels are those of the plug-in there."""
+
+
+ZOO = {
+    "dead_reckoning": Entry("dead_reckoning:DeadReckoning", "riccati.kernels:DEAD_RECKONING"),
+    # on a plane bearings to three points say more than a pose needs
+    "p3p": Entry("single_frame:PerspectivePoints", on_a_plane=False),
+    "riccati": Entry("riccati.plugin:Riccati", "riccati.kernels:RICCATI"),
+    "hamel_samson": Entry("hamel_samson:HamelSamson"),
+    "mekf": Entry("mekf:Mekf"),
+    "mekf_covariance": Entry("mekf_covariance:MekfCovariance"),
+    "covariance_intersection": Entry("covariance_intersection:CovarianceIntersection"),
+    "left_invariant": Entry("left_invariant:LeftInvariant"),
+    "right_invariant": Entry("right_invariant:RightInvariant"),
+    "ukf": Entry("ukf:Ukf"),
+    "factor_graph": Entry("factor_graph:FactorGraph", needs="gtsam"),
+    "planar_ekf": Entry("planar.plugin:PlanarEkf", in_space=False),
+    "robust": Entry("robust.plugin:robust", "robust.kernels:ROBUST", kernels_on_a_plane=False),
+    # on a plane it is `robust`: there are no joint messages
+    "robust_joint": Entry("robust.plugin:robust_joint", on_a_plane=False),
+    "centralised": Entry("centralised:Centralised"),
+}
+"""By name."""
