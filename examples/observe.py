@@ -1,6 +1,6 @@
 """Step an environment by hand and watch one vehicle find out where it is.
 
-Run: python examples/observe.py
+Run: python examples/observe.py (about 10 s)
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Write an observer of one's own, compare it with others on the same ticks, and let it drive an environment.
 
-Run: python examples/own_observer.py
+Run: python examples/own_observer.py (about 45 s)
 """
 
 import numpy as np

@@ -1,6 +1,6 @@
 """Change a scenario: how much does the radio's delay cost the last vehicle of the chain?
 
-Run: python examples/own_scenario.py
+Run: python examples/own_scenario.py (about 10 s)
 """
 
 import coopenv

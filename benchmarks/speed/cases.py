@@ -21,7 +21,9 @@ class Library:
     """Whose versions matter."""
 
 
-COOPENV = Library("coopenv", "coopenv", "benchmarks.speed.coopenv_cases:build", ("coopenv", "warp-lang", "numpy"))
+COOPENV = Library(
+    "coopenv", "coopenv.api.vector_env", "benchmarks.speed.coopenv_cases:build", ("coopenv", "warp-lang", "numpy")
+)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from benchmarks.speed.workers import VARIABLES
 
 IMPORT = "import time; start = time.perf_counter(); import {module}; print(time.perf_counter() - start)"
 FIRST_STEP = """
-import time, numpy, coopenv
+import time, numpy, coopenv.api.vector_env
 start = time.perf_counter()
 env = coopenv.make_vec({environment!r}, num_worlds=1, dtype={dtype!r}, overrides={overrides!r})
 env.reset(seed=0)
