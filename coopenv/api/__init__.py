@@ -1,1 +1,1 @@
-"""The standard faces of a world: PettingZoo, Gymnasium, spaces, rewards."""
+"""The standard interfaces of a world: PettingZoo, Gymnasium, spaces, rewards."""

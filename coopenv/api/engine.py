@@ -1,4 +1,4 @@
-"""The batched core under every face: worlds plus step results, with constant Python work per step."""
+"""The batched core under every interface: worlds plus step results, with constant Python work per step."""
 
 from __future__ import annotations
 

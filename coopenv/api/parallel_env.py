@@ -1,4 +1,4 @@
-"""The PettingZoo face: one world, dictionaries keyed by agent."""
+"""The PettingZoo environment: one world, dictionaries keyed by agent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Gymnasium face: one vehicle is the agent, the others follow a fixed rule."""
+"""The Gymnasium environment: one vehicle is the agent, the others follow a fixed rule."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the faces of a world read after each decision: how good estimates are, rewards, flags that end episodes."""
+"""What the interfaces of a world read after each decision: how good estimates are, rewards, flags that end episodes."""
 
 from functools import cache
 from typing import Any

@@ -1,4 +1,4 @@
-"""The batched Gymnasium face: rows are (world, vehicle), for policies that all vehicles share."""
+"""The batched Gymnasium environment: rows are (world, vehicle), for policies that all vehicles share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every source of ticks offers; the faces of an environment know no more of it."""
+"""What every source of ticks offers; the interfaces of an environment know no more of it."""
 
 from __future__ import annotations
 

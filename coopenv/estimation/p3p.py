@@ -19,7 +19,7 @@ FIRST, SECOND = np.array([0, 0, 1]), np.array([1, 2, 2])
 ANGLES = np.arange(4) * np.pi / 4
 NEWTON_STEPS = 3
 TOLERANCE = 1e-8
-"""Of squared sides, relative to the longest: what a solution may miss."""
+"""What a solution may miss of the squared sides, relative to the longest."""
 FLAT = 1e-9
 """Twice a triangle's area over its longest squared side: below it the points are on a line."""
 

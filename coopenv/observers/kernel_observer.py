@@ -1,4 +1,4 @@
-"""The plug-in face of an observer with kernels: one vehicle, fed with ticks on the host.
+"""An observer with kernels as a plug-in: one vehicle, fed with ticks on the host.
 
 The kernels get a world of their own, in which stands what this vehicle senses and hears. Where arrays have a row per
 vehicle, one row stands for all; truth is not a number.

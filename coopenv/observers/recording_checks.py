@@ -33,13 +33,13 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     "truth.position": ("K", "N", 3),
 }
 KINDS = {"visible": "b", "due": "b", "inbox_tick": "i"}
-"""Of NumPy; all others hold floats."""
+"""NumPy's kind of the arrays that do not hold floats."""
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
 TICK_LENGTHS_S = (1e-5, 1e3)
 MAX_PERIOD_TICKS = 100_000
 LEAST_EIGENVALUE = 1e-12
-"""Of the correlations of an initial estimate."""
+"""Least eigenvalue of the correlations of an initial estimate."""
 
 
 def check_recording(recording: Recording, where: str) -> None:

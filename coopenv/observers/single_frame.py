@@ -35,12 +35,12 @@ PATIENCE = 1.0
 NARROW_STD = 0.5
 """rad, of the predicted orientation: below it Gauss-Newton from there finds what is to be found near it."""
 LARGEST_STD = 0.15
-"""Of the position, over the distance to the nearest point: beyond it the geometry is too weak."""
+"""Largest standard deviation of the position over the distance to the nearest point; beyond it geometry is weak."""
 
 ALL, PLANE = np.eye(6), np.eye(2)
 ADJUGATE = np.array([[1.0, -1.0], [-1.0, 1.0]])
 EXACT = np.zeros((3, 3))
-"""Of a point that is known, or whose sender states no covariance."""
+"""Covariance of a point that is known, or whose sender states no covariance."""
 
 Bearings = tuple[Array, Array, Array]
 """Unit bearings (m, 3), positions (m, 3) and covariances of positions (m, 3, 3)."""

@@ -22,7 +22,7 @@ def _unit_quaternion(q: tuple[float, float, float, float]) -> tuple[float, float
 
 
 LARGEST = 1e9
-"""Of any quantity, in its own unit: products of four such numbers still fit into single precision."""
+"""Largest magnitude of any quantity, in its own unit: products of four such numbers still fit into single precision."""
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Vector2 = tuple[Number, Number]

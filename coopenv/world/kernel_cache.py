@@ -13,7 +13,7 @@ import warp as wp
 from coopenv.errors import CoopenvError
 
 ATTEMPTS = 3
-"""Of loading a module. The second builds it anew; a third is for two processes that mend the same one."""
+"""Attempts to load a module. The second builds it anew; a third is for two processes that mend the same one."""
 PROBE_BYTES = 5 << 20
 """As much as the source and the code of a large module have."""
 

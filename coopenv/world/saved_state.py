@@ -20,9 +20,9 @@ Mask = NDArray[np.bool_]
 Fields = Mapping[str, Array]
 
 TOLERANCE = {np.dtype(np.float32): 1e-4, np.dtype(np.float64): 1e-6}
-"""Of rotations and directions in a precision."""
+"""How far rotations and directions may be off in a precision."""
 LEAST_EIGENVALUE = {np.dtype(np.float32): -1e-4, np.dtype(np.float64): -1e-9}
-"""Of the correlations of a covariance after rounding in a precision."""
+"""Least eigenvalue of the correlations of a covariance, after rounding in a precision."""
 
 
 class Rule(NamedTuple):
@@ -79,7 +79,7 @@ ANYTHING = Rule("anything", lambda values, fields, model: np.ones(values.shape, 
 FLAG = whole(0, 1)
 NUMBER = numbers()
 TICK = whole(-1, "tick")
-"""Of the past or now; -1: never."""
+"""A tick of the past or the present one; -1: never."""
 ODOMETRY_SAMPLES = Rule("as many as at this tick", _odometry_samples)
 DIRECTION = Rule(
     "a unit vector, or zero",

@@ -128,7 +128,7 @@ def deliver_kernel(source: Source) -> Kernel:
 
 @cache
 def start_kernel(observer: Embedded) -> Kernel:
-    """Return the kernel that starts one vehicle's observer. It and the next two serve the plug-in face."""
+    """Return the kernel that starts one vehicle's observer. It and the next two serve observers that are plug-ins."""
     start_vehicle = observer.start
 
     def start(model: Any, state: Any, memory: Any, vehicle: int):

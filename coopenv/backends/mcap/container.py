@@ -26,7 +26,7 @@ MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, time of logging, time of 
 MAX_CHUNK_BYTES = 16 * 2**20
 """Unpacked; writers make chunks of about 1 MiB."""
 MAX_EXPANSION = 50
-"""Of a whole file, beyond one such chunk; recordings expand 3 to 10 times."""
+"""Times that a whole file may grow when it is unpacked, beyond one such chunk; recordings expand 3 to 10 times."""
 
 
 class LoggedMessage(NamedTuple):

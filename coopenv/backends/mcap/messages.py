@@ -53,7 +53,7 @@ SHOWN = {"odometry": "nav_msgs/msg/Odometry", "truth": "geometry_msgs/msg/PoseSt
 """Topics of a vehicle that viewers understand: dead reckoning from the start, and the truth where it is known."""
 
 LANDMARKS_TYPE = "geometry_msgs/msg/PoseArray"
-"""Of `LANDMARKS`: positions in the map, one message whenever one has changed."""
+"""Type of the topic `LANDMARKS`: positions in the map, one message whenever one has changed."""
 
 
 def topic(vehicle: str, name: str) -> str:

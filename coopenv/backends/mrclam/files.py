@@ -22,7 +22,7 @@ ENVIRONMENT_VARIABLE = "COOPENV_DATA"
 MAX_PAUSE_S = 3600.0
 """Between two rows; more is a broken time stamp."""
 MAX_LENGTH_S = 6 * 3600.0
-"""Of a whole sub-dataset, whose clocks agree; the longest one takes 40 minutes."""
+"""Longest time that a sub-dataset may span, whose clocks agree; the longest one takes 40 minutes."""
 
 Array = NDArray[np.float64]
 Subjects = NDArray[np.int64]

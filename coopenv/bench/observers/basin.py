@@ -66,7 +66,7 @@ class Basin:
     observer: str
     draws: int
     converged_fraction: float
-    """Of the draws: those in which every vehicle ends converged."""
+    """Share of the draws in which every vehicle ends converged."""
     interval: Interval
     """95 %, Wilson."""
     by_vehicle: tuple[float, ...]

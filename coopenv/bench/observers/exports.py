@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 FORMATS = ("png", "pdf", "svg")
-"""Of figures."""
+"""Formats of figures."""
 
 
 def document(board: Leaderboard, command: str, **more: Any) -> dict[str, Any]:

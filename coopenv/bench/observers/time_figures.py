@@ -31,7 +31,7 @@ from coopenv.viz.style import (
 
 MOST_VEHICLES = 6
 NEES_RANGE = (1e-4, 1e4)
-"""Of NEES over its dimension what is drawn; beyond it an observer is as wrong as it can be."""
+"""Range of NEES over its dimension that is drawn; beyond it an observer is as wrong as it can be."""
 _FRAME = 1.15  # inches above and below the panels
 _DASHED, _DOTTED = (0, (4, 1.5)), (0, (1, 1))
 

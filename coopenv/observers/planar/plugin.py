@@ -18,7 +18,7 @@ from coopenv.observers.planar.commands import Wheels
 from coopenv.observers.planar.filter import HEADING, PlanarFilter, PlanarPose, Tuning, X, Y
 
 PLANE = np.ix_((2, 3, 4), (2, 3, 4))
-"""Of the LEFT coordinates those in the plane: yaw, forward, left."""
+"""Indices of the LEFT coordinates in the plane: yaw, forward, left."""
 OUT_OF_PLANE_STD = 1e-3  # rad and m
 LOWER = np.tril_indices(3)
 

@@ -1,4 +1,4 @@
-"""Who must be forgotten so that another one fits into a belief. See observers/robust/room.py."""
+"""Who must be forgotten so that another one fits into a belief. See reference/eviction.py."""
 
 from __future__ import annotations
 

@@ -20,9 +20,9 @@ PROBLEMS = wp.constant(31)
 STANDARD_DEVIATIONS = wp.constant(MOVED)
 SLOWNESS = wp.constant(SLOW)
 LEAST_INFORMATION = wp.constant(1e-12)
-"""Of the weakest direction relative to the strongest."""
+"""Least information of the weakest direction relative to the strongest."""
 ROOTS = wp.constant(4)
-"""Of the P3P problem, at most."""
+"""Most solutions of the P3P problem."""
 
 
 @wp.func

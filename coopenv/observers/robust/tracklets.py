@@ -30,7 +30,7 @@ PROBATION, CLOSE = wp.constant(AGREED_FOR), wp.constant(AGREED_DISTANCE)
 TWIST_MEMORY = wp.constant(TWIST_TIME)
 MASK_BITS = wp.constant(BITS)
 LESS_KNOWN = wp.constant(1.01)
-"""Of a variance against the predicted one: from there on the sender has lost something, and nothing is learnt."""
+"""Ratio of a variance to the predicted one: from there on the sender has lost something, and nothing is learnt."""
 
 
 @wp.func

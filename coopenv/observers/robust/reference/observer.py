@@ -39,9 +39,9 @@ from coopenv.observers.robust.reference.tracklets import (
 )
 
 SHARE = 0.7
-"""Of what a neighbour that leans on others has learnt."""
+"""Share that counts of what a neighbour that leans on others has learnt."""
 TRUST_GATE = 40.0
-"""Of the squared distance between a message and the belief about its sender: chi-square of 6, 1 - 5e-7."""
+"""Gate of the squared distance between a message and the belief about its sender: chi-square of 6, 1 - 5e-7."""
 AGREED_FOR, AGREED_DISTANCE = 1.0, 1.0
 """s and m: how long and how closely a distrusted sender must agree before it is believed again."""
 LOST_SHARE, LOST_TIME = 0.6, 0.5

@@ -11,7 +11,7 @@ from coopenv.observers.robust.reference.belief import Belief, View
 
 STEPS = 6
 LEAST_INFORMATION = 1e-12
-"""Of the weakest direction relative to the strongest; below it the frame does not tell the pose."""
+"""Least information of the weakest direction relative to the strongest; below it the frame does not tell the pose."""
 
 
 def resect(belief: Belief, look: Callable[[], View]) -> bool:

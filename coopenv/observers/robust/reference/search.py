@@ -25,7 +25,7 @@ MOVED = 2.0
 """By how many standard deviations a measurement is moved to look for solutions that noise may hide."""
 MOST_HYPOTHESES = 6
 GATE = 13.8
-"""Of a bearing's normalised innovation squared: chi-square of 2, 0.999."""
+"""Gate of a bearing's normalised innovation squared: chi-square of 2, 0.999."""
 MISS = 25.0
 """What a hypothesis pays at most for one bearing."""
 MARGIN = 30.0
