@@ -8,33 +8,21 @@ lacks it, by two renames, between which the place is empty: a run that is killed
 
 from __future__ import annotations
 
-import ctypes
 import os
-import secrets
 import shutil
-import stat
-import sys
 import threading
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, suppress
-from glob import escape
+from contextlib import contextmanager
 from pathlib import Path
 
 from coopenv.errors import OutputError
 from coopenv.interrupts import before_a_hard_end, held, note
+from coopenv.staging import PART, abandoned, copy_owner, heal, new_part, put_in_place, sync
 
-try:
-    import fcntl
-except ImportError:  # no POSIX: nobody can tell whether a hidden folder is still in use, so all of them stay
-    fcntl = None  # type: ignore[assignment]
-
-PART, OLD = ".part", ".old"
-"""Suffixes of hidden folders: what is being written, and what has made room for it."""
 PROBE_BYTES = 1 << 16
 """Written before the work begins, to find a disk that is full already."""
 LAST_WAIT = 0.5
 """s to wait for a result that is being put in place, before the process is ended."""
-AT_FDCWD, RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 
 _replacing = threading.Lock()
 _under_way: list[Path] = []
@@ -60,12 +48,12 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
         new = part / place.name
         with writing(path):
             yield new
-            _sync(new)
-            _copy_owner(place, new)
+            sync(new)
+            copy_owner(place, new)
             with held(), _replacing:
                 new.replace(place)
                 _written(path, place)
-            _sync(place.parent)
+            sync(place.parent)
 
 
 @contextmanager
@@ -83,7 +71,7 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
 
     def check(path: str | Path, place: Path) -> None:
         place.parent.mkdir(parents=True, exist_ok=True)
-        _heal(place, names)
+        heal(place, names)
         if os.path.lexists(place):
             _check_folder(path, place, names)
 
@@ -94,12 +82,20 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
             raise OutputError(str(error).replace(str(part), str(folder))) from None
         with writing(folder):
             for path in part.rglob("*"):
-                _sync(path)
-            _sync(part)
+                sync(path)
+            sync(part)
         with held(), _replacing:
-            _replace_folder(folder, place, part, names)
+            try:
+                put_in_place(part, place, names)
+            except OSError as error:
+                rescued = place.with_name(part.stem.removeprefix("."))
+                with writing(folder):
+                    part.rename(rescued)
+                raise OutputError(
+                    f"cannot replace {folder}: {error.strerror}; the new result is in {rescued}"
+                ) from None
             _written(folder, place)
-        _sync(place.parent)
+        sync(place.parent)
 
 
 def check_file(path: str | Path) -> None:
@@ -170,7 +166,7 @@ def _staging(path: str | Path, check: Callable[[str | Path, Path], None]) -> Ite
     with writing(path):
         place = Path(os.path.realpath(path))
         check(path, place)
-        for left in _abandoned(place, PART):
+        for left in abandoned(place, PART):
             shutil.rmtree(left, ignore_errors=True)
     if place.parent not in _under_way:
         note(f"kept: {path} of an earlier run" if os.path.lexists(place) else "nothing written")
@@ -178,11 +174,11 @@ def _staging(path: str | Path, check: Callable[[str | Path, Path], None]) -> Ite
     try:
         with writing(path):
             with held():
-                part, lock = _new_part(place)
+                part, lock = new_part(place)
                 _under_way.append(part)
             probe = part / "probe"
             probe.write_bytes(bytes(PROBE_BYTES))
-            _sync(probe)
+            sync(probe)
             probe.unlink()
         yield place, part
     finally:
@@ -191,122 +187,3 @@ def _staging(path: str | Path, check: Callable[[str | Path, Path], None]) -> Ite
             shutil.rmtree(part, ignore_errors=True)
             if lock is not None:
                 os.close(lock)
-
-
-def _new_part(place: Path) -> tuple[Path, int | None]:
-    """Return a new hidden folder beside a place, and the descriptor that holds it, if there are locks."""
-    while True:
-        part = place.with_name(f".{place.name}.{secrets.token_hex(4)}{PART}")
-        part.mkdir()
-        with suppress(FileNotFoundError):
-            lock = _lock(part, wait=True)
-            if part.exists():  # not taken for abandoned before it was locked
-                return part, lock
-            if lock is not None:
-                os.close(lock)
-
-
-def _replace_folder(folder: str | Path, place: Path, part: Path, names: Collection[str]) -> None:
-    """Put `part` in its place, together with what is there and not of `names`."""
-    try:
-        if not place.exists():
-            part.rename(place)
-            return
-        _copy_owner(place, part)
-        for entry in place.iterdir():
-            if entry.name not in names and (entry.is_symlink() or not entry.is_dir()):
-                with suppress(OSError):  # a file system without links: moved over afterwards, like folders
-                    os.link(entry, part / entry.name, follow_symlinks=False)
-        old = part.with_suffix(OLD)
-        _exchange(part, place, old)
-    except OSError as error:
-        rescued = place.with_name(part.stem.removeprefix("."))
-        with writing(folder):
-            part.rename(rescued)
-        raise OutputError(f"cannot replace {folder}: {error.strerror}; the new result is in {rescued}") from None
-    _clear(old, place, names)
-
-
-def _exchange(part: Path, place: Path, old: Path) -> None:
-    """Let `part` and the folder at `place` change places; the latter is then called `old`."""
-    part.rename(old)  # from now on nobody removes it unseen
-    rename = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
-    paths = os.fsencode(old), os.fsencode(place)
-    if rename is not None and rename(AT_FDCWD, paths[0], AT_FDCWD, paths[1], RENAME_EXCHANGE) == 0:
-        return
-    old.rename(part)
-    place.rename(old)
-    try:
-        part.rename(place)
-    except OSError:
-        old.rename(place)
-        raise
-
-
-def _heal(place: Path, names: Collection[str]) -> None:
-    """Finish what a run that was killed had begun."""
-    for old in _abandoned(place, OLD):
-        if os.path.lexists(place):
-            _clear(old, place, names)
-        else:
-            old.rename(place)
-
-
-def _clear(old: Path, place: Path, names: Collection[str]) -> None:
-    """Remove an old folder but for what is not of `names`, which goes to `place`.
-
-    Where `place` has something else under the same name, both stay where they are.
-    """
-    for entry in old.iterdir():
-        with suppress(OSError):
-            kept = place / entry.name
-            if entry.name in names or (os.path.lexists(kept) and os.path.samestat(entry.lstat(), kept.lstat())):
-                entry.unlink()
-            elif not os.path.lexists(kept):
-                entry.rename(kept)
-    with suppress(OSError):
-        old.rmdir()
-
-
-def _abandoned(place: Path, suffix: str) -> Iterator[Path]:
-    """Yield the hidden folders of a place that belong to no living process."""
-    for path in place.parent.glob(f".{escape(place.name)}.{'[0-9a-f]' * 8}{suffix}"):
-        lock = _lock(path)
-        if lock is not None:
-            try:
-                yield path
-            finally:
-                os.close(lock)
-
-
-def _lock(folder: Path, wait: bool = False) -> int | None:
-    """Return a descriptor that holds a folder until it is closed, or None: held by others, or there are no locks."""
-    if fcntl is None:
-        return None
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(descriptor)
-        return None
-    return descriptor
-
-
-def _copy_owner(old: Path, new: Path) -> None:
-    """Give what is new the mode and, where allowed, the owner of what it replaces."""
-    if os.name == "posix":
-        with suppress(OSError):
-            info = old.stat()
-            new.chmod(stat.S_IMODE(info.st_mode))
-            os.chown(new, info.st_uid, info.st_gid)
-
-
-def _sync(path: Path) -> None:
-    """Wait until a file, or a folder's list of names, is on the disk."""
-    if os.name != "posix" and path.is_dir():
-        return
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from coopenv import files
+from coopenv import staging
 from coopenv.errors import OutputError
 from coopenv.files import check_file, replacing_file, replacing_folder, writing
 from tests.helpers.processes import small_disk
@@ -127,7 +128,7 @@ def test_readers_find_a_whole_result_at_every_instant(place: Path) -> None:
         writer.wait()
 
 
-@pytest.mark.parametrize("step", ["link", "_exchange", "_clear", "rmdir"])
+@pytest.mark.parametrize("step", ["link", "exchange", "clear", "rmdir"])
 def test_a_run_killed_at_any_step_is_put_right_by_the_next(
     step: str, place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -138,11 +139,11 @@ def test_a_run_killed_at_any_step_is_put_right_by_the_next(
         raise Killed
 
     with monkeypatch.context() as patched:
-        patched.setattr({"link": os, "rmdir": Path}.get(step, files), step, killed)
-        patched.setattr(files.shutil, "rmtree", lambda *_, **__: None)  # a dead process does not clean up
+        patched.setattr({"link": os, "rmdir": Path}.get(step, staging), step, killed)
+        patched.setattr(shutil, "rmtree", lambda *_, **__: None)  # a dead process does not clean up
         with pytest.raises(Killed):
             write("result", 7)
-    assert generation_of(place / "result") == (7 if step in ("_clear", "rmdir") else 0)
+    assert generation_of(place / "result") == (7 if step in ("clear", "rmdir") else 0)
     assert hidden(place) != []
     write("result", 8)
     assert generation_of(place / "result") == 8
@@ -153,7 +154,7 @@ def test_a_run_killed_at_any_step_is_put_right_by_the_next(
 
 @pytest.fixture
 def without_exchange(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "RENAME_EXCHANGE", 1 << 20)  # a flag that no system knows
+    monkeypatch.setattr(staging, "RENAME_EXCHANGE", 1 << 20)  # a flag that no system knows
 
 
 @pytest.mark.usefixtures("without_exchange")
@@ -167,6 +168,11 @@ def test_without_an_exchange_two_renames_do(place: Path, monkeypatch: pytest.Mon
     assert generation_of(place / "result") == 2
     assert (place / "result" / "notes.txt").read_text() == "mine"
     assert hidden(place) == []
+    Path("result").rename(".result.0123abcd.old")
+    Path("result").mkdir()  # by somebody who misses it
+    with pytest.raises(ZeroDivisionError), replacing_folder("result", NAMES):
+        raise ZeroDivisionError
+    assert generation_of(place / "result") == 2
 
 
 @pytest.mark.usefixtures("without_exchange")

@@ -63,7 +63,8 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
 
 def script(folder: Path, text: str) -> tuple[str, str, int]:
     """Run a script with signals caught; return what it writes, what it complains of, and its exit status."""
-    first = "import ctypes, os, signal, threading\nfrom coopenv import files, interrupts\ninterrupts.install()\n"
+    first = "import ctypes, os, signal, threading\nfrom coopenv import files, interrupts, staging\n"
+    first += "interrupts.install()\n"
     process = start((sys.executable, "-c", first + text), folder)
     out, errors = process.communicate(timeout=DEADLOCK)
     return out, errors, process.returncode
@@ -99,9 +100,9 @@ def test_a_result_is_put_in_place_before_the_end(tmp_path: Path) -> None:
     (tmp_path / "result" / "a").write_text("old")
     _, errors, status = script(
         tmp_path,
-        "swap = files._exchange\n"
+        "swap = staging.exchange\n"
         "def slow(*paths): os.kill(os.getpid(), signal.SIGTERM); print('held', flush=True); swap(*paths)\n"
-        "files._exchange = slow\n"
+        "staging.exchange = slow\n"
         "try:\n"
         "    with files.replacing_folder('result', ['a']) as new: (new / 'a').write_text('new')\n"
         "    print('not reached')\n"
