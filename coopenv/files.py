@@ -166,6 +166,8 @@ def _staging(path: str | Path, check: Callable[[str | Path, Path], None]) -> Ite
     with writing(path):
         place = Path(os.path.realpath(path))
         check(path, place)
+        if not os.access(place.parent, os.W_OK | os.X_OK):
+            raise OutputError(f"cannot write to {path}: folder {Path(path).parent} is read-only")
         for left in abandoned(place, PART):
             shutil.rmtree(left, ignore_errors=True)
     if place.parent not in _under_way:

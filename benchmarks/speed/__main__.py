@@ -10,6 +10,8 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
+from coopenv import interrupts
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, print and write; return the exit status: 0, or 2 after a mistake in the input."""
@@ -78,4 +80,8 @@ def command(asked: argparse.Namespace) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    interrupts.install()
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        interrupts.end(interrupts.tell())
