@@ -11,8 +11,8 @@ import numpy as np
 from rich.table import Table
 
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
-from coopenv.bench.tables import number_table
 from coopenv.policies import Policy, act
+from coopenv.runs.table import number_table
 
 
 @dataclass(frozen=True)

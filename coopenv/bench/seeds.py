@@ -10,8 +10,8 @@ import numpy as np
 from rich.table import Table
 
 from coopenv.api.engine import Engine
-from coopenv.bench.tables import number_table
 from coopenv.estimation.metrics import SETTLED, settling_time
+from coopenv.runs.table import number_table
 from coopenv.scenario import Scenario
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich import box
 from rich.table import Table
 
 from coopenv.api.registration import environment_id
 from coopenv.observers.registry import find, observer_names, obstacle
 from coopenv.policies import read_card
+from coopenv.runs.table import number_table
 from coopenv.scenario import Scenario
 from coopenv.shipped import list_agents
 
@@ -63,7 +63,7 @@ def _sentence(text: str) -> str:
 
 def list_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Table:
     """Return one line per row; what does not fit into the width is cut off at the end of the last column."""
-    table = Table(box=box.HORIZONTALS, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
+    table = number_table((), ())
     for key in columns:
         cells = [_text(row[key]) for row in rows]
         heading = key.removesuffix("_s") + (" [s]" if key.endswith("_s") else "")

@@ -1,9 +1,9 @@
-"""The table that `coopenv run` ends with."""
+"""Tables that fit a terminal, and the one that `coopenv run` ends with."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from rich import box
@@ -25,12 +25,19 @@ COLUMNS = (
 """Key of a vehicle's metrics, heading, and how a column of them is written."""
 
 
+def number_table(names: Sequence[str], numbers: Sequence[str], gap: int = 1) -> Table:
+    """Return an empty table: columns of names, then of numbers, `gap` + 1 spaces between them."""
+    table = Table(box=box.HORIZONTALS, padding=(0, gap, 0, 0), pad_edge=False, show_edge=False)
+    for heading in names:
+        table.add_column(heading, no_wrap=True)
+    for heading in numbers:
+        table.add_column(heading, justify="right", no_wrap=True)
+    return table
+
+
 def metrics_table(vehicles: list[dict[str, Any]]) -> Table:
     """Return one row per vehicle: initial error, times to settle and converge, steady errors, targets, NEES."""
-    table = Table(box=box.HORIZONTALS, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
-    table.add_column("\nvehicle", no_wrap=True)
-    for _, heading, _ in COLUMNS:
-        table.add_column(heading, justify="right", no_wrap=True)
+    table = number_table(["\nvehicle"], [heading for _, heading, _ in COLUMNS])
     cells = [write([vehicle[key] for vehicle in vehicles]) for key, _, write in COLUMNS]
     for vehicle, row in zip(vehicles, zip(*cells, strict=True), strict=True):
         table.add_row(vehicle["vehicle"], *row)

@@ -15,7 +15,6 @@ from rich.table import Table
 from coopenv.bench.observers.executors import Executor
 from coopenv.bench.observers.initial_estimates import random_start
 from coopenv.bench.observers.sources import Source
-from coopenv.bench.tables import number_table
 from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.consistency import Interval, wilson_interval
@@ -24,6 +23,7 @@ from coopenv.format import fixed
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import find, portable
 from coopenv.observers.runner import run
+from coopenv.runs.table import number_table
 
 RADIUS = 15.0  # m
 ANGLE_BINS = tuple(range(0, 181, 30))  # deg

@@ -10,8 +10,8 @@ from rich.table import Table
 from coopenv.bench.observers.faults import FAULTS, NOMINAL
 from coopenv.bench.observers.leaderboard import Leaderboard
 from coopenv.bench.observers.rows import Row
-from coopenv.bench.tables import number_table
 from coopenv.format import in_parentheses, number
+from coopenv.runs.table import number_table
 
 WIDTH = 80
 MOST_COLUMNS = 5
