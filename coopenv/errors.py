@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
 MAX_MESSAGE = 600
@@ -97,6 +97,12 @@ def shown(value: object) -> str:
         return shortened(repr(value))
     except Exception:  # numbers of thousands of digits, and anybody's classes
         return f"a {type(value).__name__}"
+
+
+def listed(names: Sequence[str], most: int = 12) -> str:
+    """Return names with commas between; of very many the first few and how many there are."""
+    few = names if len(names) <= most else [*names[:most], f"... ({len(names)} in all)"]
+    return ", ".join(few)
 
 
 def suggest(word: str, valid: Iterable[str]) -> str:

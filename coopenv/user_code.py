@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from coopenv.errors import CoopenvError, suggest
+from coopenv.errors import CoopenvError, shown, suggest
 
 
 def is_reference(text: str) -> bool:
@@ -21,10 +21,14 @@ def is_reference(text: str) -> bool:
     return ":" in text
 
 
-def absolute(reference: str) -> str:
-    """Return a reference that means the same in another folder."""
+def absolute(reference: str, folder: Path | None = None) -> str:
+    """Return a reference, in which a file is looked for in a folder (None: the current one), as one for any folder.
+
+    Raises:
+        CoopenvError: no file can have this name.
+    """
     place, _, name = reference.rpartition(":")
-    return f"{_file(place)}:{name}" if place.endswith(".py") else reference
+    return f"{_file(place, folder)}:{name}" if place.endswith(".py") else reference
 
 
 def load(reference: str) -> Any:
@@ -61,8 +65,13 @@ def one_line(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-def _file(place: str) -> Path:
-    return Path(place).expanduser().resolve()
+def _file(place: str, folder: Path | None = None) -> Path:
+    try:
+        path = ((folder or Path()) / Path(place).expanduser()).resolve()
+        path.is_file()  # raises here what it would raise later
+        return path
+    except (OSError, RuntimeError, ValueError) as error:  # too long, nobody's home, a null character
+        raise CoopenvError(f"{shown(place)}: no such file ({getattr(error, 'strerror', None) or error})") from None
 
 
 @cache

@@ -15,10 +15,12 @@ from coopenv.api.terms.kernels import Plan, endings_kernel, results_kernel
 from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.base import Backend
 from coopenv.backends.simulated import Simulated
+from coopenv.errors import check_memory
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
-from coopenv.world.records import allocate
+from coopenv.world.precision import device_memory
+from coopenv.world.records import allocate, size_of
 from coopenv.world.saved_state import has_begun
 from coopenv.world.state import overwrite, state_fields
 
@@ -56,12 +58,13 @@ class Engine:
         self.plugins = PlugIns(name, self.world, backend.senses(self.world)) if hosted else None
         """The observers that run on the host; None where the embedded one estimates."""
         self.layout = observation_layout(scenario)
-        device = self.world.device
+        worlds, device = self.world.worlds, self.world.device
         weights = scenario.reward.by_name
         self.reward_terms = tuple(weights)
         """Names of the reward terms, in the order of the field `terms`."""
         p = self.world.precision
         sizes = {"W": worlds, "N": self.world.model.vehicles, "D": self.layout.size, "K": len(weights)}
+        check_memory(size_of(results_struct(p), sizes), f"results of {worlds} worlds", device_memory(device))
         self.results = allocate(results_struct(p), sizes, device)
         terms = bound_terms(scenario)
         self._fill = results_kernel(terms, p)

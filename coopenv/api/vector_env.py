@@ -74,8 +74,8 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             raise CoopenvError(f"unknown render_mode '{render_mode}'; known: None, rgb_array")
         self.scenario = scenario
         self.engine = Engine(scenario, num_worlds, dtype, device, threads)
-        self.num_worlds, self.vehicles = num_worlds, len(scenario.vehicles)
-        self.num_envs = num_worlds * self.vehicles
+        self.num_worlds, self.vehicles = self.engine.world.worlds, len(scenario.vehicles)
+        self.num_envs = self.num_worlds * self.vehicles
         self.autoreset = autoreset_mode(autoreset)
         self.render_mode = render_mode
         self.metadata = {
@@ -330,9 +330,9 @@ def make_rows(
     if "num_worlds" in options:
         raise CoopenvError("give num_envs, which counts rows (world, vehicle), instead of num_worlds")
     vehicles = len(load_scenario(name_or_path, options.get("overrides")).vehicles)
-    if not isinstance(num_envs, int) or num_envs < 1 or num_envs % vehicles:
+    if not isinstance(num_envs, int | np.integer) or num_envs < 1 or num_envs % vehicles:
         raise CoopenvError(
             f"num_envs counts rows (world, vehicle): {num_envs} is not a positive multiple of the {vehicles} vehicles "
             f"of {name_or_path}"
         )
-    return make_vec(name_or_path, num_worlds=num_envs // vehicles, **options)
+    return make_vec(name_or_path, num_worlds=int(num_envs) // vehicles, **options)

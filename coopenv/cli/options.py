@@ -130,6 +130,6 @@ def parse_value(text: str) -> Any:
     """Return a TOML value, or the text itself when it is none."""
     try:
         document = tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):  # too many digits or brackets, too
         return text
     return document["value"] if len(document) == 1 else text

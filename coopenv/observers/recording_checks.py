@@ -186,10 +186,11 @@ def _check_scenario(r: Recording) -> None:
     s, first = r.scenario, r.setups[0]
     same = (list(first.target_names), first.landmarks) == (s.target_names, len(s.landmarks))
     _require(same, "scenario: other landmarks or vehicles than the setups")
-    for setup, targets in zip(r.setups, neighbour_sets(s), strict=True):
+    neighbours = neighbour_sets(s)
+    for setup, targets in zip(r.setups, neighbours, strict=True):
         _require(setup.targets.tolist() == targets, f"scenario: {setup.name} has other neighbours than in its setup")
     rates, staleness = s.rates, np.inf if s.v2x.staleness is None else s.v2x.staleness
-    _require(list(r.order) == processing_order(s), "scenario: vehicles in another order than recorded")
+    _require(list(r.order) == processing_order(s, neighbours), "scenario: vehicles in another order than recorded")
     _require(r.dt == 1.0 / rates.camera, f"scenario: ticks of {1.0 / rates.camera:g} s, recorded {r.dt:g} s")
     _require((r.period, r.staleness) == (s.v2x.period, staleness), "scenario: another radio than recorded")
     due = due_ticks(r.ticks, min(rates.observer or rates.camera, rates.camera) / rates.camera)

@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+from coopenv.errors import shown
+
 
 class Part(BaseModel):
     """A frozen section of a scenario file; unknown keys are refused."""
@@ -19,6 +21,13 @@ def _unit_quaternion(q: tuple[float, float, float, float]) -> tuple[float, float
     if abs(norm - 1.0) > 1e-3:
         raise ValueError(f"a rotation needs a unit quaternion, this one has norm {norm:.4g}")
     return (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
+
+
+def _readable(text: str) -> str:
+    for line in text.splitlines():
+        if not line.replace("\t", " ").isprintable():
+            raise ValueError(f"control characters are not allowed, got {shown(line)}")
+    return text
 
 
 LARGEST = 1e9
@@ -37,3 +46,5 @@ PositiveVector2 = tuple[Positive, Positive]
 PositiveVector3 = tuple[Positive, Positive, Positive]
 NonNegativeVector3 = tuple[NonNegative, NonNegative, NonNegative]
 Sample = Literal["sample"]
+Text = Annotated[str, Field(max_length=10_000), AfterValidator(_readable)]
+"""Printed as it is, so that nothing in it may command a terminal."""

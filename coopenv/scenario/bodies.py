@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
@@ -15,6 +16,7 @@ from coopenv.scenario.base import (
     Positive,
     PositiveVector3,
     QuaternionWxyz,
+    Text,
     Vector2,
     Vector3,
 )
@@ -32,7 +34,7 @@ class Body(Part):
 class Obstacle(Part):
     """A building: a box that stands still."""
 
-    name: str = Field(min_length=1)
+    name: Annotated[Text, Field(min_length=1, max_length=64)]
     center: Vector3
     """Centre in the coordinates of this file, m."""
     size: PositiveVector3
@@ -83,6 +85,10 @@ class SegmentMotion(Part):
     segments: tuple[TwistSegment, ...] = Field(min_length=1)
 
 
+FASTEST = 1e6
+"""m/s, on average from one waypoint to the next."""
+
+
 class Waypoint(Part):
     """A place to be at a time."""
 
@@ -108,6 +114,9 @@ class WaypointMotion(Part):
         times = [w.time for w in self.waypoints]
         if times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
             raise ValueError("waypoint times must start at 0 and increase")
+        for n, (a, b) in enumerate(pairwise(self.waypoints)):
+            if math.dist(a.position, b.position) > FASTEST * (b.time - a.time):
+                raise ValueError(f"waypoints.{n + 1}: to be there in time takes more than {FASTEST:g} m/s")
         return self
 
 
@@ -191,7 +200,7 @@ class Goal(Part):
 class Landmark(Part):
     """A target whose position is known to everybody, static or moving."""
 
-    name: str = Field(min_length=1, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
+    name: str = Field(min_length=1, max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
     position: Vector3
     """Position (of its origin, at t = 0) in the coordinates of this file, m."""
     yaw: Number = 0.0

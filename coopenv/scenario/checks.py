@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 
-from coopenv.errors import ScenarioWarning, suggest
+from coopenv.errors import ScenarioWarning, listed, shown, suggest
 from coopenv.scenario.fields import ScenarioFields
 from coopenv.scenario.starts import check_room
 from coopenv.scenario.topology import neighbour_sets, processing_order
@@ -16,14 +17,17 @@ from coopenv.scenario.topology import neighbour_sets, processing_order
 MOST_TICKS = 1e8
 """Camera frames or odometry samples of one episode; counters are 32 bits wide."""
 
+MOST_PAIRS = 2e7
+"""Of vehicles and their targets."""
+
 FAR_FROM_ORIGIN = 50.0
 """m; beyond it the paper's observer loses accuracy, because it is not invariant to the map origin."""
 
 
 def landmark_names(names: Sequence[str]) -> None:
     """Refuse names that occur twice or that vehicles have."""
-    for name in names:
-        if names.count(name) > 1:
+    for name, times in Counter(names).items():
+        if times > 1:
             raise ValueError(f"landmark name '{name}' is used twice")
         if re.fullmatch(r"vehicle_\d+", name):
             raise ValueError(f"landmark name '{name}' is reserved for vehicles")
@@ -35,12 +39,15 @@ def everything(scenario: ScenarioFields) -> None:
     Raises:
         ValueError: the first impossibility found.
     """
-    neighbour_sets(scenario)
-    processing_order(scenario)
+    vehicles, targets = len(scenario.vehicles), len(scenario.target_names)
+    if vehicles * targets > MOST_PAIRS:
+        raise ValueError(f"vehicles: {vehicles} times {targets} targets are over {MOST_PAIRS:.0e} pairs")
+    neighbours = neighbour_sets(scenario)
+    processing_order(scenario, neighbours)
     gains(scenario)
     check_room(scenario)
     limits(scenario)
-    observability(scenario)
+    observability(scenario, neighbours)
 
 
 def gains(scenario: ScenarioFields) -> None:
@@ -49,10 +56,10 @@ def gains(scenario: ScenarioFields) -> None:
     if isinstance(k, tuple) and len(k) != len(scenario.vehicles):
         raise ValueError(f"observer.k: {len(k)} values for {len(scenario.vehicles)} vehicles")
     if isinstance(scenario.observer.q, dict):
-        targets = scenario.target_names
+        targets = set(scenario.target_names)
         for name in scenario.observer.q:
             if name not in targets:
-                raise ValueError(f"observer.q: unknown target '{name}'{suggest(name, targets)}")
+                raise ValueError(f"observer.q: unknown target {shown(name)}{suggest(name, targets)}")
 
 
 def limits(scenario: ScenarioFields) -> None:
@@ -80,7 +87,7 @@ def limits(scenario: ScenarioFields) -> None:
         )
 
 
-def observability(scenario: ScenarioFields) -> None:
+def observability(scenario: ScenarioFields, neighbours: Sequence[Sequence[int]]) -> None:
     """Warn where the paper's conditions for convergence are not met by construction."""
     count = len(scenario.landmarks)
     if count < 3:
@@ -90,13 +97,14 @@ def observability(scenario: ScenarioFields) -> None:
             ScenarioWarning,
             stacklevel=2,
         )
-    for i, targets in enumerate(neighbour_sets(scenario)):
-        if count >= 3 and len(targets) < 3:
-            warnings.warn(
-                f"vehicle_{i + 1} has fewer than three neighbours: observability is not guaranteed",
-                ScenarioWarning,
-                stacklevel=2,
-            )
+    lonely = [f"vehicle_{i + 1}" for i, targets in enumerate(neighbours) if len(targets) < 3]
+    if lonely and count >= 3:
+        verb = "has" if len(lonely) == 1 else "have"
+        warnings.warn(
+            f"{listed(lonely)} {verb} fewer than three neighbours: observability is not guaranteed",
+            ScenarioWarning,
+            stacklevel=2,
+        )
     origin = np.array(scenario.map.origin)
     for landmark in scenario.landmarks:
         distance = float(np.linalg.norm(np.array(landmark.position) - origin))

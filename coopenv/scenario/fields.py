@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from coopenv.errors import suggest
-from coopenv.scenario.base import Part, Positive, Vector3
+from coopenv.scenario.base import Part, Positive, Text, Vector3
 from coopenv.scenario.bodies import Landmark, Obstacle, Road, Vehicle
 from coopenv.scenario.learning import Action, Dynamics, Observation, Reward, Termination
 from coopenv.scenario.sensing import Camera, Noise, Observer, Rates, Topology, V2x
@@ -21,17 +20,17 @@ class Map(Part):
 class ScenarioFields(Part):
     """One environment. Units: m, s, rad; frames: x east, y north, z up; body x forward, y left, z up."""
 
-    title: str
-    description: str = ""
-    source: str = ""
+    title: Text
+    description: Text = ""
+    source: Text = ""
     """Where the figures come from."""
     horizon: Positive
     """Length of an episode, s."""
     map: Map = Map()
-    roads: tuple[Road, ...] = ()
-    obstacles: tuple[Obstacle, ...] = ()
-    landmarks: tuple[Landmark, ...]
-    vehicles: tuple[Vehicle, ...] = Field(min_length=1)
+    roads: tuple[Road, ...] = Field(default=(), max_length=10_000)
+    obstacles: tuple[Obstacle, ...] = Field(default=(), max_length=10_000)
+    landmarks: tuple[Landmark, ...] = Field(max_length=50_000)
+    vehicles: tuple[Vehicle, ...] = Field(min_length=1, max_length=1_000)
     camera: Camera = Camera()
     rates: Rates = Rates()
     noise: Noise = Noise()
@@ -68,14 +67,3 @@ class ScenarioFields(Part):
     def horizon_ticks(self) -> int:
         """Camera ticks of an episode."""
         return max(1, round(self.horizon * self.rates.camera))
-
-    def target_index(self, name: str) -> int:
-        """Return the index of a target.
-
-        Raises:
-            ValueError: no landmark or vehicle has this name.
-        """
-        names = self.target_names
-        if name not in names:
-            raise ValueError(f"unknown target '{name}'{suggest(name, names)}; known: {', '.join(names)}")
-        return names.index(name)

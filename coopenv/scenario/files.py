@@ -11,14 +11,17 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from coopenv.errors import ScenarioError, UnknownEnvironmentError, suggest
+from coopenv.errors import ScenarioError, UnknownEnvironmentError, shortened, shown, suggest
 from coopenv.scenario.own_terms import located
 from coopenv.scenario.schema import Scenario
-from coopenv.scenario.validation import one_line
+from coopenv.scenario.validation import TOO_DEEP, one_line
 from coopenv.shipped import data_directory, list_envs
 
 DEFAULTS_KEY = "vehicle_defaults"
 """A table of the file whose entries every vehicle takes over unless it says otherwise."""
+
+MOST_BYTES = 8 * 2**20
+"""Of a file; 20,000 landmarks take one or two million."""
 
 
 BAGS = (".db3", ".bag")
@@ -33,17 +36,22 @@ def scenario_path(name_or_path: str | Path) -> Path:
     """
     text = str(name_or_path)
     if text.endswith((".toml", *BAGS)) or "/" in text or "\\" in text:
-        path = Path(text).expanduser()
-        if path.suffix in BAGS or (path / "metadata.yaml").is_file():
+        try:
+            path = Path(text).expanduser()
+            there, is_bag = path.is_file(), path.suffix in BAGS or (path / "metadata.yaml").is_file()
+        except (OSError, RuntimeError, ValueError) as error:  # too long, nobody's home, a null character
+            reason = getattr(error, "strerror", None) or error
+            raise UnknownEnvironmentError(f"no such scenario file: {shown(text)} ({reason})") from None
+        if is_bag:
             raise UnknownEnvironmentError(
                 f"{path}: a ROS bag, which coopenv does not read; it replays the MCAP files of `coopenv record`"
             )
-        if not path.is_file():
-            raise UnknownEnvironmentError(f"no such scenario file: {path}")
+        if not there:
+            raise UnknownEnvironmentError(f"no such scenario file: {shortened(str(path), 200)}")
         return path
     if text not in list_envs():
         raise UnknownEnvironmentError(
-            f"unknown environment '{text}'{suggest(text, list_envs())}; known: {', '.join(list_envs())}"
+            f"unknown environment {shown(text)}{suggest(text, list_envs())}; known: {', '.join(list_envs())}"
         )
     return data_directory("envs") / f"{text}.toml"
 
@@ -63,18 +71,31 @@ def load_scenario(name_or_path: str | Path, overrides: Mapping[str, Any] | None 
     if overrides is not None and not isinstance(overrides, Mapping):
         raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
     try:
-        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        raw = located(_read(path), path.parent)
+        for key, value in (overrides or {}).items():
+            override(raw, str(key), value)
+        raw = located(raw, Path.cwd())  # those of overrides
+        return parse_scenario(apply_vehicle_defaults(raw, path.name), path.name)
+    except RecursionError:
+        raise ScenarioError(f"{path.name}: {TOO_DEEP}") from None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """Return the contents of a TOML file."""
+    try:
+        with path.open("rb") as stream:
+            text = stream.read(MOST_BYTES + 1)
+        if len(text) > MOST_BYTES:
+            raise ScenarioError(f"{path.name}: larger than {MOST_BYTES // 2**20} MiB")
+        return tomllib.loads(text.decode("utf-8-sig").replace("\r\n", "\n"))
     except UnicodeDecodeError:
         raise ScenarioError(f"{path}: not a text file, expected a scenario in TOML") from None
     except OSError as error:
         raise ScenarioError(f"{path.name}: cannot be read ({error})") from None
-    except tomllib.TOMLDecodeError as error:
+    except ScenarioError:
+        raise
+    except ValueError as error:  # of tomllib itself, or of numbers with thousands of digits
         raise ScenarioError(f"{path.name}: not valid TOML: {error}") from None
-    raw = located(raw, path.parent)
-    for key, value in (overrides or {}).items():
-        override(raw, str(key), value)
-    raw = located(raw, Path.cwd())  # those of overrides
-    return parse_scenario(apply_vehicle_defaults(raw, path.name), path.name)
 
 
 def parse_scenario(raw: Mapping[str, Any], where: str) -> Scenario:
@@ -85,7 +106,13 @@ def parse_scenario(raw: Mapping[str, Any], where: str) -> Scenario:
     """
     try:
         # Through JSON, where the strict mode refuses "5" and true for a number but takes lists for tuples.
-        return Scenario.model_validate_json(json.dumps(raw, default=_plain), strict=True)
+        text = json.dumps(raw, default=_plain)
+    except (TypeError, ValueError) as error:  # keys that are no text, tables within themselves, thousands of digits
+        raise ScenarioError(f"{where}: {error}") from None
+    except RecursionError:
+        raise ScenarioError(f"{where}: {TOO_DEEP}") from None
+    try:
+        return Scenario.model_validate_json(text, strict=True)
     except ValidationError as error:
         raise ScenarioError(one_line(error, where, Scenario)) from None
 
@@ -104,7 +131,7 @@ def apply_vehicle_defaults(raw: Mapping[str, Any], where: str = "scenario") -> d
     merged = dict(raw)
     defaults = merged.pop(DEFAULTS_KEY, {})
     if not isinstance(defaults, dict):
-        raise ScenarioError(f"{where}: {DEFAULTS_KEY}: must be a table, got {defaults!r}")
+        raise ScenarioError(f"{where}: {DEFAULTS_KEY}: must be a table, got {shown(defaults)}")
     vehicles = merged.get("vehicles")
     if isinstance(vehicles, list):
         merged["vehicles"] = [_with_defaults(defaults, v) if isinstance(v, dict) else v for v in vehicles]
@@ -157,7 +184,7 @@ def _descend(node: Any, path: list[str], value: Any, key: str, parent: str = "")
         else:
             node[head] = _merged({head: node.get(head)}, {head: value})[head]
     else:
-        raise ScenarioError(f"override '{key}': '{head}' lies below a plain value")
+        raise ScenarioError(f"override {shown(key)}: {shown(head)} lies below a plain value")
 
 
 def _indices(node: list[Any], head: str, key: str, parent: str) -> range | list[int]:
@@ -167,7 +194,10 @@ def _indices(node: list[Any], head: str, key: str, parent: str) -> range | list[
     if head in names:
         return [names.index(head)]
     number = head.removeprefix("vehicle_") if parent == "vehicles" else head
-    index = int(number) - (1 if head != number else 0) if number.isdigit() else -1
+    whole = number.isascii() and number.isdigit() and len(number) < 10
+    index = int(number) - (1 if head != number else 0) if whole else -1
     if not 0 <= index < len(node):
-        raise ScenarioError(f"override '{key}': no entry '{head}' (there are {len(node)}; 0..{len(node) - 1} or *)")
+        raise ScenarioError(
+            f"override {shown(key)}: no entry {shown(head)} (there are {len(node)}; 0..{len(node) - 1} or *)"
+        )
     return [index]

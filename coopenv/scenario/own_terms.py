@@ -28,7 +28,7 @@ def _located(row: Any, folder: Path) -> Any:
     if isinstance(row, dict) and "function" in row:
         return {**row, "function": _located(row["function"], folder)}
     if isinstance(row, str) and user_code.is_reference(row):
-        return user_code.absolute(str(folder / Path(row).expanduser()) if ".py:" in row else row)
+        return user_code.absolute(row, folder)
     return row
 
 

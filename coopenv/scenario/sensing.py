@@ -143,7 +143,7 @@ class V2x(Part):
 class Observer(Part):
     """The estimator that every vehicle runs, and its gains."""
 
-    name: str = Field(default="riccati", pattern=r"^[A-Za-z][A-Za-z0-9_.-]*$")
+    name: str = Field(default="riccati", max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_.-]*$")
     """`riccati`: the paper's observer; `robust`: this project's own; `dead_reckoning`: odometry alone, the lower
     reference; or any plug-in observer, which runs in Python and is looked up when the world is built."""
     k: Positive | tuple[Positive, ...] = 1.0

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from itertools import product
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from coopenv.errors import ScenarioWarning
-from coopenv.scenario.bodies import Body, Landmark, Vehicle
+from coopenv.scenario.bodies import Landmark, Vehicle
+from coopenv.scenario.boxes import Boxes, overlapping_pairs
 from coopenv.scenario.fields import ScenarioFields
 from coopenv.scenario.motion import path_heading
 
-Box = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Centre (3,) m, rotation (3, 3), half size (3,) m."""
+SAME_PLACE = 1e-6
+"""m"""
 
 
 def rotation_of(yaw: float | None, quaternion_wxyz: Any) -> np.ndarray:
@@ -46,32 +49,18 @@ def agent_starts(scenario: ScenarioFields) -> tuple[np.ndarray, np.ndarray]:
     return np.array([p for p, _ in starts]) - np.array(scenario.map.origin), np.array([R for _, R in starts])
 
 
-def box_at(body: Body | None, position: np.ndarray, rotation: np.ndarray) -> Box:
-    """Return the box of a body at a pose; without a body it is a point."""
-    center = np.array(body.center) if body else np.zeros(3)
-    return position + rotation @ center, rotation, np.array(body.size if body else (0.0, 0.0, 0.0)) / 2
-
-
-def boxes_overlap(a: Box, b: Box) -> bool:
-    """Return whether two oriented boxes overlap (separating axis theorem)."""
-    (ca, Ra, ha), (cb, Rb, hb) = a, b
-    edges = [np.cross(Ra[:, i], Rb[:, j]) for i, j in product(range(3), range(3))]
-    axes = np.array([*Ra.T, *Rb.T, *(e for e in edges if np.linalg.norm(e) > 1e-9)])
-    reach = np.abs(axes @ Ra) @ ha + np.abs(axes @ Rb) @ hb
-    return bool((np.abs(axes @ (cb - ca)) < reach).all())
-
-
-def possible_boxes(vehicle: Vehicle) -> list[Box]:
-    """Return the boxes of a vehicle at its nominal start and at the corners of its spread."""
+def possible_boxes(vehicle: Vehicle) -> Boxes:
+    """Return the boxes of a vehicle at its nominal start, which comes first, and at the corners of its spread."""
     position, rotation = start_of(vehicle)
     pose = vehicle.initial_pose
     spread = np.array(pose.position_spread if pose else (0.0, 0.0, 0.0))
     turn = pose.yaw_spread if pose else 0.0
-    boxes = [box_at(vehicle.body, position, rotation)]
-    for *signs, side in product((-1, 1), repeat=4) if spread.any() or turn else ():
-        turned = rotation @ Rotation.from_euler("z", side * turn).as_matrix()
-        boxes.append(box_at(vehicle.body, position + rotation @ (spread * signs), turned))
-    return boxes
+    corners = [(0, 0, 0, 0), *(product((-1, 1), repeat=4) if spread.any() or turn else ())]
+    signs = np.array(corners, dtype=float)
+    rotations = rotation @ Rotation.from_rotvec(np.outer(signs[:, 3] * turn, (0.0, 0.0, 1.0))).as_matrix()
+    positions = position + (signs[:, :3] * spread) @ rotation.T
+    center, size = (vehicle.body.center, vehicle.body.size) if vehicle.body else (np.zeros(3), np.zeros(3))
+    return Boxes(positions + rotations @ np.array(center), rotations, np.tile(np.array(size) / 2, (len(signs), 1)))
 
 
 def check_room(scenario: ScenarioFields) -> None:
@@ -80,19 +69,33 @@ def check_room(scenario: ScenarioFields) -> None:
     Raises:
         ValueError: names the vehicle and what it would be inside.
     """
-    buildings = {
-        o.name: (np.array(o.center), rotation_of(o.yaw, None), np.array(o.size) / 2) for o in scenario.obstacles
-    }
-    nominal: list[Box] = []
-    for i, vehicle in enumerate(scenario.vehicles):
-        boxes = possible_boxes(vehicle)
-        for name, building in buildings.items():
-            if any(boxes_overlap(box, building) for box in boxes):
-                raise ValueError(f"vehicles.{i}.initial_pose: vehicle_{i + 1} starts inside obstacle '{name}'")
-        for j, other in enumerate(nominal):
-            where = f"vehicles.{i}.initial_pose: vehicle_{i + 1} starts in the place of vehicle_{j + 1}"
-            if np.linalg.norm(start_of(vehicle)[0] - start_of(scenario.vehicles[j])[0]) < 1e-6:
-                raise ValueError(where)
-            if boxes_overlap(boxes[0], other):
-                warnings.warn(f"{where}: their boxes overlap", ScenarioWarning, stacklevel=2)
-        nominal.append(boxes[0])
+    boxes = [possible_boxes(vehicle) for vehicle in scenario.vehicles]
+    _check_buildings(scenario, boxes)
+    starts = np.array([start_of(vehicle)[0] for vehicle in scenario.vehicles])
+    if same := cKDTree(starts).query_pairs(SAME_PLACE):
+        raise ValueError(_in_place(*min(pair[::-1] for pair in same)))
+    nominal = Boxes(*(np.array([part[0] for part in parts]) for parts in zip(*boxes, strict=True)))
+    overlaps = overlapping_pairs(nominal, nominal)
+    if len(overlaps):
+        more = f" (and those of {len(overlaps) - 1} more pairs)" if len(overlaps) > 1 else ""
+        warnings.warn(f"{_in_place(*overlaps[0].tolist())}: their boxes overlap{more}", ScenarioWarning, stacklevel=2)
+
+
+def _in_place(second: int, first: int) -> str:
+    return f"vehicles.{second}.initial_pose: vehicle_{second + 1} starts in the place of vehicle_{first + 1}"
+
+
+def _check_buildings(scenario: ScenarioFields, boxes: Sequence[Boxes]) -> None:
+    buildings = scenario.obstacles
+    if not buildings:
+        return
+    walls = Boxes(
+        np.array([o.center for o in buildings]),
+        np.array([rotation_of(o.yaw, None) for o in buildings]),
+        np.array([o.size for o in buildings]) / 2,
+    )
+    everywhere = Boxes(*(np.concatenate(parts) for parts in zip(*boxes, strict=True)))
+    whose = np.repeat(np.arange(len(boxes)), [len(part.half) for part in boxes])
+    for box, building in overlapping_pairs(everywhere, walls)[:1].tolist():
+        i, name = int(whose[box]), buildings[building].name
+        raise ValueError(f"vehicles.{i}.initial_pose: vehicle_{i + 1} starts inside obstacle '{name}'")

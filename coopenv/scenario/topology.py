@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from graphlib import CycleError, TopologicalSorter
 
-from coopenv.errors import suggest
+from coopenv.errors import listed, shown, suggest
 from coopenv.scenario.fields import ScenarioFields
 
 
@@ -14,43 +15,47 @@ def neighbour_sets(scenario: ScenarioFields) -> list[list[int]]:
     Without an explicit list these are all landmarks and, under the acyclic restriction, the vehicles before it
     (paper, Assumption 1: N_i within {1, ..., i-1}), otherwise all other vehicles.
     """
-    landmarks = len(scenario.landmarks)
-    targets = scenario.target_names
+    landmarks, vehicles = len(scenario.landmarks), len(scenario.vehicles)
+    index = {name: target for target, name in enumerate(scenario.target_names)}
     result = []
     for i, vehicle in enumerate(scenario.vehicles):
+        own = landmarks + i
         if vehicle.neighbours is None:
-            others = range(i) if scenario.topology.acyclic else range(len(scenario.vehicles))
-            result.append([*range(landmarks), *(landmarks + j for j in others if j != i)])
+            last = own if scenario.topology.acyclic else landmarks + vehicles
+            result.append([*range(own), *range(own + 1, last)])
             continue
         where = f"vehicles.{i}.neighbours"
         for name in vehicle.neighbours:
-            if name not in targets:
+            if name not in index:
                 raise ValueError(
-                    f"{where}: unknown target '{name}'{suggest(name, targets)}; known: {', '.join(targets)}"
+                    f"{where}: unknown target {shown(name)}{suggest(name, index)}; known: {listed([*index])}"
                 )
-            if name == f"vehicle_{i + 1}":
+            if index[name] == own:
                 raise ValueError(f"{where}: a vehicle cannot be its own neighbour")
-        result.append(sorted({scenario.target_index(name) for name in vehicle.neighbours}))
+        result.append(sorted({index[name] for name in vehicle.neighbours}))
     return result
 
 
-def processing_order(scenario: ScenarioFields) -> list[int]:
+def processing_order(scenario: ScenarioFields, neighbours: Sequence[Sequence[int]]) -> list[int]:
     """Return vehicle indices so that leaders come before their followers.
+
+    Args:
+        scenario: for who is there, and whether cycles are allowed.
+        neighbours: its `neighbour_sets`.
 
     Raises:
         ValueError: the neighbour sets contain a cycle although `topology.acyclic` is set.
     """
     landmarks = len(scenario.landmarks)
-    graph = {
-        i: {j - landmarks for j in targets if j >= landmarks} for i, targets in enumerate(neighbour_sets(scenario))
-    }
     if not scenario.topology.acyclic:
-        return sorted(graph)
-    sorter = TopologicalSorter(graph)
+        return list(range(len(neighbours)))
+    leaders = [[j - landmarks for j in targets if j >= landmarks] for targets in neighbours]
+    sorter = TopologicalSorter(dict(enumerate(leaders)))
     try:
         sorter.prepare()
     except CycleError as error:
-        cycle = " -> ".join(f"vehicle_{i + 1}" for i in error.args[1])
+        names = [f"vehicle_{i + 1}" for i in error.args[1]]
+        cycle = " -> ".join(names if len(names) <= 8 else [*names[:6], f"{len(names) - 7} more", names[-1]])
         raise ValueError(
             f"topology: the neighbours form a cycle ({cycle}); the paper's Assumption 1 needs an acyclic order "
             "(or set topology.acyclic = false)"

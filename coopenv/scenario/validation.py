@@ -9,6 +9,8 @@ from pydantic import BaseModel, ValidationError
 
 from coopenv.errors import shortened, shown, suggest
 
+TOO_DEEP = "lists or tables stand too deep in one another"
+
 
 def one_line(error: ValidationError, where: str, model: type[BaseModel]) -> str:
     """Return the most helpful of the problems, in one line.
@@ -43,8 +45,8 @@ def one_line(error: ValidationError, where: str, model: type[BaseModel]) -> str:
     if first["type"] == "value_error":  # our own checks: their messages start with the field that they are about
         joint = "." if field and _starts_with_field(message) else ": "
         return f"{where}: {field}{joint if field else ''}{message}{more}"
-    if first["type"] == "json_invalid":  # of data that are valid TOML or Python
-        return f"{where}: lists or tables stand in one another over a hundred levels deep"
+    if first["type"] == "json_invalid":
+        return f"{where}: {TOO_DEEP if 'recursion' in message else message}"
     got = first.get("input")
     given = f", got {shown(got)}" if isinstance(got, bool | int | float | str) else ""
     return f"{where}: {field}: {message}{given}{more}"

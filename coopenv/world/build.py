@@ -76,7 +76,7 @@ def _fill_topology(model: Any, scenario: Scenario, fill: _Filler) -> None:
     table = np.full((model.vehicles, model.agents), -1, dtype=np.int32)
     for i, targets in enumerate(sets):
         table[i, : len(targets)] = targets
-    order = processing_order(scenario)
+    order = processing_order(scenario, sets)
     model.targets = wp.array(table, dtype=wp.int32, ndim=2, device=fill.device)
     model.target_count = fill.array([len(targets) for targets in sets], wp.int32)
     model.order = fill.array(order, wp.int32)

@@ -70,3 +70,9 @@ def check_device(device: str) -> str:
     except (ValueError, RuntimeError):
         known = ", ".join(str(d) for d in wp.get_devices())
         raise DeviceError(f"unknown device '{device}'; known: {known}") from None
+
+
+def device_memory(device: str) -> int | None:
+    """Return the bytes of a device's own memory; None: it shares this machine's."""
+    found = wp.get_device(device)
+    return int(found.total_memory) if found.is_cuda else None

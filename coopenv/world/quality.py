@@ -24,10 +24,16 @@ def log_determinant(I11: Any, I22: Any):
 
 @wp.func
 def normalised_error_squared(I11: Any, L21: Any, I22: Any, e1: Any, e2: Any):
-    """Return e^T P^-1 e for e = (e1, e2) and P = L L^T."""
+    """Return e^T P^-1 e for e = (e1, e2) and P = L L^T; a very large number where the precision has no room for it.
+
+    NaN where the error is.
+    """
     x1 = I11 * e1
     x2 = I22 * (e2 - L21 * x1)
-    return wp.dot(x1, x1) + wp.dot(x2, x2)
+    square = wp.dot(x1, x1) + wp.dot(x2, x2)
+    if wp.isfinite(wp.dot(e1, e1) + wp.dot(e2, e2)) and not wp.isfinite(square):
+        square = e1.dtype(1.0e18)
+    return square
 
 
 @wp.func

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,6 +24,12 @@ def array(axes: str, dtype: Any) -> Any:
 def fields(record: Any) -> dict[str, Any]:
     """Return the arrays that a record's struct declares with `array`, by name: annotations with `axes` and `dtype`."""
     return {name: var.type for name, var in record.vars.items() if hasattr(var.type, "axes")}
+
+
+def size_of(record: Any, sizes: Mapping[str, int]) -> int:
+    """Return how many bytes a record's arrays take."""
+    arrays = fields(record).values()
+    return sum(math.prod(sizes[a] for a in x.axes) * int(wp.types.type_size_in_bytes(x.dtype)) for x in arrays)
 
 
 def allocate(record: Any, sizes: Mapping[str, int], device: str, shared: str = "") -> Any:

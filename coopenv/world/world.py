@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.errors import CoopenvError
+from coopenv.errors import CoopenvError, check_memory
 from coopenv.scenario import Scenario
 from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
 from coopenv.world.launch import Launcher, PerWorld, default_threads
 from coopenv.world.model import mat66d
-from coopenv.world.precision import check_device, precision
-from coopenv.world.records import allocate, fields
+from coopenv.world.precision import check_device, device_memory, precision
+from coopenv.world.records import allocate, fields, size_of
 from coopenv.world.saved_state import Rule, checked_state
-from coopenv.world.state import VALID, allocate_state, overwrite, state_fields, state_sizes
+from coopenv.world.state import VALID, allocate_state, overwrite, state_fields, state_sizes, state_struct
 from coopenv.world.step import (
     advance_kernel,
     broadcast_kernel,
@@ -63,13 +63,13 @@ class World:
 
         Raises:
             DeviceError: unknown precision or device.
-            CoopenvError: no worlds or no threads.
+            CoopenvError: no worlds or no threads, or they would not fit into memory.
         """
         for name, count in (("num_worlds", worlds), ("threads", 1 if threads is None else threads)):
             if isinstance(count, bool) or not isinstance(count, int | np.integer) or not 1 <= count < 2**31:
                 raise CoopenvError(f"{name} must be at least 1, whole and below 2^31, got {count!r}")
         self.scenario = scenario
-        self.worlds = worlds
+        self.worlds = worlds = int(worlds)
         self.precision = precision(dtype)
         self.device = check_device(device)
         self.threads = default_threads(worlds, self.device) if threads is None else min(threads, worlds)
@@ -78,11 +78,13 @@ class World:
         self.model = self._build_model()
         self.observer = observer if observer.fit is None else observer.fit(self.model)
         """What estimates in the kernels; `HOST` where estimates are written from outside, see `PlugIns`."""
+        sizes = {**state_sizes(self.model, worlds), **self.observer.sizes}
+        needed = size_of(state_struct(self.precision), sizes) + size_of(self.observer.memory, sizes)
+        check_memory(needed, f"num_worlds: {worlds}", device_memory(self.device))
         self.state = allocate_state(self.model, worlds, self.precision, self.device)
         N = self.model.vehicles
         covariance = np.zeros((N, 6, 6)) if start_covariance is None else np.ascontiguousarray(start_covariance)
         self.model.start.covariance = wp.array(covariance, dtype=mat66d, device=self.device)
-        sizes = {**state_sizes(self.model, worlds), **self.observer.sizes}
         self.memory = allocate(self.observer.memory, sizes, self.device)
         """What the embedded observer remembers besides the state."""
         self._record = self._build_record()

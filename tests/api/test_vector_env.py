@@ -269,6 +269,7 @@ def test_nan_on_the_device_harms_nobody_else() -> None:
     ("options", "message"),
     [
         ({"num_worlds": 0}, "num_worlds must be at least 1"),
+        ({"num_worlds": 10**9}, r"num_worlds: 1000000000 would need .* GiB of memory, there are"),
         ({"num_worlds": 1, "device": "gpu"}, "unknown device 'gpu'"),
         ({"num_worlds": 1, "device": "cuda:0"}, "no CUDA device is available"),
         ({"num_worlds": 1, "dtype": "float16"}, r"unknown dtype 'float16' \(did you mean"),
@@ -347,3 +348,9 @@ def test_wrong_resets() -> None:
         env.reset(seed=[1, 2, 3])
     with pytest.raises(coopenv.CoopenvError, match="not a positive multiple of the 5 vehicles"):
         gymnasium.make_vec("coopenv/BusyIntersection-v0", num_envs=7)
+
+
+def test_counts_may_be_of_numpy() -> None:
+    env = coopenv.make_vec("busy_intersection", num_worlds=np.int64(2))
+    assert type(env.num_envs) is int and env.reset(seed=0)[0].shape[0] == 10
+    assert gymnasium.make_vec("coopenv/BusyIntersection-v0", num_envs=np.int64(10)).num_envs == 10

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from tests.fuzz import large
 from tests.fuzz.harness import run_cases
 
-COUNTS = {"states": (60, 1000)}
+COUNTS = {"states": (60, 1000), "scenarios": (60, 3000)}
 """How many cases of a kind: quick, and all."""
 
 
@@ -28,6 +29,11 @@ def test_some(kind: str) -> None:
 @pytest.mark.parametrize("kind", COUNTS)
 def test_all(kind: str) -> None:
     check(kind, *COUNTS[kind])
+
+
+def test_large_scenarios_load_at_once() -> None:
+    outcome = run_cases("tests.fuzz.large", range(len(large.CASES)))
+    assert outcome.taken == {"accepted": len(large.CASES)}, outcome.failures
 
 
 def test_a_crash_a_hang_and_an_error_are_failures_of_their_cases(monkeypatch: pytest.MonkeyPatch) -> None:

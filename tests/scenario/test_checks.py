@@ -10,7 +10,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 from coopenv.errors import ScenarioError, ScenarioWarning
-from coopenv.scenario import Scenario, checks, parse_scenario
+from coopenv.scenario import Scenario, parse_scenario
+from coopenv.scenario.topology import neighbour_sets, processing_order
 from tests.helpers import builders
 from tests.helpers.builders import errors, landmark, run, start, vehicle
 
@@ -26,9 +27,13 @@ def fleet(*neighbours: list[str] | None, **sections: Any) -> Scenario:
 
 
 def test_default_neighbours_are_all_landmarks_and_leaders() -> None:
-    assert checks.neighbour_sets(fleet(None, None, None)) == [[0, 1, 2, 3], [0, 1, 2, 3, 4], [0, 1, 2, 3, 4, 5]]
-    everyone = checks.neighbour_sets(fleet(None, None, topology={"acyclic": False}))
+    assert neighbour_sets(fleet(None, None, None)) == [[0, 1, 2, 3], [0, 1, 2, 3, 4], [0, 1, 2, 3, 4, 5]]
+    everyone = neighbour_sets(fleet(None, None, topology={"acyclic": False}))
     assert everyone == [[0, 1, 2, 3, 5], [0, 1, 2, 3, 4]]
+
+
+def order_of(scenario: Scenario) -> list[int]:
+    return processing_order(scenario, neighbour_sets(scenario))
 
 
 @pytest.mark.parametrize(
@@ -42,7 +47,7 @@ def test_default_neighbours_are_all_landmarks_and_leaders() -> None:
     ],
 )
 def test_leaders_come_first(neighbours: list[list[str]], order: list[int]) -> None:
-    assert checks.processing_order(fleet(*neighbours)) == order
+    assert order_of(fleet(*neighbours)) == order
 
 
 @pytest.mark.parametrize(
@@ -56,7 +61,13 @@ def test_leaders_come_first(neighbours: list[list[str]], order: list[int]) -> No
 def test_cycles_are_refused_and_named(neighbours: list[list[str]]) -> None:
     with pytest.raises(ScenarioError, match=r"topology: the neighbours form a cycle \(vehicle_\d -> .*Assumption 1"):
         fleet(*neighbours)
-    assert checks.processing_order(fleet(*neighbours, topology={"acyclic": False})) == list(range(len(neighbours)))
+    assert order_of(fleet(*neighbours, topology={"acyclic": False})) == list(range(len(neighbours)))
+
+
+def test_long_cycles_are_shortened() -> None:
+    names = [f"vehicle_{i + 1}" for i in range(40)]
+    with pytest.raises(ScenarioError, match=r"\(vehicle_\d+( -> vehicle_\d+){5} -> 34 more -> vehicle_\d+\)"):
+        fleet(*([name] for name in names[1:] + names[:1]))
 
 
 def test_unknown_neighbours_and_oneself() -> None:
@@ -118,6 +129,16 @@ def test_waypoint_starts_are_checked_too() -> None:
 def test_two_vehicles_in_one_place() -> None:
     with pytest.raises(ScenarioError, match="vehicle_2 starts in the place of vehicle_1"):
         parse_scenario(builders.raw([vehicle((1, 1, 1)), vehicle((1, 1, 1))]), "here")
+
+
+def test_overlapping_boxes_warn_once() -> None:
+    cars = [vehicle((x, 0, 0), body={"size": [2.0, 1.0, 1.0]}) for x in (0.0, 1.9, 5.0, 6.9, 8.8)]
+    with pytest.warns(ScenarioWarning) as caught:
+        parse_scenario(builders.raw(cars), "here")
+    assert [str(warning.message) for warning in caught] == [
+        "vehicles.1.initial_pose: vehicle_2 starts in the place of vehicle_1: their boxes overlap (and those of 2 more "
+        "pairs)"
+    ]
 
 
 def test_limits_between_sections() -> None:

@@ -63,12 +63,71 @@ def test_unknown_names_and_files(tmp_path: Path) -> None:
         load_scenario(str(tmp_path) + "/")
 
 
-@pytest.mark.parametrize(("content", "words"), [(b"a = ", "not valid TOML"), (b"\xff\xfe = 1", "cannot be read")])
+@pytest.mark.parametrize("name", ["~nosuchuser/x.toml", "a" * 5000 + ".toml", "x\0.toml", "/" + "a/" * 5000])
+def test_names_that_no_file_can_have(name: str) -> None:
+    with pytest.raises(UnknownEnvironmentError, match="no such scenario file: ") as caught:
+        load_scenario(name)
+    assert len(str(caught.value)) < 300
+    with pytest.raises(UnknownEnvironmentError, match=r"unknown environment 'aaa.*aaa'"):
+        load_scenario("a" * 5000)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"a = ", "not valid TOML"),
+        (b"\xff\xfe = 1", "not a text file"),
+        (b"a = " + b"[" * 2000 + b"]" * 2000, "lists or tables stand too deep in one another"),
+        (b"a = " + b"[" * 300 + b"]" * 300, "lists or tables stand too deep in one another|a: unknown key"),
+        (b"a." * 3000 + b"a = 1", "lists or tables stand too deep in one another"),
+        (b"a = 1" + b"0" * 5000, "not valid TOML: Exceeds the limit"),
+        (b"#" * 9_000_000, "larger than 8 MiB"),
+        (b'title = "\\u001b]0;owned\\u0007"', r"title: control characters are not allowed, got '\\x1b]0;owned\\x07'"),
+        (b'"\\u001b[2J" = 1\ntitle = "t"', r"\\x1b\[2J: unknown key"),
+        (b'title = 5\ndescription = "' + b"a" * 11_000 + b'"', "title: Input should be a valid string, got 5"),
+        (b'title = "t"\ndescription = "' + b"a" * 11_000 + b'"', "description: .*at most 10000 characters, got 'aaa"),
+        (
+            b'title = "t"\nhorizon = "' + b"a" * 5000 + b'"',
+            r"horizon: Input should be a valid number, got 'a{27}...a{27}'",
+        ),
+    ],
+)
 def test_broken_files(tmp_path: Path, content: bytes, words: str) -> None:
     path = tmp_path / "broken.toml"
     path.write_bytes(content)
-    with pytest.raises(ScenarioError, match=f"broken.toml: {words}"):
+    with pytest.raises(ScenarioError, match=f"broken.toml: {words}") as caught:
         load_scenario(path)
+    assert len(str(caught.value)) < 300 and str(caught.value).isprintable()
+
+
+def circular() -> dict[str, Any]:
+    table: dict[str, Any] = {}
+    table["a"] = table
+    return table
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "words"),
+    [
+        (
+            "vehicles.\u00b2.goal.radius",
+            1.0,
+            r"override 'vehicles.\u00b2.goal.radius': no entry '\u00b2' \(there are 2",
+        ),
+        ("vehicles." + "9" * 5000, 1.0, "no entry '9{27}...9{27}'"),
+        (".".join("a" * 3000), 1, "too deep in one another"),
+        ("noise", {("a", 1): 2}, "keys must be str"),
+        ("noise", circular(), "Circular reference|too deep"),
+        ("noise.velocity", 10**5000, "Exceeds the limit"),
+        ("noise.velocity", "\ud800", "Invalid JSON: .* hex escape"),
+        ("title", "\x1b[2J", "control characters"),
+    ],
+    ids=lambda value: ascii(value)[1:20] if isinstance(value, str) else "value",
+)
+def test_overrides_that_are_none(file: Path, key: str, value: Any, words: str) -> None:
+    with pytest.raises(ScenarioError, match=words) as caught:
+        load_scenario(file, {key: value})
+    assert len(str(caught.value)) < 300 and str(caught.value).isprintable()
 
 
 def test_vehicle_defaults_merge_below_each_vehicle(file: Path) -> None:

@@ -33,7 +33,7 @@ from coopenv.observers.riccati.gradient_kernels import (
     vec3,
 )
 from coopenv.scenario import Scenario
-from coopenv.scenario.topology import processing_order
+from coopenv.scenario.topology import neighbour_sets, processing_order
 from coopenv.world import kernel_cache
 from coopenv.world.dynamics import LONGEST_SUBSTEP
 from coopenv.world.launch import kernel
@@ -68,7 +68,7 @@ class DifferentiableWorld:
         check_differentiable(scenario)
         self.scenario = scenario
         self._world = World(scenario, worlds, "float64", device)
-        self._order = processing_order(scenario)
+        self._order = processing_order(scenario, neighbour_sets(scenario))
 
     def rollout(self, actions: np.ndarray, seed: int = 0) -> Rollout:
         """Drive by actions (T, W, N, 2) in (-1, 1), one per decision, and differentiate the final uncertainty.
