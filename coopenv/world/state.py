@@ -117,6 +117,8 @@ VALID: dict[str, Rule] = {
     "estimate_rotation": ROTATION,
     "covariance": COVARIANCE,
     "corrected_tick": whole(0, "tick"),
+    "nis": numbers(LARGEST**3),
+    "nis_dof": whole(0, 10**6),
     **dict.fromkeys(("gramian_11", "gramian_12", "gramian_22"), numbers(LARGEST**3)),
     "actions": ANYTHING,
 }
