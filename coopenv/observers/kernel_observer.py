@@ -82,7 +82,7 @@ class KernelObserver:
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose; its covariance is in LEFT coordinates."""
         for view in self._all_views():
-            view[...] = 0
+            view[...] = np.zeros((), view.dtype)
         s, L, (R, p) = self.state, self.setup.landmarks, initial_pose
         s.estimate_rotation[...], s.estimate_position[...] = R, np.asarray(R).T @ p
         s.covariance[...] = np.diag(np.repeat(self.setup.gains.P0, 3))

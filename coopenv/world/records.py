@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
+import numpy as np
 import warp as wp
 
 
@@ -51,6 +52,47 @@ def allocate(record: Any, sizes: Mapping[str, int], device: str, shared: str = "
         else:
             setattr(result, name, wp.zeros(shape, dtype=field.dtype, device=device))
     return result
+
+
+class Part:
+    """One field of the entries of an array of structs, read and written as an array of its own."""
+
+    def __init__(self, array: Any, path: tuple[str, ...]) -> None:
+        self._array, self._path = array, path
+
+    def numpy(self) -> np.ndarray:
+        """Return it on the host, without a copy on the CPU."""
+        return self._of(self._array.numpy())
+
+    def assign(self, values: np.ndarray) -> None:
+        """Overwrite it."""
+        host = self._array.numpy()
+        self._of(host)[...] = values
+        if not self._array.device.is_cpu:
+            self._array.assign(host)
+
+    def _of(self, host: np.ndarray) -> np.ndarray:
+        for name in self._path:
+            host = host[name]
+        return host
+
+
+def parts(record: Any, struct: Any) -> dict[str, Any]:
+    """Return the arrays of a record by name, and of arrays of structs every field by a name with dots."""
+    found: dict[str, Any] = {}
+    for name in fields(struct):
+        array = getattr(record, name)
+        paths = list(_paths(array.numpy().dtype))
+        found |= {".".join((name, *path)): Part(array, path) if path else array for path in paths}
+    return found
+
+
+def _paths(dtype: np.dtype) -> Iterator[tuple[str, ...]]:
+    """Yield the way to every field of a structured type that has no fields itself."""
+    if dtype.names is None:
+        yield ()
+    for name in dtype.names or ():
+        yield from ((name, *path) for path in _paths(dtype[name]))
 
 
 def repeated(row: Any, axis: int, count: int) -> Any:

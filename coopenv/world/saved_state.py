@@ -65,16 +65,6 @@ def _odometry_samples(values: Array, fields: Fields, model: Any) -> Mask:
     return np.asarray((values >= 0) & (np.abs(values - due) <= 2.0))
 
 
-def _joint_covariances(values: Array, fields: Fields, model: Any) -> Mask:
-    """Return (W, N) which blocks (W, N, M, M, 6, 6) are covariances, those of no member left out."""
-    M, n = values.shape[-3], values.shape[-1]
-    member = np.arange(M) < fields["observer_members"][..., None]
-    used = np.repeat(member, n, axis=-1)
-    P = np.swapaxes(values, -3, -2).reshape(*values.shape[:2], M * n, M * n)
-    whole = np.where(used[..., :, None] & used[..., None, :], P, np.eye(M * n))
-    return are_covariances(whole, LEAST_EIGENVALUE[values.dtype])
-
-
 ANYTHING = Rule("anything", lambda values, fields, model: np.ones(values.shape, dtype=bool))
 FLAG = whole(0, 1)
 NUMBER = numbers()
@@ -90,7 +80,6 @@ ROTATION = Rule("a rotation", lambda values, fields, model: are_rotations(values
 COVARIANCE = Rule(
     "a covariance", lambda values, fields, model: are_covariances(values, LEAST_EIGENVALUE[values.dtype]), axes=2
 )
-JOINT_COVARIANCE = Rule("a covariance", _joint_covariances, axes=4)
 
 
 def checked_state(

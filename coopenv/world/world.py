@@ -15,7 +15,7 @@ from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
 from coopenv.world.launch import Launcher, PerWorld, default_threads
 from coopenv.world.model import mat66d
 from coopenv.world.precision import check_device, device_memory, precision
-from coopenv.world.records import allocate, fields, size_of
+from coopenv.world.records import allocate, parts, size_of
 from coopenv.world.saved_state import Rule, checked_state
 from coopenv.world.state import VALID, allocate_state, overwrite, state_fields, state_sizes, state_struct
 from coopenv.world.step import (
@@ -198,5 +198,5 @@ class World:
     def state_arrays(self) -> dict[str, Any]:
         """Return every array that `set_state` writes, by name."""
         known = {name: getattr(self.state, name) for name in state_fields(self.precision)}
-        own = {f"observer_{name}": getattr(self.memory, name) for name in fields(self.observer.memory)}
+        own = {f"observer_{name}": array for name, array in parts(self.memory, self.observer.memory).items()}
         return {**known, **own, "actions": self.actions}

@@ -36,5 +36,5 @@ def replayed(
         R = world.view("estimate_rotation")[0].astype(float)
         p = (R @ world.view("estimate_position")[0].astype(float)[..., None])[..., 0]
         P = world.view("covariance")[0].astype(float)
-        rows.append((R, p, P, world.state_arrays()["observer_searching"].numpy()[0] == 1))
+        rows.append((R, p, P, world.state_arrays()["observer_search.active"].numpy()[0] == 1))
     return Played(*(np.array(column) for column in zip(*rows, strict=True)), world=world)

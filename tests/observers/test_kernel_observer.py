@@ -104,8 +104,8 @@ def damaged(message: Message) -> list[Message]:
         replace(message, extra={**extra, "odometry": np.zeros(5)}),
         replace(message, extra={**extra, "odometry": np.full(6, np.inf)}),
         replace(message, extra={**extra, "odometry": np.array(["x"] * 6)}),
-        replace(message, extra={**extra, "leans_on": np.zeros(1)}),
-        replace(message, extra={**extra, "leans_on": np.zeros(0, np.uint64)}),
+        replace(message, extra={**extra, "depends_on": np.zeros(1)}),
+        replace(message, extra={**extra, "depends_on": np.zeros(0, np.uint64)}),
     ]
 
 

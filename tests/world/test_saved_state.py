@@ -31,14 +31,19 @@ def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
 @pytest.mark.parametrize(
     ("name", "index", "value", "why"),
     [
-        ("observer_members", (0, 1), 2**31 - 1, r"'observer_members' at \(0, 1\): 2147483647 is not in 1 \.\. \d+"),
-        ("observer_members", (0, 1), -(2**31), r"is not in 1 .. \d+"),
-        ("observer_members", (0, 1), 0, r"is not in 1 .. \d+"),
-        ("observer_vehicle", (0, 1, 0), 2**31 - 1, "'observer_vehicle'"),
-        ("observer_hypotheses", (0, 0), 10**6, "'observer_hypotheses'"),
-        ("observer_attempts", (0, 0), -1, "'observer_attempts'"),
+        (
+            "observer_belief.members",
+            (0, 1),
+            2**31 - 1,
+            r"members' at \(0, 1\): 2147483647 is not in 1 \.\. \d+",
+        ),
+        ("observer_belief.members", (0, 1), -(2**31), r"is not in 1 .. \d+"),
+        ("observer_belief.members", (0, 1), 0, r"is not in 1 .. \d+"),
+        ("observer_member.vehicle", (0, 1, 0), 2**31 - 1, "'observer_member.vehicle'"),
+        ("observer_search.hypotheses", (0, 0), 10**6, "'observer_search.hypotheses'"),
+        ("observer_search.attempts", (0, 0), -1, "'observer_search.attempts'"),
         ("observer_P", (0, 0, 0, 0, 1, 1), -5.0, "'observer_P' at .* is not a covariance"),
-        ("observer_R", (0, 0, 0), 0.0, "'observer_R' at .* is not a rotation"),
+        ("observer_member.R", (0, 0, 0), 0.0, "'observer_member.R' at .* is not a rotation"),
         ("odometry_samples", (0, 2), -(2**31), "'odometry_samples' at .* is not as many as at this tick"),
         ("odometry_samples", (0, 2), 2**31 - 1, "'odometry_samples'"),
         ("odometry_samples", (0, 2), 0, "'odometry_samples'"),
@@ -128,8 +133,9 @@ def test_every_field_has_a_rule() -> None:
     world = World(coopenv.load_scenario("busy_intersection"), observer=find_embedded("robust"))
     rules = world.state_rules()
     whole = {name for name, array in world.state_arrays().items() if array.numpy().dtype.kind in "iu"}
-    free = {"observer_leans_on", "observer_report_leans_on", "observer_outbox_leans_on", "observer_inbox_leans_on"}
-    assert whole - rules.keys() == free  # bits
+    bits = ("belief", "member.report", "outbox", "inbox")
+    free = {f"observer_{name}.depends_on" for name in bits}
+    assert whole - rules.keys() == free
     assert rules.keys() <= world.state_arrays().keys()
 
 

@@ -1,5 +1,5 @@
-"""The observer `robust` (specified in reference/) as Warp functions, embedded in the world's kernels.
+"""The observer `robust` as Warp functions: observer.py is one tick, and the place to begin.
 
-Equation by equation it is that observer; its constants are read from there. It computes in float64 whatever the
-world's precision, because what a neighbour has learnt is a small difference of large inverses.
+They serve every face: embedded in the world's kernels, and for one vehicle on the host. `tests/oracles/robust` computes
+the same in NumPy.
 """

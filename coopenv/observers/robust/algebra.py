@@ -8,15 +8,12 @@ import warp as wp
 
 from coopenv.estimation.linalg import eigen_symmetric6
 from coopenv.estimation.so3 import quaternion_vector, rotation_vector_sine, skew
-from coopenv.observers.robust.reference.observer import LEAST_ANGULAR_STD, LEAST_VELOCITY_STD
-from coopenv.observers.robust.reference.search import KNOWN_ANGLE, KNOWN_POSITION
+from coopenv.observers.robust.constants import KNOWN_ANGLE, KNOWN_POSITION, MIN_ANGULAR_VELOCITY_STD, MIN_VELOCITY_STD
 from coopenv.observers.robust.types import lower_blocks, mat66d, stacked, vec3d
 
-LEAST_ANGULAR = wp.constant(LEAST_ANGULAR_STD)
-LEAST_VELOCITY = wp.constant(LEAST_VELOCITY_STD)
-KNOWN_ANGLE_VARIANCE = wp.constant(KNOWN_ANGLE**2)
-KNOWN_POSITION_VARIANCE = wp.constant(KNOWN_POSITION**2)
-BEYOND = wp.constant(-0.9)
+KNOWN_ANGLE_VARIANCE = KNOWN_ANGLE**2
+KNOWN_POSITION_VARIANCE = KNOWN_POSITION**2
+BEYOND = -0.9
 """Cosine of an angle from which on the skew part of a rotation says little of its axis."""
 
 
@@ -53,8 +50,8 @@ def transition(dR: Any, dp: Any):
 def odometry_variances(model: Any, dt: Any):
     """Return the variances (rotation, translation) per axis of an odometry increment over dt."""
     scale = model.odometry_period * dt
-    angular = wp.max(wp.float64(model.noise.angular_velocity), wp.float64(LEAST_ANGULAR))
-    linear = wp.max(wp.float64(model.noise.velocity), wp.float64(LEAST_VELOCITY))
+    angular = wp.max(wp.float64(model.noise.angular_velocity), wp.float64(MIN_ANGULAR_VELOCITY_STD))
+    linear = wp.max(wp.float64(model.noise.velocity), wp.float64(MIN_VELOCITY_STD))
     return angular * angular * scale, linear * linear * scale
 
 

@@ -1,4 +1,8 @@
-"""The joint belief of one vehicle: poses with one covariance in 6x6 blocks. See observers/robust/belief.py."""
+"""The joint belief of one vehicle: its own pose and those of vehicles that it hears, with one covariance.
+
+Errors are left errors, R = Rhat Exp(theta), p = phat + Rhat rho, six per member, the vehicle itself first; the
+covariance is kept in blocks of 6x6. A member stands where its last message put it.
+"""
 
 from __future__ import annotations
 
@@ -8,60 +12,60 @@ import warp as wp
 
 from coopenv.estimation.so3 import exp_so3, orthonormalise
 from coopenv.observers.robust.algebra import inverse6, transition, with_noise
-from coopenv.observers.robust.types import (
-    first_half,
-    mat66d,
-    second_half,
-)
+from coopenv.observers.robust.memory import Member
+from coopenv.observers.robust.types import first_half, mat66d, second_half
 
 
 @wp.func
-def place_of(mind: Any, world: int, i: int, vehicle: int) -> int:
-    """Return a vehicle's number among the members of i's belief, 0 if it is not one."""
-    for n in range(1, mind.members[world, i]):
-        if mind.vehicle[world, i, n] == vehicle:
+def index_of(memory: Any, world: int, i: int, vehicle: int) -> int:
+    """Return the index of a vehicle among the members of i's belief, 0 if it is not one of the others."""
+    for n in range(1, memory.belief[world, i].members):
+        if memory.member[world, i, n].vehicle == vehicle:
             return n
     return 0
 
 
 @wp.func
-def move(mind: Any, world: int, i: int, n: int, dR: Any, dp: Any, rotation: Any, translation: Any):
+def propagate(memory: Any, world: int, i: int, n: int, dR: Any, dp: Any, rotation: Any, translation: Any):
     """Carry a member through an odometry increment with noise variances per axis."""
-    R = mind.R[world, i, n]
-    mind.p[world, i, n] = mind.p[world, i, n] + R * dp
-    mind.R[world, i, n] = orthonormalise(R * dR)
+    R = memory.member[world, i, n].R
+    memory.member[world, i, n].p = memory.member[world, i, n].p + R * dp
+    memory.member[world, i, n].R = orthonormalise(R * dR)
     F = transition(dR, dp)
-    for k in range(mind.members[world, i]):
+    for k in range(memory.belief[world, i].members):
         if k != n:
-            block = F * mind.P[world, i, n, k]
-            mind.P[world, i, n, k] = block
-            mind.P[world, i, k, n] = wp.transpose(block)
-    mind.P[world, i, n, n] = with_noise(F * mind.P[world, i, n, n] * wp.transpose(F), rotation, translation)
+            block = F * memory.P[world, i, n, k]
+            memory.P[world, i, n, k] = block
+            memory.P[world, i, k, n] = wp.transpose(block)
+    memory.P[world, i, n, n] = with_noise(F * memory.P[world, i, n, n] * wp.transpose(F), rotation, translation)
 
 
 @wp.func
-def shift(mind: Any, world: int, i: int, n: int, dx: Any):
+def apply_error(memory: Any, world: int, i: int, n: int, error: Any):
     """Move a member's pose by an error."""
-    R = mind.R[world, i, n]
-    mind.p[world, i, n] = mind.p[world, i, n] + R * second_half(dx)
-    mind.R[world, i, n] = R * exp_so3(first_half(dx))
+    R = memory.member[world, i, n].R
+    memory.member[world, i, n].p = memory.member[world, i, n].p + R * second_half(error)
+    memory.member[world, i, n].R = R * exp_so3(first_half(error))
 
 
 @wp.func
-def lower(mind: Any, world: int, i: int, k: int, j: int, block: Any):
-    """Take a block off the covariance, at (k, j) and transposed at (j, k)."""
-    left = mind.P[world, i, k, j] - block
+def subtract_block(memory: Any, world: int, i: int, k: int, j: int, block: Any):
+    """Subtract a block from the covariance at (k, j), and its transpose at (j, k)."""
+    left = memory.P[world, i, k, j] - block
     if k == j:
         left = (left + wp.transpose(left)) * wp.float64(0.5)
-    mind.P[world, i, k, j] = left
-    mind.P[world, i, j, k] = wp.transpose(left)
+    memory.P[world, i, k, j] = left
+    memory.P[world, i, j, k] = wp.transpose(left)
 
 
 @wp.func
-def inform(mind: Any, world: int, i: int, n: int, information: Any, vector: Any):
-    """Take information about a member's error x: its likelihood has the exponent vector^T x - x^T information x / 2."""
-    members = mind.members[world, i]
-    product = mind.P[world, i, n, n] * information
+def fuse_information(memory: Any, world: int, i: int, n: int, information: Any, vector: Any):
+    """Fuse information about a member's error x, whose likelihood has the exponent vector^T x - x^T information x / 2.
+
+    P' = P - P_n M P_n^T with M = information (I + P_nn information)^-1, P_n being the member's columns.
+    """
+    members = memory.belief[world, i].members
+    product = memory.P[world, i, n, n] * information
     for k in range(6):
         product[k, k] = product[k, k] + wp.float64(1.0)
     W = inverse6(product)
@@ -69,34 +73,49 @@ def inform(mind: Any, world: int, i: int, n: int, information: Any, vector: Any)
     M = (M + wp.transpose(M)) * wp.float64(0.5)
     along = wp.transpose(W) * vector
     for k in range(members):
-        mind.column[world, k] = mind.P[world, i, k, n]
+        memory.scratch[world, k].column = memory.P[world, i, k, n]
     for k in range(members):
-        gain = mind.column[world, k] * M
+        gain = memory.scratch[world, k].column * M
         for j in range(k + 1):
-            lower(mind, world, i, k, j, gain * wp.transpose(mind.column[world, j]))
-        shift(mind, world, i, k, mind.column[world, k] * along)
+            subtract_block(memory, world, i, k, j, gain * wp.transpose(memory.scratch[world, j].column))
+        apply_error(memory, world, i, k, memory.scratch[world, k].column * along)
 
 
 @wp.func
-def add(mind: Any, world: int, i: int, vehicle: int, R: Any, p: Any, P: Any):
-    """Take in a member whose error is independent of those of the others; there must be room."""
-    n = mind.members[world, i]
+def append_member(memory: Any, world: int, i: int, vehicle: int, R: Any, p: Any, P: Any):
+    """Add a member whose error is independent of those of the others; there must be room. Nothing else is set."""
+    n = memory.belief[world, i].members
     for k in range(n):
-        mind.P[world, i, n, k] = mat66d()
-        mind.P[world, i, k, n] = mat66d()
-    mind.P[world, i, n, n] = P
-    mind.vehicle[world, i, n] = vehicle
-    mind.R[world, i, n] = R
-    mind.p[world, i, n] = p
-    mind.twists[world, i, n] = 0
-    mind.members[world, i] = n + 1
+        memory.P[world, i, n, k] = mat66d()
+        memory.P[world, i, k, n] = mat66d()
+    memory.P[world, i, n, n] = P
+    member = Member()
+    member.vehicle = vehicle
+    member.R = R
+    member.p = p
+    memory.member[world, i, n] = member
+    memory.belief[world, i].members = n + 1
 
 
 @wp.func
-def begin(mind: Any, world: int, i: int, R: Any, p: Any, P: Any):
+def remove_member(memory: Any, world: int, i: int, n: int):
+    """Remove a member; those behind it move up."""
+    members = memory.belief[world, i].members
+    for m in range(n + 1, members):
+        memory.member[world, i, m - 1] = memory.member[world, i, m]
+        for k in range(members):
+            memory.P[world, i, m - 1, k] = memory.P[world, i, m, k]
+    for m in range(n + 1, members):
+        for k in range(members):
+            memory.P[world, i, k, m - 1] = memory.P[world, i, k, m]
+    memory.belief[world, i].members = members - 1
+
+
+@wp.func
+def begin_belief(memory: Any, world: int, i: int, R: Any, p: Any, P: Any):
     """Believe in the vehicle itself alone."""
-    mind.members[world, i] = 1
-    mind.vehicle[world, i, 0] = i
-    mind.R[world, i, 0] = R
-    mind.p[world, i, 0] = p
-    mind.P[world, i, 0, 0] = P
+    memory.belief[world, i].members = 1
+    memory.member[world, i, 0].vehicle = i
+    memory.member[world, i, 0].R = R
+    memory.member[world, i, 0].p = p
+    memory.P[world, i, 0, 0] = P

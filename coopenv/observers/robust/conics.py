@@ -8,8 +8,8 @@ import warp as wp
 
 from coopenv.observers.robust.types import vec2d, vec3d
 
-THIRD_TURN = wp.constant(2.0943951023931953)
-THIRD = wp.constant(1.0 / 3.0)
+THIRD_TURN = 2.0943951023931953
+THIRD = 1.0 / 3.0
 
 
 @wp.func

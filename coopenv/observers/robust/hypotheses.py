@@ -1,4 +1,8 @@
-"""The hypotheses of a search: which has paid least, and which are given up. See observers/robust/search.py."""
+"""The hypotheses of a search: which costs least, and which are given up.
+
+A hypothesis costs its normalised innovations squared, each limited, so that the difference of two costs is twice the
+logarithm of their likelihoods' ratio.
+"""
 
 from __future__ import annotations
 
@@ -7,97 +11,82 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust.algebra import distance_squared, left_error
-from coopenv.observers.robust.reference.search import FLOOR, MARGIN, SAME
-from coopenv.observers.robust.state import SPARE_PLACE
-
-MOST_DEBT, CREDIT = wp.constant(MARGIN), wp.constant(FLOOR)
-INDISTINCT = wp.constant(SAME)
+from coopenv.observers.robust.constants import MAX_BEST_COST, PRUNE_GAP, SAME_HYPOTHESIS
 
 
 @wp.func
-def keep(mind: Any, world: int, i: int, h: int):
-    """Put what is believed in the place of a hypothesis."""
-    mind.bank_rotation[world, i, h] = mind.R[world, i, 0]
-    mind.bank_position[world, i, h] = mind.p[world, i, 0]
-    mind.bank_covariance[world, i, h] = mind.P[world, i, 0, 0]
+def store_hypothesis(memory: Any, world: int, i: int, h: int):
+    """Make what is believed a hypothesis."""
+    memory.hypothesis[world, i, h].R = memory.member[world, i, 0].R
+    memory.hypothesis[world, i, h].p = memory.member[world, i, 0].p
+    memory.hypothesis[world, i, h].P = memory.P[world, i, 0, 0]
 
 
 @wp.func
-def is_cheaper(mind: Any, world: int, i: int, h: int, g: int) -> bool:
-    """Return whether a hypothesis has paid less than another one, or as much and is nearer to the prior."""
-    if mind.paid[world, i, h] == mind.paid[world, i, g]:
-        return mind.surprise[world, i, h] < mind.surprise[world, i, g]
-    return mind.paid[world, i, h] < mind.paid[world, i, g]
+def costs_less(memory: Any, world: int, i: int, h: int, g: int) -> bool:
+    """Return whether a hypothesis costs less than another one, or as much and is nearer to the prior."""
+    a = memory.hypothesis[world, i, h].cost
+    b = memory.hypothesis[world, i, g].cost
+    if a == b:
+        return memory.hypothesis[world, i, h].prior_distance < memory.hypothesis[world, i, g].prior_distance
+    return a < b
 
 
 @wp.func
-def best_hypothesis(mind: Any, world: int, i: int) -> int:
-    """Return the hypothesis that has paid least, -1 if there is none."""
+def best_hypothesis(memory: Any, world: int, i: int) -> int:
+    """Return the hypothesis that costs least, -1 if there is none."""
     best = int(-1)
-    for h in range(mind.hypotheses[world, i]):
-        if best < 0 or is_cheaper(mind, world, i, h, best):
+    for h in range(memory.search[world, i].hypotheses):
+        if best < 0 or costs_less(memory, world, i, h, best):
             best = h
     return best
 
 
 @wp.func
-def copy_hypothesis(mind: Any, world: int, i: int, h: int, to: int):
-    """Put a hypothesis in the place of another one."""
-    mind.bank_rotation[world, i, to] = mind.bank_rotation[world, i, h]
-    mind.bank_position[world, i, to] = mind.bank_position[world, i, h]
-    mind.bank_covariance[world, i, to] = mind.bank_covariance[world, i, h]
-    mind.paid[world, i, to] = mind.paid[world, i, h]
-    mind.surprise[world, i, to] = mind.surprise[world, i, h]
-    mind.bearings[world, i, to] = mind.bearings[world, i, h]
-
-
-@wp.func
-def swap(mind: Any, world: int, i: int, h: int, g: int):
-    """Exchange two hypotheses, by way of the place behind all."""
-    copy_hypothesis(mind, world, i, h, SPARE_PLACE)
-    copy_hypothesis(mind, world, i, g, h)
-    copy_hypothesis(mind, world, i, SPARE_PLACE, g)
-
-
-@wp.func
-def are_same(mind: Any, world: int, i: int, h: int, g: int):
+def are_same(memory: Any, world: int, i: int, h: int, g: int):
     """Return whether two hypotheses cannot be told apart."""
-    R = mind.bank_rotation[world, i, h]
-    P = mind.bank_covariance[world, i, h] + mind.bank_covariance[world, i, g]
-    e = left_error(R, mind.bank_position[world, i, h], mind.bank_rotation[world, i, g], mind.bank_position[world, i, g])
-    return distance_squared(e, P) < wp.float64(INDISTINCT)
+    P = memory.hypothesis[world, i, h].P + memory.hypothesis[world, i, g].P
+    R = memory.hypothesis[world, i, h].R
+    p = memory.hypothesis[world, i, h].p
+    e = left_error(R, p, memory.hypothesis[world, i, g].R, memory.hypothesis[world, i, g].p)
+    return distance_squared(e, P) < wp.float64(SAME_HYPOTHESIS)
 
 
 @wp.func
-def is_new(mind: Any, world: int, i: int, h: int, count: int) -> bool:
+def is_new(memory: Any, world: int, i: int, h: int, count: int) -> bool:
     """Return whether a hypothesis can be told apart from each of the first `count`."""
     for g in range(count):
-        if are_same(mind, world, i, h, g):
+        if are_same(memory, world, i, h, g):
             return False
     return True
 
 
 @wp.func
-def rank(mind: Any, world: int, i: int):
-    """Put the cheapest first."""
-    count = mind.hypotheses[world, i]
+def sort_hypotheses(memory: Any, world: int, i: int):
+    """Put those that cost least first; the last element serves to swap by."""
+    count = memory.search[world, i].hypotheses
+    spare = memory.hypothesis.shape[2] - 1
     for h in range(count):
         for g in range(h + 1, count):
-            if is_cheaper(mind, world, i, g, h):
-                swap(mind, world, i, h, g)
+            if costs_less(memory, world, i, g, h):
+                memory.hypothesis[world, i, spare] = memory.hypothesis[world, i, h]
+                memory.hypothesis[world, i, h] = memory.hypothesis[world, i, g]
+                memory.hypothesis[world, i, g] = memory.hypothesis[world, i, spare]
 
 
 @wp.func
-def prune(mind: Any, world: int, i: int):
-    """Give up what pays much more than the best, what is the same as a better one, and all if none is good."""
-    count = mind.hypotheses[world, i]
-    rank(mind, world, i)
-    least = mind.paid[world, i, 0]
+def prune(memory: Any, world: int, i: int):
+    """Give up what costs much more than the best, what is the same as a better one, and all if the best is not good."""
+    count = memory.search[world, i].hypotheses
+    sort_hypotheses(memory, world, i)
+    least = memory.hypothesis[world, i, 0].cost
     kept = int(0)
     for h in range(count):
-        if mind.paid[world, i, h] <= least + wp.float64(MOST_DEBT) and is_new(mind, world, i, h, kept):
-            copy_hypothesis(mind, world, i, h, kept)
+        near = memory.hypothesis[world, i, h].cost <= least + wp.float64(PRUNE_GAP)
+        if near and is_new(memory, world, i, h, kept):
+            memory.hypothesis[world, i, kept] = memory.hypothesis[world, i, h]
             kept += 1
-    if least > wp.float64(CREDIT) + wp.float64(4.0) * wp.float64(mind.bearings[world, i, 0]):
+    expected = wp.float64(2.0) * wp.float64(memory.hypothesis[world, i, 0].bearings)
+    if least > wp.float64(MAX_BEST_COST) + wp.float64(2.0) * expected:
         kept = 0
-    mind.hypotheses[world, i] = kept
+    memory.search[world, i].hypotheses = kept

@@ -1,6 +1,6 @@
-"""A frame's bearings as measurements of the belief, and the correction by them. See observers/robust/belief.py.
+"""A frame's bearings as measurements of the belief, and the correction by them.
 
-`aim` says what each bearing is about, once per frame; `draw` linearises it at the poses believed now.
+A line of sight is set once per frame, with the point that the bearing is to, and linearised at the poses believed now.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import warp as wp
 
 from coopenv.estimation.so3 import skew
 from coopenv.observers.contract import MIN_BEARING_STD
-from coopenv.observers.robust.belief import lower, shift
-from coopenv.observers.robust.reference.belief import MOST_STEPS, STRAIGHT
+from coopenv.observers.robust.belief import apply_error, subtract_block
+from coopenv.observers.robust.constants import MAX_LINEARISATIONS, RELINEARISATION_ANGLE
 from coopenv.observers.robust.types import (
     beside,
     first_half,
@@ -23,12 +23,10 @@ from coopenv.observers.robust.types import (
     wide_vector,
 )
 
-LEAST_BEARING = wp.constant(MIN_BEARING_STD)
-PAPER_VARIANCE = wp.constant(1.0 / 3.0)
+PAPER_VARIANCE = 1.0 / 3.0
 """Variance of a uniform distribution over [-1, 1], which the paper's noise has on the image plane."""
-LINEARISATIONS, LEAST_BEND = wp.constant(MOST_STEPS), wp.constant(STRAIGHT)
-NOTHING = wp.constant(-1)
-"""In place of a member: the bearing is of no use now."""
+NOTHING = -1
+"""In place of a member: the bearing cannot be used now."""
 
 
 @wp.func
@@ -38,7 +36,7 @@ def bearing_variance(model: Any):
     variance = std * std
     if model.noise.bearing_paper == 1:
         variance = variance * wp.float64(PAPER_VARIANCE)
-    return wp.max(variance, wp.float64(LEAST_BEARING) * wp.float64(LEAST_BEARING))
+    return wp.max(variance, wp.float64(MIN_BEARING_STD) * wp.float64(MIN_BEARING_STD))
 
 
 @wp.func
@@ -59,121 +57,127 @@ def isotropic(variance: Any):
 
 
 @wp.func
-def aim(mind: Any, world: int, n: int, place: int, b: Any, point: Any, variance: Any):
-    """Say what the n-th bearing b is about: a point in the body of the member `place`, or (0) one in the map.
+def set_line(memory: Any, world: int, n: int, member: int, b: Any, point: Any, variance: Any):
+    """Let the n-th bearing b be to a point in the body of a member, or (member 0) in the map.
 
     `variance` is that of the point per axis, m^2, besides the member's own.
     """
-    mind.line_place[world, n] = place
-    mind.line_bearing[world, n] = b
-    mind.line_point[world, n] = point
-    mind.line_spread[world, n] = variance
+    memory.line[world, n].member = member
+    memory.line[world, n].bearing = b
+    memory.line[world, n].point = point
+    memory.line[world, n].variance = variance
 
 
 @wp.func
-def draw(model: Any, mind: Any, world: int, i: int, n: int):
-    """Write the n-th bearing as a measurement, residual = H x + noise; return whether its target is ahead."""
-    place = mind.line_place[world, n]
-    R = mind.R[world, i, 0]
-    point = mind.line_point[world, n]
+def linearise(model: Any, memory: Any, world: int, i: int, n: int):
+    """Linearise the n-th bearing, residual = H x + noise; return whether its target is ahead of the camera."""
+    member = memory.line[world, n].member
+    R = memory.member[world, i, 0].R
+    point = memory.line[world, n].point
     z = point
-    if place > 0:
-        z = mind.p[world, i, place] + mind.R[world, i, place] * point
-    a = wp.transpose(R) * (z - mind.p[world, i, 0])
+    if member > 0:
+        z = memory.member[world, i, member].p + memory.member[world, i, member].R * point
+    a = wp.transpose(R) * (z - memory.member[world, i, 0].p)
     d = a - wide_vector(model.camera.position)
     distance = wp.max(wp.length(d), wp.float64(1.0e-9))
     u = d / distance
     T = tangent_basis(u)
     B = T / distance
-    b = mind.line_bearing[world, n]
-    mind.line_own[world, n] = beside(B * skew(a), -B)
-    if place > 0:
-        G = B * (wp.transpose(R) * mind.R[world, i, place])
-        mind.line_other[world, n] = beside(-(G * skew(point)), G)
-    mind.line_residual[world, n] = T * b
-    mind.line_distance[world, n] = distance
-    mind.line_noise[world, n] = bearing_variance(model) + mind.line_spread[world, n] / (distance * distance)
+    b = memory.line[world, n].bearing
+    memory.line[world, n].jacobian = beside(B * skew(a), -B)
+    if member > 0:
+        G = B * (wp.transpose(R) * memory.member[world, i, member].R)
+        memory.line[world, n].member_jacobian = beside(-(G * skew(point)), G)
+    memory.line[world, n].residual = T * b
+    memory.line[world, n].distance = distance
+    memory.line[world, n].noise = bearing_variance(model) + memory.line[world, n].variance / (distance * distance)
     return wp.dot(u, b) > wp.float64(0.0)
 
 
 @wp.func
-def normalised(mind: Any, world: int, i: int, n: int):
+def normalised_innovation(memory: Any, world: int, i: int, n: int):
     """Return a line's normalised innovation squared."""
-    H = mind.line_own[world, n]
+    H = memory.line[world, n].jacobian
     Ht = wp.transpose(H)
-    S = isotropic(mind.line_noise[world, n]) + H * (mind.P[world, i, 0, 0] * Ht)
-    place = mind.line_place[world, n]
-    if place > 0:
-        G = mind.line_other[world, n]
+    S = isotropic(memory.line[world, n].noise) + H * (memory.P[world, i, 0, 0] * Ht)
+    member = memory.line[world, n].member
+    if member > 0:
+        G = memory.line[world, n].member_jacobian
         Gt = wp.transpose(G)
-        cross = H * (mind.P[world, i, 0, place] * Gt)
-        S = S + cross + wp.transpose(cross) + G * (mind.P[world, i, place, place] * Gt)
-    residual = mind.line_residual[world, n]
+        cross = H * (memory.P[world, i, 0, member] * Gt)
+        S = S + cross + wp.transpose(cross) + G * (memory.P[world, i, member, member] * Gt)
+    residual = memory.line[world, n].residual
     return wp.dot(residual, wp.inverse(S) * residual)
 
 
 @wp.func
-def keep_belief(mind: Any, world: int, i: int):
-    """Keep poses and covariance as they are before a correction."""
-    for k in range(mind.members[world, i]):
-        mind.last[world, k] = vec6d()
-        mind.before_rotation[world, k] = mind.R[world, i, k]
-        mind.before_position[world, k] = mind.p[world, i, k]
+def store_belief(memory: Any, world: int, i: int):
+    """Store poses and covariance as they are before a correction."""
+    for k in range(memory.belief[world, i].members):
+        memory.scratch[world, k].last_correction = vec6d()
+        memory.scratch[world, k].R = memory.member[world, i, k].R
+        memory.scratch[world, k].p = memory.member[world, i, k].p
         for j in range(k + 1):
-            mind.before_covariance[world, k, j] = mind.P[world, i, k, j]
+            memory.scratch_blocks[world, k, j] = memory.P[world, i, k, j]
 
 
 @wp.func
-def restore_covariance(mind: Any, world: int, i: int):
-    """Take the covariance before a correction; the correction so far becomes the last one."""
-    for k in range(mind.members[world, i]):
-        mind.last[world, k] = mind.dx[world, k]
+def restore_covariance(memory: Any, world: int, i: int):
+    """Restore the covariance before a correction; the correction so far becomes the last one."""
+    for k in range(memory.belief[world, i].members):
+        memory.scratch[world, k].last_correction = memory.scratch[world, k].correction
         for j in range(k + 1):
-            P = mind.before_covariance[world, k, j]
-            mind.P[world, i, k, j] = P
-            mind.P[world, i, j, k] = wp.transpose(P)
+            P = memory.scratch_blocks[world, k, j]
+            memory.P[world, i, k, j] = P
+            memory.P[world, i, j, k] = wp.transpose(P)
 
 
 @wp.func
-def condense_line(mind: Any, world: int, i: int, n: int):
-    """Take a line into the covariance, and add to the correction what it says beyond those before."""
-    members = mind.members[world, i]
-    place = mind.line_place[world, n]
-    H = mind.line_own[world, n]
-    G = mind.line_other[world, n]
+def remaining_correction(memory: Any, world: int, k: int):
+    """Return the error of a member at which the lines were linearised, less the correction so far."""
+    return memory.scratch[world, k].last_correction - memory.scratch[world, k].correction
+
+
+@wp.func
+def update_by_line(memory: Any, world: int, i: int, n: int):
+    """Update the covariance by a line, and the correction by what the line says beyond those before."""
+    members = memory.belief[world, i].members
+    member = memory.line[world, n].member
+    H = memory.line[world, n].jacobian
+    G = memory.line[world, n].member_jacobian
     for k in range(members):
-        C = mind.P[world, i, k, 0] * wp.transpose(H)
-        if place > 0:
-            C = C + mind.P[world, i, k, place] * wp.transpose(G)
-        mind.narrow[world, k] = C
-    S = isotropic(mind.line_noise[world, n]) + H * mind.narrow[world, 0]
-    residual = mind.line_residual[world, n] + H * (mind.last[world, 0] - mind.dx[world, 0])
-    if place > 0:
-        S = S + G * mind.narrow[world, place]
-        residual = residual + G * (mind.last[world, place] - mind.dx[world, place])
+        C = memory.P[world, i, k, 0] * wp.transpose(H)
+        if member > 0:
+            C = C + memory.P[world, i, k, member] * wp.transpose(G)
+        memory.scratch[world, k].PHt = C
+    S = isotropic(memory.line[world, n].noise) + H * memory.scratch[world, 0].PHt
+    residual = memory.line[world, n].residual + H * remaining_correction(memory, world, 0)
+    if member > 0:
+        S = S + G * memory.scratch[world, member].PHt
+        residual = residual + G * remaining_correction(memory, world, member)
     weight = wp.inverse(S)
     for k in range(members):
-        K = mind.narrow[world, k] * weight
-        mind.dx[world, k] = mind.dx[world, k] + K * residual
+        K = memory.scratch[world, k].PHt * weight
+        memory.scratch[world, k].correction = memory.scratch[world, k].correction + K * residual
         for j in range(k + 1):
-            lower(mind, world, i, k, j, K * wp.transpose(mind.narrow[world, j]))
+            subtract_block(memory, world, i, k, j, K * wp.transpose(memory.scratch[world, j].PHt))
 
 
 @wp.func
-def condense(mind: Any, world: int, i: int, lines: int):
-    """Take all lines that fit into the covariance, and put the poses where they say, from where they were before.
+def update_by_lines(memory: Any, world: int, i: int, lines: int):
+    """Update the covariance by all lines that fit, and move the poses from where they were before.
 
     One line after the other, with the residual that those before have left, is the batch update.
     """
-    for k in range(mind.members[world, i]):
-        mind.dx[world, k] = vec6d()
+    for k in range(memory.belief[world, i].members):
+        memory.scratch[world, k].correction = vec6d()
     for n in range(lines):
-        if mind.line_fits[world, n] == 1:
-            condense_line(mind, world, i, n)
-    for k in range(mind.members[world, i]):
-        mind.R[world, i, k] = mind.before_rotation[world, k]
-        mind.p[world, i, k] = mind.before_position[world, k]
-        shift(mind, world, i, k, mind.dx[world, k])
+        if memory.line[world, n].fits == 1:
+            update_by_line(memory, world, i, n)
+    for k in range(memory.belief[world, i].members):
+        memory.member[world, i, k].R = memory.scratch[world, k].R
+        memory.member[world, i, k].p = memory.scratch[world, k].p
+        apply_error(memory, world, i, k, memory.scratch[world, k].correction)
 
 
 @wp.func
@@ -183,41 +187,45 @@ def largest(v: Any):
 
 
 @wp.func
-def bend(mind: Any, world: int, i: int, lines: int):
+def turn_of_sight(memory: Any, world: int, i: int, lines: int):
     """Return by how much the correction, beyond the last one, turns the lines of sight, rad."""
     distance = wp.float64(wp.inf)
     for n in range(lines):
-        if mind.line_fits[world, n] == 1:
-            distance = wp.min(distance, mind.line_distance[world, n])
+        if memory.line[world, n].fits == 1:
+            distance = wp.min(distance, memory.line[world, n].distance)
     turn = wp.float64(0.0)
-    for k in range(mind.members[world, i]):
-        step = mind.dx[world, k] - mind.last[world, k]
+    for k in range(memory.belief[world, i].members):
+        step = memory.scratch[world, k].correction - memory.scratch[world, k].last_correction
         turn = wp.max(turn, wp.max(largest(first_half(step)), largest(second_half(step)) / distance))
     return turn
 
 
 @wp.func
-def settle(model: Any, mind: Any, world: int, i: int):
-    """Correct by the lines that fit, linearised anew at where they put the poses while that is far from before."""
+def iterated_update(model: Any, memory: Any, world: int, i: int):
+    """Correct by the lines that fit, linearised anew at where they put the poses while that is far from before.
+
+    Source: the iterated extended Kalman filter as Gauss-Newton steps, Bell and Cathey, The iterated Kalman filter
+    update as a Gauss-Newton method, IEEE Transactions on Automatic Control 38(2), 1993.
+    """
     lines = model.target_count[i]
-    keep_belief(mind, world, i)
+    store_belief(memory, world, i)
     step = int(0)
-    while step < LINEARISATIONS:
+    while step < MAX_LINEARISATIONS:
         if step > 0:
-            restore_covariance(mind, world, i)
+            restore_covariance(memory, world, i)
             for n in range(lines):
-                if mind.line_fits[world, n] == 1:
-                    draw(model, mind, world, i, n)
-        condense(mind, world, i, lines)
+                if memory.line[world, n].fits == 1:
+                    linearise(model, memory, world, i, n)
+        update_by_lines(memory, world, i, lines)
         step += 1
-        if bend(mind, world, i, lines) < wp.float64(LEAST_BEND):
-            step = LINEARISATIONS
+        if turn_of_sight(memory, world, i, lines) < wp.float64(RELINEARISATION_ANGLE):
+            step = MAX_LINEARISATIONS
 
 
 @wp.func
-def fitting_lines(mind: Any, world: int, lines: int) -> int:
+def fitting_lines(memory: Any, world: int, lines: int) -> int:
     """Return how many lines fit."""
     count = int(0)
     for n in range(lines):
-        count += mind.line_fits[world, n]
+        count += memory.line[world, n].fits
     return count

@@ -11,24 +11,22 @@ from coopenv.errors import CoopenvError
 from coopenv.estimation.rotations import exp_so3, log_so3
 from coopenv.observers.checks import check_estimate
 from coopenv.observers.contract import Estimate, Message
+from coopenv.observers.robust.constants import MIN_VARIANCE
 from coopenv.scenario.base import LARGEST
 from coopenv.world.embedded import Messages
-
-LEAST_VARIANCE = 1e-14
-"""rad^2 and m^2: nobody knows a pose to 0.1 um."""
 
 
 def write(observer: Any) -> Message:
     """Return pose, covariance (single precision), dead reckoning and a mask, or nothing while the pose is not known."""
-    m = observer.memory
-    if not m.outbox_says[0]:
+    report = observer.memory.outbox[0]
+    if not report["valid"]:
         return Message()
-    odometry = np.concatenate([log_so3(m.outbox_odometry_rotation[0]), m.outbox_odometry_position[0]])
+    R, p = report["odometry"]["R"], report["odometry"]["p"]
     return Message(
-        position=m.outbox_position[0].copy(),
-        rotation=m.outbox_rotation[0].copy(),
-        covariance=m.outbox_covariance[0].copy(),
-        extra={"odometry": odometry, "leans_on": m.outbox_leans_on[:1].copy()},
+        position=report["p"].copy(),
+        rotation=report["R"].copy(),
+        covariance=report["P"].copy(),
+        extra={"odometry": np.concatenate([log_so3(R), p]), "depends_on": np.array([report["depends_on"]])},
     )
 
 
@@ -39,21 +37,19 @@ def read(observer: Any, sender: int, message: Message, sent: int) -> None:
         CoopenvError: it is malformed.
         LookupError: likewise.
     """
-    m = observer.memory
-    m.inbox_tick[sender], m.inbox_says[sender] = sent, 0
+    report = observer.memory.inbox[sender]
+    report["tick"], report["valid"] = sent, 0
     if message.position is None and not message.extra:  # the sender does not know where it is
         return
     check_pose(message)
-    odometry, leans_on = (np.asarray(message.extra[name]) for name in ("odometry", "leans_on"))
+    odometry, depends_on = (np.asarray(message.extra[name]) for name in ("odometry", "depends_on"))
     if odometry.shape != (6,) or not (np.abs(odometry) <= LARGEST).all():
         raise CoopenvError("message: odometry")
-    if leans_on.shape != (1,) or leans_on.dtype != np.uint64:
-        raise CoopenvError("message: leans_on")
-    m.inbox_rotation[sender], m.inbox_position[sender] = message.rotation, message.position
-    m.inbox_covariance[sender] = message.covariance
-    m.inbox_odometry_rotation[sender], m.inbox_odometry_position[sender] = exp_so3(odometry[:3]), odometry[3:]
-    m.inbox_leans_on[sender] = leans_on[0]
-    m.inbox_says[sender] = 1
+    if depends_on.shape != (1,) or depends_on.dtype != np.uint64:
+        raise CoopenvError("message: depends_on")
+    report["R"], report["p"], report["P"] = message.rotation, message.position, message.covariance
+    report["odometry"]["R"], report["odometry"]["p"] = exp_so3(odometry[:3]), odometry[3:]
+    report["depends_on"], report["valid"] = depends_on[0], 1
 
 
 def check_pose(message: Message) -> None:
@@ -66,7 +62,7 @@ def check_pose(message: Message) -> None:
         raise CoopenvError("message: no pose with a covariance")
     P = np.asarray(message.covariance, dtype=np.float64)
     check_estimate(Estimate(message.rotation, message.position, P))
-    if dpotrf(P)[1] != 0 or P.diagonal().min() < LEAST_VARIANCE or not (np.abs(message.position) <= LARGEST).all():
+    if dpotrf(P)[1] != 0 or P.diagonal().min() < MIN_VARIANCE or not (np.abs(message.position) <= LARGEST).all():
         raise CoopenvError("message: covariance or position")
 
 

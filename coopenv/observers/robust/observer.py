@@ -1,4 +1,10 @@
-"""One tick of one vehicle's observer. See observers/robust/observer.py."""
+"""One tick of one vehicle's observer, and its start.
+
+One vehicle keeps a joint belief about itself and the vehicles that it hears. Bearings, to landmarks and to vehicles,
+correct that belief; a neighbour's messages add what the neighbour has learnt since its last one, and no more. So
+nothing that was heard before counts twice, and the neighbour's slowly varying error is no white noise. Without a useful
+prior, or when most bearings contradict the belief, the pose is searched for; meanwhile the vehicle sends nothing.
+"""
 
 from __future__ import annotations
 
@@ -8,72 +14,61 @@ import warp as wp
 
 from coopenv.estimation.so3 import identity3, orthonormalise, skew
 from coopenv.observers.robust.algebra import is_known, odometry_variances
-from coopenv.observers.robust.belief import begin, move, place_of
-from coopenv.observers.robust.eviction import notice
+from coopenv.observers.robust.belief import begin_belief, propagate
 from coopenv.observers.robust.hypotheses import best_hypothesis
+from coopenv.observers.robust.memory import Belief, Hypothesis, Line, Member, Report, Scratch, Search
 from coopenv.observers.robust.resection import resect
-from coopenv.observers.robust.search import begin_search, confirms_prior, look_around, move_search
-from coopenv.observers.robust.tracklets import collect, hear, may_lean_on, meet
-from coopenv.observers.robust.types import lower_blocks, wide_matrix, wide_vector
-from coopenv.observers.robust.update import drop_anchor, look
-from coopenv.world.camera import VISIBLE
-from coopenv.world.v2x import fresh
+from coopenv.observers.robust.search import advance_search, begin_search, confirms_prior, propagate_search
+from coopenv.observers.robust.tracklets import possible_dependencies, receive
+from coopenv.observers.robust.types import lower_blocks, mat66d, wide_matrix, wide_vector
+from coopenv.observers.robust.update import set_anchor, update
 
 
 @wp.func
-def start_vehicle(model: Any, state: Any, mind: Any, world: int, i: int):
-    """Start at the initial estimate; one that is too uncertain to linearise about is only a hint for the search."""
+def clear(model: Any, memory: Any, world: int, i: int):
+    """Forget an earlier episode, down to what is only used within a tick: equal states are equal in every bit."""
+    memory.belief[world, i] = Belief()
+    memory.search[world, i] = Search()
+    members = memory.member.shape[2]
+    for n in range(members):
+        memory.member[world, i, n] = Member()
+        memory.scratch[world, n] = Scratch()
+        for k in range(members):
+            memory.P[world, i, n, k] = mat66d()
+            memory.scratch_blocks[world, n, k] = mat66d()
+    for h in range(memory.hypothesis.shape[2]):
+        memory.hypothesis[world, i, h] = Hypothesis()
+    for slot in range(memory.outbox.shape[2]):
+        memory.outbox[world, i, slot] = Report()
+    for sender in range(model.vehicles):
+        memory.inbox[world, i, sender] = Report()
+        memory.inbox[world, i, sender].tick = -1
+    for n in range(model.agents):
+        memory.line[world, n] = Line()
+
+
+@wp.func
+def start(model: Any, state: Any, memory: Any, world: int, i: int):
+    """Start at the initial estimate; one that is too uncertain to linearise about is only a prior for the search."""
+    clear(model, memory, world, i)
     R = orthonormalise(wide_matrix(state.estimate_rotation[world, i]))
     p = R * wide_vector(state.estimate_position[world, i])
     P = model.start.covariance[i]
-    begin(mind, world, i, R, p, P)
-    mind.odometry_rotation[world, i] = wp.identity(3, wp.float64)
-    mind.leans_on[world, i] = may_lean_on(model, i)
-    drop_anchor(mind, world, i, P, 0)
+    begin_belief(memory, world, i, R, p, P)
+    memory.belief[world, i].odometry.R = wp.identity(3, wp.float64)
+    memory.belief[world, i].depends_on = possible_dependencies(model, i)
+    set_anchor(memory, world, i, P, 0)
     if not is_known(P):
-        begin_search(mind, world, i, R, p, P)
+        begin_search(memory, world, i, R, p, P)
+    receive(model, state, memory, world, i)
 
 
 @wp.func
-def listen(model: Any, state: Any, mind: Any, world: int, i: int, tick: int):
-    """Take in the messages of those in view, and of those that are already believed in."""
-    notice(model, state, mind, world, i, tick)
-    for n in range(model.target_count[i]):
-        target = model.targets[i, n]
-        sender = target - model.landmarks
-        if sender >= 0:
-            if fresh(model, state, world, i, sender, tick) and mind.inbox_says[world, i, sender] == 1:
-                place = place_of(mind, world, i, sender)
-                if place > 0:
-                    hear(model, mind, world, i, place, sender)
-                elif state.sight[world, i, target] == VISIBLE:
-                    meet(model, mind, world, i, sender, tick)
-
-
-@wp.func
-def believe(model: Any, state: Any, mind: Any, world: int, i: int, tick: int, R: Any, p: Any, P: Any):
-    """Believe in a pose and in those that are in view."""
-    begin(mind, world, i, R, p, P)
-    mind.leans_on[world, i] = may_lean_on(model, i)
-    mind.missed[world, i] = wp.float64(0.0)
-    listen(model, state, mind, world, i, tick)
-
-
-@wp.func
-def search(model: Any, state: Any, mind: Any, world: int, i: int, now: Any):
-    """Look for the pose; once only one is possible, go on with the prior, or with what this frame alone says."""
-    if not look_around(model, state, mind, world, i, now):
-        return
-    if confirms_prior(mind, world, i):
-        P = mind.prior_covariance[world, i]
-        believe(model, state, mind, world, i, now.tick, mind.prior_rotation[world, i], mind.prior_position[world, i], P)
-        mind.searching[world, i] = 0
-        look(model, state, mind, world, i, now)
-        return
-    P = mind.bank_covariance[world, i, 0]
-    believe(model, state, mind, world, i, now.tick, mind.bank_rotation[world, i, 0], mind.bank_position[world, i, 0], P)
-    if resect(model, state, mind, world, i, now.tick) and is_known(mind.P[world, i, 0, 0]):
-        mind.searching[world, i] = 0
+def restart_belief(model: Any, memory: Any, world: int, i: int, R: Any, p: Any, P: Any):
+    """Believe in a pose alone."""
+    begin_belief(memory, world, i, R, p, P)
+    memory.belief[world, i].depends_on = possible_dependencies(model, i)
+    memory.belief[world, i].missed_share = wp.float64(0.0)
 
 
 @wp.func
@@ -100,43 +95,75 @@ def write_pose(state: Any, world: int, i: int, R: Any, p: Any, P: Any):
 
 
 @wp.func
-def write(state: Any, mind: Any, world: int, i: int):
-    """Write where the vehicle believes to be."""
-    if mind.searching[world, i] == 0:
-        write_pose(state, world, i, mind.R[world, i, 0], mind.p[world, i, 0], mind.P[world, i, 0, 0])
+def write(state: Any, memory: Any, world: int, i: int):
+    """Write the pose believed, while it is searched for that of the best hypothesis."""
+    if memory.search[world, i].active == 0:
+        p = memory.member[world, i, 0].p
+        write_pose(state, world, i, memory.member[world, i, 0].R, p, memory.P[world, i, 0, 0])
         return
-    R = mind.prior_rotation[world, i]
-    p = mind.prior_position[world, i]
-    P = mind.prior_covariance[world, i]
-    h = best_hypothesis(mind, world, i)
+    R = memory.search[world, i].prior.R
+    p = memory.search[world, i].prior.p
+    P = memory.search[world, i].prior.P
+    h = best_hypothesis(memory, world, i)
     if h >= 0:
-        R = mind.bank_rotation[world, i, h]
-        p = mind.bank_position[world, i, h]
-        P = mind.bank_covariance[world, i, h]
+        R = memory.hypothesis[world, i, h].R
+        p = memory.hypothesis[world, i, h].p
+        P = memory.hypothesis[world, i, h].P
     write_pose(state, world, i, R, p, P)
 
 
-@wp.func
-def update(model: Any, state: Any, mind: Any, world: int, i: int, now: Any):
-    """Take one camera tick of one vehicle, whose messages have been delivered."""
-    state.nis[world, i] = wp.float64(0.0)
-    state.nis_dof[world, i] = 0
-    collect(model, state, mind, world, i)
-    dR = orthonormalise(wide_matrix(state.increment_rotation[world, i]))
-    dp = wide_vector(state.increment_translation[world, i])
-    R = mind.odometry_rotation[world, i]
-    mind.odometry_rotation[world, i] = orthonormalise(R * dR)
-    mind.odometry_position[world, i] = mind.odometry_position[world, i] + R * dp
-    rotation, translation = odometry_variances(model, now.period)
-    if mind.searching[world, i] == 1:
-        move_search(mind, world, i, dR, dp, rotation, translation)
+def make_estimate(receive: Any, fuse_messages: Any) -> Any:
+    """Return the Warp function of one tick.
+
+    Args:
+        receive: (model, state, memory, world, i): take what the radio has delivered.
+        fuse_messages: (model, state, memory, world, i, tick): fuse what has been received.
+    """
+
+    @wp.func
+    def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
+        """Search for the pose; with one hypothesis left, go on with the prior if it is that, else with this frame."""
+        if not advance_search(model, state, memory, world, i, now):
+            return
+        confirmed = confirms_prior(memory, world, i)
+        R = memory.search[world, i].prior.R
+        p = memory.search[world, i].prior.p
+        P = memory.search[world, i].prior.P
+        if not confirmed:
+            R = memory.hypothesis[world, i, 0].R
+            p = memory.hypothesis[world, i, 0].p
+            P = memory.hypothesis[world, i, 0].P
+        restart_belief(model, memory, world, i, R, p, P)
+        fuse_messages(model, state, memory, world, i, now.tick)
+        if confirmed:
+            memory.search[world, i].active = 0
+            update(model, state, memory, world, i, now)
+        elif resect(model, state, memory, world, i, now.tick) and is_known(memory.P[world, i, 0, 0]):
+            memory.search[world, i].active = 0
+
+    @wp.func
+    def estimate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
+        """Take one camera tick of one vehicle, whose messages have been delivered."""
+        state.nis[world, i] = wp.float64(0.0)
+        state.nis_dof[world, i] = 0
+        receive(model, state, memory, world, i)
+        dR = orthonormalise(wide_matrix(state.increment_rotation[world, i]))
+        dp = wide_vector(state.increment_translation[world, i])
+        R = memory.belief[world, i].odometry.R
+        memory.belief[world, i].odometry.R = orthonormalise(R * dR)
+        memory.belief[world, i].odometry.p = memory.belief[world, i].odometry.p + R * dp
+        rotation, translation = odometry_variances(model, now.period)
+        if memory.search[world, i].active == 1:
+            propagate_search(memory, world, i, dR, dp, rotation, translation)
+            if now.due:
+                search(model, state, memory, world, i, now)
+        else:
+            propagate(memory, world, i, 0, dR, dp, rotation, translation)
+            fuse_messages(model, state, memory, world, i, now.tick)
+            if now.due:
+                update(model, state, memory, world, i, now)
+        write(state, memory, world, i)
         if now.due:
-            search(model, state, mind, world, i, now)
-    else:
-        move(mind, world, i, 0, dR, dp, rotation, translation)
-        listen(model, state, mind, world, i, now.tick)
-        if now.due:
-            look(model, state, mind, world, i, now)
-    write(state, mind, world, i)
-    if now.due:
-        state.corrected_tick[world, i] = now.tick
+            state.corrected_tick[world, i] = now.tick
+
+    return estimate

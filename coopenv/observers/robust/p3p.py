@@ -14,10 +14,10 @@ from coopenv.estimation.p3p import FLAT, NEWTON_STEPS, TOLERANCE
 from coopenv.observers.robust.conics import directions_in, null_vector, plane_slopes, singular_member, unit_matrix
 from coopenv.observers.robust.types import mat33d, mat43d, vec3d
 
-FLAT_TRIANGLE = wp.constant(FLAT)
-STEPS = wp.constant(NEWTON_STEPS)
-MOST_MISFIT = wp.constant(TOLERANCE)
-EIGHTH_TURN = wp.constant(0.7853981633974483)
+FLAT_TRIANGLE = FLAT
+STEPS = NEWTON_STEPS
+MOST_MISFIT = TOLERANCE
+EIGHTH_TURN = 0.7853981633974483
 
 
 @wp.func
@@ -151,10 +151,10 @@ def solutions_of(a: Any, gaps: Any):
     for n in range(4):
         d = polished(rows[n], gaps, a)
         if solves(d, gaps, a):
-            place = count
-            while place > 0 and d[0] < result[wp.max(place - 1, 0), 0]:
-                result[place] = result[place - 1]
-                place -= 1
-            result[place] = d
+            member = count
+            while member > 0 and d[0] < result[wp.max(member - 1, 0), 0]:
+                result[member] = result[member - 1]
+                member -= 1
+            result[member] = d
             count += 1
     return count, result

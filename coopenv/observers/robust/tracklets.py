@@ -1,4 +1,11 @@
-"""What vehicles tell each other, and what is new in it. See observers/robust/report.py."""
+"""What vehicles send each other, and the information that is new in it.
+
+A sender sends its pose, the covariance of it, and its odometry: where it would be by dead reckoning alone. So a
+receiver can carry the sender's last message to the new one as the sender itself did, P- = F P F^T + Q, and what the
+sender has learnt in between is P^-1 - P-^-1, whatever messages were lost. Source: the information decorrelation of
+tracklets, Drummond, Tracklets and a hybrid fusion with process noise, SPIE 3163, 1997; the channel filter of Grime and
+Durrant-Whyte, Data fusion in decentralized sensor networks, Control Engineering Practice 2(5), 1994.
+"""
 
 from __future__ import annotations
 
@@ -17,20 +24,21 @@ from coopenv.observers.robust.algebra import (
     transition,
     with_noise,
 )
-from coopenv.observers.robust.belief import add, inform, move
-from coopenv.observers.robust.eviction import make_room
-from coopenv.observers.robust.reference.belief import TWIST_TIME
-from coopenv.observers.robust.reference.observer import AGREED_DISTANCE, AGREED_FOR, SHARE, TRUST_GATE
-from coopenv.observers.robust.reference.tracklets import BITS
+from coopenv.observers.robust.belief import append_member, fuse_information, index_of, propagate
+from coopenv.observers.robust.constants import (
+    AGREEMENT_DISTANCE,
+    AGREEMENT_TIME,
+    DEPENDENT_SHARE,
+    MASK_BITS,
+    MAX_VARIANCE_GROWTH,
+    MESSAGE_GATE,
+    TWIST_AVERAGING_TIME,
+)
+from coopenv.observers.robust.eviction import make_room, mark_seen
+from coopenv.observers.robust.memory import Pose, Report
 from coopenv.observers.robust.types import lower_blocks, mat66d, mat66f, second_half, wide_vector
-
-RUMOUR_SHARE = wp.constant(SHARE)
-MOST_DISTANCE = wp.constant(TRUST_GATE)
-PROBATION, CLOSE = wp.constant(AGREED_FOR), wp.constant(AGREED_DISTANCE)
-TWIST_MEMORY = wp.constant(TWIST_TIME)
-MASK_BITS = wp.constant(BITS)
-LESS_KNOWN = wp.constant(1.01)
-"""Ratio of a variance to the predicted one: from there on the sender has lost something, and nothing is learnt."""
+from coopenv.world.camera import VISIBLE
+from coopenv.world.v2x import fresh
 
 
 @wp.func
@@ -40,8 +48,8 @@ def bit_of(vehicle: int) -> wp.uint64:
 
 
 @wp.func
-def may_lean_on(model: Any, i: int) -> wp.uint64:
-    """Return the vehicles that may be heard, as bits."""
+def possible_dependencies(model: Any, i: int) -> wp.uint64:
+    """Return the vehicles that may be heard, as bits: on them the first belief may depend."""
     bits = wp.uint64(0)
     for n in range(model.target_count[i]):
         sender = model.targets[i, n] - model.landmarks
@@ -51,188 +59,184 @@ def may_lean_on(model: Any, i: int) -> wp.uint64:
 
 
 @wp.func
-def tell(model: Any, mind: Any, world: int, i: int, tick: int):
-    """Put pose, covariance and odometry on the air if a message is due; an empty one while the pose is not known."""
-    if tick % model.radio.period != 0:
-        return
-    slot = tick % model.radio.slots
-    says = int(0)
-    P = mind.P[world, i, 0, 0]
-    if mind.searching[world, i] == 0 and is_known(P):
-        says = int(1)
-        marker = wide_vector(model.scene.marker[model.landmarks + i])
-        R = mind.R[world, i, 0]
-        one = wp.identity(3, wp.float64)
-        J = lower_blocks(one, -skew(marker), one)
-        seen = J * P * wp.transpose(J)
-        told = mat66f()
-        for k in range(6):
-            for j in range(6):
-                told[k, j] = wp.float32(seen[k, j])
-        odometry = mind.odometry_rotation[world, i]
-        mind.outbox_rotation[world, i, slot] = R
-        mind.outbox_position[world, i, slot] = mind.p[world, i, 0] + R * marker
-        mind.outbox_covariance[world, i, slot] = told
-        mind.outbox_odometry_rotation[world, i, slot] = odometry
-        mind.outbox_odometry_position[world, i, slot] = mind.odometry_position[world, i] + odometry * marker
-        mind.outbox_leans_on[world, i, slot] = mind.leans_on[world, i]
-    mind.outbox_says[world, i, slot] = says
+def narrow(P: Any):
+    """Return a 6x6 matrix in float32, as it is sent."""
+    result = mat66f()
+    for k in range(6):
+        for j in range(6):
+            result[k, j] = wp.float32(P[k, j])
+    return result
 
 
 @wp.func
-def collect(model: Any, state: Any, mind: Any, world: int, i: int):
+def wide(P: Any):
+    """Return a 6x6 matrix in float64."""
+    result = mat66d()
+    for k in range(6):
+        for j in range(6):
+            result[k, j] = wp.float64(P[k, j])
+    return result
+
+
+@wp.func
+def own_report(model: Any, memory: Any, world: int, i: int):
+    """Return pose, covariance and odometry at the marker, or an empty report while the pose is not known."""
+    report = Report()
+    P = memory.P[world, i, 0, 0]
+    if memory.search[world, i].active == 1 or not is_known(P):
+        return report
+    marker = wide_vector(model.scene.marker[model.landmarks + i])
+    R = memory.member[world, i, 0].R
+    one = wp.identity(3, wp.float64)
+    J = lower_blocks(one, -skew(marker), one)
+    odometry = memory.belief[world, i].odometry
+    report.valid = 1
+    report.R = R
+    report.p = memory.member[world, i, 0].p + R * marker
+    report.P = narrow(J * P * wp.transpose(J))
+    report.odometry = Pose(odometry.R, odometry.p + odometry.R * marker)
+    report.depends_on = memory.belief[world, i].depends_on
+    return report
+
+
+@wp.func
+def send(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
+    """Send a report if one is due."""
+    if tick % model.radio.period == 0:
+        memory.outbox[world, i, tick % model.radio.slots] = own_report(model, memory, world, i)
+
+
+@wp.func
+def receive(model: Any, state: Any, memory: Any, world: int, i: int):
     """Take what the radio has delivered at this tick."""
     for n in range(model.target_count[i]):
         sender = model.targets[i, n] - model.landmarks
         if sender >= 0:
             sent = state.inbox_tick[world, i, sender]
-            if sent >= 0 and sent != mind.inbox_tick[world, i, sender]:
-                slot = sent % model.radio.slots
-                mind.inbox_tick[world, i, sender] = sent
-                mind.inbox_says[world, i, sender] = mind.outbox_says[world, sender, slot]
-                mind.inbox_rotation[world, i, sender] = mind.outbox_rotation[world, sender, slot]
-                mind.inbox_position[world, i, sender] = mind.outbox_position[world, sender, slot]
-                mind.inbox_covariance[world, i, sender] = mind.outbox_covariance[world, sender, slot]
-                mind.inbox_odometry_rotation[world, i, sender] = mind.outbox_odometry_rotation[world, sender, slot]
-                mind.inbox_odometry_position[world, i, sender] = mind.outbox_odometry_position[world, sender, slot]
-                mind.inbox_leans_on[world, i, sender] = mind.outbox_leans_on[world, sender, slot]
+            if sent >= 0 and sent != memory.inbox[world, i, sender].tick:
+                memory.inbox[world, i, sender] = memory.outbox[world, sender, sent % model.radio.slots]
+                memory.inbox[world, i, sender].tick = sent
 
 
 @wp.func
-def covariance_heard(mind: Any, world: int, i: int, sender: int):
-    """Return the covariance in a sender's last message."""
-    P = mind.inbox_covariance[world, i, sender]
-    wide = mat66d()
-    for k in range(6):
-        for j in range(6):
-            wide[k, j] = wp.float64(P[k, j])
-    return wide
-
-
-@wp.func
-def remember(mind: Any, world: int, i: int, n: int, sender: int):
-    """Keep a member's message as its last one."""
-    mind.report_tick[world, i, n] = mind.inbox_tick[world, i, sender]
-    mind.report_rotation[world, i, n] = mind.inbox_rotation[world, i, sender]
-    mind.report_position[world, i, n] = mind.inbox_position[world, i, sender]
-    mind.report_covariance[world, i, n] = covariance_heard(mind, world, i, sender)
-    mind.report_odometry_rotation[world, i, n] = mind.inbox_odometry_rotation[world, i, sender]
-    mind.report_odometry_position[world, i, n] = mind.inbox_odometry_position[world, i, sender]
-    mind.report_leans_on[world, i, n] = mind.inbox_leans_on[world, i, sender]
-
-
-@wp.func
-def meet(model: Any, mind: Any, world: int, i: int, sender: int, tick: int):
-    """Take in a sender that is new, if there is room."""
-    if not make_room(model, mind, world, i, tick):
+def add_member(model: Any, memory: Any, world: int, i: int, sender: int, tick: int):
+    """Add a sender that is new to the belief, if there is room."""
+    if not make_room(model, memory, world, i, tick):
         return
-    n = mind.members[world, i]
-    R = mind.inbox_rotation[world, i, sender]
-    add(mind, world, i, sender, R, mind.inbox_position[world, i, sender], covariance_heard(mind, world, i, sender))
-    remember(mind, world, i, n, sender)
-    mind.seen_tick[world, i, n] = tick
-    mind.distrusted[world, i, n] = 0
-    mind.agreed[world, i, n] = wp.float64(0.0)
-    leans_on = mind.inbox_leans_on[world, i, sender] | bit_of(sender)
-    mind.leans_on[world, i] = mind.leans_on[world, i] | leans_on
+    n = memory.belief[world, i].members
+    report = memory.inbox[world, i, sender]
+    append_member(memory, world, i, sender, report.R, report.p, wide(report.P))
+    memory.member[world, i, n].report = report
+    memory.member[world, i, n].seen_tick = tick
+    depends_on = report.depends_on | bit_of(sender)
+    memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
 
 
 @wp.func
-def carry(model: Any, mind: Any, world: int, i: int, n: int, dR: Any, dp: Any, dt: Any):
+def propagate_member(model: Any, memory: Any, world: int, i: int, n: int, dR: Any, dp: Any, dt: Any):
     """Carry a member on to its new message by its odometry, and average its twist."""
     rotation, translation = odometry_variances(model, dt)
-    move(mind, world, i, n, dR, dp, rotation, translation)
+    propagate(memory, world, i, n, dR, dp, rotation, translation)
     v = dp / dt
     w = log_so3(dR) / dt
-    if mind.twists[world, i, n] == 1:
-        share = wp.min(wp.float64(1.0), dt / wp.float64(TWIST_MEMORY))
-        v = mind.v[world, i, n] + share * (v - mind.v[world, i, n])
-        w = mind.w[world, i, n] + share * (w - mind.w[world, i, n])
-    mind.v[world, i, n] = v
-    mind.w[world, i, n] = w
-    mind.twists[world, i, n] = 1
+    if memory.member[world, i, n].has_twist == 1:
+        share = wp.min(wp.float64(1.0), dt / wp.float64(TWIST_AVERAGING_TIME))
+        v = memory.member[world, i, n].v + share * (v - memory.member[world, i, n].v)
+        w = memory.member[world, i, n].w + share * (w - memory.member[world, i, n].w)
+    memory.member[world, i, n].v = v
+    memory.member[world, i, n].w = w
+    memory.member[world, i, n].has_twist = 1
 
 
 @wp.func
-def judge(mind: Any, world: int, i: int, n: int, R: Any, p: Any, P: Any, dt: Any):
-    """Decide whether a sender is believed, from its message and the belief about it."""
-    e = left_error(mind.R[world, i, n], mind.p[world, i, n], R, p)
-    agrees = distance_squared(e, mind.P[world, i, n, n] + P) < wp.float64(MOST_DISTANCE)
-    if mind.distrusted[world, i, n] == 0:
-        mind.distrusted[world, i, n] = wp.where(agrees, 0, 1)
-        mind.agreed[world, i, n] = wp.float64(0.0)
+def test_sender(memory: Any, world: int, i: int, n: int, report: Any, dt: Any):
+    """Decide whether a sender is trusted, from its new report, dt after the last one, and the belief about it."""
+    e = left_error(memory.member[world, i, n].R, memory.member[world, i, n].p, report.R, report.p)
+    agrees = distance_squared(e, memory.P[world, i, n, n] + wide(report.P)) < wp.float64(MESSAGE_GATE)
+    if memory.member[world, i, n].distrusted == 0:
+        memory.member[world, i, n].distrusted = wp.where(agrees, 0, 1)
+        memory.member[world, i, n].agreement_time = wp.float64(0.0)
         return
     agreed = wp.float64(0.0)
-    if agrees and wp.length(second_half(e)) < wp.float64(CLOSE):
-        agreed = mind.agreed[world, i, n] + dt
-    mind.agreed[world, i, n] = agreed
-    mind.distrusted[world, i, n] = wp.where(agreed >= wp.float64(PROBATION), 0, 1)
+    if agrees and wp.length(second_half(e)) < wp.float64(AGREEMENT_DISTANCE):
+        agreed = memory.member[world, i, n].agreement_time + dt
+    memory.member[world, i, n].agreement_time = agreed
+    memory.member[world, i, n].distrusted = wp.where(agreed >= wp.float64(AGREEMENT_TIME), 0, 1)
 
 
 @wp.func
-def share_of(mind: Any, world: int, i: int, leans_on: wp.uint64):
-    """Return how much of the news counts of a sender that leans on these vehicles.
+def information_share(memory: Any, world: int, i: int, depends_on: wp.uint64):
+    """Return which share of its new information counts of a sender that depends on these vehicles.
 
-    All if on nobody. Of n senders that lean on this vehicle in turn each counts 1 / (n + 1).
+    All if on none, `DEPENDENT_SHARE` if on others. Where senders depend on this vehicle in turn, each of n counts
+    1 / (n + 1): then what comes back round any loop fades, however dense the graph is.
     """
-    if leans_on == wp.uint64(0):
+    if depends_on == wp.uint64(0):
         return wp.float64(1.0)
     own = bit_of(i)
-    if (leans_on & own) == wp.uint64(0):
-        return wp.float64(RUMOUR_SHARE)
+    if (depends_on & own) == wp.uint64(0):
+        return wp.float64(DEPENDENT_SHARE)
     count = int(1)
-    for n in range(1, mind.members[world, i]):
-        if (mind.report_leans_on[world, i, n] & own) != wp.uint64(0):
+    for n in range(1, memory.belief[world, i].members):
+        if (memory.member[world, i, n].report.depends_on & own) != wp.uint64(0):
             count += 1
     return wp.float64(1.0) / wp.float64(count)
 
 
 @wp.func
-def learn(mind: Any, world: int, i: int, n: int, sender: int, before: Any, R: Any, p: Any):
-    """Take in what a sender has learnt since its last message, which odometry has carried on to (R, p, before)."""
-    after = covariance_heard(mind, world, i, sender)
+def fuse_tracklet(memory: Any, world: int, i: int, n: int, report: Any, before: Any, R: Any, p: Any):
+    """Fuse what a sender has learnt since its last report, which odometry has carried on to (R, p, before)."""
+    after = wide(report.P)
     for k in range(6):
-        if after[k, k] > wp.float64(LESS_KNOWN) * before[k, k]:
+        if after[k, k] > wp.float64(MAX_VARIANCE_GROWTH) * before[k, k]:
             return
     precision = inverse6(after)
     information = precision - inverse6(before)
     information = (information + wp.transpose(information)) * wp.float64(0.5)
-    c = left_error(R, p, mind.inbox_rotation[world, i, sender], mind.inbox_position[world, i, sender])
-    offset = left_error(R, p, mind.R[world, i, n], mind.p[world, i, n])
+    c = left_error(R, p, report.R, report.p)
+    offset = left_error(R, p, memory.member[world, i, n].R, memory.member[world, i, n].p)
     vector = precision * c - information * offset
-    share = share_of(mind, world, i, mind.inbox_leans_on[world, i, sender])
-    inform(mind, world, i, n, share * information, share * vector)
-    mind.leans_on[world, i] = mind.leans_on[world, i] | mind.inbox_leans_on[world, i, sender]
+    share = information_share(memory, world, i, report.depends_on)
+    fuse_information(memory, world, i, n, share * information, share * vector)
+    memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | report.depends_on
 
 
 @wp.func
-def hear(model: Any, mind: Any, world: int, i: int, n: int, sender: int):
-    """Carry a sender to its new message, and take in what it has learnt since the last one."""
-    ticks = mind.inbox_tick[world, i, sender] - mind.report_tick[world, i, n]
+def fuse_message(model: Any, memory: Any, world: int, i: int, n: int, sender: int):
+    """Carry a member to its new report, and fuse what it has learnt since the last one."""
+    last = memory.member[world, i, n].report
+    report = memory.inbox[world, i, sender]
+    ticks = report.tick - last.tick
     if ticks <= 0:
         return
     dt = wp.float64(ticks) * model.camera_period
-    Rt = wp.transpose(mind.report_odometry_rotation[world, i, n])
-    dR = Rt * mind.inbox_odometry_rotation[world, i, sender]
-    dp = Rt * (mind.inbox_odometry_position[world, i, sender] - mind.report_odometry_position[world, i, n])
-    carry(model, mind, world, i, n, dR, dp, dt)
-    last = mind.report_rotation[world, i, n]
-    R = orthonormalise(last * dR)
-    p = mind.report_position[world, i, n] + last * dp
+    Rt = wp.transpose(last.odometry.R)
+    dR = Rt * report.odometry.R
+    dp = Rt * (report.odometry.p - last.odometry.p)
+    propagate_member(model, memory, world, i, n, dR, dp, dt)
+    R = orthonormalise(last.R * dR)
+    p = last.p + last.R * dp
     F = transition(dR, dp)
     rotation, translation = odometry_variances(model, dt)
-    before = with_noise(F * mind.report_covariance[world, i, n] * wp.transpose(F), rotation, translation)
-    was_distrusted = mind.distrusted[world, i, n]
-    remember(mind, world, i, n, sender)
-    judge(
-        mind,
-        world,
-        i,
-        n,
-        mind.report_rotation[world, i, n],
-        mind.report_position[world, i, n],
-        mind.report_covariance[world, i, n],
-        dt,
-    )
-    if was_distrusted == 0 and mind.distrusted[world, i, n] == 0:
-        learn(mind, world, i, n, sender, before, R, p)
+    before = with_noise(F * wide(last.P) * wp.transpose(F), rotation, translation)
+    was_distrusted = memory.member[world, i, n].distrusted
+    memory.member[world, i, n].report = report
+    test_sender(memory, world, i, n, report, dt)
+    if was_distrusted == 0 and memory.member[world, i, n].distrusted == 0:
+        fuse_tracklet(memory, world, i, n, report, before, R, p)
+
+
+@wp.func
+def fuse_messages(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
+    """Fuse the messages of members, and add senders in view to the belief."""
+    mark_seen(model, state, memory, world, i, tick)
+    for n in range(model.target_count[i]):
+        target = model.targets[i, n]
+        sender = target - model.landmarks
+        if sender >= 0:
+            if fresh(model, state, world, i, sender, tick) and memory.inbox[world, i, sender].valid == 1:
+                member = index_of(memory, world, i, sender)
+                if member > 0:
+                    fuse_message(model, memory, world, i, member, sender)
+                elif state.sight[world, i, target] == VISIBLE:
+                    add_member(model, memory, world, i, sender, tick)

@@ -8,28 +8,35 @@ import warp as wp
 
 from coopenv.estimation.so3 import exp_so3, orthonormalise
 from coopenv.observers.robust.algebra import odometry_variances, transition, with_noise
-from coopenv.observers.robust.belief import place_of
-from coopenv.observers.robust.measurements import NOTHING, aim, draw, fitting_lines, normalised, settle
-from coopenv.observers.robust.reference.observer import (
-    ACCELERATION,
+from coopenv.observers.robust.belief import index_of
+from coopenv.observers.robust.constants import (
+    ANCHOR_ANGLE_VARIANCE,
+    ANCHOR_POSITION_VARIANCE,
+    BEARING_GATE,
     HEALTHY_SHARE,
     HEALTHY_TIME,
     LOST_SHARE,
     LOST_TIME,
-    SLACK,
+    MAX_ACCELERATION,
 )
-from coopenv.observers.robust.search import FITTING, begin_search
+from coopenv.observers.robust.measurements import (
+    NOTHING,
+    fitting_lines,
+    iterated_update,
+    linearise,
+    normalised_innovation,
+    set_line,
+)
+from coopenv.observers.robust.memory import Anchor
+from coopenv.observers.robust.search import begin_search
 from coopenv.observers.robust.types import vec3d, wide_vector
 from coopenv.world.camera import VISIBLE, marker_position
 
-HALF_ACCELERATION = wp.constant(0.5 * ACCELERATION)
-SLACK_ANGLE, SLACK_POSITION = wp.constant(float(SLACK[0, 0])), wp.constant(float(SLACK[3, 3]))
-MOST_AILING, LEAST_HEALTHY = wp.constant(HEALTHY_SHARE), wp.constant(HEALTHY_TIME)
-MOST_LOST, LOST_MEMORY = wp.constant(LOST_SHARE), wp.constant(LOST_TIME)
+HALF_ACCELERATION = 0.5 * MAX_ACCELERATION
 
 
 @wp.func
-def drift(model: Any, age: Any):
+def drift_variance(model: Any, age: Any):
     """Return the variance per axis, m^2, of where a sender is a time after its last message."""
     if age <= wp.float64(0.0):
         return wp.float64(0.0)
@@ -39,36 +46,36 @@ def drift(model: Any, age: Any):
 
 
 @wp.func
-def aim_at_member(model: Any, mind: Any, world: int, i: int, n: int, place: int, tick: int, b: Any):
-    """Let a bearing be about a member, which is carried on by its last twist."""
-    age = wp.float64(tick - mind.report_tick[world, i, place]) * model.camera_period
+def set_line_to_member(model: Any, memory: Any, world: int, i: int, n: int, member: int, tick: int, b: Any):
+    """Let a bearing be to a member, which is carried on by its last twist."""
+    age = wp.float64(tick - memory.member[world, i, member].report.tick) * model.camera_period
     gone = vec3d()
-    if age > wp.float64(0.0) and mind.twists[world, i, place] == 1:
-        half_turn = mind.w[world, i, place] * (wp.float64(0.5) * age)
-        gone = exp_so3(half_turn) * mind.v[world, i, place] * age
-    aim(mind, world, n, place, b, gone, drift(model, age))
+    if age > wp.float64(0.0) and memory.member[world, i, member].has_twist == 1:
+        half_turn = memory.member[world, i, member].w * (wp.float64(0.5) * age)
+        gone = exp_so3(half_turn) * memory.member[world, i, member].v * age
+    set_line(memory, world, n, member, b, gone, drift_variance(model, age))
 
 
 @wp.func
-def aim_at_belief(model: Any, state: Any, mind: Any, world: int, i: int, tick: int):
-    """Say what each bearing of the frame is about."""
+def set_lines_to_belief(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
+    """Set the line of sight of each bearing to a landmark or a member."""
     for n in range(model.target_count[i]):
         target = model.targets[i, n]
-        mind.line_place[world, n] = NOTHING
+        memory.line[world, n].member = NOTHING
         if state.sight[world, i, target] == VISIBLE:
             b = wide_vector(model.camera.rotation * state.bearing[world, i, target])
             if target < model.landmarks:
                 z = wide_vector(marker_position(model, state, world, target))
-                aim(mind, world, n, 0, b, z, wp.float64(0.0))
+                set_line(memory, world, n, 0, b, z, wp.float64(0.0))
             else:
-                place = place_of(mind, world, i, target - model.landmarks)
-                if place > 0:
-                    aim_at_member(model, mind, world, i, n, place, tick, b)
+                member = index_of(memory, world, i, target - model.landmarks)
+                if member > 0:
+                    set_line_to_member(model, memory, world, i, n, member, tick, b)
 
 
 @wp.func
-def examine(model: Any, mind: Any, world: int, i: int):
-    """Draw the lines and mark those that fit; return the share of those that do not, and the NIS of those that do.
+def gate(model: Any, memory: Any, world: int, i: int):
+    """Linearise the lines and mark those that fit; return the share of the others, and the NIS of those that do.
 
     Bearings to distrusted senders do not count in the share; it is -1 if none counts.
     """
@@ -77,68 +84,70 @@ def examine(model: Any, mind: Any, world: int, i: int):
     total = wp.float64(0.0)
     for n in range(model.target_count[i]):
         fitting = int(0)
-        place = mind.line_place[world, n]
-        if place != NOTHING:
-            if draw(model, mind, world, i, n):
-                nis = normalised(mind, world, i, n)
-                if nis < wp.float64(FITTING):
+        member = memory.line[world, n].member
+        if member != NOTHING:
+            if linearise(model, memory, world, i, n):
+                nis = normalised_innovation(memory, world, i, n)
+                if nis < wp.float64(BEARING_GATE):
                     fitting = 1
                     total += nis
-            if place == 0 or mind.distrusted[world, i, place] == 0:
+            if member == 0 or memory.member[world, i, member].distrusted == 0:
                 counted += 1
                 missed += 1 - fitting
-        mind.line_fits[world, n] = fitting
+        memory.line[world, n].fits = fitting
     if counted == 0:
         return wp.float64(-1.0), total
     return wp.float64(missed) / wp.float64(counted), total
 
 
 @wp.func
-def drop_anchor(mind: Any, world: int, i: int, P: Any, tick: int):
+def set_anchor(memory: Any, world: int, i: int, P: Any, tick: int):
     """Remember where the vehicle is, for a search after a loss."""
-    mind.anchor_rotation[world, i] = mind.R[world, i, 0]
-    mind.anchor_position[world, i] = mind.p[world, i, 0]
-    mind.anchor_covariance[world, i] = P
-    mind.anchor_odometry_rotation[world, i] = mind.odometry_rotation[world, i]
-    mind.anchor_odometry_position[world, i] = mind.odometry_position[world, i]
-    mind.anchor_tick[world, i] = tick
+    anchor = Anchor()
+    anchor.R = memory.member[world, i, 0].R
+    anchor.p = memory.member[world, i, 0].p
+    anchor.P = P
+    anchor.odometry = memory.belief[world, i].odometry
+    anchor.tick = tick
+    memory.anchor[world, i] = anchor
 
 
 @wp.func
-def lose(model: Any, mind: Any, world: int, i: int, tick: int):
+def restart_search(model: Any, memory: Any, world: int, i: int, tick: int):
     """Search anew, from where the vehicle was when most bearings fitted, carried on by its odometry."""
-    since = wp.transpose(mind.anchor_odometry_rotation[world, i])
-    dR = since * mind.odometry_rotation[world, i]
-    dp = since * (mind.odometry_position[world, i] - mind.anchor_odometry_position[world, i])
-    elapsed = wp.float64(tick - mind.anchor_tick[world, i]) * model.camera_period
+    since = wp.transpose(memory.anchor[world, i].odometry.R)
+    dR = since * memory.belief[world, i].odometry.R
+    dp = since * (memory.belief[world, i].odometry.p - memory.anchor[world, i].odometry.p)
+    elapsed = wp.float64(tick - memory.anchor[world, i].tick) * model.camera_period
     rotation, translation = odometry_variances(model, elapsed)
-    R = mind.anchor_rotation[world, i]
+    R = memory.anchor[world, i].R
     F = transition(dR, dp)
-    P = with_noise(F * mind.anchor_covariance[world, i] * wp.transpose(F), rotation, translation)
-    begin_search(mind, world, i, orthonormalise(R * dR), mind.anchor_position[world, i] + R * dp, P)
+    P = with_noise(F * memory.anchor[world, i].P * wp.transpose(F), rotation, translation)
+    begin_search(memory, world, i, orthonormalise(R * dR), memory.anchor[world, i].p + R * dp, P)
 
 
 @wp.func
-def look(model: Any, state: Any, mind: Any, world: int, i: int, now: Any):
+def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
     """Correct the belief by every bearing that fits it; search anew when most do not."""
-    aim_at_belief(model, state, mind, world, i, now.tick)
-    share, nis = examine(model, mind, world, i)
+    set_lines_to_belief(model, state, memory, world, i, now.tick)
+    share, nis = gate(model, memory, world, i)
     state.nis[world, i] = nis
-    fitting = fitting_lines(mind, world, model.target_count[i])
+    fitting = fitting_lines(memory, world, model.target_count[i])
     state.nis_dof[world, i] = 2 * fitting
     if fitting > 0:
-        settle(model, mind, world, i)
+        iterated_update(model, memory, world, i)
     if share < wp.float64(0.0):
         return
-    memory = wp.min(wp.float64(1.0), now.period / wp.float64(LOST_MEMORY))
-    missed = mind.missed[world, i] + (share - mind.missed[world, i]) * memory
-    healthy = mind.healthy[world, i] + now.period
-    if missed >= wp.float64(MOST_AILING):
+    weight = wp.min(wp.float64(1.0), now.period / wp.float64(LOST_TIME))
+    missed = memory.belief[world, i].missed_share + (share - memory.belief[world, i].missed_share) * weight
+    healthy = memory.belief[world, i].healthy_time + now.period
+    if missed >= wp.float64(HEALTHY_SHARE):
         healthy = wp.float64(0.0)
-    mind.missed[world, i] = missed
-    mind.healthy[world, i] = healthy
-    if missed > wp.float64(MOST_LOST):
-        lose(model, mind, world, i, now.tick)
-    elif healthy > wp.float64(LEAST_HEALTHY):
-        P = wp.float64(4.0) * mind.P[world, i, 0, 0]
-        drop_anchor(mind, world, i, with_noise(P, wp.float64(SLACK_ANGLE), wp.float64(SLACK_POSITION)), now.tick)
+    memory.belief[world, i].missed_share = missed
+    memory.belief[world, i].healthy_time = healthy
+    if missed > wp.float64(LOST_SHARE):
+        restart_search(model, memory, world, i, now.tick)
+    elif healthy > wp.float64(HEALTHY_TIME):
+        P = wp.float64(4.0) * memory.P[world, i, 0, 0]
+        P = with_noise(P, wp.float64(ANCHOR_ANGLE_VARIANCE), wp.float64(ANCHOR_POSITION_VARIANCE))
+        set_anchor(memory, world, i, P, now.tick)

@@ -15,8 +15,8 @@ from coopenv.bench.observers.faults import FAULTS, Lie
 from coopenv.bench.observers.initial_estimates import random_start, with_start
 from coopenv.observers import Estimate, Recording, Tick, run
 from coopenv.observers.riccati_coordinates import riccati_covariance
+from coopenv.observers.robust.constants import PATIENCE
 from coopenv.observers.robust.reference.observer import Robust
-from coopenv.observers.robust.reference.search import PATIENCE
 from coopenv.policies import Policy
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
@@ -139,7 +139,8 @@ def test_the_same_members_make_room(leaders: int, gone: int) -> None:
 
     def note(world: World, tick: int) -> None:
         memory: Any = world.memory
-        members[tick] = memory.vehicle.numpy()[0, leaders, : memory.members.numpy()[0, leaders]].tolist()
+        count = memory.belief.numpy()["members"][0, leaders]
+        members[tick] = memory.member.numpy()["vehicle"][0, leaders, :count].tolist()
 
     class Noted(Robust):
         def update(self, tick: Tick) -> Estimate:
@@ -172,9 +173,10 @@ def test_a_liar_is_found_out_as_in_numpy() -> None:
         if lie.applies(1, tick * recording.dt):
             slot = tick % world.model.radio.slots
             memory: Any = world.memory
-            memory.outbox_position.numpy()[0, 1, slot] += lie.offset
-            memory.outbox_covariance.numpy()[0, 1, slot] = lie.std**2 * np.eye(6)
-        told[tick] = world.memory.distrusted.numpy()[0, 2].max()
+            report = memory.outbox.numpy()[0, 1, slot]
+            report["p"] += lie.offset
+            report["P"] = lie.std**2 * np.eye(6)
+        told[tick] = world.memory.member.numpy()["distrusted"][0, 2].max()
 
     check(recording, replayed(recording, meddle), lie)
     assert told[119] == 0 and told[180] == 1

@@ -54,8 +54,8 @@ def test_a_world_does_not_know_its_batch(dtype: str) -> None:
     alone = played(start(noisy(), [123 + 17], dtype))
     many = played(start(noisy(), range(123, 123 + 64), dtype))
     assert_same(alone, many, slice(0, 1), slice(17, 18))
-    assert not many["observer_searching"].all() and (many["observer_members"] == 3).any()
-    assert len(np.unique(many["observer_p"].reshape(64, -1), axis=0)) == 64
+    assert not many["observer_search.active"].all() and (many["observer_belief.members"] == 3).any()
+    assert len(np.unique(many["observer_member.p"].reshape(64, -1), axis=0)) == 64
 
 
 def test_threads_change_nothing() -> None:
@@ -68,7 +68,7 @@ def test_threads_change_nothing() -> None:
 def test_a_reset_leaves_nothing_of_the_last_episode() -> None:
     world = start(noisy(), [3, 4])
     fresh = world.get_state()
-    assert not (fresh["observer_searching"][:, 0]).any() and fresh["observer_searching"][:, 1:].all()
+    assert not (fresh["observer_search.active"][:, 0]).any() and fresh["observer_search.active"][:, 1:].all()
     played(world)
     reset(world, [3, 4])
     assert_same(fresh, world.get_state())
@@ -90,7 +90,7 @@ def test_a_saved_state_continues_as_if_nothing_happened(dtype: str) -> None:
     world = start(noisy(), [1, 2], dtype)
     played(world, 24)  # the second vehicle is still searching
     saved = world.get_state()
-    assert saved["observer_searching"].any() and saved["observer_hypotheses"].any()
+    assert saved["observer_search.active"].any() and saved["observer_search.hypotheses"].any()
     straight = played(world, 90)
     other = start(noisy(), [77, 78], dtype)
     played(other, 42)
@@ -102,8 +102,8 @@ def test_a_saved_state_continues_as_if_nothing_happened(dtype: str) -> None:
 def test_a_saved_state_without_the_memory_is_refused() -> None:
     world = start(noisy(), [1])
     saved = world.get_state()
-    with pytest.raises(ValueError, match="observer_searching"):
-        world.set_state({name: value for name, value in saved.items() if name != "observer_searching"})
+    with pytest.raises(ValueError, match="observer_search"):
+        world.set_state({name: value for name, value in saved.items() if name != "observer_search.active"})
 
 
 def test_other_observers_remember_nothing_more() -> None:
@@ -117,5 +117,5 @@ def test_lost_vehicles_find_themselves() -> None:
     state = played(world, 480)
     p = np.einsum("wnij,wnj->wni", state["estimate_rotation"], state["estimate_position"])
     error = np.linalg.norm(p - state["position"][:, world.model.landmarks :], axis=2)
-    assert not state["observer_searching"].any()
+    assert not state["observer_search.active"].any()
     assert error.max() < 0.2

@@ -18,13 +18,12 @@ from coopenv.estimation.rotations import exp_so3, lengths, log_so3, orthonormali
 from coopenv.estimation.small_matrices import solve, solve_positive
 from coopenv.observers.contract import SensorNoise
 from coopenv.observers.mekf import transition
-
-MOST_STEPS, STRAIGHT = 8, 0.01
-"""Linearisations of one correction; how far it may turn a line of sight without another one, rad."""
-AT_ONCE = 1e-6
-"""s; times that differ by less differ by rounding only."""
-TWIST_TIME = 0.3
-"""s, over which a neighbour's twist is averaged."""
+from coopenv.observers.robust.constants import (
+    MAX_LINEARISATIONS,
+    RELINEARISATION_ANGLE,
+    SAME_TIME,
+    TWIST_AVERAGING_TIME,
+)
 
 
 @dataclass
@@ -128,7 +127,7 @@ class Belief:
         """Carry a member on to where its own odometry says that it was at a time."""
         member = self.members[n]
         dt = time - member.time
-        if dt < AT_ONCE or member.odometry is None:
+        if dt < SAME_TIME or member.odometry is None:
             return
         R, p = member.odometry
         dR, dp = R.T.dot(odometry_turn), R.T.dot(odometry_position - p)
@@ -137,7 +136,7 @@ class Belief:
         if member.v is None or member.w is None:
             member.v, member.w = v, w
         else:
-            share = min(1.0, dt / TWIST_TIME)
+            share = min(1.0, dt / TWIST_AVERAGING_TIME)
             member.v, member.w = member.v + share * (v - member.v), member.w + share * (w - member.w)
         member.time, member.odometry = time, (odometry_turn, odometry_position)
 
@@ -191,7 +190,7 @@ class Belief:
         """
         before = [(member.R, member.p) for member in self.members]
         dx = np.zeros(len(self.P))
-        for step in range(MOST_STEPS):
+        for step in range(MAX_LINEARISATIONS):
             if step > 0:
                 sight, noise = look()
             H, variances = sight.H[fits].reshape(-1, len(dx)), np.repeat(noise[fits], 2)
@@ -200,7 +199,7 @@ class Belief:
             for member, (R, p) in zip(self.members, before, strict=True):
                 member.R, member.p = R, p
             self.shift(dx)
-            if _bend(dx - last, float(sight.distance[fits].min())) < STRAIGHT:
+            if _bend(dx - last, float(sight.distance[fits].min())) < RELINEARISATION_ANGLE:
                 break
         self.condense(K, H, variances)
 

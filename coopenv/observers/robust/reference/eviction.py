@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from coopenv.observers.robust.reference.belief import AT_ONCE, Belief
-
-FORGET_TIME = 1.0
-"""s out of view after which a member may be forgotten."""
+from coopenv.observers.robust.constants import FORGET_TIME, SAME_TIME
+from coopenv.observers.robust.reference.belief import Belief
 
 
 def room_for(belief: Belief, vehicles: set[int], most: int, time: float) -> set[int] | None:
@@ -18,7 +16,7 @@ def room_for(belief: Belief, vehicles: set[int], most: int, time: float) -> set[
         time: now, s.
     """
     staying = [member for member in belief.members[1:] if member.vehicle not in vehicles]
-    unseen = [member for member in staying if time - member.seen > FORGET_TIME + AT_ONCE]
+    unseen = [member for member in staying if time - member.seen > FORGET_TIME + SAME_TIME]
     excess = max(0, 1 + len(staying) + len(vehicles) - most)
     if excess > len(unseen):
         return None

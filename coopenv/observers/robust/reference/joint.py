@@ -1,4 +1,4 @@
-"""The same observer with larger messages: a vehicle tells its whole belief, up to `MOST_TOLD` vehicles and 2 kB.
+"""The same observer with larger messages: a vehicle tells its whole belief, up to `MAX_TOLD` vehicles and 2 kB.
 
 What could reach a receiver by two ways is recognised: a sender whom another message speaks for adds nothing of its own.
 So along a leader-follower graph no information is lost, and none counts twice.
@@ -17,26 +17,23 @@ from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import exp_so3, log_so3
 from coopenv.estimation.small_matrices import cholesky
 from coopenv.observers.contract import Message
+from coopenv.observers.robust.constants import MAX_MEMBERS_JOINT, MAX_TOLD, SUPERSEDING_TIME
 from coopenv.observers.robust.reference.belief import Member
 from coopenv.observers.robust.reference.observer import Robust
 from coopenv.observers.robust.reference.tracklets import Report, from_message, marker_jacobian, mask_of
-
-MOST_TOLD = 4
-SPEAKS_FOR = 1.0
-"""s, for which a message speaks for the vehicles that it tells of."""
 
 
 class RobustJoint(Robust):
     """One vehicle's observer; messages hold a joint belief: 281 bytes alone, 1715 with three others."""
 
-    most_members = 8
+    most_members = MAX_MEMBERS_JOINT
 
     def message(self) -> Message:
         """Return the belief about oneself and as many others as fit, or nothing while the pose is not known."""
         message = super().message()
         if message.position is None:
             return message
-        told = self.belief.members[:MOST_TOLD]
+        told = self.belief.members[:MAX_TOLD]
         P = self.belief.P[: 6 * len(told), : 6 * len(told)]
         if self.marker.any():
             J = np.eye(len(P))
@@ -68,7 +65,7 @@ class RobustJoint(Robust):
 def _speaks_for(other: Report, report: Report) -> bool:
     """Return whether another report says all that this one does."""
     sender = report.vehicles[0]
-    if sender == other.vehicles[0] or sender not in other.vehicles or report.time[0] - other.time[0] > SPEAKS_FOR:
+    if sender == other.vehicles[0] or sender not in other.vehicles or report.time[0] - other.time[0] > SUPERSEDING_TIME:
         return False
     return len(other.vehicles) > len(report.vehicles) or other.vehicles[0] < sender
 

@@ -11,7 +11,7 @@ more. So nothing that was heard before counts twice, and the neighbour's slowly 
   odometry and by bearings, until its messages have agreed for a while.
 - Loss and delay: a sender stands in the belief where its last message put it, and is carried on by its last twist.
 - Many neighbours: where there is no room for one in view, those that have been out of view for longest make room.
-- Rumours: what a neighbour learnt from others may reach this vehicle by more ways than one. `SHARE` of it counts.
+- Rumours: what a neighbour learnt from others may reach this vehicle by more ways than one. A share of it counts.
 """
 
 from __future__ import annotations
@@ -25,37 +25,30 @@ from coopenv.estimation.coordinates import Coordinates
 from coopenv.estimation.rotations import orthonormalise
 from coopenv.estimation.small_matrices import solve_positive
 from coopenv.observers.contract import Estimate, Message, SensorNoise, Setup, Tick
-from coopenv.observers.robust.reference.belief import AT_ONCE, Belief, Member, View, errors_of
+from coopenv.observers.robust.constants import (
+    AGREEMENT_DISTANCE,
+    AGREEMENT_TIME,
+    ANCHOR_ANGLE_VARIANCE,
+    ANCHOR_POSITION_VARIANCE,
+    BEARING_GATE,
+    DEPENDENT_SHARE,
+    HEALTHY_SHARE,
+    HEALTHY_TIME,
+    LOST_SHARE,
+    LOST_TIME,
+    MAX_ACCELERATION,
+    MAX_MEMBERS,
+    MAX_SPEED,
+    MESSAGE_GATE,
+    MIN_ANGULAR_VELOCITY_STD,
+    MIN_VELOCITY_STD,
+    SAME_TIME,
+)
+from coopenv.observers.robust.reference.belief import Belief, Member, View, errors_of
 from coopenv.observers.robust.reference.eviction import room_for
 from coopenv.observers.robust.reference.resection import resect
-from coopenv.observers.robust.reference.search import GATE, Search, Sighting, is_known
-from coopenv.observers.robust.reference.tracklets import (
-    Report,
-    from_message,
-    left_error,
-    mask_of,
-    to_message,
-    tracklet,
-)
-
-SHARE = 0.7
-"""Share that counts of what a neighbour that leans on others has learnt."""
-TRUST_GATE = 40.0
-"""Gate of the squared distance between a message and the belief about its sender: chi-square of 6, 1 - 5e-7."""
-AGREED_FOR, AGREED_DISTANCE = 1.0, 1.0
-"""s and m: how long and how closely a distrusted sender must agree before it is believed again."""
-LOST_SHARE, LOST_TIME = 0.6, 0.5
-"""Share of bearings that contradict the belief, and the time over which it is averaged, s."""
-ACCELERATION = 1.0
-"""m/s^2 by which a vehicle may leave its last known twist."""
-SPEED = 1.0
-"""m/s at which a sender may have gone on since a message that is used in the search."""
-HEALTHY_SHARE, HEALTHY_TIME = 0.2, 1.0
-"""Share of contradicting bearings, and for how long, s, it must be lower for the pose to be worth remembering."""
-SLACK = np.diag([0.05**2] * 3 + [0.5**2] * 3)
-"""Added to the covariance of a pose that is remembered, rad^2 and m^2."""
-LEAST_VELOCITY_STD, LEAST_ANGULAR_STD = 2e-3, 2e-4
-"""m/s and rad/s, of an odometry sample: the increments of a moving vehicle are never exact."""
+from coopenv.observers.robust.reference.search import Search, Sighting, is_known
+from coopenv.observers.robust.reference.tracklets import Report, from_message, left_error, mask_of, to_message, tracklet
 
 
 @dataclass
@@ -83,15 +76,15 @@ class Anchor:
 class Robust:
     """One vehicle's observer; messages hold pose and covariance (196 bytes)."""
 
-    most_members = 5
+    most_members = MAX_MEMBERS
     """The vehicle itself and those it keeps in its belief."""
 
     def __init__(self, setup: Setup) -> None:
         """Take what the vehicle knows before it starts."""
         self.vehicle, self.landmarks, self.marker = setup.vehicle, setup.landmarks, setup.marker
         self.noise = SensorNoise(
-            max(setup.noise.velocity, LEAST_VELOCITY_STD),
-            max(setup.noise.angular_velocity, LEAST_ANGULAR_STD),
+            max(setup.noise.velocity, MIN_VELOCITY_STD),
+            max(setup.noise.angular_velocity, MIN_ANGULAR_VELOCITY_STD),
             setup.noise.odometry_period,
             setup.noise.bearing,
         )
@@ -168,7 +161,7 @@ class Robust:
                 result.append(Sighting(tick.bearings[n], tick.landmarks[target], 0.0))
             elif (report := reports.get(target - self.landmarks)) is not None:
                 age = tick.time - report.time[0]
-                variance = float(np.trace(report.P[3:6, 3:6])) / 3.0 + (SPEED * age) ** 2
+                variance = float(np.trace(report.P[3:6, 3:6])) / 3.0 + (MAX_SPEED * age) ** 2
                 result.append(Sighting(tick.bearings[n], report.p[0], variance))
         return result
 
@@ -252,7 +245,7 @@ class Robust:
         """Carry a sender to its new message, and take in what it has learnt since the last one."""
         last = contact.last
         dt = float(report.time[0] - last.time[0])
-        if dt < AT_ONCE:  # the same message again
+        if dt < SAME_TIME:  # the same message again
             return
         contact.last = report
         members = [member.vehicle for member in self.belief.members]
@@ -275,14 +268,14 @@ class Robust:
     def _share(self, report: Report) -> float:
         """Return how much of a sender's news counts.
 
-        All if it leans on nobody, `SHARE` if it leans on others. Where senders lean on this vehicle in turn, each of n
-        counts 1 / (n + 1): then what comes back round any loop fades, however dense the graph is.
+        All if it depends on nobody, `DEPENDENT_SHARE` if on others. Where senders depend on this vehicle in turn, each
+        of n counts 1 / (n + 1): then what comes back round any loop fades, however dense the graph is.
         """
         if not report.leans_on:
             return 1.0
         own = int(mask_of({self.vehicle}))
         if not report.leans_on & own:
-            return SHARE
+            return DEPENDENT_SHARE
         return 1.0 / (1.0 + sum(bool(contact.last.leans_on & own) for contact in self.contacts.values()))
 
     def _judge(self, contact: Contact, report: Report, dt: float) -> None:
@@ -292,13 +285,13 @@ class Robust:
             return
         member, block = self.belief.members[n], slice(6 * n, 6 * n + 6)
         e = left_error(member.R, member.p, report.R[0], report.p[0])
-        agrees = float(e.dot(solve_positive(self.belief.P[block, block] + report.P[:6, :6], e))) < TRUST_GATE
+        agrees = float(e.dot(solve_positive(self.belief.P[block, block] + report.P[:6, :6], e))) < MESSAGE_GATE
         if contact.trusted:
             contact.trusted, contact.agreed = agrees, 0.0
             return
-        near = agrees and e[3:].dot(e[3:]) < AGREED_DISTANCE**2
+        near = agrees and e[3:].dot(e[3:]) < AGREEMENT_DISTANCE**2
         contact.agreed = contact.agreed + dt if near else 0.0
-        contact.trusted = contact.agreed >= AGREED_FOR
+        contact.trusted = contact.agreed >= AGREEMENT_TIME
 
     def _look(self, tick: Tick) -> None:
         """Correct the belief by every bearing that fits it; search anew when most do not."""
@@ -313,7 +306,14 @@ class Robust:
                 self._lose(tick.time)
             elif self.healthy > HEALTHY_TIME:
                 own = self.belief.own
-                self.anchor = Anchor(own.R, own.p, 4.0 * self.belief.P[:6, :6] + SLACK, self.odometry, tick.time)
+                self.anchor = Anchor(
+                    own.R,
+                    own.p,
+                    4.0 * self.belief.P[:6, :6]
+                    + np.diag(np.repeat([ANCHOR_ANGLE_VARIANCE, ANCHOR_POSITION_VARIANCE], 3)),
+                    self.odometry,
+                    tick.time,
+                )
 
     def _view(self, tick: Tick) -> View:
         """Return the frame's bearings to landmarks and to members of the belief, as measurements."""
@@ -341,7 +341,7 @@ class Robust:
         sight = belief.sight(tick.bearings[known], tick.lever_arm, np.array(z).reshape(-1, 3), places, points)
         noise = self.variance + np.array(drift) / sight.distance**2
         nis = sight.normalised(belief.P, noise)
-        fits = sight.ahead & (nis < GATE)
+        fits = sight.ahead & (nis < BEARING_GATE)
         judged = [fit for fit, judges in zip(fits.tolist(), counts, strict=True) if judges]
         return View(sight, noise, nis, fits, judged.count(False) / len(judged) if judged else None)
 
@@ -349,4 +349,4 @@ class Robust:
         """Return the variance per axis, m^2, of where a sender is a time after its last message."""
         if age <= 0.0:
             return 0.0
-        return float(self.noise.odometry(age)[3]) + (0.5 * ACCELERATION * age * age) ** 2
+        return float(self.noise.odometry(age)[3]) + (0.5 * MAX_ACCELERATION * age * age) ** 2

@@ -7,11 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from coopenv.estimation.small_matrices import solve
+from coopenv.observers.robust.constants import GAUSS_NEWTON_STEPS, MIN_INFORMATION_RATIO
 from coopenv.observers.robust.reference.belief import Belief, View
-
-STEPS = 6
-LEAST_INFORMATION = 1e-12
-"""Least information of the weakest direction relative to the strongest; below it the frame does not tell the pose."""
 
 
 def resect(belief: Belief, look: Callable[[], View]) -> bool:
@@ -25,7 +22,7 @@ def resect(belief: Belief, look: Callable[[], View]) -> bool:
         look: returns the frame's bearings at the pose that is believed now.
     """
     others = belief.P[6:, 6:]
-    for step in range(STEPS):
+    for step in range(GAUSS_NEWTON_STEPS):
         view = look()
         sight, noise, fits = view.sight, view.noise, view.fits
         if fits.sum() < 3:
@@ -37,10 +34,10 @@ def resect(belief: Belief, look: Callable[[], View]) -> bool:
         weighted = own.transpose(0, 2, 1) @ W
         M = (weighted @ own).sum(axis=0)
         spectrum = np.linalg.eigvalsh(M)
-        if not spectrum[0] > LEAST_INFORMATION * spectrum[-1]:
+        if not spectrum[0] > MIN_INFORMATION_RATIO * spectrum[-1]:
             return False
         G = solve(M, np.concatenate(weighted, axis=1))
-        if step < STEPS - 1:
+        if step < GAUSS_NEWTON_STEPS - 1:
             belief.shift(G.dot(sight.residual[fits].ravel()))
     rest = rest.reshape(2 * len(rest), len(others))
     belief.P[:6, :6] = G @ (np.diag(np.repeat(N, 2)) + rest @ others @ rest.T) @ G.T

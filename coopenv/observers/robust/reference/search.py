@@ -18,32 +18,25 @@ from coopenv.estimation.p3p import solve_p3p, solve_p3p_batch
 from coopenv.estimation.rotations import tangent_basis
 from coopenv.estimation.small_matrices import invert_positive, solve
 from coopenv.observers.contract import Tick
+from coopenv.observers.robust.constants import (
+    BEARING_GATE,
+    CLEAR_TIME,
+    CORRELATION_FACTOR,
+    KNOWN_ANGLE,
+    KNOWN_POSITION,
+    MAX_BEARING_COST,
+    MAX_BEST_COST,
+    MAX_HYPOTHESES,
+    MAX_PRIOR_COST,
+    MIN_SEARCH_TIME,
+    PATIENCE,
+    PERTURBATION,
+    PRUNE_GAP,
+    SAME_HYPOTHESIS,
+    SAME_PRIOR,
+)
 from coopenv.observers.robust.reference.belief import Belief, Sight
 from coopenv.observers.robust.reference.tracklets import left_error
-
-MOVED = 2.0
-"""By how many standard deviations a measurement is moved to look for solutions that noise may hide."""
-MOST_HYPOTHESES = 6
-GATE = 13.8
-"""Gate of a bearing's normalised innovation squared: chi-square of 2, 0.999."""
-MISS = 25.0
-"""What a hypothesis pays at most for one bearing."""
-MARGIN = 30.0
-"""By how much it may have paid more than the best one: odds of exp(-15)."""
-MOST_SURPRISE = 50.0
-"""What a hypothesis pays at most for being far from the prior: that may be wrong altogether."""
-FLOOR = 80.0
-"""What the best may have paid beyond twice what is expected of a true one."""
-CLEAR_TIME, PATIENCE = 0.25, 15.0
-"""s, for which all solutions must have been well determined, and after which that is asked no more."""
-LEAST_TIME = 0.5
-"""s, before a hypothesis is believed."""
-KNOWN_ANGLE, KNOWN_POSITION = 0.2, 2.0
-"""rad and m, standard deviation per axis below which a pose is one to go on with."""
-SLOW = 4.0
-"""By how much a neighbour's variance counts: its error changes slowly, so that it does not average out."""
-SAME, SAME_PRIOR = 16.0, 30.0
-"""Squared distance, in standard deviations, below which two hypotheses are one, and one is the prior."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +100,7 @@ class Search:
         for hypothesis in self.bank:
             _follow(hypothesis, tick, sightings, variance)
         self._prune()
-        return self.bank[0].belief if len(self.bank) == 1 and self.age >= LEAST_TIME else None
+        return self.bank[0].belief if len(self.bank) == 1 and self.age >= MIN_SEARCH_TIME else None
 
     def _begin(self, tick: Tick, sightings: list[Sighting], variance: float) -> None:
         """Follow a known prior at first; then a frame's solutions, too, if for a while all were well determined.
@@ -130,7 +123,7 @@ class Search:
             _follow(hypothesis, tick, [s for n, s in enumerate(sightings) if n not in three], variance)
         if is_known(self.prior.P):
             solutions.append(self._prior(tick, sightings, variance))
-        self.bank = sorted(solutions, key=lambda h: h.price)[:MOST_HYPOTHESES]
+        self.bank = sorted(solutions, key=lambda h: h.price)[:MAX_HYPOTHESES]
         self.age, self.clear, self.attempts = 0.0, 0.0, self.attempts + 1
 
     def _prior(self, tick: Tick, sightings: list[Sighting], variance: float) -> Hypothesis:
@@ -158,8 +151,8 @@ class Search:
         result: list[Hypothesis] = []
         for belief in poses:
             surprise = self._surprise(belief)
-            hypothesis = Hypothesis(belief, min(surprise, MOST_SURPRISE), surprise)
-            if len(result) < MOST_HYPOTHESES and not any(_same(hypothesis, other) for other in result):
+            hypothesis = Hypothesis(belief, min(surprise, MAX_PRIOR_COST), surprise)
+            if len(result) < MAX_HYPOTHESES and not any(_same(hypothesis, other) for other in result):
                 result.append(hypothesis)
         return result
 
@@ -177,10 +170,10 @@ class Search:
         ranked = sorted(self.bank, key=lambda h: h.price)
         kept: list[Hypothesis] = []
         for hypothesis in ranked:
-            if hypothesis.paid <= ranked[0].paid + MARGIN and not any(_same(hypothesis, other) for other in kept):
+            if hypothesis.paid <= ranked[0].paid + PRUNE_GAP and not any(_same(hypothesis, other) for other in kept):
                 kept.append(hypothesis)
         best = kept[0]
-        self.bank = [] if best.paid > FLOOR + 4.0 * best.bearings else kept
+        self.bank = [] if best.paid > MAX_BEST_COST + 4.0 * best.bearings else kept
 
 
 def is_known(P: Array) -> bool:
@@ -200,13 +193,13 @@ def _perspectives(three: list[Sighting], variance: float) -> Iterator[tuple[Arra
     """Yield the poses (R, camera) that explain three sightings, then what they may have been.
 
     Where two solutions lie close together noise can make both of them vanish. So every bearing, and every place that is
-    not exactly known, is also moved by `MOVED` standard deviations to each side.
+    not exactly known, is also moved by `PERTURBATION` standard deviations to each side.
     """
     b, z = np.array([s.bearing for s in three]), np.array([s.z for s in three])
     yield from zip(*solve_p3p(b, z), strict=True)
     bearings, places = [], []
     for n, s in enumerate(three):
-        for side in (MOVED, -MOVED):
+        for side in (PERTURBATION, -PERTURBATION):
             for axis in tangent_basis(b[n : n + 1])[0]:
                 moved = b.copy()
                 moved[n] += side * math.sqrt(variance) * axis
@@ -224,7 +217,7 @@ def _perspectives(three: list[Sighting], variance: float) -> Iterator[tuple[Arra
 
 def _noise(distance: Array, sightings: list[Sighting], variance: float) -> Array:
     """Return the variances (m,) of bearings, their targets' uncertainty included."""
-    return variance + SLOW * np.array([s.variance for s in sightings]) / distance**2
+    return variance + CORRELATION_FACTOR * np.array([s.variance for s in sightings]) / distance**2
 
 
 def _seen(belief: Belief, tick: Tick, sightings: list[Sighting], variance: float) -> tuple[Sight, Array]:
@@ -252,9 +245,9 @@ def _follow(hypothesis: Hypothesis, tick: Tick, sightings: list[Sighting], varia
     belief = hypothesis.belief
     sight, noise = _seen(belief, tick, sightings, variance)
     nis = sight.normalised(belief.P, noise)
-    hypothesis.paid += float(np.where(sight.ahead, np.minimum(nis, MISS), MISS).sum())
+    hypothesis.paid += float(np.where(sight.ahead, np.minimum(nis, MAX_BEARING_COST), MAX_BEARING_COST).sum())
     hypothesis.bearings += len(sightings)
-    fits = sight.ahead & (nis < GATE)
+    fits = sight.ahead & (nis < BEARING_GATE)
     if fits.any():
         belief.settle(sight, noise, fits, lambda: _seen(belief, tick, sightings, variance))
 
@@ -263,4 +256,4 @@ def _same(one: Hypothesis, other: Hypothesis) -> bool:
     """Return whether two hypotheses cannot be told apart."""
     a, b = one.belief, other.belief
     e = left_error(a.own.R, a.own.p, b.own.R, b.own.p)
-    return float(e.dot(solve(a.P + b.P, e))) < SAME
+    return float(e.dot(solve(a.P + b.P, e))) < SAME_HYPOTHESIS

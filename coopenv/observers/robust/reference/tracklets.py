@@ -19,16 +19,15 @@ from coopenv.estimation.rotations import exp_so3, log_so3, orthonormalise, skew
 from coopenv.estimation.small_matrices import invert_positive
 from coopenv.observers.contract import Message, SensorNoise
 from coopenv.observers.mekf import transition
+from coopenv.observers.robust.constants import MASK_BITS
 from coopenv.observers.robust.reference.belief import Belief, Member
-
-BITS = 64
 
 
 def mask_of(vehicles: set[int]) -> np.uint64:
     """Return a set of vehicles as bits; numbers from 64 on share bits with lower ones."""
     bits = 0
     for vehicle in vehicles:
-        bits |= 1 << (vehicle % BITS)
+        bits |= 1 << (vehicle % MASK_BITS)
     return np.uint64(bits)
 
 
@@ -121,7 +120,7 @@ def to_message(belief: Belief, marker: Array, odometry: tuple[Array, Array], lea
         covariance=P.astype(np.float32),
         extra={
             "odometry": np.concatenate([log_so3(odometry[0]), odometry[1] + odometry[0].dot(marker)]),
-            "leans_on": np.array([leans_on], dtype=np.uint64),
+            "depends_on": np.array([leans_on], dtype=np.uint64),
         },
     )
 
@@ -141,5 +140,5 @@ def from_message(message: Message, sender: int, time: float) -> Report | None:
         odometry_turn=exp_so3(odometry[:3])[None],
         odometry_position=odometry[None, 3:],
         P=np.asarray(message.covariance, float),
-        leans_on=int(message.extra["leans_on"][0]),
+        leans_on=int(message.extra["depends_on"][0]),
     )

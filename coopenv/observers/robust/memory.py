@@ -1,0 +1,153 @@
+"""What every vehicle's observer remembers: small records, and one record of arrays of them.
+
+Covariances are of left errors (theta, rho), rad and m; positions are in the map frame. Numbers are float64 in worlds of
+any precision, because what a neighbour has learnt is a small difference of large inverses.
+"""
+
+import warp as wp
+
+from coopenv.observers.robust.constants import MAX_HYPOTHESES, MAX_MEMBERS
+from coopenv.observers.robust.types import mat26d, mat33d, mat62d, mat66d, mat66f, vec2d, vec3d, vec6d
+from coopenv.world.records import array
+
+
+@wp.struct
+class Pose:
+    """Body to map."""
+
+    R: mat33d
+    p: vec3d
+
+
+@wp.struct
+class Estimate:
+    """A pose and its covariance."""
+
+    R: mat33d
+    p: vec3d
+    P: mat66d
+
+
+@wp.struct
+class Report:
+    """A message: where its sender is, what the sender's odometry says, and from whom it has heard."""
+
+    tick: wp.int32  # when it was sent; -1: never
+    valid: wp.int32  # 0: empty, the sender does not know where it is
+    R: mat33d
+    p: vec3d  # of the marker
+    P: mat66f  # at the marker
+    odometry: Pose  # of the marker, by dead reckoning from the start, in a frame of its own
+    depends_on: wp.uint64  # bits of the vehicles whose messages are in it
+
+
+@wp.struct
+class Member:
+    """One vehicle in a belief."""
+
+    vehicle: wp.int32
+    R: mat33d
+    p: vec3d
+    has_twist: wp.int32
+    v: vec3d  # m/s, body
+    w: vec3d  # rad/s, body
+    seen_tick: wp.int32  # when it was last in view
+    report: Report  # its last one, at which it stands
+    distrusted: wp.int32
+    agreement_time: wp.float64  # s for which a distrusted sender has agreed
+
+
+@wp.struct
+class Belief:
+    """What a vehicle believes, but for the members' poses and covariance."""
+
+    odometry: Pose  # by dead reckoning, in a frame of its own
+    members: wp.int32  # how many
+    depends_on: wp.uint64  # bits of vehicles
+    missed_share: wp.float64  # mean share of bearings that do not fit
+    healthy_time: wp.float64  # s for which it has been low
+
+
+@wp.struct
+class Anchor:
+    """Where a vehicle was when its bearings last fitted, or at the start."""
+
+    R: mat33d
+    p: vec3d
+    P: mat66d
+    odometry: Pose  # then
+    tick: wp.int32
+
+
+@wp.struct
+class Search:
+    """A search for the pose."""
+
+    active: wp.int32
+    prior: Estimate  # carried on by odometry
+    hypotheses: wp.int32  # how many
+    followed_time: wp.float64  # s for which hypotheses have been followed
+    waited_time: wp.float64  # s for which there were none
+    clear_time: wp.float64  # s for which the last frames' solutions have been well determined
+    attempts: wp.int32
+
+
+@wp.struct
+class Hypothesis:
+    """A pose that may be the vehicle's."""
+
+    R: mat33d
+    p: vec3d
+    P: mat66d
+    cost: wp.float64  # sum of normalised innovations squared, each limited
+    prior_distance: wp.float64  # squared, in standard deviations
+    bearings: wp.int32  # in the cost
+
+
+@wp.struct
+class Line:
+    """A bearing of the frame as a measurement; scratch, see measurements.py."""
+
+    member: wp.int32  # that it is to; 0: to a point in the map; `NOTHING`: not used
+    bearing: vec3d  # body frame
+    point: vec3d  # m, in the member's body or in the map
+    variance: wp.float64  # m^2, of the point per axis
+    fits: wp.int32
+    jacobian: mat26d  # H of the vehicle's own error
+    member_jacobian: mat26d  # H of the member's error
+    noise: wp.float64  # rad^2 per axis
+    distance: wp.float64  # m
+    residual: vec2d  # rad
+
+
+@wp.struct
+class Scratch:
+    """What a correction needs of a member."""
+
+    column: mat66d  # a block of the covariance
+    PHt: mat62d
+    correction: vec6d
+    last_correction: vec6d  # where the lines were linearised
+    R: mat33d  # before the correction
+    p: vec3d
+
+
+@wp.struct
+class RobustMemory:
+    """K members of a belief (the vehicle itself first), H hypotheses; other axes as in `coopenv.world.state`."""
+
+    belief: array("WN", Belief)
+    member: array("WNK", Member)
+    P: array("WNKK", mat66d)  # blocks of the members' joint covariance
+    anchor: array("WN", Anchor)
+    search: array("WN", Search)
+    hypothesis: array("WNH", Hypothesis)
+    outbox: array("WNS", Report)
+    inbox: array("WNN", Report)  # per receiver and sender
+    line: array("WA", Line)
+    scratch: array("WK", Scratch)
+    scratch_blocks: array("WKK", mat66d)  # before the correction
+
+
+SIZES = {"K": MAX_MEMBERS, "H": MAX_HYPOTHESES + 2}
+"""Besides the hypotheses of one frame there are the prior and a spare one to swap by."""
