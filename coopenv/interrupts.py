@@ -16,6 +16,8 @@ from typing import NoReturn
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 PATIENCE = 1.0
 """s that a command has to end by itself. One that is within a long call of a library, such as a compiler, cannot."""
+REMINDERS = 10
+"""Signals that are sent again to the main thread meanwhile."""
 HIDDEN_CURSOR_BACK = "\x1b[?25h"
 
 _received = 0
@@ -117,8 +119,12 @@ def _watch(signals: socket.socket) -> None:
     number = 0
     while number not in SIGNALS:
         number = signals.recv(1)[0]
-    if _ended.wait(PATIENCE):
-        time.sleep(PATIENCE / 2)  # for what libraries do at the end
+    for _ in range(REMINDERS):
+        if _ended.wait(PATIENCE / REMINDERS):
+            time.sleep(PATIENCE / 2)  # for what libraries do at the end
+            break
+        if hasattr(signal, "pthread_kill"):  # a thread that was about to wait for a lock has slept through the first
+            signal.pthread_kill(threading.main_thread().ident or 0, number)
     else:
         for step in _last_steps:
             step()
