@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,6 +30,15 @@ def test_blocks_are_whole_programs(page: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "ruff", "check", "--isolated", "--select=E9,F", "--no-cache", str(tmp_path)]
     result = subprocess.run(command, capture_output=True, text=True)
     assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_the_backend_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    (block,) = python_blocks(DOCS / "backends.md")
+    program: dict[str, Any] = {}
+    exec(compile(block, "backends.md", "exec"), program)
+    assert "missing=24" in capsys.readouterr().out
+    estimates = [info["estimate"]["position"] for info in program["infos"].values()]
+    assert np.abs(estimates - program["env"].engine.backend.places).max() < 0.05
 
 
 def test_the_tutorials_observer_runs() -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,10 @@ from coopenv.api.terms.kernels import Plan, endings_kernel, results_kernel
 from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.base import Backend
 from coopenv.backends.simulated import Simulated
+from coopenv.backends.tick_world import open_world
 from coopenv.errors import check_memory
 from coopenv.scenario import Scenario
+from coopenv.user_code import one_line
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
 from coopenv.world.precision import device_memory
@@ -51,11 +54,10 @@ class Engine:
             threads: shares of the batch on the CPU.
             backend: where ticks come from (None: computed).
         """
-        backend = backend or Simulated(scenario)
-        self.world = backend.world(worlds, dtype, device, threads)
-        name = scenario.observer.name
-        hosted = self.world.observer is HOST
-        self.plugins = PlugIns(name, self.world, backend.senses(self.world)) if hosted else None
+        self.backend: Backend = backend or Simulated(scenario)
+        self.world = open_world(self.backend, worlds, dtype, device, threads)
+        on_host = self.world.observer is HOST
+        self.plugins = PlugIns(scenario.observer.name, self.world) if on_host else None
         """The observers that run on the host; None where the embedded one estimates."""
         self.layout = observation_layout(scenario)
         worlds, device = self.world.worlds, self.world.device
@@ -80,9 +82,14 @@ class Engine:
         self._state_fields = set(state_fields(self.world.precision))
         self._views: dict[str, np.ndarray] = {}
 
-    def reset(self, seeds: Sequence[int] | np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
+    def reset(
+        self,
+        seeds: Sequence[int] | np.ndarray | None = None,
+        mask: np.ndarray | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
         """Start new episodes, see `World.reset`; the results of the other worlds stay."""
-        self.world.reset(seeds, mask)
+        self.world.reset(seeds, mask, options)
         chosen = np.ones(self.world.worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
         self._start_plugins(chosen)
         self._fresh.assign(chosen.astype(np.int32))
@@ -170,6 +177,20 @@ class Engine:
         if name == "actions":
             return self.world.actions
         return getattr(self.world.state if name in self._state_fields else self.results, name)
+
+    @contextmanager
+    def stopping(self) -> Iterator[None]:
+        """Stop the backend's vehicles when something goes wrong meanwhile."""
+        try:
+            yield
+        except BaseException as error:
+            self.backend.stop(one_line(error))
+            raise
+
+    def close(self) -> None:
+        """Stop and close the backend, and end the threads."""
+        self.backend.close()
+        self.world.launch.close()
 
     def get_state(self) -> dict[str, Any]:
         """Return a copy of everything that the next step depends on.

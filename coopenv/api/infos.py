@@ -45,6 +45,7 @@ class InfoWriter:
         vehicle_seen, target_seen = np.nonzero(view("sight")[0] == Sight.VISIBLE)
         for i, target in zip(vehicle_seen.tolist(), target_seen.tolist(), strict=True):
             seen[i].append(self._targets[target])
+        late, missing = self._engine.world.late.tolist(), self._engine.world.missing.tolist()
         time = int(view("tick")[0]) * self._tick_length
         infos = {}
         for agent in agents:
@@ -66,5 +67,7 @@ class InfoWriter:
                 "reward_terms": dict(zip(self._engine.reward_terms, terms[i], strict=True)),
                 "time": time,
                 "outcome": self._outcomes[ended[i]],
+                "late_ticks": late[i],
+                "missing_ticks": missing[i],
             }
         return infos

@@ -16,7 +16,7 @@ from coopenv.api.engine import Engine
 from coopenv.api.infos import InfoWriter
 from coopenv.api.state import state_space, state_vector
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
-from coopenv.backends.base import Backend
+from coopenv.backends.base import Backend, Health
 from coopenv.backends.simulated import Simulated
 from coopenv.backends.sources import open_backend
 from coopenv.errors import CoopenvError, ScenarioError, checked_seed, shown, suggest
@@ -44,12 +44,14 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
 
     Reward: the weighted sum of the named terms in `info["reward_terms"]`.
 
-    `terminated` on collision or arrival, `truncated` at the horizon. A vehicle that has ended leaves `agents` and goes
-    on observing and sending, so that its followers keep their neighbour; a driven one parks where it is, a prescribed
-    motion goes on.
+    `terminated` on collision or arrival, `truncated` at the horizon, or where the backend has no more ticks. A vehicle
+    that has ended leaves `agents` and goes on observing and sending, so that its followers keep their neighbour; a
+    driven one parks where it is, a prescribed motion goes on.
 
     Info: `truth`, `estimate`, `position_error` (m), `orientation_error` (deg), `visible` (target names), `nees`,
-    `log_determinant`, `gramian_min_eigenvalue`, `reward_terms`, `time` (s), `outcome`.
+    `log_determinant`, `gramian_min_eigenvalue`, `reward_terms`, `time` (s), `outcome`, and of the camera ticks of this
+    step `late_ticks`, which came late, and `missing_ticks`, in which nothing came from the vehicle: it has gone on with
+    its last odometry. Truth that the backend does not know is NaN, and so is what follows from it.
     """
 
     def __init__(
@@ -115,11 +117,12 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
 
         Args:
             seed: fixes the episode; None goes on with a new episode of the last seed (a random one at first).
-            options: not used.
+            options: for a backend that takes any; the others need none.
         """
         if seed is None and not self._seeded:
             _, seed = seeding.np_random(None)
-        self.engine.reset(None if seed is None else [checked_seed(seed)])
+        with self.engine.stopping():
+            self.engine.reset(None if seed is None else [checked_seed(seed)], options=options)
         self._seeded = True
         self.agents = list(self.possible_agents)
         if self.render_mode == "human":
@@ -140,7 +143,8 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         alive = self.agents
         if not alive:
             return {}, {}, {}, {}, {}
-        self.engine.step(self._read_actions(actions, alive))
+        with self.engine.stopping():
+            self.engine.step(self._read_actions(actions, alive))
         indices = [self._index[agent] for agent in alive]
         reward = self.engine.view("reward")[0].tolist()
         terminated = self.engine.view("terminated")[0].tolist()
@@ -166,6 +170,11 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             agent: {name: rows[self._index[agent], field.slice] for name, field in layout.items()} for agent in agents
         }
 
+    @property
+    def health(self) -> Health:
+        """What has come from the backend so far, and what not."""
+        return self.engine.backend.health
+
     def state(self) -> np.ndarray:
         """Return the truth and the estimates of all vehicles as one vector, see `coopenv.api.state`."""
         return state_vector(self.engine)
@@ -185,7 +194,8 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         return picture
 
     def close(self) -> None:
-        """Close the window, if any."""
+        """Stop the backend's vehicles, let go of it, and close the window, if any."""
+        self.engine.close()
         if self._view is not None:
             self._view.close()
             self._view = None
@@ -239,7 +249,7 @@ def parallel_env(
     *,
     render_mode: str | None = None,
     observer: str | Factory | None = None,
-    backend: str | None = None,
+    backend: str | Backend | None = None,
     observation: Literal["flat", "dict"] = "flat",
     device: str = "cpu",
     dtype: str = "float32",
@@ -252,11 +262,13 @@ def parallel_env(
     A recording goes by as it was, whatever the actions; see docs/replay.md.
 
     Args:
-        name_or_path: for example "busy_intersection"; "mrclam_6" or "drive.mcap" replay what was recorded.
+        name_or_path: for example "busy_intersection"; "mrclam_6" or "drive.mcap" replay what was recorded. Where
+            `backend` is an object, any name for the environment.
         render_mode: None, "rgb_array" or "human".
         observer: estimator that every vehicle runs, embedded or a plug-in: a name, a class, or where one stands
             (`mine.py:Mine`, `package.module:Mine`); None: as the scenario says.
-        backend: where measurements come from, "simulated" or "replay"; None: as the name says.
+        backend: where measurements come from, "simulated" or "replay", or a `coopenv.backends.base.Backend`, which
+            has its own scenario; None: as the name says.
         observation: "flat" Box or one-level "dict".
         device: "cpu" or a CUDA device.
         dtype: "float32" or "float64" (of the world; observations are float32).

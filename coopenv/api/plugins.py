@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.backends.base import Senses
+from coopenv.backends.base import SensingWorld
 from coopenv.errors import CoopenvError
 from coopenv.observers.contract import Estimate
 from coopenv.observers.group import Group, ObserverError
 from coopenv.observers.recording import Sensed
 from coopenv.observers.registry import find
 from coopenv.observers.riccati_coordinates import riccati_covariance
-from coopenv.world.world import World
 
 
 class PlugIns:
@@ -25,7 +24,7 @@ class PlugIns:
     as from the embedded observer's. Where an observer states no covariance, the scenario's P(0) stands.
     """
 
-    def __init__(self, name: str, world: World, senses: Senses) -> None:
+    def __init__(self, name: str, world: SensingWorld) -> None:
         """Find the observer.
 
         Raises:
@@ -34,8 +33,8 @@ class PlugIns:
         factory = find(name)
         if world.device != "cpu":
             raise CoopenvError(f"observer '{name}' runs on the host; use device='cpu' instead of '{world.device}'")
-        self.name, self._world, self._senses = name, world, senses
-        briefing = senses.briefing
+        self.name, self._world = name, world
+        briefing = world.briefing
         self.groups = [Group(factory, briefing) for _ in range(world.worlds)]
         self._order: Sequence[int] = briefing.order
         self._active = wp.zeros(world.worlds, dtype=wp.int32, device=world.device)
@@ -66,7 +65,7 @@ class PlugIns:
         self._world.decide()
         for _ in range(ticks):
             active = (self._world.mask.numpy() == 0) & (self._world.view("tick") < self._world.model.horizon_ticks)
-            if not active.any():
+            if not active.any() or not self._world.fetch():
                 return
             self._tick(active)
 
@@ -77,7 +76,7 @@ class PlugIns:
                 raise CoopenvError(f"{self._failures[w]} (reset starts anew)")
         self._active.numpy()[...] = active
         world.sense(self._active)
-        sensed = {w: self._senses.read(w, int(world.view("tick")[w]) + 1) for w in worlds}
+        sensed = {w: world.sensed(w, int(world.view("tick")[w]) + 1) for w in worlds}
         joint = self.groups[0].joint
         if joint:
             for w in worlds:

@@ -97,8 +97,8 @@ def assess(model: Any, state: Any, results: Any, world: int, vehicle: int):
 
 @wp.func
 def is_over(model: Any, state: Any, world: int) -> bool:
-    """Return whether a world is at its horizon or has no vehicle under way."""
-    if state.tick[world] >= model.horizon_ticks:
+    """Return whether a world is at its horizon, without further ticks, or has no vehicle under way."""
+    if state.tick[world] >= model.horizon_ticks or state.exhausted[world] != 0:
         return True
     for vehicle in range(model.vehicles):
         if state.ended[world, vehicle] == UNDER_WAY:

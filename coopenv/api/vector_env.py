@@ -17,9 +17,9 @@ from gymnasium.vector.utils import batch_space
 from coopenv.api.array_io import ArrayKind, Exchange
 from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import Layout, action_space, flat_space
-from coopenv.backends.replay.source import is_recorded
+from coopenv.backends.sources import open_simulation
 from coopenv.errors import CoopenvError, checked_seed, suggest
-from coopenv.scenario import Scenario, load_scenario
+from coopenv.scenario import Scenario
 
 INFO_FIELDS = ("alive", "ended", "position_error", "orientation_error", "nees")
 """Arrays (num_envs,) in every info: `alive` is false for a vehicle that had ended before this step; `ended` is 0 under
@@ -252,7 +252,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     def close_extras(self, **kwargs: Any) -> None:
         """Close the renderer and end the threads."""
         if hasattr(self, "engine"):
-            self.engine.world.launch.close()
+            self.engine.close()
         if self._view is not None:
             self._view.close()
             self._view = None
@@ -301,10 +301,8 @@ def make_vec(
     Raises:
         CoopenvError: any argument is not valid.
     """
-    if is_recorded(name_or_path):
-        raise CoopenvError(f"'{name_or_path}' is recorded, which is one world: replay it with parallel_env")
     return CooperativeVectorEnv(
-        load_scenario(name_or_path, overrides),
+        open_simulation(name_or_path, overrides),
         Path(str(name_or_path)).stem,
         num_worlds=num_worlds,
         device=device,
@@ -329,7 +327,7 @@ def make_rows(
     """
     if "num_worlds" in options:
         raise CoopenvError("give num_envs, which counts rows (world, vehicle), instead of num_worlds")
-    vehicles = len(load_scenario(name_or_path, options.get("overrides")).vehicles)
+    vehicles = len(open_simulation(name_or_path, options.get("overrides")).vehicles)
     if not isinstance(num_envs, int | np.integer) or num_envs < 1 or num_envs % vehicles:
         raise CoopenvError(
             f"num_envs counts rows (world, vehicle): {num_envs} is not a positive multiple of the {vehicles} vehicles "

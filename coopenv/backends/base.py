@@ -1,37 +1,155 @@
-"""What every source of ticks offers; the interfaces of an environment know no more of it."""
+"""What a source of ticks is: the contract of every backend, simulated, recorded or on real vehicles.
+
+Time goes in ticks, the frames of the scenario's camera rate; between two decisions there are
+`scenario.ticks_per_decision` of them. A backend gives every tick, index after index: where nothing came in time from a
+vehicle it is marked `missing`, what came after its deadline `late`, and a frame in which nothing was detected simply
+has nothing visible (`Sensed`). A backend never waits longer than its deadlines; it ends by giving fewer ticks.
+"""
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+
+from coopenv.estimation.arrays import Array
 from coopenv.observers.recording import Briefing, Sensed
 from coopenv.scenario import Scenario
+from coopenv.world.command import ACCELERATION, SPEED, STEERING
 from coopenv.world.world import World
 
 
-class Senses(Protocol):
-    """Where the ticks of plug-in observers are read from."""
+@dataclass(frozen=True)
+class Command:
+    """What N vehicles are to do until the next decision, see `coopenv.world.command`; one that has ended is to stand.
+
+    Vehicles with prescribed motion are not driven, whatever their rows say.
+    """
+
+    speed: Array  # (N,) m/s, to reach
+    steering: Array  # (N,) rad, positive to the left
+    acceleration: Array  # (N,) m/s^2, at most, on the way to the speed
+
+    @classmethod
+    def of(cls, rows: Array) -> Command:
+        """Return the command whose entries stand in the columns of (N, 3), as in the state of a world."""
+        values = np.array(rows, dtype=np.float64)
+        return cls(values[:, int(SPEED)], values[:, int(STEERING)], values[:, int(ACCELERATION)])
 
     @property
-    def briefing(self) -> Briefing:
-        """What the observers are told before the first tick."""
-        ...
-
-    def read(self, world: int, k: int) -> Sensed:
-        """Return what the vehicles of one world sense at the present tick k."""
-        ...
+    def rows(self) -> Array:
+        """(N, 3) as in the state of a world."""
+        return np.stack([self.speed, self.steering, self.acceleration], axis=-1)
 
 
+@dataclass(frozen=True)
+class Capabilities:
+    """What a backend can do."""
+
+    truth: bool
+    """Whether poses are known; where not, errors are NaN and privileged rewards 0."""
+    driven: bool
+    """Whether commands have an effect."""
+    real_time: bool
+    """Whether its clock is real time, so that every decision has a deadline."""
+    ticks: int | None
+    """How many there are, the start included; None: no end of its own."""
+    batched: bool
+    """Whether it makes worlds on a device itself (`WorldBackend`)."""
+
+
+@dataclass
+class Health:
+    """What has come since the backend was built; `late`, `missing` and `empty` count vehicles' rows."""
+
+    ticks: int = 0
+    late: int = 0
+    missing: int = 0
+    empty: int = 0
+    received: int = 0
+    """Messages from vehicles or sensors, of any kind."""
+    rejected: int = 0
+    """Those of them that were refused."""
+
+    def count(self, tick: Sensed) -> None:
+        """Count one tick."""
+        missing = np.zeros(len(tick.visible), bool) if tick.missing is None else np.asarray(tick.missing, bool)
+        self.ticks += 1
+        self.received += len(tick.messages)
+        self.late += 0 if tick.late is None else int(np.sum(tick.late))
+        self.missing += int(missing.sum())
+        self.empty += int((~np.any(tick.visible, axis=-1) & ~missing).sum())
+
+
+@runtime_checkable
 class Backend(Protocol):
-    """Where measurements come from: computed, or replayed."""
+    """A source of ticks of one world."""
 
     scenario: Scenario
     """Who is there, how they sense, talk and estimate."""
+    capabilities: Capabilities
+    health: Health
 
-    def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> World:
-        """Return the world whose state the ticks fill; arguments as for `World`."""
+    @property
+    def clock(self) -> float:
+        """Time since the reset in s, simulated or real."""
         ...
 
-    def senses(self, world: World) -> Senses:
-        """Return the reader of that world's ticks for observers on the host."""
+    def reset(self, seed: int | None, options: Mapping[str, Any]) -> Sensed:
+        """Begin an episode and return tick 0.
+
+        Args:
+            seed: fixes the episode where anything is drawn; None: the next one.
+            options: as given to the environment's `reset`.
+
+        Raises:
+            CoopenvError: it cannot begin.
+        """
+        ...
+
+    def advance(self, command: Command) -> Iterable[Sensed]:
+        """Drive until the next decision and return its ticks, each as soon as it is there; fewer at the end."""
+        ...
+
+    def stop(self, reason: str) -> None:
+        """Bring the vehicles to a stand at once and end the episode; may be called at any time, and again."""
+        ...
+
+    def close(self) -> None:
+        """Stop, and let go of everything; may be called again."""
+        ...
+
+
+class SensingWorld(World):
+    """A world that tells observers on the host what its vehicles sense."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        """Build the arrays; arguments and errors as for `World`."""
+        super().__init__(*arguments, **options)
+        self.late = np.zeros(self.model.vehicles, dtype=np.int64)
+        """(N,) ticks of the decision under way whose row came late."""
+        self.missing = np.zeros(self.model.vehicles, dtype=np.int64)
+        """(N,) ticks of it of which nothing came."""
+
+    @property
+    def briefing(self) -> Briefing:
+        """What observers are told before the first tick."""
+        raise NotImplementedError
+
+    def sensed(self, world: int, k: int) -> Sensed:
+        """Return what the vehicles of one world sense at the present tick k, without truth and messages."""
+        raise NotImplementedError
+
+    def fetch(self) -> bool:
+        """Make the next tick ready for `sense`; return False where the source has no more."""
+        return True
+
+
+class WorldBackend(Backend, Protocol):
+    """A backend whose ticks come about on the device, in any number of worlds."""
+
+    def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> SensingWorld:
+        """Return worlds that step by themselves; arguments as for `World`."""
         ...

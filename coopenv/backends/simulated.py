@@ -2,55 +2,82 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
+import warp as wp
 
+from coopenv.backends.base import Capabilities, SensingWorld
+from coopenv.backends.generator import Episode, TickGenerator
 from coopenv.estimation.trajectory import Sight
 from coopenv.observers.briefing import briefing_of, start_covariances
-from coopenv.observers.recording import Briefing, Sensed
+from coopenv.observers.recording import Briefing, Sensed, Truth, is_due
 from coopenv.observers.registry import find_embedded
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST
-from coopenv.world.world import World
 
 
-class Simulated:
-    """Worlds that are computed."""
+class Simulated(TickGenerator):
+    """Worlds that are computed: many at once on a device, or one of them tick by tick."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self.scenario = scenario
+        """Simulate a scenario."""
+        super().__init__(
+            scenario,
+            Capabilities(
+                truth=True, driven=scenario.driven, real_time=False, ticks=scenario.horizon_ticks + 1, batched=True
+            ),
+        )
+        self._world: SimulatedWorld | None = None
 
-    def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> World:
-        """Return the world."""
+    def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> SimulatedWorld:
+        """Return the worlds, with the observer that the scenario names."""
         observer = find_embedded(self.scenario.observer.name) or HOST
-        return World(self.scenario, worlds, dtype, device, threads, observer, start_covariances(self.scenario))
+        start = start_covariances(self.scenario)
+        return SimulatedWorld(self.scenario, worlds, dtype, device, threads, observer, start)
 
-    def senses(self, world: World) -> SimulatedSenses:
-        """Return the reader of its ticks."""
-        return SimulatedSenses(self.scenario, world)
+    def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
+        """Simulate one world in float64, without an observer: the radio decides on messages, whatever they say."""
+        if self._world is None:
+            self._world = SimulatedWorld(self.scenario, 1, "float64", threads=1)
+        world = self._world
+        world.reset(None if seed is None else [seed])
+        active = wp.ones(1, dtype=wp.int32, device=world.device)
+        command = yield world.told(0)
+        for k in range(1, self.scenario.horizon_ticks + 1):
+            world.view("command")[0] = command.rows
+            world.sense(active)
+            for vehicle in world.briefing.order:
+                world.deliver(active, vehicle)
+                world.broadcast(active, vehicle)
+            world.finish(active)
+            command = yield world.told(k)
 
 
-class SimulatedSenses:
-    """Reads what vehicles sense from a world's state: copies in float64, bearings in the body frame."""
+class SimulatedWorld(SensingWorld):
+    """A world that reads what vehicles sense from its state: copies in float64, bearings in the body frame."""
 
-    def __init__(self, scenario: Scenario, world: World) -> None:
-        self._world = world
-        self._dt = 1.0 / scenario.rates.camera
-        self._ratio = world.model.observer.rate / scenario.rates.camera
-        self._camera = np.array(world.model.camera.rotation, dtype=float).reshape(3, 3)
-        self._markers = np.array([landmark.marker for landmark in scenario.landmarks], float).reshape(-1, 3, 1)
-        self._scenario = scenario
-        self._single = world.precision.numpy is np.float32
-
-    @property
+    @cached_property
     def briefing(self) -> Briefing:
-        """What the observers are told before the first tick."""
-        return briefing_of(self._scenario, self._world.model)
+        """What observers are told before the first tick."""
+        return briefing_of(self.scenario, self.model)
 
-    def read(self, world: int, k: int) -> Sensed:
+    @cached_property
+    def _camera(self) -> np.ndarray:
+        """(3, 3) camera to body."""
+        return np.array(self.model.camera.rotation, dtype=float).reshape(3, 3)
+
+    @cached_property
+    def _markers(self) -> np.ndarray:
+        """(L, 3, 1) of the landmarks, m."""
+        return np.array([landmark.marker for landmark in self.scenario.landmarks], float).reshape(-1, 3, 1)
+
+    def sensed(self, world: int, k: int) -> Sensed:
         """Return what the vehicles of one world sense now, at tick k."""
-        L = len(self._markers)
+        L, rates = len(self._markers), self.scenario.rates
         visible = self._copy("sight", world) == Sight.VISIBLE
         bearings = np.where(visible[..., None], self._pointed("bearing", world) @ self._camera.T, np.nan)
         R, position = self._copy("rotation", world)[:L], self._copy("position", world)[:L]
@@ -65,22 +92,34 @@ class SimulatedSenses:
         }
         for values in arrays.values():
             values.setflags(write=False)
-        due = math.floor(k * self._ratio + 1e-9) > math.floor(max(k - 1, 0) * self._ratio + 1e-9)
-        return Sensed(index=k, dt=self._dt, due=due, **arrays)
+        due = bool(is_due(k, self.model.observer.rate / rates.camera))
+        return Sensed(index=k, dt=1.0 / rates.camera, due=due, **arrays)
+
+    def told(self, k: int) -> Sensed:
+        """Return all that a source of ticks tells of the first world, truth and messages included."""
+        L = len(self._markers)
+        taken = self._copy("odometry_samples", 0)
+        now = k / self.scenario.rates.camera
+        return replace(
+            self.sensed(0, k),
+            odometry_age=np.where(taken > 0, now - (taken - 1) / self.scenario.rates.odometry, np.inf),
+            truth=Truth(self._copy("rotation", 0)[L:], self._copy("position", 0)[L:]),
+            inbox_tick=self.view("inbox_tick")[0].astype(np.int64),
+        )
 
     def _turned(self, name: str, world: int) -> np.ndarray:
         """Return rotations that are so in float64 too: over thousands of ticks float32's rounding would add up."""
         R = self._copy(name, world)
-        if self._single:
+        if self.precision.numpy is np.float32:
             R = R @ (1.5 * np.eye(3) - 0.5 * np.swapaxes(R, -1, -2) @ R)  # a Newton step towards the nearest rotation
         return R
 
     def _pointed(self, name: str, world: int) -> np.ndarray:
         """Return unit vectors that are so in float64 too; zero where nothing has been measured."""
         b = self._copy(name, world)
-        if self._single:
+        if self.precision.numpy is np.float32:
             b /= np.maximum(np.linalg.norm(b, axis=-1, keepdims=True), 0.5)
         return b
 
     def _copy(self, name: str, world: int) -> np.ndarray:
-        return np.array(self._world.view(name)[world], dtype=float)
+        return np.array(self.view(name)[world], dtype=float)

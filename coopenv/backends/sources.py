@@ -1,23 +1,92 @@
-"""Backends by name."""
+"""Sources of ticks by name: the only place that knows what a name means."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from coopenv.backends.base import Backend
-from coopenv.backends.replay import Replay, is_recorded, open_recording
+from coopenv.backends.replay import Replay
 from coopenv.backends.simulated import Simulated
-from coopenv.errors import CoopenvError, suggest
-from coopenv.scenario import load_scenario
+from coopenv.errors import CoopenvError, DataError, suggest
+from coopenv.observers.recording import Recording
+from coopenv.scenario import Scenario, load_scenario
 
 BACKENDS = ("simulated", "replay")
+PLANNED = ("svea", "highway")
+"""Backends that there will be."""
+
+LOG_SUFFIX = ".mcap"
+DATASETS = re.compile(r"mrclam_\d+")
+DEFAULT_VARIANT = "landmarks+robots"
+
+
+class Kind(Enum):
+    """What a name stands for."""
+
+    ENVIRONMENT = "an environment by name or TOML file"
+    LOG = "an MCAP file"
+    DATASET = "a sub-dataset of MR.CLAM"
+
+
+def kind_of(name: str | Path) -> Kind:
+    """Return what a name stands for, whether or not it exists."""
+    if str(name).endswith(LOG_SUFFIX):
+        return Kind.LOG
+    return Kind.DATASET if DATASETS.fullmatch(str(name)) else Kind.ENVIRONMENT
+
+
+def is_recorded(name: str | Path) -> bool:
+    """Return whether a name is that of a recording and not of an environment."""
+    return kind_of(name) is not Kind.ENVIRONMENT
+
+
+def open_recording(name: str | Path, data: str | Path | None = None, variant: str | None = None) -> Recording:
+    """Read a recording.
+
+    Args:
+        name: path of an MCAP file, or `mrclam_1` .. `mrclam_9`.
+        data: folder of the data sets (None: what COOPENV_DATA says).
+        variant: of a data set: "landmarks", "landmarks+robots" (as recorded, the default) or "blind".
+
+    Raises:
+        CoopenvError: no such recording or variant, or the file is not what it should be.
+    """
+    kind = kind_of(name)
+    if kind is Kind.LOG:
+        if variant is not None:
+            raise DataError(f"{name}: a file has no variants, got variant '{variant}'")
+        from coopenv.backends.mcap import read_recording
+
+        return read_recording(name)
+    if kind is not Kind.DATASET:
+        raise DataError(f"'{name}' is no recording; known: FILE{LOG_SUFFIX}, mrclam_1 .. mrclam_9")
+    from coopenv.backends.mrclam import load_dataset
+    from coopenv.backends.mrclam.recording import recording_of
+    from coopenv.backends.mrclam.variants import Variant, check_variant
+
+    chosen = variant or DEFAULT_VARIANT
+    check_variant(chosen)
+    return recording_of(load_dataset(str(name), data), cast(Variant, chosen))
+
+
+def open_simulation(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scenario:
+    """Return the scenario of an environment that is to be simulated in many worlds.
+
+    Raises:
+        CoopenvError: there is none of that name, or it is recorded, or an override is not valid.
+    """
+    if is_recorded(name_or_path):
+        raise CoopenvError(f"'{name_or_path}' is recorded, which is one world: replay it with parallel_env")
+    return load_scenario(name_or_path, overrides)
 
 
 def open_backend(
     name_or_path: str | Path,
-    backend: str | None,
+    backend: str | Backend | None,
     overrides: Mapping[str, Any],
     data: str | Path | None = None,
     variant: str | None = None,
@@ -26,7 +95,7 @@ def open_backend(
 
     Args:
         name_or_path: environment, TOML file, MCAP file or data set.
-        backend: one of `BACKENDS`; None: as the name says.
+        backend: one of `BACKENDS`; None: as the name says; a backend itself is returned as it is.
         overrides: dotted scenario keys.
         data: folder of the data sets.
         variant: of a data set.
@@ -35,12 +104,23 @@ def open_backend(
         CoopenvError: any of it does not exist or does not fit.
     """
     if backend is not None and backend not in BACKENDS:
-        raise CoopenvError(
-            f"unknown backend '{backend}'{suggest(str(backend), BACKENDS)}; known: {', '.join(BACKENDS)}"
-        )
+        return _given(backend, {**overrides, "data": data, "variant": variant})
     if backend == "replay" or (backend is None and is_recorded(name_or_path)):
         return Replay(open_recording(name_or_path, data, variant), Path(name_or_path).name, overrides)
     for what, value in (("data", data), ("variant", variant)):
         if value is not None:
             raise CoopenvError(f"{what} is for recorded data, '{name_or_path}' is simulated")
     return Simulated(load_scenario(name_or_path, overrides))
+
+
+def _given(backend: object, choices: Mapping[str, Any]) -> Backend:
+    """Return a backend that is given as an object, with nothing else to choose."""
+    if isinstance(backend, Backend):
+        for key, value in choices.items():
+            if value is not None:
+                raise CoopenvError(f"{key}: {type(backend).__name__} has its scenario already, choose it there")
+        return backend
+    known = f"known: {', '.join(BACKENDS)}"
+    if backend in PLANNED:
+        raise CoopenvError(f"backend '{backend}' is planned, but not there yet; {known}")
+    raise CoopenvError(f"unknown backend '{backend}'{suggest(str(backend), BACKENDS)}; {known}")

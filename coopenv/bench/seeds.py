@@ -11,6 +11,7 @@ from rich.table import Table
 
 from coopenv.api.engine import Engine
 from coopenv.estimation.metrics import SETTLED, settling_time
+from coopenv.runs.episode import Views, play
 from coopenv.runs.table import number_table
 from coopenv.scenario import Scenario
 
@@ -72,17 +73,13 @@ def study_seeds(
         dtype: precision.
         on_progress: called with the share of the ticks done.
     """
-    engine = Engine(scenario, len(seeds), dtype)
-    engine.reset(list(seeds))
-    ticks = scenario.horizon_ticks
-    position = np.empty((ticks + 1, len(seeds), len(scenario.vehicles)))
-    orientation = np.empty_like(position)
-    for tick in range(ticks + 1):
-        if tick > 0:
-            engine.step(ticks=1)
-        position[tick], orientation[tick] = engine.view("position_error"), engine.view("orientation_error")
+    engine, ticks = Engine(scenario, len(seeds), dtype), scenario.horizon_ticks
+    views = Views(engine, ("position_error", "orientation_error"))
+    for tick in play(engine, seeds, ticks):
+        views.take()
         if tick % 100 == 0:
             on_progress(tick / ticks)
+    position, orientation = views["position_error"], views["orientation_error"]
     t = np.arange(ticks + 1) / scenario.rates.camera
     steady = t > steady_from
     return SeedStudy(

@@ -86,7 +86,7 @@ def refuse_for_recordings(environment: str, seed: int, policy: str) -> None:
     Raises:
         CoopenvError: one was given for a recording.
     """
-    from coopenv.backends.replay import is_recorded
+    from coopenv.backends.sources import is_recorded
 
     for option, value in (("--seed", seed), ("--policy", policy)):
         if is_recorded(environment) and value not in (0, "zero"):
@@ -108,7 +108,7 @@ def record_command(
     The file holds every tick; Foxglove opens it and coopenv replays it.
     """
     from coopenv.backends.mcap import check_target, write_recording
-    from coopenv.backends.replay import is_recorded, open_recording
+    from coopenv.backends.sources import is_recorded, open_recording
     from coopenv.runs.recorder import record
 
     check_target(out)

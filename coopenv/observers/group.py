@@ -104,7 +104,7 @@ class Group:
         k = sensed.index
         try:
             observer = self.observers[vehicle]
-            tick = sensed.tick(self.briefing.setups[vehicle], self.mail.inbox(k, vehicle, inbox_tick))
+            tick = sensed.tick(self.briefing.setups[vehicle], self.mail.inbox(k, vehicle, inbox_tick, sensed.messages))
             begin = perf_counter()
             estimate = observer.update(tick)
             message = observer.message() if self.mail.due(k) else None

@@ -16,12 +16,11 @@ from coopenv.world.precision import Precision
 from coopenv.world.records import repeated
 
 
-def views_of(record: Any, declared: Mapping[str, Any]) -> SimpleNamespace:
-    """Return a vehicle's part of a record's arrays, which it shares."""
+def views_of(record: Any, declared: Mapping[str, Any], vehicle: int = 0) -> SimpleNamespace:
+    """Return a vehicle's part of a record's arrays, which it shares; of the first world."""
     arrays = {name: getattr(record, name).numpy() for name in declared}
-    return SimpleNamespace(
-        **{name: array[(0, 0, ...) if declared[name].axes[1:2] == "N" else (0, ...)] for name, array in arrays.items()}
-    )
+    rows = {name: (0, vehicle, ...) if declared[name].axes[1:2] == "N" else (0, ...) for name in arrays}
+    return SimpleNamespace(**{name: array[rows[name]] for name, array in arrays.items()})
 
 
 def model_of(setup: Setup, p: Precision) -> Any:

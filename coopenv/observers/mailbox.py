@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from operator import index
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -45,20 +47,29 @@ class Mailbox:
         """Count the bytes of a message."""
         self.bytes[vehicle] += message.size_bytes
 
-    def inbox(self, k: int, vehicle: int, inbox_tick: ArrayLike) -> dict[int, Received]:
+    def inbox(
+        self,
+        k: int,
+        vehicle: int,
+        inbox_tick: ArrayLike,
+        arrived: Mapping[tuple[int, int], Received] = MappingProxyType({}),
+    ) -> dict[int, Received]:
         """Return what a vehicle has heard by tick k, by target, without what is stale.
 
         Args:
             k: now.
             vehicle: the receiver.
             inbox_tick: (N,) tick of sending of the last message that the radio delivered of each sender; -1: none.
+            arrived: what came at this tick from vehicles that are estimated elsewhere, see `Sensed.messages`.
         """
         b, landmarks, heard = self.briefing, self.briefing.setups[vehicle].landmarks, self.heard[vehicle]
         ticks, received = np.asarray(inbox_tick).tolist(), {}
         for target in self._senders[vehicle]:
             sender = target - landmarks
             sent = ticks[sender]
-            if sent in self.sent[sender]:
+            if (vehicle, sender) in arrived:
+                heard[sender] = (sent, _copied(arrived[vehicle, sender].message))
+            elif sent in self.sent[sender] and (sender not in heard or heard[sender][0] != sent):
                 heard[sender] = (sent, self.sent[sender][sent])
             age = (k - sent) * b.dt
             if sent >= 0 and age <= b.staleness and sender in heard and heard[sender][0] == sent:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Received, Setup, Tick
@@ -31,26 +31,58 @@ class Briefing:
 
 
 @dataclass(frozen=True)
+class Truth:
+    """What no observer reads, of one tick or (K, ...) of several; NaN where it is not known."""
+
+    rotation: Array  # (..., N, 3, 3) body to map
+    position: Array  # (..., N, 3) map, m
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(..., N) where the whole pose is known."""
+        whole = np.concatenate([self.rotation, self.position[..., None]], axis=-1)
+        return np.asarray(np.isfinite(whole).all(axis=(-1, -2)))
+
+
+@dataclass(frozen=True)
 class Sensed:
-    """What N vehicles sense at one tick; T targets, of which the first L are landmarks. Nobody can write to it."""
+    """What N vehicles sense at one tick; T targets, of which the first L are landmarks. Nobody can write to it.
+
+    Ticks are the frames of the scenario's camera rate, one after the other: tick k is due at k / rate. What a source
+    has of a vehicle at that time is in its row; of a vehicle from which nothing came the row is not read.
+    """
 
     index: int
-    dt: float  # s
-    rotation: Array  # (N, 3, 3) odometry increments
+    dt: float  # s, between ticks
+    rotation: Array  # (N, 3, 3) odometry increments since the last tick
     translation: Array  # (N, 3) m
     velocity: Array  # (N, 3) m/s, last odometry sample
     angular_velocity: Array  # (N, 3) rad/s
     bearings: Array  # (N, T, 3) camera -> target, body frame, NaN where not measured
     visible: NDArray[np.bool_]  # (N, T)
     landmarks: Array  # (L, 3) map, m
-    due: bool  # whether the scenario's observer rate asks for a correction
+    due: bool = True  # whether the scenario's observer rate asks for a correction
+    time: float | None = None
+    """s since the reset on the source's clock; None: index * dt."""
+    odometry_age: Array | None = None  # (N,) s since the last odometry sample; None: 0
+    bearing_age: Array | None = None  # (N,) s since the frame was exposed; None: 0
+    missing: NDArray[np.bool_] | None = None
+    """(N,) of whom nothing came; None: of nobody."""
+    late: NDArray[np.bool_] | None = None
+    """(N,) whose row came after its deadline; None: nobody's."""
+    truth: Truth | None = None
+    inbox_tick: NDArray[np.int64] | None = None
+    """(N receiver, N sender) tick of sending of the last message that arrived, -1: none, where the source knows what
+    its radio delivered; None: the scenario's radio decides. What they say is up to the senders' observers."""
+    messages: Mapping[tuple[int, int], Received] = field(default_factory=dict)
+    """(receiver, sender) to a message that arrived since the last tick from a vehicle that is estimated elsewhere."""
 
     def tick(self, setup: Setup, messages: Mapping[int, Received]) -> Tick:
         """Return what one vehicle senses, with the messages that it has; nobody can write to it."""
         i = setup.vehicle
         return Tick(
             index=self.index,
-            time=self.index * self.dt,
+            time=self.index * self.dt if self.time is None else self.time,
             dt=self.dt,
             rotation=self.rotation[i],
             translation=self.translation[i],
@@ -70,22 +102,6 @@ class Sensed:
 def _sealed(view: NDArray[Any]) -> NDArray[Any]:
     view.setflags(write=False)
     return view
-
-
-@dataclass(frozen=True)
-class Truth:
-    """What no observer reads. Tick 0 is the start; NaN where it is not known."""
-
-    rotation: Array  # (K, N, 3, 3) body to map
-    position: Array  # (K, N, 3) map, m
-
-    @property
-    def known(self) -> NDArray[np.bool_]:
-        """(K, N) where the whole pose is known."""
-        result: NDArray[np.bool_] = np.isfinite(np.concatenate([self.rotation, self.position[..., None]], axis=-1)).all(
-            axis=(-1, -2)
-        )
-        return result
 
 
 @dataclass(frozen=True)
@@ -151,6 +167,8 @@ class Recording:
             visible=_sealed(self.visible[k]),
             landmarks=_sealed(self.landmarks[k]),
             due=bool(self.due[k]),
+            truth=Truth(self.truth.rotation[k], self.truth.position[k]),
+            inbox_tick=_sealed(self.inbox_tick[k]),
         )
 
     def tick(self, k: int, vehicle: int, messages: Mapping[int, Received]) -> Tick:
@@ -158,8 +176,7 @@ class Recording:
         return self.at(k).tick(self.setups[vehicle], messages)
 
 
-def due_ticks(ticks: int, ratio: float) -> NDArray[np.bool_]:
-    """Return (K,) at which ticks a correction at `ratio` times the camera's rate is due."""
-    counts = np.floor(np.arange(ticks) * ratio + 1e-9)
-    result: NDArray[np.bool_] = np.diff(counts, prepend=counts[:1]) > 0
-    return result
+def is_due(index: ArrayLike, ratio: float) -> NDArray[np.bool_]:
+    """Return at which ticks a correction at `ratio` times the camera's rate is due; at the start none is."""
+    k = np.asarray(index)
+    return np.asarray(np.floor(k * ratio + 1e-9) > np.floor(np.maximum(k - 1, 0) * ratio + 1e-9))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from coopenv.errors import DataError, shown
 from coopenv.estimation.validity import are_covariances, are_numbers, are_rotations, are_unit_vectors, everywhere
 from coopenv.observers.contract import Gains, SensorNoise, Setup
-from coopenv.observers.recording import Recording, due_ticks
+from coopenv.observers.recording import Recording, is_due
 from coopenv.scenario.base import LARGEST
 from coopenv.scenario.topology import neighbour_sets, processing_order
 
@@ -193,5 +193,5 @@ def _check_scenario(r: Recording) -> None:
     _require(list(r.order) == processing_order(s, neighbours), "scenario: vehicles in another order than recorded")
     _require(r.dt == 1.0 / rates.camera, f"scenario: ticks of {1.0 / rates.camera:g} s, recorded {r.dt:g} s")
     _require((r.period, r.staleness) == (s.v2x.period, staleness), "scenario: another radio than recorded")
-    due = due_ticks(r.ticks, min(rates.observer or rates.camera, rates.camera) / rates.camera)
+    due = is_due(np.arange(r.ticks), min(rates.observer or rates.camera, rates.camera) / rates.camera)
     _require(np.array_equal(r.due, due), "scenario: corrections due at other ticks than recorded")

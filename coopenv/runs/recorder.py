@@ -1,52 +1,43 @@
-"""Record what every vehicle of a simulated world senses, once per seed, so that all observers see the same ticks."""
+"""Record what every vehicle senses, once per seed, so that all observers see the same ticks."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.backends.simulated import SimulatedSenses
-from coopenv.observers.briefing import briefing_of
-from coopenv.observers.recording import Recording, Truth, due_ticks
-from coopenv.policies import Policy, decide, load_policy
+from coopenv.backends.base import Backend
+from coopenv.backends.simulated import Simulated
+from coopenv.observers.recording import Recording, Truth, is_due
+from coopenv.policies import Policy, load_policy
+from coopenv.runs.episode import Views, play
 from coopenv.scenario import Scenario
 
+SENSED = ("rotation", "translation", "velocity", "angular_velocity", "bearings", "visible", "landmarks")
 
-def record(scenario: Scenario, seed: int = 0, policy: str | Policy = "zero") -> Recording:
-    """Run a world in float64 to its horizon and keep what is sensed.
+
+def record(source: Scenario | Backend, seed: int = 0, policy: str | Policy = "zero") -> Recording:
+    """Drive a backend in float64 to its horizon, or as long as it has ticks, and keep what is sensed.
 
     Args:
-        scenario: what to run.
-        seed: of the world.
+        source: where the ticks come from; a scenario is simulated.
+        seed: of the episode.
         policy: of driven vehicles: "zero", "random", the name of an agent, or a function of the observations.
 
     Raises:
-        CoopenvError: unknown policy or observer.
+        CoopenvError: unknown policy or observer, or the backend cannot begin.
     """
+    backend: Backend = Simulated(source) if isinstance(source, Scenario) else source
+    scenario = backend.scenario
     driver = load_policy(policy, scenario, seed) if isinstance(policy, str) else policy
-    engine = Engine(scenario, 1, "float64")
-    engine.reset([seed])
-    model, senses = engine.world.model, SimulatedSenses(scenario, engine.world)
-    briefing = briefing_of(scenario, model)
-    L, K = len(scenario.landmarks), scenario.horizon_ticks + 1
-    sensed_names = ("rotation", "translation", "velocity", "angular_velocity", "bearings", "visible", "landmarks")
-    world_names = {"inbox_tick": "inbox_tick", "true_rotation": "rotation", "true_position": "position"}
-    rows: dict[str, list[np.ndarray]] = {name: [] for name in (*sensed_names, *world_names)}
-    start_rotation = engine.view("estimate_rotation")[0].copy()
-    start_position = (start_rotation @ engine.view("estimate_position")[0][..., None])[..., 0]
-    for k in range(K):
-        if k > 0:
-            if scenario.driven and (k - 1) % scenario.ticks_per_decision == 0:
-                engine.set_actions(decide(driver, engine.view("observation")[0].copy())[None])
-            engine.step(ticks=1)
-        sensed = senses.read(0, k)
-        for name in sensed_names:
-            rows[name].append(getattr(sensed, name))
-        for name, field in world_names.items():
-            rows[name].append(engine.view(field)[0].copy())
-    kept = {name: np.stack(values) for name, values in rows.items()}
-    kept["inbox_tick"] = kept["inbox_tick"].astype(np.int64)
-    truth = Truth(kept.pop("true_rotation")[:, L:], kept.pop("true_position")[:, L:])
+    engine = Engine(scenario, 1, "float64", backend=backend)
+    views = Views(engine, ("rotation", "position", "estimate_rotation", "estimate_position", "inbox_tick"))
+    ticks = []
+    for k in play(engine, [seed], scenario.horizon_ticks, driver if scenario.driven else None):
+        views.take()
+        ticks.append(engine.world.sensed(0, k))
+    L, briefing = len(scenario.landmarks), engine.world.briefing
+    kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in SENSED}
+    start_rotation = views["estimate_rotation"][0, 0]
     for values in (*kept.values(), start_rotation):
         values.setflags(write=False)  # observers get views
     return Recording(
@@ -55,11 +46,12 @@ def record(scenario: Scenario, seed: int = 0, policy: str | Policy = "zero") -> 
         dt=briefing.dt,
         period=briefing.period,
         staleness=briefing.staleness,
-        due=due_ticks(K, model.observer.rate / scenario.rates.camera),
+        due=is_due(np.arange(len(ticks)), engine.world.model.observer.rate / scenario.rates.camera),
+        inbox_tick=views["inbox_tick"][:, 0].astype(np.int64),
         start_rotation=start_rotation,
-        start_position=start_position,
+        start_position=(start_rotation @ views["estimate_position"][0, 0][..., None])[..., 0],
         start_covariance=briefing.start_covariance,
-        truth=truth,
+        truth=Truth(views["rotation"][:, 0, L:], views["position"][:, 0, L:]),
         scenario=scenario,
         **kept,
     )

@@ -13,7 +13,8 @@ from coopenv.api.infos import outcome_words
 from coopenv.backends.base import Backend
 from coopenv.errors import CoopenvError
 from coopenv.estimation.trajectory import Sight, Trajectory
-from coopenv.policies import Policy, decide, load_policy
+from coopenv.policies import Policy, load_policy
+from coopenv.runs.episode import Views, play
 from coopenv.scenario import Scenario
 
 RECORDED = (
@@ -65,13 +66,12 @@ class Rollout:
         if steps is not None:
             self.ticks_planned = min(self.ticks_planned, steps * scenario.ticks_per_decision)
         self.wall_time = 0.0
-        self._rows: dict[str, list[np.ndarray]] = {}
-        self._taken = 0
+        self._views = Views(self.engine, RECORDED)
 
     @property
     def ticks_recorded(self) -> int:
         """Camera ticks since t = 0 that have been recorded."""
-        return max(0, self._taken - 1)
+        return max(0, self._views.taken - 1)
 
     def warm_up(self) -> None:
         """Load all kernels, compiling those that this machine has not compiled yet."""
@@ -85,34 +85,17 @@ class Rollout:
         `wall_time` (s) counts what is spent in here, not what the caller does between two ticks.
         """
         start = perf_counter()
-        self._rows = {name: [] for name in RECORDED}
-        self._taken = 0
+        self._views = Views(self.engine, RECORDED)
         self.wall_time = 0.0
-        self.engine.reset([self.seed])
-        self._take()
-        for tick in range(self.ticks_planned + 1):
-            if tick > 0:
-                self.engine.step(ticks=1)
-                self._take()
+        for tick in play(self.engine, [self.seed], self.ticks_planned, self.policy, to_the_end=False):
+            self._views.take()
             self.wall_time += perf_counter() - start
             yield tick
             start = perf_counter()
-            if tick % self.scenario.ticks_per_decision == 0:
-                if self.engine.view("ended")[0].all():
-                    return
-                self._decide()
-
-    def _decide(self) -> None:
-        self.engine.set_actions(decide(self.policy, self.engine.view("observation")[0].copy())[None])
-
-    def _take(self) -> None:
-        for name, rows in self._rows.items():
-            rows.append(self.engine.view(name)[0].copy())
-        self._taken += 1
 
     def _recorded(self, name: str) -> np.ndarray:
-        """Return (K, ...) of one view; an interrupted tick is left out."""
-        return np.stack(self._rows[name][: self._taken])
+        """Return (K, ...) of one view."""
+        return self._views[name][:, 0]
 
     def trajectory(self) -> Trajectory:
         """Return what has been recorded so far; `play` must have yielded at least once."""

@@ -158,6 +158,7 @@ def believe(model: Any, state: Any, world: int, vehicle: int):
 def reset_world(model: Any, state: Any, world: int):
     """Start a new episode in one world; its seed and episode number are already set."""
     state.tick[world] = 0
+    state.exhausted[world] = 0
     for agent in range(model.agents):
         place_agent(model, state, world, agent)
     for vehicle in range(model.vehicles):

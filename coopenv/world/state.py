@@ -42,6 +42,7 @@ def state_struct(p: Precision) -> Any:
         seed: array("W", wp.uint64)
         episode: array("W", wp.uint32)
         tick: array("W", wp.int32)  # camera ticks since the reset
+        exhausted: array("W", wp.int32)  # 1: its source has no more ticks, the episode is over
 
         start_rotation: array("WA", mat33)
         start_position: array("WA", vec3)  # map
@@ -96,6 +97,7 @@ VALID: dict[str, Rule] = {
     "seed": ANYTHING,
     "episode": ANYTHING,
     "tick": whole(0, "horizon_ticks"),
+    "exhausted": FLAG,
     "start_rotation": ROTATION,
     "rotation": ROTATION._replace(of_truth=True),
     "position": NUMBER._replace(of_truth=True),

@@ -101,12 +101,18 @@ class World:
         """Return what the source of ticks reads."""
         return Nothing()
 
-    def reset(self, seeds: Sequence[int] | np.ndarray | None = None, mask: np.ndarray | None = None) -> None:
+    def reset(
+        self,
+        seeds: Sequence[int] | np.ndarray | None = None,
+        mask: np.ndarray | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
         """Start a new episode in the worlds of `mask` (all by default).
 
         Args:
             seeds: one per world, reduced modulo 2^64; None keeps each world's seed and draws a new episode from it.
             mask: (W,) bool.
+            options: for a source of ticks that is not on the device; others need none.
         """
         chosen = np.ones(self.worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
         if seeds is not None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from coopenv.backends.replay.device_recording import upload
+from coopenv.backends.base import Capabilities, SensingWorld
+from coopenv.backends.generator import Episode, TickGenerator
+from coopenv.backends.replay.device_recording import samples_taken, upload
 from coopenv.backends.replay.kernels import RECORDED
 from coopenv.backends.replay.scenario import scenario_of
 from coopenv.observers.recording import Briefing, Recording, Sensed
@@ -16,47 +19,39 @@ from coopenv.observers.recording_checks import check_recording
 from coopenv.observers.registry import find_embedded
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST
-from coopenv.world.world import World
 
 
-class Replay:
+class Replay(TickGenerator):
     """A recording as a backend. Actions change nothing; every episode is the recording again."""
 
     def __init__(self, recording: Recording, name: str, overrides: Mapping[str, Any] | None = None) -> None:
         """Find the recording's scenario; arguments and errors as for `check_recording` and `scenario_of`."""
         check_recording(recording, name)
         self.recording = recording
-        self.scenario = scenario_of(recording, name, overrides or {})
+        known = bool(recording.truth.known.any())
+        scenario = scenario_of(recording, name, overrides or {})
+        super().__init__(
+            scenario,
+            Capabilities(truth=known, driven=False, real_time=False, ticks=scenario.horizon_ticks + 1, batched=True),
+        )
 
-    def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> World:
-        """Return the world that goes through the recording."""
+    def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> ReplayWorld:
+        """Return worlds that go through the recording."""
         planar = any(setup.planar for setup in self.recording.setups)
         observer = find_embedded(self.scenario.observer.name, planar) or HOST
         covariance = self.recording.start_covariance
         return ReplayWorld(self.recording, self.scenario, worlds, dtype, device, threads, observer, covariance)
 
-    def senses(self, world: World) -> RecordedSenses:
-        """Return the recorded ticks."""
-        return RecordedSenses(self.recording)
+    def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
+        """Go through the recording tick by tick."""
+        recording, rate = self.recording, self.scenario.rates.odometry
+        taken = samples_taken(recording.t, rate)
+        age = np.where(taken > 0, recording.t - (taken - 1) / rate, np.inf)
+        for k in range(self.scenario.horizon_ticks + 1):
+            yield replace(recording.at(k), odometry_age=np.full(len(recording.setups), age[k]))
 
 
-class RecordedSenses:
-    """Plug-in observers read the record itself, in float64 whatever the world's precision."""
-
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-
-    @property
-    def briefing(self) -> Briefing:
-        """What the observers are told before the first tick."""
-        return self._recording.briefing
-
-    def read(self, world: int, k: int) -> Sensed:
-        """Return what was sensed at tick k, the same in every world."""
-        return self._recording.at(k)
-
-
-class ReplayWorld(World):
+class ReplayWorld(SensingWorld):
     """A world whose truth, measurements and deliveries are recorded."""
 
     source = RECORDED
@@ -65,6 +60,15 @@ class ReplayWorld(World):
         """Build the arrays; further arguments and errors as for `World`."""
         self._recording = recording
         super().__init__(scenario, *arguments)
+
+    @property
+    def briefing(self) -> Briefing:
+        """What observers are told before the first tick."""
+        return self._recording.briefing
+
+    def sensed(self, world: int, k: int) -> Sensed:
+        """Return what was sensed at tick k, the same in every world and in float64 whatever the precision."""
+        return self._recording.at(k)
 
     def _build_model(self) -> Any:
         model = super()._build_model()

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.observers.recording import Recording, Truth
 from coopenv.world.precision import Precision
+from coopenv.world.records import array, fields
 
 
 @cache
@@ -20,21 +21,23 @@ def record_struct(p: Precision) -> Any:
     class Record:
         """K ticks, N vehicles, T targets, L landmarks; lengths in m."""
 
-        rotation: wp.array2d(dtype=mat33)  # (K, N) odometry increments
-        translation: wp.array2d(dtype=vec3)  # (K, N)
-        velocity: wp.array2d(dtype=vec3)  # (K, N) m/s, last odometry sample
-        angular_velocity: wp.array2d(dtype=vec3)  # (K, N) rad/s
-        samples: wp.array(dtype=wp.int32)  # (K,) odometry samples so far
-        bearings: wp.array3d(dtype=vec3)  # (K, N, T) body frame
-        visible: wp.array3d(dtype=wp.uint8)  # (K, N, T)
-        landmarks: wp.array2d(dtype=vec3)  # (K, L) map
-        inbox_tick: wp.array3d(dtype=wp.int32)  # (K, N, N)
-        true_rotation: wp.array2d(dtype=mat33)  # (K, N) NaN: not known
-        true_position: wp.array2d(dtype=vec3)  # (K, N)
-        true_velocity: wp.array2d(dtype=vec3)  # (K, N) body frame, m/s
-        true_angular_velocity: wp.array2d(dtype=vec3)  # (K, N) rad/s
-        start_rotation: wp.array(dtype=mat33)  # (N,) initial estimates
-        start_position: wp.array(dtype=vec3)  # (N,) map
+        last: wp.int32  # K - 1
+        rotation: array("KN", mat33)  # odometry increments
+        translation: array("KN", vec3)
+        velocity: array("KN", vec3)  # m/s, last odometry sample
+        angular_velocity: array("KN", vec3)  # rad/s
+        samples: array("KN", wp.int32)  # odometry samples so far
+        bearings: array("KNT", vec3)  # body frame
+        bearing_lag: array("KN", wp.int32)  # ticks since the frame was exposed
+        visible: array("KNT", wp.uint8)
+        landmarks: array("KL", vec3)  # map
+        inbox_tick: array("KNN", wp.int32)  # of sending, per receiver and sender; BY_RADIO: not known
+        true_rotation: array("KN", mat33)  # NaN: not known
+        true_position: array("KN", vec3)
+        true_velocity: array("KN", vec3)  # body frame, m/s
+        true_angular_velocity: array("KN", vec3)  # rad/s
+        start_rotation: array("N", mat33)  # initial estimates; NaN: as the scenario says
+        start_position: array("N", vec3)  # map
 
     return Record
 
@@ -42,18 +45,21 @@ def record_struct(p: Precision) -> Any:
 def upload(recording: Recording, odometry_rate: float, p: Precision, device: str) -> Any:
     """Return the `Record` of a recording."""
     linear, angular = true_twists(recording.truth, recording.dt)
+    shape = recording.ticks, len(recording.setups)
     values: dict[str, np.ndarray] = {
-        "samples": samples_taken(recording.t, odometry_rate),
+        "samples": np.broadcast_to(samples_taken(recording.t, odometry_rate)[:, None], shape),
+        "bearing_lag": np.zeros(shape),
         "true_rotation": recording.truth.rotation,
         "true_position": recording.truth.position,
         "true_velocity": linear,
         "true_angular_velocity": angular,
     }
     record = record_struct(p)()
-    for name, var in record_struct(p).vars.items():
+    record.last = recording.ticks - 1
+    for name, field in fields(record_struct(p)).items():
         data = values[name] if name in values else getattr(recording, name)
-        kind = {wp.int32: np.int32, wp.uint8: np.uint8}.get(var.type.dtype, p.numpy)
-        setattr(record, name, wp.array(np.array(data, dtype=kind), dtype=var.type.dtype, device=device))
+        kind = {wp.int32: np.int32, wp.uint8: np.uint8}.get(field.dtype, p.numpy)
+        setattr(record, name, wp.array(np.array(data, dtype=kind), dtype=field.dtype, device=device))
     return record
 
 

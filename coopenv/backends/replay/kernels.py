@@ -1,4 +1,4 @@
-"""A tick of a recording: what was sensed and what arrived is copied, everything after that is as in the simulation."""
+"""A tick from elsewhere: what was sensed and what arrived is copied, everything after that is as in the simulation."""
 
 from __future__ import annotations
 
@@ -10,42 +10,62 @@ from coopenv.world.camera import NOT_A_NEIGHBOUR, OUT_OF_VIEW, VISIBLE
 from coopenv.world.collision import referee, touches_anything
 from coopenv.world.embedded import Source
 from coopenv.world.reset import believe, place_agent, place_vehicle
-from coopenv.world.v2x import broadcast
+from coopenv.world.v2x import broadcast, deliver
+
+BY_RADIO = wp.constant(-2)
+"""In place of the ticks of sending of messages that a receiver heard: the scenario's radio decides."""
+
+
+@wp.func
+def row_of(record: Any, tick: int) -> int:
+    """Return where a tick stands in a record; a record of one tick holds the present one."""
+    return wp.min(tick, record.last)
+
+
+@wp.func
+def recall_truth(model: Any, state: Any, record: Any, world: int, vehicle: int, row: int):
+    """Write a vehicle's true pose and twist, NaN where they are not known."""
+    agent = model.landmarks + vehicle
+    state.rotation[world, agent] = record.true_rotation[row, vehicle]
+    state.position[world, agent] = record.true_position[row, vehicle]
+    state.velocity[world, agent] = record.true_velocity[row, vehicle]
+    state.angular_velocity[world, agent] = record.true_angular_velocity[row, vehicle]
 
 
 @wp.func
 def recall(model: Any, state: Any, record: Any, world: int, tick: int):
     """Write what was sensed at a tick, and the truth that is known."""
+    row = row_of(record, tick)
     for landmark in range(model.landmarks):
-        state.position[world, landmark] = record.landmarks[tick, landmark]
+        state.position[world, landmark] = record.landmarks[row, landmark]
     for vehicle in range(model.vehicles):
-        agent = model.landmarks + vehicle
-        state.rotation[world, agent] = record.true_rotation[tick, vehicle]
-        state.position[world, agent] = record.true_position[tick, vehicle]
-        state.velocity[world, agent] = record.true_velocity[tick, vehicle]
-        state.angular_velocity[world, agent] = record.true_angular_velocity[tick, vehicle]
-        state.increment_rotation[world, vehicle] = record.rotation[tick, vehicle]
-        state.increment_translation[world, vehicle] = record.translation[tick, vehicle]
-        state.odometry_velocity[world, vehicle] = record.velocity[tick, vehicle]
-        state.odometry_angular_velocity[world, vehicle] = record.angular_velocity[tick, vehicle]
-        state.odometry_samples[world, vehicle] = record.samples[tick]
+        recall_truth(model, state, record, world, vehicle, row)
+        state.increment_rotation[world, vehicle] = record.rotation[row, vehicle]
+        state.increment_translation[world, vehicle] = record.translation[row, vehicle]
+        state.odometry_velocity[world, vehicle] = record.velocity[row, vehicle]
+        state.odometry_angular_velocity[world, vehicle] = record.angular_velocity[row, vehicle]
+        state.odometry_samples[world, vehicle] = record.samples[row, vehicle]
         for target in range(model.agents):
             state.sight[world, vehicle, target] = NOT_A_NEIGHBOUR
         for n in range(model.target_count[vehicle]):
             target = model.targets[vehicle, n]
             state.sight[world, vehicle, target] = OUT_OF_VIEW
-            if record.visible[tick, vehicle, target] != wp.uint8(0):
-                bearing = wp.transpose(model.camera.rotation) * record.bearings[tick, vehicle, target]
+            if record.visible[row, vehicle, target] != wp.uint8(0):
+                bearing = wp.transpose(model.camera.rotation) * record.bearings[row, vehicle, target]
                 state.bearing[world, vehicle, target] = bearing
-                state.bearing_tick[world, vehicle, target] = tick
+                state.bearing_tick[world, vehicle, target] = tick - record.bearing_lag[row, vehicle]
                 state.sight[world, vehicle, target] = VISIBLE
 
 
 @wp.func
 def redeliver(model: Any, state: Any, record: Any, world: int, receiver: int, tick: int):
-    """Receive the messages that arrived at this tick when it was recorded."""
+    """Receive the messages that arrived at this tick, as the source says or else as the scenario's radio lets them."""
+    row = row_of(record, tick)
+    if record.inbox_tick[row, receiver, receiver] == BY_RADIO:
+        deliver(model, state, world, receiver, tick)
+        return
     for sender in range(model.vehicles):
-        sent = record.inbox_tick[tick, receiver, sender]
+        sent = record.inbox_tick[row, receiver, sender]
         slot = wp.max(sent, 0) % model.radio.slots
         if sent > state.inbox_tick[world, receiver, sender] and state.outbox_tick[world, sender, slot] == sent:
             state.inbox_rotation[world, receiver, sender] = state.outbox_rotation[world, sender, slot]
@@ -55,7 +75,7 @@ def redeliver(model: Any, state: Any, record: Any, world: int, receiver: int, ti
 
 @wp.func
 def resense(model: Any, state: Any, record: Any, world: int, tick: int):
-    """Recall a tick and judge contacts and arrivals by its truth."""
+    """Recall a tick and judge contacts and arrivals by its truth, where that is known."""
     recall(model, state, record, world, tick)
     for vehicle in range(model.vehicles):
         referee(model, state, world, vehicle)
@@ -63,16 +83,21 @@ def resense(model: Any, state: Any, record: Any, world: int, tick: int):
 
 @wp.func
 def rewind(model: Any, state: Any, record: Any, world: int):
-    """Go to the start of the recording in one world."""
+    """Go to the start in one world: initial estimates are those of the record, or drawn as the scenario says."""
     state.tick[world] = 0
+    state.exhausted[world] = 0
     for agent in range(model.agents):
         place_agent(model, state, world, agent)
     for vehicle in range(model.vehicles):
         place_vehicle(model, state, world, vehicle)
+        position = record.true_position[0, vehicle]
+        if wp.isfinite(position[0]):
+            recall_truth(model, state, record, world, vehicle, 0)
         believe(model, state, world, vehicle)
         R = record.start_rotation[vehicle]
-        state.estimate_rotation[world, vehicle] = R
-        state.estimate_position[world, vehicle] = wp.transpose(R) * record.start_position[vehicle]
+        if wp.isfinite(R[0, 0]):
+            state.estimate_rotation[world, vehicle] = R
+            state.estimate_position[world, vehicle] = wp.transpose(R) * record.start_position[vehicle]
     recall(model, state, record, world, 0)
     for vehicle in range(model.vehicles):
         state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
@@ -83,4 +108,4 @@ def rewind(model: Any, state: Any, record: Any, world: int):
 
 
 RECORDED = Source("recorded", rewind, resense, redeliver, knows_truth=False)
-"""Ticks of a recording."""
+"""Ticks of a recording, or of any other source that is not on the device."""

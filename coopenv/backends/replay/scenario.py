@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.errors import CoopenvError, DataError
-from coopenv.observers.recording import Recording, due_ticks
+from coopenv.observers.recording import Recording, is_due
 from coopenv.scenario import Scenario
 from coopenv.scenario.files import override, parse_scenario
 
@@ -54,6 +54,8 @@ def _raw(recording: Recording, name: str) -> dict[str, Any]:
     else:
         raw = _of_robots(recording, name)
     for landmark in raw["landmarks"]:  # recorded is the point that cameras see
+        if landmark.get("body"):
+            landmark["body"]["center"] = np.subtract(landmark["body"]["center"], landmark["marker"]).tolist()
         landmark["marker"] = (0.0, 0.0, 0.0)
     return raw
 
@@ -69,7 +71,7 @@ def _of_robots(recording: Recording, name: str) -> dict[str, Any]:
         if not np.array_equal(setup.lever_arm, first.lever_arm):
             raise DataError(f"{name}: the camera of {setup.name} sits elsewhere than that of {first.name}")
     corrections = float(recording.due[1:].mean()) * rate
-    if not np.array_equal(due_ticks(recording.ticks, corrections / rate)[1:], recording.due[1:]):
+    if not np.array_equal(is_due(np.arange(recording.ticks), corrections / rate)[1:], recording.due[1:]):
         raise DataError(f"{name}: its corrections are not due at a fixed rate")
     return {
         "title": name,

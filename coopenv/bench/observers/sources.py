@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from coopenv.backends.replay import is_recorded, open_recording
+from coopenv.backends.sources import Kind, kind_of, open_recording
 from coopenv.bench.observers.faults import FAULTS, NOMINAL, Lie, followers
 from coopenv.errors import CoopenvError, DataWarning, suggest
 from coopenv.estimation.metrics import STEADY_SHARE, steady_start
@@ -182,19 +182,18 @@ def find_source(text: str, overrides: Mapping[str, Any] | None = None, data: Pat
     Raises:
         CoopenvError: there is none of that name, or an option for what is no such source.
     """
-    path = Path(text)
-    robots = is_recorded(text) and not path.suffix
-    if data is not None and not robots:
+    kind = kind_of(text)
+    if data is not None and kind is not Kind.DATASET:
         raise CoopenvError(f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9")
-    if not is_recorded(text):
-        return Simulated(path.stem, load_scenario(text, overrides))
+    if kind is Kind.ENVIRONMENT:
+        return Simulated(Path(text).stem, load_scenario(text, overrides))
     if overrides:
         raise CoopenvError(f"--set {next(iter(overrides))}: {text} is recorded, it has no scenario to change")
-    if robots:
-        return Robots(text, data)
-    if not path.is_file():
-        raise CoopenvError(f"no such log file: {text}")
-    return LogFile(path.stem, path)
+    if kind is Kind.LOG:
+        if not Path(text).is_file():
+            raise CoopenvError(f"no such log file: {text}")
+        return LogFile(Path(text).stem, Path(text))
+    return Robots(text, data)
 
 
 def variants_of(source: Source, asked: str | None) -> tuple[str, ...]:

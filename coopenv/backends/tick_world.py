@@ -1,0 +1,227 @@
+"""A world whose ticks come from a backend, one after the other; estimators and reports run on it as on any other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from types import SimpleNamespace
+from typing import Any, NoReturn, cast
+
+import numpy as np
+
+from coopenv.backends.base import Backend, Command, SensingWorld, WorldBackend
+from coopenv.backends.replay.device_recording import record_struct, true_twists
+from coopenv.backends.replay.kernels import BY_RADIO, RECORDED
+from coopenv.backends.tick_checks import MEASURED, check_tick
+from coopenv.errors import CoopenvError
+from coopenv.estimation.se3 import exp_se3
+from coopenv.observers.briefing import briefing_of, start_covariances
+from coopenv.observers.contract import Message
+from coopenv.observers.kernel_world import views_of
+from coopenv.observers.recording import Briefing, Sensed, Truth, is_due
+from coopenv.observers.registry import find_embedded
+from coopenv.world.embedded import HOST, Messages
+from coopenv.world.records import allocate, fields
+
+
+def open_world(backend: Backend, worlds: int, dtype: str, device: str, threads: int | None) -> SensingWorld:
+    """Return the world or worlds that a backend's ticks fill; arguments and errors as for `World`."""
+    if backend.capabilities.batched:
+        return cast(WorldBackend, backend).world(worlds, dtype, device, threads)
+    return TickWorld(backend, worlds, dtype, device)
+
+
+class TickWorld(SensingWorld):
+    """One world that is filled with what a backend gives.
+
+    A vehicle from which nothing came goes on with the last odometry that it had, and sees nothing. Truth that the
+    backend does not know is NaN. The episode is over when the backend gives no more ticks.
+    """
+
+    source = RECORDED
+
+    def __init__(self, backend: Backend, worlds: int, dtype: str, device: str) -> None:
+        """Build the arrays.
+
+        Raises:
+            CoopenvError: more than one world, or not on the CPU.
+        """
+        self._backend = backend
+        self._name = f"backend {type(backend).__name__}"
+        if worlds != 1 or device != "cpu":
+            raise CoopenvError(f"{self._name} gives the ticks of one world to the CPU, not of {worlds} to {device}")
+        scenario = backend.scenario
+        observer = find_embedded(scenario.observer.name) or HOST
+        super().__init__(scenario, 1, dtype, device, 1, observer, start_covariances(scenario))
+        self._present = _nothing(self.briefing)
+        self._ticks: Iterator[Sensed] = iter(())
+
+    @cached_property
+    def briefing(self) -> Briefing:
+        """What observers are told before the first tick."""
+        return briefing_of(self.scenario, self.model)
+
+    def sensed(self, world: int, k: int) -> Sensed:
+        """Return the present tick."""
+        return self._present
+
+    def _build_model(self) -> Any:
+        model = super()._build_model()
+        markers, centers = model.scene.marker.numpy(), model.scene.body_center.numpy()
+        centers[: model.landmarks] -= markers[: model.landmarks]
+        markers[: model.landmarks] = 0.0  # a source tells the point of a landmark that is seen
+        model.scene.marker.assign(markers)
+        model.scene.body_center.assign(centers)
+        return model
+
+    def _build_record(self) -> Any:
+        struct, model = record_struct(self.precision), self.model
+        sizes = {"K": 1, "N": model.vehicles, "T": model.agents, "L": model.landmarks}
+        record = allocate(struct, sizes, self.device)
+        for start in (record.start_rotation, record.start_position):
+            start.fill_(np.nan)
+        self._row = {n: getattr(record, n).numpy()[0] for n, field in fields(struct).items() if field.axes[0] == "K"}
+        return record
+
+    def reset(
+        self,
+        seeds: Sequence[int] | np.ndarray | None = None,
+        mask: np.ndarray | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Begin an episode of the backend, see `World.reset`."""
+        self._ticks = iter(())
+        self._present = _nothing(self.briefing)
+        self._clear_marks()
+        self._take(self._backend.reset(None if seeds is None else int(seeds[0]), options or {}), 0)
+        super().reset(seeds, mask)
+        self._receive(self._present)
+
+    def advance(self, ticks: int) -> None:
+        """Run camera ticks, as many as the backend gives."""
+        for _ in range(ticks):
+            over = self.view("tick")[0] >= self.model.horizon_ticks or self.mask.numpy()[0] != 0
+            if over or not self.fetch():
+                return
+            super().advance(1)
+
+    def fetch(self) -> bool:
+        """Get the next tick from the backend, which is sent its command first where a decision begins."""
+        k = int(self.view("tick")[0]) + 1
+        if self.view("exhausted")[0] != 0:
+            return False
+        if (k - 1) % self.model.ticks_per_decision == 0:
+            self.decide()
+            self._clear_marks()
+            self._ticks = iter(self._backend.advance(Command.of(self.view("command")[0])))
+        tick = next(self._ticks, None)
+        if tick is None:
+            self.view("exhausted")[0] = 1
+            return False
+        self._take(tick, k)
+        self._receive(self._present)
+        return True
+
+    def get_state(self) -> NoReturn:
+        """Refuse.
+
+        Raises:
+            CoopenvError: always.
+        """
+        raise CoopenvError(f"{self._name} gives ticks from elsewhere, so that no state of them can be saved")
+
+    def _clear_marks(self) -> None:
+        self.late[:] = 0
+        self.missing[:] = 0
+
+    def _take(self, tick: Sensed, k: int) -> None:
+        """Check a tick and put it where the kernels read it."""
+        try:
+            check_tick(tick, k, self.briefing)
+        except CoopenvError as error:
+            raise CoopenvError(f"{self._name}: {error}") from None
+        last, self._present = self._present, self._completed(tick)
+        now, rate = self._present, self.scenario.rates.odometry
+        for name in MEASURED:
+            self._row[name][...] = getattr(now, name)
+        known = _truth_of(now)
+        before = known if k == 0 else _truth_of(last)
+        pair = Truth(np.stack([before.rotation, known.rotation]), np.stack([before.position, known.position]))
+        linear, angular = true_twists(pair, now.dt)
+        self._row["true_rotation"][...], self._row["true_position"][...] = known.rotation, known.position
+        self._row["true_velocity"][...], self._row["true_angular_velocity"][...] = linear[1], angular[1]
+        sampled = (now.index * now.dt - cast(Any, now.odometry_age) + 1e-9) * rate
+        self._row["samples"][...] = np.where(sampled >= 0.0, np.floor(np.maximum(sampled, 0.0)) + 1, 0)
+        lag = np.round(np.minimum(cast(Any, now.bearing_age) / now.dt, now.index))
+        self._row["bearing_lag"][...] = lag
+        self._row["inbox_tick"][...] = BY_RADIO if now.inbox_tick is None else now.inbox_tick
+        self.late += now.late
+        self.missing += now.missing
+
+    def _completed(self, tick: Sensed) -> Sensed:
+        """Return a tick without gaps, which nobody can write to: who is missing goes on with the last odometry."""
+        N, last = len(tick.rotation), self._present
+        arrays: dict[str, Any] = {name: np.array(getattr(tick, name), dtype=float) for name in MEASURED}
+        arrays["visible"] = tick.visible.copy()
+        arrays.update({name: _or_zeros(getattr(tick, name), N) for name in ("odometry_age", "bearing_age")})
+        missing = _or_zeros(tick.missing, N).astype(bool)
+        twist = np.concatenate([last.angular_velocity, last.velocity], axis=-1)[missing]
+        arrays["rotation"][missing], arrays["translation"][missing] = exp_se3(twist * tick.dt)
+        for name in ("velocity", "angular_velocity"):
+            arrays[name][missing] = getattr(last, name)[missing]
+        arrays["odometry_age"][missing] = cast(Any, last.odometry_age)[missing] + tick.dt
+        arrays["visible"][missing] = False
+        arrays["bearings"][~arrays["visible"]] = np.nan
+        for values in arrays.values():
+            values.setflags(write=False)
+        due = bool(is_due(tick.index, self.model.observer.rate / self.scenario.rates.camera))
+        return replace(tick, **arrays, missing=missing, late=_or_zeros(tick.late, N).astype(bool), due=due)
+
+    def _receive(self, tick: Sensed) -> None:
+        """Put messages from vehicles that are estimated elsewhere into the inboxes; malformed ones are as none."""
+        for (receiver, sender), received in tick.messages.items():
+            message, sent = received.message, max(0, tick.index - round(received.age / tick.dt))
+            if self.observer.messages is not None and not self._read(receiver, sender, message, sent):
+                self._backend.health.rejected += 1
+            elif message.position is not None:
+                R = np.eye(3) if message.rotation is None else np.asarray(message.rotation, dtype=float)
+                self.view("inbox_rotation")[0, receiver, sender] = R
+                position = message.position - R @ self.briefing.setups[sender].marker
+                self.view("inbox_position")[0, receiver, sender] = position
+                self.view("inbox_tick")[0, receiver, sender] = sent
+
+    def _read(self, receiver: int, sender: int, message: Message, sent: int) -> bool:
+        """Hand a message to the embedded observer; return whether it is well-formed."""
+        memory = views_of(self.memory, fields(self.observer.memory), receiver)
+        try:
+            cast(Messages, self.observer.messages).read(SimpleNamespace(memory=memory), sender, message, sent)
+        except (CoopenvError, ValueError, TypeError, LookupError, ArithmeticError):
+            return False
+        return True
+
+
+def _nothing(briefing: Briefing) -> Sensed:
+    """Return what there is before the first tick: no motion, nothing in view."""
+    N, T = len(briefing.setups), len(briefing.setups[0].target_names)
+    return Sensed(
+        index=-1,
+        dt=briefing.dt,
+        rotation=np.tile(np.eye(3), (N, 1, 1)),
+        translation=np.zeros((N, 3)),
+        velocity=np.zeros((N, 3)),
+        angular_velocity=np.zeros((N, 3)),
+        bearings=np.full((N, T, 3), np.nan),
+        visible=np.zeros((N, T), bool),
+        landmarks=np.zeros((briefing.setups[0].landmarks, 3)),
+        odometry_age=np.full(N, np.inf),
+    )
+
+
+def _truth_of(tick: Sensed) -> Truth:
+    shape = tick.translation.shape
+    return tick.truth or Truth(np.full((*shape, 3), np.nan), np.full(shape, np.nan))
+
+
+def _or_zeros(values: Any, count: int) -> np.ndarray:
+    return np.zeros(count) if values is None else np.array(values, dtype=float)

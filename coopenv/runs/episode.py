@@ -1,0 +1,60 @@
+"""Go through an episode camera tick by camera tick, and keep what an engine shows at each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+
+from coopenv.api.engine import Engine
+from coopenv.policies import Policy, decide
+
+
+def play(
+    engine: Engine, seeds: Sequence[int], ticks: int, policy: Policy | None = None, to_the_end: bool = True
+) -> Iterator[int]:
+    """Start an episode in every world and yield the number of each camera tick, from 0, once the worlds are there.
+
+    Args:
+        engine: what is run, on any backend; it is stopped when something fails meanwhile.
+        seeds: one per world.
+        ticks: how many after the start; fewer where the backend has no more.
+        policy: drives the first world; None: action zero.
+        to_the_end: go on when all vehicles of the first world have ended.
+
+    Raises:
+        CoopenvError: the policy returns actions of another shape.
+    """
+    with engine.stopping():
+        engine.reset(seeds)
+        engine.set_actions(np.zeros_like(engine.view("actions")))
+        yield 0
+        for tick in range(ticks):
+            if tick % engine.world.model.ticks_per_decision == 0:
+                if not to_the_end and engine.view("ended")[0].all():
+                    return
+                if policy is not None:
+                    engine.set_actions(decide(policy, engine.view("observation")[0].copy())[None])
+            engine.step(ticks=1)
+            if engine.view("exhausted")[0]:
+                return
+            yield tick + 1
+
+
+class Views:
+    """Fields of an engine at several ticks; one whose copying was interrupted does not count."""
+
+    def __init__(self, engine: Engine, names: Iterable[str]) -> None:
+        self._engine = engine
+        self._rows: dict[str, list[np.ndarray]] = {name: [] for name in names}
+        self.taken = 0
+
+    def take(self) -> None:
+        """Copy the fields as they are now."""
+        for name, rows in self._rows.items():
+            rows.append(self._engine.view(name).copy())
+        self.taken += 1
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Return (K, W, ...) of one field."""
+        return np.stack(self._rows[name][: self.taken])

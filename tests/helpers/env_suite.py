@@ -1,0 +1,194 @@
+"""The suite that every environment passes, whatever is behind it: checks of what a function of options makes."""
+
+from __future__ import annotations
+
+import copy
+import re
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from pettingzoo.test import api_test, parallel_api_test, render_test, seed_test
+from pettingzoo.test.state_test import state_test
+from pettingzoo.utils import parallel_to_aec
+
+import coopenv
+
+Env = coopenv.CooperativeLocalisationEnv
+Make = Callable[..., Env]
+"""Makes one and the same environment with options of `coopenv.parallel_env`: observation, dtype, render_mode."""
+
+CHECKS: list[Callable[[Make], None]] = []
+"""All checks that hold for environments of any backend."""
+
+
+def check(function: Callable[[Make], None]) -> Callable[[Make], None]:
+    CHECKS.append(function)
+    return function
+
+
+def random_actions(env: Env, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    return {agent: rng.uniform(-1.0, 1.0, 2).astype(np.float32) for agent in env.agents}
+
+
+def rollout(env: Env, seed: int, steps: int) -> list[Any]:
+    rng = np.random.default_rng(seed)
+    record: list[Any] = [env.reset(seed=seed)]
+    for _ in range(steps):
+        if not env.agents:
+            break
+        record.append(env.step(random_actions(env, rng)))
+    return record
+
+
+def assert_equal(a: Any, b: Any) -> None:
+    if isinstance(a, dict):
+        assert a.keys() == b.keys()
+        for key in a:
+            assert_equal(a[key], b[key])
+    elif isinstance(a, list | tuple):
+        assert len(a) == len(b)
+        for x, y in zip(a, b, strict=True):
+            assert_equal(x, y)
+    else:
+        assert np.array_equal(a, b), (a, b)
+
+
+@check
+def official_tests(make: Make) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        parallel_api_test(make(), num_cycles=600)
+        api_test(parallel_to_aec(make()), num_cycles=1500)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # PettingZoo advises against Dict observations
+        api_test(parallel_to_aec(make(observation="dict")), num_cycles=200)
+
+
+@check
+def seeds(make: Make) -> None:
+    seed_test(lambda: parallel_to_aec(make()), num_cycles=300)
+
+
+@check
+def state_space(make: Make) -> None:
+    env = make()
+    state_test(parallel_to_aec(env), env)
+
+
+@check
+def rendering(make: Make) -> None:
+    render_test(lambda render_mode=None: parallel_to_aec(make(render_mode=render_mode)))
+
+
+@check
+def agent_names(make: Make) -> None:
+    env = make()
+    assert env.possible_agents == [f"vehicle_{i + 1}" for i in range(len(env.possible_agents))]
+    assert all(re.fullmatch("[a-z]+_[0-9]+", agent) for agent in env.possible_agents)
+    for agent in env.possible_agents:
+        assert env.observation_space(agent) is env.observation_space(agent)
+        assert env.action_space(agent) is env.action_space(agent)
+
+
+@check
+def rollouts_of_a_seed_are_equal_flat(make: Make) -> None:
+    _rollouts_of_a_seed_are_equal(make, "flat")
+
+
+@check
+def rollouts_of_a_seed_are_equal_dict(make: Make) -> None:
+    _rollouts_of_a_seed_are_equal(make, "dict")
+
+
+def _rollouts_of_a_seed_are_equal(make: Make, observation: str) -> None:
+    """Three rollouts of one seed agree exactly; every observation is in its space, finite, and a fresh array."""
+    env = make(observation=observation)
+    first = rollout(env, 11, 10_000)
+    assert len(first) > 20
+    for step in first:
+        for agent, seen in step[0].items():
+            assert env.observation_space(agent).contains(seen)
+            parts = list(seen.values()) if isinstance(seen, dict) else [seen]
+            assert all(part.dtype == np.float32 and np.isfinite(part).all() for part in parts)
+    kept = copy.deepcopy(first)
+    assert_equal(rollout(env, 11, 10_000), first)
+    assert_equal(kept, first)  # later steps did not write into what was handed out
+    assert_equal(rollout(make(observation=observation), 11, 10_000), first)
+    other = rollout(env, 12, 30)
+    assert any(not np.array_equal(a, b) for a, b in zip(_flatten(first[25]), _flatten(other[25]), strict=False))
+
+
+def _flatten(step: Any) -> list[np.ndarray]:
+    return [
+        np.asarray(v) for agent in step[0].values() for v in (agent.values() if isinstance(agent, dict) else [agent])
+    ]
+
+
+@check
+def flat_and_dict_hold_the_same(make: Make) -> None:
+    flat, named = make(), make(observation="dict")
+    layout = flat.observation_layout
+    a, b = rollout(flat, 3, 15), rollout(named, 3, 15)
+    for x, y in zip(a, b, strict=True):
+        for agent in x[0]:
+            for field, place in layout.items():
+                assert np.array_equal(x[0][agent][place.slice], y[0][agent][field])
+
+
+@check
+def layout_covers_the_observation_once(make: Make) -> None:
+    env = make()
+    covered = np.zeros(env.observation_space("vehicle_1").shape, dtype=int)
+    for field in env.observation_layout.values():
+        covered[field.slice] += 1
+        assert field.stop - field.start == int(np.prod(field.shape))
+    assert (covered == 1).all()
+
+
+@check
+def infos(make: Make) -> None:
+    env = make(dtype="float64")
+    steps = rollout(env, 5, 40)
+    keys = set(steps[0][1]["vehicle_1"])
+    weights = env.scenario.reward.weights.model_dump()
+    for step in steps:
+        for agent, info in step[-1].items():
+            assert set(info) == keys
+            truth, estimate = info["truth"], info["estimate"]
+            assert info["position_error"] == pytest.approx(
+                float(np.linalg.norm(truth["position"] - estimate["position"])), rel=1e-9
+            )
+            assert set(info["visible"]) <= set(env.scenario.target_names) - {agent}
+            assert info["nees"] >= 0.0
+            if len(step) == 5:
+                total = sum(weights[term] * value for term, value in info["reward_terms"].items())
+                assert step[1][agent] == pytest.approx(total, abs=1e-5)
+
+
+@check
+def ends_by_itself(make: Make) -> None:
+    env = make()
+    steps = rollout(env, 0, 100_000)
+    assert env.agents == []
+    horizon = round(env.scenario.horizon * env.scenario.rates.decision)
+    assert len(steps) - 1 <= horizon
+    for agent in env.possible_agents:
+        last = [step for step in steps[1:] if agent in step[1]][-1]
+        assert last[2][agent] != last[3][agent]
+        assert isinstance(last[2][agent], bool) and isinstance(last[3][agent], bool)
+    assert env.step({}) == ({}, {}, {}, {}, {})
+
+
+@check
+def reset_without_seed_draws_anew(make: Make) -> None:
+    env = make(dtype="float64")
+    env.reset(seed=7)
+    runs = []
+    for _ in range(2):
+        env.reset()
+        steps = [env.step({agent: np.zeros(2) for agent in env.agents}) for _ in range(3)]
+        runs.append([info["estimate"]["position"] for info in steps[-1][-1].values()])
+    assert not np.allclose(runs[0], runs[1], atol=1e-12)
