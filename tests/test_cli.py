@@ -282,19 +282,19 @@ def test_scenarios_from_a_path_and_their_warnings(capsys: pytest.CaptureFixture[
 def test_an_interrupted_run_leaves_the_earlier_result(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from coopenv.runs.rollouts import Rollout
+    from coopenv.runs.episode import Views
 
-    take = Rollout._take
+    take = Views.take
 
-    def interrupted(self: Rollout) -> None:
-        if self.ticks_recorded == 30:
+    def interrupted(self: Views) -> None:
+        if self.taken == 31:
             raise KeyboardInterrupt
         take(self)
 
     assert main(["run", "overtaking", "--steps", "3", "--out", "cut"]) == 0
     before = {path.name: path.read_bytes() for path in Path("cut").iterdir()}
     capsys.readouterr()
-    monkeypatch.setattr(Rollout, "_take", interrupted)
+    monkeypatch.setattr(Views, "take", interrupted)
     assert main(["run", "overtaking", "--seed", "1", "--out", "cut"]) == 130
     assert capsys.readouterr().out == ""
     assert {path.name: path.read_bytes() for path in Path("cut").iterdir()} == before

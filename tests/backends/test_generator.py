@@ -254,7 +254,7 @@ class Neighbourly(Fleet):
         return replace(tick, inbox_tick=np.full((3, 3), -1), messages=messages)
 
 
-SAID = {"odometry": np.zeros(6), "leans_on": np.zeros(1, np.uint64)}
+SAID = {"odometry": np.zeros(6), "depends_on": np.zeros(1, np.uint64)}
 """What `robust` needs besides a pose."""
 
 
@@ -273,7 +273,7 @@ def test_messages_may_come_from_elsewhere(observer: str, extra: dict[str, np.nda
         heard = engine.plugins.groups[0].mail.heard
         assert [sorted(h) for h in heard] == [[], [], [0]] and heard[2][0][0] == 6
     if observer == "robust":
-        assert engine.world.memory.inbox_says.numpy()[0].tolist() == [[0] * 3, [0] * 3, [1, 0, 0]]
+        assert engine.world.memory.inbox.numpy()["valid"][0].tolist() == [[0] * 3, [0] * 3, [1, 0, 0]]
 
 
 def test_messages_that_an_observer_cannot_read_are_rejected() -> None:
