@@ -231,7 +231,7 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.Mon
     messages.codec.cache_clear()
     monkeypatch.setattr(builtins, "__import__", without)
     for act in (lambda: read_recording(tmp_path / "a.mcap"), lambda: write_recording(simulated(), tmp_path / "a.mcap")):
-        with pytest.raises(CoopenvError, match=r"pip install 'coopenv\[log\]'"):
+        with pytest.raises(CoopenvError, match=r"pip install '\.\[log\]'"):
             act()
     assert not list(tmp_path.iterdir())
 

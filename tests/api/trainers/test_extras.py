@@ -19,5 +19,5 @@ import pytest
 def test_missing_extra(module: str, needed: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, needed, None)
     monkeypatch.delitem(sys.modules, module, raising=False)
-    with pytest.raises(ImportError, match=rf"^{module} needs .+: pip install 'coopenv\[{extra}\]'$"):
+    with pytest.raises(ImportError, match=rf"^{module} needs .+: pip install '\.\[{extra}\]'$"):
         importlib.import_module(module)
