@@ -76,6 +76,7 @@ def test_json(folder: Path) -> None:
     assert [basin["observer"] for basin in board["basin"]] == ["riccati", "mekf"]
 
 
+@pytest.mark.slow
 def test_the_command_in_the_file_gives_the_same_table(folder: Path, tmp_path: Path) -> None:
     board = json.loads((folder / "leaderboard.json").read_text())
     words = board["command"].split()
