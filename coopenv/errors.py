@@ -99,6 +99,15 @@ def shown(value: object) -> str:
         return f"a {type(value).__name__}"
 
 
+def told(error: BaseException) -> str:
+    """Return the kind of anybody's error and what it says."""
+    try:
+        text = str(error)
+    except Exception as another:
+        text = f"says nothing, but raises {type(another).__name__}"
+    return f"{type(error).__name__}: {text}"
+
+
 def listed(names: Sequence[str], most: int = 12) -> str:
     """Return names with commas between; of very many the first few and how many there are."""
     few = names if len(names) <= most else [*names[:most], f"... ({len(names)} in all)"]

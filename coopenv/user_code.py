@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from coopenv.errors import CoopenvError, shown, suggest
+from coopenv.errors import CoopenvError, shown, suggest, told
 
 
 def is_reference(text: str) -> bool:
@@ -53,16 +53,11 @@ def load(reference: str) -> Any:
             with _importing_from(Path.cwd()):
                 module = import_module(place)
     except (Exception, SystemExit) as error:  # anybody's code
-        raise CoopenvError(f"'{reference}' cannot be loaded: {one_line(error)}") from error
+        raise CoopenvError(f"'{reference}' cannot be loaded: {told(error)}") from error
     if not hasattr(module, name):
         known = [known for known in vars(module) if not known.startswith("_")]
         raise CoopenvError(f"'{reference}': no '{name}' in {place}{suggest(name, known)}")
     return getattr(module, name)
-
-
-def one_line(error: BaseException) -> str:
-    """Return the kind of an error and what it says, on one line."""
-    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def _file(place: str, folder: Path | None = None) -> Path:

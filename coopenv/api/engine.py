@@ -17,9 +17,8 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.base import Backend
 from coopenv.backends.simulated import Simulated
 from coopenv.backends.tick_world import open_world
-from coopenv.errors import check_memory
+from coopenv.errors import check_memory, told
 from coopenv.scenario import Scenario
-from coopenv.user_code import one_line
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
 from coopenv.world.precision import device_memory
@@ -184,7 +183,7 @@ class Engine:
         try:
             yield
         except BaseException as error:
-            self.backend.stop(one_line(error))
+            self.backend.stop(told(error))
             raise
 
     def close(self) -> None:

@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf
 
-from coopenv.errors import CoopenvError
+from coopenv.errors import CoopenvError, shown
 from coopenv.estimation.arrays import Array
+from coopenv.estimation.coordinates import Coordinates
 from coopenv.observers.contract import Estimate, Message
+from coopenv.scenario.base import LARGEST
 
 MOST_BENT = 1e-6
 """By how much entries of R^T R may differ from those of I."""
@@ -32,11 +34,13 @@ def check_estimate(estimate: Estimate) -> None:
     Raises:
         CoopenvError: a field has another shape, is not real and finite, or is no rotation or covariance.
     """
-    _check_array("rotation", estimate.rotation, ROTATION)
-    _check_array("position", estimate.position, POSITION)
+    _check_array("rotation", estimate.rotation, LARGEST, ROTATION)
+    _check_array("position", estimate.position, LARGEST, POSITION)
     _check_rotation(np.asarray(estimate.rotation))
+    if not isinstance(estimate.coordinates, Coordinates):
+        raise CoopenvError(f"coordinates are {shown(estimate.coordinates)}, not a member of Coordinates")
     if estimate.covariance is not None:
-        _check_array("covariance", estimate.covariance, COVARIANCE)
+        _check_array("covariance", estimate.covariance, LARGEST**2, COVARIANCE)
         _check_covariance(np.asarray(estimate.covariance))
     if estimate.nis is not None and not (isfinite(estimate.nis) and index(estimate.nis_dof) >= 0):
         raise CoopenvError("nis is not finite, or nis_dof negative")
@@ -49,28 +53,31 @@ def check_message(message: Message) -> None:
         CoopenvError: a field has another shape, or is not real and finite.
     """
     if message.position is not None:
-        _check_array("message: position", message.position, POSITION)
+        _check_array("message: position", message.position, LARGEST, POSITION)
     if message.rotation is not None:
-        _check_array("message: rotation", message.rotation, ROTATION)
+        _check_array("message: rotation", message.rotation, LARGEST, ROTATION)
     if message.covariance is not None:
-        _check_array("message: covariance", message.covariance, *SENT_COVARIANCES)
+        _check_array("message: covariance", message.covariance, LARGEST**2, *SENT_COVARIANCES)
     for name, value in message.extra.items():
         if np.asarray(value).dtype.kind not in "biufc":
             raise CoopenvError(f"message: extra '{name}' is no array of numbers")
 
 
-def is_finite(values: NDArray[Any]) -> bool:
-    """Return whether every one of some numbers is finite; a sum of squares tells it sooner, unless that overflows."""
-    return isfinite(np.vdot(values, values)) or bool(np.isfinite(values).all())
+def _are_bounded(values: NDArray[Any], largest: float) -> bool:
+    """Return whether numbers are finite and not too large; a sum of squares tells it sooner, unless that is large."""
+    if values.dtype.kind == "f" and np.vdot(values, values) <= largest * largest:
+        return True
+    return bool((np.abs(values.astype(float)) <= largest).all())
 
 
-def _check_array(name: str, value: ArrayLike, *shapes: tuple[int, ...]) -> None:
+def _check_array(name: str, value: ArrayLike, largest: float, *shapes: tuple[int, ...]) -> None:
     array = np.asarray(value)
     kind = array.dtype.kind
     if kind == "c":
         raise CoopenvError(f"{name} is complex")
-    if array.shape not in shapes or kind not in "iuf" or not is_finite(array):
-        raise CoopenvError(f"{name} is not a finite array of shape {' or '.join(map(str, shapes))}")
+    if array.shape not in shapes or kind not in "iuf" or not _are_bounded(array, largest):
+        shape = " or ".join(map(str, shapes))
+        raise CoopenvError(f"{name} is not a finite array of shape {shape} with numbers up to {largest:g}")
 
 
 def _check_rotation(R: Array) -> None:

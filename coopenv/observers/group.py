@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol
 
 from numpy.typing import ArrayLike
 
-from coopenv.errors import CoopenvError
+from coopenv.errors import CoopenvError, told
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.observers.checks import check_estimate, check_message
@@ -47,11 +47,6 @@ class Tamper(Protocol):
     def told(self, observer: Observer, message: Message) -> Message:
         """Return what is broadcast in place of a message."""
         ...
-
-
-def _told(error: BaseException) -> str:
-    """Return what an error says, on one line."""
-    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 class Group:
@@ -149,7 +144,7 @@ class Group:
     def _blamed(self, error: BaseException, k: int, vehicle: int | None = None) -> ObserverError:
         """Return an error that says whose observer failed, when, and how."""
         whose = "" if vehicle is None else f"of {self.briefing.setups[vehicle].name} "
-        return ObserverError(f"{whose}at {k * self.briefing.dt:.3f} s: {_told(error)}")
+        return ObserverError(f"{whose}at {k * self.briefing.dt:.3f} s: {told(error)}")
 
     def get_state(self) -> dict[str, Any]:
         """Return a deep copy of the observers and of all messages; empty before the start.
@@ -165,7 +160,7 @@ class Group:
                 {"observers": observers, "coordinates": self.coordinates, "mail": self.mail.get_state()}
             )
         except Exception as error:
-            raise CoopenvError(f"the observers' state cannot be copied: {_told(error)}") from error
+            raise CoopenvError(f"the observers' state cannot be copied: {told(error)}") from error
 
     def checked_state(self, state: Any) -> dict[str, Any]:
         """Return a deep copy of what `get_state` of such a group returned.
@@ -185,7 +180,7 @@ class Group:
                 raise CoopenvError("not one observer per vehicle, or not with their coordinates")
             Mailbox(self.briefing).set_state(mail)
         except Exception as error:  # of anything that is no state
-            raise CoopenvError(f"state: the observers do not fit: {_told(error)}") from error
+            raise CoopenvError(f"state: the observers do not fit: {told(error)}") from error
         return dict(copied)
 
     def set_state(self, state: dict[str, Any]) -> None:

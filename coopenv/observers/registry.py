@@ -15,17 +15,17 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-from coopenv.errors import CoopenvError, suggest
+from coopenv.errors import CoopenvError, shown, suggest, told
 from coopenv.observers.contract import Factory
 from coopenv.observers.zoo import ZOO
-from coopenv.user_code import absolute, is_reference, load, one_line
+from coopenv.user_code import absolute, is_reference, load
 
 if TYPE_CHECKING:
     from coopenv.world.embedded import Embedded
 
 GROUP = "coopenv.observers"
 
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
 
 
 class Registered(NamedTuple):
@@ -44,7 +44,7 @@ def register(name: str, factory: Factory | None = None, *, embedded: Embedded | 
     """Make an observer known by name in this program.
 
     Args:
-        name: letters, digits and `_.-`, a letter first, as scenarios and the command line take it.
+        name: up to 64 letters, digits and `_.-`, a letter first, as scenarios and the command line take it.
         factory: class, or function of a setup; None: made of the kernels.
         embedded: its kernels, for worlds that run it without leaving the device.
 
@@ -52,11 +52,13 @@ def register(name: str, factory: Factory | None = None, *, embedded: Embedded | 
         CoopenvError: it is no such name, taken by another observer, or there is neither.
     """
     if not isinstance(name, str) or not NAME.fullmatch(name):
-        raise CoopenvError(f"an observer's name is a letter and then letters, digits or any of _.-, got {name!r}")
+        raise CoopenvError(
+            f"an observer's name is a letter and then letters, digits or any of _.-, at most 64, got {shown(name)}"
+        )
     if factory is not None and not callable(factory):
-        raise CoopenvError(f"observer '{name}': expected a class or function, got {factory!r:.60}")
+        raise CoopenvError(f"observer '{name}': expected a class or function, got {shown(factory)}")
     if (factory is None and embedded is None) or (embedded is not None and not _has_kernels(embedded)):
-        raise CoopenvError(f"observer '{name}': expected a class, a function or an Embedded, got {embedded!r:.60}")
+        raise CoopenvError(f"observer '{name}': expected a class, a function or an Embedded, got {shown(embedded)}")
     row = Registered(factory, embedded)
     if name in ZOO or _registered.get(name, row) != row:
         raise CoopenvError(f"an observer named '{name}' exists already")
@@ -95,7 +97,7 @@ def named(observer: str | Factory) -> str:
     row = _row(found)
     name = row.embedded.name if row.embedded is not None else place.rpartition(":")[2] or getattr(found, "__name__", "")
     if not (row.embedded or callable(found)) or not NAME.fullmatch(name):
-        raise CoopenvError(f"observer {found!r:.60}: expected a name, or a class or function that has one")
+        raise CoopenvError(f"observer {shown(found)}: expected a name, or a class or function that has one")
     module = Path(place.rpartition(":")[0]).stem if place else _origin(row)[0]
     full = f"{module.rpartition('.')[2]}.{name}"
     for short in (name, full):
@@ -228,7 +230,7 @@ def _found(observer: str | Factory) -> Registered:
     try:
         return _row(point.load())
     except (Exception, SystemExit) as error:  # anybody's code
-        raise CoopenvError(f"observer '{observer}' ({point.value}) cannot be loaded: {one_line(error)}") from error
+        raise CoopenvError(f"observer '{observer}' ({point.value}) cannot be loaded: {told(error)}") from error
 
 
 def is_joint(factory: Factory) -> bool:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv import CoopenvError
 from coopenv.observers import Estimate, Message
-from coopenv.observers.checks import check_estimate, check_message, is_finite
+from coopenv.observers.checks import check_estimate, check_message
 
 POSE: dict[str, Any] = {"rotation": np.eye(3), "position": np.zeros(3)}
 LOPSIDED = np.eye(6) + np.eye(6, k=1) * 1e-3
@@ -34,6 +34,7 @@ LOPSIDED = np.eye(6) + np.eye(6, k=1) * 1e-3
         ({"covariance": LOPSIDED.T}, "covariance is not symmetric"),
         ({"covariance": np.full((6, 6), np.nan)}, "covariance is not a finite array"),
         ({"covariance": np.eye(3)}, r"covariance is not a finite array of shape \(6, 6\)"),
+        ({"coordinates": "left"}, "coordinates are 'left', not a member of Coordinates"),
         ({"nis": float("nan"), "nis_dof": 2}, "nis is not finite"),
         ({"nis": 1.0, "nis_dof": -2}, "nis_dof negative"),
     ],
@@ -74,5 +75,11 @@ def test_messages_of_both_sizes_and_any_numbers() -> None:
     check_message(Message(np.zeros(3, np.float32), covariance=np.eye(6)))
 
 
-def test_large_numbers_are_finite() -> None:
-    assert is_finite(np.array([1e200, -1e300])) and not is_finite(np.array([1e200, np.inf]))
+@pytest.mark.parametrize("dtype", [float, np.float32, int])
+def test_quantities_have_a_bound(dtype: type) -> None:
+    """Beyond it products would overflow single precision; sums of squares of numbers within it may be large, too."""
+    check_estimate(Estimate(np.eye(3), np.full(3, 1e9).astype(dtype), 1e18 * np.eye(6)))
+    with pytest.raises(CoopenvError, match=r"position .* with numbers up to 1e\+09"):
+        check_estimate(Estimate(np.eye(3), np.full(3, 2e9).astype(dtype)))
+    with pytest.raises(CoopenvError, match=r"covariance .* with numbers up to 1e\+18"):
+        check_message(Message(np.zeros(3), covariance=(np.eye(3) * 2e18).astype(dtype)))

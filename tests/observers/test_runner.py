@@ -171,6 +171,11 @@ def test_failures_end_in_a_word_not_in_a_crash() -> None:
     assert "of vehicle_1 at 0.017 s" in run(Nan, recording()).failure and "finite" in run(Nan, recording()).failure
 
 
+class UnspeakableError(Exception):
+    def __str__(self) -> str:
+        return str(1 // 0)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -183,6 +188,17 @@ def test_failures_end_in_a_word_not_in_a_crash() -> None:
         (lambda e: replace(e, rotation=np.zeros((3, 3))), "rotation is not orthogonal"),
         (lambda e: replace(e, covariance=-np.eye(6)), "covariance is not positive semidefinite"),
         (lambda e: replace(e, nis=float("nan")), "nis"),
+        (
+            lambda e: (_ for _ in ()).throw(UnspeakableError()),
+            "UnspeakableError: says nothing, but raises ZeroDivisionError",
+        ),
+        (lambda e: (_ for _ in ()).throw(ValueError("\x1b[2J" + "a" * 5000)), "ValueError: \\x1b[2Jaaa"),
+        (lambda e: replace(e, coordinates="x"), "coordinates are 'x', not a member of Coordinates"),
+        (lambda e: replace(e, coordinates=None), "coordinates are None"),
+        (lambda e: replace(e, covariance=1e300 * np.eye(6)), "covariance is not a finite array of shape (6, 6) with"),
+        (lambda e: replace(e, covariance=2e18 * np.eye(6)), "with numbers up to 1e+18"),
+        (lambda e: replace(e, position=1e10 + e.position), "with numbers up to 1e+09"),
+        (lambda e: replace(e, position=np.full(3, 2**62)), "with numbers up to 1e+09"),
         (lambda e: replace(e, nis="small", nis_dof=2), "TypeError"),
     ],
 )
@@ -217,7 +233,7 @@ def test_what_is_no_message_is_told_in_one_line() -> None:
             return Message(position=self.p * (np.nan if self.index == 6 else 1.0))
 
     assert run(Mute, recording()).failure.endswith(
-        "at 0.100 s: CoopenvError: message: position is not a finite array of shape (3,)"
+        "at 0.100 s: CoopenvError: message: position is not a finite array of shape (3,) with numbers up to 1e+09"
     )
 
 
@@ -319,7 +335,7 @@ def test_registry(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("mine", "riccati"):
         with pytest.raises(CoopenvError, match="exists already"):
             register(name, Message)
-    for odd in (5, "", "a,b", "a b", "all\n"):
+    for odd in (5, "", "a,b", "a b", "all\n", "a" * 1000):
         with pytest.raises(CoopenvError, match="an observer's name is"):
             register(odd, Probe)  # type: ignore[arg-type]
     with pytest.raises(CoopenvError, match="'x': expected a class or function, got 3"):
