@@ -58,6 +58,8 @@ class Capabilities:
     """How many there are, the start included; None: no end of its own."""
     batched: bool
     """Whether it makes worlds on a device itself (`WorldBackend`)."""
+    recorded: bool = False
+    """Whether its ticks are always the same ones: neither seeds nor commands change anything."""
 
 
 @dataclass

@@ -25,12 +25,9 @@ class Simulated(TickGenerator):
 
     def __init__(self, scenario: Scenario) -> None:
         """Simulate a scenario."""
-        super().__init__(
-            scenario,
-            Capabilities(
-                truth=True, driven=scenario.driven, real_time=False, ticks=scenario.horizon_ticks + 1, batched=True
-            ),
-        )
+        driven, ticks = scenario.driven, scenario.horizon_ticks + 1
+        capabilities = Capabilities(truth=True, driven=driven, real_time=False, ticks=ticks, batched=True)
+        super().__init__(scenario, capabilities)
         self._world: SimulatedWorld | None = None
 
     def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> SimulatedWorld:

@@ -57,14 +57,13 @@ def describe(
     variant: Variant = None,
 ) -> None:
     """Say what an environment is: vehicles, sensors, observer."""
-    from coopenv.backends.simulated import Simulated
     from coopenv.jsonable import json_text
     from coopenv.runs.describe import describe_scenario
     from coopenv.runs.summary import document, summary
 
     name = Path(environment).stem
     backend = open_source(environment, parse_overrides(overrides), data, variant)
-    scenario, recorded = backend.scenario, not isinstance(backend, Simulated)
+    scenario, recorded = backend.scenario, backend.capabilities.recorded
     if as_json:
         sys.stdout.write(json_text(document(name, scenario)))
         return

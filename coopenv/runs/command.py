@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from coopenv.backends.base import Backend
-from coopenv.backends.simulated import Simulated
 from coopenv.errors import CoopenvError
 from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import Observability, analyse_observability
@@ -149,7 +148,7 @@ def report(request: RunRequest, result: RunResult, out: Console) -> None:
     """Print the result for people."""
     metrics, scenario = result.metrics, request.scenario
     source = f"seed {request.seed}, noise {'on' if scenario.noise.enabled else 'off'}"
-    if not isinstance(request.backend, Simulated):
+    if request.backend.capabilities.recorded:
         source = "recorded"
     out.print(f"{scenario.title}: {source}, {metrics['dtype']} on {metrics['device']}", soft_wrap=True)
     out.print()

@@ -30,10 +30,11 @@ class Replay(TickGenerator):
         self.recording = recording
         known = bool(recording.truth.known.any())
         scenario = scenario_of(recording, name, overrides or {})
-        super().__init__(
-            scenario,
-            Capabilities(truth=known, driven=False, real_time=False, ticks=scenario.horizon_ticks + 1, batched=True),
+        ticks = scenario.horizon_ticks + 1
+        capabilities = Capabilities(
+            truth=known, driven=False, real_time=False, ticks=ticks, batched=True, recorded=True
         )
+        super().__init__(scenario, capabilities)
 
     def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> ReplayWorld:
         """Return worlds that go through the recording."""
