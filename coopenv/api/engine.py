@@ -88,11 +88,19 @@ class Engine:
         options: Mapping[str, Any] | None = None,
     ) -> None:
         """Start new episodes, see `World.reset`; the results of the other worlds stay."""
+        if self.backend.capabilities.real_time:
+            self.load()  # before anybody waits for a command
         self.world.reset(seeds, mask, options)
         chosen = np.ones(self.world.worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
         self._start_plugins(chosen)
         self._fresh.assign(chosen.astype(np.int32))
         self._fill_results("results fresh", self._fresh, self._fresh)
+
+    def load(self) -> None:
+        """Load all kernels, compiling those that this machine has not compiled yet; nothing moves."""
+        (self.plugins or self.world).load()
+        self._end_episodes()
+        self._fill_results("load", self._nowhere, self._nowhere)
 
     def _start_plugins(self, chosen: np.ndarray) -> None:
         if self.plugins is not None:

@@ -56,6 +56,16 @@ class PlugIns:
             except ObserverError as failure:
                 raise self._failed(failure) from failure.__cause__
 
+    def load(self) -> None:
+        """Load the kernels of the stages, see `World.load`."""
+        self._active.zero_()
+        self._world.restart()
+        self._world.decide()
+        self._world.sense(self._active)
+        self._world.deliver(self._active, 0)
+        self._world.broadcast(self._active, 0)
+        self._world.finish(self._active)
+
     def advance(self, ticks: int) -> None:
         """Run camera ticks, stopping each world at its horizon; worlds in the world's mask stay as they are.
 

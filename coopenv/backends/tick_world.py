@@ -98,6 +98,11 @@ class TickWorld(SensingWorld):
         super().reset(seeds, mask)
         self._receive(self._present)
 
+    def load(self) -> None:
+        """Load the kernels, see `World.load`."""
+        super().load()
+        self.decide()
+
     def advance(self, ticks: int) -> None:
         """Run camera ticks, as many as the backend gives."""
         for _ in range(ticks):

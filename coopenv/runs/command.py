@@ -75,7 +75,7 @@ def execute(request: RunRequest, log: Console) -> RunResult:
     steady_from = steady_start(request.steady_from, scenario.horizon, end)
     with replacing_folder(request.folder, result_names()) as folder:
         with compile_notice(log):
-            recording.warm_up()
+            recording.engine.load()
         film = open_film(folder, _fps(scenario)) if request.video else None
         _simulate(recording, film, log)
         trajectory = recording.trajectory()

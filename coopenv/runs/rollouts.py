@@ -73,11 +73,6 @@ class Rollout:
         """Camera ticks since t = 0 that have been recorded."""
         return max(0, self._views.taken - 1)
 
-    def warm_up(self) -> None:
-        """Load all kernels, compiling those that this machine has not compiled yet."""
-        self.engine.reset([self.seed])
-        self.engine.step(ticks=0)
-
     def play(self) -> Iterator[int]:
         """Start the episode and yield the number of each camera tick, from 0, once it is recorded.
 

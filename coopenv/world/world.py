@@ -135,6 +135,11 @@ class World:
         moving = [PerWorld(self.actions), PerWorld(self.mask), ticks]
         self.launch(("advance", ticks), kernel, [*self._everything(), *moving])
 
+    def load(self) -> None:
+        """Load the kernels, compiling those that this machine has not compiled yet; nothing moves."""
+        self.restart()
+        World.advance(self, 0)
+
     def _everything(self) -> list[Any]:
         return [self.model, PerWorld(self.state), PerWorld(self.memory), self._record]
 

@@ -21,6 +21,7 @@ from coopenv.observers.recording import Sensed
 from coopenv.observers.recording_checks import check_recording
 from coopenv.policies import load_policy
 from coopenv.runs import record
+from coopenv.world.launch import kernel
 from tests.helpers.env_suite import CHECKS, Env, Make, official_tests, rollout
 from tests.helpers.fleet import CAMERA, MAX_SPEED, MAX_STEERING, Fleet
 
@@ -283,6 +284,22 @@ def test_messages_that_an_observer_cannot_read_are_rejected() -> None:
     engine.step()
     assert (fleet.health.received, fleet.health.rejected) == (2, 2)
     assert (engine.view("inbox_tick") == -1).all()
+
+
+@pytest.mark.parametrize("observer", ["riccati", "mekf"])
+def test_in_real_time_kernels_are_there_before_the_episode_begins(observer: str) -> None:
+    class Hurried(Fleet):
+        def episode(self, seed: int | None, options: Any) -> Any:
+            self.kernels = kernel.cache_info().misses
+            return super().episode(seed, options)
+
+    fleet = Hurried(observer)
+    fleet.capabilities = replace(fleet.capabilities, real_time=True)
+    kernel.cache_clear()
+    env = make(fleet)
+    env.reset(seed=0)
+    env.step(forwards(env))
+    assert fleet.kernels == kernel.cache_info().misses > 3
 
 
 def test_it_is_recorded_like_any_other(tmp_path: Any) -> None:
