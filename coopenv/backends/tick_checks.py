@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from coopenv.errors import CoopenvError
 from coopenv.estimation.validity import are_numbers, are_rotations, are_unit_vectors, everywhere
 from coopenv.observers.checks import check_message
+from coopenv.observers.contract import Message
 from coopenv.observers.recording import Briefing, Sensed
 from coopenv.observers.recording_checks import SHAPES
 
@@ -89,9 +90,15 @@ def _wrong_messages(tick: Sensed, N: int) -> Iterator[tuple[str, int | None, str
     for (receiver, sender), received in tick.messages.items():
         if not (0 <= receiver < N and 0 <= sender < N and receiver != sender):
             yield "messages", None, f"({receiver!r:.20}, {sender!r:.20}) are no two vehicles"
-        try:
-            check_message(received.message)
-        except CoopenvError as error:
-            yield "messages", receiver, str(error)
         if not received.age >= 0.0:
             yield "messages", receiver, "of negative age"
+
+
+def is_sound(message: Message) -> bool:
+    """Return whether a message from elsewhere holds what an inbox may hold."""
+    try:
+        check_message(message)
+    except CoopenvError:
+        return False
+    turned = message.rotation is None or bool(are_rotations(np.asarray(message.rotation, dtype=float)))
+    return turned and (message.position is None or bool(are_numbers(message.position).all()))

@@ -13,7 +13,7 @@ import numpy as np
 from coopenv.backends.base import Backend, Command, SensingWorld, WorldBackend
 from coopenv.backends.replay.device_recording import record_struct, true_twists
 from coopenv.backends.replay.kernels import BY_RADIO, RECORDED
-from coopenv.backends.tick_checks import MEASURED, check_tick
+from coopenv.backends.tick_checks import MEASURED, check_tick, is_sound
 from coopenv.errors import CoopenvError
 from coopenv.estimation.se3 import exp_se3
 from coopenv.observers.briefing import briefing_of, start_covariances
@@ -21,7 +21,7 @@ from coopenv.observers.contract import Message
 from coopenv.observers.kernel_world import views_of
 from coopenv.observers.recording import Briefing, Sensed, Truth, is_due
 from coopenv.observers.registry import find_embedded
-from coopenv.world.embedded import HOST, Messages
+from coopenv.world.embedded import HOST
 from coopenv.world.records import allocate, fields
 
 
@@ -96,7 +96,7 @@ class TickWorld(SensingWorld):
         self._clear_marks()
         self._take(self._backend.reset(None if seeds is None else int(seeds[0]), options or {}), 0)
         super().reset(seeds, mask)
-        self._receive(self._present)
+        self._receive()
 
     def load(self) -> None:
         """Load the kernels, see `World.load`."""
@@ -125,7 +125,7 @@ class TickWorld(SensingWorld):
             self.view("exhausted")[0] = 1
             return False
         self._take(tick, k)
-        self._receive(self._present)
+        self._receive()
         return True
 
     def get_state(self) -> NoReturn:
@@ -156,10 +156,9 @@ class TickWorld(SensingWorld):
         linear, angular = true_twists(pair, now.dt)
         self._row["true_rotation"][...], self._row["true_position"][...] = known.rotation, known.position
         self._row["true_velocity"][...], self._row["true_angular_velocity"][...] = linear[1], angular[1]
-        sampled = (now.index * now.dt - cast(Any, now.odometry_age) + 1e-9) * rate
+        sampled = (now.index * now.dt - np.asarray(now.odometry_age) + 1e-9) * rate
         self._row["samples"][...] = np.where(sampled >= 0.0, np.floor(np.maximum(sampled, 0.0)) + 1, 0)
-        lag = np.round(np.minimum(cast(Any, now.bearing_age) / now.dt, now.index))
-        self._row["bearing_lag"][...] = lag
+        self._row["bearing_lag"][...] = np.round(np.minimum(np.asarray(now.bearing_age) / now.dt, now.index))
         self._row["inbox_tick"][...] = BY_RADIO if now.inbox_tick is None else now.inbox_tick
         self.late += now.late
         self.missing += now.missing
@@ -175,7 +174,7 @@ class TickWorld(SensingWorld):
         arrays["rotation"][missing], arrays["translation"][missing] = exp_se3(twist * tick.dt)
         for name in ("velocity", "angular_velocity"):
             arrays[name][missing] = getattr(last, name)[missing]
-        arrays["odometry_age"][missing] = cast(Any, last.odometry_age)[missing] + tick.dt
+        arrays["odometry_age"][missing] = np.asarray(last.odometry_age)[missing] + tick.dt
         arrays["visible"][missing] = False
         arrays["bearings"][~arrays["visible"]] = np.nan
         for values in arrays.values():
@@ -183,24 +182,30 @@ class TickWorld(SensingWorld):
         due = bool(is_due(tick.index, self.model.observer.rate / self.scenario.rates.camera))
         return replace(tick, **arrays, missing=missing, late=_or_zeros(tick.late, N).astype(bool), due=due)
 
-    def _receive(self, tick: Sensed) -> None:
+    def _receive(self) -> None:
         """Put messages from vehicles that are estimated elsewhere into the inboxes; malformed ones are as none."""
-        for (receiver, sender), received in tick.messages.items():
-            message, sent = received.message, max(0, tick.index - round(received.age / tick.dt))
-            if self.observer.messages is not None and not self._read(receiver, sender, message, sent):
+        now, accepted = self._present, {}
+        for (receiver, sender), received in now.messages.items():
+            message, sent = received.message, max(0, now.index - round(received.age / now.dt))
+            if not (is_sound(message) and self._read(receiver, sender, message, sent)):
                 self._backend.health.rejected += 1
-            elif message.position is not None:
+                continue
+            accepted[receiver, sender] = received
+            if message.position is not None:
                 R = np.eye(3) if message.rotation is None else np.asarray(message.rotation, dtype=float)
                 self.view("inbox_rotation")[0, receiver, sender] = R
                 position = message.position - R @ self.briefing.setups[sender].marker
                 self.view("inbox_position")[0, receiver, sender] = position
                 self.view("inbox_tick")[0, receiver, sender] = sent
+        self._present = replace(now, messages=accepted)
 
     def _read(self, receiver: int, sender: int, message: Message, sent: int) -> bool:
-        """Hand a message to the embedded observer; return whether it is well-formed."""
+        """Hand a message to the embedded observer, if that has messages of its own; return whether it can read it."""
+        if self.observer.messages is None:
+            return True
         memory = views_of(self.memory, fields(self.observer.memory), receiver)
         try:
-            cast(Messages, self.observer.messages).read(SimpleNamespace(memory=memory), sender, message, sent)
+            self.observer.messages.read(SimpleNamespace(memory=memory), sender, message, sent)
         except (CoopenvError, ValueError, TypeError, LookupError, ArithmeticError):
             return False
         return True

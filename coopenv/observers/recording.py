@@ -73,7 +73,8 @@ class Sensed:
     truth: Truth | None = None
     inbox_tick: NDArray[np.int64] | None = None
     """(N receiver, N sender) tick of sending of the last message that arrived, -1: none, where the source knows what
-    its radio delivered; None: the scenario's radio decides. What they say is up to the senders' observers."""
+    its radio delivered; None: the scenario's radio decides. What they say is up to the senders' observers, which keep
+    it for `v2x.delay` ticks (at least one)."""
     messages: Mapping[tuple[int, int], Received] = field(default_factory=dict)
     """(receiver, sender) to a message that arrived since the last tick from a vehicle that is estimated elsewhere."""
 

@@ -246,11 +246,13 @@ class Neighbourly(Fleet):
     def __init__(self, observer: str, **extra: np.ndarray) -> None:
         super().__init__(observer)
         self._extra = extra
+        self.said: dict[str, Any] = {}
 
     def tick(self, k: int, *arguments: Any) -> Sensed:
         tick = super().tick(k, *arguments)
         assert tick.truth is not None
         said = Message(tick.truth.position[0], tick.truth.rotation[0], np.eye(6) * 1e-4, self._extra)
+        said = replace(said, **self.said)
         messages = {(2, 0): Received(said, 0.0)} if k % 2 == 0 else {}
         return replace(tick, inbox_tick=np.full((3, 3), -1), messages=messages)
 
@@ -277,13 +279,24 @@ def test_messages_may_come_from_elsewhere(observer: str, extra: dict[str, np.nda
         assert engine.world.memory.inbox.numpy()["valid"][0].tolist() == [[0] * 3, [0] * 3, [1, 0, 0]]
 
 
-def test_messages_that_an_observer_cannot_read_are_rejected() -> None:
-    fleet = Neighbourly("robust")
+@pytest.mark.parametrize(
+    ("observer", "said"),
+    [
+        ("robust", {}),
+        ("riccati", {"rotation": 2.0 * np.eye(3)}),
+        ("riccati", {"position": np.array([0.0, 1e12, 0.0])}),
+        ("mekf", {"position": np.array([0.0, np.nan, 0.0])}),
+    ],
+)
+def test_messages_that_cannot_be_read_are_rejected(observer: str, said: dict[str, np.ndarray]) -> None:
+    fleet = Neighbourly(observer)
+    fleet.said = said
     engine = Engine(fleet.scenario, 1, "float64", backend=fleet)
     engine.reset([0])
     engine.step()
     assert (fleet.health.received, fleet.health.rejected) == (2, 2)
     assert (engine.view("inbox_tick") == -1).all()
+    assert engine.plugins is None or not engine.plugins.groups[0].mail.heard[2]
 
 
 @pytest.mark.parametrize("observer", ["riccati", "mekf"])
