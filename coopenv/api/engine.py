@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from gymnasium.utils import seeding
 
 from coopenv.api.plugins import PlugIns
 from coopenv.api.step_results import MEMORY, results_struct
@@ -17,7 +18,7 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.base import Backend
 from coopenv.backends.simulated import Simulated
 from coopenv.backends.tick_world import open_world
-from coopenv.errors import check_memory, told
+from coopenv.errors import CoopenvError, check_memory, told
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
@@ -80,21 +81,45 @@ class Engine:
         self._fresh: Any = wp.zeros(worlds, dtype=wp.int32, device=device)
         self._state_fields = set(state_fields(self.world.precision))
         self._views: dict[str, np.ndarray] = {}
+        self.begun = False
+        """Whether every world has been reset, or restored from one that had."""
 
     def reset(
         self,
         seeds: Sequence[int] | np.ndarray | None = None,
         mask: np.ndarray | None = None,
         options: Mapping[str, Any] | None = None,
-    ) -> None:
-        """Start new episodes, see `World.reset`; the results of the other worlds stay."""
+    ) -> Sequence[int] | np.ndarray | None:
+        """Start new episodes, see `World.reset`; the results of the other worlds stay.
+
+        The first reset is of all worlds, and draws a seed unless one is given.
+
+        Returns:
+            The seeds of the worlds, or None where they go on from their last ones.
+        """
         if self.backend.capabilities.real_time:
             self.load()  # before anybody waits for a command
+        if not self.begun:
+            mask = None
+            if seeds is None:
+                first = seeding.np_random(None)[1]
+                seeds = [first + world for world in range(self.world.worlds)]
         self.world.reset(seeds, mask, options)
         chosen = np.ones(self.world.worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
         self._start_plugins(chosen)
         self._fresh.assign(chosen.astype(np.int32))
         self._fill_results("results fresh", self._fresh, self._fresh)
+        self.begun = True
+        return seeds
+
+    def check_begun(self) -> None:
+        """Make sure that there is something to step.
+
+        Raises:
+            CoopenvError: nothing has been reset.
+        """
+        if not self.begun:
+            raise CoopenvError("step() called before reset()")
 
     def load(self) -> None:
         """Load all kernels, compiling those that this machine has not compiled yet; nothing moves."""
@@ -222,8 +247,4 @@ class Engine:
         overwrite(self.world.state_arrays(), checked)
         self.refresh()
         overwrite(memory, checked)
-
-    @property
-    def begun(self) -> bool:
-        """Whether every world has been reset, or restored from one that had."""
-        return bool(has_begun(self.view("start_rotation")).all())
+        self.begun = bool(has_begun(self.view("start_rotation")).all())

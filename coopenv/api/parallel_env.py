@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 
 from coopenv.api.actions import ActionReader
 from coopenv.api.engine import Engine
 from coopenv.api.infos import InfoWriter
+from coopenv.api.pictures import Pictures
 from coopenv.api.state import state_space, state_vector
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
 from coopenv.backends.base import Backend, Health
@@ -23,9 +23,6 @@ from coopenv.errors import CoopenvError, ScenarioError, checked_seed, shown, sug
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import named
 from coopenv.scenario import Scenario
-
-if TYPE_CHECKING:
-    from coopenv.viz.topview import TopView
 
 Observations = dict[str, Any]
 Infos = dict[str, dict[str, Any]]
@@ -96,8 +93,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         self.state_space = state_space(scenario)
         self._read_actions = ActionReader(self.possible_agents, self.engine)
         self._infos = InfoWriter(self.engine, scenario)
-        self._view: TopView | None = None
-        self._seeded = False
+        self._pictures = Pictures(self.engine, scenario)
 
     @property
     def observation_layout(self) -> Layout:
@@ -119,11 +115,8 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             seed: fixes the episode; None goes on with a new episode of the last seed (a random one at first).
             options: for a backend that takes any; the others need none.
         """
-        if seed is None and not self._seeded:
-            _, seed = seeding.np_random(None)
         with self.engine.stopping():
             self.engine.reset(None if seed is None else [checked_seed(seed)], options=options)
-        self._seeded = True
         self.agents = list(self.possible_agents)
         if self.render_mode == "human":
             self.render()
@@ -138,8 +131,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             ActionError: an action is missing, unknown, of the wrong shape, or not finite.
             CoopenvError: `reset` has not been called.
         """
-        if not self._seeded:
-            raise CoopenvError("step() called before reset()")
+        self.engine.check_begun()
         alive = self.agents
         if not alive:
             return {}, {}, {}, {}, {}
@@ -183,22 +175,15 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         """Draw the top view: an (H, W, 3) uint8 picture for `rgb_array`, a window for `human`."""
         if self.render_mode is None:
             return None
-        if self._view is None:
-            from coopenv.viz.topview import TopView  # matplotlib is loaded by those who draw
-
-            self._view = TopView(self.scenario)
-        picture = self._view.draw(self.engine)
         if self.render_mode == "human":
-            self._view.show(picture)
+            self._pictures.show()
             return None
-        return picture
+        return self._pictures.of()
 
     def close(self) -> None:
         """Stop the backend's vehicles, let go of it, and close the window, if any."""
         self.engine.close()
-        if self._view is not None:
-            self._view.close()
-            self._view = None
+        self._pictures.close()
 
     def get_state(self) -> dict[str, Any]:
         """Return everything that the next step depends on, random streams included; see `set_state`."""
@@ -228,7 +213,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             self.engine.set_state(state)
         except CoopenvError as error:
             raise CoopenvError(f"{where}: {error}") from None
-        self.agents, self._seeded = list(agents), self.engine.begun
+        self.agents = list(agents)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"arguments": self._arguments, "state": self.get_state()}

@@ -16,6 +16,7 @@ from gymnasium.vector.utils import batch_space
 
 from coopenv.api.array_io import ArrayKind, Exchange
 from coopenv.api.engine import Engine
+from coopenv.api.pictures import Pictures
 from coopenv.api.terms.layout import Layout, action_space, flat_space
 from coopenv.backends.sources import open_simulation
 from coopenv.errors import CoopenvError, checked_seed, suggest
@@ -24,17 +25,6 @@ from coopenv.scenario import Scenario
 INFO_FIELDS = ("alive", "ended", "position_error", "orientation_error", "nees")
 """Arrays (num_envs,) in every info: `alive` is false for a vehicle that had ended before this step; `ended` is 0 under
 way, 1 arrived, 2 collided; errors in m and deg."""
-
-
-class OneWorld:
-    """An engine's views as if one of its worlds were the only one, for what draws world 0."""
-
-    def __init__(self, engine: Engine, world: int) -> None:
-        self._engine, self._world = engine, world
-
-    def view(self, name: str) -> np.ndarray:
-        """Return a field with a leading axis of one world."""
-        return self._engine.view(name)[self._world : self._world + 1]
 
 
 class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
@@ -54,8 +44,6 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     environment's memory, valid until the next step, and `step` does not synchronise with the host.
     """
 
-    _view: Any = None
-
     def __init__(
         self,
         scenario: Scenario,
@@ -74,6 +62,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             raise CoopenvError(f"unknown render_mode '{render_mode}'; known: None, rgb_array")
         self.scenario = scenario
         self.engine = Engine(scenario, num_worlds, dtype, device, threads)
+        self._pictures = Pictures(self.engine, scenario)
         self.num_worlds, self.vehicles = self.engine.world.worlds, len(scenario.vehicles)
         self.num_envs = self.num_worlds * self.vehicles
         self.autoreset = autoreset_mode(autoreset)
@@ -87,7 +76,6 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.single_observation_space = flat_space(self.engine.layout)
         self.single_action_space = action_space()
         self._exchange = Exchange(self.engine, arrays)
-        self._seeded = False
 
     @cached_property
     def observation_space(self) -> spaces.Space[Any]:  # type: ignore[override]
@@ -123,15 +111,10 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             CoopenvError: a mask that splits a world, or a sequence of the wrong length.
         """
         mask = self._world_mask(self._reset_mask(options))
-        if not self._seeded:
-            mask = None  # nothing has begun yet: the first reset is of all worlds
-            seed = seeding.np_random(None)[1] if seed is None else seed
         self._exchange.follow_torch()
-        seeds = self._world_seeds(seed)
+        seeds = self.engine.reset(self._world_seeds(seed), mask)
         if seeds is not None:
-            self._np_random, self._np_random_seed = seeding.np_random(seeds[0])
-        self.engine.reset(seeds, mask)
-        self._seeded = True
+            self._np_random, self._np_random_seed = seeding.np_random(int(seeds[0]))
         return self._exchange.rows("observation"), self._infos()
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -144,8 +127,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             ActionError: wrong shape or dtype, or (host arrays) not finite.
             CoopenvError: `reset` has not been called.
         """
-        if not self._seeded:
-            raise CoopenvError("step() called before reset()")
+        self.engine.check_begun()
         self._exchange.follow_torch()
         self._exchange.set_actions(actions)
         if self.autoreset == AutoresetMode.NEXT_STEP:
@@ -223,11 +205,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Return one (H, W, 3) uint8 picture per row; the rows of a world share the top view of their world."""
         if self.render_mode is None:
             return None
-        if self._view is None:
-            from coopenv.viz.topview import TopView  # matplotlib is loaded by those who draw
-
-            self._view = TopView(self.scenario)
-        pictures = [self._view.draw(OneWorld(self.engine, world)) for world in range(self.num_worlds)]
+        pictures = [self._pictures.of(world) for world in range(self.num_worlds)]
         return tuple(picture for picture in pictures for _ in range(self.vehicles))
 
     def get_state(self) -> dict[str, Any]:
@@ -247,15 +225,12 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             self.engine.set_state(state)
         except CoopenvError as error:
             raise CoopenvError(f"{where}: {error}") from None
-        self._seeded = self.engine.begun
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the renderer and end the threads."""
         if hasattr(self, "engine"):
             self.engine.close()
-        if self._view is not None:
-            self._view.close()
-            self._view = None
+            self._pictures.close()
 
 
 def autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.api.array_io import host_actions
+from coopenv.api.array_io import Exchange, host_actions
 from coopenv.api.engine import Engine
+from coopenv.api.pictures import Pictures
 from coopenv.api.terms.layout import Layout, action_space, flat_space
 from coopenv.errors import CoopenvError, checked_seed
 from coopenv.scenario import Scenario, load_scenario
@@ -19,8 +20,6 @@ try:
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 except ImportError as error:
     raise ImportError("coopenv.api.trainers.sb3 needs stable-baselines3: pip install '.[train]'") from error
-
-from gymnasium.utils import seeding
 
 
 class CooperativeSB3VecEnv(VecEnv):
@@ -43,8 +42,8 @@ class CooperativeSB3VecEnv(VecEnv):
         self.render_mode = "rgb_array"
         self.metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": scenario.rates.decision}
         self._actions = np.zeros((num_worlds, self.vehicles, 2), dtype=np.float32)
-        self._view: Any = None
-        self._seeded = False
+        self._pictures = Pictures(self.engine, scenario)
+        self._rows = Exchange(self.engine, "numpy").rows
         super().__init__(num_worlds * self.vehicles, flat_space(self.engine.layout), action_space())
 
     @property
@@ -52,22 +51,16 @@ class CooperativeSB3VecEnv(VecEnv):
         """Name, slice, unit and scale of every field of an observation row."""
         return self.engine.layout.copy()
 
-    def _rows(self, name: str) -> np.ndarray:
-        view = self.engine.view(name)
-        return view.reshape(self.num_envs, *view.shape[2:]).copy()
-
     def reset(self) -> np.ndarray:
         """Start a new episode in every world; seeds given by `seed()` count once."""
         first = self._seeds[0]
-        if first is None and not self._seeded:
-            _, first = seeding.np_random(None)
         seeds = None if first is None else [checked_seed(first) + w for w in range(self.engine.world.worlds)]
-        self._seeded = True
         self.engine.reset(seeds)
         self._reset_seeds()
         self._reset_options()
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        return self._rows("observation")
+        observation: np.ndarray = self._rows("observation")
+        return observation
 
     def step_async(self, actions: np.ndarray) -> None:
         """Take the actions, (num_envs, 2).
@@ -75,8 +68,7 @@ class CooperativeSB3VecEnv(VecEnv):
         Raises:
             ActionError: wrong shape, or not finite.
         """
-        if not self._seeded:
-            raise CoopenvError("step() called before reset()")
+        self.engine.check_begun()
         self._actions[...] = host_actions(actions, self._actions.shape)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
@@ -108,17 +100,11 @@ class CooperativeSB3VecEnv(VecEnv):
     def close(self) -> None:
         """Close the renderer and end the threads."""
         self.engine.world.launch.close()
-        if self._view is not None:
-            self._view.close()
-            self._view = None
+        self._pictures.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Return one picture, the top view of world 0."""
-        if self._view is None:
-            from coopenv.viz.topview import TopView  # matplotlib is loaded by those who draw
-
-            self._view = TopView(self.scenario)
-        return [self._view.draw(self.engine)]
+        return [self._pictures.of()]
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of the batch once per row."""
