@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -13,7 +13,7 @@ from gymnasium.utils import seeding
 from coopenv.api.plugins import PlugIns
 from coopenv.api.step_results import MEMORY, results_struct
 from coopenv.api.terms.binding import bound_terms
-from coopenv.api.terms.kernels import Plan, endings_kernel, results_kernel
+from coopenv.api.terms.kernels import endings_kernel, results_kernel
 from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.base import Backend
 from coopenv.backends.simulated import Simulated
@@ -72,10 +72,9 @@ class Engine:
         self._fill = results_kernel(terms, p)
         self._end = endings_kernel(terms.conditions, p) if terms.conditions else None
         fields = self.layout.values()
-        self._plan: Any = Plan()
-        self._plan.start = wp.array([field.start for field in fields], dtype=wp.int32, device=device)
-        self._plan.factor = wp.array([1.0 / field.scale for field in fields], dtype=wp.float32, device=device)
-        self._plan.weight = wp.array(list(weights.values()), dtype=wp.float32, device=device)
+        self._start = _vector(wp.int32, [field.start for field in fields])
+        self._factor = _vector(wp.float32, [1.0 / field.scale for field in fields])
+        self._weight = _vector(wp.float32, weights.values())
         self._everywhere: Any = wp.ones(worlds, dtype=wp.int32, device=device)
         self._nowhere: Any = wp.zeros(worlds, dtype=wp.int32, device=device)
         self._fresh: Any = wp.zeros(worlds, dtype=wp.int32, device=device)
@@ -188,7 +187,9 @@ class Engine:
         arguments = [
             self.world.model,
             PerWorld(self.world.state),
-            self._plan,
+            self._start,
+            self._factor,
+            self._weight,
             PerWorld(self.results),
             PerWorld(fresh),
             PerWorld(chosen),
@@ -196,7 +197,7 @@ class Engine:
         self.world.launch(key, self._fill, arguments, inner=(self.world.model.vehicles,))
 
     def view(self, name: str) -> np.ndarray:
-        """Return a field of the report, the state or the actions on the host."""
+        """Return a field of the results, the state or the actions on the host."""
         view = self._views.get(name)
         if view is None:
             view = self.array(name).numpy()
@@ -248,3 +249,8 @@ class Engine:
         self.refresh()
         overwrite(memory, checked)
         self.begun = bool(has_begun(self.view("start_rotation")).all())
+
+
+def _vector(dtype: Any, values: Collection[float]) -> Any:
+    """Return a Warp vector, which a kernel takes by value."""
+    return wp.types.vector(length=len(values), dtype=dtype)(*values)

@@ -6,7 +6,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.so3 import rotation_angle
-from coopenv.world.collision import UNDER_WAY, goal_distance
+from coopenv.world.collision import UNDER_WAY
 from coopenv.world.precision import Precision
 from coopenv.world.quality import (
     cholesky_of,
@@ -61,19 +61,11 @@ MEMORY = {
 
 
 @wp.func
-def forget(model: Any, state: Any, results: Any, world: int, vehicle: int):
-    """Start the memory of a new episode."""
-    results.last_goal_distance[world, vehicle] = goal_distance(model, state, world, vehicle)
-    results.last_ended[world, vehicle] = UNDER_WAY
-    results.last_tick[world, vehicle] = 0
-
-
-@wp.func
-def remember(model: Any, state: Any, results: Any, world: int, vehicle: int):
+def remember(results: Any, world: int, vehicle: int, goal_distance: Any, ended: int, tick: int):
     """Keep what the next step compares with."""
-    results.last_goal_distance[world, vehicle] = goal_distance(model, state, world, vehicle)
-    results.last_ended[world, vehicle] = state.ended[world, vehicle]
-    results.last_tick[world, vehicle] = state.tick[world]
+    results.last_goal_distance[world, vehicle] = goal_distance
+    results.last_ended[world, vehicle] = ended
+    results.last_tick[world, vehicle] = tick
 
 
 @wp.func
@@ -107,13 +99,12 @@ def is_over(model: Any, state: Any, world: int) -> bool:
 
 
 @wp.func
-def set_flags(model: Any, state: Any, results: Any, world: int, vehicle: int):
-    """Write who is under way, who has just ended, and whether the world is over."""
+def set_flags(results: Any, world: int, vehicle: int, ended: int, over: bool, horizon_ticks: int):
+    """Write who was under way, who has just ended, and whether the world is over."""
     # Over since the last step: nothing more is earned before a reset (each vehicle reads its own memory only).
-    waiting = results.last_tick[world, vehicle] >= model.horizon_ticks
+    waiting = results.last_tick[world, vehicle] >= horizon_ticks
     alive = results.last_ended[world, vehicle] == UNDER_WAY and not waiting
-    terminated = alive and state.ended[world, vehicle] != UNDER_WAY
-    over = is_over(model, state, world)
+    terminated = alive and ended != UNDER_WAY
     results.alive[world, vehicle] = alive
     results.terminated[world, vehicle] = terminated
     results.truncated[world, vehicle] = over and not terminated

@@ -57,7 +57,7 @@ def vector_put(size: int) -> wp.Function:
 
 
 @wp.func
-def no_field(out: Any, plan: Any, world: int, vehicle: int, n: int, ego: Any, other: Any):
+def no_field(out: Any, start: Any, factor: Any, world: int, vehicle: int, n: int, ego: Any, other: Any):
     """Write nothing."""
 
 
@@ -66,13 +66,13 @@ def with_field(rest: wp.Function, bound: Bound) -> wp.Function:
     function, index, size = bound.function, bound.index, bound.size
     put_value = put if size == 1 else vector_put(size)
 
-    def of_ego(out: Any, plan: Any, world: int, vehicle: int, n: int, ego: Any, other: Any):
-        rest(out, plan, world, vehicle, n, ego, other)
-        put_value(out, world, vehicle, plan.start[index], function(ego), plan.factor[index])
+    def of_ego(out: Any, start: Any, factor: Any, world: int, vehicle: int, n: int, ego: Any, other: Any):
+        rest(out, start, factor, world, vehicle, n, ego, other)
+        put_value(out, world, vehicle, start[index], function(ego), factor[index])
 
-    def of_both(out: Any, plan: Any, world: int, vehicle: int, n: int, ego: Any, other: Any):
-        rest(out, plan, world, vehicle, n, ego, other)
-        put_value(out, world, vehicle, plan.start[index] + n * size, function(ego, other), plan.factor[index])
+    def of_both(out: Any, start: Any, factor: Any, world: int, vehicle: int, n: int, ego: Any, other: Any):
+        rest(out, start, factor, world, vehicle, n, ego, other)
+        put_value(out, world, vehicle, start[index] + n * size, function(ego, other), factor[index])
 
     return wp.func(of_ego if bound.records == 1 else of_both, name=f"write_field_{index}")
 

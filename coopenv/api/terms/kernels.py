@@ -14,7 +14,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.api.step_results import assess, forget, remember, set_flags
+from coopenv.api.step_results import assess, is_over, remember, set_flags
 from coopenv.api.terms.chains import (
     Bound,
     Terms,
@@ -25,18 +25,9 @@ from coopenv.api.terms.chains import (
     with_field,
     with_reward,
 )
-from coopenv.api.terms.records import fill_ego, fill_neighbour, fill_target, fill_truth, records
-from coopenv.world.collision import UNDER_WAY
+from coopenv.api.terms.records import fill_neighbour, fill_own, fill_target, records
+from coopenv.world.collision import UNDER_WAY, goal_distance
 from coopenv.world.precision import Precision
-
-
-@wp.struct
-class Plan:
-    """Where fields go and how they are scaled, and what terms weigh."""
-
-    start: wp.array(dtype=wp.int32)  # (F,) first entry in the observation
-    factor: wp.array(dtype=wp.float32)  # (F,) 1 / scale
-    weight: wp.array(dtype=wp.float32)  # (K,)
 
 
 @cache
@@ -51,38 +42,42 @@ def results_kernel(terms: Terms, p: Precision) -> wp.Kernel:
     def step_results(
         model: Any,
         state: Any,
-        plan: Plan,
+        start: Any,
+        factor: Any,
+        weight: Any,
         results: Any,
         fresh: wp.array(dtype=wp.int32),
         chosen: wp.array(dtype=wp.int32),
     ):
         """One thread per (world, vehicle).
 
-        `fresh` marks worlds that have just been reset: they forget the last episode and earn no reward.
+        Vectors: `start` and `factor`, a field's first entry and 1 / scale; `weight` of the reward terms. `fresh` marks
+        worlds that have just been reset: they forget the last episode and earn no reward.
         """
         world, vehicle = wp.tid()
         if chosen[world] == 0:
             return
+        distance = goal_distance(model, state, world, vehicle)
         if fresh[world] != 0:
-            forget(model, state, results, world, vehicle)
+            remember(results, world, vehicle, distance, UNDER_WAY, 0)
+        ended = state.ended[world, vehicle]
+        set_flags(results, world, vehicle, ended, is_over(model, state, world), model.horizon_ticks)
         assess(model, state, results, world, vehicle)
-        set_flags(model, state, results, world, vehicle)
-        ego = fill_ego(Ego(), model, state, results, world, vehicle)
-        truth = fill_truth(Truth(), model, state, results, world, vehicle)
-        remember(model, state, results, world, vehicle)
-        total = add_rewards(results.terms, plan.weight, world, vehicle, ego, truth)
+        ego, truth = fill_own(Ego(), Truth(), model, state, results, world, vehicle, distance)
+        remember(results, world, vehicle, distance, ended, state.tick[world])
+        total = add_rewards(results.terms, weight, world, vehicle, ego, truth)
         earns = results.alive[world, vehicle] and fresh[world] == 0
         results.reward[world, vehicle] = wp.where(earns, total, 0.0)
 
         out = results.observation
-        write_own(out, plan, world, vehicle, 0, ego, ego)
+        write_own(out, start, factor, world, vehicle, 0, ego, ego)
         for n in range(model.agents):
             target = fill_target(Target(), model, state, world, vehicle, n)
-            write_of_target(out, plan, world, vehicle, n, ego, target)
+            write_of_target(out, start, factor, world, vehicle, n, ego, target)
         for n in range(model.vehicles - 1):
             sender = wp.where(n >= vehicle, n + 1, n)
             neighbour = fill_neighbour(Neighbour(), model, state, world, vehicle, sender)
-            write_of_neighbour(out, plan, world, vehicle, n, ego, neighbour)
+            write_of_neighbour(out, start, factor, world, vehicle, n, ego, neighbour)
 
     return _kernel(step_results, p, [*chain(*terms[:4])])
 
@@ -100,8 +95,8 @@ def endings_kernel(conditions: tuple[Bound, ...], p: Precision) -> wp.Kernel:
         decided = tick > 0 and (tick % model.ticks_per_decision == 0 or tick == model.horizon_ticks)
         if decided and state.ended[world, vehicle] == UNDER_WAY:
             assess(model, state, results, world, vehicle)
-            ego = fill_ego(Ego(), model, state, results, world, vehicle)
-            truth = fill_truth(Truth(), model, state, results, world, vehicle)
+            distance = goal_distance(model, state, world, vehicle)
+            ego, truth = fill_own(Ego(), Truth(), model, state, results, world, vehicle, distance)
             state.ended[world, vehicle] = outcome_of(ego, truth)
 
     return _kernel(end_episodes, p, conditions)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from coopenv.world.camera import VISIBLE
-from coopenv.world.collision import UNDER_WAY, goal_distance
+from coopenv.world.collision import UNDER_WAY
 from coopenv.world.precision import Precision
 from coopenv.world.v2x import fresh
 
@@ -98,41 +98,34 @@ def known(value: Any) -> wp.float32:
 
 
 @wp.func
-def seconds_since(model: Any, now: int, then: int) -> wp.float64:
-    """Return the age of a measurement or message in s; very old if there is none."""
+def seconds_since(now: int, then: int, rate: wp.float64) -> wp.float64:
+    """Return the age in s of a measurement or message by its tick; very old if there is none."""
     if then < 0:
         return NEVER
-    return wp.float64(now - then) / model.camera_rate
+    return wp.float64(now - then) / rate
 
 
 @wp.func
-def goal_seen(model: Any, state: Any, world: int, vehicle: int):
-    """Return the goal, which is known in the map, as seen from the vehicle's own estimate; 0 without a goal."""
-    p = state.estimate_position[world, vehicle]
-    if model.scene.goal_radius[vehicle] > p.dtype(0.0):
-        return wp.transpose(state.estimate_rotation[world, vehicle]) * model.scene.goal[vehicle] - p
-    return p - p
-
-
-@wp.func
-def odometry_age(model: Any, state: Any, world: int, vehicle: int) -> wp.float64:
-    """Return the age of the last odometry sample, s."""
-    samples = state.odometry_samples[world, vehicle]
+def odometry_age(samples: int, time: wp.float64, rate: wp.float64) -> wp.float64:
+    """Return the age in s of the last of so many samples, the first of which was at 0 s."""
     if samples == 0:
         return NEVER
-    now = wp.float64(state.tick[world]) / model.camera_rate
-    return wp.max(now - wp.float64(samples - 1) / model.odometry_rate, wp.float64(0.0))
+    return wp.max(time - wp.float64(samples - 1) / rate, wp.float64(0.0))
 
 
 @wp.func
-def fill_ego(ego: Any, model: Any, state: Any, results: Any, world: int, vehicle: int):
-    """Return the record of what a vehicle knows; `results` holds how good its estimate is."""
+def fill_own(ego: Any, truth: Any, model: Any, state: Any, results: Any, world: int, vehicle: int, goal_distance: Any):
+    """Return the records of a vehicle: what it knows, and what is true.
+
+    `results` holds how good its estimate is, and what was so after the last decision. One function for both, as model,
+    state and results are handed over by value, over which compilers take their time.
+    """
     tick = state.tick[world]
-    last = results.last_tick[world, vehicle]
     ego.time = wp.float64(tick) / model.camera_rate
-    ego.elapsed = wp.float32(wp.float64(tick - last) / model.camera_rate)
+    ego.elapsed = wp.float32(wp.float64(tick - results.last_tick[world, vehicle]) / model.camera_rate)
     R = state.estimate_rotation[world, vehicle]
-    ego.position_estimate = R * state.estimate_position[world, vehicle]
+    p = state.estimate_position[world, vehicle]
+    ego.position_estimate = R * p
     ego.rotation_estimate = R
     ego.covariance = state.covariance[world, vehicle]
     ego.log_determinant = results.log_determinant[world, vehicle]
@@ -141,17 +134,13 @@ def fill_ego(ego: Any, model: Any, state: Any, results: Any, world: int, vehicle
     ego.possible_targets = model.target_count[vehicle]
     ego.velocity = state.odometry_velocity[world, vehicle]
     ego.angular_velocity = state.odometry_angular_velocity[world, vehicle]
-    ego.odometry_age = odometry_age(model, state, world, vehicle)
+    ego.odometry_age = odometry_age(state.odometry_samples[world, vehicle], ego.time, model.odometry_rate)
     ego.action = state.action[world, vehicle]
     ego.command = state.command[world, vehicle]
-    ego.goal = goal_seen(model, state, world, vehicle)
+    if model.scene.goal_radius[vehicle] > p.dtype(0.0):
+        ego.goal = wp.transpose(R) * model.scene.goal[vehicle] - p
     ego.outcome = wp.where(results.alive[world, vehicle], state.ended[world, vehicle], UNDER_WAY)
-    return ego
 
-
-@wp.func
-def fill_truth(truth: Any, model: Any, state: Any, results: Any, world: int, vehicle: int):
-    """Return the record of what is true of a vehicle; `results` holds its errors and the last distance to its goal."""
     agent = model.landmarks + vehicle
     truth.position = state.position[world, agent]
     truth.rotation = state.rotation[world, agent]
@@ -160,12 +149,11 @@ def fill_truth(truth: Any, model: Any, state: Any, results: Any, world: int, veh
     truth.position_error = known(results.position_error[world, vehicle])
     truth.orientation_error = known(results.orientation_error[world, vehicle])
     truth.nees = known(results.nees[world, vehicle])
-    distance = goal_distance(model, state, world, vehicle)
-    truth.goal_distance = known(distance)
-    progress = results.last_goal_distance[world, vehicle] - distance
-    truth.progress = wp.where(model.scene.goal_radius[vehicle] > distance - distance, known(progress), 0.0)
+    truth.goal_distance = known(goal_distance)
+    if model.scene.goal_radius[vehicle] > goal_distance - goal_distance:
+        truth.progress = known(results.last_goal_distance[world, vehicle] - goal_distance)
     truth.contact = state.collided[world, vehicle] != 0
-    return truth
+    return ego, truth
 
 
 @wp.func
@@ -174,7 +162,7 @@ def fill_target(target: Any, model: Any, state: Any, world: int, vehicle: int, i
     target.index = index
     target.bearing = state.bearing[world, vehicle, index]
     target.in_view = state.sight[world, vehicle, index] == VISIBLE
-    target.age = seconds_since(model, state.tick[world], state.bearing_tick[world, vehicle, index])
+    target.age = seconds_since(state.tick[world], state.bearing_tick[world, vehicle, index], model.camera_rate)
     return target
 
 
@@ -190,5 +178,5 @@ def fill_neighbour(neighbour: Any, model: Any, state: Any, world: int, vehicle: 
         p = state.estimate_position[world, vehicle]
         neighbour.position = Rt * state.inbox_position[world, vehicle, sender] - p
         neighbour.rotation = Rt * state.inbox_rotation[world, vehicle, sender]
-        neighbour.age = seconds_since(model, now, state.inbox_tick[world, vehicle, sender])
+        neighbour.age = seconds_since(now, state.inbox_tick[world, vehicle, sender], model.camera_rate)
     return neighbour
