@@ -24,31 +24,17 @@ FLAT = 1e-9
 """Twice a triangle's area over its longest squared side: below it the points are on a line."""
 
 
-def solve_p3p(bearings: Array, positions: Array) -> tuple[Array, Array]:
-    """Return every pose from which three points are seen in three directions.
+def solve_p3p(bearings: Array, positions: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return every pose from which three points are seen in three directions, for each of B triples.
 
     Args:
-        bearings: (3, 3) unit vectors from the camera to the points, body frame, one a row.
-        positions: (3, 3) the points, map frame, m, one a row.
+        bearings: (B, 3, 3) unit vectors from the camera to the points, body frame, one a row.
+        positions: (B, 3, 3) the points, map frame, m, one a row.
 
     Returns:
-        Rotations (n, 3, 3) from body to map and camera positions (n, 3) in the map frame, n = 0..4, ordered by distance
-        from the first point; a double one may come twice. None for degenerate input: points on a line, bearings not of
-        length 1, values that are not finite.
-    """
-    R, c, mask = solve_p3p_batch(np.asarray(bearings)[None], np.asarray(positions)[None])
-    return R[0, mask[0]], c[0, mask[0]]
-
-
-def solve_p3p_batch(bearings: Array, positions: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Return every pose for each of B triples; see `solve_p3p`.
-
-    Args:
-        bearings: (B, 3, 3) unit vectors, body frame.
-        positions: (B, 3, 3) points, map frame, m.
-
-    Returns:
-        Rotations (B, 4, 3, 3), camera positions (B, 4, 3), and a mask (B, 4) of what is a solution; the rest is NaN.
+        Rotations (B, 4, 3, 3) from body to map, camera positions (B, 4, 3) in the map frame, and a mask (B, 4) of what
+        is a solution, ordered by distance from the first point; the rest is NaN. A double one may come twice. None for
+        degenerate input: points on a line, bearings not of length 1, values that are not finite.
     """
     b, z = np.asarray(bearings, dtype=np.float64), np.asarray(positions, dtype=np.float64)
     with np.errstate(all="ignore"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg.lapack import dgesv, dposv, dpotrf
+from scipy.linalg.lapack import dgesv, dpotrf
 
 from coopenv.estimation.arrays import Array
 
@@ -32,26 +32,3 @@ def cholesky(A: Array) -> Array:
         raise np.linalg.LinAlgError("not positive definite")
     result: Array = factor
     return result
-
-
-def solve_positive(A: Array, b: Array) -> Array:
-    """Return A^-1 b of a positive definite A.
-
-    Raises:
-        LinAlgError: A is not positive definite.
-    """
-    _, x, failed = dposv(A, b)
-    if failed:
-        raise np.linalg.LinAlgError("not positive definite")
-    result: Array = x
-    return result
-
-
-def invert_positive(A: Array) -> Array:
-    """Return A^-1 of a positive definite A, symmetric.
-
-    Raises:
-        LinAlgError: A is not positive definite.
-    """
-    inverse = solve_positive(A, np.eye(len(A)))
-    return (inverse + inverse.T) / 2

@@ -71,6 +71,8 @@ class KernelObserver:
         """The vehicle's part of the state by name: arrays without the axes W and N."""
         self.memory = views_of(self._records[1], fields(self._kernels.memory))
         """The same of the memory."""
+        if self._messages.tampered is not None:
+            self.tampered = self._messages.tampered
         self._now = [wp.zeros(1, dtype=kind, device="cpu") for kind in (wp.int32, wp.float64, wp.int32)]
         self._now_views = [array.numpy() for array in self._now]
         self._start_covariance = self._model.start.covariance.numpy()[setup.vehicle]
@@ -105,9 +107,9 @@ class KernelObserver:
         """
         if self._origin is None:
             self._set_clock(tick.time - tick.dt, tick.dt)
-        now = self._units(tick.time - (self._origin or 0.0))
+        now = self.units(tick.time - (self._origin or 0.0))
         if not 0 <= now < MOST_UNITS:
-            raise CoopenvError(f"{tick.time:g} s is not within {MOST_UNITS * self._unit:.0f} s of the start")
+            raise CoopenvError(f"{tick.time:g} s is not within {MOST_UNITS * self.unit:.0f} s of the start")
         for view, value in zip(self._now_views, (now, tick.dt, tick.due), strict=True):
             view[0] = value
         self._sense(tick, now)
@@ -117,7 +119,7 @@ class KernelObserver:
 
     def message(self) -> Message:
         """Return what the kernels put on the air."""
-        self._run("send", send_kernel)
+        self._run("send", send_kernel, self._now[0])
         message: Message = self._messages.write(self)
         return message
 
@@ -136,7 +138,7 @@ class KernelObserver:
         s = self.state
         s.inbox_tick[...] = -1
         for target, received in messages.items():
-            sender, sent = target - self.setup.landmarks, now - self._units(received.age)
+            sender, sent = target - self.setup.landmarks, now - self.units(received.age)
             last = self._heard.get(sender)
             if last is None or last.message is not received.message or abs(last.sent - sent) > 1:
                 valid = sent >= 0 and self._read(sender, received.message, sent)
@@ -162,16 +164,16 @@ class KernelObserver:
             P = left_covariance(p, P)
         return Estimate(R, R.dot(p), P, coordinates, float(s.nis) if dof else None, dof)
 
-    def _units(self, seconds: float) -> int:
+    def units(self, seconds: float) -> int:
         """Return a time in the kernels' units."""
-        return round(min(max(seconds / self._unit, -MOST_UNITS), MOST_UNITS))
+        return round(min(max(seconds / self.unit, -MOST_UNITS), MOST_UNITS))
 
     def _set_clock(self, origin: float | None, period: float) -> None:
         """Let the kernels count from an origin on, s, by parts of a tick of a period, s."""
         if not 0.0 < period < math.inf:
             raise CoopenvError(f"a tick of {period} s")
-        self._origin, self._unit = origin, period / UNITS_PER_TICK
-        self._model.camera_period, self._model.camera_rate = self._unit, 1.0 / self._unit
+        self._origin, self.unit = origin, period / UNITS_PER_TICK
+        self._model.camera_period, self._model.camera_rate = self.unit, 1.0 / self.unit
         self._launch = Launcher(1, "cpu", PRECISION)
 
     def _run(self, key: str, factory: Callable[[Embedded], Any], *moving: Any) -> None:
@@ -179,12 +181,12 @@ class KernelObserver:
 
     def _all_views(self) -> list[Any]:
         """Return every array that changes."""
-        return [*vars(self.state).values(), *vars(self.memory).values(), self._start_covariance]
+        return [*vars(self.state).values(), *vars(self.memory).values(), *self._now_views, self._start_covariance]
 
     def __reduce__(self) -> Any:
         """Travel, and be copied, as the name of the kernels and all that has changed since they began."""
         arrays = [view.copy() for view in self._all_views()]
-        return _observer, (self.embedded.name, self.setup), (arrays, self._origin, self._unit, self._heard)
+        return _observer, (self.embedded.name, self.setup), (arrays, self._origin, self.unit, self._heard)
 
     def __setstate__(self, state: Any) -> None:
         """Go on where another one was."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array
-from coopenv.estimation.p3p import solve_p3p_batch
+from coopenv.estimation.p3p import solve_p3p
 from coopenv.estimation.small_matrices import solve
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.mekf import LeftError, innovation
@@ -108,7 +108,7 @@ def candidates(tick: Tick, data: Bearings) -> list[tuple[Array, Array]]:
     """Return the poses (R, p) of the body that P3P finds for triples of the bearings."""
     b, z, _ = data
     triples = np.array(list(combinations(range(len(b)), 3))[:MOST_TRIPLES])
-    R, camera, mask = solve_p3p_batch(b[triples], z[triples])
+    R, camera, mask = solve_p3p(b[triples], z[triples])
     return [(turn, place - turn @ tick.lever_arm) for turn, place in zip(R[mask], camera[mask], strict=True)]
 
 

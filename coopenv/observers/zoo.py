@@ -39,7 +39,12 @@ ZOO = {
     "planar_ekf": Entry("planar.plugin:PlanarEkf", in_space=False),
     "robust": Entry("robust.plugin:robust", "robust.kernels:ROBUST", kernels_on_a_plane=False),
     # on a plane it is `robust`: there are no joint messages
-    "robust_joint": Entry("robust.plugin:robust_joint", on_a_plane=False),
+    "robust_joint": Entry(
+        "robust.joint.plugin:robust_joint",
+        "robust.joint.kernels:ROBUST_JOINT",
+        on_a_plane=False,
+        kernels_on_a_plane=False,
+    ),
     "centralised": Entry("centralised:Centralised"),
 }
 """By name."""

@@ -165,12 +165,13 @@ def estimate_kernel(observer: Embedded) -> Kernel:
 
 @cache
 def send_kernel(observer: Embedded) -> Kernel:
-    """Return the kernel that lets one vehicle put a message on the air, whatever the tick."""
+    """Return the kernel that lets one vehicle put a message on the air."""
     send_message = observer.send
 
-    def send(model: Any, state: Any, memory: Any, vehicle: int):
+    def send(model: Any, state: Any, memory: Any, vehicle: int, tick: wp.array(dtype=wp.int32)):
         """Send. One thread per world."""
-        send_message(model, state, memory, wp.tid(), vehicle, 0)
+        world = wp.tid()
+        send_message(model, state, memory, world, vehicle, tick[world])
 
     return _named(send, observer.name, **observer.options)
 

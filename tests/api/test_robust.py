@@ -16,8 +16,8 @@ import coopenv
 import coopenv.observers.registry as registry
 from coopenv.api.engine import Engine
 from coopenv.observers import register
-from coopenv.observers.robust.reference.observer import Robust
 from tests.helpers import mrclam_files
+from tests.oracles.robust.observer import Robust
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "the paper's start": ("busy_intersection", {"horizon": 3.0}),

@@ -23,10 +23,13 @@ class Played(NamedTuple):
 
 
 def replayed(
-    recording: Recording, meddle: Callable[[World, int], None] = lambda world, tick: None, dtype: str = "float64"
+    recording: Recording,
+    meddle: Callable[[World, int], None] = lambda world, tick: None,
+    dtype: str = "float64",
+    observer: str = "robust",
 ) -> Played:
     """Replay a record; `meddle` may change what is on the air after each tick."""
-    world = Replay(recording, "record", {"observer.name": "robust"}).world(1, dtype, "cpu", 1)
+    world = Replay(recording, "record", {"observer.name": observer}).world(1, dtype, "cpu", 1)
     world.reset([0])
     rows = []
     for tick in range(recording.ticks):

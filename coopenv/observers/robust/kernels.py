@@ -5,9 +5,9 @@ from __future__ import annotations
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.observers.robust.memory import SIZES, RobustMemory
 from coopenv.observers.robust.messages import MESSAGES
-from coopenv.observers.robust.observer import make_estimate, start
+from coopenv.observers.robust.observer import make_estimate, make_start
 from coopenv.observers.robust.rules import rules_for
-from coopenv.observers.robust.tracklets import fuse_messages, receive, send
+from coopenv.observers.robust.tracklets import clear_messages, fuse_messages, receive, send
 from coopenv.world.embedded import Embedded
 
 OPTIONS = {"max_unroll": 1}
@@ -16,7 +16,7 @@ OPTIONS = {"max_unroll": 1}
 ROBUST = Embedded(
     "robust",
     make_estimate(receive, fuse_messages),
-    start,
+    make_start(clear_messages, receive),
     send,
     RobustMemory,
     SIZES,

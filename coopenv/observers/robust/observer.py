@@ -16,10 +16,10 @@ from coopenv.estimation.so3 import identity3, orthonormalise, skew
 from coopenv.observers.robust.algebra import is_known, odometry_variances
 from coopenv.observers.robust.belief import begin_belief, propagate
 from coopenv.observers.robust.hypotheses import best_hypothesis
-from coopenv.observers.robust.memory import Belief, Hypothesis, Line, Member, Report, Scratch, Search
+from coopenv.observers.robust.memory import Belief, Hypothesis, Line, Member, Scratch, Search
 from coopenv.observers.robust.resection import resect
 from coopenv.observers.robust.search import advance_search, begin_search, confirms_prior, propagate_search
-from coopenv.observers.robust.tracklets import possible_dependencies, receive
+from coopenv.observers.robust.tracklets import possible_dependencies
 from coopenv.observers.robust.types import lower_blocks, mat66d, wide_matrix, wide_vector
 from coopenv.observers.robust.update import set_anchor, update
 
@@ -38,19 +38,13 @@ def clear(model: Any, memory: Any, world: int, i: int):
             memory.scratch_blocks[world, n, k] = mat66d()
     for h in range(memory.hypothesis.shape[2]):
         memory.hypothesis[world, i, h] = Hypothesis()
-    for slot in range(memory.outbox.shape[2]):
-        memory.outbox[world, i, slot] = Report()
-    for sender in range(model.vehicles):
-        memory.inbox[world, i, sender] = Report()
-        memory.inbox[world, i, sender].tick = -1
     for n in range(model.agents):
         memory.line[world, n] = Line()
 
 
 @wp.func
-def start(model: Any, state: Any, memory: Any, world: int, i: int):
+def start_belief(model: Any, state: Any, memory: Any, world: int, i: int):
     """Start at the initial estimate; one that is too uncertain to linearise about is only a prior for the search."""
-    clear(model, memory, world, i)
     R = orthonormalise(wide_matrix(state.estimate_rotation[world, i]))
     p = R * wide_vector(state.estimate_position[world, i])
     P = model.start.covariance[i]
@@ -60,7 +54,6 @@ def start(model: Any, state: Any, memory: Any, world: int, i: int):
     set_anchor(memory, world, i, P, 0)
     if not is_known(P):
         begin_search(memory, world, i, R, p, P)
-    receive(model, state, memory, world, i)
 
 
 @wp.func
@@ -110,6 +103,25 @@ def write(state: Any, memory: Any, world: int, i: int):
         p = memory.hypothesis[world, i, h].p
         P = memory.hypothesis[world, i, h].P
     write_pose(state, world, i, R, p, P)
+
+
+def make_start(clear_messages: Any, receive: Any) -> Any:
+    """Return the Warp function that starts an observer.
+
+    Args:
+        clear_messages: (model, memory, world, i): forget what was sent and received.
+        receive: (model, state, memory, world, i): take what the radio has delivered.
+    """
+
+    @wp.func
+    def start(model: Any, state: Any, memory: Any, world: int, i: int):
+        """Start the observer of a vehicle, and take what its leaders have sent."""
+        clear(model, memory, world, i)
+        clear_messages(model, memory, world, i)
+        start_belief(model, state, memory, world, i)
+        receive(model, state, memory, world, i)
+
+    return start
 
 
 def make_estimate(receive: Any, fuse_messages: Any) -> Any:

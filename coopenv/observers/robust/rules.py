@@ -23,7 +23,7 @@ def _joint_covariances(values: Any, fields: Any, model: Any) -> Any:
     return are_covariances(joint, LEAST_EIGENVALUE[values.dtype])
 
 
-def _where(used: str, **rules: Rule) -> dict[str, Rule]:
+def where(used: str, **rules: Rule) -> dict[str, Rule]:
     """Return rules of fields of `record__field` that count where a field of the memory says so."""
     return {name.replace("__", "."): rule._replace(used=f"observer_{used}") for name, rule in rules.items()}
 
@@ -33,7 +33,7 @@ def _others(rule: Rule) -> Rule:
     return rule._replace(holds=lambda v, *rest: np.insert(rule.holds(v[:, :, 1:], *rest), 0, True, axis=2))
 
 
-_LARGE = numbers(LARGEST**3)
+LARGE = numbers(LARGEST**3)
 
 
 def rules_for(members: int) -> dict[str, Rule]:
@@ -58,17 +58,17 @@ def rules_for(members: int) -> dict[str, Rule]:
         "inbox.tick": TICK,
         "line.member": whole(-1, members - 1),
         **dict.fromkeys(("member.has_twist", "member.distrusted", "member.report.valid", "line.fits"), FLAG),
-        **_where("belief.members", member__R=ROTATION, member__vehicle=whole(0, "vehicles")),
-        **_where(
+        **where("belief.members", member__R=ROTATION, member__vehicle=whole(0, "vehicles")),
+        **where(
             "belief.members",
             member__report__R=_others(ROTATION),
             member__report__P=_others(COVARIANCE),
             member__report__odometry__R=_others(ROTATION),
         ),
-        **_where("search.active", search__prior__R=ROTATION, search__prior__P=COVARIANCE),
-        **_where("search.hypotheses", hypothesis__R=ROTATION, hypothesis__P=COVARIANCE),
-        **_where("outbox.valid", outbox__R=ROTATION, outbox__P=COVARIANCE, outbox__odometry__R=ROTATION),
-        **_where("inbox.valid", inbox__R=ROTATION, inbox__P=COVARIANCE, inbox__odometry__R=ROTATION),
-        **dict.fromkeys(("hypothesis.cost", "hypothesis.prior_distance", "line.variance", "line.noise"), _LARGE),
-        **dict.fromkeys(("scratch.column", "scratch.PHt", "scratch_blocks"), _LARGE),
+        **where("search.active", search__prior__R=ROTATION, search__prior__P=COVARIANCE),
+        **where("search.hypotheses", hypothesis__R=ROTATION, hypothesis__P=COVARIANCE),
+        **where("outbox.valid", outbox__R=ROTATION, outbox__P=COVARIANCE, outbox__odometry__R=ROTATION),
+        **where("inbox.valid", inbox__R=ROTATION, inbox__P=COVARIANCE, inbox__odometry__R=ROTATION),
+        **dict.fromkeys(("hypothesis.cost", "hypothesis.prior_distance", "line.variance", "line.noise"), LARGE),
+        **dict.fromkeys(("scratch.column", "scratch.PHt", "scratch_blocks"), LARGE),
     }

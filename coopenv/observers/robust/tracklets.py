@@ -79,16 +79,23 @@ def wide(P: Any):
 
 
 @wp.func
-def own_report(model: Any, memory: Any, world: int, i: int):
+def marker_jacobian(marker: Any):
+    """Return the derivative of the left error at a point of the body by that at its origin, 6x6."""
+    one = wp.identity(3, wp.float64)
+    return lower_blocks(one, -skew(marker), one)
+
+
+@wp.func
+def own_report(model: Any, memory: Any, world: int, i: int, tick: int):
     """Return pose, covariance and odometry at the marker, or an empty report while the pose is not known."""
     report = Report()
+    report.tick = tick
     P = memory.P[world, i, 0, 0]
     if memory.search[world, i].active == 1 or not is_known(P):
         return report
     marker = wide_vector(model.scene.marker[model.landmarks + i])
     R = memory.member[world, i, 0].R
-    one = wp.identity(3, wp.float64)
-    J = lower_blocks(one, -skew(marker), one)
+    J = marker_jacobian(marker)
     odometry = memory.belief[world, i].odometry
     report.valid = 1
     report.R = R
@@ -100,10 +107,20 @@ def own_report(model: Any, memory: Any, world: int, i: int):
 
 
 @wp.func
+def clear_messages(model: Any, memory: Any, world: int, i: int):
+    """Forget what was sent and received."""
+    for slot in range(model.radio.slots):
+        memory.outbox[world, i, slot] = Report()
+    for sender in range(model.vehicles):
+        memory.inbox[world, i, sender] = Report()
+        memory.inbox[world, i, sender].tick = -1
+
+
+@wp.func
 def send(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Send a report if one is due."""
     if tick % model.radio.period == 0:
-        memory.outbox[world, i, tick % model.radio.slots] = own_report(model, memory, world, i)
+        memory.outbox[world, i, tick % model.radio.slots] = own_report(model, memory, world, i, tick)
 
 
 @wp.func
@@ -115,7 +132,6 @@ def receive(model: Any, state: Any, memory: Any, world: int, i: int):
             sent = state.inbox_tick[world, i, sender]
             if sent >= 0 and sent != memory.inbox[world, i, sender].tick:
                 memory.inbox[world, i, sender] = memory.outbox[world, sender, sent % model.radio.slots]
-                memory.inbox[world, i, sender].tick = sent
 
 
 @wp.func
@@ -149,10 +165,10 @@ def propagate_member(model: Any, memory: Any, world: int, i: int, n: int, dR: An
 
 
 @wp.func
-def test_sender(memory: Any, world: int, i: int, n: int, report: Any, dt: Any):
+def test_sender(memory: Any, world: int, i: int, n: int, R: Any, p: Any, P: Any, dt: Any):
     """Decide whether a sender is trusted, from its new report, dt after the last one, and the belief about it."""
-    e = left_error(memory.member[world, i, n].R, memory.member[world, i, n].p, report.R, report.p)
-    agrees = distance_squared(e, memory.P[world, i, n, n] + wide(report.P)) < wp.float64(MESSAGE_GATE)
+    e = left_error(memory.member[world, i, n].R, memory.member[world, i, n].p, R, p)
+    agrees = distance_squared(e, memory.P[world, i, n, n] + P) < wp.float64(MESSAGE_GATE)
     if memory.member[world, i, n].distrusted == 0:
         memory.member[world, i, n].distrusted = wp.where(agrees, 0, 1)
         memory.member[world, i, n].agreement_time = wp.float64(0.0)
@@ -221,7 +237,7 @@ def fuse_message(model: Any, memory: Any, world: int, i: int, n: int, sender: in
     before = with_noise(F * wide(last.P) * wp.transpose(F), rotation, translation)
     was_distrusted = memory.member[world, i, n].distrusted
     memory.member[world, i, n].report = report
-    test_sender(memory, world, i, n, report, dt)
+    test_sender(memory, world, i, n, report.R, report.p, wide(report.P), dt)
     if was_distrusted == 0 and memory.member[world, i, n].distrusted == 0:
         fuse_tracklet(memory, world, i, n, report, before, R, p)
 

@@ -16,14 +16,15 @@ from coopenv.bench.observers.initial_estimates import random_start, with_start
 from coopenv.observers import Estimate, Recording, Tick, run
 from coopenv.observers.riccati_coordinates import riccati_covariance
 from coopenv.observers.robust.constants import PATIENCE
-from coopenv.observers.robust.reference.observer import Robust
 from coopenv.policies import Policy
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from coopenv.world.world import World
 from tests.helpers.builders import constant, scenario, vehicle
 from tests.helpers.replays import Played, replayed
-from tests.helpers.robust_scenes import crowd
+from tests.helpers.robust_scenes import crowd, everybody_sees_everybody, noise_free, small_errors
+from tests.oracles.robust.joint import RobustJoint
+from tests.oracles.robust.observer import Robust
 
 ISOTROPIC = {"noise.bearing.model": "isotropic", "noise.bearing.scale": 0.0029}
 LOSSY = {"v2x.delay": 6, "v2x.loss": 0.3}
@@ -100,6 +101,37 @@ def test_its_plug_in_face_does_so_too(case: str) -> None:
         assert_allclose(getattr(result, name), getattr(expected, name), rtol=1e-7, atol=1e-9, err_msg=name)
     assert (result.nis_dof == expected.nis_dof).all()
     assert (result.bytes_per_second == expected.bytes_per_second).all()
+
+
+JOINT_CASES = {
+    "small errors": lambda: small_errors(4.0),
+    "rumours": lambda: everybody_sees_everybody(2.0),
+    "any start": lambda: random_start(noise_free(4.0), 0),
+    "late radio": CASES["late radio"],
+    "eviction": lambda: crowd(6.0, 9, 7),
+    "eviction of those told of": lambda: crowd(6.0, 9, 7, True),
+    "a liar": lambda: FAULTS["lying_neighbour"].applied(small_errors(4.0), 0),
+}
+
+
+@pytest.mark.parametrize("case", JOINT_CASES)
+def test_joint_messages_do_as_in_numpy(case: str) -> None:
+    made = JOINT_CASES[case](4.0) if case == "late radio" else JOINT_CASES[case]()
+    recording, lie = made if isinstance(made, tuple) else (made, None)
+    expected, result = run(RobustJoint, recording, lie), run("robust_joint", recording, lie)
+    assert not result.failure
+    for name in ("position", "rotation", "nees", "nis"):
+        assert_allclose(getattr(result, name), getattr(expected, name), rtol=1e-6, atol=1e-9, err_msg=name)
+    assert (result.nis_dof == expected.nis_dof).all()
+    assert (result.bytes_per_second == expected.bytes_per_second).all()
+
+
+@pytest.mark.parametrize("case", ["small errors", "eviction of those told of"])
+def test_joint_messages_in_a_world_do_as_on_the_host(case: str) -> None:
+    recording = JOINT_CASES[case]()
+    result, played = run("robust_joint", recording), replayed(recording, observer="robust_joint")
+    assert_allclose(played.position[1:], result.position[1:], rtol=0, atol=1e-9)
+    assert_allclose(played.rotation[1:], result.rotation[1:], rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow

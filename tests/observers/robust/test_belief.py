@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.rotations import exp_so3
 from coopenv.observers.contract import SensorNoise
-from coopenv.observers.robust.reference.belief import Belief, Member
+from tests.oracles.robust.belief import Belief, Member
 
 LEVER_ARM = np.array([0.3, 0.1, 0.5])
 NOISE = SensorNoise(velocity=0.1, angular_velocity=0.01, odometry_period=1 / 60, bearing=0.003)

@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.contract import Received
-from coopenv.observers.robust.reference.belief import Belief, Member
-from coopenv.observers.robust.reference.eviction import FORGET_TIME, room_for
-from coopenv.observers.robust.reference.joint import RobustJoint
-from coopenv.observers.robust.reference.observer import Robust
+from coopenv.observers.robust.constants import FORGET_TIME
+from tests.helpers.robust_observers import OpenJoint, OpenRobust
 from tests.helpers.robust_scenes import crowd, small_errors
+from tests.oracles.robust.belief import Belief, Member
+from tests.oracles.robust.eviction import room_for
+from tests.oracles.robust.joint import RobustJoint
 
 VEHICLES = 12
 
@@ -47,7 +48,7 @@ def test_nobody_goes_if_that_is_not_enough_or_too_early():
 
 @pytest.mark.parametrize(
     ("kind", "leaders", "gone", "telling"),
-    [(Robust, 6, 4, False), (RobustJoint, 9, 7, False), (RobustJoint, 9, 7, True)],
+    [(OpenRobust, 6, 4, False), (OpenJoint, 9, 7, False), (OpenJoint, 9, 7, True)],
 )
 def test_those_in_view_are_met_when_others_are_gone(kind, leaders, gone, telling):
     record = crowd(6.0, leaders, gone, telling)
@@ -57,14 +58,12 @@ def test_those_in_view_are_met_when_others_are_gone(kind, leaders, gone, telling
     class Watched(kind):
         def update(self, tick):
             estimate = super().update(tick)
-            if self.vehicle == leaders:
-                members = {member.vehicle for member in self.belief.members}
+            if self.setup.vehicle == leaders:
+                members = set(self.member_numbers)
                 if tick.time < left + FORGET_TIME - tick.dt:
                     full.append(members)
                 elif tick.time > left + FORGET_TIME + tick.dt:
-                    late.append(
-                        members >= set(range(gone, leaders)) and set(self.contacts) >= set(range(gone, leaders))
-                    )
+                    late.append(members >= set(range(gone, leaders)) and set(self.told) >= set(range(gone, leaders)))
             return estimate
 
     result = run(Watched, record)
@@ -84,7 +83,7 @@ class Sender(RobustJoint):
             [Member(v, np.eye(3), place(v), odometry=(np.eye(3), np.zeros(3))) for v in others],
             1e-2 * np.eye(6 * len(others)),
         )
-        self.leans_on = 0
+        self.depends_on = 0
 
 
 def place(vehicle: int) -> np.ndarray:
@@ -97,14 +96,16 @@ frame = st.tuples(
 )
 
 
-@pytest.mark.parametrize("kind", [Robust, RobustJoint])
+@pytest.mark.parametrize("kind", [OpenRobust, OpenJoint])
 @settings(max_examples=60, deadline=None)
 @given(frames=st.lists(frame, min_size=1, max_size=12))
 def test_any_meetings_leave_a_belief_in_order(kind, frames):
     """Frames of (time since the last one, who is in view, who is heard and tells of whom)."""
     first = small_errors(12.0).tick(1, 0, {})
     L = len(first.landmarks)
-    setup = replace(small_errors(12.0).setups[0], targets=np.arange(L + 1, L + VEHICLES), marker=np.zeros(3))
+    names = tuple(str(n) for n in range(L + VEHICLES))
+    targets = np.arange(L + 1, L + VEHICLES)
+    setup = replace(small_errors(12.0).setups[0], target_names=names, targets=targets, marker=np.zeros(3))
     observer, time = kind(setup), 0.0
     observer.reset((np.eye(3), place(0)), 1e-3 * np.eye(6))
     d = np.array([place(v) - place(0) for v in range(1, VEHICLES)]) - first.lever_arm
@@ -133,17 +134,17 @@ def test_any_meetings_leave_a_belief_in_order(kind, frames):
                 messages=messages,
             )
         )
-        assert observer.search is None
-        members, P = [member.vehicle for member in observer.belief.members], observer.belief.P
-        assert members[0] == 0
+        assert not observer.memory.search["active"]
+        members, P = observer.member_numbers, observer.P
+        assert members[0] == 0 and observer.ignored_messages == 0
         assert len(set(members)) == len(members) <= kind.most_members
         assert P.shape == (6 * len(members), 6 * len(members))
         np.testing.assert_array_equal(P, P.T)
         assert np.linalg.eigvalsh(P)[0] > 0.0
-        for v, contact in observer.contacts.items():
-            assert contact.last.vehicles[0] == v
-            assert set(contact.last.vehicles) <= set(members)
+        for v, told in observer.told.items():
+            assert v in told and told <= set(members)
         room = kind.most_members - len(members)
-        for v in in_view & set(heard) if kind is Robust else ():
+        for v in in_view & set(heard) if kind is OpenRobust else ():
             assert v in members or room == 0
-        assert all(m.seen == time for m in observer.belief.members if m.vehicle in in_view)
+        now = observer.units(time)
+        assert all(abs(m["seen_tick"] - now) <= 1 for m in observer.members[1:] if m["vehicle"] in in_view)

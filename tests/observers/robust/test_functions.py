@@ -10,11 +10,11 @@ import warp as wp
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.p3p import solve_p3p
 from coopenv.observers.robust.algebra import inverse6, is_regular, left_error, log_so3, transition
 from coopenv.observers.robust.p3p import solutions_of
 from coopenv.observers.robust.types import mat33d, mat43d, mat66d, vec3d, vec6d
 from coopenv.world.launch import start_warp
+from tests.helpers.p3p import solve_one
 
 start_warp()
 
@@ -123,7 +123,7 @@ def test_distances_to_three_points_are_those_of_the_solver_in_numpy() -> None:
     for n in range(400):
         found = np.sqrt(longest[n]) * out.numpy()[n]
         found = found[found.any(axis=1)]
-        cameras = solve_p3p(b[n], z[n])[1]
+        cameras = solve_one(b[n], z[n])[1]
         expected = np.linalg.norm(z[n] - cameras[:, None], axis=2)
         counts[n] = len(expected)
         assert_allclose(found, expected, rtol=0, atol=1e-6)

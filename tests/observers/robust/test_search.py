@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.metrics import orientation_error_deg
 from coopenv.observers.contract import MIN_BEARING_STD
-from coopenv.observers.robust.reference.search import Search, Sighting, is_known
 from tests.helpers.robust_scenes import first_tick, noise_free
+from tests.oracles.robust.search import Search, Sighting, is_known
 
 WIDE = np.diag([1.8] * 3 + [45.0] * 3)
 NO_NOISE = np.repeat([1e-10, 1e-8], 3)

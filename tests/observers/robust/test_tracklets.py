@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.rotations import exp_so3
 from coopenv.observers.contract import Message, SensorNoise
-from coopenv.observers.robust.reference.belief import Belief, Member
-from coopenv.observers.robust.reference.tracklets import (
+from tests.oracles.robust.belief import Belief, Member
+from tests.oracles.robust.tracklets import (
     Report,
     from_message,
     left_error,
@@ -88,7 +88,7 @@ def test_messages_hold_pose_and_covariance_and_no_more():
     assert_allclose(report.P, P, rtol=1e-6, atol=1e-6)
     assert_allclose(report.odometry_turn[0], odometry[0], atol=1e-12)
     assert_allclose(report.odometry_position[0], odometry[1] + odometry[0] @ marker)
-    assert report.leans_on == 0b100001
+    assert report.depends_on == 0b100001
 
 
 def test_other_observers_messages_are_not_ours():

@@ -17,10 +17,10 @@ from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import exp_so3, log_so3
 from coopenv.estimation.small_matrices import cholesky
 from coopenv.observers.contract import Message
-from coopenv.observers.robust.constants import MAX_MEMBERS_JOINT, MAX_TOLD, SUPERSEDING_TIME
-from coopenv.observers.robust.reference.belief import Member
-from coopenv.observers.robust.reference.observer import Robust
-from coopenv.observers.robust.reference.tracklets import Report, from_message, marker_jacobian, mask_of
+from coopenv.observers.robust.constants import MAX_MEMBERS_JOINT, MAX_TOLD, SAME_TIME, SUPERSEDING_TIME
+from tests.oracles.robust.belief import Member
+from tests.oracles.robust.observer import Robust
+from tests.oracles.robust.tracklets import Report, from_message, marker_jacobian, mask_of
 
 
 class RobustJoint(Robust):
@@ -39,7 +39,10 @@ class RobustJoint(Robust):
             J = np.eye(len(P))
             J[:6, :6] = marker_jacobian(self.marker)
             P = J.dot(P).dot(J.T)
-        return replace(message, extra={**message.extra, **_told(told, P, len(told) == len(self.belief.members))})
+        return replace(
+            message,
+            extra={**message.extra, **_told(told, P, len(told) == len(self.belief.members), self.belief.own.time)},
+        )
 
     @staticmethod
     def tampered(message: Message) -> Message:
@@ -53,7 +56,7 @@ class RobustJoint(Robust):
     def _report(self, message: Message, sender: int, time: float) -> Report | None:
         """Return what a message says of its sender and, unless it leans on this vehicle, of the others it tells of."""
         report = from_message(message, sender, time)
-        if report is None or report.leans_on & int(mask_of({self.vehicle})):
+        if report is None or report.depends_on & int(mask_of({self.vehicle})):
             return report
         return _with_others(report, message)
 
@@ -65,18 +68,22 @@ class RobustJoint(Robust):
 def _speaks_for(other: Report, report: Report) -> bool:
     """Return whether another report says all that this one does."""
     sender = report.vehicles[0]
-    if sender == other.vehicles[0] or sender not in other.vehicles or report.time[0] - other.time[0] > SUPERSEDING_TIME:
+    if (
+        sender == other.vehicles[0]
+        or sender not in other.vehicles
+        or report.time[0] - other.time[0] > SUPERSEDING_TIME + SAME_TIME
+    ):
         return False
     return len(other.vehicles) > len(report.vehicles) or other.vehicles[0] < sender
 
 
-def _told(told: list[Member], P: Array, complete: bool) -> dict[str, Array]:
+def _told(told: list[Member], P: Array, complete: bool, time: float) -> dict[str, Array]:
     """Return the others' poses and odometry, and the factor of the joint covariance P (6m, 6m), as they travel."""
     others = told[1:]
     odometry = [member.odometry for member in others if member.odometry is not None]
     return {
         "vehicles": np.array([member.vehicle for member in others], dtype=np.uint16),
-        "times": np.array([member.time for member in others]),
+        "ages": time - np.array([member.time for member in others]),
         "poses": _six([(member.R, member.p) for member in others]),
         "odometries": _six(odometry),
         "factor": _factor(P),
@@ -103,13 +110,13 @@ def _with_others(report: Report, message: Message) -> Report:
     poses, odometries = told["poses"], told["odometries"]
     return Report(
         vehicles=(*report.vehicles, *(int(v) for v in told["vehicles"])),
-        time=np.concatenate([report.time, told["times"]]),
+        time=np.concatenate([report.time, report.time[0] - told["ages"]]),
         R=np.array([report.R[0], *(exp_so3(pose[:3]) for pose in poses)]),
         p=np.concatenate([report.p, poses[:, 3:]]),
         odometry_turn=np.array([report.odometry_turn[0], *(exp_so3(o[:3]) for o in odometries)]),
         odometry_position=np.concatenate([report.odometry_position, odometries[:, 3:]]),
         P=_joint_covariance(message),
-        leans_on=0 if told["complete"][0] else report.leans_on,
+        depends_on=0 if told["complete"][0] else report.depends_on,
     )
 
 

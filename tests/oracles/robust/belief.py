@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import exp_so3, lengths, log_so3, orthonormalise, skew, tangent_basis
-from coopenv.estimation.small_matrices import solve, solve_positive
+from coopenv.estimation.small_matrices import solve
 from coopenv.observers.contract import SensorNoise
 from coopenv.observers.mekf import transition
 from coopenv.observers.robust.constants import (
@@ -24,6 +24,7 @@ from coopenv.observers.robust.constants import (
     SAME_TIME,
     TWIST_AVERAGING_TIME,
 )
+from tests.oracles.robust.matrices import solve_positive
 
 
 @dataclass

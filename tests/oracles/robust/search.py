@@ -14,9 +14,9 @@ from itertools import combinations
 import numpy as np
 
 from coopenv.estimation.arrays import Array
-from coopenv.estimation.p3p import solve_p3p, solve_p3p_batch
+from coopenv.estimation.p3p import solve_p3p
 from coopenv.estimation.rotations import tangent_basis
-from coopenv.estimation.small_matrices import invert_positive, solve
+from coopenv.estimation.small_matrices import solve
 from coopenv.observers.contract import Tick
 from coopenv.observers.robust.constants import (
     BEARING_GATE,
@@ -35,8 +35,10 @@ from coopenv.observers.robust.constants import (
     SAME_HYPOTHESIS,
     SAME_PRIOR,
 )
-from coopenv.observers.robust.reference.belief import Belief, Sight
-from coopenv.observers.robust.reference.tracklets import left_error
+from tests.helpers.p3p import solve_one
+from tests.oracles.robust.belief import Belief, Sight
+from tests.oracles.robust.matrices import invert_positive
+from tests.oracles.robust.tracklets import left_error
 
 
 @dataclass(frozen=True)
@@ -196,7 +198,7 @@ def _perspectives(three: list[Sighting], variance: float) -> Iterator[tuple[Arra
     not exactly known, is also moved by `PERTURBATION` standard deviations to each side.
     """
     b, z = np.array([s.bearing for s in three]), np.array([s.z for s in three])
-    yield from zip(*solve_p3p(b, z), strict=True)
+    yield from zip(*solve_one(b, z), strict=True)
     bearings, places = [], []
     for n, s in enumerate(three):
         for side in (PERTURBATION, -PERTURBATION):
@@ -211,7 +213,7 @@ def _perspectives(three: list[Sighting], variance: float) -> Iterator[tuple[Arra
                 moved[n] += side * math.sqrt(s.variance) * axis
                 bearings.append(b)
                 places.append(moved)
-    R, camera, mask = solve_p3p_batch(np.array(bearings), np.array(places))
+    R, camera, mask = solve_p3p(np.array(bearings), np.array(places))
     yield from zip(R[mask], camera[mask], strict=True)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from coopenv.observers.robust.constants import FORGET_TIME, SAME_TIME
-from coopenv.observers.robust.reference.belief import Belief
+from tests.oracles.robust.belief import Belief
 
 
 def room_for(belief: Belief, vehicles: set[int], most: int, time: float) -> set[int] | None:

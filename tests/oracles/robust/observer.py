@@ -23,7 +23,6 @@ import numpy as np
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.estimation.rotations import orthonormalise
-from coopenv.estimation.small_matrices import solve_positive
 from coopenv.observers.contract import Estimate, Message, SensorNoise, Setup, Tick
 from coopenv.observers.robust.constants import (
     AGREEMENT_DISTANCE,
@@ -44,11 +43,12 @@ from coopenv.observers.robust.constants import (
     MIN_VELOCITY_STD,
     SAME_TIME,
 )
-from coopenv.observers.robust.reference.belief import Belief, Member, View, errors_of
-from coopenv.observers.robust.reference.eviction import room_for
-from coopenv.observers.robust.reference.resection import resect
-from coopenv.observers.robust.reference.search import Search, Sighting, is_known
-from coopenv.observers.robust.reference.tracklets import Report, from_message, left_error, mask_of, to_message, tracklet
+from tests.oracles.robust.belief import Belief, Member, View, errors_of
+from tests.oracles.robust.eviction import room_for
+from tests.oracles.robust.matrices import solve_positive
+from tests.oracles.robust.resection import resect
+from tests.oracles.robust.search import Search, Sighting, is_known
+from tests.oracles.robust.tracklets import Report, from_message, left_error, mask_of, to_message, tracklet
 
 
 @dataclass
@@ -89,7 +89,9 @@ class Robust:
             setup.noise.bearing,
         )
         self.variance = self.noise.bearing_std**2
-        self.may_lean_on = int(mask_of({int(t) - self.landmarks for t in setup.targets if t >= self.landmarks}))
+        self.possible_dependencies = int(
+            mask_of({int(t) - self.landmarks for t in setup.targets if t >= self.landmarks})
+        )
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose; one that is too uncertain to linearise about is only a hint for the search."""
@@ -97,7 +99,7 @@ class Robust:
         P = np.array(initial_covariance, float)
         self.odometry = np.eye(3), np.zeros(3)
         self.contacts: dict[int, Contact] = {}
-        self.leans_on = self.may_lean_on
+        self.depends_on = self.possible_dependencies
         self.missed = 0.0
         self.belief = Belief(self.vehicle, R, p, P.copy())
         self.search = None if is_known(P) else Search(self.vehicle, R, p, P.copy())
@@ -127,7 +129,7 @@ class Robust:
         """Return pose, covariance and odometry, or nothing while the pose is not known."""
         if self.search is not None or not is_known(self.belief.P[:6, :6]):
             return Message()
-        return to_message(self.belief, self.marker, self.odometry, self.leans_on)
+        return to_message(self.belief, self.marker, self.odometry, self.depends_on)
 
     def _search(self, tick: Tick) -> None:
         """Look for the pose; once only one is possible, go on with the prior, or with what this frame alone says."""
@@ -148,7 +150,7 @@ class Robust:
         """Believe in a pose and in those that are in view."""
         own = pose.own
         self.belief = Belief(self.vehicle, own.R, own.p, pose.P.copy(), tick.time)
-        self.contacts, self.leans_on, self.missed = {}, self.may_lean_on, 0.0
+        self.contacts, self.depends_on, self.missed = {}, self.possible_dependencies, 0.0
         self._listen(tick)
 
     def _sightings(self, tick: Tick) -> list[Sighting]:
@@ -232,7 +234,7 @@ class Robust:
         self.belief.add([Member(*poses[n], seen=time) for n in numbers], report.P[np.ix_(index, index)])
         self.contacts[report.vehicles[0]] = Contact(report)
         self._forget_contacts()
-        self.leans_on |= report.leans_on | int(mask_of(told))
+        self.depends_on |= report.depends_on | int(mask_of(told))
 
     def _forget_contacts(self) -> None:
         """Forget the senders that tell of vehicles which are not members; they may be met again."""
@@ -263,7 +265,7 @@ class Robust:
         share = self._share(report)
         vector = learnt.about([self.belief.members[n] for n in places])
         self.belief.inform(errors_of(places), share * learnt.information, share * vector)
-        self.leans_on |= report.leans_on
+        self.depends_on |= report.depends_on
 
     def _share(self, report: Report) -> float:
         """Return how much of a sender's news counts.
@@ -271,12 +273,12 @@ class Robust:
         All if it depends on nobody, `DEPENDENT_SHARE` if on others. Where senders depend on this vehicle in turn, each
         of n counts 1 / (n + 1): then what comes back round any loop fades, however dense the graph is.
         """
-        if not report.leans_on:
+        if not report.depends_on:
             return 1.0
         own = int(mask_of({self.vehicle}))
-        if not report.leans_on & own:
+        if not report.depends_on & own:
             return DEPENDENT_SHARE
-        return 1.0 / (1.0 + sum(bool(contact.last.leans_on & own) for contact in self.contacts.values()))
+        return 1.0 / (1.0 + sum(bool(contact.last.depends_on & own) for contact in self.contacts.values()))
 
     def _judge(self, contact: Contact, report: Report, dt: float) -> None:
         """Decide whether a sender is believed, from its message and the belief about it."""

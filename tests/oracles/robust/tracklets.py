@@ -16,11 +16,11 @@ import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import exp_so3, log_so3, orthonormalise, skew
-from coopenv.estimation.small_matrices import invert_positive
 from coopenv.observers.contract import Message, SensorNoise
 from coopenv.observers.mekf import transition
 from coopenv.observers.robust.constants import MASK_BITS
-from coopenv.observers.robust.reference.belief import Belief, Member
+from tests.oracles.robust.belief import Belief, Member
+from tests.oracles.robust.matrices import invert_positive
 
 
 def mask_of(vehicles: set[int]) -> np.uint64:
@@ -42,7 +42,7 @@ class Report:
     odometry_turn: Array  # (m, 3, 3) by dead reckoning from the start, in a frame of its own
     odometry_position: Array  # (m, 3) m, of the marker
     P: Array  # (6m, 6m)
-    leans_on: int
+    depends_on: int
     """Bits of all vehicles whose messages are in it."""
 
     def motion_since(self, last: Report, n: int) -> tuple[Array, Array]:
@@ -107,7 +107,7 @@ def marker_jacobian(marker: Array) -> Array:
     return J
 
 
-def to_message(belief: Belief, marker: Array, odometry: tuple[Array, Array], leans_on: int) -> Message:
+def to_message(belief: Belief, marker: Array, odometry: tuple[Array, Array], depends_on: int) -> Message:
     """Return a vehicle's own pose and covariance, its odometry, and on whom it leans; 196 bytes in all.
 
     The covariance travels in single precision.
@@ -120,7 +120,7 @@ def to_message(belief: Belief, marker: Array, odometry: tuple[Array, Array], lea
         covariance=P.astype(np.float32),
         extra={
             "odometry": np.concatenate([log_so3(odometry[0]), odometry[1] + odometry[0].dot(marker)]),
-            "depends_on": np.array([leans_on], dtype=np.uint64),
+            "depends_on": np.array([depends_on], dtype=np.uint64),
         },
     )
 
@@ -140,5 +140,5 @@ def from_message(message: Message, sender: int, time: float) -> Report | None:
         odometry_turn=exp_so3(odometry[:3])[None],
         odometry_position=odometry[None, 3:],
         P=np.asarray(message.covariance, float),
-        leans_on=int(message.extra["depends_on"][0]),
+        depends_on=int(message.extra["depends_on"][0]),
     )

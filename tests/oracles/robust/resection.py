@@ -8,7 +8,7 @@ import numpy as np
 
 from coopenv.estimation.small_matrices import solve
 from coopenv.observers.robust.constants import GAUSS_NEWTON_STEPS, MIN_INFORMATION_RATIO
-from coopenv.observers.robust.reference.belief import Belief, View
+from tests.oracles.robust.belief import Belief, View
 
 
 def resect(belief: Belief, look: Callable[[], View]) -> bool:

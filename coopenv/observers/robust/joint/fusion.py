@@ -1,0 +1,194 @@
+"""Every message of a tick: whether its vehicles are new, its information is new, or another message has said it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.observers.robust.belief import append_member, index_of, remove_member
+from coopenv.observers.robust.constants import MAX_TOLD
+from coopenv.observers.robust.eviction import MAX_UNSEEN_TIME, longest_unseen, mark_seen
+from coopenv.observers.robust.joint.contacts import (
+    contact_of,
+    forget_contacts,
+    is_superseded,
+    note_contacts,
+    store_contact,
+    tells_of_the_same,
+)
+from coopenv.observers.robust.joint.information import fuse_joint_information, news_of, predict_told, propagate_told
+from coopenv.observers.robust.joint.matrices import AFTER, block_of
+from coopenv.observers.robust.joint.memory import Contact
+from coopenv.observers.robust.joint.radio import dependence, others_told, read_message
+from coopenv.observers.robust.tracklets import bit_of, information_share, test_sender
+from coopenv.world.camera import VISIBLE
+from coopenv.world.v2x import fresh
+
+
+@wp.func
+def is_told(memory: Any, world: int, count: int, vehicle: int) -> bool:
+    """Return whether the message that has been read tells of a vehicle."""
+    for n in range(count):
+        if memory.told[world, n].vehicle == vehicle:
+            return True
+    return False
+
+
+@wp.func
+def make_joint_room(model: Any, memory: Any, world: int, i: int, tick: int, count: int) -> bool:
+    """Remove the members that the message tells of and, for want of room, those unseen for longest.
+
+    Return False, with nothing changed, if that does not make room for all that the message tells of.
+    """
+    own = int(0)
+    if is_told(memory, world, count, i):
+        own = 1
+    staying = int(0)
+    unseen = int(0)
+    for n in range(1, memory.belief[world, i].members):
+        if not is_told(memory, world, count, memory.member[world, i, n].vehicle):
+            staying += 1
+            away = wp.float64(tick - memory.member[world, i, n].seen_tick) * model.camera_period
+            if away > wp.float64(MAX_UNSEEN_TIME):
+                unseen += 1
+    excess = wp.max(0, 1 + staying + count - own - memory.member.shape[2])
+    if excess > unseen:
+        return False
+    for a in range(count):
+        n = index_of(memory, world, i, memory.told[world, a].vehicle)
+        if n > 0:
+            remove_member(memory, world, i, n)
+    for _ in range(excess):
+        remove_member(memory, world, i, longest_unseen(model, memory, world, i, tick))
+    return True
+
+
+@wp.func
+def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, count: int, tick: int):
+    """Add all that the message that has been read tells of, if there is room; their errors are as it says."""
+    if not make_joint_room(model, memory, world, i, tick, count):
+        return
+    depends_on = dependence(memory, world, i, sender)
+    for a in range(count):
+        told = memory.told[world, a]
+        if told.vehicle != i:
+            n = memory.belief[world, i].members
+            append_member(memory, world, i, told.vehicle, told.R, told.p, block_of(memory, world, AFTER, a, a))
+            memory.member[world, i, n].report.tick = told.tick
+            memory.member[world, i, n].report.odometry = told.odometry
+            memory.member[world, i, n].seen_tick = tick
+            depends_on = depends_on | bit_of(told.vehicle)
+            for b in range(a):
+                m = index_of(memory, world, i, memory.told[world, b].vehicle)
+                if m > 0:
+                    block = block_of(memory, world, AFTER, a, b)
+                    memory.P[world, i, n, m] = block
+                    memory.P[world, i, m, n] = wp.transpose(block)
+    memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
+    c = contact_of(memory, world, i, sender)
+    if c < 0:
+        c = contact_of(memory, world, i, -1)
+    memory.contact[world, i, c] = Contact()
+    store_contact(memory, world, i, c, sender, count)
+    forget_contacts(memory, world, i)
+
+
+@wp.func
+def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, sender: int, count: int):
+    """Carry all that a message tells of to it, and fuse what has been learnt since the contact's last message."""
+    ticks = memory.told[world, 0].tick - memory.contact_told[world, i, c, 0].tick
+    if ticks <= 0:
+        return
+    predict_told(model, memory, world, i, c, count)
+    store_contact(memory, world, i, c, sender, count)
+    propagate_told(model, memory, world, i, count)
+    n = index_of(memory, world, i, sender)
+    told = memory.told[world, 0]
+    was_distrusted = memory.contact[world, i, c].distrusted
+    note_contacts(memory, world, i)
+    P = block_of(memory, world, AFTER, 0, 0)
+    test_sender(memory, world, i, n, told.R, told.p, P, wp.float64(ticks) * model.camera_period)
+    memory.contact[world, i, c].distrusted = memory.member[world, i, n].distrusted
+    memory.contact[world, i, c].agreement_time = memory.member[world, i, n].agreement_time
+    if was_distrusted == 1 or memory.contact[world, i, c].distrusted == 1:
+        return
+    depends_on = memory.contact[world, i, c].depends_on
+    if news_of(memory, world, i, count, information_share(memory, world, i, depends_on)):
+        fuse_joint_information(memory, world, i, count)
+        memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
+
+
+@wp.func
+def is_heard(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int) -> bool:
+    """Return whether there is a message of a sender that knows where it is."""
+    return fresh(model, state, world, i, sender, tick) and memory.inbox[world, i, sender].valid == 1
+
+
+@wp.func
+def tells_of_visible(model: Any, state: Any, memory: Any, world: int, i: int, sender: int) -> bool:
+    """Return whether a received message tells of a vehicle in view."""
+    if state.sight[world, i, model.landmarks + sender] == VISIBLE:
+        return True
+    for n in range(others_told(memory, world, i, sender)):
+        if state.sight[world, i, model.landmarks + memory.inbox_told[world, i, sender, n].vehicle] == VISIBLE:
+            return True
+    return False
+
+
+@wp.func
+def mark_told_seen(memory: Any, world: int, i: int, sender: int, tick: int):
+    """Note that all that a message tells of count as in view."""
+    n = index_of(memory, world, i, sender)
+    if n > 0:
+        memory.member[world, i, n].seen_tick = tick
+    for k in range(others_told(memory, world, i, sender)):
+        n = index_of(memory, world, i, memory.inbox_told[world, i, sender, k].vehicle)
+        if n > 0:
+            memory.member[world, i, n].seen_tick = tick
+
+
+@wp.func
+def fuse_one(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int):
+    """Fuse one message, or add those that it tells of, or neither where another message has said it all."""
+    count = read_message(memory, world, i, sender)
+    c = contact_of(memory, world, i, sender)
+    if is_superseded(model, memory, world, i, sender, count):
+        if c >= 0:
+            store_contact(memory, world, i, c, sender, count)
+        return
+    same = bool(False)
+    if c >= 0:
+        same = tells_of_the_same(memory, world, i, c, count)
+    if same:
+        fuse_joint_message(model, memory, world, i, c, sender, count)
+    elif c >= 0 or tells_of_visible(model, state, memory, world, i, sender):
+        add_joint_members(model, memory, world, i, sender, count, tick)
+    c = contact_of(memory, world, i, sender)
+    if c >= 0:
+        memory.contact[world, i, c].fused = 1
+
+
+@wp.func
+def fuse_joint_messages(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
+    """Fuse the messages that tell of members, and add those that vehicles in view tell of; who tells of most first."""
+    forget_contacts(memory, world, i)  # the belief may have begun anew
+    mark_seen(model, state, memory, world, i, tick)
+    for c in range(memory.contact.shape[2]):
+        memory.contact[world, i, c].fused = 1
+    for n in range(model.target_count[i]):
+        sender = model.targets[i, n] - model.landmarks
+        if sender >= 0 and is_heard(model, state, memory, world, i, wp.max(sender, 0), tick):
+            c = contact_of(memory, world, i, sender)
+            if c >= 0:
+                memory.contact[world, i, c].fused = 0
+                if tells_of_visible(model, state, memory, world, i, sender):
+                    mark_told_seen(memory, world, i, sender, tick)
+    for fewer in range(MAX_TOLD):
+        for n in range(model.target_count[i]):
+            sender = model.targets[i, n] - model.landmarks
+            if sender >= 0 and is_heard(model, state, memory, world, i, wp.max(sender, 0), tick):
+                if others_told(memory, world, i, sender) == MAX_TOLD - 1 - fewer:
+                    fuse_one(model, state, memory, world, i, sender, tick)
+    forget_contacts(memory, world, i)
+    note_contacts(memory, world, i)

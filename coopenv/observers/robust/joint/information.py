@@ -1,0 +1,159 @@
+"""The new information between two messages of a sender about the same vehicles, as in `tracklets`, but joint."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.estimation.so3 import orthonormalise
+from coopenv.observers.robust.algebra import left_error, odometry_variances, transition
+from coopenv.observers.robust.belief import apply_error, index_of, subtract_block
+from coopenv.observers.robust.constants import MAX_VARIANCE_GROWTH
+from coopenv.observers.robust.joint.matrices import (
+    AFTER,
+    BEFORE,
+    INVERSE,
+    PRODUCT,
+    block_of,
+    invert,
+    multiply,
+    set_block,
+    symmetrise,
+)
+from coopenv.observers.robust.joint.memory import DIMENSION
+from coopenv.observers.robust.memory import Pose
+from coopenv.observers.robust.tracklets import propagate_member
+from coopenv.observers.robust.types import mat66d, vec6d
+
+
+@wp.func
+def predict_told(model: Any, memory: Any, world: int, i: int, c: int, count: int):
+    """Carry the contact's last message on to the new one by odometry: poses to `step`, covariance to BEFORE."""
+    for a in range(count):
+        last = memory.contact_told[world, i, c, a]
+        Rt = wp.transpose(last.odometry.R)
+        dR = Rt * memory.told[world, a].odometry.R
+        dp = Rt * (memory.told[world, a].odometry.p - last.odometry.p)
+        memory.step[world, a] = Pose(orthonormalise(last.R * dR), last.p + last.R * dp)
+        F = transition(dR, dp)
+        for b in range(count):
+            block = mat66d()
+            for k in range(6):
+                for j in range(6):
+                    block[k, j] = memory.contact_P[world, i, c, (6 * a + k) * DIMENSION + 6 * b + j]
+            set_block(memory, world, BEFORE, a, b, F * block)
+        set_block(memory, world, PRODUCT, a, 0, F)
+    for a in range(count):
+        for b in range(count):
+            F = block_of(memory, world, PRODUCT, b, 0)
+            set_block(memory, world, BEFORE, a, b, block_of(memory, world, BEFORE, a, b) * wp.transpose(F))
+        ticks = wp.max(memory.told[world, a].tick - memory.contact_told[world, i, c, a].tick, 0)
+        rotation, translation = odometry_variances(model, wp.float64(ticks) * model.camera_period)
+        block = block_of(memory, world, BEFORE, a, a)
+        for k in range(3):
+            block[k, k] = block[k, k] + rotation
+            block[k + 3, k + 3] = block[k + 3, k + 3] + translation
+        set_block(memory, world, BEFORE, a, a, block)
+
+
+@wp.func
+def propagate_told(model: Any, memory: Any, world: int, i: int, count: int):
+    """Carry the members that a message tells of on to where it says that they were, unless they stand there already."""
+    for a in range(count):
+        told = memory.told[world, a]
+        n = index_of(memory, world, i, told.vehicle)
+        if n > 0:
+            last = memory.member[world, i, n].report
+            ticks = told.tick - last.tick
+            if ticks > 0:
+                Rt = wp.transpose(last.odometry.R)
+                dp = Rt * (told.odometry.p - last.odometry.p)
+                dt = wp.float64(ticks) * model.camera_period
+                propagate_member(model, memory, world, i, n, Rt * told.odometry.R, dp, dt)
+                memory.member[world, i, n].report.tick = told.tick
+                memory.member[world, i, n].report.odometry = told.odometry
+
+
+@wp.func
+def offset_of(memory: Any, world: int, i: int, a: int):
+    """Return the left error of a member that a message tells of against where the last message predicts it."""
+    n = index_of(memory, world, i, memory.told[world, a].vehicle)
+    step = memory.step[world, a]
+    return left_error(step.R, step.p, memory.member[world, i, n].R, memory.member[world, i, n].p)
+
+
+@wp.func
+def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
+    """Turn the covariances BEFORE and AFTER into new information, of which a share counts; return whether there is any.
+
+    Its matrix takes the place of BEFORE, its vector that of the corrections in `scratch`.
+    """
+    for k in range(6 * count):
+        diagonal = k * DIMENSION + k
+        most = wp.float64(MAX_VARIANCE_GROWTH) * memory.matrix[world, BEFORE, diagonal]
+        if memory.matrix[world, AFTER, diagonal] > most:
+            return False
+    invert(memory, world, AFTER, INVERSE, count)
+    for a in range(count):
+        vector = vec6d()
+        for b in range(count):
+            told = memory.told[world, b]
+            step = memory.step[world, b]
+            vector += block_of(memory, world, INVERSE, a, b) * left_error(step.R, step.p, told.R, told.p)
+        memory.scratch[world, a].correction = vector
+    invert(memory, world, BEFORE, AFTER, count)
+    for a in range(count):
+        for b in range(count):
+            block = block_of(memory, world, INVERSE, a, b) - block_of(memory, world, AFTER, a, b)
+            set_block(memory, world, BEFORE, a, b, share * block)
+    symmetrise(memory, world, BEFORE, count)
+    size = wp.float64(0.0)
+    for a in range(count):
+        vector = share * memory.scratch[world, a].correction
+        for b in range(count):
+            vector = vector - block_of(memory, world, BEFORE, a, b) * offset_of(memory, world, i, b)
+        memory.scratch[world, a].correction = vector
+        size += wp.dot(vector, vector)
+    return wp.isfinite(size)
+
+
+@wp.func
+def fuse_joint_information(memory: Any, world: int, i: int, count: int):
+    """Fuse information about the errors of all that a message tells of, see `fuse_information`.
+
+    The matrix BEFORE and the corrections in `scratch` hold it.
+    """
+    members = memory.belief[world, i].members
+    for a in range(count):
+        m = index_of(memory, world, i, memory.told[world, a].vehicle)
+        for k in range(members):
+            memory.blocks[world, k, a] = memory.P[world, i, k, m]
+    for a in range(count):
+        n = index_of(memory, world, i, memory.told[world, a].vehicle)
+        for b in range(count):
+            block = mat66d()
+            for c in range(count):
+                block += memory.blocks[world, n, c] * block_of(memory, world, BEFORE, c, b)
+            for k in range(6):
+                if a == b:
+                    block[k, k] = block[k, k] + wp.float64(1.0)
+            set_block(memory, world, AFTER, a, b, block)
+    invert(memory, world, AFTER, INVERSE, count)
+    for a in range(count):
+        along = vec6d()
+        for b in range(count):
+            along += wp.transpose(block_of(memory, world, INVERSE, b, a)) * memory.scratch[world, b].correction
+        memory.scratch[world, a].last_correction = along
+    multiply(memory, world, BEFORE, INVERSE, AFTER, count)
+    symmetrise(memory, world, AFTER, count)
+    for k in range(members):
+        error = vec6d()
+        for b in range(count):
+            error += memory.blocks[world, k, b] * memory.scratch[world, b].last_correction
+            gain = mat66d()
+            for a in range(count):
+                gain += memory.blocks[world, k, a] * block_of(memory, world, AFTER, a, b)
+            for j in range(k + 1):
+                subtract_block(memory, world, i, k, j, gain * wp.transpose(memory.blocks[world, j, b]))
+        apply_error(memory, world, i, k, error)

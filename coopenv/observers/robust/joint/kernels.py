@@ -1,0 +1,26 @@
+"""The observer with joint messages as the world is handed it."""
+
+from __future__ import annotations
+
+from coopenv.estimation.coordinates import Coordinates
+from coopenv.observers.robust.joint.fusion import fuse_joint_messages
+from coopenv.observers.robust.joint.memory import JOINT_SIZES, JointMemory
+from coopenv.observers.robust.joint.messages import JOINT_MESSAGES
+from coopenv.observers.robust.joint.radio import clear_joint_messages, receive_joint, send_joint
+from coopenv.observers.robust.joint.rules import joint_rules
+from coopenv.observers.robust.kernels import OPTIONS
+from coopenv.observers.robust.observer import make_estimate, make_start
+from coopenv.world.embedded import Embedded
+
+ROBUST_JOINT = Embedded(
+    "robust_joint",
+    make_estimate(receive_joint, fuse_joint_messages),
+    make_start(clear_joint_messages, receive_joint),
+    send_joint,
+    JointMemory,
+    JOINT_SIZES,
+    valid=joint_rules(),
+    messages=JOINT_MESSAGES,
+    coordinates=Coordinates.LEFT,
+    options=OPTIONS,
+)

@@ -1,0 +1,74 @@
+"""What every vehicle's observer remembers besides `robust.memory`, where messages tell of several vehicles."""
+
+import warp as wp
+
+from coopenv.observers.robust.constants import MAX_MEMBERS_JOINT, MAX_TOLD
+from coopenv.observers.robust.memory import SIZES, Pose, RobustMemory
+from coopenv.observers.robust.types import mat33d, mat66d, vec3d
+from coopenv.world.records import array, extended
+
+
+@wp.struct
+class Told:
+    """One of the vehicles that a joint message tells of."""
+
+    vehicle: wp.int32
+    tick: wp.int32  # at which it stands
+    R: mat33d
+    p: vec3d
+    odometry: Pose
+
+
+@wp.struct
+class Joint:
+    """What a joint message has besides the sender's own report."""
+
+    others: wp.int32  # how many other vehicles it tells of
+    complete: wp.int32  # whether these are all that the sender believes in
+
+
+@wp.struct
+class Contact:
+    """The last joint message of a sender."""
+
+    sender: wp.int32  # -1: none
+    count: wp.int32  # of vehicles that it tells of, the sender included
+    depends_on: wp.uint64
+    distrusted: wp.int32
+    agreement_time: wp.float64  # s for which a distrusted sender has agreed
+    fused: wp.int32  # whether it is part of the belief at this tick
+
+
+JointMemory = extended(
+    RobustMemory,
+    "JointMemory",
+    """T vehicles that a message tells of, B of them others than its sender.
+
+    Their covariances are matrices of E numbers, row by row, of which as much counts as there are vehicles; as they
+    travel, F numbers of the Cholesky factor, row by row.
+    """,
+    outbox_joint=array("WNS", Joint),
+    outbox_told=array("WNSB", Told),
+    outbox_factor=array("WNSF", wp.float32),
+    inbox_joint=array("WNN", Joint),
+    inbox_told=array("WNNB", Told),
+    inbox_factor=array("WNNF", wp.float32),
+    contact=array("WNK", Contact),
+    contact_told=array("WNKT", Told),  # the sender first
+    contact_P=array("WNKE", wp.float64),
+    told=array("WT", Told),  # scratch: of the message that is read
+    step=array("WT", Pose),  # scratch: the last report of each carried on by odometry
+    matrix=array("WXE", wp.float64),  # scratch
+    blocks=array("WKT", mat66d),  # scratch: columns of the covariance
+)
+
+DIMENSION = 6 * MAX_TOLD
+JOINT_SIZES = {
+    **SIZES,
+    "K": MAX_MEMBERS_JOINT,
+    "T": MAX_TOLD,
+    "B": MAX_TOLD - 1,
+    "E": DIMENSION**2,
+    "F": DIMENSION * (DIMENSION + 1) // 2,
+    "X": 4,
+}

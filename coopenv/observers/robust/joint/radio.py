@@ -1,0 +1,156 @@
+"""Messages that tell of up to `MAX_TOLD` vehicles: what is sent, received and read."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.observers.robust.constants import MAX_TOLD
+from coopenv.observers.robust.joint.matrices import AFTER, factorise, set_block, square_of_factor
+from coopenv.observers.robust.joint.memory import DIMENSION, Contact, Joint, Told
+from coopenv.observers.robust.memory import Pose
+from coopenv.observers.robust.tracklets import bit_of, clear_messages, marker_jacobian, own_report, receive, wide
+from coopenv.observers.robust.types import mat66d, wide_vector
+
+
+@wp.func
+def clear_contacts(memory: Any, world: int, i: int):
+    """Forget all contacts, and what is only used within a tick."""
+    for c in range(memory.contact.shape[2]):
+        memory.contact[world, i, c] = Contact()
+        memory.contact[world, i, c].sender = -1
+        for n in range(MAX_TOLD):
+            memory.contact_told[world, i, c, n] = Told()
+            memory.blocks[world, c, n] = mat66d()
+        for e in range(memory.contact_P.shape[3]):
+            memory.contact_P[world, i, c, e] = wp.float64(0.0)
+    for n in range(MAX_TOLD):
+        memory.told[world, n] = Told()
+        memory.step[world, n] = Pose()
+    for x in range(memory.matrix.shape[1]):
+        for e in range(memory.matrix.shape[2]):
+            memory.matrix[world, x, e] = wp.float64(0.0)
+
+
+@wp.func
+def clear_joint_messages(model: Any, memory: Any, world: int, i: int):
+    """Forget what was sent and received, and all contacts."""
+    clear_messages(model, memory, world, i)
+    clear_contacts(memory, world, i)
+    for slot in range(model.radio.slots):
+        memory.outbox_joint[world, i, slot] = Joint()
+        for n in range(MAX_TOLD - 1):
+            memory.outbox_told[world, i, slot, n] = Told()
+        for k in range(memory.outbox_factor.shape[3]):
+            memory.outbox_factor[world, i, slot, k] = wp.float32(0.0)
+    for sender in range(model.vehicles):
+        memory.inbox_joint[world, i, sender] = Joint()
+        for n in range(MAX_TOLD - 1):
+            memory.inbox_told[world, i, sender, n] = Told()
+        for k in range(memory.inbox_factor.shape[3]):
+            memory.inbox_factor[world, i, sender, k] = wp.float32(0.0)
+
+
+@wp.func
+def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
+    """Send the belief about oneself and as many others as fit, if a message is due."""
+    if tick % model.radio.period != 0:
+        return
+    slot = tick % model.radio.slots
+    report = own_report(model, memory, world, i, tick)
+    joint = Joint()
+    members = memory.belief[world, i].members
+    count = wp.min(members, MAX_TOLD)
+    if report.valid == 1:
+        joint.others = count - 1
+        joint.complete = wp.where(count == members, 1, 0)
+        J = marker_jacobian(wide_vector(model.scene.marker[model.landmarks + i]))
+        for a in range(count):
+            for b in range(count):
+                block = memory.P[world, i, a, b]
+                if a == 0:
+                    block = J * block
+                if b == 0:
+                    block = block * wp.transpose(J)
+                set_block(memory, world, AFTER, a, b, block)
+        if not factorise(memory, world, AFTER, 6 * count):
+            report.valid = 0
+            joint = Joint()
+    for n in range(joint.others):
+        told = Told()
+        told.vehicle = memory.member[world, i, n + 1].vehicle
+        told.tick = memory.member[world, i, n + 1].report.tick
+        told.R = memory.member[world, i, n + 1].R
+        told.p = memory.member[world, i, n + 1].p
+        told.odometry = memory.member[world, i, n + 1].report.odometry
+        memory.outbox_told[world, i, slot, n] = told
+    if report.valid == 1:
+        for k in range(6 * count):
+            for j in range(k + 1):
+                entry = memory.matrix[world, AFTER, k * DIMENSION + j]
+                memory.outbox_factor[world, i, slot, (k * (k + 1)) // 2 + j] = wp.float32(entry)
+    memory.outbox[world, i, slot] = report
+    memory.outbox_joint[world, i, slot] = joint
+
+
+@wp.func
+def receive_joint(model: Any, state: Any, memory: Any, world: int, i: int):
+    """Take what the radio has delivered at this tick."""
+    for n in range(model.target_count[i]):
+        sender = model.targets[i, n] - model.landmarks
+        if sender >= 0:
+            sent = state.inbox_tick[world, i, sender]
+            if sent >= 0 and sent != memory.inbox[world, i, sender].tick:
+                slot = sent % model.radio.slots
+                joint = memory.outbox_joint[world, sender, slot]
+                memory.inbox_joint[world, i, sender] = joint
+                for k in range(joint.others):
+                    memory.inbox_told[world, i, sender, k] = memory.outbox_told[world, sender, slot, k]
+                size = 6 * (joint.others + 1)
+                for k in range((size * (size + 1)) // 2):
+                    memory.inbox_factor[world, i, sender, k] = memory.outbox_factor[world, sender, slot, k]
+    receive(model, state, memory, world, i)
+
+
+@wp.func
+def others_told(memory: Any, world: int, i: int, sender: int) -> int:
+    """Return of how many other vehicles a received message tells; of none where the sender depends on this vehicle."""
+    if (memory.inbox[world, i, sender].depends_on & bit_of(i)) != wp.uint64(0):
+        return 0
+    return memory.inbox_joint[world, i, sender].others
+
+
+@wp.func
+def dependence(memory: Any, world: int, i: int, sender: int) -> wp.uint64:
+    """Return on whom a received message depends: on nobody where it tells of all that its sender believes in."""
+    depends_on = memory.inbox[world, i, sender].depends_on
+    own = depends_on & bit_of(i)
+    if own == wp.uint64(0) and memory.inbox_joint[world, i, sender].complete == 1:
+        return wp.uint64(0)
+    return depends_on
+
+
+@wp.func
+def read_message(memory: Any, world: int, i: int, sender: int) -> int:
+    """Write what a received message tells of to `told`, their covariance to AFTER; return how many they are."""
+    report = memory.inbox[world, i, sender]
+    own = Told()
+    own.vehicle = sender
+    own.tick = report.tick
+    own.R = report.R
+    own.p = report.p
+    own.odometry = report.odometry
+    memory.told[world, 0] = own
+    others = others_told(memory, world, i, sender)
+    for n in range(others):
+        memory.told[world, n + 1] = memory.inbox_told[world, i, sender, n]
+    if (report.depends_on & bit_of(i)) != wp.uint64(0):
+        set_block(memory, world, AFTER, 0, 0, wide(report.P))
+    else:
+        for k in range(6 * (others + 1)):
+            for j in range(k + 1):
+                entry = square_of_factor(memory, world, i, sender, k, j)
+                memory.matrix[world, AFTER, k * DIMENSION + j] = entry
+                memory.matrix[world, AFTER, j * DIMENSION + k] = entry
+    return others + 1

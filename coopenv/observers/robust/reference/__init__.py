@@ -1,1 +1,0 @@
-"""The observer `robust` in NumPy: the specification of its kernels."""
