@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from coopenv.backends.base import Backend
 from coopenv.backends.replay import Replay
@@ -21,7 +21,6 @@ PLANNED = ("svea", "highway")
 
 LOG_SUFFIX = ".mcap"
 DATASETS = re.compile(r"mrclam_\d+")
-DEFAULT_VARIANT = "landmarks+robots"
 
 
 class Kind(Enum):
@@ -64,13 +63,11 @@ def open_recording(name: str | Path, data: str | Path | None = None, variant: st
         return read_recording(name)
     if kind is not Kind.DATASET:
         raise DataError(f"'{name}' is no recording; known: FILE{LOG_SUFFIX}, mrclam_1 .. mrclam_9")
-    from coopenv.backends.mrclam import load_dataset
-    from coopenv.backends.mrclam.recording import recording_of
-    from coopenv.backends.mrclam.variants import Variant, check_variant
+    from coopenv.backends.mrclam import load_dataset, recording_of
+    from coopenv.backends.mrclam.recording import check_variant
 
-    chosen = variant or DEFAULT_VARIANT
-    check_variant(chosen)
-    return recording_of(load_dataset(str(name), data), cast(Variant, chosen))
+    chosen = check_variant(variant or "landmarks+robots")  # before much is read
+    return recording_of(load_dataset(str(name), data), chosen)
 
 
 def open_simulation(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scenario:

@@ -3,9 +3,4 @@
 from coopenv.scenario.files import load_scenario, parse_scenario, scenario_path
 from coopenv.scenario.schema import Scenario
 
-__all__ = [
-    "Scenario",
-    "load_scenario",
-    "parse_scenario",
-    "scenario_path",
-]
+__all__ = ["Scenario", "load_scenario", "parse_scenario", "scenario_path"]

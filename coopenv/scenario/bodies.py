@@ -130,8 +130,7 @@ class DrivenMotion(Part):
 
 LandmarkMotion = Annotated[StaticMotion | ConstantMotion | SegmentMotion | WaypointMotion, Field(discriminator="kind")]
 VehicleMotion = Annotated[
-    StaticMotion | ConstantMotion | SegmentMotion | WaypointMotion | DrivenMotion,
-    Field(discriminator="kind"),
+    StaticMotion | ConstantMotion | SegmentMotion | WaypointMotion | DrivenMotion, Field(discriminator="kind")
 ]
 
 

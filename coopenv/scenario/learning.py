@@ -96,10 +96,7 @@ class RewardWeights(create_model("_BuiltInWeights", __base__=Part, **_built_in))
 def _only_those_of_coopenv(names: Iterable[str], table: str = "") -> Any:
     """Return the rule, for editors, that a table has these keys only where there is no table `custom` beside it."""
     keys: dict[str, Any] = {"propertyNames": {"enum": list(names)}}
-    return {
-        "if": {"not": {"required": ["custom"]}},
-        "then": {"properties": {table: keys}} if table else keys,
-    }
+    return {"if": {"not": {"required": ["custom"]}}, "then": {"properties": {table: keys}} if table else keys}
 
 
 class Reward(Part):
@@ -140,8 +137,7 @@ class Termination(Part):
     """What ends an agent's episode before the horizon: a switch for every condition, its own and those of coopenv."""
 
     model_config = ConfigDict(
-        extra="allow",
-        json_schema_extra=_only_those_of_coopenv([*TERMINATION_CONDITIONS.built_in, "privileged"]),
+        extra="allow", json_schema_extra=_only_those_of_coopenv([*TERMINATION_CONDITIONS.built_in, "privileged"])
     )
     __pydantic_extra__: dict[str, bool] = Field(init=False)
 

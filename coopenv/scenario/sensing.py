@@ -24,10 +24,7 @@ from coopenv.scenario.base import (
 
 Pixels = Annotated[int, Field(ge=1, le=65_535)]
 
-ROTATION_OF_CAMERA = {
-    "forward": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
-    "body": np.eye(3),
-}
+ROTATION_OF_CAMERA = {"forward": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), "body": np.eye(3)}
 """Camera to body: columns are the optical frame's x (right), y (down), z (forward)."""
 
 

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from coopenv.backends.mrclam import VARIANTS, load_dataset
-from coopenv.backends.mrclam.dataset import Truth, make_dataset
-from coopenv.backends.mrclam.files import read_recording
+from coopenv.backends.mrclam.dataset import Truth
 from coopenv.backends.mrclam.odometry import MAX_HOLD_S, HeldCommands
-from coopenv.backends.mrclam.variants import check_variant, frames_of
+from coopenv.backends.mrclam.recording import check_variant, counted
 from coopenv.errors import DataError, DataWarning
 from tests.helpers.mrclam_files import LANDMARKS, write
 
@@ -28,9 +27,8 @@ def test_clock_and_frames(dataset):
     assert set(dataset.landmarks) == set(LANDMARKS)
     for robot in dataset.robots:
         assert robot.odometry[0, 0] == pytest.approx(0.0, abs=1e-6)
-        times = [frame.t for frame in robot.frames]
-        assert times == sorted(set(times))
-        assert max(len(frame.subjects) for frame in robot.frames) > 1
+        times, seen = np.unique(robot.detections[:, 0], return_counts=True)
+        assert (np.diff(robot.detections[:, 0]) >= 0).all() and seen.max() > 1
         assert times[0] >= 0.9
 
 
@@ -49,8 +47,7 @@ def test_truth_is_invalid_in_gaps_outside_and_where_corrupt():
 
 
 def test_ninth_recording_masks_robot_3(tmp_path):
-    recording = replace(read_recording("mrclam_6", write(tmp_path, seconds=3.0)), name="mrclam_9")
-    robots = make_dataset(recording).robots
+    robots = load_dataset("mrclam_9", write(tmp_path, number=9, seconds=3.0)).robots
     assert [len(robot.truth.corrupt_heading) for robot in robots] == [0, 0, 1, 0, 0]
     start, end = robots[2].truth.corrupt_heading[0]
     assert end - start == pytest.approx(343)
@@ -58,7 +55,7 @@ def test_ninth_recording_masks_robot_3(tmp_path):
 
 def test_variants_hide(dataset):
     def subjects(variant, n):
-        return {s for frame in frames_of(dataset.robots[n], variant) for s in frame.subjects.tolist()}
+        return set(dataset.robots[n].detections[counted(dataset.robots[n], variant), 1])
 
     for n in range(5):
         assert min(subjects("landmarks", n)) >= 6
@@ -67,7 +64,7 @@ def test_variants_hide(dataset):
     assert subjects("blind", 0) == subjects("landmarks+robots", 0)
     assert all(max(subjects("blind", n)) < 6 for n in (2, 3, 4))
     for variant in VARIANTS:
-        check_variant(variant)
+        assert check_variant(variant) == variant
     with pytest.raises(DataError, match="did you mean 'landmarks'"):
         check_variant("landmark")
 

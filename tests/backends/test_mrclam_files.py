@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coopenv.backends.mrclam.files import find_folder, read_recording
-from coopenv.errors import DataError
-from tests.helpers.mrclam_files import BARCODES, LANDMARKS, ORIGIN, command, pose, write
+from coopenv.backends.mrclam import load_dataset
+from coopenv.backends.mrclam.tables import find_folder
+from coopenv.errors import DataError, DataWarning
+from tests.helpers.mrclam_files import LANDMARKS, ORIGIN, command, pose, write
 
 
 @pytest.fixture
@@ -25,22 +26,22 @@ def change(path: Path, line: int, text: str) -> None:
 
 def message(folder: Path) -> str:
     with pytest.raises(DataError) as caught:
-        read_recording("mrclam_6", folder)
+        load_dataset("mrclam_6", folder)
     text = str(caught.value)
     assert "\n" not in text
     return text
 
 
 def test_round_trip(folder):
-    recording = read_recording("mrclam_6", folder)
-    assert recording.barcodes == {barcode: subject for subject, barcode in BARCODES.items()}
-    assert {m.subject: (m.x, m.y) for m in recording.landmarks} == LANDMARKS
-    assert recording.landmarks[0].y_std == 0.00027395
-    for robot in recording.robots:
-        t = robot.truth[:, 0] - ORIGIN
-        np.testing.assert_allclose(robot.truth[:, 1:], pose(robot.subject, t), atol=1e-6)
+    dataset = load_dataset("mrclam_6", folder)
+    assert {subject: tuple(point) for subject, point in dataset.landmarks.items()} == LANDMARKS
+    for robot in dataset.robots:
+        np.testing.assert_allclose(robot.truth.t[0], -0.1, atol=1e-6)  # odometry is first at 0.1 s
+        x, y, heading = pose(robot.subject, robot.truth.t + 0.1).T
+        np.testing.assert_allclose(robot.truth.position, np.column_stack([x, y]), atol=1e-6)
+        np.testing.assert_allclose(robot.truth.heading, np.unwrap(heading), atol=1e-6)
         np.testing.assert_allclose(robot.odometry[:, 1:], np.broadcast_to(command(robot.subject), (170, 2)), atol=1e-8)
-        assert set(robot.detection_subject.tolist()) <= {*LANDMARKS, 1, 2, 3, 4, 5} - {robot.subject}
+        assert set(robot.detections[:, 1]) <= {*LANDMARKS, 1, 2, 3, 4, 5} - {robot.subject}
         assert robot.skipped == 0
 
 
@@ -105,12 +106,13 @@ def test_truncated_file(folder, cut):
 def test_last_line_end_may_miss(folder):
     path = folder / "Robot5_Groundtruth.dat"
     path.write_text(path.read_text().rstrip("\n"))
-    read_recording("mrclam_6", folder)
+    load_dataset("mrclam_6", folder)
 
 
 def test_empty_files(folder):
     (folder / "Robot1_Measurement.dat").write_text("# nothing seen\n")
-    assert read_recording("mrclam_6", folder).robots[0].detection_time.size == 0
+    with pytest.warns(DataWarning, match="no detections of robot 1"):
+        assert len(load_dataset("mrclam_6", folder).robots[0].detections) == 0
     (folder / "Robot1_Odometry.dat").write_text("# nothing\n")
     assert "Robot1_Odometry.dat:1: 0 rows" in message(folder)
 
@@ -147,8 +149,9 @@ def test_clocks_that_are_days_apart(folder):
 
 
 def test_unknown_barcodes_are_counted_and_left_out(folder):
-    before = read_recording("mrclam_6", folder).robots[3]
+    before = load_dataset("mrclam_6", folder).robots[3]
     change(folder / "Robot4_Measurement.dat", 5, f"{ORIGIN + 1.04} 999 2.0 0.1\n")
-    after = read_recording("mrclam_6", folder).robots[3]
+    with pytest.warns(DataWarning, match="1 of"):
+        after = load_dataset("mrclam_6", folder).robots[3]
     assert after.skipped == 1
-    assert after.detection_time.size == before.detection_time.size - 1
+    assert len(after.detections) == len(before.detections) - 1

@@ -148,8 +148,7 @@ class TestRecorded:
         assert recorded.duration_s == pytest.approx(887.947, abs=1e-3)
         assert sorted(recorded.landmarks) == list(range(6, 21))
         assert [robot.skipped for robot in recorded.robots] == [1, 0, 2, 3, 0]
-        detections = [sum(len(f.subjects) for f in robot.frames) for robot in recorded.robots]
-        assert detections == [1941, 4031, 5625, 2396, 5378]
+        assert [len(robot.detections) for robot in recorded.robots] == [1941, 4031, 5625, 2396, 5378]
 
     def test_dead_reckoning_as_known(self, recorded):
         recording = recording_of(recorded, "blind")

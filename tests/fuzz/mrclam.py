@@ -11,9 +11,7 @@ import numpy as np
 
 from coopenv import CoopenvError, DataError
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
-from coopenv.backends.mrclam import load_dataset
-from coopenv.backends.mrclam.recording import recording_of
-from coopenv.backends.mrclam.variants import VARIANTS
+from coopenv.backends.mrclam import VARIANTS, load_dataset, recording_of
 from coopenv.backends.replay import Replay
 from tests.helpers import mrclam_files
 

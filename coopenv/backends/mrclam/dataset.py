@@ -1,4 +1,4 @@
-"""One sub-dataset on a common clock: landmarks, and per robot odometry, camera frames and interpolated truth."""
+"""One sub-dataset on a common clock: landmarks, and per robot odometry, detections and interpolated truth."""
 
 from __future__ import annotations
 
@@ -9,30 +9,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.backends.mrclam.files import Array, Recording, RobotRecord, Subjects, read_recording
-from coopenv.errors import DataWarning
+from coopenv.backends.mrclam.tables import MAX_LENGTH_S, Table, find_folder, timed
+from coopenv.errors import DataError, DataWarning
+from coopenv.estimation.arrays import Array
 
+ROBOTS = (1, 2, 3, 4, 5)
 MAX_TRUTH_GAP_S = 0.5  # motion capture runs at 60 to 70 Hz; a longer pause is a robot out of its sight
 
 # Headings that motion capture got wrong, in s of the robot's own ground truth file: (data set, robot) -> spans.
 CORRUPT_HEADING = {("mrclam_9", 3): ((757.0, 1100.0),)}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Frame:
-    """What one camera saw at one time stamp.
-
-    Attributes:
-        t: s since the time origin.
-        subjects: (n,) who was seen.
-        ranges: (n,) m.
-        bearings: (n,) rad, counter-clockwise from the heading.
-    """
-
-    t: float
-    subjects: Subjects
-    ranges: Array
-    bearings: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,9 +46,7 @@ class Truth:
             Position (K, 2) m, heading (K,) rad in [-pi, pi), and where (K,) position and heading are valid: inside
             the recording, not in a gap longer than 0.5 s, and, for the heading, not in a corrupt span.
         """
-        t = np.asarray(t, dtype=np.float64)
-        x, y = (np.interp(t, self.t, self.position[:, axis]) for axis in (0, 1))
-        heading = wrap(np.interp(t, self.t, self.heading))
+        x, y, heading = (np.interp(t, self.t, values) for values in (*self.position.T, self.heading))
         after = np.clip(np.searchsorted(self.t, t, side="left"), 1, self.t.size - 1)
         gap = self.t[after] - self.t[after - 1]
         exact = (self.t[after] == t) | (self.t[after - 1] == t)
@@ -71,7 +54,7 @@ class Truth:
         heading_valid = valid.copy()
         for start, end in self.corrupt_heading:
             heading_valid &= (t < start) | (t > end)
-        return np.stack([x, y], axis=-1), heading, valid, heading_valid
+        return np.stack([x, y], axis=-1), (heading + np.pi) % (2 * np.pi) - np.pi, valid, heading_valid
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,14 +64,15 @@ class Robot:
     Attributes:
         subject: 1..5.
         odometry: (N, 3): s since the time origin, commanded m/s forward, commanded rad/s.
-        frames: in the order of time.
+        detections: (n, 4): s since the time origin, who was seen (1..20), range m, bearing rad, counter-clockwise from
+            the heading. Those of one time are one camera frame.
         truth: for judging, and for starting where an observer is given its start.
-        skipped: detections left out because nobody carries their barcode.
+        skipped: detections left out because nobody carries their barcode (misread by the camera).
     """
 
     subject: int
     odometry: Array
-    frames: tuple[Frame, ...]
+    detections: Array
     truth: Truth
     skipped: int
 
@@ -99,22 +83,15 @@ class Dataset:
 
     Attributes:
         name: such as `mrclam_6`.
-        origin_s: absolute time of t = 0: the first odometry sample of any robot.
-        duration_s: s from the origin to the last odometry sample of any robot.
-        landmarks: subject -> (2,) m, inertial frame.
+        duration_s: s from the time origin, the first odometry sample of any robot, to the last one.
+        landmarks: subject -> (2,) m, inertial frame, in the order of their subjects.
         robots: of subjects 1..5.
     """
 
     name: str
-    origin_s: float
     duration_s: float
     landmarks: dict[int, Array]
     robots: tuple[Robot, ...]
-
-
-def wrap(angle: Array) -> Array:
-    """Return angles in [-pi, pi)."""
-    return np.asarray((np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi)
 
 
 def load_dataset(name: str, data: str | Path | None = None) -> Dataset:
@@ -125,65 +102,89 @@ def load_dataset(name: str, data: str | Path | None = None) -> Dataset:
         data: the sub-dataset's folder or its parent; by default what COOPENV_DATA says.
 
     Raises:
-        DataError: a folder, file or line is not what the format says.
+        DataError: a folder, file or line is not what the format says; the message names file and line.
     """
-    dataset = make_dataset(read_recording(name, data))
-    if remark := remark_on(dataset):
+    folder = find_folder(name, data)
+    barcodes = _barcodes(Table(folder / "Barcodes.dat", 2, least=len(ROBOTS) + 1))
+    landmarks = _landmarks(Table(folder / "Landmark_Groundtruth.dat", 5, least=1), set(barcodes.values()))
+    known = {barcode: subject for barcode, subject in barcodes.items() if subject in (*ROBOTS, *landmarks)}
+    tables = [_tables(folder, robot) for robot in ROBOTS]
+    starts = [float(odometry.values[0, 0]) for _, odometry, _ in tables]
+    for start, (_, odometry, _) in zip(starts, tables, strict=True):
+        if (apart := abs(start - starts[0])) > MAX_LENGTH_S:
+            odometry.refuse(0, f"{apart:g} s apart from Robot1_Odometry.dat, at most {MAX_LENGTH_S:g}")
+    origin, end = min(starts), max(float(odometry.values[-1, 0]) for _, odometry, _ in tables)
+    robots = tuple(_robot(name, robot, origin, known, *tables[i]) for i, robot in enumerate(ROBOTS))
+    dataset = Dataset(name, end - origin, landmarks, robots)
+    if remark := _remark_on(dataset):
         warnings.warn(DataWarning(remark), stacklevel=2)
     return dataset
 
 
-def remark_on(dataset: Dataset) -> str:
+def _remark_on(dataset: Dataset) -> str:
     """Return, in one line, which robots saw nothing and how many detections were left out; empty where neither is."""
-    skipped = sum(robot.skipped for robot in dataset.robots)
-    used = sum(frame.subjects.size for robot in dataset.robots for frame in robot.frames)
-    blind = [str(robot.subject) for robot in dataset.robots if not robot.frames]
+    skipped, used = (
+        sum(counts) for counts in zip(*((r.skipped, len(r.detections)) for r in dataset.robots), strict=True)
+    )
+    blind = [str(robot.subject) for robot in dataset.robots if not len(robot.detections)]
     remarks = [f"no detections of robot {', '.join(blind)}"] if blind else []
     if skipped:
         remarks.append(f"{skipped} of {skipped + used} detections left out, nobody carries their barcode")
     return f"{dataset.name}: {'; '.join(remarks)}" if remarks else ""
 
 
-def make_dataset(recording: Recording) -> Dataset:
-    """Put a recording on a common clock."""
-    origin = min(float(robot.odometry[0, 0]) for robot in recording.robots)
-    end = max(float(robot.odometry[-1, 0]) for robot in recording.robots)
-    return Dataset(
-        name=recording.name,
-        origin_s=origin,
-        duration_s=end - origin,
-        landmarks={landmark.subject: np.array([landmark.x, landmark.y]) for landmark in recording.landmarks},
-        robots=tuple(_robot(record, recording.name, origin) for record in recording.robots),
-    )
+def _barcodes(table: Table) -> dict[int, int]:
+    """Return barcode -> subject."""
+    result: dict[int, int] = {}
+    for row, (subject, barcode) in enumerate(zip(table.whole(0), table.whole(1), strict=True)):
+        if not 1 <= subject <= 20:
+            table.refuse(row, f"subject {subject} is not in 1..20")
+        if subject in result.values() or barcode in result:
+            table.refuse(row, f"subject {subject} or barcode {barcode} occurs twice")
+        result[barcode] = subject
+    for robot in set(ROBOTS) - set(result.values()):
+        raise DataError(f"{table.path}: no barcode for robot {robot}")
+    return result
 
 
-def _robot(record: RobotRecord, name: str, origin: float) -> Robot:
-    odometry = record.odometry.copy()
-    odometry[:, 0] -= origin
-    _, first = np.unique(record.truth[:, 0], return_index=True)  # a repeated time stamp counts once
-    rows = record.truth[first]
-    t = rows[:, 0] - origin
-    spans = CORRUPT_HEADING.get((name, record.subject), ())
-    truth = Truth(
-        t=t,
-        position=rows[:, 1:3].copy(),
-        heading=np.unwrap(rows[:, 3]),
-        corrupt_heading=tuple((float(t[0] + start), float(t[0] + end)) for start, end in spans),
-    )
-    return Robot(record.subject, odometry, _frames(record, origin), truth, record.skipped)
+def _landmarks(table: Table, with_barcode: set[int]) -> dict[int, Array]:
+    result: dict[int, Array] = {}
+    for row, subject in enumerate(table.whole(0)):
+        if not 6 <= subject <= 20:
+            table.refuse(row, f"subject {subject} is not in 6..20")
+        if subject in result:
+            table.refuse(row, f"subject {subject} occurs twice")
+        if subject not in with_barcode:
+            table.refuse(row, f"landmark {subject} has no barcode")
+        result[subject] = table.values[row, 1:3].copy()
+    return dict(sorted(result.items()))
 
 
-def _frames(record: RobotRecord, origin: float) -> tuple[Frame, ...]:
-    if record.detection_time.size == 0:
-        return ()
-    cuts = np.flatnonzero(np.diff(record.detection_time) > 0) + 1
-    groups = np.split(np.arange(record.detection_time.size), cuts)
-    return tuple(
-        Frame(
-            t=float(record.detection_time[rows[0]] - origin),
-            subjects=record.detection_subject[rows],
-            ranges=record.detection_range[rows],
-            bearings=record.detection_bearing[rows],
-        )
-        for rows in groups
+def _tables(folder: Path, robot: int) -> tuple[Table, Table, Table]:
+    """Return a robot's truth, odometry and detections."""
+    truth = timed(folder / f"Robot{robot}_Groundtruth.dat", 4, least=2)
+    odometry = timed(folder / f"Robot{robot}_Odometry.dat", 3, least=2)
+    seen = timed(folder / f"Robot{robot}_Measurement.dat", 4, least=0)
+    for row in np.flatnonzero(seen.values[:, 2] < 0).tolist():
+        seen.refuse(row, f"negative range {seen.values[row, 2]:g}")
+    return truth, odometry, seen
+
+
+def _robot(
+    name: str, subject: int, origin: float, barcodes: dict[int, int], truth: Table, odometry: Table, seen: Table
+) -> Robot:
+    subjects = np.array([barcodes.get(barcode, 0) for barcode in seen.whole(1)], dtype=np.float64)
+    clock = np.array([origin, 0.0, 0.0, 0.0])
+    detections = np.column_stack([seen.values[:, 0], subjects, seen.values[:, 2:]]) - clock
+    _, first = np.unique(truth.values[:, 0], return_index=True)  # a repeated time stamp counts once
+    rows = truth.values[first] - clock
+    spans = [rows[0, 0] + np.array(span) for span in CORRUPT_HEADING.get((name, subject), ())]
+    corrupt = tuple((float(start), float(end)) for start, end in spans)
+    known = subjects > 0
+    return Robot(
+        subject,
+        odometry.values - clock[:3],
+        detections[known],
+        Truth(rows[:, 0], rows[:, 1:3], np.unwrap(rows[:, 3]), corrupt),
+        int(np.count_nonzero(~known)),
     )

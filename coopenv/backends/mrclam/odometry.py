@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from coopenv.backends.mrclam.dataset import Robot
-from coopenv.backends.mrclam.files import Array
+from coopenv.estimation.arrays import Array
 
 MAX_HOLD_S = 2.0
 """A command holds until the next one, but no longer than this: where a log ends, its robot does not drive on."""

@@ -9,18 +9,22 @@ tick k - 1 or before.
 from __future__ import annotations
 
 import math
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.backends.mrclam.dataset import MAX_TRUTH_GAP_S, Dataset, Robot
-from coopenv.backends.mrclam.files import ROBOTS, Array
+from coopenv.backends.mrclam.dataset import MAX_TRUTH_GAP_S, ROBOTS, Dataset, Robot
 from coopenv.backends.mrclam.odometry import HeldCommands
-from coopenv.backends.mrclam.variants import Variant, check_variant, frames_of
-from coopenv.errors import DataError
+from coopenv.errors import DataError, suggest
+from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Recording, Truth
 from coopenv.observers.recording_checks import check_recording
+
+Variant = Literal["landmarks", "landmarks+robots", "blind"]
+VARIANTS: tuple[Variant, ...] = get_args(Variant)
+BLIND_ROBOTS = (3, 4, 5)
 
 TICK_S = 0.05
 MESSAGE_PERIOD_TICKS = 2  # 10 Hz, as V2X radios send
@@ -30,6 +34,18 @@ NOISE = SensorNoise(velocity=0.15, angular_velocity=0.3, odometry_period=TICK_S,
 GAINS = (1.0, 10.0, (0.1, 1.0), (0.01, 0.01), 0.1)  # k, q, V, P0, largest turn of a sub-step
 START_STD = (0.01, 0.01)  # rad, m
 DRIFT_STD = (0.05, 0.1)  # rad and m per square root of a second without truth before the start
+
+
+def check_variant(name: str) -> Variant:
+    """Return the variant of that name.
+
+    Raises:
+        DataError: there is none.
+    """
+    for variant in VARIANTS:
+        if variant == name:
+            return variant
+    raise DataError(f"unknown variant {name!r}{suggest(str(name), VARIANTS)}; there are {', '.join(VARIANTS)}")
 
 
 def recording_of(dataset: Dataset, variant: Variant) -> Recording:
@@ -50,44 +66,41 @@ def recording_of(dataset: Dataset, variant: Variant) -> Recording:
     L, N, T = len(dataset.landmarks), len(ROBOTS), len(subjects)
     t = np.arange(int(dataset.duration_s / TICK_S) + 1, dtype=np.float64) * TICK_S
     K = len(t)
-    rotation, translation = np.broadcast_to(np.eye(3), (K, N, 3, 3)).copy(), np.zeros((K, N, 3))
-    velocity, angular_velocity = np.zeros((K, N, 3)), np.zeros((K, N, 3))
-    bearings, visible = np.full((K, N, T, 3), np.nan), np.zeros((K, N, T), bool)
-    pose = np.full((K, N, 3), np.nan)
-    start, covariance = np.zeros((N, 3)), np.zeros((N, 6, 6))
+    column = np.zeros(max(subjects) + 1, dtype=np.int64)
+    column[subjects] = np.arange(T)
+    arrays: dict[str, Any] = {
+        "rotation": np.broadcast_to(np.eye(3), (K, N, 3, 3)).copy(),
+        **{name: np.zeros((K, N, 3)) for name in ("translation", "velocity", "angular_velocity")},
+        "bearings": np.full((K, N, T, 3), np.nan),
+        "visible": np.zeros((K, N, T), bool),
+        "start_covariance": np.zeros((N, 6, 6)),
+    }
+    pose, start = np.zeros((K, N, 3)), np.zeros((N, 3))
     for i, robot in enumerate(dataset.robots):
         held = HeldCommands(robot)
-        velocity[:, i, 0], angular_velocity[:, i, 2] = held.commands(t)
-        turn, translation[1:, i, :2] = _increments(held, t)
-        rotation[1:, i] = _yaw(turn)
-        _see(robot, variant, held, t, subjects, bearings[:, i], visible[:, i])
+        heading, position = held.heading(t), held.position(t)
+        arrays["velocity"][:, i, 0], arrays["angular_velocity"][:, i, 2] = held.commands(t)
+        arrays["translation"][1:, i, :2] = _turned(np.diff(position, axis=0), -heading[:-1])
+        arrays["rotation"][1:, i] = _yaw(np.diff(heading))
+        k, seen, vectors = _seen(robot, variant, held, t)
+        arrays["bearings"][k, i, column[seen]], arrays["visible"][k, i, column[seen]] = vectors, True
         pose[:, i] = _truth(robot, held, t)
-        start[i], covariance[i] = _start(robot, held, pose[:, i], t)
-    truth = Truth(_yaw(pose[..., 2]), np.concatenate([pose[..., :2], 0.0 * pose[..., :1]], axis=-1))
+        start[i], arrays["start_covariance"][i] = _start(robot, held, pose[:, i], t)
     points = np.array([[*dataset.landmarks[subject], 0.0] for subject in subjects[:L]])
-    start_position = np.column_stack([start[:, :2], np.zeros(N)])
-    start_rotation, landmarks = _yaw(start[:, 2]), np.broadcast_to(points, (K, L, 3))
-    for array in (rotation, translation, velocity, angular_velocity, bearings, visible, start_rotation):
+    arrays["landmarks"] = np.broadcast_to(points, (K, L, 3))
+    arrays["start_rotation"], arrays["start_position"] = _yaw(start[:, 2]), start * (1.0, 1.0, 0.0)
+    for array in arrays.values():
         array.setflags(write=False)  # observers get views
     recording = Recording(
         setups=_setups(subjects, L),
         order=tuple(range(N)),
         dt=TICK_S,
-        rotation=rotation,
-        translation=translation,
-        velocity=velocity,
-        angular_velocity=angular_velocity,
-        bearings=bearings,
-        visible=visible,
-        landmarks=landmarks,
         inbox_tick=_inbox(K, N),
         period=MESSAGE_PERIOD_TICKS,
         staleness=math.inf,
         due=np.ones(K, bool),
-        start_rotation=start_rotation,
-        start_position=start_position,
-        start_covariance=covariance,
-        truth=truth,
+        truth=Truth(_yaw(pose[..., 2]), np.concatenate([pose[..., :2], 0.0 * pose[..., :1]], axis=-1)),
+        **arrays,
     )
     check_recording(recording, dataset.name)
     return recording
@@ -124,33 +137,26 @@ def _inbox(ticks: int, vehicles: int) -> NDArray[np.int64]:
     return inbox
 
 
-def _increments(held: HeldCommands, t: Array) -> tuple[Array, Array]:
-    """Return turn (K - 1,) and displacement (K - 1, 2) over each tick, in the body frame at its start."""
-    heading, position = held.heading(t), held.position(t)
-    return np.diff(heading), _turned(np.diff(position, axis=0), -heading[:-1])
+def counted(robot: Robot, variant: Variant) -> NDArray[np.bool_]:
+    """Return (n,) which of a robot's detections an observer gets in a variant."""
+    who = robot.detections[:, 1]
+    keep: NDArray[np.bool_] = who != robot.subject  # its own barcode is a misreading
+    if variant == "landmarks":
+        keep &= who > len(ROBOTS)
+    elif variant == "blind" and robot.subject in BLIND_ROBOTS:
+        keep &= who <= len(ROBOTS)
+    return keep
 
 
-def _see(
-    robot: Robot,
-    variant: Variant,
-    held: HeldCommands,
-    t: Array,
-    subjects: list[int],
-    bearings: Array,
-    visible: NDArray[np.bool_],
-) -> None:
-    """Fill in what one robot's camera saw: bearings (K, T, 3) and visible (K, T)."""
-    column = {subject: n for n, subject in enumerate(subjects)}
-    for frame in frames_of(robot, variant):
-        k = max(int(np.searchsorted(t, frame.t)), 1)
-        if k == len(t):
-            break
-        turned = held.heading(np.array([frame.t, t[k]]))
-        beta = frame.bearings - (turned[1] - turned[0])
-        for subject, angle in zip(frame.subjects.tolist(), beta.tolist(), strict=True):
-            if subject in column:  # a landmark that is not in the survey is of no use
-                bearings[k, column[subject]] = (math.cos(angle), math.sin(angle), 0.0)
-                visible[k, column[subject]] = True
+def _seen(robot: Robot, variant: Variant, held: HeldCommands, t: Array) -> tuple[NDArray[Any], NDArray[Any], Array]:
+    """Return of what one robot's camera saw the ticks (n,), the subjects (n,), and unit vectors (n, 3)."""
+    time, who, _, angle = robot.detections[counted(robot, variant)].T
+    k = np.maximum(np.searchsorted(t, time), 1)
+    inside = k < len(t)
+    k = k[inside]
+    beta = angle[inside] - (held.heading(t[k]) - held.heading(time[inside]))
+    vectors = np.array([(math.cos(b), math.sin(b), 0.0) for b in beta.tolist()]).reshape(-1, 3)
+    return k, who[inside].astype(np.int64), vectors
 
 
 def _truth(robot: Robot, held: HeldCommands, t: Array) -> Array:

@@ -1,0 +1,118 @@
+"""The files of one MR.CLAM sub-dataset: columns of numbers, comments behind `#`, times in absolute seconds."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from coopenv.errors import DataError, suggest
+
+NAMES = tuple(f"mrclam_{number}" for number in range(1, 10))
+ENVIRONMENT_VARIABLE = "COOPENV_DATA"
+
+MAX_PAUSE_S = 3600.0
+"""Between two rows; more is a broken time stamp."""
+MAX_LENGTH_S = 6 * 3600.0
+"""Longest time that a sub-dataset may span, whose clocks agree; the longest one takes 40 minutes."""
+
+
+def find_folder(name: str, data: str | Path | None = None) -> Path:
+    """Return the folder of a sub-dataset.
+
+    Args:
+        name: `mrclam_1` .. `mrclam_9`.
+        data: the sub-dataset's folder or its parent; by default what COOPENV_DATA says.
+
+    Raises:
+        DataError: unknown name, nothing said where the data are, or they are not there.
+    """
+    if name not in NAMES:
+        raise DataError(f"unknown data set {name!r}{suggest(str(name), NAMES)}; there are {NAMES[0]} .. {NAMES[-1]}")
+    where = data if data is not None else os.environ.get(ENVIRONMENT_VARIABLE)
+    if not where:
+        raise DataError(f"{name}: name its folder with --data DIR or {ENVIRONMENT_VARIABLE} (docs/data.md)")
+    root = Path(where).expanduser()
+    wanted = f"MRCLAM_Dataset{name.removeprefix('mrclam_')}"
+    if (root / wanted).is_dir():
+        return root / wanted
+    if not root.is_dir():
+        raise DataError(f"{name}: folder {root} does not exist")
+    other = re.fullmatch(r"MRCLAM_Dataset\d+", root.resolve().name)
+    if root.resolve().name == wanted or ((root / "Barcodes.dat").is_file() and other is None):
+        return root
+    if other:
+        raise DataError(f"{name}: {root} is another sub-dataset, expected {wanted}")
+    raise DataError(f"{name}: neither {wanted} nor Barcodes.dat in {root}")
+
+
+class Table:
+    """A file's rows of finite numbers, which know their lines."""
+
+    def __init__(self, path: Path, columns: int, least: int) -> None:
+        """Read a file that has so many columns, and at least so many rows.
+
+        Raises:
+            DataError: it is not there, or a line is not what the format says, or cut off.
+        """
+        try:
+            lines = path.read_text(encoding="latin-1").split("\n")
+        except OSError as error:
+            why = f"cannot be read ({error.strerror})" if path.is_file() else "no such file"
+            raise DataError(f"{path}: {why}") from None
+        self.path, self.lines, last, rows = path, list[int](), [""], list[list[float]]()
+        for number, line in enumerate(lines, start=1):
+            if fields := line.partition("#")[0].split():
+                self.lines.append(number)
+                if len(fields) != columns:
+                    self.refuse(-1, f"{len(fields)} columns, expected {columns}")
+                try:
+                    rows.append([float(field) for field in fields])
+                except ValueError as error:
+                    self.refuse(-1, f"{str(error).partition(': ')[2][:42]} is not a number")
+                last = [last[-1], fields[-1]]
+        self.values = np.array(rows, dtype=np.float64).reshape(-1, columns)
+        for row in np.flatnonzero(~np.isfinite(self.values).all(axis=1)).tolist():
+            self.refuse(row, "a value is not finite")
+        if len(rows) < least:
+            end = max(len(lines) - (lines[-1] == ""), 1)
+            raise DataError(f"{path}:{end}: {len(rows)} rows of data, expected at least {least}")
+        above, here = (len(field.partition(".")[2]) for field in last) if len(rows) > 1 else (0, 0)
+        if self.lines[-1:] == [len(lines)] and here < above:  # a last line without an end
+            self.refuse(-1, f"cut off in the middle of the last number {last[-1]!r}")
+
+    def refuse(self, row: int, why: str) -> NoReturn:
+        """Blame a row of data, by its line in the file."""
+        raise DataError(f"{self.path}:{self.lines[row]}: {why}")
+
+    def whole(self, column: int) -> list[int]:
+        """Return a column of whole numbers.
+
+        Raises:
+            DataError: a number is not whole.
+        """
+        values = self.values[:, column]
+        for row in np.flatnonzero(values != np.round(values)).tolist():
+            self.refuse(row, "subject and barcode numbers must be whole")
+        return [int(value) for value in values]
+
+
+def timed(path: Path, columns: int, least: int) -> Table:
+    """Return a table whose first column is the time, s.
+
+    Raises:
+        DataError: as for `Table`, or the time runs backwards, or ahead by hours.
+    """
+    table = Table(path, columns, least)
+    t = table.values[:, 0]
+    steps, length = np.diff(t, prepend=t[:1]), t - t[:1]
+    for row in np.flatnonzero(steps < 0).tolist():
+        table.refuse(row, f"time runs backwards, {t[row]:.14g} after {t[row - 1]:.14g}")
+    for row in np.flatnonzero(steps > MAX_PAUSE_S).tolist():
+        table.refuse(row, f"{steps[row]:g} s after the row above, at most {MAX_PAUSE_S:g}")
+    for row in np.flatnonzero(length > MAX_LENGTH_S).tolist():
+        table.refuse(row, f"{length[row]:g} s after the first row, at most {MAX_LENGTH_S:g}")
+    return table
