@@ -16,7 +16,8 @@ VIDEO_FILES = ("video.mp4", "video.gif")
 
 def result_names() -> list[str]:
     """Return the names of all files that a run can write."""
-    from coopenv.viz.figures import FIGURE_NAMES, FORMATS
+    from coopenv.viz.figures import FIGURE_NAMES
+    from coopenv.viz.style import FORMATS
 
     figures = [f"{name}.{file_format}" for name in FIGURE_NAMES for file_format in FORMATS]
     return [METRICS_FILE, TRAJECTORY_FILE, *figures, *VIDEO_FILES]

@@ -3,46 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.patheffects import withStroke
 
-from coopenv.estimation.metrics import (
-    CONVERGED,
-    error_rotation,
-    live_ticks,
-    roll_pitch_yaw_deg,
-    settling_times,
-)
+from coopenv.estimation.metrics import CONVERGED, error_rotation, live_ticks, roll_pitch_yaw_deg, settling_times
 from coopenv.estimation.trajectory import Trajectory
-from coopenv.viz.style import (
-    AXES_COLOURS,
-    ENDED,
-    GREY,
-    INK,
-    LINE,
-    MERGED_GAP,
-    NORMAL,
-    SHADE,
-    SMALL,
-    drawable,
-    moving_target_seen,
-    new_figure,
-    runs,
-    shade,
-    shade_ended,
-    show_decades,
-    thinned,
-    tidy,
-    time_axis,
-    time_span,
-    vehicle_label,
-)
+from coopenv.viz import style
 
 _ROW, _HEAD, _FOOT = 2.2, 0.7, 0.5  # inches
 _LEFT, _RIGHT, _GAP = 0.105, 0.985, 0.2  # shares of the width; the gap as a share of a panel's
@@ -53,7 +25,6 @@ _LEAST_SHARE = 0.2  # of the height: curves lower than this are magnified, and t
 _PAD = 0.07  # of the height, above and below
 _DOT = 4.0  # pt
 _NOTE = (0.27, 0.22)  # width and height of a note, shares of a panel
-_HALO = withStroke(linewidth=2.0, foreground="white")
 
 
 class _Quantity(NamedTuple):
@@ -77,95 +48,73 @@ def error_figure(trajectory: Trajectory, ends: Sequence[float] | None = None) ->
     """
     count = len(trajectory.vehicles)
     height = _HEAD + _FOOT + _ROW * count
-    figure = new_figure(10.0, height)
-    grid = figure.add_gridspec(
-        count,
-        2,
-        left=_LEFT,
-        right=_RIGHT,
-        bottom=_FOOT / height,
-        top=1 - _HEAD / height,
-        wspace=_GAP,
-        hspace=0.14,
-    )
+    figure = style.new_figure(10.0, height)
+    edges = {"left": _LEFT, "right": _RIGHT, "bottom": _FOOT / height, "top": 1 - _HEAD / height}
+    grid = figure.add_gridspec(count, 2, wspace=_GAP, hspace=0.14, **edges)
     converged = settling_times(trajectory, ends)
     live = live_ticks(trajectory.t, count, ends)
     shaded = [_moving_seen(trajectory, vehicle, ticks) for vehicle, ticks in enumerate(live)]
     for vehicle, ticks in enumerate(live):
+        settled = float(converged[vehicle])
         for column, quantity in enumerate(_quantities(trajectory, vehicle, ticks)):
             panels = grid[vehicle, column].subgridspec(2, 1, height_ratios=(1.8, 1), hspace=0.1)
             linear, log = figure.add_subplot(panels[0]), figure.add_subplot(panels[1])
             for ax, label in ((linear, quantity.label), (log, quantity.magnitude_label)):
-                tidy(ax, y_label=label)
-                time_axis(ax, trajectory.t, labelled=ax is log and vehicle == count - 1)
-                shade(ax, shaded[vehicle])
-                shade_ended(ax, trajectory.t, ticks)
-                if np.isfinite(converged[vehicle]):
-                    ax.axvline(float(converged[vehicle]), color=INK, linewidth=0.8, linestyle=_DASHED)
-            _draw_components(linear, trajectory.t[:ticks], quantity, float(converged[vehicle]))
-            _draw_magnitude(log, trajectory.t[:ticks], quantity, float(converged[vehicle]))
-            for ax in (linear, log):
+                style.tidy(ax, y_label=label)
                 ax.yaxis.set_label_coords(_LABEL_X, 0.5)
+                style.time_axis(ax, trajectory.t, labelled=ax is log and vehicle == count - 1)
+                style.shade(ax, shaded[vehicle])
+                style.shade_ended(ax, trajectory.t, ticks)
+                if np.isfinite(settled):
+                    ax.axvline(settled, color=style.INK, linewidth=0.8, linestyle=_DASHED)
+            _draw_components(linear, trajectory.t[:ticks], quantity, settled)
+            _draw_magnitude(log, trajectory.t[:ticks], quantity, settled)
             if column == 0:
-                name = vehicle_label(trajectory.vehicles[vehicle])
-                linear.text(-0.245, 0.15, name, transform=linear.transAxes, fontsize=13, color=INK)
-    _add_legends(
-        figure, height, _marks(bool(np.isfinite(converged).any()), any(shaded), live.min() < len(trajectory.t))
-    )
+                name = style.vehicle_label(trajectory.vehicles[vehicle])
+                linear.text(-0.245, 0.15, name, transform=linear.transAxes, fontsize=13, color=style.INK)
+    marks = _marks(bool(np.isfinite(converged).any()), any(shaded), live.min() < len(trajectory.t))
+    _add_legends(figure, height, marks)
     return figure
 
 
 def _moving_seen(trajectory: Trajectory, vehicle: int, ticks: int) -> list[tuple[float, float]]:
-    seen = moving_target_seen(trajectory, vehicle) & (np.arange(len(trajectory.t)) < ticks)
-    return runs(trajectory.t, seen, MERGED_GAP)
+    seen = style.moving_target_seen(trajectory, vehicle) & (np.arange(len(trajectory.t)) < ticks)
+    return style.runs(trajectory.t, seen, style.MERGED_GAP)
 
 
 def _quantities(trajectory: Trajectory, vehicle: int, ticks: int) -> tuple[_Quantity, _Quantity]:
     part = slice(ticks), vehicle
     with np.errstate(invalid="ignore", over="ignore"):  # of an observer that has diverged
         tilde = error_rotation(trajectory.rotation[part], trajectory.rotation_estimate[part])
-        position = np.asarray(trajectory.position[part], float) - trajectory.position_estimate[part]
+        position = style.drawable(np.asarray(trajectory.position[part], float) - trajectory.position_estimate[part])
+    distance = style.drawable(trajectory.position_error[part], positive=True)
+    angle = style.drawable(trajectory.orientation_error[part], positive=True)
+    angles, names = style.drawable(roll_pitch_yaw_deg(tilde)), ("orientation error\n[deg]", "angle\n[deg]")
     return (
-        _Quantity(
-            components=drawable(position),
-            magnitude=drawable(trajectory.position_error[part], positive=True),
-            unit="m",
-            label="position error\n[m]",
-            magnitude_label="norm\n[m]",
-            tolerance=CONVERGED.position_m,
-        ),
-        _Quantity(
-            components=drawable(roll_pitch_yaw_deg(tilde)),
-            magnitude=drawable(trajectory.orientation_error[part], positive=True),
-            unit="deg",
-            label="orientation error\n[deg]",
-            magnitude_label="angle\n[deg]",
-            tolerance=CONVERGED.orientation_deg,
-        ),
+        _Quantity(position, distance, "m", "position error\n[m]", "norm\n[m]", CONVERGED.position_m),
+        _Quantity(angles, angle, "deg", *names, CONVERGED.orientation_deg),
     )
 
 
 def _draw_components(ax: Axes, t: np.ndarray, quantity: _Quantity, converged: float) -> None:
-    keep = thinned(len(t))
-    ax.axhline(0.0, color=GREY, linewidth=0.6, zorder=1)
+    keep = style.thinned(len(t))
+    ax.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
     low, high = _limits(quantity.components)
     ax.set_ylim(low, high)
-    for component, colour in zip(quantity.components.T, AXES_COLOURS, strict=True):
-        ax.plot(t[keep], _without_wraps(component[keep]), color=colour, linewidth=LINE)
-        start = component[0]
-        marker = "^" if start > high else "v" if start < low else "o"
-        look: dict[str, Any] = {"marker": marker, "markersize": _DOT, "color": colour, "zorder": 4}
-        ax.plot([t[0]], [np.clip(start, low, high)], clip_on=False, **look)
+    for component, colour in zip(quantity.components.T, style.AXES_COLOURS, strict=True):
+        ax.plot(t[keep], _without_wraps(component[keep]), color=colour, linewidth=style.LINE)
+        start = np.clip(component[0], low, high)
+        marker = "^" if component[0] > high else "v" if component[0] < low else "o"
+        ax.plot([t[0]], [start], marker, color=colour, markersize=_DOT, clip_on=False, zorder=4)
     start = quantity.components[0]
     if np.any((start < low) | (start > high)):
         values = ", ".join(f"{value + 0.0:.3g}" for value in start.round(6))
         y, align = (0.04, "bottom") if np.nanmax(-start) > np.nanmax(start) else (0.96, "top")
-        note = f"starts at {values} {quantity.unit}"
         begin, end = ax.get_xlim()
         line = (converged - begin) / (end - begin)
         x = line + 0.015 if 0.02 < line < 0.4 else 0.02  # beside the dashed line
         box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1.0}
-        ax.text(x, y, note, transform=ax.transAxes, va=align, fontsize=SMALL, color=INK, bbox=box)
+        style.note(ax, x, y, f"starts at {values} {quantity.unit}", va=align, bbox=box)
 
 
 def _limits(components: np.ndarray) -> tuple[float, float]:
@@ -187,42 +136,28 @@ def _range(values: np.ndarray) -> tuple[float, float]:
 
 
 def _draw_magnitude(ax: Axes, t: np.ndarray, quantity: _Quantity, converged: float) -> None:
-    keep = thinned(len(t))
+    keep = style.thinned(len(t))
     ax.set_yscale("log")
-    ax.plot(t[keep], quantity.magnitude[keep], color=INK, linewidth=0.8)
-    ax.axhline(quantity.tolerance, color=GREY, linewidth=0.9, linestyle=_DOTTED)
-    ax.plot([t[0]], [quantity.magnitude[0]], "o", markersize=_DOT, color=INK, clip_on=False, zorder=4)
-    show_decades(ax)
-    text = f"converged at {converged:.1f} s" if np.isfinite(converged) else "not converged"
+    ax.plot(t[keep], quantity.magnitude[keep], color=style.INK, linewidth=0.8)
+    ax.axhline(quantity.tolerance, color=style.GREY, linewidth=0.9, linestyle=_DOTTED)
+    ax.plot([t[0]], [quantity.magnitude[0]], "o", markersize=_DOT, color=style.INK, clip_on=False, zorder=4)
+    style.show_decades(ax)
     right, top = _quiet_corner(ax, t, quantity, converged)
-    ax.text(
-        0.99 if right else 0.02,
-        0.95 if top else 0.07,
-        text,
-        transform=ax.transAxes,
-        ha="right" if right else "left",
-        va="top" if top else "bottom",
-        fontsize=SMALL,
-        color=INK,
-        path_effects=[_HALO],
-    )
+    x, ha = (0.99, "right") if right else (0.02, "left")
+    y, va = (0.95, "top") if top else (0.07, "bottom")
+    text = f"converged at {converged:.1f} s" if np.isfinite(converged) else "not converged"
+    style.note(ax, x, y, text, ha=ha, va=va, path_effects=style.HALO)
 
 
-def _quiet_corner(ax: Axes, t: np.ndarray, quantity: _Quantity, converged: float) -> tuple[bool, bool]:
-    """Return the corner (right, top) of a logarithmic panel where a note covers the least."""
-    bottom, top = np.log(ax.get_ylim())
-    begin, end = time_span(np.array(ax.get_xlim()))
-    x, line = (t - begin) / (end - begin), (converged - begin) / (end - begin)
-    y, tolerance = ((np.log(v) - bottom) / (top - bottom) for v in (quantity.magnitude, quantity.tolerance))
-    width, height = _NOTE
+def _quiet_corner(ax: Axes, t: np.ndarray, quantity: _Quantity, converged: float) -> tuple[int, int]:
+    """Return the corner (1: right, 1: top) of a logarithmic panel where a note covers the least."""
+    curve = np.stack([t, quantity.magnitude], axis=-1)
+    places = (ax.transScale + ax.transLimits).transform([*curve, (converged, quantity.tolerance)])  # shares
     costs = {}
-    for at_right in (True, False):
-        beside = x > 1 - width if at_right else x < width
-        crossed = line > 1 - width if at_right else line < width
-        for at_top in (True, False):
-            covered = beside & (y > 1 - height if at_top else y < height)
-            on_tolerance = tolerance > 1 - height if at_top else tolerance < height
-            costs[at_right, at_top] = 4.0 * crossed + 10.0 * covered.mean() / width + 0.5 * on_tolerance
+    for corner in product((1, 0), (1, 0)):
+        near = np.abs(places - corner) < _NOTE
+        covered, (crossed, on_tolerance) = near[:-1].all(axis=-1).mean(), near[-1]
+        costs[corner] = 4.0 * crossed + 10.0 * covered / _NOTE[0] + 0.5 * on_tolerance
     return min(costs, key=lambda corner: costs[corner])
 
 
@@ -234,36 +169,25 @@ def _without_wraps(angle: np.ndarray) -> np.ndarray:
 
 def _marks(converged: bool, shaded: bool, ended: bool) -> list[Line2D | Patch]:
     """Return what the legend explains of all that is in the figure."""
-    tolerance = f"{CONVERGED.position_m:g} m, {CONVERGED.orientation_deg:g} deg"
+    ink, tolerance = style.INK, f"{CONVERGED.position_m:g} m, {CONVERGED.orientation_deg:g} deg"
     marks: list[Line2D | Patch] = [
-        Line2D([], [], color=INK, linestyle="none", marker="o", markersize=_DOT, label="at t = 0"),
-        Line2D([], [], color=GREY, linestyle=_DOTTED, linewidth=0.9, label=tolerance),
+        Line2D([], [], color=ink, linestyle="none", marker="o", markersize=_DOT, label="at t = 0"),
+        Line2D([], [], color=style.GREY, linestyle=_DOTTED, linewidth=0.9, label=tolerance),
     ]
     if converged:
-        marks.append(Line2D([], [], color=INK, linestyle=_DASHED, linewidth=0.8, label="below both from here on"))
+        marks.append(Line2D([], [], color=ink, linestyle=_DASHED, linewidth=0.8, label="below both from here on"))
     if shaded:
-        marks.append(Patch(facecolor=SHADE, label="moving target detected"))
+        marks.append(Patch(facecolor=style.SHADE, label="moving target detected"))
     if ended:
-        marks.append(Patch(facecolor=ENDED, label="ended, parked"))
+        marks.append(Patch(facecolor=style.ENDED, label="ended, parked"))
     return marks
 
 
 def _add_legends(figure: Figure, height: float, marks: list[Line2D | Patch]) -> None:
+    look = {"fontsize": style.NORMAL, "handlelength": 1.8, "columnspacing": 1.4, "borderpad": 0.0, "borderaxespad": 0.0}
+    style.legend(figure, marks, "center left", (_LEFT, 1 - 0.2 / height), ncols=len(marks), **look)
     second = _LEFT + (_RIGHT - _LEFT) * (1 + _GAP) / (2 + _GAP)
-    rows = [(_LEFT, 0.2, marks)]
     for x, names in ((_LEFT, ("x", "y", "z")), (second, ("roll", "pitch", "yaw"))):
-        pairs = zip(names, AXES_COLOURS, strict=True)
-        rows.append((x, 0.48, [Line2D([], [], color=c, linewidth=LINE, label=n) for n, c in pairs]))
-    for x, drop, handles in rows:
-        figure.legend(
-            handles=handles,
-            loc="center left",
-            bbox_to_anchor=(x, 1 - drop / height),
-            ncols=len(handles),
-            fontsize=NORMAL,
-            frameon=False,
-            handlelength=1.8,
-            columnspacing=1.4,
-            borderpad=0.0,
-            borderaxespad=0.0,
-        )
+        pairs = zip(names, style.AXES_COLOURS, strict=True)
+        handles = [Line2D([], [], color=colour, linewidth=style.LINE, label=name) for name, colour in pairs]
+        style.legend(figure, handles, "center left", (x, 1 - 0.48 / height), ncols=3, **look)

@@ -16,15 +16,7 @@ from coopenv.viz.style import save
 from coopenv.viz.topology import topology_figure
 from coopenv.viz.trajectories import trajectory_figure_2d, trajectory_figure_3d
 
-FIGURE_NAMES = (
-    "errors",
-    "trajectories_2d",
-    "trajectories_3d",
-    "topology",
-    "consistency",
-    "observability",
-)
-FORMATS = ("png", "pdf", "svg")
+FIGURE_NAMES = ("errors", "trajectories_2d", "trajectories_3d", "topology", "consistency", "observability")
 
 
 def save_figures(
@@ -46,7 +38,7 @@ def save_figures(
         scenario: of the run, for the roads and buildings under its paths.
         ends: s, when each vehicle arrived or collided and was parked, where its lines stop (None: no vehicle was).
         steady_from: s, start of the steady state that mean NEES are over (None: at 70 % of the record).
-        file_format: one of `FORMATS`.
+        file_format: one of `style.FORMATS`.
 
     Returns:
         The paths written.
@@ -55,9 +47,7 @@ def save_figures(
         OutputError: the directory cannot be made or written to.
     """
     directory = Path(directory)
-    if observability is None:
-        observability = analyse_observability(trajectory)
-    seen = observability
+    seen = analyse_observability(trajectory) if observability is None else observability
     draw = {
         "errors": lambda: error_figure(trajectory, ends),
         "trajectories_2d": lambda: trajectory_figure_2d(trajectory, ends, scenario),

@@ -12,25 +12,11 @@ from matplotlib.patches import Patch
 
 from coopenv.estimation.metrics import observability_of
 from coopenv.estimation.observability import Observability
-from coopenv.viz.style import (
-    GREEN,
-    INK,
-    LINE,
-    NORMAL,
-    SMALL,
-    VERMILION,
-    new_figure,
-    show_decades,
-    thinned,
-    tidy,
-    time_axis,
-    vehicle_colour,
-    vehicle_label,
-)
+from coopenv.viz import style
 
 _VERDICTS: dict[bool, dict[str, Any]] = {
-    True: {"facecolor": GREEN, "edgecolor": "none", "label": "observable"},
-    False: {"facecolor": "white", "edgecolor": VERMILION, "hatch": "//////", "label": "not\nobservable"},
+    True: {"facecolor": style.GREEN, "edgecolor": "none", "label": "observable"},
+    False: {"facecolor": "white", "edgecolor": style.VERMILION, "hatch": "//////", "label": "not\nobservable"},
 }
 _FLOOR = 1e-8  # smaller eigenvalues are drawn here: they are zero but for rounding
 
@@ -44,50 +30,41 @@ def observability_figure(observability: Observability, ends: Sequence[float] | N
     cut = [observability_of(observability, i, np.nan if ends is None else ends[i]) for i in range(count)]
     strip = 0.3 + 0.24 * count
     height = 5.6 + strip
-    figure = new_figure(9.0, height)
-    local, theorem, verdict = figure.subplots(
-        3,
-        1,
-        gridspec_kw={
-            "height_ratios": (2.5, 1.6, strip),
-            "left": 0.11,
-            "right": 0.875,
-            "bottom": 0.55 / height,
-            "top": 1 - 0.45 / height,
-            "hspace": 0.14,
-        },
-    )
+    figure = style.new_figure(9.0, height)
+    edges = {"left": 0.11, "right": 0.875, "bottom": 0.55 / height, "top": 1 - 0.45 / height}
+    grid = figure.add_gridspec(3, 1, height_ratios=(2.5, 1.6, strip), hspace=0.14, **edges)
+    local, theorem, verdict = grid.subplots(squeeze=False)[:, 0]
     title = f"Observability Gramian, {observability.window:.3g} s windows (values below {_FLOOR:g} drawn there)"
-    figure.suptitle(title, x=0.11, y=1 - 0.12 / height, ha="left", va="top", fontsize=NORMAL + 1, color=INK)
-    _draw_eigenvalues(local, [(part.t, part.local_eigenvalue[:, 0]) for part in cut], observability.vehicles)
-    local.set_ylabel("smallest eigenvalue about\nthe vehicle, scaled [-]", fontsize=NORMAL)
-    local.axhline(observability.threshold, color=INK, linewidth=0.9, linestyle=(0, (4, 2)), label="threshold")
-    local.legend(loc="upper left", bbox_to_anchor=(1.005, 1.0), fontsize=NORMAL, frameon=False)
-    _draw_eigenvalues(theorem, [(part.t, part.min_eigenvalue[:, 0]) for part in cut], observability.vehicles)
-    theorem.set_ylabel("smallest eigenvalue\nabout the map origin", fontsize=NORMAL)
+    place = {"x": 0.11, "y": 1 - 0.12 / height, "ha": "left", "va": "top"}
+    figure.suptitle(title, fontsize=style.NORMAL + 1, color=style.INK, **place)
+    _draw_eigenvalues(local, cut, [part.local_eigenvalue for part in cut])
+    local.set_ylabel("smallest eigenvalue about\nthe vehicle, scaled [-]", fontsize=style.NORMAL)
+    local.axhline(observability.threshold, color=style.INK, linewidth=0.9, linestyle=(0, (4, 2)), label="threshold")
+    style.legend(local, local.get_lines(), "upper left", (1.005, 1.0), fontsize=style.NORMAL)
+    _draw_eigenvalues(theorem, cut, [part.min_eigenvalue for part in cut])
+    theorem.set_ylabel("smallest eigenvalue\nabout the map origin", fontsize=style.NORMAL)
     _draw_verdict(verdict, cut)
     for ax in (local, theorem):
-        show_decades(ax)
+        style.show_decades(ax)
     for ax in (local, theorem, verdict):
         if len(observability.t):
             span = np.array([observability.t[0], observability.t[-1] + observability.window])
-            time_axis(ax, span, labelled=ax is verdict)
+            style.time_axis(ax, span, labelled=ax is verdict)
     return figure
 
 
-def _draw_eigenvalues(ax: Axes, curves: list[tuple[np.ndarray, np.ndarray]], vehicles: np.ndarray) -> None:
-    tidy(ax)
+def _draw_eigenvalues(ax: Axes, cut: list[Observability], eigenvalues: list[np.ndarray]) -> None:
+    style.tidy(ax)
     ax.set_yscale("log")
-    for vehicle, (t, values) in enumerate(curves):
-        if len(t):
-            keep = thinned(len(t))
-            drawn = np.maximum(values[keep], _FLOOR)
-            look: dict[str, Any] = {"color": vehicle_colour(vehicle), "label": vehicle_label(vehicles[vehicle])}
-            ax.plot(t[keep], drawn, linewidth=LINE, **look)
+    for vehicle, (part, values) in enumerate(zip(cut, eigenvalues, strict=True)):
+        if len(part.t):
+            keep, colour = style.thinned(len(part.t)), style.vehicle_colour(vehicle)
+            drawn, name = np.maximum(values[keep, 0], _FLOOR), style.vehicle_label(part.vehicles[0])
+            ax.plot(part.t[keep], drawn, linewidth=style.LINE, color=colour, label=name)
 
 
 def _draw_verdict(ax: Axes, cut: list[Observability]) -> None:
-    tidy(ax)
+    style.tidy(ax)
     ax.grid(False, axis="y")
     occurring = set()
     for vehicle, part in enumerate(cut):
@@ -96,13 +73,7 @@ def _draw_verdict(ax: Axes, cut: list[Observability]) -> None:
             if stretches:
                 occurring.add(observable)
                 ax.broken_barh(stretches, (vehicle - 0.32, 0.64), linewidth=0.4, **look)
-    ax.set_yticks(range(len(cut)), [vehicle_label(part.vehicles[0]) for part in cut])
+    ax.set_yticks(range(len(cut)), [style.vehicle_label(part.vehicles[0]) for part in cut])
     ax.set_ylim(len(cut) - 0.5, -0.5)
-    ax.legend(
-        handles=[Patch(**look) for observable, look in _VERDICTS.items() if observable in occurring],
-        loc="upper left",
-        bbox_to_anchor=(1.005, 1.0),
-        fontsize=SMALL,
-        frameon=False,
-        handlelength=1.6,
-    )
+    handles = [Patch(**look) for observable, look in _VERDICTS.items() if observable in occurring]
+    style.legend(ax, handles, "upper left", (1.005, 1.0), handlelength=1.6)

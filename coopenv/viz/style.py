@@ -5,13 +5,17 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullFormatter
 
+from coopenv.errors import CoopenvError
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.files import replacing_file
 
@@ -24,9 +28,11 @@ DARK_BLUE = "#00264D"  # landmarks, as in the paper
 AXES_COLOURS = (VERMILION, GREEN, BLUE)  # x, y, z and roll, pitch, yaw
 VEHICLE_COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, INK, GREY)
 
+FORMATS = ("png", "pdf", "svg")
 DPI = 130
 LINE = 1.2  # pt
 SMALL, NORMAL = 7.5, 9.0  # pt
+HALO = (withStroke(linewidth=2.0, foreground="white"),)  # of words that stand on lines
 MAX_POINTS = 1500  # of a line: more than the pixels it crosses
 MERGED_GAP = 0.2  # s, longest gap in a shade that is not drawn: a frame or two without a detection
 _LEAST_DECADES = 1.05  # on a logarithmic axis
@@ -40,14 +46,18 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def save(figure: Figure, path: Path) -> Path:
-    """Write a figure in the format that the path's suffix names, and return the path.
+def save(figure: Figure, path: Path, file_format: str = "") -> Path:
+    """Write a figure in one of `FORMATS` (by default as the path ends), and return the path.
 
     Raises:
-        OutputError: it cannot be written; an older file is untouched.
+        CoopenvError: no such format, or the file cannot be written; an older one is untouched.
     """
+    form = file_format or path.suffix.removeprefix(".")
+    if form not in FORMATS:
+        raise CoopenvError(f"{path}: unknown format '{form}' of a figure; known: {', '.join(FORMATS)}")
+    stamp = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}[form]  # the same figure is the same file
     with replacing_file(path) as new:
-        figure.savefig(new, dpi=DPI, format=path.suffix.removeprefix("."))
+        figure.savefig(new, dpi=DPI, format=form, metadata={stamp: None})
     return path
 
 
@@ -98,8 +108,7 @@ def runs(t: np.ndarray, mask: np.ndarray, gap: float = 0.0) -> list[tuple[float,
 
 def moving_target_seen(trajectory: Trajectory, vehicle: int) -> np.ndarray:
     """Return (K,) whether a vehicle's camera detects a vehicle or a moving landmark."""
-    result: np.ndarray = np.any(trajectory.visible[:, vehicle] & trajectory.target_moving, axis=-1)
-    return result
+    return np.asarray(np.any(trajectory.visible[:, vehicle] & trajectory.target_moving, axis=-1))
 
 
 def shade(ax: Axes, stretches: Sequence[tuple[float, float]], colour: str = SHADE) -> None:
@@ -119,12 +128,23 @@ def tidy(ax: Axes, *, x_label: str = "", y_label: str = "") -> None:
     ax.grid(True, color=RULE, linewidth=0.5)
     ax.tick_params(labelsize=SMALL, length=2.5, width=0.6, colors=INK)
     ax.tick_params(which="minor", length=0)
-    for side in ("top", "right"):
-        ax.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        ax.spines[side].set_linewidth(0.6)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.spines[["left", "bottom"]].set_linewidth(0.6)
     ax.set_xlabel(x_label, fontsize=NORMAL, color=INK)
     ax.set_ylabel(y_label, fontsize=NORMAL, color=INK)
+
+
+def note(ax: Axes, x: float, y: float, text: str, **look: Any) -> None:
+    """Write words at a place given in shares of the axes."""
+    ax.text(x, y, text, transform=ax.transAxes, **{"fontsize": SMALL, "color": INK, **look})
+
+
+def legend(
+    owner: Axes | Figure, handles: Sequence[Artist], loc: str, place: tuple[float, float] | None = None, **look: Any
+) -> None:
+    """Explain marks without a frame, the corner or edge `loc` of the legend at a place in shares of its owner."""
+    look = {"loc": loc, "bbox_to_anchor": place, "fontsize": SMALL, "frameon": False, **look}
+    owner.legend(handles=handles, **look)
 
 
 def show_decades(ax: Axes) -> None:

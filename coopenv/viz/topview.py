@@ -12,33 +12,9 @@ from coopenv.estimation.trajectory import Outcome, Sight
 from coopenv.format import fixed
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Body, Landmark, Vehicle
+from coopenv.viz import topview_geometry as geometry
+from coopenv.viz import topview_ground as ground
 from coopenv.viz.style import DARK_BLUE, INK, NORMAL, vehicle_colour
-from coopenv.viz.topview_geometry import (
-    box_shape,
-    camera_fan,
-    ellipses,
-    free_lengths,
-    nose_shape,
-    outlines,
-    pointers,
-    position_covariance,
-)
-from coopenv.viz.topview_ground import (
-    DOTTED,
-    HEIGHT,
-    MOST_ROWS,
-    PANEL,
-    ROW,
-    SIGHT_LOOKS,
-    SMALLER,
-    TABLE_TOP,
-    draw_legend,
-    label_landmark,
-    new_ground,
-    pixels,
-    sees_a_part,
-    vehicle_mark,
-)
 from coopenv.viz.topview_layers import Layers
 from coopenv.viz.window import Window
 
@@ -52,15 +28,8 @@ _HALO: dict[str, Any] = {"path_effects": [withStroke(linewidth=2.2, foreground="
 _FARTHEST = 10.0  # pictures' sides from the middle, of an estimate as drawn
 _POINT = Body(size=(2e-3, 1e-3, 1e-3))  # stands in for a vehicle without a body, drawn at the least size
 _FIELDS = (
-    "rotation",
-    "position",
-    "estimate_rotation",
-    "estimate_position",
-    "covariance",
-    "sight",
-    "ended",
-    "position_error",
-    "orientation_error",
+    *("rotation", "position", "estimate_rotation", "estimate_position", "covariance"),
+    *("sight", "ended", "position_error", "orientation_error"),
 )
 
 
@@ -75,7 +44,7 @@ class TopView:
         """Draw the ground."""
         self.scenario = scenario
         self._landmarks = len(scenario.landmarks)
-        self._figure, self._axes = new_ground(scenario)
+        self._figure, self._axes = ground.new_ground(scenario)
         self._layers = Layers(self._figure, self._axes)
         (x0, x1), (y0, y1) = self._axes.get_xlim(), self._axes.get_ylim()
         self._low, self._high = np.array([x0, y0]), np.array([x1, y1])
@@ -92,7 +61,7 @@ class TopView:
         R, position = view["rotation"], view["position"]
         R_hat, p_hat = view["estimate_rotation"], view["estimate_position"]
         estimate = (R_hat @ p_hat[..., None])[..., 0]
-        sigma = self._place_ellipses(estimate, position_covariance(R_hat, p_hat, view["covariance"]))
+        sigma = self._place_ellipses(estimate, geometry.position_covariance(R_hat, p_hat, view["covariance"]))
         self._place_bodies(R, position, R_hat, estimate)
         self._place_sight(R, position, view["sight"])
         self._place_marks(R, position, view["ended"])
@@ -112,16 +81,16 @@ class TopView:
         agents: list[Landmark | Vehicle] = [*s.landmarks, *s.vehicles]
         shortest = _SHORTEST * self._pixel
         bodies = [vehicle.body or _POINT for vehicle in s.vehicles]
-        self._box = np.array([box_shape(b.size, b.center, shortest) for b in bodies])
-        self._nose = np.array([nose_shape(box) for box in self._box])
+        self._box = np.array([geometry.box_shape(b.size, b.center, shortest) for b in bodies])
+        self._nose = np.array([geometry.nose_shape(box) for box in self._box])
         self._others = [i for i, m in enumerate(s.landmarks) if m.body]
         bodies = [m.body for m in s.landmarks if m.body]
-        self._other_box = np.array([box_shape(b.size, b.center, shortest) for b in bodies]).reshape(-1, 4, 2)
+        self._other_box = np.array([geometry.box_shape(b.size, b.center, shortest) for b in bodies]).reshape(-1, 4, 2)
         self._marker = np.array([agent.marker for agent in agents])
         self._camera, self._origin = np.array(s.camera.position), np.array(s.map.origin)
         limit = _REACH * self._side
         self._reach = min(s.camera.range or limit, limit)
-        self._fan = camera_fan(s.camera) if sees_a_part(s) else None
+        self._fan = geometry.camera_fan(s.camera) if ground.sees_a_part(s) else None
         aside = self._box[:, 2, 1] + _LABEL * self._pixel
         self._label = np.stack([self._box[:, :, 0].mean(axis=1), aside], axis=-1)
 
@@ -131,13 +100,13 @@ class TopView:
         self._rgba = to_rgba_array(colours)
         self._wedges = layers.polygons(facecolor=_faded(self._rgba, 0.11), edgecolor="none")
         self._ellipses = layers.polygons(linewidth=1.0)
-        self._sight = {sight: layers.lines(**look) for sight, look in SIGHT_LOOKS.items()}
+        self._sight = {sight: layers.lines(**look) for sight, look in ground.SIGHT_LOOKS.items()}
         self._still = layers.points("o", DARK_BLUE, "white", 5.5)
         self._other = layers.polygons(facecolor=DARK_BLUE, edgecolor="white", linewidth=0.8)
         self._moving = layers.points("D", DARK_BLUE, "white", 5.5)
         self._truth = layers.polygons(facecolor=self._rgba, edgecolor=INK, linewidth=0.8)
         self._truth_nose = layers.polygons(facecolor="white", edgecolor="none")
-        self._links = layers.lines(color=colours, linewidth=1.0, linestyle=DOTTED)
+        self._links = layers.lines(color=colours, linewidth=1.0, linestyle=ground.DOTTED)
         self._casing = layers.polygons(facecolor="none", edgecolor="white", linewidth=2.3)
         self._estimate = layers.polygons(facecolor="none", edgecolor=self._rgba, linewidth=1.1)
         self._estimate_nose = layers.polygons(facecolor="none", edgecolor=self._rgba, linewidth=0.9)
@@ -147,11 +116,11 @@ class TopView:
         self._collided = layers.points("X", INK, "white", 11)
         look = {"fontsize": NORMAL, "weight": "bold", "ha": "center", "va": "center", "clip_on": True, **_HALO}
         self._names = [
-            layers.keep(self._axes.text(0, 0, vehicle_mark(i), color=colour, **look))
+            layers.keep(self._axes.text(0, 0, ground.vehicle_mark(i), color=colour, **look))
             for i, colour in enumerate(colours)
         ]
         self._moving_names = {
-            i: label_landmark(self._axes, m.name, np.zeros(2))
+            i: ground.label_landmark(self._axes, m.name, np.zeros(2))
             for i, m in enumerate(self.scenario.landmarks)
             if m.motion.kind != "static"
         }
@@ -160,23 +129,25 @@ class TopView:
 
     def _prepare_table(self) -> None:
         count = len(self.scenario.vehicles)
-        shown = min(count, MOST_ROWS)
-        title = self._figure.text(*pixels(PANEL, HEIGHT - 21), "", fontsize=NORMAL + 1.5, weight="bold", color=INK)
+        shown = min(count, ground.MOST_ROWS)
+        title = self._figure.text(
+            *ground.pixels(ground.PANEL, ground.HEIGHT - 21), "", fontsize=NORMAL + 1.5, weight="bold", color=INK
+        )
         self._time = self._layers.keep(title)
-        look: dict[str, Any] = {"fontsize": SMALLER, "family": "monospace"}
+        look: dict[str, Any] = {"fontsize": ground.SMALLER, "family": "monospace"}
         head = f"{'':4}{'error':>7}{'error':>7}{'3σ':>7}{'sees':>6}\n{'':4}{'[m]':>7}{'[deg]':>7}{'[m]':>7}"
-        self._figure.text(*pixels(PANEL, TABLE_TOP), head, color=INK, va="bottom", **look)
-        places = [pixels(PANEL, TABLE_TOP - ROW * (i + 1)) for i in range(shown + 1)]
+        self._figure.text(*ground.pixels(ground.PANEL, ground.TABLE_TOP), head, color=INK, va="bottom", **look)
+        places = [ground.pixels(ground.PANEL, ground.TABLE_TOP - ground.ROW * (i + 1)) for i in range(shown + 1)]
         self._rows = [
             self._layers.keep(self._figure.text(*places[i], "", color=vehicle_colour(i), **look)) for i in range(shown)
         ]
         if count > shown:
             self._figure.text(*places[-1], f"and {count - shown} more", color=INK, **look)
-        draw_legend(self._figure, self.scenario, shown + 1)
+        ground.draw_legend(self._figure, self.scenario, shown + 1)
 
     def _place_ellipses(self, estimate: np.ndarray, covariance: np.ndarray) -> np.ndarray:
         """Place the 3-sigma ellipses; return their major semi-axes (N,) in m."""
-        shapes, semi = ellipses(self._drawable(estimate[:, :2]), covariance[:, :2, :2])
+        shapes, semi = geometry.ellipses(self._drawable(estimate[:, :2]), covariance[:, :2, :2])
         drawn = semi <= _LARGEST * self._side
         alpha = np.where(semi[drawn] <= _FILLED * self._side, 0.09, 0.0)
         self._ellipses.set_verts(list(shapes[drawn]))
@@ -187,13 +158,13 @@ class TopView:
     def _place_bodies(self, R: np.ndarray, position: np.ndarray, R_hat: np.ndarray, estimate: np.ndarray) -> None:
         L = self._landmarks
         place, guess = position[L:, :2], self._drawable(estimate[:, :2])
-        self._truth.set_verts(outlines(R[L:], place, self._box))
-        self._truth_nose.set_verts(outlines(R[L:], place, self._nose))
-        believed = outlines(R_hat, guess, self._box)
+        self._truth.set_verts(geometry.outlines(R[L:], place, self._box))
+        self._truth_nose.set_verts(geometry.outlines(R[L:], place, self._nose))
+        believed = geometry.outlines(R_hat, guess, self._box)
         self._casing.set_verts(believed)
         self._estimate.set_verts(believed)
-        self._estimate_nose.set_verts(outlines(R_hat, guess, self._nose))
-        self._other.set_verts(outlines(R[self._others], position[self._others, :2], self._other_box))
+        self._estimate_nose.set_verts(geometry.outlines(R_hat, guess, self._nose))
+        self._other.set_verts(geometry.outlines(R[self._others], position[self._others, :2], self._other_box))
         self._links.set_segments(list(np.stack([place, guess], axis=1)))
         self._point_outside(self._pointers, place, guess)
         self._point_outside(self._strays, guess, place)
@@ -202,14 +173,11 @@ class TopView:
         """Return points (N, 2), those too far for the renderer drawn nearer in their direction."""
         middle = (self._low + self._high) / 2
         away = np.linalg.norm(points - middle, axis=-1, keepdims=True)
-        result: np.ndarray = middle + (points - middle) * np.minimum(
-            1.0, _FARTHEST * self._side / np.maximum(away, 1e-9)
-        )
-        return result
+        return np.asarray(middle + (points - middle) * np.minimum(1, _FARTHEST * self._side / np.maximum(away, 1e-9)))
 
     def _point_outside(self, pointing: Any, origin: np.ndarray, point: np.ndarray) -> None:
         """Point from the border to what lies outside the picture."""
-        triangles, which = pointers(origin, point, self._low, self._high, _POINTER * self._pixel)
+        triangles, which = geometry.pointers(origin, point, self._low, self._high, _POINTER * self._pixel)
         pointing.set_verts(triangles)
         pointing.set_edgecolor(self._rgba[which])
         if pointing is self._strays:
@@ -222,11 +190,11 @@ class TopView:
         for kind, lines in self._sight.items():
             observer, seen = np.nonzero(sight == kind)
             lines.set_segments(list(np.stack([camera[observer, :2], target[seen]], axis=1)))
-            if "color" not in SIGHT_LOOKS[kind]:
+            if "color" not in ground.SIGHT_LOOKS[kind]:
                 lines.set_color(_faded(self._rgba[observer], 0.9))
         if self._fan is not None:
             rays = self._fan @ np.swapaxes(R[L:], 1, 2)
-            length = free_lengths(camera, rays, self._reach, self.scenario.obstacles, self._origin)
+            length = geometry.free_lengths(camera, rays, self._reach, self.scenario.obstacles, self._origin)
             rim = camera[:, None] + length[..., None] * rays
             self._wedges.set_verts(np.concatenate([camera[:, None], rim], axis=1)[..., :2])
         moving = np.array(list(self._moving_names), dtype=int)
@@ -237,10 +205,10 @@ class TopView:
 
     def _place_marks(self, R: np.ndarray, position: np.ndarray, ended: np.ndarray) -> None:
         L = self._landmarks
-        place = outlines(R[L:], position[L:, :2], self._box.mean(axis=1, keepdims=True))[:, 0]
+        place = geometry.outlines(R[L:], position[L:, :2], self._box.mean(axis=1, keepdims=True))[:, 0]
         self._arrived.set_data(*place[ended == Outcome.ARRIVED].T)
         self._collided.set_data(*place[ended == Outcome.COLLIDED].T)
-        beside = outlines(R[L:], position[L:, :2], self._label[:, None])[:, 0]
+        beside = geometry.outlines(R[L:], position[L:, :2], self._label[:, None])[:, 0]
         for name, (x, y) in zip(self._names, beside.tolist(), strict=True):
             name.set_position((x, y))
 
@@ -251,7 +219,7 @@ class TopView:
         for i, row in enumerate(self._rows):
             error, angle = view["position_error"][i], view["orientation_error"][i]
             row.set_text(
-                f"{vehicle_mark(i):<4}{fixed(error, 3):>7}{angle:>7.1f}{fixed(sigma[i], 3):>7}"
+                f"{ground.vehicle_mark(i):<4}{fixed(error, 3):>7}{angle:>7.1f}{fixed(sigma[i], 3):>7}"
                 f"{f'{seen[i]}/{possible[i]}':>6}"
             )
 

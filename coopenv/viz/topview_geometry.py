@@ -37,8 +37,7 @@ def position_covariance(rotation: np.ndarray, position: np.ndarray, covariance: 
     J[..., :3] = np.cross(p[..., None, :], np.eye(3))  # row i: phat x e_i, which is row i of -S(phat)
     J[..., 3:] = np.eye(3)
     J = np.asarray(rotation, float) @ J
-    result: np.ndarray = J @ np.asarray(covariance, float) @ np.swapaxes(J, -1, -2)
-    return result
+    return np.asarray(J @ np.asarray(covariance, float) @ np.swapaxes(J, -1, -2))
 
 
 def ellipses(center: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -58,17 +57,14 @@ def ellipses(center: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np
 
 def outlines(rotation: np.ndarray, position: np.ndarray, shape: np.ndarray) -> np.ndarray:
     """Return body-fixed outlines (N, K, 2) in plan, of rotations (N, 3, 3), places (N, 2), `shape` (N, K, 2)."""
-    turned: np.ndarray = shape @ np.swapaxes(rotation[:, :2, :2], 1, 2)
-    result: np.ndarray = position[:, None] + turned
-    return result
+    return np.asarray(position[:, None] + shape @ np.swapaxes(rotation[:, :2, :2], 1, 2))
 
 
 def box_shape(size: tuple[float, ...], center: tuple[float, ...], shortest: float) -> np.ndarray:
     """Return a box's four corners (4, 2) in the body frame, enlarged to at least `shortest` m long."""
     half = np.array(size[:2]) / 2
     corners = np.array(center[:2]) + half * [(-1, -1), (1, -1), (1, 1), (-1, 1)]
-    result: np.ndarray = corners * max(1.0, shortest / (2 * half.max()))
-    return result
+    return np.asarray(corners * max(1.0, shortest / (2 * half.max())))
 
 
 def nose_shape(corners: np.ndarray) -> np.ndarray:
@@ -85,16 +81,9 @@ def camera_fan(camera: Camera) -> np.ndarray:
     left, right = (float(np.arctan(_undistorted(float(edge), camera))) for edge in edges)
     x = np.linspace(left, right, _FAN_RAYS)
     rays = np.stack([np.sin(x), np.zeros_like(x), np.cos(x)], axis=-1)
-    result: np.ndarray = rays @ camera_rotation(camera).T
-    return result
-
-
-def camera_rotation(camera: Camera) -> np.ndarray:
-    """Return the rotation (3, 3) from the camera to the body."""
     if isinstance(camera.orientation, str):
-        return ROTATION_OF_CAMERA[camera.orientation]
-    result: np.ndarray = Rotation.from_quat(camera.orientation, scalar_first=True).as_matrix()
-    return result
+        return np.asarray(rays @ ROTATION_OF_CAMERA[camera.orientation].T)
+    return np.asarray(Rotation.from_quat(camera.orientation, scalar_first=True).apply(rays))
 
 
 def free_lengths(
@@ -133,17 +122,15 @@ def _undistorted(edge: float, camera: Camera) -> float:
     return x
 
 
-def limits(scenario: Scenario, aspect: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return opposite corners (2,) of the picture: all that is known of the episode beforehand, with a margin.
+def limits(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+    """Return opposite corners (2,) of a square around all that is known of the episode beforehand, with a margin.
 
-    Landmarks, roads, starts, prescribed motions over the horizon, and goals; `aspect` is width over height.
+    Landmarks, roads, starts, prescribed motions over the horizon, and goals.
     """
     points = np.concatenate([*_places(scenario), *_paths(scenario)])
     low, high = points.min(axis=0), points.max(axis=0)
-    middle, size = (low + high) / 2, np.maximum(high - low, 1.0)
-    height = (1 + 2 * _MARGIN) * max(float(size[0]) / aspect, float(size[1]))
-    half = np.array([height * aspect, height]) / 2
-    return middle - half, middle + half
+    half = (0.5 + _MARGIN) * max(1.0, float((high - low).max()))
+    return (low + high) / 2 - half, (low + high) / 2 + half
 
 
 def _places(scenario: Scenario) -> list[np.ndarray]:
@@ -159,12 +146,11 @@ def _places(scenario: Scenario) -> list[np.ndarray]:
 def _paths(scenario: Scenario) -> list[np.ndarray]:
     positions, rotations = agent_starts(scenario)
     agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
-    motions = [agent.motion for agent in agents]
     t = np.linspace(0.0, scenario.horizon, _PATH_SAMPLES)
     paths = []
-    for motion, position, rotation in zip(motions, positions, rotations, strict=True):
-        still = motion.kind in ("static", "driven")
-        relative = _positions(compile_motion(motion, rotation, scenario.horizon), t[:1] if still else t)
+    for agent, position, rotation in zip(agents, positions, rotations, strict=True):
+        still = agent.motion.kind in ("static", "driven")
+        relative = _positions(compile_motion(agent.motion, rotation, scenario.horizon), t[:1] if still else t)
         paths.append((position + relative @ rotation.T)[:, :2])
     return paths
 

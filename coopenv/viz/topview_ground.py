@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -13,7 +15,7 @@ from matplotlib.text import Annotation
 
 from coopenv.estimation.trajectory import Sight
 from coopenv.scenario import Scenario
-from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, new_figure, vehicle_colour
+from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, legend, new_figure, vehicle_colour
 from coopenv.viz.topview_geometry import limits, road_corners
 
 WIDTH, HEIGHT = 896, 672  # px; multiples of 16, as video codecs like them
@@ -58,9 +60,8 @@ def new_ground(scenario: Scenario) -> tuple[Figure, Axes]:
     ax.set_ylabel("y [m]", fontsize=NORMAL, color=INK, labelpad=-2)
     for spine in ax.spines.values():
         spine.set(linewidth=0.6, color=GREY)
-    low, high = limits(scenario, 1.0)
-    ax.set_xlim(low[0], high[0])
-    ax.set_ylim(low[1], high[1])
+    low, high = limits(scenario)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.set_aspect("equal")
     ax.set_autoscale_on(False)
     figure.text(*pixels(_LEFT, HEIGHT - 21), scenario.title, fontsize=NORMAL + 1.5, color=INK)
@@ -103,16 +104,9 @@ def _draw_goals(ax: Axes, scenario: Scenario) -> None:
 
 def label_landmark(ax: Axes, name: str, place: np.ndarray) -> Annotation:
     """Write a landmark's name beside it."""
-    return ax.annotate(
-        name,
-        (float(place[0]), float(place[1])),
-        xytext=(4.5, 4.5),
-        textcoords="offset points",
-        fontsize=SMALL,
-        color=DARK_BLUE,
-        path_effects=[withStroke(linewidth=1.8, foreground="white")],
-        annotation_clip=True,
-    )
+    look: dict[str, Any] = {"path_effects": [withStroke(linewidth=1.8, foreground="white")], "annotation_clip": True}
+    anchor, offset = (float(place[0]), float(place[1])), (4.5, 4.5)
+    return ax.annotate(name, anchor, offset, textcoords="offset points", fontsize=SMALL, color=DARK_BLUE, **look)
 
 
 def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
@@ -142,18 +136,9 @@ def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
     if scenario.termination.collision and any(vehicle.body for vehicle in scenario.vehicles):
         handles.append(_mark("X", "white", INK, 8, "collided"))
     handles.append(_mark(">", GREY, "white", 6, "estimate outside"))
-    figure.legend(
-        handles=handles,
-        loc="upper left",
-        bbox_to_anchor=pixels(PANEL - 4, TABLE_TOP - ROW * (rows + 1)),
-        fontsize=SMALL,
-        labelcolor=INK,
-        frameon=False,
-        borderaxespad=0.0,
-        borderpad=0.0,
-        handlelength=1.9,
-        labelspacing=0.42,
-    )
+    place = pixels(PANEL - 4, TABLE_TOP - ROW * (rows + 1))
+    gaps = {"borderaxespad": 0.0, "borderpad": 0.0, "handlelength": 1.9, "labelspacing": 0.42}
+    legend(figure, handles, "upper left", place, labelcolor=INK, **gaps)
 
 
 def sees_a_part(scenario: Scenario) -> bool:
@@ -166,14 +151,6 @@ def _sight(sight: Sight, label: str) -> Line2D:
 
 
 def _mark(marker: str, edge: str, face: str, size: float, label: str) -> Line2D:
-    return Line2D(
-        [],
-        [],
-        linestyle="none",
-        marker=marker,
-        markersize=size,
-        markeredgecolor=edge,
-        markerfacecolor=face,
-        markeredgewidth=0.9,
-        label=label,
-    )
+    mark = Line2D([], [], linestyle="none", marker=marker, markersize=size, markeredgewidth=0.9, label=label)
+    mark.set(markeredgecolor=edge, markerfacecolor=face)
+    return mark

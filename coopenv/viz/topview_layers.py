@@ -24,11 +24,11 @@ class Layers:
 
     def polygons(self, **look: Any) -> Any:
         """Add a collection of polygons, in axes coordinates."""
-        return self._collection(PolyCollection([], **look))
+        return self.keep(self._axes.add_collection(PolyCollection([], **look), autolim=False))
 
     def lines(self, **look: Any) -> Any:
         """Add a collection of lines, in axes coordinates."""
-        return self._collection(LineCollection([], **look))
+        return self.keep(self._axes.add_collection(LineCollection([], **look), autolim=False))
 
     def points(self, marker: str, face: str, edge: str, size: float) -> Any:
         """Add points, in axes coordinates; `size` in pt."""
@@ -52,7 +52,3 @@ class Layers:
         for artist in self._artists:
             artist.draw(renderer)
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
-
-    def _collection(self, collection: Any) -> Any:
-        self._axes.add_collection(collection, autolim=False)
-        return self.keep(collection)

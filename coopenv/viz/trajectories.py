@@ -9,26 +9,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d import proj3d
 
 from coopenv.estimation.metrics import live_ticks
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.scenario import Scenario
+from coopenv.viz import style
 from coopenv.viz.clipping import clipped
 from coopenv.viz.labels import place_names
-from coopenv.viz.style import (
-    DARK_BLUE,
-    INK,
-    NORMAL,
-    SMALL,
-    new_figure,
-    target_labels,
-    thinned,
-    tidy,
-    vehicle_colour,
-    vehicle_label,
-)
+from coopenv.viz.style import DARK_BLUE, INK, NORMAL, vehicle_colour, vehicle_label
 from coopenv.viz.topview_ground import ASPHALT, ROOF, WALL, draw_site
 
 _DOTTED = (0, (1, 1.6))
@@ -52,15 +41,15 @@ class _Drawing:
 
     def line(self, path: np.ndarray, **look: Any) -> None:
         """Draw what lies in the box of a path (K, 3)."""
-        high, low = self.high[: self.dimensions], self.low[: self.dimensions]
-        shown = clipped(path[:, : self.dimensions], low, high)
+        used = slice(self.dimensions)
+        shown = clipped(path[:, used], self.low[used], self.high[used])
         self.ax.plot(*shown.T, **look)
         self._lines.append(shown)
 
-    def mark(self, point: np.ndarray, marker: str, *, edge: str, face: str) -> None:
-        """Mark a point (3,)."""
+    def mark(self, point: np.ndarray, marker: str, edge: str, face: str | None = None) -> None:
+        """Mark a point (3,); the face has the colour of the edge unless another one is given."""
         point = point[: self.dimensions]
-        self.ax.plot(*([value] for value in point), clip_on=False, zorder=4, **_marker(marker, edge, face))
+        self.ax.plot(*point[:, None], clip_on=False, zorder=4, **_marker(marker, edge, face or edge))
         self._marks.append(point)
 
     def name(self, point: np.ndarray, text: str, colour: str) -> None:
@@ -77,17 +66,9 @@ class _Drawing:
         marks, lines = self._plane(np.array(self._marks)), self._plane(np.concatenate(self._lines or [points]))
         pixels = self.ax.transData.transform
         offsets = place_names(texts, pixels(anchors), pixels(marks), pixels(lines), _NAME)
+        look: dict[str, Any] = {"fontsize": _NAME, "path_effects": style.HALO, "zorder": 5}
         for text, anchor, offset, colour in zip(texts, anchors, offsets, colours, strict=True):
-            self.ax.annotate(
-                text,
-                tuple(anchor),
-                xytext=tuple(offset),
-                textcoords="offset points",
-                fontsize=_NAME,
-                color=colour,
-                zorder=5,
-                path_effects=[withStroke(linewidth=2.0, foreground="white")],
-            )
+            self.ax.annotate(text, anchor, offset, textcoords="offset points", color=colour, **look)
 
     def _plane(self, points: np.ndarray) -> np.ndarray:
         """Return points (K, D) in the coordinates of the plane that is drawn."""
@@ -111,36 +92,33 @@ def trajectory_figure_2d(
     drawn = np.maximum((width * scale, depth * scale), 2.4)
     middle, half = (low[:2] + high[:2]) / 2, drawn / scale / 2
     low[:2], high[:2] = middle - half, middle + half
-    figure = new_figure(float(drawn[0]) + 0.75 + _LEGEND, float(drawn[1]) + 0.75)
-    w, h = figure.get_size_inches()
+    w, h = float(drawn[0]) + 0.75 + _LEGEND, float(drawn[1]) + 0.75
+    figure = style.new_figure(w, h)
     ax = figure.add_axes((0.65 / w, 0.55 / h, drawn[0] / w, drawn[1] / h))
-    tidy(ax, x_label="x [m]", y_label="y [m]")
+    style.tidy(ax, x_label="x [m]", y_label="y [m]")
     if scenario is not None:
         draw_site(ax, scenario)
     drawing = _Drawing(ax, low, high, dimensions=2)
     _draw_paths(drawing, trajectory, ends)
-    ax.set_xlim(low[0], high[0])
-    ax.set_ylim(low[1], high[1])
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.set_aspect("equal", adjustable="datalim")
     drawing.write_names()
-    _legend(figure, trajectory, x=1 - (_LEGEND - 0.1) / w, y=1 - 0.2 / h, outside=drawing.outside, scenario=scenario)
+    _legend(figure, trajectory, (1 - (_LEGEND - 0.1) / w, 1 - 0.2 / h), drawing.outside, scenario)
     return figure
 
 
 def trajectory_figure_3d(trajectory: Trajectory, ends: Sequence[float] | None = None) -> Figure:
     """Draw the paths in space, one scale on all axes, in metres; frame and ends as in plan."""
     low, high = _scene(trajectory)
-    figure = new_figure(9.5, 5.8)
+    figure = style.new_figure(9.5, 5.8)
     ax: Any = figure.add_axes((-0.01, -0.12, 0.85, 1.24), projection="3d")
     ax.view_init(elev=32, azim=-58)
     drawing = _Drawing(ax, low, high, dimensions=3)
     _draw_paths(drawing, trajectory, ends)
-    ax.set_xlim(low[0], high[0])
-    ax.set_ylim(low[1], high[1])
-    ax.set_zlim(low[2], high[2])
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     steep = float((high - low)[2] / np.max((high - low)[:2]))
     ax.set_box_aspect(high - low, zoom=float(np.clip(1.2 - 0.5 * steep, 0.7, 1.0)))
-    ax.tick_params(labelsize=SMALL, pad=0)
+    ax.tick_params(labelsize=style.SMALL, pad=0)
     ax.locator_params(axis="z", nbins=4)
     ax.set_xlabel("x [m]", fontsize=NORMAL)
     ax.set_ylabel("y [m]", fontsize=NORMAL)
@@ -148,7 +126,7 @@ def trajectory_figure_3d(trajectory: Trajectory, ends: Sequence[float] | None = 
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
         axis.pane.set_facecolor("#F7F7F7")
     drawing.write_names()
-    _legend(figure, trajectory, x=0.84, y=0.93, outside=drawing.outside)
+    _legend(figure, trajectory, (0.84, 0.93), drawing.outside)
     return figure
 
 
@@ -184,7 +162,7 @@ def _draw_paths(drawing: _Drawing, trajectory: Trajectory, ends: Sequence[float]
     used = slice(drawing.dimensions)
     _draw_landmarks(drawing, trajectory)
     for vehicle, ticks in enumerate(live_ticks(trajectory.t, len(trajectory.vehicles), ends)):
-        keep = thinned(ticks)
+        keep = style.thinned(ticks)
         colour = vehicle_colour(vehicle)
         estimate = np.asarray(trajectory.position_estimate[keep, vehicle], float)
         inside = np.all((estimate >= low)[:, used] & (estimate <= high)[:, used], axis=-1)
@@ -192,27 +170,27 @@ def _draw_paths(drawing: _Drawing, trajectory: Trajectory, ends: Sequence[float]
         if np.isfinite(estimate[0]).all():
             drawing.outside |= not inside[0]
             start = np.clip(estimate[0], low, high)
-            drawing.mark(start, "^", edge=colour, face=colour if inside[0] else "white")
+            drawing.mark(start, "^", colour, None if inside[0] else "white")
         if inside[-1]:
-            drawing.mark(estimate[-1], "x", edge=colour, face=colour)
+            drawing.mark(estimate[-1], "x", colour)
         truth = trajectory.position[keep, vehicle]
         drawing.line(truth, color=INK, linewidth=1.1, linestyle=_DOTTED)
-        drawing.mark(truth[0], "^", edge=INK, face=colour)
-        drawing.mark(truth[-1], "x", edge=INK, face=INK)
+        drawing.mark(truth[0], "^", INK, colour)
+        drawing.mark(truth[-1], "x", INK)
         drawing.name(truth[0], vehicle_label(trajectory.vehicles[vehicle]), INK)
 
 
 def _draw_landmarks(drawing: _Drawing, trajectory: Trajectory) -> None:
-    keep = thinned(len(trajectory.t))
-    labels = target_labels(trajectory)
+    keep = style.thinned(len(trajectory.t))
+    labels = style.target_labels(trajectory)
     for target, moving in _landmarks(trajectory):
         path = trajectory.target_position[keep, target]
         if moving:
             drawing.line(path, color=DARK_BLUE, linewidth=1.1, linestyle=_DASHED)
-            drawing.mark(path[0], "^", edge=DARK_BLUE, face=DARK_BLUE)
-            drawing.mark(path[-1], "x", edge=DARK_BLUE, face=DARK_BLUE)
+            drawing.mark(path[0], "^", DARK_BLUE)
+            drawing.mark(path[-1], "x", DARK_BLUE)
         else:
-            drawing.mark(path[0], "o", edge=DARK_BLUE, face=DARK_BLUE)
+            drawing.mark(path[0], "o", DARK_BLUE)
         drawing.name(path[0], labels[target], DARK_BLUE)
 
 
@@ -224,46 +202,34 @@ def _landmarks(trajectory: Trajectory) -> list[tuple[int, bool]]:
 
 
 def _marker(marker: str, edge: str, face: str) -> dict[str, Any]:
-    return {
-        "linestyle": "none",
-        "marker": marker,
-        "markersize": 6.5,
-        "markeredgecolor": edge,
-        "markerfacecolor": face,
-        "markeredgewidth": 1.1,
-    }
+    look = {"marker": marker, "markeredgecolor": edge, "markerfacecolor": face}
+    return {"linestyle": "none", "markersize": 6.5, "markeredgewidth": 1.1, **look}
 
 
 def _legend(
-    figure: Figure, trajectory: Trajectory, x: float, y: float, *, outside: bool, scenario: Scenario | None = None
+    figure: Figure,
+    trajectory: Trajectory,
+    place: tuple[float, float],
+    outside: bool,
+    scenario: Scenario | None = None,
 ) -> None:
-    handles: list[Line2D | Patch] = [
-        Line2D([], [], color=vehicle_colour(i), linewidth=1.6, label=vehicle_label(name))
+    truth = {"color": INK, "linewidth": 1.1, "linestyle": _DOTTED}
+    looks: dict[str, dict[str, Any]] = {
+        vehicle_label(name): {"color": vehicle_colour(i), "linewidth": 1.6}
         for i, name in enumerate(trajectory.vehicles)
-    ]
-    handles += [
-        Line2D([], [], color=INK, linewidth=1.1, linestyle=_DOTTED, label="truth"),
-        Line2D([], [], color=INK, linewidth=1.6, alpha=0.8, label="estimate"),
-        Line2D([], [], label="start", **_marker("^", INK, INK)),
-        Line2D([], [], label="end", **_marker("x", INK, INK)),
-    ]
+    }
+    looks |= {"truth": truth, "estimate": {"color": INK, "linewidth": 1.6, "alpha": 0.8}}
+    looks |= {"start": _marker("^", INK, INK), "end": _marker("x", INK, INK)}
     motions = {moving for _, moving in _landmarks(trajectory)}
     if False in motions:
-        handles.append(Line2D([], [], label="landmark", **_marker("o", DARK_BLUE, DARK_BLUE)))
+        looks["landmark"] = _marker("o", DARK_BLUE, DARK_BLUE)
     if True in motions:
-        handles.append(Line2D([], [], label="moving landmark", color=DARK_BLUE, linewidth=1.1, linestyle=_DASHED))
+        looks["moving landmark"] = {"color": DARK_BLUE, "linewidth": 1.1, "linestyle": _DASHED}
     if outside:
-        handles.append(Line2D([], [], label="starts outside", **_marker("^", INK, "white")))
+        looks["starts outside"] = _marker("^", INK, "white")
+    handles: list[Line2D | Patch] = [Line2D([], [], label=label, **look) for label, look in looks.items()]
     if scenario is not None and scenario.roads:
         handles.append(Patch(facecolor=ASPHALT, edgecolor="none", label="road"))
     if scenario is not None and scenario.obstacles:
         handles.append(Patch(facecolor=ROOF, edgecolor=WALL, hatch="//", label="building"))
-    figure.legend(
-        handles=handles,
-        loc="upper left",
-        bbox_to_anchor=(x, y),
-        fontsize=NORMAL,
-        frameon=False,
-        borderaxespad=0.0,
-        handlelength=2.0,
-    )
+    style.legend(figure, handles, "upper left", place, fontsize=NORMAL, borderaxespad=0.0, handlelength=2.0)

@@ -231,7 +231,7 @@ def test_pointer_sits_at_the_border_and_points_outwards() -> None:
 @pytest.mark.parametrize("name", coopenv.list_envs())
 def test_limits_hold_the_whole_prescribed_episode(name: str) -> None:
     scenario = load_scenario(name)
-    low, high = limits(scenario, 1.0)
+    low, high = limits(scenario)
     engine = Engine(scenario)
     engine.reset([0])
     prescribed = [a.motion.kind != "driven" for a in (*scenario.landmarks, *scenario.vehicles)]
@@ -243,8 +243,8 @@ def test_limits_hold_the_whole_prescribed_episode(name: str) -> None:
 
 
 def test_limits_follow_the_map_origin() -> None:
-    low, high = limits(load_scenario("urban_crossing"), 1.0)
-    moved = limits(load_scenario("urban_crossing", {"map.origin": [3.0, -2.0, 0.5]}), 1.0)
+    low, high = limits(load_scenario("urban_crossing"))
+    moved = limits(load_scenario("urban_crossing", {"map.origin": [3.0, -2.0, 0.5]}))
     np.testing.assert_allclose(moved, np.array([low, high]) - [3.0, -2.0])
 
 
