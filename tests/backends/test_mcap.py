@@ -154,7 +154,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> bytes:
         (lambda b: b"", "not an MCAP file"),
         (lambda b: b"hello" * 100, "not an MCAP file"),
         (lambda b: b[:400] + bytes(200) + b[600:], "recording.json is damaged"),
-        (lambda b: b[:8] + b[-8:], "no recording of coopenv"),
+        (lambda b: b[:8] + b[-8:], "damaged MCAP file"),
         (lambda b: b.replace(b'"staleness"', b'"staleless"'), "recording.json is damaged"),
         (
             lambda b: b.replace(b"coopenv recording 1", b"coopenv recording 9"),

@@ -1,27 +1,23 @@
-"""The records of an MCAP file, one by one: every length is checked before anything is read, unpacked or allocated.
+"""The records of an MCAP file: the library reads them, but what a chunk unpacks to is checked before it is unpacked.
 
-The library's own readers unpack a chunk to whatever size it claims. Needs the extra `log`.
+Needs the extra `log`.
 """
 
 from __future__ import annotations
 
-import struct
-import zlib
 from collections.abc import Iterator
+from dataclasses import replace
 from io import BytesIO
-from typing import IO, NamedTuple
+from pathlib import Path
 
 import zstandard
 from lz4.frame import LZ4FrameDecompressor
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
 
-from coopenv.errors import DataError
+from coopenv.errors import DataError, check_memory
 
 MAGIC = b"\x89MCAP0\r\n"
-RECORD = struct.Struct("<BQ")  # opcode, length of the contents
-MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, time of logging, time of publishing; data follow
 
 MAX_CHUNK_BYTES = 16 * 2**20
 """Unpacked; writers make chunks of about 1 MiB."""
@@ -29,104 +25,69 @@ MAX_EXPANSION = 50
 """Times that a whole file may grow when it is unpacked, beyond one such chunk; recordings expand 3 to 10 times."""
 
 
-class LoggedMessage(NamedTuple):
-    """A message, and what the file says about its channel."""
-
-    channel: Channel
-    schema: Schema | None
-    sequence: int
-    data: bytes
-
-
 class Container:
     """An MCAP file, read from begin to end; the index behind its data says nothing that its records do not."""
 
-    def __init__(self, stream: IO[bytes], where: str) -> None:
-        """Check both ends of the file, whose name `where` is.
+    def __init__(self, path: Path) -> None:
+        """Check both ends of a file.
 
         Raises:
             DataError: it is no MCAP file, or cut off.
         """
-        self._stream = stream
-        if stream.read(len(MAGIC)) != MAGIC:
-            raise DataError(f"{where}: not an MCAP file (it does not begin as one)")
-        self._end = stream.seek(0, 2) - len(MAGIC)
-        stream.seek(max(0, self._end))
-        if self._end < len(MAGIC) or stream.read() != MAGIC:
-            raise DataError(f"{where}: cut off, the end of the MCAP file is missing")
+        check_memory(path.stat().st_size, f"{path}:")
+        self._data = path.read_bytes()
+        if not self._data.startswith(MAGIC):
+            raise DataError(f"{path}: not an MCAP file (it does not begin as one)")
+        if len(self._data) < 2 * len(MAGIC) or not self._data.endswith(MAGIC):
+            raise DataError(f"{path}: cut off, the end of the MCAP file is missing")
 
     def extras(self) -> tuple[dict[str, dict[str, str]], dict[str, bytes]]:
-        """Return the file's metadata and its attachments, by name.
-
-        Raises:
-            ValueError: a record goes on beyond the end.
-        """
+        """Return the file's metadata and its attachments, by name; errors are those of the library."""
         metadata, attachments = {}, {}
-        for opcode, contents in self._records(Opcode.METADATA, Opcode.ATTACHMENT):
-            if opcode == Opcode.METADATA:
-                entry = Metadata.read(_stream(contents))
-                metadata[entry.name] = entry.metadata
-            else:
-                attachment = Attachment.read(_stream(contents))
-                attachments[attachment.name] = attachment.data
+        for record in self._records():
+            if isinstance(record, Metadata):
+                metadata[record.name] = record.metadata
+            elif isinstance(record, Attachment):
+                attachments[record.name] = record.data
         return metadata, attachments
 
-    def messages(self) -> Iterator[LoggedMessage]:
-        """Yield all messages in the order of the file.
+    def messages(self) -> Iterator[tuple[Channel, Schema | None, Message]]:
+        """Yield all messages in the order of the file, each with its channel and the schema of that.
 
         Raises:
-            ValueError: a record goes on beyond the end of its chunk or of the file, a chunk is damaged or would unpack
-                to too much, or a message has no channel.
+            ValueError: a chunk is damaged or would unpack to too much, or a message has no channel.
+            Exception: any other of the library.
         """
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
-        for opcode, contents in self._unpacked_records(Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
-            if opcode == Opcode.SCHEMA:
-                schema = Schema.read(_stream(contents))
-                schemas[schema.id] = schema
-            elif opcode == Opcode.CHANNEL:
-                channel = Channel.read(_stream(contents))
-                channels[channel.id] = channel
+        for record in self._unpacked():
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                if record.channel_id not in channels:
+                    raise ValueError(f"a message's channel {record.channel_id} is not described")
+                channel = channels[record.channel_id]
+                yield channel, schemas.get(channel.schema_id), record
+
+    def _records(self) -> Iterator[McapRecord]:
+        """Yield the records of the data section, chunks as they are."""
+        for record in StreamReader(BytesIO(self._data), emit_chunks=True, record_size_limit=len(self._data)).records:
+            if isinstance(record, DataEnd):
+                return
+            yield record
+
+    def _unpacked(self) -> Iterator[McapRecord]:
+        """Yield the records inside and outside of chunks."""
+        allowance = MAX_CHUNK_BYTES + MAX_EXPANSION * len(self._data)
+        for record in self._records():
+            if isinstance(record, Chunk):
+                data = _unpack(record, min(MAX_CHUNK_BYTES, allowance))
+                allowance -= len(data)
+                yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
             else:
-                number, sequence, *_ = MESSAGE.unpack_from(contents)
-                if number not in channels:
-                    raise ValueError(f"a message's channel {number} is not described")
-                channel = channels[number]
-                yield LoggedMessage(channel, schemas.get(channel.schema_id), sequence, contents[MESSAGE.size :])
-
-    def _records(self, *wanted: Opcode) -> Iterator[tuple[int, bytes]]:
-        self._stream.seek(len(MAGIC))
-        return _records_of(self._stream, self._end, wanted)
-
-    def _unpacked_records(self, *wanted: Opcode) -> Iterator[tuple[int, bytes]]:
-        """Yield opcode and contents of records inside and outside of chunks."""
-        allowance = MAX_CHUNK_BYTES + MAX_EXPANSION * self._end
-        for opcode, contents in self._records(Opcode.CHUNK, *wanted):
-            if opcode != Opcode.CHUNK:
-                yield opcode, contents
-                continue
-            data = _unpack(Chunk.read(_stream(contents)), min(MAX_CHUNK_BYTES, allowance))
-            allowance -= len(data)
-            yield from _records_of(BytesIO(data), len(data), wanted)
-
-
-def _stream(contents: bytes) -> ReadDataStream:
-    return ReadDataStream(BytesIO(contents))
-
-
-def _records_of(stream: IO[bytes], end: int, wanted: tuple[Opcode, ...]) -> Iterator[tuple[int, bytes]]:
-    """Yield opcode and contents of the wanted records from here to a position, or to the end of the data section."""
-    position = stream.tell()
-    while position < end:
-        opcode, length = RECORD.unpack(stream.read(RECORD.size).ljust(RECORD.size))
-        position += RECORD.size + length
-        if position > end:
-            raise ValueError(f"a record of {length} bytes goes on beyond the end")
-        if opcode == Opcode.DATA_END:
-            return
-        if opcode in wanted:
-            yield opcode, stream.read(length)
-        stream.seek(position)
+                yield record
 
 
 def _unpack(chunk: Chunk, limit: int) -> bytes:
@@ -146,6 +107,4 @@ def _unpack(chunk: Chunk, limit: int) -> bytes:
         raise ValueError(f"unknown compression {chunk.compression!r:.20}")
     if len(data) != chunk.uncompressed_size:
         raise ValueError(f"a chunk unpacks to {len(data)} bytes, not to {chunk.uncompressed_size} as it says")
-    if chunk.uncompressed_crc not in (0, zlib.crc32(data)):
-        raise ValueError("the check sum of a chunk differs")
     return data

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import fields, is_dataclass
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from coopenv.errors import DataError
+from coopenv.jsonable import jsonable
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Recording
 from coopenv.scenario.base import Number, Part, Vector3
@@ -75,14 +76,6 @@ class Header(Part):
     scenario: dict[str, Any] | None
 
     @classmethod
-    def of(cls, recording: Recording) -> Header:
-        """Return the header of a recording."""
-        values = {name: _plain(getattr(recording, name)) for name in cls.model_fields}
-        if values["scenario"] is not None:
-            values["scenario"] = without_own_terms(values["scenario"])
-        return cls.model_validate(values)
-
-    @classmethod
     def read(cls, text: bytes, where: str) -> Header:
         """Return a header from its JSON.
 
@@ -113,17 +106,12 @@ class Header(Part):
         }
 
 
-def _plain(value: Any) -> Any:
-    """Return plain data of what a recording holds."""
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, tuple):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json")
-    if is_dataclass(value):
-        return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
-    return None if value == math.inf else value
+def header_of(recording: Recording) -> bytes:
+    """Return the header of a recording as JSON."""
+    values = jsonable({name: getattr(recording, name) for name in Header.model_fields})
+    if values["scenario"] is not None:
+        values["scenario"] = without_own_terms(values["scenario"])
+    return json.dumps(values, separators=(",", ":")).encode()
 
 
 def _setup(header: SetupHeader) -> Setup:

@@ -49,6 +49,15 @@ EXACT = {
 }
 """Topics of a vehicle that hold the recording, one message a tick."""
 
+CONTENTS = {
+    "increment": {name: name for name in ("rotation", "translation", "velocity", "angular_velocity")},
+    "bearings": {},
+    "v2x": {"tick_sent": "inbox_tick"},
+    "truth_exact": {"rotation": "truth.rotation", "position": "truth.position"},
+}
+"""Topic to the entries of its messages that hold a vehicle's row of an array of the `Recording`; of bearings only those
+that there are hold any."""
+
 SHOWN = {"odometry": "nav_msgs/msg/Odometry", "truth": "geometry_msgs/msg/PoseStamped"}
 """Topics of a vehicle that viewers understand: dead reckoning from the start, and the truth where it is known."""
 

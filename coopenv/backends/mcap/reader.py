@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from coopenv.backends.mcap.header import Header
 from coopenv.backends.mcap.messages import ATTACHMENT, EXACT, FORMAT, LANDMARKS, LANDMARKS_TYPE, codec, topic
@@ -14,7 +14,7 @@ from coopenv.observers.recording import Recording
 from coopenv.observers.recording_checks import check_recording
 
 if TYPE_CHECKING:
-    from coopenv.backends.mcap.container import Container, LoggedMessage
+    from coopenv.backends.mcap.container import Container
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -30,8 +30,7 @@ def read_recording(path: str | Path) -> Recording:
 
     where = str(path)
     try:
-        with Path(path).open("rb") as stream:
-            recording = _read(Container(stream, where), where)
+        recording = _read(Container(Path(path)), where)
     except OSError as error:
         raise DataError(f"{where}: cannot be read ({error.strerror or error})") from None
     except DataError:
@@ -47,18 +46,21 @@ def read_recording(path: str | Path) -> Recording:
 def _read(container: Container, where: str) -> Recording:
     header = _header(container, where)
     constants = header.constants(f"{where}: {ATTACHMENT}")
-    first = header.setups[0]
     names = [setup.name for setup in header.setups]
-    ticks = TickArrays(header.ticks, names, len(first.target_names), first.landmarks)
-    types = {LANDMARKS: LANDMARKS_TYPE} | {topic(name, field): EXACT[field] for name in names for field in EXACT}
-    for logged in container.messages():
-        kind = types.get(logged.channel.topic)
-        if kind is not None:
-            try:
-                ticks.put(logged.channel.topic, logged.sequence, _decoded(logged, kind))
-            except Exception as error:  # of the codec too, which has its own
-                reason = str(error) or type(error).__name__
-                raise DataError(f"{where}: {logged.channel.topic}, tick {logged.sequence}: {reason}") from None
+    ticks = TickArrays(header.ticks, names, len(header.setups[0].target_names), header.setups[0].landmarks)
+    kinds = {LANDMARKS: LANDMARKS_TYPE} | {topic(name, field): EXACT[field] for name in names for field in EXACT}
+    for channel, schema, message in container.messages():
+        kind = kinds.get(channel.topic)
+        if kind is None:
+            continue
+        try:
+            found = f"{schema.name} ({schema.encoding}, {channel.message_encoding})" if schema else "no schema"
+            if found != f"{kind} (ros2msg, cdr)":
+                raise ValueError(f"holds {found}, expected {kind} (ros2msg, cdr)")
+            ticks.put(channel.topic, message.sequence, codec().deserialize_cdr(message.data, kind))
+        except Exception as error:  # of the codec too, which has its own
+            reason = str(error) or type(error).__name__
+            raise DataError(f"{where}: {channel.topic}, tick {message.sequence}: {reason}") from None
     try:
         return Recording(**ticks.complete(), **constants)
     except ValueError as error:
@@ -77,16 +79,3 @@ def _header(container: Container, where: str) -> Header:
     if hashlib.sha256(attachments[ATTACHMENT]).hexdigest() != found.get("sha256"):
         raise DataError(f"{where}: {ATTACHMENT} is damaged, its check sum differs")
     return Header.read(attachments[ATTACHMENT], f"{where}: {ATTACHMENT}")
-
-
-def _decoded(logged: LoggedMessage, kind: str) -> Any:
-    """Return a message of a type.
-
-    Raises:
-        ValueError: its channel holds another type, or another encoding.
-    """
-    schema, encoding = logged.schema, logged.channel.message_encoding
-    if schema is None or (encoding, schema.encoding, schema.name) != ("cdr", "ros2msg", kind):
-        found = "no schema" if schema is None else f"{schema.name} ({schema.encoding}, {encoding})"
-        raise ValueError(f"holds {found}, expected {kind} (ros2msg, cdr)")
-    return codec().deserialize_cdr(logged.data, kind)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from coopenv.backends.mcap.messages import EXACT, LANDMARKS, topic
+from coopenv.backends.mcap.messages import CONTENTS, EXACT, LANDMARKS, topic
 from coopenv.errors import check_memory
 from coopenv.observers.recording import Truth
-
-BYTES_PER_VEHICLE = 8 * (9 + 3 + 3 + 3 + 9 + 3) + len(EXACT)
-BYTES_PER_TARGET = 8 * 3 + 1
+from coopenv.observers.recording_checks import KINDS, SHAPES
 
 
 class TickArrays:
@@ -24,23 +23,19 @@ class TickArrays:
         Raises:
             CoopenvError: they would not fit into memory.
         """
-        K, N, T, L = self._sizes = ticks, len(vehicles), targets, landmarks
-        size = K * (N * (BYTES_PER_VEHICLE + T * BYTES_PER_TARGET + N * 8) + L * 24)
-        check_memory(size, f"a recording of {K} ticks, {N} vehicles and {T} targets")
-        self.arrays = {  # zeros take no memory before they are written to
-            "rotation": np.zeros((K, N, 3, 3)),
-            "translation": np.zeros((K, N, 3)),
-            "velocity": np.zeros((K, N, 3)),
-            "angular_velocity": np.zeros((K, N, 3)),
-            "bearings": np.zeros((K, N, T, 3)),
-            "visible": np.zeros((K, N, T), dtype=bool),
-            "inbox_tick": np.zeros((K, N, N), dtype=np.int64),
-        }
-        self._due = np.zeros((K, N), dtype=bool)
-        self._truth = Truth(np.zeros((K, N, 3, 3)), np.zeros((K, N, 3)))
+        sizes = {"K": ticks, "N": len(vehicles), "T": targets, "L": landmarks}
+        shapes = {name: [int(sizes.get(str(n), n)) for n in shape] for name, shape in SHAPES.items() if shape[0] == "K"}
+        needed = 8 * sum(math.prod(shape) for shape in shapes.values())
+        check_memory(needed, f"a recording of {ticks} ticks, {len(vehicles)} vehicles and {targets} targets")
+        self._shape_of_landmarks = shapes.pop("landmarks")[1:]
+        shapes["due"].append(len(vehicles))
+        dtypes: dict[str, Any] = {"b": np.bool_, "i": np.int64}
+        # zeros take no memory before they are written to
+        self._arrays = {name: np.zeros(n, dtypes.get(KINDS.get(name, ""), np.float64)) for name, n in shapes.items()}
+        self._ticks, self._targets = ticks, targets
         self._landmarks: dict[int, np.ndarray] = {}
         self._places = {topic(name, field): (field, i) for i, name in enumerate(vehicles) for field in EXACT}
-        self._seen = {name: np.zeros(K, dtype=bool) for name in self._places}
+        self._seen = {name: np.zeros(ticks, dtype=bool) for name in self._places}
 
     def put(self, name: str, k: int, message: Any) -> None:
         """Take the message of a topic at a tick.
@@ -48,39 +43,30 @@ class TickArrays:
         Raises:
             ValueError: there is no such tick, it has been there, or the message has the wrong size.
         """
-        K, _, _, L = self._sizes
-        if k >= K:
-            raise ValueError(f"the recording ends at tick {K - 1}")
+        if k >= self._ticks:
+            raise ValueError(f"the recording ends at tick {self._ticks - 1}")
         if self._seen[name][k] if name in self._seen else k in self._landmarks:
             raise ValueError("is there twice")
         if name == LANDMARKS:
             points = [[q.position.x, q.position.y, q.position.z] for q in message.poses]
-            self._landmarks[k] = np.array(points, np.float64).reshape(L, 3)
+            self._landmarks[k] = np.array(points, np.float64).reshape(self._shape_of_landmarks)
             return
         field, i = self._places[name]
         self._seen[name][k] = True
-        getattr(self, f"_put_{field}")(k, i, message)
-
-    def _put_increment(self, k: int, i: int, m: Any) -> None:
-        self.arrays["rotation"][k, i] = m.rotation.reshape(3, 3)
-        for name in ("translation", "velocity", "angular_velocity"):
-            self.arrays[name][k, i] = getattr(m, name)
+        if field == "bearings":
+            self._put_bearings(k, i, message)
+        for part, array in CONTENTS[field].items():
+            row = self._arrays[array][k, i, ...]
+            row[...] = getattr(message, part).reshape(row.shape)
 
     def _put_bearings(self, k: int, i: int, m: Any) -> None:
-        targets = m.targets
-        if len(np.unique(targets)) != len(targets) or (targets >= self._sizes[2]).any():
-            raise ValueError(f"targets are not different ones of {self._sizes[2]}")
-        self._due[k, i] = m.due
-        self.arrays["bearings"][k, i] = np.nan
-        self.arrays["bearings"][k, i, targets] = m.vectors.reshape(len(targets), 3)
-        self.arrays["visible"][k, i, targets] = m.visible.reshape(len(targets)).view(np.uint8) != 0
-
-    def _put_v2x(self, k: int, i: int, m: Any) -> None:
-        self.arrays["inbox_tick"][k, i] = m.tick_sent.reshape(self._sizes[1])
-
-    def _put_truth_exact(self, k: int, i: int, m: Any) -> None:
-        self._truth.rotation[k, i] = m.rotation.reshape(3, 3)
-        self._truth.position[k, i] = m.position
+        targets, count = m.targets, len(m.targets)
+        if len(np.unique(targets)) != count or (targets >= self._targets).any():
+            raise ValueError(f"targets are not different ones of {self._targets}")
+        self._arrays["due"][k, i] = m.due
+        self._arrays["bearings"][k, i] = np.nan
+        self._arrays["bearings"][k, i, targets] = m.vectors.reshape(count, 3)
+        self._arrays["visible"][k, i, targets] = m.visible.reshape(count).view(np.uint8) != 0
 
     def complete(self) -> dict[str, Any]:
         """Return the arrays as arguments of a `Recording`.
@@ -93,12 +79,14 @@ class TickArrays:
                 raise ValueError(f"topic '{name}' is missing")
             if not seen.all():
                 raise ValueError(f"topic '{name}': tick {int(np.argmin(seen))} is missing")
-        if (self._due != self._due[:, :1]).any():
-            k = int(np.argwhere(self._due != self._due[:, :1])[0, 0])
+        arrays, changes = dict(self._arrays), sorted(self._landmarks)
+        due = arrays.pop("due")
+        for k in np.flatnonzero((due != due[:, :1]).any(axis=1)).tolist():
             raise ValueError(f"at tick {k} a correction is due for some vehicles only")
-        changes = sorted(self._landmarks)
-        lengths = np.diff([*changes, self._sizes[0]])
-        landmarks = np.repeat([self._landmarks[k] for k in changes], lengths, axis=0)
-        for values in (*self.arrays.values(), landmarks):
+        arrays["due"] = due[:, 0].copy()
+        lengths = np.diff([*changes, self._ticks])
+        arrays["landmarks"] = np.repeat([self._landmarks[k] for k in changes], lengths, axis=0)
+        truth = Truth(arrays.pop("truth.rotation"), arrays.pop("truth.position"))
+        for values in arrays.values():
             values.setflags(write=False)  # observers get views
-        return {**self.arrays, "landmarks": landmarks, "due": self._due[:, 0].copy(), "truth": self._truth}
+        return {**arrays, "truth": truth}
