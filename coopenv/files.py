@@ -56,6 +56,16 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
             sync(place.parent)
 
 
+def replace_text(path: str | Path, text: str) -> None:
+    """Write a text that takes the place of the file `path`.
+
+    Raises:
+        OutputError: it cannot be written; the old file is untouched.
+    """
+    with replacing_file(path) as new:
+        new.write_text(text, encoding="utf-8")
+
+
 @contextmanager
 def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Path]:
     """Yield a new folder to write to; at the end it takes the place of `folder`, which is made if need be.

@@ -51,16 +51,9 @@ def score(episodes: Iterator[tuple[float, list[str], list[float]]]) -> Score:
         outcomes.update(ends)
         errors += seen
     vehicles = max(1, outcomes.total())
-    return Score(
-        len(returns),
-        outcomes["arrived"] / vehicles,
-        outcomes["collided"] / vehicles,
-        outcomes["under way"] / vehicles,
-        float(np.mean(returns)),
-        float(np.std(returns)),
-        float(np.median(errors)),
-        float(np.percentile(errors, 95)),
-    )
+    arrived, collided, under_way = (outcomes[word] / vehicles for word in ("arrived", "collided", "under way"))
+    error = float(np.median(errors)), float(np.percentile(errors, 95))
+    return Score(len(returns), arrived, collided, under_way, float(np.mean(returns)), float(np.std(returns)), *error)
 
 
 def score_document(rows: Iterable[tuple[str, str, Score]]) -> list[dict[str, Any]]:

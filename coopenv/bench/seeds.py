@@ -24,36 +24,29 @@ class SeedStudy:
     seeds: list[int]
     steady_from: float
     """s"""
-    position_rmse: np.ndarray
-    """(S, N) m, over t > steady_from."""
-    orientation_rmse: np.ndarray
-    """(S, N) deg"""
-    settle_time: np.ndarray
-    """(S, N) s after which the errors stay within SETTLED; NaN: never."""
-    final_position_error: np.ndarray
-    """(S, N) m"""
-    final_orientation_error: np.ndarray
-    """(S, N) deg"""
+    position_rmse_m: np.ndarray
+    """(S, N), over t > steady_from."""
+    orientation_rmse_deg: np.ndarray
+    """(S, N)"""
+    settle_time_s: np.ndarray
+    """(S, N), after which the errors stay within SETTLED; NaN: never."""
+    final_position_error_m: np.ndarray
+    """(S, N)"""
+    final_orientation_error_deg: np.ndarray
+    """(S, N)"""
 
     def document(self, environment: str) -> dict[str, Any]:
         """Return what `bench seeds --json` prints: per vehicle, one figure per seed."""
-        names = {
-            "position_rmse_m": self.position_rmse,
-            "orientation_rmse_deg": self.orientation_rmse,
-            "settle_time_s": self.settle_time,
-            "final_position_error_m": self.final_position_error,
-            "final_orientation_error_deg": self.final_orientation_error,
-        }
-        rows = [
-            {"vehicle": vehicle, **{name: values[:, i] for name, values in names.items()}}
-            for i, vehicle in enumerate(self.vehicles)
-        ]
+        figures = {name: values for name, values in vars(self).items() if isinstance(values, np.ndarray)}
         return {
             "environment": environment,
             "seeds": self.seeds,
             "steady_from_s": self.steady_from,
             "settled_below": SETTLED._asdict(),
-            "vehicles": rows,
+            "vehicles": [
+                {"vehicle": vehicle, **{name: values[:, i] for name, values in figures.items()}}
+                for i, vehicle in enumerate(self.vehicles)
+            ],
         }
 
 
@@ -86,34 +79,27 @@ def study_seeds(
         vehicles=scenario.vehicle_names,
         seeds=list(seeds),
         steady_from=steady_from,
-        position_rmse=np.sqrt((position[steady] ** 2).mean(axis=0)),
-        orientation_rmse=np.sqrt((orientation[steady] ** 2).mean(axis=0)),
-        settle_time=settling_time(t, position, orientation, SETTLED),
-        final_position_error=position[-1],
-        final_orientation_error=orientation[-1],
+        position_rmse_m=np.sqrt((position[steady] ** 2).mean(axis=0)),
+        orientation_rmse_deg=np.sqrt((orientation[steady] ** 2).mean(axis=0)),
+        settle_time_s=settling_time(t, position, orientation, SETTLED),
+        final_position_error_m=position[-1],
+        final_orientation_error_deg=orientation[-1],
     )
 
 
 def seed_table(study: SeedStudy) -> Table:
     """Return one row per vehicle: settled seeds, settling time, steady RMSE as mean, spread and worst."""
-    table = number_table(
-        ("vehicle",),
-        (
-            "settled\nseeds",
-            "settles at [s]\nmedian (last)",
-            "position RMSE [m]\nmean±std (worst)",
-            "orientation [deg]\nmean±std (worst)",
-        ),
-    )
+    rmse = ("position RMSE [m]\nmean±std (worst)", "orientation [deg]\nmean±std (worst)")
+    table = number_table(("vehicle",), ("settled\nseeds", "settles at [s]\nmedian (last)", *rmse))
     for i, vehicle in enumerate(study.vehicles):
-        times = study.settle_time[:, i]
+        times = study.settle_time_s[:, i]
         settled = times[np.isfinite(times)]
         table.add_row(
             vehicle,
             f"{len(settled)}/{len(times)}",
             f"{np.median(settled):.1f} ({settled.max():.1f})" if len(settled) else "-",
-            _spread(study.position_rmse[:, i], 4),
-            _spread(study.orientation_rmse[:, i], 2),
+            _spread(study.position_rmse_m[:, i], 4),
+            _spread(study.orientation_rmse_deg[:, i], 2),
         )
     return table
 

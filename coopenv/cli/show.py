@@ -78,11 +78,10 @@ def schema(
     out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None,
 ) -> None:
     """Write the JSON schema of scenario files, for editors."""
-    from coopenv.files import replacing_file
+    from coopenv.files import replace_text
     from coopenv.scenario.json_schema import schema_text
 
     if out is None:
         sys.stdout.write(schema_text())
         return
-    with replacing_file(out) as new:
-        new.write_text(schema_text(), encoding="utf-8")
+    replace_text(out, schema_text())

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from coopenv.estimation.trajectory import Trajectory
-from coopenv.files import replacing_file
+from coopenv.files import replace_text
 from coopenv.jsonable import json_text
+from coopenv.viz import FORMATS
 
 METRICS_FILE = "metrics.json"
 TRAJECTORY_FILE = "trajectory.npz"
@@ -17,7 +18,6 @@ VIDEO_FILES = ("video.mp4", "video.gif")
 def result_names() -> list[str]:
     """Return the names of all files that a run can write."""
     from coopenv.viz.figures import FIGURE_NAMES
-    from coopenv.viz.style import FORMATS
 
     figures = [f"{name}.{file_format}" for name in FIGURE_NAMES for file_format in FORMATS]
     return [METRICS_FILE, TRAJECTORY_FILE, *figures, *VIDEO_FILES]
@@ -29,7 +29,6 @@ def write_results(folder: Path, trajectory: Trajectory, metrics: dict[str, Any])
     Raises:
         OutputError: a file cannot be written.
     """
-    with replacing_file(folder / METRICS_FILE) as path:
-        path.write_text(json_text(metrics), encoding="utf-8")
+    replace_text(folder / METRICS_FILE, json_text(metrics))
     trajectory.save(folder / TRAJECTORY_FILE)
     return [folder / METRICS_FILE, folder / TRAJECTORY_FILE]

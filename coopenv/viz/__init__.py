@@ -1,1 +1,4 @@
 """Figures of runs, drawn without a display and without touching matplotlib's global state."""
+
+FORMATS = ("png", "pdf", "svg")
+"""Of the files that figures are written to."""

@@ -38,7 +38,7 @@ def save_figures(
         scenario: of the run, for the roads and buildings under its paths.
         ends: s, when each vehicle arrived or collided and was parked, where its lines stop (None: no vehicle was).
         steady_from: s, start of the steady state that mean NEES are over (None: at 70 % of the record).
-        file_format: one of `style.FORMATS`.
+        file_format: one of `FORMATS`.
 
     Returns:
         The paths written.

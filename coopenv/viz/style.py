@@ -18,6 +18,7 @@ from matplotlib.ticker import NullFormatter
 from coopenv.errors import CoopenvError
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.files import replacing_file
+from coopenv.viz import FORMATS
 
 # Okabe and Ito (2008), without the yellow that vanishes on white.
 BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"
@@ -28,7 +29,6 @@ DARK_BLUE = "#00264D"  # landmarks, as in the paper
 AXES_COLOURS = (VERMILION, GREEN, BLUE)  # x, y, z and roll, pitch, yaw
 VEHICLE_COLOURS = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, INK, GREY)
 
-FORMATS = ("png", "pdf", "svg")
 DPI = 130
 LINE = 1.2  # pt
 SMALL, NORMAL = 7.5, 9.0  # pt

@@ -20,16 +20,16 @@ def test_study_equals_single_runs() -> None:
         run = rollout(scenario, seed=seed)
         steady = run.t > 2.0
         expected = np.sqrt((run.position_error[steady] ** 2).mean(axis=0))
-        np.testing.assert_allclose(study.position_rmse[row], expected, rtol=1e-12)
-        np.testing.assert_array_equal(study.final_position_error[row], run.position_error[-1])
+        np.testing.assert_allclose(study.position_rmse_m[row], expected, rtol=1e-12)
+        np.testing.assert_array_equal(study.final_position_error_m[row], run.position_error[-1])
 
 
 def test_all_vehicles_settle_under_the_papers_noise() -> None:
     """Seeds 0..19 of the busy intersection: every vehicle in every seed, with errors that grow along the chain."""
     study = study_seeds(coopenv.load_scenario("busy_intersection"), range(20), 35.0)
-    assert np.isfinite(study.settle_time).all()
-    assert (study.final_position_error < 0.5).all() and (study.final_orientation_error < 5.0).all()
-    mean = study.position_rmse.mean(axis=0)
+    assert np.isfinite(study.settle_time_s).all()
+    assert (study.final_position_error_m < 0.5).all() and (study.final_orientation_error_deg < 5.0).all()
+    mean = study.position_rmse_m.mean(axis=0)
     assert (np.diff(mean) > 0).all()
     assert mean == pytest.approx([0.0124, 0.0202, 0.0370, 0.0541, 0.106], rel=0.35)
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from rich.table import Table
@@ -16,7 +15,6 @@ from coopenv.bench.observers.executors import Executor
 from coopenv.bench.observers.initial_estimates import random_start
 from coopenv.bench.observers.sources import Source
 from coopenv.errors import CoopenvError
-from coopenv.estimation.arrays import Array
 from coopenv.estimation.consistency import Interval, wilson_interval
 from coopenv.estimation.metrics import CONVERGED, settling_time
 from coopenv.format import fixed
@@ -40,22 +38,20 @@ class BasinTask:
 
 @dataclass(frozen=True)
 class Draw:
-    """One observer from one draw of the initial estimates; arrays (N,)."""
+    """How one vehicle fared from one draw of the initial estimates: a line of `basin.csv`."""
 
     draw: int
     observer: str
-    vehicles: tuple[str, ...]
-    initial_angle: Array  # deg
-    initial_distance: Array  # m
-    convergence_time: Array  # s from which on the errors stay within CONVERGED; NaN where they do not
-    end_position: Array  # m
-    end_orientation: Array  # deg
+    vehicle: str
+    initial_orientation_error_deg: float
+    initial_position_error_m: float
+    converged: bool
+    """Whether the vehicle ends within CONVERGED."""
+    convergence_time_s: float
+    """From then on the errors stay within CONVERGED; NaN where they do not."""
+    final_position_error_m: float
+    final_orientation_error_deg: float
     failure: str
-
-    @property
-    def converged(self) -> np.ndarray:
-        """(N,) whether the vehicle ends within CONVERGED."""
-        return CONVERGED.contains(self.end_position, self.end_orientation)
 
 
 @dataclass(frozen=True)
@@ -86,21 +82,16 @@ def draw_starts(task: BasinTask) -> list[Draw]:
         started = random_start(recording, draw, RADIUS)
         for name, factory in task.observers.items():
             result = run(factory, started)
-            found.append(
+            angle, distance = result.orientation_error, result.position_error
+            times = settling_time(result.t, distance, angle, CONVERGED)
+            converged = CONVERGED.contains(distance[-1], angle[-1])
+            found += [
                 Draw(
-                    draw=draw,
-                    observer=name,
-                    vehicles=tuple(setup.name for setup in recording.setups),
-                    initial_angle=result.orientation_error[0],
-                    initial_distance=result.position_error[0],
-                    convergence_time=settling_time(
-                        result.t, result.position_error, result.orientation_error, CONVERGED
-                    ),
-                    end_position=result.position_error[-1],
-                    end_orientation=result.orientation_error[-1],
-                    failure=result.failure,
+                    *(draw, name, setup.name, float(angle[0, i]), float(distance[0, i]), bool(converged[i])),
+                    *(float(times[i]), float(distance[-1, i]), float(angle[-1, i]), result.failure),
                 )
-            )
+                for i, setup in enumerate(recording.setups)
+            ]
     return found
 
 
@@ -123,13 +114,6 @@ def study_basin(
 ) -> list[Draw]:
     """Return the draws 0, 1, ... of every observer, on the record of seed 0.
 
-    Args:
-        source: of the record.
-        observers: names.
-        draws: how many.
-        executor: where the work is done.
-        on_progress: called with the share that is done.
-
     Raises:
         CoopenvError: an unknown observer, or a source whose geometry is not the question.
     """
@@ -144,24 +128,23 @@ def study_basin(
 
 def basins_of(environment: str, draws: Sequence[Draw]) -> list[Basin]:
     """Sum up draws by observer."""
-    groups: dict[str, list[Draw]] = {}
-    for draw in draws:
-        groups.setdefault(draw.observer, []).append(draw)
     basins = []
-    for name, own in groups.items():
-        converged = np.array([draw.converged for draw in own])
+    for name in dict.fromkeys(draw.observer for draw in draws):
+        own = [draw for draw in draws if draw.observer == name]
+        vehicles = len({draw.vehicle for draw in own})
+        converged = np.array([draw.converged for draw in own]).reshape(-1, vehicles)
+        times = np.array([draw.convergence_time_s for draw in own]).reshape(-1, vehicles)
         everybody = converged.all(axis=1)
-        failures = [draw.failure for draw in own if draw.failure]
-        last = np.array([draw.convergence_time.max() for draw in own])[everybody]
+        failures = [draw.failure for draw in own[::vehicles] if draw.failure]
         basins.append(
             Basin(
                 environment=environment,
                 observer=name,
-                draws=len(own),
+                draws=len(converged),
                 converged_fraction=float(everybody.mean()),
-                interval=wilson_interval(int(everybody.sum()), len(own)),
+                interval=wilson_interval(int(everybody.sum()), len(converged)),
                 by_vehicle=tuple(converged.mean(axis=0).tolist()),
-                convergence_time_s=float(np.median(last)) if len(last) else float("nan"),
+                convergence_time_s=float(np.median(times[everybody].max(axis=1))) if everybody.any() else float("nan"),
                 failed=len(failures),
                 failure=failures[0] if failures else "",
             )
@@ -197,27 +180,9 @@ def basin_failures(basins: Sequence[Basin]) -> list[str]:
 
 def by_angle(draws: Sequence[Draw]) -> list[tuple[int, int]]:
     """Return (converged, all) vehicles in each bin of `ANGLE_BINS` of their own initial angle."""
-    angle = np.concatenate([draw.initial_angle for draw in draws])
-    converged = np.concatenate([draw.converged for draw in draws])
-    bins = np.clip(np.digitize(angle, ANGLE_BINS) - 1, 0, len(ANGLE_BINS) - 2)
-    return [(int(converged[bins == b].sum()), int((bins == b).sum())) for b in range(len(ANGLE_BINS) - 1)]
-
-
-def plain_draws(draws: Sequence[Draw]) -> list[dict[str, Any]]:
-    """Return one line per draw, observer and vehicle."""
-    return [
-        {
-            "draw": draw.draw,
-            "observer": draw.observer,
-            "vehicle": vehicle,
-            "initial_orientation_error_deg": float(draw.initial_angle[i]),
-            "initial_position_error_m": float(draw.initial_distance[i]),
-            "converged": bool(draw.converged[i]),
-            "convergence_time_s": float(draw.convergence_time[i]),
-            "final_position_error_m": float(draw.end_position[i]),
-            "final_orientation_error_deg": float(draw.end_orientation[i]),
-            "failure": draw.failure,
-        }
-        for draw in draws
-        for i, vehicle in enumerate(draw.vehicles)
-    ]
+    angle = [draw.initial_orientation_error_deg for draw in draws]
+    every, converged = (
+        np.histogram(angle, ANGLE_BINS, weights=weights)[0].astype(int).tolist()
+        for weights in (np.ones(len(draws)), np.array([draw.converged for draw in draws], float))
+    )
+    return list(zip(converged, every, strict=True))

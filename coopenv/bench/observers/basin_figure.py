@@ -49,9 +49,9 @@ def _pairs(figure: Figure, rows: int, columns: int, count: int) -> list[tuple[Ax
 
 def _draw_cloud(ax: Axes, draws: Sequence[Draw], first: bool) -> None:
     tidy(ax, y_label="distance [m]" if first else "")
-    angle = np.concatenate([draw.initial_angle for draw in draws])
-    distance = np.concatenate([draw.initial_distance for draw in draws])
-    converged = np.concatenate([draw.converged for draw in draws])
+    angle = np.array([draw.initial_orientation_error_deg for draw in draws])
+    distance = np.array([draw.initial_position_error_m for draw in draws])
+    converged = np.array([draw.converged for draw in draws])
     ax.scatter(angle[converged], distance[converged], s=5, color=BLUE, linewidth=0, alpha=0.6)
     ax.scatter(angle[~converged], distance[~converged], s=8, color=VERMILION, marker="x", linewidth=0.6, alpha=0.7)
     ax.set(xlim=(0, 180), ylim=(0, RADIUS), xticks=ANGLE_BINS)

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from coopenv.errors import CoopenvError
+from coopenv.viz import style
 from coopenv.viz.style import INK, NORMAL, SMALL, new_figure
 
 PAGE = 10.5
@@ -49,15 +50,8 @@ def legend(figure: Figure, handles: Sequence[Artist]) -> None:
     """Put a legend above the panels."""
     length = sum(_LEGEND_MARK + _LEGEND_LETTER * len(str(handle.get_label())) for handle in handles)
     columns = fitting(float(figure.get_figwidth()), length / len(handles), len(handles))
-    figure.legend(
-        handles=list(handles),
-        loc="outside upper center",
-        ncols=columns,
-        fontsize=SMALL + 0.5,
-        frameon=False,
-        handlelength=2.2,
-        columnspacing=1.6,
-    )
+    spacing: dict[str, Any] = {"handlelength": 2.2, "columnspacing": 1.6}
+    style.legend(figure, handles, "outside upper center", ncols=columns, fontsize=SMALL + 0.5, **spacing)
 
 
 def panels(figure: Figure, rows: int, columns: int) -> list[list[Axes]]:

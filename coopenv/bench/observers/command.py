@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple
 
 from rich.console import Console
 
-from coopenv.bench.observers import exports
 from coopenv.bench.observers.basin import (
     Basin,
     Draw,
@@ -20,19 +19,19 @@ from coopenv.bench.observers.basin import (
     basin_table,
     basins_of,
     check_source,
-    plain_draws,
     study_basin,
 )
 from coopenv.bench.observers.comparison import Comparison, observers_of, run_comparison, work_of
 from coopenv.bench.observers.executors import Executor
+from coopenv.bench.observers.exports import csv_text
 from coopenv.bench.observers.sources import ALL, Source, find_source, variants_of
 from coopenv.errors import CoopenvError
-from coopenv.files import replacing_folder
-from coopenv.jsonable import json_text
+from coopenv.files import replace_text, replacing_folder
+from coopenv.jsonable import json_text, jsonable
+from coopenv.machine import versions
 from coopenv.observers.registry import observer_names, obstacle
 from coopenv.runs.console import Progress
-
-T = TypeVar("T")
+from coopenv.viz import FORMATS
 
 JSON_FILE, CSV_FILE, REPORT_FILE, BASIN_FILE = "leaderboard.json", "leaderboard.csv", "report.html", "basin.csv"
 
@@ -78,18 +77,7 @@ def request_of(
     overrides: Mapping[str, Any],
     assignments: Sequence[str],
 ) -> Request:
-    """Return the request behind the options of the command line.
-
-    Args:
-        text: environment, dataset or log file.
-        observers: names, or where classes stand, with commas between; None: all that are meant for such vehicles.
-        variants: names with commas between, or `all`; None: the usual ones of the source.
-        seeds: which.
-        steady_from: s; None: the source's own.
-        basin: draws.
-        data: folder of recorded data.
-        overrides: of the scenario.
-        assignments: the same, as they were written.
+    """Return the request behind the options of the command line, `overrides` being `assignments` as they are read.
 
     Raises:
         CoopenvError: something of it does not exist.
@@ -110,8 +98,7 @@ def request_of(
     return Request(source, text, written, wanted, seeds, steady_from, basin, tuple(options), told)
 
 
-@dataclass(frozen=True)
-class Found:
+class Found(NamedTuple):
     """What came of a request."""
 
     comparison: Comparison
@@ -120,8 +107,10 @@ class Found:
 
     def document(self, command: str) -> dict[str, Any]:
         """Return what `leaderboard.json` holds."""
-        more = {"basin": [asdict(basin) for basin in self.basins]} if self.basins else {}
-        return exports.document(self.comparison, command, **more)
+        packages = versions("coopenv", "numpy", "scipy", "warp-lang")
+        rows, basins = ([asdict(entry) for entry in entries] for entries in (self.comparison.rows, self.basins))
+        content = {"command": command, "versions": packages, "seeds": list(self.comparison.seeds), "rows": rows}
+        return dict(jsonable(content | ({"basin": basins} if basins else {})))
 
 
 def perform(
@@ -151,7 +140,7 @@ def perform(
     if wanted and out is None:
         raise CoopenvError(f"--figures {figures}: figures need a folder, --out DIR")
     found, names = None, [JSON_FILE, CSV_FILE, REPORT_FILE, BASIN_FILE]
-    names += [name for form in exports.FORMATS for name in figure_files(tuple(request.source.variants), form)]
+    names += [name for form in FORMATS for name in figure_files(tuple(request.source.variants), form)]
     try:
         with nullcontext() if out is None else replacing_folder(out, names) as folder:
             found = _compare(request, executor, log)
@@ -170,22 +159,14 @@ def perform(
 def _compare(request: Request, executor: Executor, log: Console) -> Found:
     for name, reason in request.left_out.items():
         log.print(f"left out: {name} ({reason})", soft_wrap=True, markup=False)
-    observers = tuple(request.observers)
-    comparison = _with_progress(
-        log,
-        work_of(observers, request.variants, request.seeds),
-        lambda update: run_comparison(
-            request.source, observers, request.seeds, request.variants, request.steady_from, executor, update
-        ),
-    )
-    draws: list[Draw] = []
+    source, observers, draws = request.source, tuple(request.observers), []
+    with Progress(log, work_of(observers, request.variants, request.seeds), total=1.0) as progress:
+        wanted = request.seeds, request.variants, request.steady_from
+        comparison = run_comparison(source, observers, *wanted, executor, progress.update)
     if request.basin:
-        draws = _with_progress(
-            log,
-            f"{len(observers)} observers, {request.basin} initial estimates",
-            lambda update: study_basin(request.source, observers, request.basin, executor, update),
-        )
-    return Found(comparison, draws, basins_of(request.source.name, draws))
+        with Progress(log, f"{len(observers)} observers, {request.basin} initial estimates", total=1.0) as progress:
+            draws = study_basin(source, observers, request.basin, executor, progress.update)
+    return Found(comparison, draws, basins_of(source.name, draws))
 
 
 def print_tables(found: Found, printed: Console) -> None:
@@ -206,8 +187,8 @@ def figure_files(variants: Sequence[str], form: str | None) -> dict[str, tuple[s
     """
     if form is None:
         return {}
-    if form not in exports.FORMATS:
-        raise CoopenvError(f"--figures {form}: known are {', '.join(exports.FORMATS)}")
+    if form not in FORMATS:
+        raise CoopenvError(f"--figures {form}: known are {', '.join(FORMATS)}")
     drawn = {f"{kind}-{v}.{form}": (kind, v) for v in variants for kind in ("errors", "consistency")}
     return drawn | {f"{kind}.{form}": (kind, variants[0]) for kind in ("cost", "variants")}
 
@@ -218,22 +199,18 @@ def write_files(found: Found, command: str, out: Path, figures: Mapping[str, tup
     Raises:
         OutputError: a file cannot be written.
     """
-    from coopenv.bench.observers.figures import KINDS, save
+    from coopenv.bench.observers.figures import KINDS
     from coopenv.bench.observers.report import report_text
+    from coopenv.viz.style import save
 
-    comparison, draws, basins = found.comparison, found.draws, found.basins
+    comparison, draws, basins = found
     content = found.document(command)
-    texts = {JSON_FILE: json_text(content), CSV_FILE: exports.csv_text(comparison.rows)}
-    texts |= {BASIN_FILE: exports.csv_text(plain_draws(draws))} if draws else {}
+    texts = {JSON_FILE: json_text(content), CSV_FILE: comparison.to_csv()}
+    texts |= {BASIN_FILE: csv_text(draws)} if draws else {}
     texts[REPORT_FILE] = report_text(comparison, content, draws, basins)
     for name, text in texts.items():
-        exports.text_to(out / name, text)
+        replace_text(out / name, text)
     for name, (kind, variant) in figures.items():
         figure = KINDS[kind](comparison, variant, None)
         if figure is not None:
             save(figure, out / name)
-
-
-def _with_progress(log: Console, description: str, work: Callable[[Callable[[float], None]], T]) -> T:
-    with Progress(log, description, total=1.0) as progress:
-        return work(progress.update)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, fields
 from io import StringIO
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +16,10 @@ from coopenv.bench.observers import exports, tables
 from coopenv.bench.observers.executors import Executor, Local
 from coopenv.bench.observers.judge import Sample, Task, judge
 from coopenv.bench.observers.leaderboard import Leaderboard
+from coopenv.bench.observers.rows import Row
 from coopenv.bench.observers.sources import Source, find_source, variants_of
 from coopenv.errors import CoopenvError, checked_seed, suggest
+from coopenv.files import replace_text
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import available_names, find, named, portable
 from coopenv.runs.console import Progress
@@ -47,7 +51,11 @@ class Comparison(Leaderboard):
         Raises:
             CoopenvError: pandas is not installed.
         """
-        return exports.data_frame(self.rows)
+        try:
+            from pandas import DataFrame
+        except ImportError:
+            raise CoopenvError("a table of pandas needs pandas: pip install pandas") from None
+        return DataFrame([asdict(row) for row in self.rows], columns=[f.name for f in fields(Row)])
 
     def to_csv(self, path: str | Path | None = None) -> str:
         """Return the rows with all columns as CSV, and write them where a path is given.
@@ -55,7 +63,10 @@ class Comparison(Leaderboard):
         Raises:
             OutputError: the file cannot be written.
         """
-        return exports.text_to(path, exports.csv_text(self.rows))
+        text = exports.csv_text(self.rows)
+        if path is not None:
+            replace_text(path, text)
+        return text
 
     def to_latex(self, path: str | Path | None = None, variant: str | None = None) -> str:
         """Return the position RMSE with standard errors as a LaTeX table (package booktabs); write it to a path.
@@ -67,7 +78,10 @@ class Comparison(Leaderboard):
         Raises:
             CoopenvError: the variant was not run, or the file cannot be written.
         """
-        return exports.text_to(path, exports.latex(self, self._checked(variant)))
+        text = exports.latex(self, self._checked(variant))
+        if path is not None:
+            replace_text(path, text)
+        return text
 
     def figure(
         self,
@@ -90,7 +104,8 @@ class Comparison(Leaderboard):
         Raises:
             CoopenvError: no such kind or variant, nothing to draw, or the file cannot be written.
         """
-        from coopenv.bench.observers.figures import KINDS, save
+        from coopenv.bench.observers.figures import KINDS
+        from coopenv.viz.style import save
 
         if kind not in KINDS:
             raise CoopenvError(f"unknown figure '{kind}'{suggest(kind, KINDS)}; known: {', '.join(KINDS)}")
@@ -98,7 +113,7 @@ class Comparison(Leaderboard):
         if drawn is None:
             raise CoopenvError(f"figure '{kind}': there is nothing to draw")
         if path is not None:
-            save(drawn, Path(path), format)
+            save(drawn, Path(path), format or "")
         return drawn
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
@@ -203,16 +218,7 @@ def run_comparison(
     executor: Executor | None = None,
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> Comparison:
-    """Judge observers on the records of a source; the result does not depend on the executor.
-
-    Args:
-        source: of the records.
-        observers: names.
-        seeds: of a simulated source; a recorded one has one record only.
-        variants: of the source.
-        steady_from: s; None: the source's own.
-        executor: where the work is done; None: this process.
-        on_progress: called with the share that is done.
+    """Judge observers on the records of a source; the result does not depend on the executor (None: this process).
 
     Raises:
         CoopenvError: an unknown observer, a record that cannot be made, or a start of the steady state beyond it.
@@ -224,9 +230,7 @@ def run_comparison(
     # One record serves all observers. Recorded robots are few records and long ones: their observers are shared out.
     groups = [sent] if source.seeded else [{name: observer} for name, observer in sent.items()]
     used = tuple(seeds) if source.seeded else (0,)
-    tasks = [
-        Task(source, variant, seed, group, steady_from) for variant in variants for seed in used for group in groups
-    ]
+    tasks = [Task(source, *made, steady_from) for made in product(variants, used, groups)]
     judged = (executor or Local(1)).map(judge, tasks, lambda done: on_progress(done / len(tasks)))
     order: dict[tuple[str, str], list[Sample]] = {(variant, name): [] for variant in variants for name in observers}
     for sample in (sample for samples in judged for sample in samples):

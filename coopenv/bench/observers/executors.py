@@ -33,14 +33,6 @@ PATIENCE = 30.0  # s, to reach a cluster
 class Executor(Protocol):
     """Runs tasks somewhere."""
 
-    def check(self) -> None:
-        """Make sure that it can work, before the work begins.
-
-        Raises:
-            CoopenvError: it cannot.
-        """
-        ...
-
     def map(self, function: Callable[[T], R], tasks: Sequence[T], on_done: Callable[[int], None]) -> list[R]:
         """Return function(task) of every task, in their order; calls `on_done(count)` whenever one is done."""
         ...
@@ -75,9 +67,6 @@ class Local:
     """Processes of this machine, or this very process where one is enough."""
 
     jobs: int
-
-    def check(self) -> None:
-        """Do nothing: this machine is here."""
 
     def map(self, function: Callable[[T], R], tasks: Sequence[T], on_done: Callable[[int], None]) -> list[R]:
         """Return function(task) of every task."""
@@ -176,28 +165,29 @@ class Ray:
             import ray
         except ImportError:
             raise CoopenvError("--engine ray needs Ray: pip install '.[ray]'") from None
-        if not ray.is_initialized():
-            # In a thread that may be left behind: something that accepts and never answers would hold up Ray for ever.
-            failure: list[BaseException | None] = []
-            attempt = threading.Thread(target=self._attempt, args=(ray, failure), daemon=True)
-            attempt.start()
-            attempt.join(PATIENCE)
-            if not failure or failure[0] is not None:
-                reason = str(failure[0]).strip().splitlines()[0] if failure else f"no answer within {PATIENCE:g} s"
-                raise CoopenvError(
-                    f"no Ray cluster at '{self.address}': {reason} (one with tokens needs RAY_AUTH_MODE=token and "
-                    "RAY_AUTH_TOKEN_PATH)"
-                )
-        return ray
+        if ray.is_initialized():
+            return ray
+        failure: list[BaseException | None] = []
 
-    def _attempt(self, ray: Any, failure: list[BaseException | None]) -> None:
-        runtime = {"env_vars": dict(ONE_THREAD)}
-        try:
-            ray.init(address=self.address, runtime_env=runtime, log_to_driver=False, configure_logging=False)
-        except Exception as error:
-            failure.append(error)
-        else:
-            failure.append(None)
+        def attempt() -> None:
+            try:
+                options = {"runtime_env": {"env_vars": dict(ONE_THREAD)}, "log_to_driver": False}
+                ray.init(address=self.address, configure_logging=False, **options)
+                failure.append(None)
+            except Exception as error:
+                failure.append(error)
+
+        # In a thread that may be left behind: something that accepts and never answers would hold up Ray for ever.
+        thread = threading.Thread(target=attempt, daemon=True)
+        thread.start()
+        thread.join(PATIENCE)
+        if not failure or failure[0] is not None:
+            reason = str(failure[0]).strip().splitlines()[0] if failure else f"no answer within {PATIENCE:g} s"
+            raise CoopenvError(
+                f"no Ray cluster at '{self.address}': {reason} (one with tokens needs RAY_AUTH_MODE=token and "
+                "RAY_AUTH_TOKEN_PATH)"
+            )
+        return ray
 
 
 def reach(address: str, patience: float = 10.0) -> None:

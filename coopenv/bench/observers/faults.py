@@ -29,17 +29,11 @@ LOST_FROM, LOST_FOR = 0.6, 10.0  # of the horizon, s
 
 
 def with_loss(recording: Recording, probability: float = LOSS, seed: int = 0) -> Recording:
-    """Lose each message, per receiver, with a probability; what was heard last stays known.
-
-    Args:
-        recording: with its own deliveries.
-        probability: in [0, 1].
-        seed: of the draws.
-    """
+    """Lose each message, per receiver, with a probability in [0, 1]; what was heard last stays known."""
     inbox = recording.inbox_tick
     news = np.diff(inbox, axis=0, prepend=-1) > 0
     kept = news & (_generator(seed, 1).random(inbox.shape) >= probability)
-    return _changed(recording, inbox_tick=np.maximum.accumulate(np.where(kept, inbox, -1), axis=0))
+    return changed(recording, inbox_tick=np.maximum.accumulate(np.where(kept, inbox, -1), axis=0))
 
 
 def with_delay(recording: Recording, seconds: float = DELAY) -> Recording:
@@ -47,7 +41,7 @@ def with_delay(recording: Recording, seconds: float = DELAY) -> Recording:
     ticks = min(round(seconds / recording.dt), recording.ticks)
     inbox = np.full_like(recording.inbox_tick, -1)
     inbox[ticks:] = recording.inbox_tick[: recording.ticks - ticks]
-    return _changed(recording, inbox_tick=inbox)
+    return changed(recording, inbox_tick=inbox)
 
 
 def with_wrong_association(recording: Recording, share: float = WRONG_SHARE, seed: int = 0) -> Recording:
@@ -66,26 +60,17 @@ def with_wrong_association(recording: Recording, share: float = WRONG_SHARE, see
         if len(others):
             pair = [target, others[int(partners[k, i, target] * len(others))]]
             bearings[k, i, pair] = bearings[k, i, pair[::-1]]
-    return _changed(recording, bearings=bearings)
+    return changed(recording, bearings=bearings)
 
 
 def without_landmarks(recording: Recording, start: float | None = None, duration: float = LOST_FOR) -> Recording:
-    """Show no landmark to anybody for a while.
-
-    Args:
-        recording: of K ticks.
-        start: s; None: after `LOST_FROM` of the record.
-        duration: s.
-    """
+    """Show no landmark to anybody for a while (s), from a time on (s; None: after `LOST_FROM` of the record)."""
     begin = LOST_FROM * recording.t[-1] if start is None else start
     lost = (recording.t >= begin) & (recording.t < begin + duration)
     landmarks = np.arange(recording.visible.shape[2]) < recording.landmarks.shape[1]
     hidden = lost[:, None, None] & landmarks
-    return _changed(
-        recording,
-        visible=recording.visible & ~hidden,
-        bearings=np.where(hidden[..., None], np.nan, recording.bearings),
-    )
+    bearings = np.where(hidden[..., None], np.nan, recording.bearings)
+    return changed(recording, visible=recording.visible & ~hidden, bearings=bearings)
 
 
 @dataclass(frozen=True)
@@ -150,8 +135,8 @@ class Fault:
 
     def applied(self, recording: Recording, seed: int) -> tuple[Recording, Lie | None]:
         """Return the changed record, and the lie for `runner.run`."""
-        changed = recording if self.change is None else self.change(recording, seed)
-        return changed, Lie(liar(recording), LIE_FROM * float(recording.t[-1])) if self.lies else None
+        made = recording if self.change is None else self.change(recording, seed)
+        return made, Lie(liar(recording), LIE_FROM * float(recording.t[-1])) if self.lies else None
 
 
 FAULTS = {
@@ -179,7 +164,7 @@ def _generator(seed: int, stream: int) -> np.random.Generator:
     return np.random.default_rng([seed, stream])
 
 
-def _changed(recording: Recording, **arrays: Any) -> Recording:
+def changed(recording: Recording, **arrays: Any) -> Recording:
     """Return the record with other arrays, which nobody can write to."""
     for array in arrays.values():
         array.setflags(write=False)

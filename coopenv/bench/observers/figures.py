@@ -1,19 +1,218 @@
-"""The figures of a comparison by kind, and as files."""
+"""The figures of a comparison: errors and consistency over time, variants as a heat map, cost against accuracy."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from typing import Any
 
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from coopenv.bench.observers.exports import FORMATS
-from coopenv.bench.observers.leaderboard import Leaderboard
-from coopenv.bench.observers.summary_figures import cost_figure, variant_figure
-from coopenv.bench.observers.time_figures import error_figure, nees_figure
-from coopenv.errors import CoopenvError
-from coopenv.files import replacing_file
-from coopenv.viz.style import DPI
+from coopenv.bench.observers.canvas import NOTE, PAGE, TEXT, canvas, fitting, legend, panels
+from coopenv.bench.observers.faults import NOMINAL
+from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
+from coopenv.bench.observers.rows import mean_of
+from coopenv.bench.observers.tables import FAILED, short_name
+from coopenv.estimation.consistency import mean_bounds
+from coopenv.format import number
+from coopenv.viz import style
+from coopenv.viz.labels import place_names
+from coopenv.viz.style import BLUE, GREY, INK, NORMAL, SHADE, SMALL, VERMILION, vehicle_colour, vehicle_label
+
+MOST_VEHICLES = 6
+NEES_RANGE = (1e-4, 1e4)
+"""Range of NEES over its dimension that is drawn; beyond it an observer is as wrong as it can be."""
+_WIDE_CELL = 1.0  # inches, of a cell that has room for a ratio too
+_NAME = SMALL + 0.5  # pt
+_FRAME = 1.15  # inches above and below the panels
+_DASHED, _DOTTED = (0, (4, 1.5)), (0, (1, 1))
+
+
+def error_figure(board: Leaderboard, variant: str, width: float | None = None) -> Figure | None:
+    """Draw position errors against time: a row per observer, a column per vehicle.
+
+    Median over the seeds of the error and of three standard deviations that the observer claims, beside the bound.
+
+    Returns:
+        None where every observer failed.
+    """
+    groups = board.samples_in(variant)
+    if not groups:
+        return None
+    scene = board.samples[0].scene
+    figure, inches = canvas(width, _FRAME + 1.05 * len(groups), f"{board.title}, {variant}")
+    shown = _chosen(len(scene.vehicles), fitting(inches, 1.6, MOST_VEHICLES))
+    axes = panels(figure, len(groups), len(shown))
+    for (name, own), line in zip(groups.items(), axes, strict=True):
+        error = np.median([sample.series.position_error for sample in own], axis=0)
+        claimed = 3.0 * np.median([sample.series.position_std for sample in own], axis=0)
+        bound = np.sqrt(np.mean([sample.scene.bound**2 for sample in own], axis=0))
+        for ax, i in zip(line, shown, strict=True):
+            style.tidy(ax)
+            ax.set_yscale("log")
+            ax.plot(scene.t, style.drawable(claimed[:, i], positive=True), color=VERMILION, linestyle=_DASHED, lw=1.0)
+            ax.plot(scene.t, style.drawable(bound[:, i], positive=True), color=GREY, lw=1.0)
+            ax.plot(scene.t, style.drawable(error[:, i], positive=True), color=BLUE, lw=0.9)
+            if scene.steady_from > 0.0:
+                ax.axvline(scene.steady_from, color=INK, linewidth=0.6, linestyle=_DOTTED)
+        line[0].set_ylabel(short_name(name), rotation=0, ha="right", va="center", labelpad=4, **TEXT)
+    _share_axes([ax for line in axes for ax in line], len(shown), scene.t)
+    for ax, i in zip(axes[0], shown, strict=True):
+        ax.set_title(vehicle_label(scene.vehicles[i]), fontsize=NORMAL + 2, color=INK, pad=4)
+    figure.supylabel("position error [m]", **TEXT)
+    median = ", median over seeds" if len(board.seeds) > 1 else ""
+    handles = [
+        Line2D([], [], color=BLUE, lw=1.2, label=f"error{median}"),
+        Line2D([], [], color=VERMILION, lw=1.2, ls=_DASHED, label=f"3 standard deviations claimed{median}"),
+    ]
+    if np.isfinite(scene.bound).any():
+        handles.append(Line2D([], [], color=GREY, lw=1.2, label="Cramér-Rao bound (joint)"))
+    if scene.steady_from > 0.0:
+        handles.append(Line2D([], [], color=INK, lw=0.8, ls=_DOTTED, label="steady state begins"))
+    legend(figure, handles)
+    return figure
+
+
+def nees_figure(board: Leaderboard, variant: str, width: float | None = None) -> Figure | None:
+    """Draw NEES, averaged over the seeds at each instant, with the bounds that hold for it at each instant.
+
+    Returns:
+        None where no observer states a covariance.
+    """
+    groups = {name: own for name, own in board.samples_in(variant).items() if np.isfinite(own[0].series.nees[1:]).any()}
+    if not groups:
+        return None
+    first = board.samples[0]
+    scene, runs, dof = first.scene, len(board.seeds), first.nees_dof
+    columns = fitting(width or PAGE, 3.0, min(3, len(groups)))
+    rows = -(-len(groups) // columns)
+    figure, _ = canvas(width, _FRAME + 1.5 * rows, f"{board.title}, {variant}")
+    axes = [ax for line in panels(figure, rows, columns) for ax in line]
+    for unused in axes[len(groups) :]:
+        unused.set_visible(False)
+    shown = _chosen(len(scene.vehicles), MOST_VEHICLES)
+    for ax, (name, own) in zip(axes, groups.items(), strict=False):
+        style.tidy(ax)
+        ax.axhspan(*mean_bounds(dof, runs), color=SHADE, zorder=0)
+        ax.axhline(1.0, color=GREY, linewidth=0.7)
+        mean = np.mean([sample.series.nees for sample in own], axis=0) / dof
+        for i in shown:
+            values = np.clip(style.drawable(mean[:, i], positive=True), *NEES_RANGE)
+            ax.plot(scene.t, values, color=vehicle_colour(i), linewidth=0.8)
+        ax.set_yscale("log")
+        ax.set_title(name, fontsize=NORMAL, color=INK, pad=3)
+    _share_axes(axes[: len(groups)], columns, scene.t)
+    figure.supylabel(f"NEES / {dof}" + (", mean over runs" if runs > 1 else ""), **TEXT)
+    vehicles = [Line2D([], [], color=vehicle_colour(i), lw=1.4, label=vehicle_label(scene.vehicles[i])) for i in shown]
+    runs_word = f"{runs} run{'s' if runs > 1 else ''}"
+    band = Patch(facecolor=SHADE, label=f"95 % of an honest one ($\\chi^2$, {runs_word}, at one instant)")
+    legend(figure, [*vehicles, band])
+    return figure
+
+
+def _chosen(vehicles: int, most: int) -> list[int]:
+    """Return which vehicles are drawn: all, or some from first to last."""
+    return [int(i) for i in np.unique(np.linspace(0, vehicles - 1, min(vehicles, most)).round())]
+
+
+def _share_axes(axes: Sequence[Axes], columns: int, t: np.ndarray) -> None:
+    """Give panels, row by row, the same time and the same whole decades, and label them at the figure's edge."""
+    drawn = [np.asarray(line.get_ydata(), float) for ax in axes for line in ax.get_lines()]
+    values = np.concatenate([line for line in drawn if line.size > 2])  # and not what marks a level
+    values = values[np.isfinite(values) & (values > 0)]
+    low, high = np.quantile(values, (0.001, 0.999)) if len(values) else (0.1, 10.0)
+    bottom, top = np.floor(np.log10(low)), max(np.ceil(np.log10(high)), np.floor(np.log10(low)) + 1)
+    step = max(1, int(np.ceil((top - bottom) / 4)))
+    for n, ax in enumerate(axes):
+        ax.set(ylim=(10**bottom, 10**top), yticks=10.0 ** np.arange(bottom, top + 1, step))
+        ax.minorticks_off()
+        lowest = n + columns >= len(axes)
+        style.time_axis(ax, t, labelled=lowest)
+        # Without the last label, which would touch that of the next panel.
+        ax.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10], prune="upper"))
+        ax.tick_params(labelleft=n % columns == 0)
+
+
+def variant_figure(board: Leaderboard, variant: str, width: float | None = None) -> Figure | None:
+    """Draw a heat map of the mean position RMSE: a row per observer, a column per variant (all of them).
+
+    Returns:
+        None where there is one variant only, or everybody failed.
+    """
+    variants, names = list(board.variants), board.ranked
+    table = np.array([[board.totals[variant, name].rmse.value for variant in variants] for name in names])
+    finite = table[np.isfinite(table)]
+    if len(variants) < 2 or not len(finite):
+        return None
+    figure, inches = canvas(width, 0.9 + 0.3 * len(names), board.title)
+    ax = figure.add_subplot()
+    norm = LogNorm(finite.min(), max(finite.max(), finite.min() * 1.01))
+    image = ax.imshow(table, cmap="viridis_r", norm=norm, aspect="auto")
+    relative = variants[0] == NOMINAL and inches > _WIDE_CELL * (len(variants) + 2)
+    for (y, x), value in np.ndenumerate(table):
+        worse = f"  ×{number(value / table[y, 0], 2)}" if x and relative else ""
+        dark = np.isfinite(value) and norm(value) > 0.55
+        text = f"{number(float(value), 3)}{worse}" if np.isfinite(value) else FAILED
+        ax.text(x, y, text, ha="center", va="center", fontsize=_NAME, color="white" if dark else INK)
+    ax.set_xticks(range(len(variants)), variants, fontsize=_NAME)
+    ax.set_yticks(range(len(names)), names, fontsize=_NAME)
+    ax.xaxis.tick_top()
+    ax.tick_params(length=0, colors=INK)
+    ax.spines[:].set_visible(False)
+    bar = figure.colorbar(image, ax=ax, fraction=0.05, aspect=40, pad=0.01)
+    bar.ax.set_title("worse", fontsize=SMALL, color=INK)
+    bar.ax.set_xlabel("better", fontsize=SMALL, color=INK)
+    bar.set_label("mean RMSE [m]" + (", × nominal" if relative else ""), fontsize=SMALL, color=INK)
+    bar.ax.tick_params(labelsize=SMALL, colors=INK)
+    _plain(bar.ax.yaxis)
+    return figure
+
+
+def cost_figure(board: Leaderboard, variant: str, width: float | None = None) -> Figure | None:
+    """Draw the mean position RMSE of a variant against the time of an update; the area tells the bytes sent.
+
+    Returns:
+        None where every observer failed.
+    """
+    names = list(board.samples_in(variant))
+    if not names:
+        return None
+    figure, _ = canvas(width, 4.6, f"{board.title}, {variant}")
+    ax = figure.add_subplot()
+    style.tidy(ax, x_label="time per update [µs]", y_label="mean position RMSE [m]")
+    ax.set(xscale="log", yscale="log")
+    rows = [board.rows_in(variant, name) for name in names]
+    micro, sent = ([mean_of(own, column) for own in rows] for column in ("us_per_update", "bytes_per_s"))
+    points = np.stack([micro, [board.totals[variant, name].rmse.value for name in names]], axis=-1)
+    ax.scatter(micro, points[:, 1], s=28.0 + 0.9 * np.sqrt(sent), color=BLUE, alpha=0.5, edgecolor="white", zorder=3)
+    if joint := board.bounds_in(variant).get("bound_m"):
+        bound = float(np.mean(joint))
+        ax.axhline(bound, color=GREY, linewidth=1.0)
+        place: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
+        ax.annotate(BOUNDS["bound_m"], (0.005, bound), (0, 3), fontsize=SMALL, color=NOTE, **place)
+    ax.margins(0.16, 0.12)
+    _plain(ax.xaxis)
+    _plain(ax.yaxis)
+    figure.draw_without_rendering()  # which settles the scales
+    places = ax.transData.transform(points)
+    look = {**TEXT, "fontsize": _NAME, "textcoords": "offset points", "zorder": 30}
+    for name, point, offset in zip(names, points, place_names(names, places, places, places[:0], _NAME), strict=True):
+        ax.annotate(name, point, offset, **look)
+    return figure
+
+
+def _plain(axis: Axis) -> None:
+    """Label a logarithmic axis with plain numbers."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
 
 KINDS: dict[str, Callable[[Leaderboard, str, float | None], Figure | None]] = {
     "errors": error_figure,
@@ -22,22 +221,3 @@ KINDS: dict[str, Callable[[Leaderboard, str, float | None], Figure | None]] = {
     "cost": cost_figure,
 }
 """Each of a board, one of its variants and a width in inches (None: a page's); None where nothing is to draw."""
-
-
-def save(figure: Figure, path: Path, kind: str | None = None) -> None:
-    """Write a figure.
-
-    Args:
-        figure: what to write.
-        path: of the file.
-        kind: one of `FORMATS`; None: as the path ends.
-
-    Raises:
-        CoopenvError: another format, or the file cannot be written.
-    """
-    form = kind or path.suffix.removeprefix(".")
-    if form not in FORMATS:
-        raise CoopenvError(f"{path}: unknown format '{form}' of a figure; known: {', '.join(FORMATS)}")
-    stamp = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}[form]  # the same figure is the same file
-    with replacing_file(path) as new:
-        figure.savefig(new, dpi=DPI, format=form, metadata={stamp: None})

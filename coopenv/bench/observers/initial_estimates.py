@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from coopenv.bench.observers.faults import changed
 from coopenv.estimation.arrays import Array
 from coopenv.observers.recording import Recording
 
@@ -26,14 +24,12 @@ def with_start(recording: Recording, rotations: Array, positions: Array, covaria
         covariance: (6, 6) for all or (N, 6, 6), in LEFT coordinates, rad and m.
     """
     N = len(recording.setups)
-    arrays: dict[str, Any] = {
-        "start_rotation": np.array(np.broadcast_to(rotations, (N, 3, 3)), float),
-        "start_position": np.array(np.broadcast_to(positions, (N, 3)), float),
-        "start_covariance": np.array(np.broadcast_to(np.asarray(covariance, float), (N, 6, 6))),
-    }
-    for array in arrays.values():
-        array.setflags(write=False)
-    return replace(recording, **arrays)
+    return changed(
+        recording,
+        start_rotation=np.array(rotations, float),
+        start_position=np.array(positions, float),
+        start_covariance=np.array(np.broadcast_to(np.asarray(covariance, float), (N, 6, 6))),
+    )
 
 
 def random_start(recording: Recording, seed: int, radius: float = 15.0) -> Recording:

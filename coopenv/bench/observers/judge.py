@@ -147,50 +147,50 @@ class _Geometry:
 def _markers(recording: Recording) -> Array:
     """Return (K, N, 3) the points of the vehicles that cameras see."""
     marker = np.array([setup.marker for setup in recording.setups])
-    result: Array = recording.truth.position + (recording.truth.rotation @ marker[..., None])[..., 0]
-    return result
+    return np.asarray(recording.truth.position + (recording.truth.rotation @ marker[..., None])[..., 0])
 
 
 def sample_of(variant: str, observer: str, scene: Scene, recording: Recording, result: Run) -> Sample:
     """Judge one run. Where it failed, everything but its costs is NaN."""
-    steady = result.t > scene.steady_from
     N = len(scene.vehicles)
     if result.failure:
-        nothing: dict[str, Any] = dict.fromkeys(_JUDGED, np.full(N, np.nan))
-        gone = Series(*np.full((3, len(scene.t), N), np.nan))
-        return Sample(
-            variant=variant,
-            observer=observer,
-            scene=scene,
-            **nothing,
-            diverged=np.ones(N, bool),
-            **_costs(result),
-            failure=result.failure,
-            series=gone,
-        )
-    ends = _last(result.position_error), _last(result.orientation_error)
-    relative = _relative(recording, result)
-    told = np.where(steady[:, None], result.nis_dof, 0)
+        measures: dict[str, Any] = {**dict.fromkeys(_JUDGED, np.full(N, np.nan)), "diverged": np.ones(N, bool)}
+        series = Series(*np.full((3, len(scene.t), N), np.nan))
+    else:
+        measures, series = _measures(scene, recording, result), _series(recording, result)
     return Sample(
         variant=variant,
         observer=observer,
         scene=scene,
-        position_mse=result.mean(result.position_error**2, steady),
-        orientation_mse=result.mean(result.orientation_error**2, steady),
-        anees=result.mean(result.nees, steady) / result.nees_dof,
-        nis=np.where(told > 0, result.nis, 0.0).sum(axis=0),
-        nis_dof=told.sum(axis=0).astype(float),
-        settle_time=_settling(result, SETTLED),
-        converge_time=_settling(result, CONVERGED),
-        rate=np.array([_rate(result, i) for i in range(N)]),
-        diverged=diverged(*ends),
-        ate=np.array([absolute_error(recording.truth.position[:, i], result.position[:, i]) for i in range(N)]),
-        rpe=relative[0],
-        rpe_orientation=relative[1],
-        **_costs(result),
-        failure="",
-        series=_series(recording, result),
+        **measures,
+        bytes_per_s=result.bytes_per_second,
+        us_per_update=result.microseconds_per_update,
+        nees_dof=result.nees_dof,
+        failure=result.failure,
+        series=series,
     )
+
+
+def _measures(scene: Scene, recording: Recording, result: Run) -> dict[str, Any]:
+    """Return the figures of a run that did not fail, arrays (N,)."""
+    steady = result.t > scene.steady_from
+    told = np.where(steady[:, None], result.nis_dof, 0)
+    vehicles = range(len(scene.vehicles))
+    relative = np.array([_relative(recording, result, i) for i in vehicles]).T
+    return {
+        "position_mse": result.mean(result.position_error**2, steady),
+        "orientation_mse": result.mean(result.orientation_error**2, steady),
+        "anees": result.mean(result.nees, steady) / result.nees_dof,
+        "nis": np.where(told > 0, result.nis, 0.0).sum(axis=0),
+        "nis_dof": told.sum(axis=0).astype(float),
+        "settle_time": np.array([_settling(result, i, SETTLED) for i in vehicles]),
+        "converge_time": np.array([_settling(result, i, CONVERGED) for i in vehicles]),
+        "rate": np.array([_rate(result, i) for i in vehicles]),
+        "diverged": diverged(_last(result.position_error), _last(result.orientation_error)),
+        "ate": np.array([absolute_error(recording.truth.position[:, i], result.position[:, i]) for i in vehicles]),
+        "rpe": relative[0],
+        "rpe_orientation": relative[1],
+    }
 
 
 _JUDGED = (
@@ -199,51 +199,32 @@ _JUDGED = (
 )
 
 
-def _costs(result: Run) -> dict[str, Any]:
-    return {
-        "bytes_per_s": result.bytes_per_second,
-        "us_per_update": result.microseconds_per_update,
-        "nees_dof": result.nees_dof,
-    }
+def _relative(recording: Recording, result: Run, i: int) -> tuple[float, float]:
+    """Return the relative trajectory error of one vehicle, m and deg."""
+    delta, truth = max(1, round(RELATIVE_DELTA / recording.dt)), recording.truth
+    poses = truth.rotation[:, i], truth.position[:, i], result.rotation[:, i], result.position[:, i]
+    return relative_error(*poses, delta)
 
 
-def _relative(recording: Recording, result: Run) -> Array:
-    """Return (2, N): RPE in m and deg."""
-    delta = max(1, round(RELATIVE_DELTA / recording.dt))
-    truth = recording.truth
-    return np.array(
-        [
-            relative_error(
-                truth.rotation[:, i], truth.position[:, i], result.rotation[:, i], result.position[:, i], delta
-            )
-            for i in range(result.position.shape[1])
-        ]
-    ).T
-
-
-def _settling(result: Run, tolerance: SettlingTolerance) -> Array:
-    """Return (N,) s, judged where the truth is known."""
-    times = np.full(result.judged.shape[1], np.nan)
-    for i, judged in enumerate(result.judged.T):
-        if judged.any():
-            t, errors = result.t[judged], (result.position_error[judged, i], result.orientation_error[judged, i])
-            times[i] = settling_time(t, *errors, tolerance)
-    return times
-
-
-def _rate(result: Run, vehicle: int) -> float:
-    judged = result.judged[:, vehicle]
+def _settling(result: Run, i: int, tolerance: SettlingTolerance) -> float:
+    """Return when one vehicle settles, s, judged where the truth is known."""
+    judged = result.judged[:, i]
     if not judged.any():
         return float("nan")
-    return fit_exponential_rate(result.t[judged], result.position_error[judged, vehicle]).rate
+    errors = result.position_error[judged, i], result.orientation_error[judged, i]
+    return float(settling_time(result.t[judged], *errors, tolerance))
+
+
+def _rate(result: Run, i: int) -> float:
+    judged = result.judged[:, i]
+    return fit_exponential_rate(result.t[judged], result.position_error[judged, i]).rate if judged.any() else np.nan
 
 
 def _last(error: Array) -> Array:
     """Return (N,) the last error that is known."""
     known = np.isfinite(error)
     last = len(error) - 1 - np.argmax(known[::-1], axis=0)
-    result: Array = error[last, np.arange(error.shape[1])]
-    return result
+    return np.asarray(error[last, np.arange(error.shape[1])])
 
 
 def _kept(recording: Recording) -> np.ndarray:

@@ -6,8 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import numpy as np
+
 from coopenv.bench.observers.judge import Sample
 from coopenv.bench.observers.rows import Row, Total, rows_of, totals_of
+
+BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", "bound_single_m": "bound (alone)"}
+"""Column to its line in tables."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +36,7 @@ class Leaderboard:
     @cached_property
     def totals(self) -> dict[tuple[str, str], Total]:
         """Over all vehicles, by variant and observer."""
-        return {(total.variant, total.observer): total for total in totals_of(self.samples)}
+        return totals_of(self.samples)
 
     @cached_property
     def ranked(self) -> list[str]:
@@ -51,6 +56,12 @@ class Leaderboard:
     def rows_in(self, variant: str, observer: str) -> list[Row]:
         """Return the rows of one observer in one variant, a vehicle each."""
         return [row for row in self.rows if (row.variant, row.observer) == (variant, observer)]
+
+    def bounds_in(self, variant: str) -> dict[str, list[float]]:
+        """Return the bounds that are known of each vehicle in a variant, by column."""
+        first = self.rows_in(variant, self.observers[0])
+        found = {column: [float(getattr(row, column)) for row in first] for column in BOUNDS}
+        return {column: values for column, values in found.items() if np.isfinite(values).all()}
 
     def samples_in(self, variant: str) -> dict[str, list[Sample]]:
         """Return the samples of one variant of every observer that did not fail, the best first."""

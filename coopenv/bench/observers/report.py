@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from typing import Any
 
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
@@ -18,9 +17,9 @@ from coopenv.bench.observers.basin import RADIUS, Basin, Draw, basin_failures
 from coopenv.bench.observers.basin_figure import basin_figure
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.figures import KINDS
-from coopenv.bench.observers.leaderboard import Leaderboard
-from coopenv.bench.observers.rows import Row
-from coopenv.bench.observers.tables import BOUNDS, bounded, failures, honest_line
+from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
+from coopenv.bench.observers.rows import Row, mean_of
+from coopenv.bench.observers.tables import failures, honest_line
 from coopenv.estimation.metrics import CONVERGED
 from coopenv.format import number, with_error
 
@@ -75,7 +74,7 @@ def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("coopenv.bench.observers", ""), autoescape=True, undefined=StrictUndefined
     )
-    environment.globals |= {"with_error": with_error, "extremes": _extremes, "mean": _mean, "nan": math.nan}
+    environment.globals |= {"with_error": with_error, "extremes": _extremes, "mean": mean_of, "nan": math.nan}
     environment.filters["append"] = lambda text, more: text + more
     return environment
 
@@ -85,7 +84,7 @@ def _variant(board: Leaderboard, name: str) -> dict[str, Any]:
     return {
         "name": name,
         "summary": board.variants[name],
-        "bounds": {BOUNDS[column]: values for column, values in bounded(board, name).items()},
+        "bounds": {BOUNDS[column]: values for column, values in board.bounds_in(name).items()},
         "paper_noise": board.samples[0].scene.paper_noise,
         "observers": {
             observer: {"rows": board.rows_in(name, observer), "total": board.totals[name, observer]}
@@ -94,10 +93,6 @@ def _variant(board: Leaderboard, name: str) -> dict[str, Any]:
         "errors": _picture(board, "errors", name),
         "consistency": _picture(board, "consistency", name),
     }
-
-
-def _mean(rows: Sequence[Row], column: str) -> float:
-    return float(np.mean([getattr(row, column) for row in rows]))
 
 
 def _extremes(rows: Sequence[Row], column: str) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -80,14 +80,11 @@ class Row:
 NOWHERE = Interval(float("nan"), float("nan"))
 
 
-@dataclass(frozen=True)
-class Total:
+class Total(NamedTuple):
     """One observer in one variant, over all vehicles and seeds; NaN where a run failed."""
 
-    variant: str
-    observer: str
     rmse: Measured
-    """Mean over the vehicles of the position RMSE, m."""
+    """Position RMSE, m, its mean over the vehicles."""
     degradation: Measured
     """`rmse` over that of the nominal variant; NaN without one."""
 
@@ -100,6 +97,11 @@ def grouped(samples: Sequence[Sample]) -> dict[tuple[str, str], list[Sample]]:
     return groups
 
 
+def mean_of(rows: Sequence[Row], column: str) -> float:
+    """Return the mean of a column."""
+    return float(np.mean([getattr(row, column) for row in rows]))
+
+
 def rows_of(environment: str, samples: Sequence[Sample]) -> list[Row]:
     """Sum up samples over seeds, in the order of variants and observers in which they come."""
     groups = grouped(samples)
@@ -110,21 +112,15 @@ def rows_of(environment: str, samples: Sequence[Sample]) -> list[Row]:
     ]
 
 
-def totals_of(samples: Sequence[Sample]) -> list[Total]:
-    """Sum up samples over seeds and vehicles, in the order in which they come."""
+def totals_of(samples: Sequence[Sample]) -> dict[tuple[str, str], Total]:
+    """Sum up samples over seeds and vehicles, by variant and observer."""
     groups = grouped(samples)
-    return [
-        Total(variant, observer, *_position(own, groups.get((NOMINAL, observer), [])))
-        for (variant, observer), own in groups.items()
-    ]
+    return {key: _total(own, groups.get((NOMINAL, key[1]), [])) for key, own in groups.items()}
 
 
-def _position(
-    own: Sequence[Sample], nominal: Sequence[Sample], vehicles: slice = slice(None)
-) -> tuple[Measured, Measured]:
-    """Return the position RMSE (m), mean over some vehicles, and its ratio to that of the nominal variant."""
+def _total(own: Sequence[Sample], nominal: Sequence[Sample], vehicles: slice = slice(None)) -> Total:
     squares, reference = (np.array([s.position_mse[vehicles] for s in samples]) for samples in (own, nominal))
-    return mean_root(squares), ratio(squares, reference) if nominal else UNKNOWN
+    return Total(mean_root(squares), ratio(squares, reference) if nominal else UNKNOWN)
 
 
 def _row(environment: str, i: int, own: Sequence[Sample], nominal: Sequence[Sample]) -> Row:
@@ -134,7 +130,7 @@ def _row(environment: str, i: int, own: Sequence[Sample], nominal: Sequence[Samp
     def bound(name: str) -> float:
         return float(np.sqrt(np.mean([getattr(sample.scene, name)[i] for sample in own])))
 
-    position, degradation = _position(own, nominal, slice(i, i + 1))
+    position, degradation = _total(own, nominal, slice(i, i + 1))
     orientation = mean_root(over_seeds("orientation_mse")[:, None])
     each, dof = np.sqrt(over_seeds("position_mse")), over_seeds("nis_dof").sum()
     settle, converge = over_seeds("settle_time"), over_seeds("converge_time")

@@ -107,11 +107,7 @@ class Simulated(Source):
         return NOBODY_FOLLOWS if FAULTS[variant].lies and not followed else ""
 
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
-        """Return when the steady state starts, s.
-
-        Raises:
-            CoopenvError: what was asked for does not lie within the horizon.
-        """
+        """Return when the steady state starts, s."""
         return steady_start(given, self.scenario.horizon)
 
 

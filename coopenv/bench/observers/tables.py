@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from rich.table import Table
 
 from coopenv.bench.observers.faults import FAULTS, NOMINAL
-from coopenv.bench.observers.leaderboard import Leaderboard
-from coopenv.bench.observers.rows import Row
+from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
+from coopenv.bench.observers.rows import Row, mean_of
 from coopenv.format import in_parentheses, number
 from coopenv.runs.table import number_table
 
@@ -20,8 +20,6 @@ FAILED = "failed"
 SPREAD_NOTE = "0.0123(4): 0.0123 with a standard error of 0.0004 over the seeds"
 
 _NAMED = 16  # characters of an observer's name on one line
-BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", "bound_single_m": "bound (alone)"}
-"""Column to its line in the table of errors."""
 
 
 def everything(board: Leaderboard) -> Iterator[Table | str]:
@@ -32,7 +30,7 @@ def everything(board: Leaderboard) -> Iterator[Table | str]:
         yield error_table(board, variant)
         if len(board.seeds) > 1:
             yield f"{SPREAD_NOTE}."
-        if bounded(board, variant):
+        if board.bounds_in(variant):
             yield ""
             yield ratio_table(board, variant)
         yield ""
@@ -48,16 +46,9 @@ def everything(board: Leaderboard) -> Iterator[Table | str]:
     yield from failures(board.rows)
 
 
-def bounded(board: Leaderboard, variant: str) -> dict[str, list[float]]:
-    """Return the bounds that are known of each vehicle in a variant, by column."""
-    first = board.rows_in(variant, board.observers[0])
-    found = {column: [float(getattr(row, column)) for row in first] for column in BOUNDS}
-    return {column: values for column, values in found.items() if np.isfinite(values).all()}
-
-
 def error_table(board: Leaderboard, variant: str) -> Table:
     """Return position RMSE in m of one variant per vehicle, and their mean, the bounds first."""
-    bounds, few = bounded(board, variant), _few(board)
+    bounds, few = board.bounds_in(variant), _few(board)
     table = number_table(["position RMSE [m]"], _headings(board, "mean"), gap=0)
     for column, values in bounds.items():
         average = sum(values) / len(values)
@@ -77,12 +68,10 @@ def ratio_table(board: Leaderboard, variant: str) -> Table:
     table = number_table(["RMSE / bound\n(ancestors)"], _headings(board, "x joint\nworst"), gap=0)
     for name in board.ranked:
         own = board.rows_in(variant, name)
-        worst = _worst(own, "ratio_to_bound")
-        shown = own if few else [_worst(own, "ratio_to_bound_ancestors")]
-        cells = [in_parentheses(row.ratio_to_bound_ancestors, row.ratio_to_bound_ancestors_se) for row in shown]
-        if not few:
-            cells.insert(0, number(float(np.mean([row.ratio_to_bound_ancestors for row in own])), 3))
-        _add(table, name, own, [*cells, in_parentheses(worst.ratio_to_bound, worst.ratio_to_bound_se)])
+        joint, shown = _worst(own, "ratio_to_bound"), own if few else [_worst(own, "ratio_to_bound_ancestors")]
+        cells = [] if few else [number(mean_of(own, "ratio_to_bound_ancestors"), 3)]
+        cells += [in_parentheses(row.ratio_to_bound_ancestors, row.ratio_to_bound_ancestors_se) for row in shown]
+        _add(table, name, own, [*cells, in_parentheses(joint.ratio_to_bound, joint.ratio_to_bound_se)])
     return table
 
 
@@ -100,16 +89,14 @@ def quality_table(board: Leaderboard, variant: str) -> Table:
     table = number_table(["observer"], headings, gap=0)
     for name in board.ranked:
         own = board.rows_in(variant, name)
-        anees, nis = _finite(row.anees for row in own), _finite(row.nis for row in own)
-        cells = [
-            f"{100 * np.mean([getattr(row, column) for row in own]):.0f}%"
-            for column in ("settled_fraction", "converged_fraction", "diverged_fraction")
-        ]
+        anees, nis = (
+            [value for row in own if np.isfinite(value := getattr(row, column))] for column in ("anees", "nis")
+        )
+        shares = ("settled_fraction", "converged_fraction", "diverged_fraction")
+        cells = [f"{100 * mean_of(own, column):.0f}%" for column in shares]
         cells += [number(min(anees), 2), number(max(anees), 2)] if anees else ["-", "-"]
         cells += [number(float(np.mean(nis)), 2) if nis else "-"]
-        cells += [
-            f"{np.mean([getattr(row, column) for row in own]):.0f}" for column in ("bytes_per_s", "us_per_update")
-        ]
+        cells += [f"{mean_of(own, column):.0f}" for column in ("bytes_per_s", "us_per_update")]
         _add(table, name, own, cells)
     return table
 
@@ -128,9 +115,8 @@ def degradation_table(board: Leaderboard) -> Table:
     variants = [name for name in board.variants if name != NOMINAL]
     table = number_table(["RMSE / nominal"], [_heading(name) for name in variants], gap=0)
     for name in board.ranked:
-        table.add_row(
-            short_name(name), *(in_parentheses(*board.totals[variant, name].degradation) for variant in variants)
-        )
+        ratios = [in_parentheses(*board.totals[variant, name].degradation) for variant in variants]
+        table.add_row(short_name(name), *ratios)
     return table
 
 
@@ -162,8 +148,7 @@ def _headings(board: Leaderboard, last: str) -> list[str]:
 
 def _heading(variant: str) -> str:
     """Return a name with one word per line."""
-    words = variant.replace("+", "_+").split("_")
-    return "\n".join(words)
+    return "\n".join(variant.replace("+", "_+").split("_"))
 
 
 def _add(table: Table, name: str, rows: Sequence[Row], cells: Sequence[str]) -> None:
@@ -173,7 +158,3 @@ def _add(table: Table, name: str, rows: Sequence[Row], cells: Sequence[str]) -> 
 
 def _worst(rows: Sequence[Row], column: str = "position_rmse_m") -> Row:
     return max(rows, key=lambda row: getattr(row, column))
-
-
-def _finite(values: Iterable[float]) -> list[float]:
-    return [value for value in values if np.isfinite(value)]
