@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array
-from coopenv.estimation.p3p import solve_p3p
 from coopenv.estimation.small_matrices import solve
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.mekf import LeftError, innovation
+from coopenv.observers.robust.p3p import solve_p3p
 
 MOST_TRIPLES = 20
 ITERATIONS = 8

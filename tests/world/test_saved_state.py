@@ -43,7 +43,7 @@ def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
         ("observer_search.hypotheses", (0, 0), 10**6, "'observer_search.hypotheses'"),
         ("observer_search.attempts", (0, 0), -1, "'observer_search.attempts'"),
         ("observer_P", (0, 0, 0, 0, 1, 1), -5.0, "'observer_P' at .* is not a covariance"),
-        ("observer_member.R", (0, 0, 0), 0.0, "'observer_member.R' at .* is not a rotation"),
+        ("observer_member.pose.R", (0, 0, 0), 0.0, "'observer_member.pose.R' at .* is not a rotation"),
         ("odometry_samples", (0, 2), -(2**31), "'odometry_samples' at .* is not as many as at this tick"),
         ("odometry_samples", (0, 2), 2**31 - 1, "'odometry_samples'"),
         ("odometry_samples", (0, 2), 0, "'odometry_samples'"),

@@ -1,4 +1,4 @@
-"""Errors of poses, their transport, and 6x6 systems, in float64."""
+"""Poses, their errors and how odometry carries them on, and 6x6 systems, in float64."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import eigen_symmetric6
-from coopenv.estimation.so3 import quaternion_vector, rotation_vector_sine, skew
+from coopenv.estimation.linalg import eigen_symmetric6, symmetric_part
+from coopenv.estimation.so3 import exp_so3, orthonormalise, quaternion_vector, rotation_vector_sine, skew
 from coopenv.observers.robust.constants import KNOWN_ANGLE, KNOWN_POSITION, MIN_ANGULAR_VELOCITY_STD, MIN_VELOCITY_STD
-from coopenv.observers.robust.types import lower_blocks, mat66d, stacked, vec3d
+from coopenv.observers.robust.memory import Estimate, Pose, mat66d, vec2d, vec3d, vec6d
 
 KNOWN_ANGLE_VARIANCE = KNOWN_ANGLE**2
 KNOWN_POSITION_VARIANCE = KNOWN_POSITION**2
@@ -33,36 +33,75 @@ def log_so3(R: Any):
 
 
 @wp.func
-def left_error(R: Any, p: Any, R_other: Any, p_other: Any):
-    """Return the left error (theta, rho) of the other pose against (R, p)."""
-    Rt = wp.transpose(R)
-    return stacked(log_so3(Rt * R_other), Rt * (p_other - p))
+def left_error(pose: Pose, other: Pose):
+    """Return the left error (theta, rho) of another pose against one."""
+    Rt = wp.transpose(pose.R)
+    error = vec6d()
+    error[:3] = log_so3(Rt * other.R)
+    error[3:] = Rt * (other.p - pose.p)
+    return error
 
 
 @wp.func
-def transition(dR: Any, dp: Any):
-    """Return F of the left error over an odometry increment."""
-    E = wp.transpose(dR)
-    return lower_blocks(E, -E * skew(dp), E)
+def displaced(pose: Pose, error: Any):
+    """Return the pose that has a left error against one."""
+    return Pose(pose.R * exp_so3(error[:3]), pose.p + pose.R * error[3:])
 
 
 @wp.func
-def odometry_variances(model: Any, dt: Any):
-    """Return the variances (rotation, translation) per axis of an odometry increment over dt."""
+def moved(pose: Pose, step: Pose):
+    """Return a pose after an increment of odometry."""
+    return Pose(orthonormalise(pose.R * step.R), pose.p + pose.R * step.p)
+
+
+@wp.func
+def between(before: Pose, after: Pose):
+    """Return the increment from one pose to another."""
+    Rt = wp.transpose(before.R)
+    return Pose(Rt * after.R, Rt * (after.p - before.p))
+
+
+@wp.func
+def lower_blocks(A: Any, C: Any, D: Any):
+    """Return the 6x6 matrix [[A, 0], [C, D]]."""
+    M = mat66d()
+    M[:3, :3] = A
+    M[3:, :3] = C
+    M[3:, 3:] = D
+    return M
+
+
+@wp.func
+def transition(step: Pose):
+    """Return F of the left error over an increment of odometry."""
+    E = wp.transpose(step.R)
+    return lower_blocks(E, -E * skew(step.p), E)
+
+
+@wp.func
+def odometry_noise(model: Any, dt: Any):
+    """Return the variances (rotation, translation) per axis of an increment of odometry over dt."""
     scale = model.odometry_period * dt
     angular = wp.max(wp.float64(model.noise.angular_velocity), wp.float64(MIN_ANGULAR_VELOCITY_STD))
     linear = wp.max(wp.float64(model.noise.velocity), wp.float64(MIN_VELOCITY_STD))
-    return angular * angular * scale, linear * linear * scale
+    return vec2d(angular * angular * scale, linear * linear * scale)
 
 
 @wp.func
-def with_noise(P: Any, rotation: Any, translation: Any):
-    """Return the symmetric part of P with variances added to its diagonal."""
-    result = (P + wp.transpose(P)) * wp.float64(0.5)
+def with_noise(P: Any, noise: Any):
+    """Return the symmetric part of P with variances (rotation, translation) added to its diagonal."""
+    result = symmetric_part(P)
     for i in range(3):
-        result[i, i] = result[i, i] + rotation
-        result[i + 3, i + 3] = result[i + 3, i + 3] + translation
+        result[i, i] += noise[0]
+        result[i + 3, i + 3] += noise[1]
     return result
+
+
+@wp.func
+def carried(estimate: Estimate, step: Pose, noise: Any):
+    """Return an estimate after an increment of odometry with noise."""
+    F = transition(step)
+    return Estimate(moved(estimate.pose, step), with_noise(F * estimate.P * wp.transpose(F), noise))
 
 
 @wp.func
@@ -77,52 +116,41 @@ def is_known(P: Any):
 @wp.func
 def is_regular(M: Any, least: Any):
     """Return whether the smallest eigenvalue of a symmetric M exceeds a share of the largest."""
-    identity = mat66d()
-    for k in range(6):
-        identity[k, k] = wp.float64(1.0)
-    D, _ = eigen_symmetric6(M, identity)
-    low = D[0, 0]
-    high = D[0, 0]
-    for k in range(6):
-        low = wp.min(low, D[k, k])
-        high = wp.max(high, D[k, k])
-    return low > least * high
+    D, _ = eigen_symmetric6(M, wp.identity(6, wp.float64))
+    spectrum = wp.get_diag(D)
+    return wp.min(spectrum) > least * wp.max(spectrum)
 
 
 @wp.func
 def inverse6(A: Any):
     """Return the inverse of a 6x6 matrix, by Gauss-Jordan elimination with partial pivoting."""
     M = A
-    X = mat66d()
-    for i in range(6):
-        X[i, i] = wp.float64(1.0)
+    X = wp.identity(6, wp.float64)
     for k in range(6):
         best = int(k)
         for i in range(k + 1, 6):
             if wp.abs(M[i, k]) > wp.abs(M[best, k]):
                 best = i
         if best != k:
-            for j in range(6):
-                kept = M[k, j]
-                M[k, j] = M[best, j]
-                M[best, j] = kept
-                kept = X[k, j]
-                X[k, j] = X[best, j]
-                X[best, j] = kept
+            row = M[k]
+            M[k] = M[best]
+            M[best] = row
+            row = X[k]
+            X[k] = X[best]
+            X[best] = row
         scale = wp.float64(1.0) / M[k, k]
-        for j in range(6):
-            M[k, j] = M[k, j] * scale
-            X[k, j] = X[k, j] * scale
+        M[k] = M[k] * scale
+        X[k] = X[k] * scale
         for i in range(6):
             if i != k:
                 factor = M[i, k]
-                for j in range(6):
-                    M[i, j] = M[i, j] - factor * M[k, j]
-                    X[i, j] = X[i, j] - factor * X[k, j]
+                M[i] = M[i] - factor * M[k]
+                X[i] = X[i] - factor * X[k]
     return X
 
 
 @wp.func
-def distance_squared(e: Any, P: Any):
-    """Return e^T P^-1 e."""
-    return wp.dot(e, inverse6(P) * e)
+def distance_squared(a: Estimate, b: Estimate):
+    """Return the squared distance of two independent estimates, in standard deviations."""
+    e = left_error(a.pose, b.pose)
+    return wp.dot(e, inverse6(a.P + b.P) * e)

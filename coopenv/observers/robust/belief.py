@@ -1,7 +1,8 @@
 """The joint belief of one vehicle: its own pose and those of vehicles that it hears, with one covariance.
 
 Errors are left errors, R = Rhat Exp(theta), p = phat + Rhat rho, six per member, the vehicle itself first; the
-covariance is kept in blocks of 6x6. A member stands where its last message put it.
+covariance is kept in blocks of 6x6. A member stands where its last message put it. Where there is no room for another
+one, the member that has been out of view for longest has to leave.
 """
 
 from __future__ import annotations
@@ -10,10 +11,13 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.so3 import exp_so3, orthonormalise
-from coopenv.observers.robust.algebra import inverse6, transition, with_noise
-from coopenv.observers.robust.memory import Member
-from coopenv.observers.robust.types import first_half, mat66d, second_half
+from coopenv.estimation.linalg import symmetric_part
+from coopenv.observers.robust.algebra import displaced, inverse6, moved, transition, with_noise
+from coopenv.observers.robust.constants import FORGET_TIME, SAME_TIME
+from coopenv.observers.robust.memory import Estimate, Member, Pose, mat66d
+from coopenv.world.camera import VISIBLE
+
+MAX_UNSEEN_TIME = FORGET_TIME + SAME_TIME
 
 
 @wp.func
@@ -26,26 +30,37 @@ def index_of(memory: Any, world: int, i: int, vehicle: int) -> int:
 
 
 @wp.func
-def propagate(memory: Any, world: int, i: int, n: int, dR: Any, dp: Any, rotation: Any, translation: Any):
-    """Carry a member through an odometry increment with noise variances per axis."""
-    R = memory.member[world, i, n].R
-    memory.member[world, i, n].p = memory.member[world, i, n].p + R * dp
-    memory.member[world, i, n].R = orthonormalise(R * dR)
-    F = transition(dR, dp)
+def begin_belief(memory: Any, world: int, i: int, estimate: Estimate):
+    """Believe in the vehicle itself alone."""
+    memory.belief[world, i].members = 1
+    memory.member[world, i, 0].vehicle = i
+    memory.member[world, i, 0].pose = estimate.pose
+    memory.P[world, i, 0, 0] = estimate.P
+
+
+@wp.func
+def own_estimate(memory: Any, world: int, i: int):
+    """Return what is believed of the vehicle itself."""
+    return Estimate(memory.member[world, i, 0].pose, memory.P[world, i, 0, 0])
+
+
+@wp.func
+def propagate(memory: Any, world: int, i: int, n: int, step: Pose, noise: Any):
+    """Carry a member through an increment of odometry with noise."""
+    memory.member[world, i, n].pose = moved(memory.member[world, i, n].pose, step)
+    F = transition(step)
     for k in range(memory.belief[world, i].members):
         if k != n:
             block = F * memory.P[world, i, n, k]
             memory.P[world, i, n, k] = block
             memory.P[world, i, k, n] = wp.transpose(block)
-    memory.P[world, i, n, n] = with_noise(F * memory.P[world, i, n, n] * wp.transpose(F), rotation, translation)
+    memory.P[world, i, n, n] = with_noise(F * memory.P[world, i, n, n] * wp.transpose(F), noise)
 
 
 @wp.func
 def apply_error(memory: Any, world: int, i: int, n: int, error: Any):
     """Move a member's pose by an error."""
-    R = memory.member[world, i, n].R
-    memory.member[world, i, n].p = memory.member[world, i, n].p + R * second_half(error)
-    memory.member[world, i, n].R = R * exp_so3(first_half(error))
+    memory.member[world, i, n].pose = displaced(memory.member[world, i, n].pose, error)
 
 
 @wp.func
@@ -53,7 +68,7 @@ def subtract_block(memory: Any, world: int, i: int, k: int, j: int, block: Any):
     """Subtract a block from the covariance at (k, j), and its transpose at (j, k)."""
     left = memory.P[world, i, k, j] - block
     if k == j:
-        left = (left + wp.transpose(left)) * wp.float64(0.5)
+        left = symmetric_part(left)
     memory.P[world, i, k, j] = left
     memory.P[world, i, j, k] = wp.transpose(left)
 
@@ -65,12 +80,8 @@ def fuse_information(memory: Any, world: int, i: int, n: int, information: Any, 
     P' = P - P_n M P_n^T with M = information (I + P_nn information)^-1, P_n being the member's columns.
     """
     members = memory.belief[world, i].members
-    product = memory.P[world, i, n, n] * information
-    for k in range(6):
-        product[k, k] = product[k, k] + wp.float64(1.0)
-    W = inverse6(product)
-    M = information * W
-    M = (M + wp.transpose(M)) * wp.float64(0.5)
+    W = inverse6(memory.P[world, i, n, n] * information + wp.identity(6, wp.float64))
+    M = symmetric_part(information * W)
     along = wp.transpose(W) * vector
     for k in range(members):
         memory.scratch[world, k].column = memory.P[world, i, k, n]
@@ -82,7 +93,7 @@ def fuse_information(memory: Any, world: int, i: int, n: int, information: Any, 
 
 
 @wp.func
-def append_member(memory: Any, world: int, i: int, vehicle: int, R: Any, p: Any, P: Any):
+def append_member(memory: Any, world: int, i: int, vehicle: int, pose: Pose, P: Any):
     """Add a member whose error is independent of those of the others; there must be room. Nothing else is set."""
     n = memory.belief[world, i].members
     for k in range(n):
@@ -91,8 +102,7 @@ def append_member(memory: Any, world: int, i: int, vehicle: int, R: Any, p: Any,
     memory.P[world, i, n, n] = P
     member = Member()
     member.vehicle = vehicle
-    member.R = R
-    member.p = p
+    member.pose = pose
     memory.member[world, i, n] = member
     memory.belief[world, i].members = n + 1
 
@@ -112,10 +122,39 @@ def remove_member(memory: Any, world: int, i: int, n: int):
 
 
 @wp.func
-def begin_belief(memory: Any, world: int, i: int, R: Any, p: Any, P: Any):
-    """Believe in the vehicle itself alone."""
-    memory.belief[world, i].members = 1
-    memory.member[world, i, 0].vehicle = i
-    memory.member[world, i, 0].R = R
-    memory.member[world, i, 0].p = p
-    memory.P[world, i, 0, 0] = P
+def mark_seen(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
+    """Note which members are in view."""
+    for n in range(model.target_count[i]):
+        target = model.targets[i, n]
+        if target >= model.landmarks and state.sight[world, i, target] == VISIBLE:
+            member = index_of(memory, world, i, target - model.landmarks)
+            if member > 0:
+                memory.member[world, i, member].seen_tick = tick
+
+
+@wp.func
+def is_unseen(model: Any, memory: Any, world: int, i: int, n: int, tick: int):
+    """Return whether a member has been out of view for so long that it may be evicted."""
+    return wp.float64(tick - memory.member[world, i, n].seen_tick) * model.camera_period > wp.float64(MAX_UNSEEN_TIME)
+
+
+@wp.func
+def longest_unseen(model: Any, memory: Any, world: int, i: int, tick: int) -> int:
+    """Return the member that has been out of view for longest, 0 if all have been in view lately."""
+    found = int(0)
+    for n in range(1, memory.belief[world, i].members):
+        if is_unseen(model, memory, world, i, n, tick):
+            if found == 0 or memory.member[world, i, n].seen_tick < memory.member[world, i, found].seen_tick:
+                found = n
+    return found
+
+
+@wp.func
+def make_room(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
+    """Return whether there is room for one more, after an eviction if there has to be one and may be one."""
+    if memory.belief[world, i].members < memory.member.shape[2]:
+        return True
+    n = longest_unseen(model, memory, world, i, tick)
+    if n > 0:
+        remove_member(memory, world, i, n)
+    return n > 0

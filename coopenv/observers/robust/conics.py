@@ -1,4 +1,4 @@
-"""Where two cones meet: the planes of their pencil, and the directions in them. See observers/perspective.py."""
+"""Where two cones meet: the planes of their pencil, and the directions in them, see p3p.py."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.observers.robust.types import vec2d, vec3d
+from coopenv.observers.robust.memory import vec2d, vec3d
 
 THIRD_TURN = 2.0943951023931953
 THIRD = 1.0 / 3.0

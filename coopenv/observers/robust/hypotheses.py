@@ -10,16 +10,8 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.observers.robust.algebra import distance_squared, left_error
+from coopenv.observers.robust.algebra import distance_squared
 from coopenv.observers.robust.constants import MAX_BEST_COST, PRUNE_GAP, SAME_HYPOTHESIS
-
-
-@wp.func
-def store_hypothesis(memory: Any, world: int, i: int, h: int):
-    """Make what is believed a hypothesis."""
-    memory.hypothesis[world, i, h].R = memory.member[world, i, 0].R
-    memory.hypothesis[world, i, h].p = memory.member[world, i, 0].p
-    memory.hypothesis[world, i, h].P = memory.P[world, i, 0, 0]
 
 
 @wp.func
@@ -43,50 +35,39 @@ def best_hypothesis(memory: Any, world: int, i: int) -> int:
 
 
 @wp.func
-def are_same(memory: Any, world: int, i: int, h: int, g: int):
-    """Return whether two hypotheses cannot be told apart."""
-    P = memory.hypothesis[world, i, h].P + memory.hypothesis[world, i, g].P
-    R = memory.hypothesis[world, i, h].R
-    p = memory.hypothesis[world, i, h].p
-    e = left_error(R, p, memory.hypothesis[world, i, g].R, memory.hypothesis[world, i, g].p)
-    return distance_squared(e, P) < wp.float64(SAME_HYPOTHESIS)
-
-
-@wp.func
 def is_new(memory: Any, world: int, i: int, h: int, count: int) -> bool:
     """Return whether a hypothesis can be told apart from each of the first `count`."""
     for g in range(count):
-        if are_same(memory, world, i, h, g):
+        distance = distance_squared(memory.hypothesis[world, i, h].estimate, memory.hypothesis[world, i, g].estimate)
+        if distance < wp.float64(SAME_HYPOTHESIS):
             return False
     return True
 
 
 @wp.func
 def sort_hypotheses(memory: Any, world: int, i: int):
-    """Put those that cost least first; the last element serves to swap by."""
+    """Put those that cost least first."""
     count = memory.search[world, i].hypotheses
-    spare = memory.hypothesis.shape[2] - 1
     for h in range(count):
         for g in range(h + 1, count):
             if costs_less(memory, world, i, g, h):
-                memory.hypothesis[world, i, spare] = memory.hypothesis[world, i, h]
+                other = memory.hypothesis[world, i, h]
                 memory.hypothesis[world, i, h] = memory.hypothesis[world, i, g]
-                memory.hypothesis[world, i, g] = memory.hypothesis[world, i, spare]
+                memory.hypothesis[world, i, g] = other
 
 
 @wp.func
 def prune(memory: Any, world: int, i: int):
     """Give up what costs much more than the best, what is the same as a better one, and all if the best is not good."""
-    count = memory.search[world, i].hypotheses
     sort_hypotheses(memory, world, i)
     least = memory.hypothesis[world, i, 0].cost
+    expected = wp.float64(2.0) * wp.float64(memory.hypothesis[world, i, 0].bearings)
     kept = int(0)
-    for h in range(count):
+    for h in range(memory.search[world, i].hypotheses):
         near = memory.hypothesis[world, i, h].cost <= least + wp.float64(PRUNE_GAP)
         if near and is_new(memory, world, i, h, kept):
             memory.hypothesis[world, i, kept] = memory.hypothesis[world, i, h]
             kept += 1
-    expected = wp.float64(2.0) * wp.float64(memory.hypothesis[world, i, 0].bearings)
     if least > wp.float64(MAX_BEST_COST) + wp.float64(2.0) * expected:
         kept = 0
     memory.search[world, i].hypotheses = kept

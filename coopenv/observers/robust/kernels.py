@@ -1,8 +1,11 @@
-"""The observer as the world is handed it."""
+"""The observer as the world is handed it, and as a plug-in."""
 
 from __future__ import annotations
 
 from coopenv.estimation.coordinates import Coordinates
+from coopenv.observers.contract import Observer, Setup
+from coopenv.observers.kernel_observer import KernelObserver
+from coopenv.observers.planar.plugin import PlanarRobust
 from coopenv.observers.robust.memory import SIZES, RobustMemory
 from coopenv.observers.robust.messages import MESSAGES
 from coopenv.observers.robust.observer import make_estimate, make_start
@@ -25,3 +28,11 @@ ROBUST = Embedded(
     coordinates=Coordinates.LEFT,
     options=OPTIONS,
 )
+
+
+def robust(setup: Setup) -> Observer:
+    """This project's observer: several hypotheses, gates.
+
+    Where a vehicle moves on a plane and its odometry is its commands, it is a planar one.
+    """
+    return PlanarRobust(setup) if setup.planar else KernelObserver(ROBUST, setup)

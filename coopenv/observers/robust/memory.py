@@ -4,16 +4,26 @@ Covariances are of left errors (theta, rho), rad and m; positions are in the map
 any precision, because what a neighbour has learnt is a small difference of large inverses.
 """
 
+from typing import Any
+
 import warp as wp
 
 from coopenv.observers.robust.constants import MAX_HYPOTHESES, MAX_MEMBERS
-from coopenv.observers.robust.types import mat26d, mat33d, mat62d, mat66d, mat66f, vec2d, vec3d, vec6d
 from coopenv.world.records import array
+
+vec2d: Any = wp.vec2d
+vec3d: Any = wp.vec3d
+mat33d: Any = wp.mat33d
+vec6d: Any = wp.types.vector(6, wp.float64)
+mat26d: Any = wp.types.matrix((2, 6), wp.float64)
+mat62d: Any = wp.types.matrix((6, 2), wp.float64)
+mat66d: Any = wp.types.matrix((6, 6), wp.float64)
+mat66f: Any = wp.types.matrix((6, 6), wp.float32)
 
 
 @wp.struct
 class Pose:
-    """Body to map."""
+    """Body to map; or an increment of odometry, from its end to its start."""
 
     R: mat33d
     p: vec3d
@@ -23,8 +33,7 @@ class Pose:
 class Estimate:
     """A pose and its covariance."""
 
-    R: mat33d
-    p: vec3d
+    pose: Pose
     P: mat66d
 
 
@@ -34,8 +43,7 @@ class Report:
 
     tick: wp.int32  # when it was sent; -1: never
     valid: wp.int32  # 0: empty, the sender does not know where it is
-    R: mat33d
-    p: vec3d  # of the marker
+    pose: Pose  # of the marker
     P: mat66f  # at the marker
     odometry: Pose  # of the marker, by dead reckoning from the start, in a frame of its own
     depends_on: wp.uint64  # bits of the vehicles whose messages are in it
@@ -46,8 +54,7 @@ class Member:
     """One vehicle in a belief."""
 
     vehicle: wp.int32
-    R: mat33d
-    p: vec3d
+    pose: Pose
     has_twist: wp.int32
     v: vec3d  # m/s, body
     w: vec3d  # rad/s, body
@@ -72,9 +79,7 @@ class Belief:
 class Anchor:
     """Where a vehicle was when its bearings last fitted, or at the start."""
 
-    R: mat33d
-    p: vec3d
-    P: mat66d
+    estimate: Estimate
     odometry: Pose  # then
     tick: wp.int32
 
@@ -96,9 +101,7 @@ class Search:
 class Hypothesis:
     """A pose that may be the vehicle's."""
 
-    R: mat33d
-    p: vec3d
-    P: mat66d
+    estimate: Estimate
     cost: wp.float64  # sum of normalised innovations squared, each limited
     prior_distance: wp.float64  # squared, in standard deviations
     bearings: wp.int32  # in the cost
@@ -128,8 +131,7 @@ class Scratch:
     PHt: mat62d
     correction: vec6d
     last_correction: vec6d  # where the lines were linearised
-    R: mat33d  # before the correction
-    p: vec3d
+    pose: Pose  # before the correction
 
 
 @wp.struct
@@ -149,5 +151,5 @@ class RobustMemory:
     scratch_blocks: array("WKK", mat66d)  # before the correction
 
 
-SIZES = {"K": MAX_MEMBERS, "H": MAX_HYPOTHESES + 2}
-"""Besides the hypotheses of one frame there are the prior and a spare one to swap by."""
+SIZES = {"K": MAX_MEMBERS, "H": MAX_HYPOTHESES + 1}
+"""Besides the hypotheses of one frame there is the prior."""

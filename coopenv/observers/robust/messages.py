@@ -8,6 +8,7 @@ import numpy as np
 from scipy.linalg.lapack import dpotrf
 
 from coopenv.errors import CoopenvError
+from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import exp_so3, log_so3
 from coopenv.observers.checks import check_estimate
 from coopenv.observers.contract import Estimate, Message
@@ -21,13 +22,18 @@ def write(observer: Any) -> Message:
     report = observer.memory.outbox[0]
     if not report["valid"]:
         return Message()
-    R, p = report["odometry"]["R"], report["odometry"]["p"]
-    return Message(
-        position=report["p"].copy(),
-        rotation=report["R"].copy(),
-        covariance=report["P"].copy(),
-        extra={"odometry": np.concatenate([log_so3(R), p]), "depends_on": np.array([report["depends_on"]])},
-    )
+    extra = {"odometry": six_of(report["odometry"]), "depends_on": np.array([report["depends_on"]])}
+    return Message(report["pose"]["p"].copy(), report["pose"]["R"].copy(), report["P"].copy(), extra)
+
+
+def six_of(pose: Any) -> Array:
+    """Return a pose as rotation vector and position (6,)."""
+    return np.concatenate([log_so3(pose["R"]), pose["p"]])
+
+
+def from_six(values: Array) -> tuple[Array, Array]:
+    """Return the rotation and position of a pose (6,)."""
+    return exp_so3(values[:3]), values[3:]
 
 
 def read(observer: Any, sender: int, message: Message, sent: int) -> None:
@@ -47,9 +53,8 @@ def read(observer: Any, sender: int, message: Message, sent: int) -> None:
         raise CoopenvError("message: odometry")
     if depends_on.shape != (1,) or depends_on.dtype != np.uint64:
         raise CoopenvError("message: depends_on")
-    report["R"], report["p"], report["P"] = message.rotation, message.position, message.covariance
-    report["odometry"]["R"], report["odometry"]["p"] = exp_so3(odometry[:3]), odometry[3:]
-    report["depends_on"], report["valid"] = depends_on[0], 1
+    report["pose"], report["P"] = (message.rotation, message.position), message.covariance
+    report["odometry"], report["depends_on"], report["valid"] = from_six(odometry), depends_on[0], 1
 
 
 def check_pose(message: Message) -> None:

@@ -12,16 +12,27 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.so3 import identity3, orthonormalise, skew
-from coopenv.observers.robust.algebra import is_known, odometry_variances
-from coopenv.observers.robust.belief import begin_belief, propagate
+from coopenv.estimation.linalg import symmetric_part
+from coopenv.estimation.so3 import orthonormalise, skew
+from coopenv.observers.robust.algebra import is_known, lower_blocks, moved, odometry_noise
+from coopenv.observers.robust.belief import begin_belief, own_estimate, propagate
 from coopenv.observers.robust.hypotheses import best_hypothesis
-from coopenv.observers.robust.memory import Belief, Hypothesis, Line, Member, Scratch, Search
-from coopenv.observers.robust.resection import resect
+from coopenv.observers.robust.memory import (
+    Belief,
+    Estimate,
+    Hypothesis,
+    Line,
+    Member,
+    Pose,
+    Scratch,
+    Search,
+    mat33d,
+    mat66d,
+    vec3d,
+)
 from coopenv.observers.robust.search import advance_search, begin_search, confirms_prior, propagate_search
 from coopenv.observers.robust.tracklets import possible_dependencies
-from coopenv.observers.robust.types import lower_blocks, mat66d, wide_matrix, wide_vector
-from coopenv.observers.robust.update import set_anchor, update
+from coopenv.observers.robust.update import resect, set_anchor, update
 
 
 @wp.func
@@ -45,64 +56,42 @@ def clear(model: Any, memory: Any, world: int, i: int):
 @wp.func
 def start_belief(model: Any, state: Any, memory: Any, world: int, i: int):
     """Start at the initial estimate; one that is too uncertain to linearise about is only a prior for the search."""
-    R = orthonormalise(wide_matrix(state.estimate_rotation[world, i]))
-    p = R * wide_vector(state.estimate_position[world, i])
-    P = model.start.covariance[i]
-    begin_belief(memory, world, i, R, p, P)
+    R = orthonormalise(mat33d(state.estimate_rotation[world, i]))
+    start = Estimate(Pose(R, R * vec3d(state.estimate_position[world, i])), model.start.covariance[i])
+    restart_belief(model, memory, world, i, start)
     memory.belief[world, i].odometry.R = wp.identity(3, wp.float64)
-    memory.belief[world, i].depends_on = possible_dependencies(model, i)
-    set_anchor(memory, world, i, P, 0)
-    if not is_known(P):
-        begin_search(memory, world, i, R, p, P)
+    set_anchor(memory, world, i, start.P, 0)
+    if not is_known(start.P):
+        begin_search(memory, world, i, start)
 
 
 @wp.func
-def restart_belief(model: Any, memory: Any, world: int, i: int, R: Any, p: Any, P: Any):
+def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: Estimate):
     """Believe in a pose alone."""
-    begin_belief(memory, world, i, R, p, P)
+    begin_belief(memory, world, i, estimate)
     memory.belief[world, i].depends_on = possible_dependencies(model, i)
     memory.belief[world, i].missed_share = wp.float64(0.0)
 
 
 @wp.func
-def write_pose(state: Any, world: int, i: int, R: Any, p: Any, P: Any):
-    """Write an estimate as the state holds it: position in the body, covariance over (2 lambda, p) to first order."""
-    position = wp.transpose(R) * p
-    one = identity3(position)
-    J = lower_blocks(one, skew(position), one)
-    Q = J * P * wp.transpose(J)
-    rotation = state.estimate_rotation[world, i]
-    covariance = state.covariance[world, i]
-    for k in range(3):
-        for j in range(3):
-            rotation[k, j] = rotation.dtype(R[k, j])
-    for k in range(6):
-        for j in range(6):
-            covariance[k, j] = covariance.dtype((Q[k, j] + Q[j, k]) * wp.float64(0.5))
-    old = state.estimate_position[world, i]
-    state.estimate_rotation[world, i] = rotation
-    state.estimate_position[world, i] = type(old)(
-        old.dtype(position[0]), old.dtype(position[1]), old.dtype(position[2])
-    )
-    state.covariance[world, i] = covariance
-
-
-@wp.func
 def write(state: Any, memory: Any, world: int, i: int):
-    """Write the pose believed, while it is searched for that of the best hypothesis."""
-    if memory.search[world, i].active == 0:
-        p = memory.member[world, i, 0].p
-        write_pose(state, world, i, memory.member[world, i, 0].R, p, memory.P[world, i, 0, 0])
-        return
-    R = memory.search[world, i].prior.R
-    p = memory.search[world, i].prior.p
-    P = memory.search[world, i].prior.P
-    h = best_hypothesis(memory, world, i)
-    if h >= 0:
-        R = memory.hypothesis[world, i, h].R
-        p = memory.hypothesis[world, i, h].p
-        P = memory.hypothesis[world, i, h].P
-    write_pose(state, world, i, R, p, P)
+    """Write the pose believed, while it is searched for that of the best hypothesis, as the state holds it.
+
+    There positions are in the body, and covariances over (2 lambda, p), to first order.
+    """
+    estimate = own_estimate(memory, world, i)
+    if memory.search[world, i].active == 1:
+        estimate = memory.search[world, i].prior
+        h = best_hypothesis(memory, world, i)
+        if h >= 0:
+            estimate = memory.hypothesis[world, i, h].estimate
+    position = wp.transpose(estimate.pose.R) * estimate.pose.p
+    one = wp.identity(3, wp.float64)
+    J = lower_blocks(one, skew(position), one)
+    P = symmetric_part(J * estimate.P * wp.transpose(J))
+    state.estimate_rotation[world, i] = type(state.estimate_rotation[world, i])(estimate.pose.R)
+    state.estimate_position[world, i] = type(state.estimate_position[world, i])(position)
+    state.covariance[world, i] = type(state.covariance[world, i])(P)
 
 
 def make_start(clear_messages: Any, receive: Any) -> Any:
@@ -138,14 +127,10 @@ def make_estimate(receive: Any, fuse_messages: Any) -> Any:
         if not advance_search(model, state, memory, world, i, now):
             return
         confirmed = confirms_prior(memory, world, i)
-        R = memory.search[world, i].prior.R
-        p = memory.search[world, i].prior.p
-        P = memory.search[world, i].prior.P
-        if not confirmed:
-            R = memory.hypothesis[world, i, 0].R
-            p = memory.hypothesis[world, i, 0].p
-            P = memory.hypothesis[world, i, 0].P
-        restart_belief(model, memory, world, i, R, p, P)
+        found = memory.hypothesis[world, i, 0].estimate
+        if confirmed:
+            found = memory.search[world, i].prior
+        restart_belief(model, memory, world, i, found)
         fuse_messages(model, state, memory, world, i, now.tick)
         if confirmed:
             memory.search[world, i].active = 0
@@ -159,18 +144,16 @@ def make_estimate(receive: Any, fuse_messages: Any) -> Any:
         state.nis[world, i] = wp.float64(0.0)
         state.nis_dof[world, i] = 0
         receive(model, state, memory, world, i)
-        dR = orthonormalise(wide_matrix(state.increment_rotation[world, i]))
-        dp = wide_vector(state.increment_translation[world, i])
-        R = memory.belief[world, i].odometry.R
-        memory.belief[world, i].odometry.R = orthonormalise(R * dR)
-        memory.belief[world, i].odometry.p = memory.belief[world, i].odometry.p + R * dp
-        rotation, translation = odometry_variances(model, now.period)
+        R = orthonormalise(mat33d(state.increment_rotation[world, i]))
+        step = Pose(R, vec3d(state.increment_translation[world, i]))
+        memory.belief[world, i].odometry = moved(memory.belief[world, i].odometry, step)
+        noise = odometry_noise(model, now.period)
         if memory.search[world, i].active == 1:
-            propagate_search(memory, world, i, dR, dp, rotation, translation)
+            propagate_search(memory, world, i, step, noise)
             if now.due:
                 search(model, state, memory, world, i, now)
         else:
-            propagate(memory, world, i, 0, dR, dp, rotation, translation)
+            propagate(memory, world, i, 0, step, noise)
             fuse_messages(model, state, memory, world, i, now.tick)
             if now.due:
                 update(model, state, memory, world, i, now)

@@ -1,28 +1,43 @@
-"""The distances to three points from their bearings (P3P). See observers/perspective.py, which this follows.
+"""The pose from three bearings to known points (P3P): every solution, in closed form.
 
-The cubic is solved in closed form and its singular member's eigenvectors are found from its null space; Newton steps
-on the squared sides bring the solutions to rounding.
+Source: Persson and Nordberg, Lambda Twist: An accurate fast robust perspective three point (P3P) solver, ECCV 2018. The
+distances l (3,) to the points satisfy l^T M_ij l = a_ij, where a_ij = |z_i - z_j|^2 and M_ij holds the cosine between
+the bearings. Two combinations without right hand side are cones; one of their pencil is a pair of planes (a root of a
+cubic), and in each plane the other cone leaves a quadratic. Newton steps on the squared sides bring the solutions to
+rounding.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
-from coopenv.estimation.p3p import FLAT, NEWTON_STEPS, TOLERANCE
+from coopenv.estimation.arrays import Array
 from coopenv.observers.robust.conics import directions_in, null_vector, plane_slopes, singular_member, unit_matrix
-from coopenv.observers.robust.types import mat33d, mat43d, vec3d
+from coopenv.observers.robust.memory import mat33d, vec3d
+from coopenv.world import kernel_cache
+from coopenv.world.launch import kernel, start_warp
 
-FLAT_TRIANGLE = FLAT
-STEPS = NEWTON_STEPS
-MOST_MISFIT = TOLERANCE
+mat43d: Any = wp.types.matrix((4, 3), wp.float64)
+
+NEWTON_STEPS = 3
+TOLERANCE = 1e-8
+"""What a solution may miss of the squared sides, relative to the longest."""
+FLAT = 1e-9
+"""Twice a triangle's area over its longest squared side: below it the points are on a line."""
+THIRD = 1.0 / 3.0
 EIGHTH_TURN = 0.7853981633974483
 
 
 @wp.func
 def misfit(d: Any, gaps: Any, a: Any):
-    """Return the squared sides that distances make, less those of the triangle: pairs (0, 1), (0, 2), (1, 2)."""
+    """Return the squared sides that distances make, less those of the triangle: pairs (0, 1), (0, 2), (1, 2).
+
+    With gaps |b_i - b_j|^2 for the cosines, small angles keep their digits.
+    """
     return vec3d(
         (d[0] - d[1]) * (d[0] - d[1]) + d[0] * d[1] * gaps[0] - a[0],
         (d[0] - d[2]) * (d[0] - d[2]) + d[0] * d[2] * gaps[1] - a[1],
@@ -36,7 +51,7 @@ def polished(distances: Any, gaps: Any, a: Any):
     two = wp.float64(2.0)
     d = distances
     f = misfit(d, gaps, a)
-    for _ in range(STEPS):
+    for _ in range(NEWTON_STEPS):
         p = two * (d[0] - d[1]) + d[1] * gaps[0]
         q = two * (d[1] - d[0]) + d[0] * gaps[0]
         r = two * (d[0] - d[2]) + d[2] * gaps[1]
@@ -67,23 +82,17 @@ def scaled(direction: Any, plane: Any, null: Any, gaps: Any, perimeter: Any):
 
 
 @wp.func
-def side_form(a: Any, b: Any, c: Any, x: Any, y: Any, z: Any):
-    """Return the symmetric matrix with diagonal (a, b, c) and entries x at (0, 1), y at (0, 2), z at (1, 2)."""
-    return mat33d(a, x, y, x, b, z, y, z, c)
-
-
-@wp.func
 def distances_of(a: Any, gaps: Any):
     """Return four rows of distances, not numbers where there is no solution; a: squared sides, of longest 1."""
-    one = wp.float64(1.0)
+    i = wp.float64(1.0)
     o = wp.float64(0.0)
     half = wp.float64(0.5)
-    x = half * gaps[0] - one
-    y = half * gaps[1] - one
-    z = half * gaps[2] - one
-    M01 = side_form(one, one, o, x, o, o)
-    M02 = side_form(one, o, one, o, y, o)
-    M12 = side_form(o, one, one, o, o, z)
+    x = half * gaps[0] - i
+    y = half * gaps[1] - i
+    z = half * gaps[2] - i
+    M01 = mat33d(i, x, o, x, i, o, o, o, o)
+    M02 = mat33d(i, o, y, o, o, o, y, o, i)
+    M12 = mat33d(o, o, o, o, i, z, o, z, i)
     D1 = unit_matrix(a[2] * M01 - a[0] * M12)
     D2 = unit_matrix(a[2] * M02 - a[1] * M12)
     best = o
@@ -115,6 +124,47 @@ def distances_of(a: Any, gaps: Any):
 
 
 @wp.func
+def solves(d: Any, gaps: Any, a: Any):
+    """Return whether distances solve the problem."""
+    missed = wp.max(wp.abs(misfit(d, gaps, a)))
+    o = wp.float64(0.0)
+    return d[0] > o and d[1] > o and d[2] > o and missed < wp.float64(TOLERANCE)
+
+
+@wp.func
+def is_sound(b: Any, z: Any, longest: Any):
+    """Return whether three points make a triangle and the bearings are unit vectors."""
+    area = wp.length(wp.cross(z[1] - z[0], z[2] - z[0]))
+    if not (area > wp.float64(FLAT) * longest and wp.isfinite(longest)):
+        return False
+    lengths = vec3d(wp.dot(b[0], b[0]), wp.dot(b[1], b[1]), wp.dot(b[2], b[2]))
+    return wp.max(wp.abs(lengths - vec3d(wp.float64(1.0)))) < wp.float64(1.0e-3)
+
+
+@wp.func
+def solve_triangle(b: Any, z: Any):
+    """Return how many solutions there are for bearings and points, rows, and the distances, the nearest first."""
+    sides = vec3d(wp.length_sq(z[0] - z[1]), wp.length_sq(z[0] - z[2]), wp.length_sq(z[1] - z[2]))
+    longest = wp.max(sides)
+    count = int(0)
+    result = mat43d()
+    if is_sound(b, z, longest):
+        a = sides / longest
+        gaps = vec3d(wp.length_sq(b[0] - b[1]), wp.length_sq(b[0] - b[2]), wp.length_sq(b[1] - b[2]))
+        rows = distances_of(a, gaps)
+        for n in range(4):
+            d = polished(rows[n], gaps, a)
+            if solves(d, gaps, a):
+                place = count
+                while place > 0 and d[0] < result[wp.max(place - 1, 0), 0]:
+                    result[place] = result[place - 1]
+                    place -= 1
+                result[place] = d
+                count += 1
+    return count, result * wp.sqrt(longest)
+
+
+@wp.func
 def axes_of(a: Any, b: Any, c: Any):
     """Return the right-handed axes, as columns, of a triangle."""
     x = wp.normalize(b - a)
@@ -123,38 +173,50 @@ def axes_of(a: Any, b: Any, c: Any):
 
 
 @wp.func
-def is_sound(b0: Any, b1: Any, b2: Any, z0: Any, z1: Any, z2: Any, longest: Any):
-    """Return whether three points make a triangle and the bearings are unit vectors."""
-    area = wp.length(wp.cross(z1 - z0, z2 - z0))
-    if not (area > wp.float64(FLAT_TRIANGLE) * longest and wp.isfinite(longest)):
-        return False
-    worst = wp.max(wp.abs(wp.dot(b0, b0) - wp.float64(1.0)), wp.abs(wp.dot(b1, b1) - wp.float64(1.0)))
-    worst = wp.max(worst, wp.abs(wp.dot(b2, b2) - wp.float64(1.0)))
-    return worst < wp.float64(1.0e-3)
+def camera_pose(b: Any, z: Any, distances: Any):
+    """Return the rotation and position of a camera from which three points are at these distances."""
+    p0 = distances[0] * b[0]
+    p1 = distances[1] * b[1]
+    p2 = distances[2] * b[2]
+    R = axes_of(z[0], z[1], z[2]) * wp.transpose(axes_of(p0, p1, p2))
+    third = wp.float64(THIRD)
+    return R, (z[0] + z[1] + z[2]) * third - R * ((p0 + p1 + p2) * third)
 
 
-@wp.func
-def solves(d: Any, gaps: Any, a: Any):
-    """Return whether distances solve the problem."""
-    f = misfit(d, gaps, a)
-    missed = wp.max(wp.max(wp.abs(f[0]), wp.abs(f[1])), wp.abs(f[2]))
-    o = wp.float64(0.0)
-    return d[0] > o and d[1] > o and d[2] > o and missed < wp.float64(MOST_MISFIT)
+def p3p_kernel(
+    bearings: wp.array(dtype=mat33d),
+    positions: wp.array(dtype=mat33d),
+    R: wp.array2d(dtype=mat33d),
+    camera: wp.array2d(dtype=vec3d),
+    mask: wp.array2d(dtype=wp.bool),
+):
+    """Solve one problem per thread."""
+    n = wp.tid()
+    count, distances = solve_triangle(bearings[n], positions[n])
+    for s in range(count):
+        turn, place = camera_pose(bearings[n], positions[n], distances[s])
+        if wp.isfinite(wp.ddot(turn, turn) + wp.dot(place, place)):
+            R[n, s] = turn
+            camera[n, s] = place
+            mask[n, s] = True
 
 
-@wp.func
-def solutions_of(a: Any, gaps: Any):
-    """Return how many solutions there are, and their distances, row by row, nearest to the first point first."""
-    rows = distances_of(a, gaps)
-    result = mat43d()
-    count = int(0)
-    for n in range(4):
-        d = polished(rows[n], gaps, a)
-        if solves(d, gaps, a):
-            member = count
-            while member > 0 and d[0] < result[wp.max(member - 1, 0), 0]:
-                result[member] = result[member - 1]
-                member -= 1
-            result[member] = d
-            count += 1
-    return count, result
+def solve_p3p(bearings: Array, positions: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Return every pose from which three points are seen in three directions, for each of B triples.
+
+    Args:
+        bearings: (B, 3, 3) unit vectors from the camera to the points, body frame, one a row.
+        positions: (B, 3, 3) the points, map frame, m, one a row.
+
+    Returns:
+        Rotations (B, 4, 3, 3) from body to map, camera positions (B, 4, 3) in the map frame, and a mask (B, 4) of what
+        is a solution, ordered by distance from the first point; the rest is NaN. A double one may come twice. None for
+        degenerate input: points on a line, bearings not of length 1, values that are not finite.
+    """
+    start_warp()
+    b, z = (np.ascontiguousarray(given, dtype=np.float64) for given in (bearings, positions))
+    R, camera, mask = np.full((len(b), 4, 3, 3), np.nan), np.full((len(b), 4, 3), np.nan), np.zeros((len(b), 4), bool)
+    typed = ((b, mat33d), (z, mat33d), (R, mat33d), (camera, vec3d), (mask, wp.bool))
+    views = [wp.array(array, dtype=dtype, device="cpu", copy=False) for array, dtype in typed]
+    kernel_cache.launch(kernel(p3p_kernel, "float64"), dim=len(b), inputs=views, device="cpu")
+    return R, camera, mask

@@ -10,9 +10,8 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.so3 import orthonormalise
-from coopenv.observers.robust.algebra import distance_squared, is_known, left_error, transition, with_noise
-from coopenv.observers.robust.belief import begin_belief
+from coopenv.observers.robust.algebra import carried, distance_squared, is_known
+from coopenv.observers.robust.belief import begin_belief, own_estimate
 from coopenv.observers.robust.constants import (
     BEARING_GATE,
     CLEAR_TIME,
@@ -23,74 +22,52 @@ from coopenv.observers.robust.constants import (
     PATIENCE,
     SAME_PRIOR,
 )
-from coopenv.observers.robust.hypotheses import prune, sort_hypotheses, store_hypothesis
-from coopenv.observers.robust.measurements import (
-    NOTHING,
-    fitting_lines,
-    iterated_update,
-    linearise,
-    normalised_innovation,
-)
-from coopenv.observers.robust.memory import Estimate, Search
-from coopenv.observers.robust.sightings import next_triple, set_lines_to_known
-from coopenv.observers.robust.solutions import solve_triple
+from coopenv.observers.robust.correction import iterated_update
+from coopenv.observers.robust.hypotheses import prune, sort_hypotheses
+from coopenv.observers.robust.measurements import NOTHING, innovation_squared, set_lines
+from coopenv.observers.robust.memory import Estimate, Hypothesis, Pose, Search
+from coopenv.observers.robust.solutions import next_triple, solve_triple
 
 
 @wp.func
-def begin_search(memory: Any, world: int, i: int, R: Any, p: Any, P: Any):
+def begin_search(memory: Any, world: int, i: int, prior: Estimate):
     """Start from a prior, without hypotheses."""
-    search = Search()
-    search.active = 1
-    search.prior = Estimate(R, p, P)
-    memory.search[world, i] = search
+    memory.search[world, i] = Search()
+    memory.search[world, i].active = 1
+    memory.search[world, i].prior = prior
 
 
 @wp.func
-def propagate_search(memory: Any, world: int, i: int, dR: Any, dp: Any, rotation: Any, translation: Any):
+def propagate_search(memory: Any, world: int, i: int, step: Pose, noise: Any):
     """Carry the prior and all hypotheses through a tick's odometry."""
-    F = transition(dR, dp)
-    Ft = wp.transpose(F)
-    R = memory.search[world, i].prior.R
-    memory.search[world, i].prior.p = memory.search[world, i].prior.p + R * dp
-    memory.search[world, i].prior.R = orthonormalise(R * dR)
-    memory.search[world, i].prior.P = with_noise(F * memory.search[world, i].prior.P * Ft, rotation, translation)
+    memory.search[world, i].prior = carried(memory.search[world, i].prior, step, noise)
     for h in range(memory.search[world, i].hypotheses):
-        R = memory.hypothesis[world, i, h].R
-        P = memory.hypothesis[world, i, h].P
-        memory.hypothesis[world, i, h].p = memory.hypothesis[world, i, h].p + R * dp
-        memory.hypothesis[world, i, h].R = orthonormalise(R * dR)
-        memory.hypothesis[world, i, h].P = with_noise(F * P * Ft, rotation, translation)
+        memory.hypothesis[world, i, h].estimate = carried(memory.hypothesis[world, i, h].estimate, step, noise)
 
 
 @wp.func
 def follow_hypothesis(model: Any, memory: Any, world: int, i: int, h: int, used: Any):
     """Add the frame's bearings, but those used already, to the cost of a hypothesis; correct it by those that fit."""
-    R = memory.hypothesis[world, i, h].R
-    begin_belief(memory, world, i, R, memory.hypothesis[world, i, h].p, memory.hypothesis[world, i, h].P)
+    begin_belief(memory, world, i, memory.hypothesis[world, i, h].estimate)
+    fitting = int(0)
     for n in range(model.target_count[i]):
-        fitting = int(0)
+        memory.line[world, n].fits = 0
         if memory.line[world, n].member != NOTHING and n != used[0] and n != used[1] and n != used[2]:
-            cost = wp.float64(MAX_BEARING_COST)
-            if linearise(model, memory, world, i, n):
-                nis = normalised_innovation(memory, world, i, n)
-                cost = wp.min(nis, cost)
-                if nis < wp.float64(BEARING_GATE):
-                    fitting = 1
-            memory.hypothesis[world, i, h].cost = memory.hypothesis[world, i, h].cost + cost
-            memory.hypothesis[world, i, h].bearings = memory.hypothesis[world, i, h].bearings + 1
-        memory.line[world, n].fits = fitting
-    if fitting_lines(memory, world, model.target_count[i]) > 0:
+            nis = innovation_squared(model, memory, world, i, n)
+            if nis < wp.float64(BEARING_GATE):
+                memory.line[world, n].fits = 1
+                fitting += 1
+            memory.hypothesis[world, i, h].cost += wp.min(nis, wp.float64(MAX_BEARING_COST))
+            memory.hypothesis[world, i, h].bearings += 1
+    if fitting > 0:
         iterated_update(model, memory, world, i)
-        store_hypothesis(memory, world, i, h)
+        memory.hypothesis[world, i, h].estimate = own_estimate(memory, world, i)
 
 
 @wp.func
 def distance_from_prior(memory: Any, world: int, i: int, h: int):
     """Return the squared distance of a hypothesis from the prior, in standard deviations."""
-    R = memory.search[world, i].prior.R
-    p = memory.search[world, i].prior.p
-    e = left_error(R, p, memory.hypothesis[world, i, h].R, memory.hypothesis[world, i, h].p)
-    return distance_squared(e, memory.search[world, i].prior.P + memory.hypothesis[world, i, h].P)
+    return distance_squared(memory.search[world, i].prior, memory.hypothesis[world, i, h].estimate)
 
 
 @wp.func
@@ -101,42 +78,27 @@ def confirms_prior(memory: Any, world: int, i: int) -> bool:
 
 
 @wp.func
-def set_prior_cost(memory: Any, world: int, i: int, h: int):
-    """Begin the cost of a new hypothesis with its distance from the prior."""
-    distance = distance_from_prior(memory, world, i, h)
-    memory.hypothesis[world, i, h].cost = wp.min(distance, wp.float64(MAX_PRIOR_COST))
-    memory.hypothesis[world, i, h].prior_distance = distance
-    memory.hypothesis[world, i, h].bearings = 0
-
-
-@wp.func
 def add_prior(model: Any, memory: Any, world: int, i: int):
     """Add the prior as a hypothesis if it is known well enough to be followed."""
-    P = memory.search[world, i].prior.P
-    if not is_known(P):
-        return
-    h = memory.search[world, i].hypotheses
-    begin_belief(memory, world, i, memory.search[world, i].prior.R, memory.search[world, i].prior.p, P)
-    store_hypothesis(memory, world, i, h)
-    memory.search[world, i].hypotheses = h + 1
-    memory.hypothesis[world, i, h].cost = wp.float64(0.0)
-    memory.hypothesis[world, i, h].prior_distance = wp.float64(0.0)
-    memory.hypothesis[world, i, h].bearings = 0
-    follow_hypothesis(model, memory, world, i, h, wp.vec3i(-1, -1, -1))
+    prior = memory.search[world, i].prior
+    if is_known(prior.P):
+        h = memory.search[world, i].hypotheses
+        memory.hypothesis[world, i, h] = Hypothesis()
+        memory.hypothesis[world, i, h].estimate = prior
+        memory.search[world, i].hypotheses = h + 1
+        follow_hypothesis(model, memory, world, i, h, wp.vec3i(-1, -1, -1))
 
 
 @wp.func
 def chosen_triple(model: Any, memory: Any, world: int, i: int, seen: int):
     """Return three well placed bearings, others at every attempt."""
     triples = seen * (seen - 1) * (seen - 2) // 6
-    n0 = int(0)
-    n1 = int(0)
-    n2 = int(0)
+    lines = wp.vec3i(0, 0, 0)
     size = wp.float64(wp.inf)
     number = int(-1)
     for _ in range(memory.search[world, i].attempts % triples + 1):
-        n0, n1, n2, size, number = next_triple(memory, world, model.target_count[i], size, number)
-    return wp.vec3i(n0, n1, n2)
+        lines, size, number = next_triple(memory, world, model.target_count[i], size, number)
+    return lines
 
 
 @wp.func
@@ -161,12 +123,15 @@ def solve_frame(model: Any, memory: Any, world: int, i: int, seen: int, period: 
         following = False
     if following:
         for h in range(memory.search[world, i].hypotheses):
-            set_prior_cost(memory, world, i, h)
+            distance = distance_from_prior(memory, world, i, h)
+            memory.hypothesis[world, i, h].cost = wp.min(distance, wp.float64(MAX_PRIOR_COST))
+            memory.hypothesis[world, i, h].prior_distance = distance
+            memory.hypothesis[world, i, h].bearings = 0
             follow_hypothesis(model, memory, world, i, h, lines)
         add_prior(model, memory, world, i)
         sort_hypotheses(memory, world, i)
         memory.search[world, i].hypotheses = wp.min(memory.search[world, i].hypotheses, MAX_HYPOTHESES)
-        memory.search[world, i].attempts = memory.search[world, i].attempts + 1
+        memory.search[world, i].attempts += 1
         memory.search[world, i].followed_time = wp.float64(0.0)
         clear = wp.float64(0.0)
     memory.search[world, i].waited_time = waited
@@ -176,12 +141,12 @@ def solve_frame(model: Any, memory: Any, world: int, i: int, seen: int, period: 
 @wp.func
 def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> bool:
     """Take a frame's bearings; return whether one hypothesis alone is left after some frames."""
-    seen = set_lines_to_known(model, state, memory, world, i, now.tick)
+    seen = set_lines(model, state, memory, world, i, now.tick, True)
     if memory.search[world, i].hypotheses == 0:
         if seen >= 3:
             solve_frame(model, memory, world, i, seen, now.period)
         return False
-    memory.search[world, i].followed_time = memory.search[world, i].followed_time + now.period
+    memory.search[world, i].followed_time += now.period
     for h in range(memory.search[world, i].hypotheses):
         follow_hypothesis(model, memory, world, i, h, wp.vec3i(-1, -1, -1))
     prune(memory, world, i)

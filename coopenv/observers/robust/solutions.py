@@ -10,13 +10,43 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.observers.robust.algebra import inverse6, is_known, is_regular, with_noise
+from coopenv.estimation.linalg import symmetric_part
+from coopenv.observers.robust.algebra import inverse6, is_known, is_regular
 from coopenv.observers.robust.belief import begin_belief
 from coopenv.observers.robust.constants import CORRELATION_FACTOR, MAX_HYPOTHESES, MIN_INFORMATION_RATIO, PERTURBATION
-from coopenv.observers.robust.hypotheses import is_new, store_hypothesis
-from coopenv.observers.robust.measurements import bearing_variance, linearise, tangent_basis
-from coopenv.observers.robust.p3p import axes_of, is_sound, solutions_of
-from coopenv.observers.robust.types import mat33d, mat66d, vec3d, wide_vector
+from coopenv.observers.robust.hypotheses import is_new
+from coopenv.observers.robust.measurements import NOTHING, bearing_variance, linearise, tangent_basis
+from coopenv.observers.robust.memory import Estimate, Pose, mat33d, mat66d, vec3d
+from coopenv.observers.robust.p3p import camera_pose, solve_triangle
+
+
+@wp.func
+def next_triple(memory: Any, world: int, count: int, size: Any, number: int):
+    """Return (bearings, size, number) of the triple that spans most after the one of this size and number.
+
+    The size is twice the area that three bearings span; a good triple looks in three very different directions.
+    """
+    best = wp.vec3i(-1, -1, -1)
+    best_size = wp.float64(-1.0)
+    best_number = int(0)
+    here = int(0)
+    for n0 in range(count):
+        for n1 in range(n0 + 1, count):
+            for n2 in range(n1 + 1, count):
+                if (
+                    memory.line[world, n0].member != NOTHING
+                    and memory.line[world, n1].member != NOTHING
+                    and memory.line[world, n2].member != NOTHING
+                ):
+                    a = memory.line[world, n0].bearing
+                    area = wp.length(wp.cross(memory.line[world, n1].bearing - a, memory.line[world, n2].bearing - a))
+                    later = area < size or (area == size and here > number)
+                    if later and area > best_size:
+                        best = wp.vec3i(n0, n1, n2)
+                        best_size = area
+                        best_number = here
+                    here += 1
+    return best, best_size, best_number
 
 
 @wp.func
@@ -42,18 +72,18 @@ def covariance_of(model: Any, memory: Any, world: int, i: int, lines: Any, patie
     M = information_of(model, memory, world, i, lines[0])
     M += information_of(model, memory, world, i, lines[1])
     M += information_of(model, memory, world, i, lines[2])
-    P = with_noise(inverse6(M), wp.float64(0.0), wp.float64(0.0))
+    P = symmetric_part(inverse6(M))
     if patient:  # then the information is far from singular, and needs no costly spectrum
         return is_known(P), P
     return angles_within(P, wp.float64(1.0)) and is_regular(M, wp.float64(MIN_INFORMATION_RATIO)), P
 
 
 @wp.func
-def add_hypothesis(memory: Any, world: int, i: int):
-    """Make what is believed a hypothesis, unless there is one like it."""
+def add_hypothesis(memory: Any, world: int, i: int, estimate: Estimate):
+    """Add a hypothesis, unless there is one like it."""
     h = memory.search[world, i].hypotheses
     if h < MAX_HYPOTHESES:
-        store_hypothesis(memory, world, i, h)
+        memory.hypothesis[world, i, h].estimate = estimate
         if is_new(memory, world, i, h, h):
             memory.search[world, i].hypotheses = h + 1
 
@@ -64,36 +94,18 @@ def solve(model: Any, memory: Any, world: int, i: int, lines: Any, b: Any, z: An
 
     They become hypotheses if they are to be followed.
     """
-    a = vec3d(wp.length_sq(z[0] - z[1]), wp.length_sq(z[0] - z[2]), wp.length_sq(z[1] - z[2]))
-    longest = wp.max(wp.max(a[0], a[1]), a[2])
-    if not is_sound(b[0], b[1], b[2], z[0], z[1], z[2], longest):
-        return True
-    gaps = vec3d(wp.length_sq(b[0] - b[1]), wp.length_sq(b[0] - b[2]), wp.length_sq(b[1] - b[2]))
-    count, distances = solutions_of(a / longest, gaps)
-    axes = axes_of(z[0], z[1], z[2])
-    third = wp.float64(1.0) / wp.float64(3.0)
+    count, distances = solve_triangle(b, z)
     for n in range(count):
-        d = distances[n] * wp.sqrt(longest)
-        p0 = d[0] * b[0]
-        p1 = d[1] * b[1]
-        p2 = d[2] * b[2]
-        R = axes * wp.transpose(axes_of(p0, p1, p2))
-        camera = (z[0] + z[1] + z[2]) * third - R * ((p0 + p1 + p2) * third)
+        R, camera = camera_pose(b, z, distances[n])
         if wp.isfinite(wp.ddot(R, R) + wp.dot(camera, camera)):
-            begin_belief(memory, world, i, R, camera - R * wide_vector(model.camera.position), mat66d())
+            pose = Pose(R, camera - R * vec3d(model.camera.position))
+            begin_belief(memory, world, i, Estimate(pose, mat66d()))
             determined, P = covariance_of(model, memory, world, i, lines, patient)
             if patient and not determined:
                 return False
             if following and determined:
-                memory.P[world, i, 0, 0] = P
-                add_hypothesis(memory, world, i)
+                add_hypothesis(memory, world, i, Estimate(pose, P))
     return True
-
-
-@wp.func
-def perturbed_bearing(b: Any, axis: int, step: Any):
-    """Return a bearing moved along an axis across it."""
-    return wp.normalize(b + step * tangent_basis(b)[axis])
 
 
 @wp.func
@@ -111,7 +123,8 @@ def solve_perturbed(
             moved_b = b
             moved_z = z
             if axis < 2:
-                moved_b[n] = perturbed_bearing(b[n], axis, step * wp.sqrt(bearing_variance(model)))
+                across = step * wp.sqrt(bearing_variance(model))
+                moved_b[n] = wp.normalize(b[n] + across * tangent_basis(b[n])[axis])
             else:
                 moved_z[n, axis - 2] = z[n, axis - 2] + step * wp.sqrt(variance)
             if axis < 2 or variance > wp.float64(0.0):

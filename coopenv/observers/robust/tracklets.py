@@ -13,18 +13,20 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.so3 import orthonormalise, skew
+from coopenv.estimation.linalg import symmetric_part
+from coopenv.estimation.so3 import skew
 from coopenv.observers.robust.algebra import (
+    between,
+    carried,
     distance_squared,
     inverse6,
     is_known,
     left_error,
     log_so3,
-    odometry_variances,
-    transition,
-    with_noise,
+    lower_blocks,
+    odometry_noise,
 )
-from coopenv.observers.robust.belief import append_member, fuse_information, index_of, propagate
+from coopenv.observers.robust.belief import append_member, fuse_information, index_of, make_room, mark_seen, propagate
 from coopenv.observers.robust.constants import (
     AGREEMENT_DISTANCE,
     AGREEMENT_TIME,
@@ -34,11 +36,9 @@ from coopenv.observers.robust.constants import (
     MESSAGE_GATE,
     TWIST_AVERAGING_TIME,
 )
-from coopenv.observers.robust.eviction import make_room, mark_seen
-from coopenv.observers.robust.memory import Pose, Report
-from coopenv.observers.robust.types import lower_blocks, mat66d, mat66f, second_half, wide_vector
+from coopenv.observers.robust.measurements import is_heard
+from coopenv.observers.robust.memory import Estimate, Pose, Report, mat66d, mat66f, vec3d
 from coopenv.world.camera import VISIBLE
-from coopenv.world.v2x import fresh
 
 
 @wp.func
@@ -59,23 +59,15 @@ def possible_dependencies(model: Any, i: int) -> wp.uint64:
 
 
 @wp.func
-def narrow(P: Any):
-    """Return a 6x6 matrix in float32, as it is sent."""
-    result = mat66f()
-    for k in range(6):
-        for j in range(6):
-            result[k, j] = wp.float32(P[k, j])
-    return result
+def marker_of(model: Any, i: int):
+    """Return the point of a vehicle that others' cameras measure, in its body, m."""
+    return vec3d(model.scene.marker[model.landmarks + i])
 
 
 @wp.func
-def wide(P: Any):
-    """Return a 6x6 matrix in float64."""
-    result = mat66d()
-    for k in range(6):
-        for j in range(6):
-            result[k, j] = wp.float64(P[k, j])
-    return result
+def point_of(pose: Pose, point: Any):
+    """Return the pose of a point of the body, with the body's axes."""
+    return Pose(pose.R, pose.p + pose.R * point)
 
 
 @wp.func
@@ -91,18 +83,14 @@ def own_report(model: Any, memory: Any, world: int, i: int, tick: int):
     report = Report()
     report.tick = tick
     P = memory.P[world, i, 0, 0]
-    if memory.search[world, i].active == 1 or not is_known(P):
-        return report
-    marker = wide_vector(model.scene.marker[model.landmarks + i])
-    R = memory.member[world, i, 0].R
-    J = marker_jacobian(marker)
-    odometry = memory.belief[world, i].odometry
-    report.valid = 1
-    report.R = R
-    report.p = memory.member[world, i, 0].p + R * marker
-    report.P = narrow(J * P * wp.transpose(J))
-    report.odometry = Pose(odometry.R, odometry.p + odometry.R * marker)
-    report.depends_on = memory.belief[world, i].depends_on
+    if memory.search[world, i].active == 0 and is_known(P):
+        marker = marker_of(model, i)
+        J = marker_jacobian(marker)
+        report.valid = 1
+        report.pose = point_of(memory.member[world, i, 0].pose, marker)
+        report.P = mat66f(J * P * wp.transpose(J))
+        report.odometry = point_of(memory.belief[world, i].odometry, marker)
+        report.depends_on = memory.belief[world, i].depends_on
     return report
 
 
@@ -137,24 +125,22 @@ def receive(model: Any, state: Any, memory: Any, world: int, i: int):
 @wp.func
 def add_member(model: Any, memory: Any, world: int, i: int, sender: int, tick: int):
     """Add a sender that is new to the belief, if there is room."""
-    if not make_room(model, memory, world, i, tick):
-        return
-    n = memory.belief[world, i].members
-    report = memory.inbox[world, i, sender]
-    append_member(memory, world, i, sender, report.R, report.p, wide(report.P))
-    memory.member[world, i, n].report = report
-    memory.member[world, i, n].seen_tick = tick
-    depends_on = report.depends_on | bit_of(sender)
-    memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
+    if make_room(model, memory, world, i, tick):
+        n = memory.belief[world, i].members
+        report = memory.inbox[world, i, sender]
+        append_member(memory, world, i, sender, report.pose, mat66d(report.P))
+        memory.member[world, i, n].report = report
+        memory.member[world, i, n].seen_tick = tick
+        depends_on = report.depends_on | bit_of(sender)
+        memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
 
 
 @wp.func
-def propagate_member(model: Any, memory: Any, world: int, i: int, n: int, dR: Any, dp: Any, dt: Any):
-    """Carry a member on to its new message by its odometry, and average its twist."""
-    rotation, translation = odometry_variances(model, dt)
-    propagate(memory, world, i, n, dR, dp, rotation, translation)
-    v = dp / dt
-    w = log_so3(dR) / dt
+def propagate_member(memory: Any, world: int, i: int, n: int, step: Pose, dt: Any, noise: Any):
+    """Carry a member on to its new message by its odometry over dt, and average its twist."""
+    propagate(memory, world, i, n, step, noise)
+    v = step.p / dt
+    w = log_so3(step.R) / dt
     if memory.member[world, i, n].has_twist == 1:
         share = wp.min(wp.float64(1.0), dt / wp.float64(TWIST_AVERAGING_TIME))
         v = memory.member[world, i, n].v + share * (v - memory.member[world, i, n].v)
@@ -165,19 +151,19 @@ def propagate_member(model: Any, memory: Any, world: int, i: int, n: int, dR: An
 
 
 @wp.func
-def test_sender(memory: Any, world: int, i: int, n: int, R: Any, p: Any, P: Any, dt: Any):
+def test_sender(memory: Any, world: int, i: int, n: int, told: Estimate, dt: Any):
     """Decide whether a sender is trusted, from its new report, dt after the last one, and the belief about it."""
-    e = left_error(memory.member[world, i, n].R, memory.member[world, i, n].p, R, p)
-    agrees = distance_squared(e, memory.P[world, i, n, n] + P) < wp.float64(MESSAGE_GATE)
-    if memory.member[world, i, n].distrusted == 0:
-        memory.member[world, i, n].distrusted = wp.where(agrees, 0, 1)
-        memory.member[world, i, n].agreement_time = wp.float64(0.0)
-        return
+    believed = Estimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
+    agrees = distance_squared(believed, told) < wp.float64(MESSAGE_GATE)
     agreed = wp.float64(0.0)
-    if agrees and wp.length(second_half(e)) < wp.float64(AGREEMENT_DISTANCE):
-        agreed = memory.member[world, i, n].agreement_time + dt
+    distrusted = wp.where(agrees, 0, 1)
+    if memory.member[world, i, n].distrusted == 1:
+        away = left_error(believed.pose, told.pose)
+        if agrees and wp.length(away[3:]) < wp.float64(AGREEMENT_DISTANCE):
+            agreed = memory.member[world, i, n].agreement_time + dt
+        distrusted = wp.where(agreed >= wp.float64(AGREEMENT_TIME), 0, 1)
     memory.member[world, i, n].agreement_time = agreed
-    memory.member[world, i, n].distrusted = wp.where(agreed >= wp.float64(AGREEMENT_TIME), 0, 1)
+    memory.member[world, i, n].distrusted = distrusted
 
 
 @wp.func
@@ -200,18 +186,16 @@ def information_share(memory: Any, world: int, i: int, depends_on: wp.uint64):
 
 
 @wp.func
-def fuse_tracklet(memory: Any, world: int, i: int, n: int, report: Any, before: Any, R: Any, p: Any):
-    """Fuse what a sender has learnt since its last report, which odometry has carried on to (R, p, before)."""
-    after = wide(report.P)
+def fuse_tracklet(memory: Any, world: int, i: int, n: int, report: Report, before: Estimate):
+    """Fuse what a sender has learnt since its last report, which odometry has carried on to `before`."""
+    after = mat66d(report.P)
     for k in range(6):
-        if after[k, k] > wp.float64(MAX_VARIANCE_GROWTH) * before[k, k]:
+        if after[k, k] > wp.float64(MAX_VARIANCE_GROWTH) * before.P[k, k]:
             return
     precision = inverse6(after)
-    information = precision - inverse6(before)
-    information = (information + wp.transpose(information)) * wp.float64(0.5)
-    c = left_error(R, p, report.R, report.p)
-    offset = left_error(R, p, memory.member[world, i, n].R, memory.member[world, i, n].p)
-    vector = precision * c - information * offset
+    information = symmetric_part(precision - inverse6(before.P))
+    offset = left_error(before.pose, memory.member[world, i, n].pose)
+    vector = precision * left_error(before.pose, report.pose) - information * offset
     share = information_share(memory, world, i, report.depends_on)
     fuse_information(memory, world, i, n, share * information, share * vector)
     memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | report.depends_on
@@ -222,24 +206,17 @@ def fuse_message(model: Any, memory: Any, world: int, i: int, n: int, sender: in
     """Carry a member to its new report, and fuse what it has learnt since the last one."""
     last = memory.member[world, i, n].report
     report = memory.inbox[world, i, sender]
-    ticks = report.tick - last.tick
-    if ticks <= 0:
-        return
-    dt = wp.float64(ticks) * model.camera_period
-    Rt = wp.transpose(last.odometry.R)
-    dR = Rt * report.odometry.R
-    dp = Rt * (report.odometry.p - last.odometry.p)
-    propagate_member(model, memory, world, i, n, dR, dp, dt)
-    R = orthonormalise(last.R * dR)
-    p = last.p + last.R * dp
-    F = transition(dR, dp)
-    rotation, translation = odometry_variances(model, dt)
-    before = with_noise(F * wide(last.P) * wp.transpose(F), rotation, translation)
-    was_distrusted = memory.member[world, i, n].distrusted
-    memory.member[world, i, n].report = report
-    test_sender(memory, world, i, n, report.R, report.p, wide(report.P), dt)
-    if was_distrusted == 0 and memory.member[world, i, n].distrusted == 0:
-        fuse_tracklet(memory, world, i, n, report, before, R, p)
+    if report.tick > last.tick:
+        dt = wp.float64(report.tick - last.tick) * model.camera_period
+        step = between(last.odometry, report.odometry)
+        noise = odometry_noise(model, dt)
+        propagate_member(memory, world, i, n, step, dt, noise)
+        before = carried(Estimate(last.pose, mat66d(last.P)), step, noise)
+        was_distrusted = memory.member[world, i, n].distrusted
+        memory.member[world, i, n].report = report
+        test_sender(memory, world, i, n, Estimate(report.pose, mat66d(report.P)), dt)
+        if was_distrusted == 0 and memory.member[world, i, n].distrusted == 0:
+            fuse_tracklet(memory, world, i, n, report, before)
 
 
 @wp.func
@@ -250,7 +227,7 @@ def fuse_messages(model: Any, state: Any, memory: Any, world: int, i: int, tick:
         target = model.targets[i, n]
         sender = target - model.landmarks
         if sender >= 0:
-            if fresh(model, state, world, i, sender, tick) and memory.inbox[world, i, sender].valid == 1:
+            if is_heard(model, state, memory, world, i, sender, tick):
                 member = index_of(memory, world, i, sender)
                 if member > 0:
                     fuse_message(model, memory, world, i, member, sender)

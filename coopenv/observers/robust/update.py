@@ -1,4 +1,9 @@
-"""A frame's bearings against the belief: which of them fit, and whether the vehicle is where it believes to be."""
+"""A frame's bearings against the belief: which of them fit, and whether the vehicle is where it believes to be.
+
+After a search the vehicle's pose is taken from one frame alone, whatever was believed of it before. The other members
+stay. The vehicle's covariance becomes that of the solution, which inherits the members' errors,
+G (N + H_o P_o H_o^T) G^T with G = (H^T W H)^-1 H^T W, and so do its covariances with them, -G H_o P_o.
+"""
 
 from __future__ import annotations
 
@@ -6,133 +11,76 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.so3 import exp_so3, orthonormalise
-from coopenv.observers.robust.algebra import odometry_variances, transition, with_noise
-from coopenv.observers.robust.belief import index_of
+from coopenv.estimation.linalg import symmetric_part
+from coopenv.observers.robust.algebra import between, carried, inverse6, is_regular, odometry_noise, with_noise
+from coopenv.observers.robust.belief import apply_error
 from coopenv.observers.robust.constants import (
     ANCHOR_ANGLE_VARIANCE,
     ANCHOR_POSITION_VARIANCE,
     BEARING_GATE,
+    GAUSS_NEWTON_STEPS,
     HEALTHY_SHARE,
     HEALTHY_TIME,
     LOST_SHARE,
     LOST_TIME,
-    MAX_ACCELERATION,
+    MIN_INFORMATION_RATIO,
 )
-from coopenv.observers.robust.measurements import (
-    NOTHING,
-    fitting_lines,
-    iterated_update,
-    linearise,
-    normalised_innovation,
-    set_line,
-)
-from coopenv.observers.robust.memory import Anchor
+from coopenv.observers.robust.correction import iterated_update
+from coopenv.observers.robust.measurements import NOTHING, innovation_squared, isotropic, set_lines
+from coopenv.observers.robust.memory import Anchor, Estimate, mat66d, vec2d, vec6d
 from coopenv.observers.robust.search import begin_search
-from coopenv.observers.robust.types import vec3d, wide_vector
-from coopenv.world.camera import VISIBLE, marker_position
-
-HALF_ACCELERATION = 0.5 * MAX_ACCELERATION
-
-
-@wp.func
-def drift_variance(model: Any, age: Any):
-    """Return the variance per axis, m^2, of where a sender is a time after its last message."""
-    if age <= wp.float64(0.0):
-        return wp.float64(0.0)
-    _, translation = odometry_variances(model, age)
-    away = wp.float64(HALF_ACCELERATION) * age * age
-    return translation + away * away
-
-
-@wp.func
-def set_line_to_member(model: Any, memory: Any, world: int, i: int, n: int, member: int, tick: int, b: Any):
-    """Let a bearing be to a member, which is carried on by its last twist."""
-    age = wp.float64(tick - memory.member[world, i, member].report.tick) * model.camera_period
-    gone = vec3d()
-    if age > wp.float64(0.0) and memory.member[world, i, member].has_twist == 1:
-        half_turn = memory.member[world, i, member].w * (wp.float64(0.5) * age)
-        gone = exp_so3(half_turn) * memory.member[world, i, member].v * age
-    set_line(memory, world, n, member, b, gone, drift_variance(model, age))
-
-
-@wp.func
-def set_lines_to_belief(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
-    """Set the line of sight of each bearing to a landmark or a member."""
-    for n in range(model.target_count[i]):
-        target = model.targets[i, n]
-        memory.line[world, n].member = NOTHING
-        if state.sight[world, i, target] == VISIBLE:
-            b = wide_vector(model.camera.rotation * state.bearing[world, i, target])
-            if target < model.landmarks:
-                z = wide_vector(marker_position(model, state, world, target))
-                set_line(memory, world, n, 0, b, z, wp.float64(0.0))
-            else:
-                member = index_of(memory, world, i, target - model.landmarks)
-                if member > 0:
-                    set_line_to_member(model, memory, world, i, n, member, tick, b)
 
 
 @wp.func
 def gate(model: Any, memory: Any, world: int, i: int):
-    """Linearise the lines and mark those that fit; return the share of the others, and the NIS of those that do.
+    """Linearise the lines and mark those that fit; return the share of the others, how many fit, and their NIS.
 
     Bearings to distrusted senders do not count in the share; it is -1 if none counts.
     """
     counted = int(0)
     missed = int(0)
+    fitting = int(0)
     total = wp.float64(0.0)
     for n in range(model.target_count[i]):
-        fitting = int(0)
+        memory.line[world, n].fits = 0
         member = memory.line[world, n].member
         if member != NOTHING:
-            if linearise(model, memory, world, i, n):
-                nis = normalised_innovation(memory, world, i, n)
-                if nis < wp.float64(BEARING_GATE):
-                    fitting = 1
-                    total += nis
+            nis = innovation_squared(model, memory, world, i, n)
+            if nis < wp.float64(BEARING_GATE):
+                memory.line[world, n].fits = 1
+                fitting += 1
+                total += nis
             if member == 0 or memory.member[world, i, member].distrusted == 0:
                 counted += 1
-                missed += 1 - fitting
-        memory.line[world, n].fits = fitting
-    if counted == 0:
-        return wp.float64(-1.0), total
-    return wp.float64(missed) / wp.float64(counted), total
+                missed += 1 - memory.line[world, n].fits
+    share = wp.float64(-1.0)
+    if counted > 0:
+        share = wp.float64(missed) / wp.float64(counted)
+    return share, fitting, total
 
 
 @wp.func
 def set_anchor(memory: Any, world: int, i: int, P: Any, tick: int):
     """Remember where the vehicle is, for a search after a loss."""
-    anchor = Anchor()
-    anchor.R = memory.member[world, i, 0].R
-    anchor.p = memory.member[world, i, 0].p
-    anchor.P = P
-    anchor.odometry = memory.belief[world, i].odometry
-    anchor.tick = tick
-    memory.anchor[world, i] = anchor
+    here = Estimate(memory.member[world, i, 0].pose, P)
+    memory.anchor[world, i] = Anchor(here, memory.belief[world, i].odometry, tick)
 
 
 @wp.func
 def restart_search(model: Any, memory: Any, world: int, i: int, tick: int):
     """Search anew, from where the vehicle was when most bearings fitted, carried on by its odometry."""
-    since = wp.transpose(memory.anchor[world, i].odometry.R)
-    dR = since * memory.belief[world, i].odometry.R
-    dp = since * (memory.belief[world, i].odometry.p - memory.anchor[world, i].odometry.p)
-    elapsed = wp.float64(tick - memory.anchor[world, i].tick) * model.camera_period
-    rotation, translation = odometry_variances(model, elapsed)
-    R = memory.anchor[world, i].R
-    F = transition(dR, dp)
-    P = with_noise(F * memory.anchor[world, i].P * wp.transpose(F), rotation, translation)
-    begin_search(memory, world, i, orthonormalise(R * dR), memory.anchor[world, i].p + R * dp, P)
+    anchor = memory.anchor[world, i]
+    elapsed = wp.float64(tick - anchor.tick) * model.camera_period
+    step = between(anchor.odometry, memory.belief[world, i].odometry)
+    begin_search(memory, world, i, carried(anchor.estimate, step, odometry_noise(model, elapsed)))
 
 
 @wp.func
 def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
     """Correct the belief by every bearing that fits it; search anew when most do not."""
-    set_lines_to_belief(model, state, memory, world, i, now.tick)
-    share, nis = gate(model, memory, world, i)
+    set_lines(model, state, memory, world, i, now.tick, False)
+    share, fitting, nis = gate(model, memory, world, i)
     state.nis[world, i] = nis
-    fitting = fitting_lines(memory, world, model.target_count[i])
     state.nis_dof[world, i] = 2 * fitting
     if fitting > 0:
         iterated_update(model, memory, world, i)
@@ -148,6 +96,73 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
     if missed > wp.float64(LOST_SHARE):
         restart_search(model, memory, world, i, now.tick)
     elif healthy > wp.float64(HEALTHY_TIME):
-        P = wp.float64(4.0) * memory.P[world, i, 0, 0]
-        P = with_noise(P, wp.float64(ANCHOR_ANGLE_VARIANCE), wp.float64(ANCHOR_POSITION_VARIANCE))
-        set_anchor(memory, world, i, P, now.tick)
+        noise = vec2d(wp.float64(ANCHOR_ANGLE_VARIANCE), wp.float64(ANCHOR_POSITION_VARIANCE))
+        set_anchor(memory, world, i, with_noise(wp.float64(4.0) * memory.P[world, i, 0, 0], noise), now.tick)
+
+
+@wp.func
+def weight_of(memory: Any, world: int, i: int, n: int):
+    """Return the weight of a bearing, to whose variance the error of the member that it is to adds."""
+    N = isotropic(memory.line[world, n].noise)
+    member = memory.line[world, n].member
+    if member > 0:
+        G = memory.line[world, n].member_jacobian
+        N = N + (G * memory.P[world, i, member, member]) * wp.transpose(G)
+    return wp.inverse(N)
+
+
+@wp.func
+def normal_equations(memory: Any, world: int, i: int, lines: int):
+    """Return (M, b) of the bearings that fit: M = H^T W H, b = H^T W residual."""
+    M = mat66d()
+    b = vec6d()
+    for n in range(lines):
+        if memory.line[world, n].fits == 1:
+            H = memory.line[world, n].jacobian
+            HtW = wp.transpose(H) * weight_of(memory, world, i, n)
+            M += HtW * H
+            b += HtW * memory.line[world, n].residual
+    return M, b
+
+
+@wp.func
+def write_resected_covariance(memory: Any, world: int, i: int, lines: int, inverse: Any):
+    """Set the vehicle's covariance to that of the solution, the members' errors included."""
+    members = memory.belief[world, i].members
+    own = mat66d()
+    for k in range(members):
+        memory.scratch[world, k].column = mat66d()
+    for n in range(lines):
+        line = memory.line[world, n]
+        if line.fits == 1:
+            HtW = wp.transpose(line.jacobian) * weight_of(memory, world, i, n)
+            own += (HtW * wp.transpose(HtW)) * line.noise
+            if line.member > 0:
+                memory.scratch[world, line.member].column += HtW * line.member_jacobian
+    for k in range(1, members):
+        cross = mat66d()
+        for j in range(1, members):
+            cross += memory.scratch[world, j].column * memory.P[world, i, j, k]
+        own += cross * wp.transpose(memory.scratch[world, k].column)
+        block = -(inverse * cross)
+        memory.P[world, i, 0, k] = block
+        memory.P[world, i, k, 0] = wp.transpose(block)
+    memory.P[world, i, 0, 0] = symmetric_part(inverse * own * wp.transpose(inverse))
+
+
+@wp.func
+def resect(model: Any, state: Any, memory: Any, world: int, i: int, tick: int) -> bool:
+    """Put the vehicle where a frame's bearings see it, by least squares from where it is; return whether that works."""
+    lines = model.target_count[i]
+    set_lines(model, state, memory, world, i, tick, False)
+    inverse = mat66d()
+    for step in range(GAUSS_NEWTON_STEPS):
+        _, fitting, _ = gate(model, memory, world, i)
+        M, b = normal_equations(memory, world, i, lines)
+        if fitting < 3 or not is_regular(M, wp.float64(MIN_INFORMATION_RATIO)):
+            return False
+        inverse = inverse6(M)
+        if step < GAUSS_NEWTON_STEPS - 1:
+            apply_error(memory, world, i, 0, inverse * b)
+    write_resected_covariance(memory, world, i, lines, inverse)
+    return True

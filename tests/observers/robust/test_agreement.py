@@ -206,7 +206,7 @@ def test_a_liar_is_found_out_as_in_numpy() -> None:
             slot = tick % world.model.radio.slots
             memory: Any = world.memory
             report = memory.outbox.numpy()[0, 1, slot]
-            report["p"] += lie.offset
+            report["pose"]["p"] += lie.offset
             report["P"] = lie.std**2 * np.eye(6)
         told[tick] = world.memory.member.numpy()["distrusted"][0, 2].max()
 

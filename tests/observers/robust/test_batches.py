@@ -55,7 +55,7 @@ def test_a_world_does_not_know_its_batch(dtype: str) -> None:
     many = played(start(noisy(), range(123, 123 + 64), dtype))
     assert_same(alone, many, slice(0, 1), slice(17, 18))
     assert not many["observer_search.active"].all() and (many["observer_belief.members"] == 3).any()
-    assert len(np.unique(many["observer_member.p"].reshape(64, -1), axis=0)) == 64
+    assert len(np.unique(many["observer_member.pose.p"].reshape(64, -1), axis=0)) == 64
 
 
 def test_threads_change_nothing() -> None:

@@ -11,10 +11,11 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers.robust.algebra import inverse6, is_regular, left_error, log_so3, transition
-from coopenv.observers.robust.p3p import solutions_of
-from coopenv.observers.robust.types import mat33d, mat43d, mat66d, vec3d, vec6d
+from coopenv.observers.robust.memory import Pose, mat33d, mat66d, vec3d, vec6d
+from coopenv.observers.robust.p3p import solve_p3p
 from coopenv.world.launch import start_warp
 from tests.helpers.p3p import solve_one
+from tests.oracles.p3p import solve_p3p as oracle
 
 start_warp()
 
@@ -32,17 +33,10 @@ def algebra_kernel(
 ):
     n = wp.tid()
     w[n] = log_so3(R[n])
-    e[n] = left_error(R[n], p[n], R[0], p[0])
-    F[n] = transition(R[n], p[n])
+    e[n] = left_error(Pose(R[n], p[n]), Pose(R[0], p[0]))
+    F[n] = transition(Pose(R[n], p[n]))
     inverse[n] = inverse6(A[n])
     regular[n] = is_regular(A[n], wp.float64(1.0e-6))
-
-
-@wp.kernel(enable_backward=False, module_options={"max_unroll": 1}, module="unique")
-def perspective_kernel(sides: wp.array(dtype=vec3d), gaps: wp.array(dtype=vec3d), distances: wp.array(dtype=mat43d)):
-    n = wp.tid()
-    _, rows = solutions_of(sides[n], gaps[n])
-    distances[n] = rows
 
 
 def array(values: np.ndarray, dtype: Any) -> wp.array:
@@ -112,19 +106,13 @@ def test_distances_to_three_points_are_those_of_the_solver_in_numpy() -> None:
     R, c = Rotation.random(400, rng).as_matrix(), rng.uniform(-15, 15, (400, 3))
     lines = z - c[:, None]
     b = np.einsum("nji,nkj->nki", R, lines / np.linalg.norm(lines, axis=2, keepdims=True))
-    pairs = ((0, 1), (0, 2), (1, 2))
-    sides = np.stack([((z[:, i] - z[:, j]) ** 2).sum(1) for i, j in pairs], axis=1)
-    gaps = np.stack([((b[:, i] - b[:, j]) ** 2).sum(1) for i, j in pairs], axis=1)
-    longest = sides.max(axis=1, keepdims=True)
-    out = wp.zeros(400, dtype=mat43d, device="cpu")
-    inputs = [array(sides / longest, vec3d), array(gaps, vec3d), out]
-    wp.launch(perspective_kernel, dim=400, inputs=inputs, device="cpu")
+    turns, cameras, mask = solve_p3p(b, z)
     counts = np.zeros(400, int)
     for n in range(400):
-        found = np.sqrt(longest[n]) * out.numpy()[n]
-        found = found[found.any(axis=1)]
-        cameras = solve_one(b[n], z[n])[1]
-        expected = np.linalg.norm(z[n] - cameras[:, None], axis=2)
+        found = np.linalg.norm(z[n] - cameras[n, mask[n], None], axis=2)
+        rotations, places = solve_one(b[n], z[n], oracle)
+        assert_allclose(turns[n, mask[n]], rotations, rtol=0, atol=1e-6)
+        expected = np.linalg.norm(z[n] - places[:, None], axis=2)
         counts[n] = len(expected)
         assert_allclose(found, expected, rtol=0, atol=1e-6)
         assert np.abs(expected - np.linalg.norm(lines[n], axis=1)).max(axis=1).min() < 1e-6

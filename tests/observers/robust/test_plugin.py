@@ -111,7 +111,7 @@ def test_a_liar_is_found_out_and_tracked_all_the_same():
             estimate = super().update(tick)
             seen[self.setup.vehicle] = self.trusted
             if lie.sender in self.trusted and tick.time > lie.start:
-                p = self.members["p"][self.member_numbers.index(lie.sender)]
+                p = self.members["pose"]["p"][self.member_numbers.index(lie.sender)]
                 assert np.linalg.norm(p - record.truth.position[tick.index, lie.sender]) < 1.0
             return estimate
 
@@ -128,7 +128,7 @@ def test_a_vehicle_that_is_lost_says_nothing_and_finds_itself_again():
     class Kidnapped(OpenRobust):
         def update(self, tick):
             if tick.index == 300 and self.setup.vehicle == 0:
-                self.members["p"][0] += np.array([5.0, -4.0, 1.0])
+                self.members["pose"]["p"][0] += np.array([5.0, -4.0, 1.0])
             return super().update(tick)
 
         def message(self):

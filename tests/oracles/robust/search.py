@@ -14,7 +14,6 @@ from itertools import combinations
 import numpy as np
 
 from coopenv.estimation.arrays import Array
-from coopenv.estimation.p3p import solve_p3p
 from coopenv.estimation.rotations import tangent_basis
 from coopenv.estimation.small_matrices import solve
 from coopenv.observers.contract import Tick
@@ -36,6 +35,7 @@ from coopenv.observers.robust.constants import (
     SAME_PRIOR,
 )
 from tests.helpers.p3p import solve_one
+from tests.oracles.p3p import solve_p3p
 from tests.oracles.robust.belief import Belief, Sight
 from tests.oracles.robust.matrices import invert_positive
 from tests.oracles.robust.tracklets import left_error
@@ -198,7 +198,7 @@ def _perspectives(three: list[Sighting], variance: float) -> Iterator[tuple[Arra
     not exactly known, is also moved by `PERTURBATION` standard deviations to each side.
     """
     b, z = np.array([s.bearing for s in three]), np.array([s.z for s in three])
-    yield from zip(*solve_one(b, z), strict=True)
+    yield from zip(*solve_one(b, z, solve_p3p), strict=True)
     bearings, places = [], []
     for n, s in enumerate(three):
         for side in (PERTURBATION, -PERTURBATION):

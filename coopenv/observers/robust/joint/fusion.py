@@ -6,9 +6,15 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.observers.robust.belief import append_member, index_of, remove_member
+from coopenv.observers.robust.belief import (
+    append_member,
+    index_of,
+    is_unseen,
+    longest_unseen,
+    mark_seen,
+    remove_member,
+)
 from coopenv.observers.robust.constants import MAX_TOLD
-from coopenv.observers.robust.eviction import MAX_UNSEEN_TIME, longest_unseen, mark_seen
 from coopenv.observers.robust.joint.contacts import (
     contact_of,
     forget_contacts,
@@ -21,9 +27,10 @@ from coopenv.observers.robust.joint.information import fuse_joint_information, n
 from coopenv.observers.robust.joint.matrices import AFTER, block_of
 from coopenv.observers.robust.joint.memory import Contact
 from coopenv.observers.robust.joint.radio import dependence, others_told, read_message
+from coopenv.observers.robust.measurements import is_heard
+from coopenv.observers.robust.memory import Estimate
 from coopenv.observers.robust.tracklets import bit_of, information_share, test_sender
 from coopenv.world.camera import VISIBLE
-from coopenv.world.v2x import fresh
 
 
 @wp.func
@@ -49,8 +56,7 @@ def make_joint_room(model: Any, memory: Any, world: int, i: int, tick: int, coun
     for n in range(1, memory.belief[world, i].members):
         if not is_told(memory, world, count, memory.member[world, i, n].vehicle):
             staying += 1
-            away = wp.float64(tick - memory.member[world, i, n].seen_tick) * model.camera_period
-            if away > wp.float64(MAX_UNSEEN_TIME):
+            if is_unseen(model, memory, world, i, n, tick):
                 unseen += 1
     excess = wp.max(0, 1 + staying + count - own - memory.member.shape[2])
     if excess > unseen:
@@ -74,7 +80,7 @@ def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, 
         told = memory.told[world, a]
         if told.vehicle != i:
             n = memory.belief[world, i].members
-            append_member(memory, world, i, told.vehicle, told.R, told.p, block_of(memory, world, AFTER, a, a))
+            append_member(memory, world, i, told.vehicle, told.pose, block_of(memory, world, AFTER, a, a))
             memory.member[world, i, n].report.tick = told.tick
             memory.member[world, i, n].report.odometry = told.odometry
             memory.member[world, i, n].seen_tick = tick
@@ -107,8 +113,8 @@ def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, send
     told = memory.told[world, 0]
     was_distrusted = memory.contact[world, i, c].distrusted
     note_contacts(memory, world, i)
-    P = block_of(memory, world, AFTER, 0, 0)
-    test_sender(memory, world, i, n, told.R, told.p, P, wp.float64(ticks) * model.camera_period)
+    now = Estimate(told.pose, block_of(memory, world, AFTER, 0, 0))
+    test_sender(memory, world, i, n, now, wp.float64(ticks) * model.camera_period)
     memory.contact[world, i, c].distrusted = memory.member[world, i, n].distrusted
     memory.contact[world, i, c].agreement_time = memory.member[world, i, n].agreement_time
     if was_distrusted == 1 or memory.contact[world, i, c].distrusted == 1:
@@ -117,12 +123,6 @@ def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, send
     if news_of(memory, world, i, count, information_share(memory, world, i, depends_on)):
         fuse_joint_information(memory, world, i, count)
         memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
-
-
-@wp.func
-def is_heard(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int) -> bool:
-    """Return whether there is a message of a sender that knows where it is."""
-    return fresh(model, state, world, i, sender, tick) and memory.inbox[world, i, sender].valid == 1
 
 
 @wp.func

@@ -6,8 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.so3 import orthonormalise
-from coopenv.observers.robust.algebra import left_error, odometry_variances, transition
+from coopenv.observers.robust.algebra import between, left_error, moved, odometry_noise, transition
 from coopenv.observers.robust.belief import apply_error, index_of, subtract_block
 from coopenv.observers.robust.constants import MAX_VARIANCE_GROWTH
 from coopenv.observers.robust.joint.matrices import (
@@ -22,9 +21,8 @@ from coopenv.observers.robust.joint.matrices import (
     symmetrise,
 )
 from coopenv.observers.robust.joint.memory import DIMENSION
-from coopenv.observers.robust.memory import Pose
+from coopenv.observers.robust.memory import mat66d, vec6d
 from coopenv.observers.robust.tracklets import propagate_member
-from coopenv.observers.robust.types import mat66d, vec6d
 
 
 @wp.func
@@ -32,11 +30,9 @@ def predict_told(model: Any, memory: Any, world: int, i: int, c: int, count: int
     """Carry the contact's last message on to the new one by odometry: poses to `step`, covariance to BEFORE."""
     for a in range(count):
         last = memory.contact_told[world, i, c, a]
-        Rt = wp.transpose(last.odometry.R)
-        dR = Rt * memory.told[world, a].odometry.R
-        dp = Rt * (memory.told[world, a].odometry.p - last.odometry.p)
-        memory.step[world, a] = Pose(orthonormalise(last.R * dR), last.p + last.R * dp)
-        F = transition(dR, dp)
+        step = between(last.odometry, memory.told[world, a].odometry)
+        memory.step[world, a] = moved(last.pose, step)
+        F = transition(step)
         for b in range(count):
             block = mat66d()
             for k in range(6):
@@ -49,12 +45,9 @@ def predict_told(model: Any, memory: Any, world: int, i: int, c: int, count: int
             F = block_of(memory, world, PRODUCT, b, 0)
             set_block(memory, world, BEFORE, a, b, block_of(memory, world, BEFORE, a, b) * wp.transpose(F))
         ticks = wp.max(memory.told[world, a].tick - memory.contact_told[world, i, c, a].tick, 0)
-        rotation, translation = odometry_variances(model, wp.float64(ticks) * model.camera_period)
-        block = block_of(memory, world, BEFORE, a, a)
-        for k in range(3):
-            block[k, k] = block[k, k] + rotation
-            block[k + 3, k + 3] = block[k + 3, k + 3] + translation
-        set_block(memory, world, BEFORE, a, a, block)
+        noise = odometry_noise(model, wp.float64(ticks) * model.camera_period)
+        for k in range(6):
+            memory.matrix[world, BEFORE, (6 * a + k) * (DIMENSION + 1)] += noise[k // 3]
 
 
 @wp.func
@@ -65,22 +58,12 @@ def propagate_told(model: Any, memory: Any, world: int, i: int, count: int):
         n = index_of(memory, world, i, told.vehicle)
         if n > 0:
             last = memory.member[world, i, n].report
-            ticks = told.tick - last.tick
-            if ticks > 0:
-                Rt = wp.transpose(last.odometry.R)
-                dp = Rt * (told.odometry.p - last.odometry.p)
-                dt = wp.float64(ticks) * model.camera_period
-                propagate_member(model, memory, world, i, n, Rt * told.odometry.R, dp, dt)
+            if told.tick > last.tick:
+                dt = wp.float64(told.tick - last.tick) * model.camera_period
+                step = between(last.odometry, told.odometry)
+                propagate_member(memory, world, i, n, step, dt, odometry_noise(model, dt))
                 memory.member[world, i, n].report.tick = told.tick
                 memory.member[world, i, n].report.odometry = told.odometry
-
-
-@wp.func
-def offset_of(memory: Any, world: int, i: int, a: int):
-    """Return the left error of a member that a message tells of against where the last message predicts it."""
-    n = index_of(memory, world, i, memory.told[world, a].vehicle)
-    step = memory.step[world, a]
-    return left_error(step.R, step.p, memory.member[world, i, n].R, memory.member[world, i, n].p)
 
 
 @wp.func
@@ -98,9 +81,8 @@ def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
     for a in range(count):
         vector = vec6d()
         for b in range(count):
-            told = memory.told[world, b]
-            step = memory.step[world, b]
-            vector += block_of(memory, world, INVERSE, a, b) * left_error(step.R, step.p, told.R, told.p)
+            news = left_error(memory.step[world, b], memory.told[world, b].pose)
+            vector += block_of(memory, world, INVERSE, a, b) * news
         memory.scratch[world, a].correction = vector
     invert(memory, world, BEFORE, AFTER, count)
     for a in range(count):
@@ -112,7 +94,9 @@ def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
     for a in range(count):
         vector = share * memory.scratch[world, a].correction
         for b in range(count):
-            vector = vector - block_of(memory, world, BEFORE, a, b) * offset_of(memory, world, i, b)
+            n = index_of(memory, world, i, memory.told[world, b].vehicle)
+            offset = left_error(memory.step[world, b], memory.member[world, i, n].pose)
+            vector = vector - block_of(memory, world, BEFORE, a, b) * offset
         memory.scratch[world, a].correction = vector
         size += wp.dot(vector, vector)
     return wp.isfinite(size)
@@ -135,9 +119,8 @@ def fuse_joint_information(memory: Any, world: int, i: int, count: int):
             block = mat66d()
             for c in range(count):
                 block += memory.blocks[world, n, c] * block_of(memory, world, BEFORE, c, b)
-            for k in range(6):
-                if a == b:
-                    block[k, k] = block[k, k] + wp.float64(1.0)
+            if a == b:
+                block += wp.identity(6, wp.float64)
             set_block(memory, world, AFTER, a, b, block)
     invert(memory, world, AFTER, INVERSE, count)
     for a in range(count):

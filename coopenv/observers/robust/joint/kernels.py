@@ -1,8 +1,11 @@
-"""The observer with joint messages as the world is handed it."""
+"""The observer with joint messages as the world is handed it, and as a plug-in."""
 
 from __future__ import annotations
 
 from coopenv.estimation.coordinates import Coordinates
+from coopenv.observers.contract import Observer, Setup
+from coopenv.observers.kernel_observer import KernelObserver
+from coopenv.observers.planar.plugin import PlanarRobust
 from coopenv.observers.robust.joint.fusion import fuse_joint_messages
 from coopenv.observers.robust.joint.memory import JOINT_SIZES, JointMemory
 from coopenv.observers.robust.joint.messages import JOINT_MESSAGES
@@ -24,3 +27,11 @@ ROBUST_JOINT = Embedded(
     coordinates=Coordinates.LEFT,
     options=OPTIONS,
 )
+
+
+def robust_joint(setup: Setup) -> Observer:
+    """The robust observer with larger, joint messages.
+
+    Planar robots have one with small messages only.
+    """
+    return PlanarRobust(setup) if setup.planar else KernelObserver(ROBUST_JOINT, setup)

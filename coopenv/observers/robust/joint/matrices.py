@@ -7,7 +7,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust.joint.memory import DIMENSION
-from coopenv.observers.robust.types import mat66d
+from coopenv.observers.robust.memory import mat66d
 
 BEFORE, AFTER, INVERSE, PRODUCT = 0, 1, 2, 3
 """The matrices."""

@@ -3,8 +3,7 @@
 import warp as wp
 
 from coopenv.observers.robust.constants import MAX_MEMBERS_JOINT, MAX_TOLD
-from coopenv.observers.robust.memory import SIZES, Pose, RobustMemory
-from coopenv.observers.robust.types import mat33d, mat66d, vec3d
+from coopenv.observers.robust.memory import SIZES, Pose, RobustMemory, mat66d
 from coopenv.world.records import array, extended
 
 
@@ -14,8 +13,7 @@ class Told:
 
     vehicle: wp.int32
     tick: wp.int32  # at which it stands
-    R: mat33d
-    p: vec3d
+    pose: Pose
     odometry: Pose
 
 

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from coopenv.errors import CoopenvError
-from coopenv.estimation.rotations import exp_so3, log_so3
 from coopenv.observers.contract import Message
 from coopenv.observers.robust.constants import MAX_TOLD, MIN_VARIANCE
-from coopenv.observers.robust.messages import read, write
+from coopenv.observers.robust.messages import from_six, read, six_of, write
 from coopenv.scenario.base import LARGEST
 from coopenv.world.embedded import Messages
 
@@ -34,8 +33,8 @@ def write_joint(observer: Any) -> Message:
     joint: dict[str, Any] = {
         "vehicles": told["vehicle"].astype(np.uint16),
         "ages": (int(m.outbox[0]["tick"]) - told["tick"]) * observer.unit,
-        "poses": _six(told["R"], told["p"]),
-        "odometries": _six(told["odometry"]["R"], told["odometry"]["p"]),
+        "poses": _six(told["pose"]),
+        "odometries": _six(told["odometry"]),
         "factor": m.outbox_factor[0, : n * (n + 1) // 2].copy(),
         "complete": m.outbox_joint[0]["complete"].astype(np.uint8).reshape(1),
     }
@@ -78,9 +77,8 @@ def read_joint(observer: Any, sender: int, message: Message, sent: int) -> None:
         raise CoopenvError("message: factor is singular")
     told = m.inbox_told[sender, :others]
     told["vehicle"], told["tick"] = vehicles, [sent - observer.units(age) for age in ages.tolist()]
-    told["R"], told["p"] = [exp_so3(pose[:3]) for pose in poses] or told["R"], poses[:, 3:]
-    told["odometry"]["R"] = [exp_so3(pose[:3]) for pose in odometries] or told["R"]
-    told["odometry"]["p"] = odometries[:, 3:]
+    for one, pose, odometry in zip(told, poses, odometries, strict=True):
+        one["pose"], one["odometry"] = from_six(pose), from_six(odometry)
     m.inbox_factor[sender, : len(factor)] = factor
     m.inbox_joint[sender] = others, complete[0] != 0
     m.inbox[sender]["valid"] = 1
@@ -100,9 +98,9 @@ def tampered(message: Message) -> Message:
     return replace(message, extra=more)
 
 
-def _six(R: Any, p: Any) -> Any:
+def _six(poses: Any) -> Any:
     """Return poses as rotation vectors and positions (m, 6)."""
-    return np.array([np.concatenate([log_so3(R), p]) for R, p in zip(R, p, strict=True)]).reshape(-1, 6)
+    return np.array([six_of(pose) for pose in poses]).reshape(-1, 6)
 
 
 def _are_vehicles(observer: Any, numbers: set[int]) -> bool:

@@ -9,9 +9,8 @@ import warp as wp
 from coopenv.observers.robust.constants import MAX_TOLD
 from coopenv.observers.robust.joint.matrices import AFTER, factorise, set_block, square_of_factor
 from coopenv.observers.robust.joint.memory import DIMENSION, Contact, Joint, Told
-from coopenv.observers.robust.memory import Pose
-from coopenv.observers.robust.tracklets import bit_of, clear_messages, marker_jacobian, own_report, receive, wide
-from coopenv.observers.robust.types import mat66d, wide_vector
+from coopenv.observers.robust.memory import Pose, mat66d
+from coopenv.observers.robust.tracklets import bit_of, clear_messages, marker_jacobian, marker_of, own_report, receive
 
 
 @wp.func
@@ -65,7 +64,7 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
     if report.valid == 1:
         joint.others = count - 1
         joint.complete = wp.where(count == members, 1, 0)
-        J = marker_jacobian(wide_vector(model.scene.marker[model.landmarks + i]))
+        J = marker_jacobian(marker_of(model, i))
         for a in range(count):
             for b in range(count):
                 block = memory.P[world, i, a, b]
@@ -78,12 +77,8 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
             report.valid = 0
             joint = Joint()
     for n in range(joint.others):
-        told = Told()
-        told.vehicle = memory.member[world, i, n + 1].vehicle
-        told.tick = memory.member[world, i, n + 1].report.tick
-        told.R = memory.member[world, i, n + 1].R
-        told.p = memory.member[world, i, n + 1].p
-        told.odometry = memory.member[world, i, n + 1].report.odometry
+        other = memory.member[world, i, n + 1]
+        told = Told(other.vehicle, other.report.tick, other.pose, other.report.odometry)
         memory.outbox_told[world, i, slot, n] = told
     if report.valid == 1:
         for k in range(6 * count):
@@ -135,18 +130,12 @@ def dependence(memory: Any, world: int, i: int, sender: int) -> wp.uint64:
 def read_message(memory: Any, world: int, i: int, sender: int) -> int:
     """Write what a received message tells of to `told`, their covariance to AFTER; return how many they are."""
     report = memory.inbox[world, i, sender]
-    own = Told()
-    own.vehicle = sender
-    own.tick = report.tick
-    own.R = report.R
-    own.p = report.p
-    own.odometry = report.odometry
-    memory.told[world, 0] = own
+    memory.told[world, 0] = Told(sender, report.tick, report.pose, report.odometry)
     others = others_told(memory, world, i, sender)
     for n in range(others):
         memory.told[world, n + 1] = memory.inbox_told[world, i, sender, n]
     if (report.depends_on & bit_of(i)) != wp.uint64(0):
-        set_block(memory, world, AFTER, 0, 0, wide(report.P))
+        set_block(memory, world, AFTER, 0, 0, mat66d(report.P))
     else:
         for k in range(6 * (others + 1)):
             for j in range(k + 1):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.p3p import solve_p3p
+from coopenv.observers.robust.p3p import solve_p3p
 from tests.helpers.p3p import solve_one
 
 SEEDS = st.integers(0, 2**32 - 1)
