@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -146,16 +146,14 @@ def _with_defaults(defaults: Mapping[str, Any], vehicle: Mapping[str, Any]) -> d
     return result
 
 
-def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+def _merged(under: Any, over: Any) -> Any:
     """Return `over` on top of `under`; tables are merged unless they are of different kinds."""
-    result = dict(under)
-    for key, value in over.items():
-        below = result.get(key)
-        if isinstance(below, dict) and isinstance(value, dict):
-            kind = below.get("kind")
-            value = _merged(below, value) if value.get("kind", kind) == kind else value
-        result[key] = value
-    return result
+    if (
+        not (isinstance(under, Mapping) and isinstance(over, Mapping))
+        or over.get("kind", kind := under.get("kind")) != kind
+    ):
+        return over
+    return {**under, **{key: _merged(under.get(key), value) for key, value in over.items()}}
 
 
 def override(raw: Any, key: str, value: Any) -> None:
@@ -169,25 +167,19 @@ def override(raw: Any, key: str, value: Any) -> None:
 
 def _descend(node: Any, path: list[str], value: Any, key: str, parent: str = "") -> None:
     head, rest = path[0], path[1:]
-    if isinstance(node, list):
-        for index in _indices(node, head, key, parent):
-            if rest:
-                node[index] = dict(node[index]) if isinstance(node[index], dict) else node[index]
-                _descend(node[index], rest, value, key)
-            else:
-                node[index] = value
-    elif isinstance(node, dict):
-        if rest:
-            below = node.get(head, {})
-            node[head] = dict(below) if isinstance(below, dict) else below
-            _descend(node[head], rest, value, key, head)
-        else:
-            node[head] = _merged({head: node.get(head)}, {head: value})[head]
-    else:
+    if not isinstance(node, list | dict):
         raise ScenarioError(f"override {shown(key)}: {shown(head)} lies below a plain value")
+    places: Iterable[Any] = _indices(node, head, key, parent) if isinstance(node, list) else [head]
+    for place in places:
+        below = node.get(place, {} if rest else None) if isinstance(node, dict) else node[place]
+        if rest:
+            node[place] = dict(below) if isinstance(below, dict) else below
+            _descend(node[place], rest, value, key, head)
+        else:
+            node[place] = _merged(below, value) if isinstance(node, dict) else value
 
 
-def _indices(node: list[Any], head: str, key: str, parent: str) -> range | list[int]:
+def _indices(node: list[Any], head: str, key: str, parent: str) -> Iterable[int]:
     if head == "*":
         return range(len(node))
     names = [entry.get("name") if isinstance(entry, dict) else None for entry in node]

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Mapping
 from typing import Any
 
 from coopenv.scenario.files import DEFAULTS_KEY
 from coopenv.scenario.schema import Scenario
 
-REFERENCE = "#/$defs/"
+REFERENCE = re.compile(r"#/\$defs/(\w+)")
 
 
-def scenario_schema() -> dict[str, Any]:
+def schema_text() -> str:
     """Return the schema of a file: that of `Scenario`, and the table of defaults that the loader merges.
 
     A vehicle may leave out what the defaults say, and the defaults what every vehicle says. Both are therefore
@@ -19,77 +21,38 @@ def scenario_schema() -> dict[str, Any]:
     """
     schema = Scenario.model_json_schema()
     definitions = schema["$defs"]
-    for name in _tables_below("Vehicle", definitions):
-        definitions[_partial(name)] = _without_required(definitions[name])
-    for name in list(definitions):
-        if name.startswith("Partial"):
-            definitions[name] = _pointing_to_partials(definitions[name], definitions)
-    schema["properties"]["vehicles"]["items"] = {"$ref": REFERENCE + _partial("Vehicle")}
+    merged = _reachable({"Vehicle"}, json.loads(json.dumps(definitions), object_hook=_without_lists))
+    for name in merged:
+        text = json.dumps({key: value for key, value in definitions[name].items() if key != "required"})
+        definitions[f"Partial{name}"] = json.loads(REFERENCE.sub(lambda found: _partial(found, merged), text))
+    schema["properties"]["vehicles"]["items"] = {"$ref": "#/$defs/PartialVehicle"}
     schema["properties"][DEFAULTS_KEY] = {
-        "$ref": REFERENCE + _partial("Vehicle"),
+        "$ref": "#/$defs/PartialVehicle",
         "description": "What every vehicle takes over unless it says otherwise.",
     }
-    schema["$defs"] = {name: definitions[name] for name in sorted(_used(schema, definitions))}
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+    used = _reachable(_references(schema["properties"]), definitions)
+    schema["$defs"] = {name: definitions[name] for name in sorted(used)}
+    whole = {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+    return json.dumps(whole, indent=2) + "\n"
 
 
-def schema_text() -> str:
-    """Return the schema as it stands in `docs/scenario.schema.json`."""
-    return json.dumps(scenario_schema(), indent=2) + "\n"
+def _without_lists(node: dict[str, Any]) -> dict[str, Any]:
+    """Leave out entries of lists, which are never merged."""
+    return {key: value for key, value in node.items() if key not in ("items", "prefixItems")}
 
 
-def _partial(name: str) -> str:
-    return f"Partial{name}"
+def _partial(reference: re.Match[str], merged: set[str]) -> str:
+    return f"#/$defs/{'Partial' if reference[1] in merged else ''}{reference[1]}"
 
 
-def _without_required(definition: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in definition.items() if key != "required"}
+def _references(node: Any) -> set[str]:
+    return set(REFERENCE.findall(json.dumps(node)))
 
 
-def _tables_below(name: str, definitions: dict[str, Any]) -> set[str]:
-    """Return `name` and the definitions that it holds as tables; entries of lists are never merged."""
-    found, waiting = set(), [name]
-    while waiting:
-        current = waiting.pop()
-        if current not in found:
-            found.add(current)
-            waiting += _references(definitions[current].get("properties", {}), into_lists=False)
-    return found
-
-
-def _references(node: Any, into_lists: bool = True) -> list[str]:
-    """Return the names of the definitions that a piece of schema refers to."""
-    if isinstance(node, list):
-        return [name for item in node for name in _references(item, into_lists)]
-    if not isinstance(node, dict):
-        return []
-    here = [node["$ref"].removeprefix(REFERENCE)] if isinstance(node.get("$ref"), str) else []
-    skipped = () if into_lists else ("items", "prefixItems")
-    return here + [
-        name
-        for key, value in node.items()
-        if key not in ("discriminator", *skipped)
-        for name in _references(value, into_lists)
-    ]
-
-
-def _pointing_to_partials(node: Any, definitions: dict[str, Any]) -> Any:
-    if isinstance(node, list):
-        return [_pointing_to_partials(item, definitions) for item in node]
-    if isinstance(node, dict):
-        return {key: _pointing_to_partials(value, definitions) for key, value in node.items()}
-    if isinstance(node, str) and node.startswith(REFERENCE):
-        name = _partial(node.removeprefix(REFERENCE))
-        return REFERENCE + name if name in definitions else node
-    return node
-
-
-def _used(schema: dict[str, Any], definitions: dict[str, Any]) -> set[str]:
+def _reachable(names: set[str], definitions: Mapping[str, Any]) -> set[str]:
+    """Return these names and those of all definitions that they refer to, directly or not."""
     found: set[str] = set()
-    waiting = _references(schema["properties"])
-    while waiting:
-        name = waiting.pop()
-        if name not in found:
-            found.add(name)
-            waiting += _references(definitions[name])
+    while names:
+        found |= names
+        names = {below for name in names for below in _references(definitions[name])} - found
     return found

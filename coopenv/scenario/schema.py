@@ -1,12 +1,29 @@
-"""The scenario: everything that defines a world, typed and checked."""
+"""The scenario: everything that defines a world, typed and checked; each failure is one line that names the field."""
 
 from __future__ import annotations
 
+import re
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
 from pydantic import field_validator, model_validator
 
-from coopenv.scenario import checks
+from coopenv.errors import ScenarioWarning, listed, shown, suggest
 from coopenv.scenario.bodies import Landmark
 from coopenv.scenario.fields import ScenarioFields
+from coopenv.scenario.starts import check_room
+from coopenv.scenario.topology import neighbour_sets, processing_order
+
+MOST_TICKS = 1e8
+"""Camera frames or odometry samples of one episode; counters are 32 bits wide."""
+
+MOST_PAIRS = 2e7
+"""Of vehicles and their targets."""
+
+FAR_FROM_ORIGIN = 50.0
+"""m; beyond it the paper's observer loses accuracy, because it is not invariant to the map origin."""
 
 
 class Scenario(ScenarioFields):
@@ -14,11 +31,67 @@ class Scenario(ScenarioFields):
 
     @field_validator("landmarks")
     @classmethod
-    def _landmark_names(cls, landmarks: tuple[Landmark, ...]) -> tuple[Landmark, ...]:
-        checks.landmark_names([landmark.name for landmark in landmarks])
+    def _names_are_free(cls, landmarks: tuple[Landmark, ...]) -> tuple[Landmark, ...]:
+        for name, times in Counter(landmark.name for landmark in landmarks).items():
+            if times > 1:
+                raise ValueError(f"landmark name '{name}' is used twice")
+            if re.fullmatch(r"vehicle_\d+", name):
+                raise ValueError(f"landmark name '{name}' is reserved for vehicles")
         return landmarks
 
     @model_validator(mode="after")
     def _is_possible(self) -> Scenario:
-        checks.everything(self)
+        vehicles, targets = len(self.vehicles), len(self.target_names)
+        if vehicles * targets > MOST_PAIRS:
+            raise ValueError(f"vehicles: {vehicles} times {targets} targets are over {MOST_PAIRS:.0e} pairs")
+        neighbours = neighbour_sets(self)
+        processing_order(self, neighbours)
+        check_room(self)
+        for problem in _problems(self):
+            raise ValueError(problem)
+        for doubt in _doubts(self, neighbours):
+            warnings.warn(doubt, ScenarioWarning, stacklevel=2)
         return self
+
+
+def _problems(s: ScenarioFields) -> Iterator[str]:
+    """Yield what of one section does not fit to another."""
+    k, q, targets = s.observer.k, s.observer.q, set(s.target_names)
+    if isinstance(k, tuple) and len(k) != len(s.vehicles):
+        yield f"observer.k: {len(k)} values for {len(s.vehicles)} vehicles"
+    for name in [name for name in q if name not in targets] if isinstance(q, dict) else ():
+        yield f"observer.q: unknown target {shown(name)}{suggest(name, targets)}"
+    for name, rate in (("camera", s.rates.camera), ("odometry", s.rates.odometry)):
+        if s.horizon * rate > MOST_TICKS:
+            yield f"horizon: {s.horizon:g} s at rates.{name} = {rate:g} Hz are over {MOST_TICKS:.0e} samples"
+    top, steering, decision = s.dynamics.max_speed, s.action.steering, 1.0 / s.rates.decision
+    for i, vehicle in enumerate(s.vehicles):
+        speed = vehicle.motion.initial_speed if vehicle.motion.kind == "driven" else 0.0
+        if not (-top if s.dynamics.reverse else 0.0) <= speed <= top:
+            yield f"vehicles.{i}.motion.initial_speed: {speed:g} m/s is beyond what [dynamics] permits"
+    if s.dynamics.latency > decision:
+        yield f"dynamics.latency: {s.dynamics.latency:g} s is longer than one decision ({decision:g} s)"
+    if steering is not None and steering > s.dynamics.max_steering:
+        yield f"action.steering: {steering:g} rad is above dynamics.max_steering ({s.dynamics.max_steering:g} rad)"
+
+
+def _doubts(s: ScenarioFields, neighbours: Sequence[Sequence[int]]) -> Iterator[str]:
+    """Yield where the paper's conditions for convergence are not met by construction."""
+    lonely = [f"vehicle_{i + 1}" for i, targets in enumerate(neighbours) if len(targets) < 3]
+    if (count := len(s.landmarks)) < 3:
+        yield (
+            f"only {count} landmark{'s' if count != 1 else ''}: with fewer than three the paper's Assumption 2 "
+            "fails and observability is not guaranteed"
+        )
+    elif lonely:
+        verb = "has" if len(lonely) == 1 else "have"
+        yield f"{listed(lonely)} {verb} fewer than three neighbours: observability is not guaranteed"
+    for landmark in s.landmarks:
+        distance = float(np.linalg.norm(np.array(landmark.position) - np.array(s.map.origin)))
+        if distance > FAR_FROM_ORIGIN:
+            yield (
+                f"landmark '{landmark.name}' lies {distance:.0f} m from the map origin: the paper's observer is "
+                f"not invariant to the origin and degrades beyond {FAR_FROM_ORIGIN:.0f} m; set map.origin inside "
+                "the scene"
+            )
+            break

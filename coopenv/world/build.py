@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import warp as wp
-from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.trajectory import Outcome
 from coopenv.scenario import Scenario
-from coopenv.scenario.bodies import Body, Landmark, Vehicle
-from coopenv.scenario.motion import TwistTable, compile_motion
+from coopenv.scenario.bodies import Landmark, Vehicle
+from coopenv.scenario.motion import compile_motion
 from coopenv.scenario.sensing import ROTATION_OF_CAMERA
 from coopenv.scenario.starts import agent_starts, rotation_of
 from coopenv.scenario.topology import neighbour_sets, processing_order
 from coopenv.world.model import DRIVEN, PRESCRIBED, STATIC, model_struct
 from coopenv.world.precision import Precision
-
-NUMPY_OF = {wp.int32: np.int32, wp.float64: np.float64}
 
 GRAMIAN_RATE = 20.0
 """Hz at which the sliding Gramian is sampled: it says how the scene is seen over a second, not within a frame."""
@@ -27,153 +25,152 @@ GRAMIAN_RATE = 20.0
 GRAMIAN_BLOCKS = 10
 """Blocks of the sliding window of the observability Gramian; it moves on by one block."""
 
-
-class _Filler:
-    """Writes a struct's fields in the right dtype on a device."""
-
-    def __init__(self, p: Precision, device: str) -> None:
-        self.p, self.device = p, device
-
-    def array(self, values: Any, dtype: Any) -> Any:
-        data = np.ascontiguousarray(values, dtype=NUMPY_OF.get(dtype, self.p.numpy))
-        shape = getattr(dtype, "_shape_", ())
-        if data.size == 0:
-            return wp.zeros(0, dtype=dtype, device=self.device)
-        return wp.array(data.reshape((-1, *shape)), dtype=dtype, device=self.device)
+NOWHERE = (0.0, 0.0, 0.0)
 
 
 def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     """Return the Warp `Model` of a scenario."""
-    fill = _Filler(p, device)
     model = model_struct(p)()
-    model.landmarks = len(scenario.landmarks)
-    model.vehicles = len(scenario.vehicles)
-    model.agents = model.landmarks + model.vehicles
-    model.obstacles = len(scenario.obstacles)
-    model.sensed = int(scenario.topology.mode == "sensed")
-    model.camera_rate = scenario.rates.camera
-    model.odometry_rate = scenario.rates.odometry
-    model.camera_period = 1.0 / scenario.rates.camera
-    model.odometry_period = 1.0 / scenario.rates.odometry
-    model.samples_per_tick = math.ceil(scenario.rates.odometry / scenario.rates.camera - 1e-9) + 1
-    model.ticks_per_decision = scenario.ticks_per_decision
-    model.horizon_ticks = scenario.horizon_ticks
-    model.last_outcome = max(Outcome) + len(scenario.termination.own)
-    _fill_topology(model, scenario, fill)
-    _fill_start(model.start, scenario, fill)
-    _fill_motion(model.motion, scenario, fill)
-    _fill_dynamics(model.dynamics, scenario)
-    _fill_scene(model.scene, scenario, fill)
-    _fill_camera(model.camera, scenario, p)
-    _fill_noise(model.noise, scenario, p)
-    _fill_radio(model.radio, scenario)
-    _fill_observer(model.observer, scenario, fill)
+    _fill(model, _world(scenario), device)
+    _fill(model.start, _start(scenario), device)
+    _fill(model.motion, _motion(scenario), device)
+    _fill(model.dynamics, _dynamics(scenario), device)
+    _fill(model.scene, _scene(scenario), device)
+    _fill(model.camera, _camera(scenario), device)
+    _fill(model.noise, _noise(scenario), device)
+    _fill(model.radio, _radio(scenario), device)
+    _fill(model.observer, _observer(scenario), device)
     return model
 
 
-def _fill_topology(model: Any, scenario: Scenario, fill: _Filler) -> None:
+def _fill(struct: Any, values: Mapping[str, Any], device: str) -> None:
+    """Write fields of a struct, each in the type that it is declared with."""
+    for name, value in values.items():
+        kind = struct._cls.vars[name].type
+        if isinstance(kind, wp.array):
+            scalar = getattr(kind.dtype, "_wp_scalar_type_", kind.dtype)
+            data = np.ascontiguousarray(value, dtype=wp.dtype_to_numpy(scalar))
+            empty = wp.zeros((0,) * kind.ndim, dtype=kind.dtype, device=device)
+            value = wp.array(data, dtype=kind.dtype, ndim=kind.ndim, device=device) if data.size else empty
+        elif hasattr(kind, "_shape_"):
+            value = kind(*np.ravel(value).tolist())
+        setattr(struct, name, value)
+
+
+def _world(scenario: Scenario) -> dict[str, Any]:
+    rates, vehicles = scenario.rates, len(scenario.vehicles)
+    agents = len(scenario.landmarks) + vehicles
     sets = neighbour_sets(scenario)
-    table = np.full((model.vehicles, model.agents), -1, dtype=np.int32)
-    for i, targets in enumerate(sets):
-        table[i, : len(targets)] = targets
     order = processing_order(scenario, sets)
-    model.targets = wp.array(table, dtype=wp.int32, ndim=2, device=fill.device)
-    model.target_count = fill.array([len(targets) for targets in sets], wp.int32)
-    model.order = fill.array(order, wp.int32)
-    model.rank = fill.array(np.argsort(order), wp.int32)
+    return {
+        "landmarks": len(scenario.landmarks),
+        "vehicles": vehicles,
+        "agents": agents,
+        "obstacles": len(scenario.obstacles),
+        "sensed": int(scenario.topology.mode == "sensed"),
+        "camera_rate": rates.camera,
+        "odometry_rate": rates.odometry,
+        "camera_period": 1.0 / rates.camera,
+        "odometry_period": 1.0 / rates.odometry,
+        "samples_per_tick": math.ceil(rates.odometry / rates.camera - 1e-9) + 1,
+        "ticks_per_decision": scenario.ticks_per_decision,
+        "horizon_ticks": scenario.horizon_ticks,
+        "last_outcome": max(Outcome) + len(scenario.termination.own),
+        "targets": [targets + [-1] * (agents - len(targets)) for targets in sets],
+        "target_count": [len(targets) for targets in sets],
+        "order": order,
+        "rank": np.argsort(order),
+    }
 
 
-def _fill_start(start: Any, scenario: Scenario, fill: _Filler) -> None:
-    p = fill.p
-    landmarks = len(scenario.landmarks)
+def _start(scenario: Scenario) -> dict[str, Any]:
     positions, rotations = agent_starts(scenario)
-    poses = [vehicle.initial_pose for vehicle in scenario.vehicles]
-    spread = [pose.position_spread if pose else (0.0, 0.0, 0.0) for pose in poses]
-    start.position = fill.array(positions, p.vec3)
-    start.rotation = fill.array(rotations, p.mat33)
-    start.position_spread = fill.array([(0.0, 0.0, 0.0)] * landmarks + spread, p.vec3)
-    start.yaw_spread = fill.array([0.0] * landmarks + [pose.yaw_spread if pose else 0.0 for pose in poses], p.scalar)
-    motions = [vehicle.motion for vehicle in scenario.vehicles]
-    start.speed = fill.array([m.initial_speed if m.kind == "driven" else 0.0 for m in motions], p.scalar)
     origin = np.array(scenario.map.origin)
+    poses = [*(None for _ in scenario.landmarks), *(vehicle.initial_pose for vehicle in scenario.vehicles)]
+    motions = [vehicle.motion for vehicle in scenario.vehicles]
     estimates = [vehicle.initial_estimate for vehicle in scenario.vehicles]
-    offsets = [np.array(e.position_offset) for e in estimates]
-    start.estimate_fixed = fill.array([int(e.position is not None) for e in estimates], wp.int32)
-    start.estimate_position = fill.array(
-        [
-            o if e.position is None else np.array(e.position) - origin + o
-            for e, o in zip(estimates, offsets, strict=True)
-        ],
-        p.vec3,
-    )
-    start.estimate_radius = fill.array([e.position_radius for e in estimates], p.scalar)
+    believed = [NOWHERE if e.position is None else np.array(e.position) - origin for e in estimates]
     fixed = [e.yaw is not None or e.quaternion_wxyz is not None for e in estimates]
-    start.orientation_fixed = fill.array(np.array(fixed, dtype=int), wp.int32)
-    offset = [Rotation.from_quat(e.orientation_offset_wxyz, scalar_first=True).as_matrix() for e in estimates]
-    start.estimate_rotation = fill.array(
-        [
-            (rotation_of(e.yaw, e.quaternion_wxyz) if f else np.eye(3)) @ o
-            for e, f, o in zip(estimates, fixed, offset, strict=True)
-        ],
-        p.mat33,
-    )
-    start.orientation_angle = fill.array(
-        [-1.0 if e.orientation_angle == "uniform" else float(e.orientation_angle) for e in estimates], p.scalar
-    )
+    turned = [rotation_of(e.yaw, e.quaternion_wxyz) for e in estimates]
+    offsets = [rotation_of(None, e.orientation_offset_wxyz) for e in estimates]
+    angles = [e.orientation_angle for e in estimates]
+    return {
+        "position": positions,
+        "rotation": rotations,
+        "position_spread": [pose.position_spread if pose else NOWHERE for pose in poses],
+        "yaw_spread": [pose.yaw_spread if pose else 0.0 for pose in poses],
+        "speed": [motion.initial_speed if motion.kind == "driven" else 0.0 for motion in motions],
+        "estimate_fixed": [e.position is not None for e in estimates],
+        "estimate_position": [np.add(p, e.position_offset) for p, e in zip(believed, estimates, strict=True)],
+        "estimate_radius": [e.position_radius for e in estimates],
+        "orientation_fixed": fixed,
+        "estimate_rotation": [(R if f else np.eye(3)) @ o for R, f, o in zip(turned, fixed, offsets, strict=True)],
+        "orientation_angle": [-1.0 if angle == "uniform" else angle for angle in angles],
+    }
 
 
-def _fill_motion(motion: Any, scenario: Scenario, fill: _Filler) -> None:
-    p = fill.p
+def _motion(scenario: Scenario) -> dict[str, Any]:
     _, rotations = agent_starts(scenario)
-    motions = [a.motion for a in scenario.landmarks] + [v.motion for v in scenario.vehicles]
+    everyone: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
+    motions = [agent.motion for agent in everyone]
     until = scenario.horizon + 1.0 / scenario.rates.camera
-    tables: list[TwistTable] = [compile_motion(m, R, until) for m, R in zip(motions, rotations, strict=True)]
+    tables = [compile_motion(motion, R, until) for motion, R in zip(motions, rotations, strict=True)]
     kinds = {"static": STATIC, "driven": DRIVEN}
-    motion.kind = fill.array([kinds.get(m.kind, PRESCRIBED) for m in motions], wp.int32)
-    motion.first = fill.array(np.cumsum([0] + [len(t.start) for t in tables]), wp.int32)
-    motion.start = fill.array(np.concatenate([t.start for t in tables]), wp.float64)
-    motion.linear = fill.array(np.concatenate([t.linear for t in tables]), p.vec3)
-    motion.angular = fill.array(np.concatenate([t.angular for t in tables]), p.vec3)
-    motion.rotation = fill.array(np.concatenate([t.rotation for t in tables]), p.mat33)
-    motion.position = fill.array(np.concatenate([t.position for t in tables]), p.vec3)
+    columns = ("start", "linear", "angular", "rotation", "position")
+    return {
+        "kind": [kinds.get(motion.kind, PRESCRIBED) for motion in motions],
+        "first": np.cumsum([0] + [len(table.start) for table in tables]),
+        **{name: np.concatenate([getattr(table, name) for table in tables]) for name in columns},
+    }
 
 
-def _fill_dynamics(dynamics: Any, scenario: Scenario) -> None:
-    d = scenario.dynamics
-    dynamics.wheelbase = d.wheelbase
-    dynamics.max_speed = d.max_speed
-    dynamics.min_speed = -d.max_speed if d.reverse else 0.0
-    dynamics.max_acceleration = d.max_acceleration
-    dynamics.max_steering = d.max_steering
-    dynamics.max_steering_rate = d.max_steering_rate
-    accelerates = scenario.action.longitudinal == "acceleration"
-    dynamics.speed_lag = 0.0 if accelerates else d.speed_time_constant  # an acceleration acts at once
-    dynamics.steering_lag = d.steering_time_constant
-    dynamics.latency_ticks = round(d.latency * scenario.rates.camera)
-    dynamics.acceleration_mode = int(accelerates)
-    dynamics.action_steering = scenario.action.steering or d.max_steering
+def _dynamics(scenario: Scenario) -> dict[str, Any]:
+    d, accelerates = scenario.dynamics, scenario.action.longitudinal == "acceleration"
+    same = ("wheelbase", "max_speed", "max_acceleration", "max_steering", "max_steering_rate")
+    return {
+        **{name: getattr(d, name) for name in same},
+        "min_speed": -d.max_speed if d.reverse else 0.0,
+        "speed_lag": 0.0 if accelerates else d.speed_time_constant,  # an acceleration acts at once
+        "steering_lag": d.steering_time_constant,
+        "latency_ticks": round(d.latency * scenario.rates.camera),
+        "acceleration_mode": int(accelerates),
+        "action_steering": scenario.action.steering or d.max_steering,
+    }
 
 
-def _half(body: Body | None) -> np.ndarray:
-    return np.array(body.size) / 2 if body else np.zeros(3)
-
-
-def _fill_scene(scene: Any, scenario: Scenario, fill: _Filler) -> None:
-    p = fill.p
+def _scene(scenario: Scenario) -> dict[str, Any]:
     origin = np.array(scenario.map.origin)
     everyone: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
-    scene.body_half = fill.array([_half(a.body) for a in everyone], p.vec3)
-    scene.body_center = fill.array([a.body.center if a.body else (0.0, 0.0, 0.0) for a in everyone], p.vec3)
-    scene.marker = fill.array([a.marker for a in everyone], p.vec3)
-    yaws = [Rotation.from_euler("z", o.yaw).as_matrix() for o in scenario.obstacles]
-    scene.obstacle_rotation = fill.array(yaws, p.mat33)
-    scene.obstacle_center = fill.array([np.array(o.center) - origin for o in scenario.obstacles], p.vec3)
-    scene.obstacle_half = fill.array([np.array(o.size) / 2 for o in scenario.obstacles], p.vec3)
-    goals = [v.goal for v in scenario.vehicles]
-    scene.goal = fill.array([np.array(g.position) - origin if g else np.zeros(3) for g in goals], p.vec3)
-    scene.goal_radius = fill.array([g.radius if g else 0.0 for g in goals], p.scalar)
-    scene.end_on_collision = int(scenario.termination.collision)
-    scene.end_on_arrival = int(scenario.termination.arrival)
+    bodies, goals = [agent.body for agent in everyone], [vehicle.goal for vehicle in scenario.vehicles]
+    return {
+        "body_half": [np.array(body.size) / 2 if body else NOWHERE for body in bodies],
+        "body_center": [body.center if body else NOWHERE for body in bodies],
+        "marker": [agent.marker for agent in everyone],
+        "obstacle_rotation": [rotation_of(obstacle.yaw, None) for obstacle in scenario.obstacles],
+        "obstacle_center": [np.array(obstacle.center) - origin for obstacle in scenario.obstacles],
+        "obstacle_half": [np.array(obstacle.size) / 2 for obstacle in scenario.obstacles],
+        "goal": [np.array(goal.position) - origin if goal else NOWHERE for goal in goals],
+        "goal_radius": [goal.radius if goal else 0.0 for goal in goals],
+        "end_on_collision": int(scenario.termination.collision),
+        "end_on_arrival": int(scenario.termination.arrival),
+    }
+
+
+def _camera(scenario: Scenario) -> dict[str, Any]:
+    c = scenario.camera
+    named = ROTATION_OF_CAMERA.get(c.orientation) if isinstance(c.orientation, str) else None
+    same = ("position", "image_size", "focal_length", "principal_point")
+    return {
+        **{name: getattr(c, name) for name in same},
+        "rotation": rotation_of(None, c.orientation) if named is None else named,
+        "pinhole": int(c.model == "pinhole"),
+        **dict(zip(("k1", "k2", "p1", "p2", "k3"), c.distortion, strict=True)),
+        "max_radius": _monotone_radius(c.distortion),
+        "undistort": int(c.undistort),
+        "quantise": int(c.quantise),
+        "range": math.inf if c.range is None else c.range,
+        "miss": c.miss_probability,
+    }
 
 
 def _monotone_radius(k: tuple[float, ...]) -> float:
@@ -181,28 +178,24 @@ def _monotone_radius(k: tuple[float, ...]) -> float:
     k1, k2, _, _, k3 = k
     roots = np.roots([7 * k3, 0, 5 * k2, 0, 3 * k1, 0, 1.0]) if any((k1, k2, k3)) else np.array([])
     real = roots[np.abs(roots.imag) < 1e-9].real
-    positive = real[real > 0]
-    return float(positive.min()) if positive.size else float(np.inf)
+    return float(real[real > 0].min(initial=math.inf))
 
 
-def _fill_camera(camera: Any, scenario: Scenario, p: Precision) -> None:
-    c = scenario.camera
-    if isinstance(c.orientation, str):
-        rotation = ROTATION_OF_CAMERA[c.orientation]
-    else:
-        rotation = rotation_of(None, c.orientation)
-    camera.rotation = p.mat33(*rotation.ravel().tolist())
-    camera.position = p.vec3(*c.position)
-    camera.pinhole = int(c.model == "pinhole")
-    camera.image_size = p.vec2(*c.image_size)
-    camera.focal_length = p.vec2(*c.focal_length)
-    camera.principal_point = p.vec2(*c.principal_point)
-    camera.k1, camera.k2, camera.p1, camera.p2, camera.k3 = c.distortion
-    camera.max_radius = _monotone_radius(c.distortion)
-    camera.undistort = int(c.undistort)
-    camera.quantise = int(c.quantise)
-    camera.range = c.range if c.range is not None else float("inf")
-    camera.miss = c.miss_probability
+def _noise(scenario: Scenario) -> dict[str, Any]:
+    n, rates = scenario.noise, scenario.rates
+    on = float(n.enabled)
+    axis = np.array(n.bearing.axis) / np.linalg.norm(n.bearing.axis)
+    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    if abs(axis[2]) > 1 - 1e-12:
+        first = np.array([1.0, 0.0, 0.0])
+    first = first / np.linalg.norm(first)
+    return {
+        "velocity": on * _at_rate(n.velocity, n.odometry_rate, rates.odometry),
+        "angular_velocity": on * _at_rate(n.angular_velocity, n.odometry_rate, rates.odometry),
+        "bearing_paper": int(n.bearing.model == "paper"),
+        "bearing": on * _at_rate(n.bearing.scale, n.bearing.rate, rates.camera),
+        "axis": np.column_stack([first, np.cross(axis, first), axis]),
+    }
 
 
 def _at_rate(std: float, stated: float | str, actual: float) -> float:
@@ -210,44 +203,27 @@ def _at_rate(std: float, stated: float | str, actual: float) -> float:
     return std if isinstance(stated, str) else std * float(np.sqrt(actual / stated))
 
 
-def _fill_noise(noise: Any, scenario: Scenario, p: Precision) -> None:
-    n, rates = scenario.noise, scenario.rates
-    on = float(n.enabled)
-    noise.velocity = on * _at_rate(n.velocity, n.odometry_rate, rates.odometry)
-    noise.angular_velocity = on * _at_rate(n.angular_velocity, n.odometry_rate, rates.odometry)
-    noise.bearing_paper = int(n.bearing.model == "paper")
-    noise.bearing = on * _at_rate(n.bearing.scale, n.bearing.rate, rates.camera)
-    axis = np.array(n.bearing.axis) / np.linalg.norm(n.bearing.axis)
-    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    if abs(axis[2]) > 1 - 1e-12:
-        first = np.array([1.0, 0.0, 0.0])
-    first = first / np.linalg.norm(first)
-    frame = np.column_stack([first, np.cross(axis, first), axis])
-    noise.axis = p.mat33(*frame.ravel().tolist())
-
-
-def _fill_radio(radio: Any, scenario: Scenario) -> None:
+def _radio(scenario: Scenario) -> dict[str, Any]:
     v = scenario.v2x
-    radio.delay = v.delay
-    radio.period = v.period
-    radio.slots = max(v.delay, 1) + 1
-    radio.loss = v.loss
-    radio.range = v.range if v.range is not None else float("inf")
-    radio.staleness = v.staleness if v.staleness is not None else float("inf")
+    return {
+        **{name: getattr(v, name) for name in ("delay", "period", "loss")},
+        "slots": max(v.delay, 1) + 1,
+        "range": math.inf if v.range is None else v.range,
+        "staleness": math.inf if v.staleness is None else v.staleness,
+    }
 
 
-def _fill_observer(observer: Any, scenario: Scenario, fill: _Filler) -> None:
-    o = scenario.observer
-    count = len(scenario.vehicles)
-    observer.k = fill.array(o.k if isinstance(o.k, tuple) else [o.k] * count, fill.p.scalar)
-    q = o.q
-    weights = [q.get(name, 10.0) if isinstance(q, dict) else q for name in scenario.target_names]
-    observer.q = fill.array(weights, fill.p.scalar)
-    observer.v1, observer.v2 = o.V
-    observer.p1, observer.p2 = o.P0
-    observer.max_turn = o.max_turn
-    observer.rate = min(scenario.rates.observer or scenario.rates.camera, scenario.rates.camera)
-    stride = max(1, round(scenario.rates.camera / GRAMIAN_RATE))
-    observer.gramian_stride = stride
-    observer.block_ticks = stride * max(1, round(o.gramian_window * scenario.rates.camera / GRAMIAN_BLOCKS / stride))
-    observer.blocks = GRAMIAN_BLOCKS
+def _observer(scenario: Scenario) -> dict[str, Any]:
+    o, camera = scenario.observer, scenario.rates.camera
+    stride = max(1, round(camera / GRAMIAN_RATE))
+    block = round(o.gramian_window * camera / GRAMIAN_BLOCKS / stride)
+    return {
+        "k": o.k if isinstance(o.k, tuple) else [o.k] * len(scenario.vehicles),
+        "q": [o.q.get(name, 10.0) if isinstance(o.q, dict) else o.q for name in scenario.target_names],
+        **dict(zip(("v1", "v2", "p1", "p2"), (*o.V, *o.P0), strict=True)),
+        "max_turn": o.max_turn,
+        "rate": min(scenario.rates.observer or camera, camera),
+        "gramian_stride": stride,
+        "block_ticks": stride * max(1, block),
+        "blocks": GRAMIAN_BLOCKS,
+    }
