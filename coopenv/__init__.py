@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from coopenv.api.vector_env import CooperativeVectorEnv, make_vec
     from coopenv.bench.observers.comparison import Comparison, compare
     from coopenv.scenario import Scenario, load_scenario
+    from coopenv.scenario.own_terms import register_observation, register_reward, register_termination
 
     __version__: str
 else:
@@ -40,6 +41,9 @@ else:
         "load_scenario": "coopenv.scenario",
         "make_vec": "coopenv.api.vector_env",
         "parallel_env": "coopenv.api.parallel_env",
+        "register_observation": "coopenv.scenario.own_terms",
+        "register_reward": "coopenv.scenario.own_terms",
+        "register_termination": "coopenv.scenario.own_terms",
     }
     """Module of each name that is loaded when it is first used."""
 
@@ -76,6 +80,9 @@ __all__ = [
     "load_scenario",
     "make_vec",
     "parallel_env",
+    "register_observation",
+    "register_reward",
+    "register_termination",
 ]
 
 register_all()

@@ -13,7 +13,7 @@ from gymnasium.utils import seeding
 from coopenv.api.plugins import PlugIns
 from coopenv.api.step_results import MEMORY, results_struct
 from coopenv.api.terms.binding import bound_terms
-from coopenv.api.terms.kernels import endings_kernel, results_kernel
+from coopenv.api.terms.kernels import check_own_terms, endings_kernel, results_kernel
 from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.base import Backend
 from coopenv.backends.simulated import Simulated
@@ -69,6 +69,7 @@ class Engine:
         check_memory(size_of(results_struct(p), sizes), f"results of {worlds} worlds", device_memory(device))
         self.results = allocate(results_struct(p), sizes, device)
         terms = bound_terms(scenario)
+        check_own_terms(terms, device)
         self._fill = results_kernel(terms, p)
         self._end = endings_kernel(terms.conditions, p) if terms.conditions else None
         fields = self.layout.values()

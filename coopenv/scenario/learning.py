@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import ConfigDict, Field, create_model, model_validator
+from pydantic import AfterValidator, ConfigDict, Field, create_model, model_validator
 
 from coopenv.errors import suggest
 from coopenv.scenario.base import NonNegative, Number, Part, Positive
-from coopenv.scenario.term_tables import GROUPS, OBSERVATION_FIELDS, REWARD_TERMS, TERMINATION_CONDITIONS
-from coopenv.scenario.terms import ObservationField, RewardTerm, TerminationCondition
+from coopenv.scenario.terms import (
+    GROUPS,
+    OBSERVATION_FIELDS,
+    REWARD_TERMS,
+    TERMINATION_CONDITIONS,
+    ObservationField,
+    Term,
+    check_known,
+    check_privilege,
+)
 
 
 def _list_groups(schema: dict[str, Any]) -> None:
@@ -31,14 +39,12 @@ class Observation(Part):
     """rad/s"""
     age_scale: Positive = 1.0
     """s; older measurements read 1"""
-    custom: dict[str, ObservationField] = Field(default={})
+    custom: dict[Annotated[str, AfterValidator(OBSERVATION_FIELDS.free)], ObservationField] = Field(default={})
     """Fields of one's own by name: where their functions stand, see docs/terms.md."""
 
     @model_validator(mode="after")
     def _fields_exist(self) -> Observation:
-        OBSERVATION_FIELDS.check_names(self.custom)
-        known = OBSERVATION_FIELDS.known(self.custom)
-        groups = {row.group or name for name, row in known.items()}
+        groups = {row.group or name for name, row in OBSERVATION_FIELDS.known(self.custom).items()}
         for name in self.include:
             if name not in groups:
                 near = suggest(name, groups) or f"; known: {', '.join(sorted(groups))}"
@@ -105,7 +111,7 @@ class Reward(Part):
     model_config = ConfigDict(json_schema_extra=_only_those_of_coopenv(REWARD_TERMS.built_in, "weights"))
 
     weights: RewardWeights = RewardWeights()
-    custom: dict[str, RewardTerm] = Field(default={})
+    custom: dict[Annotated[str, AfterValidator(REWARD_TERMS.free)], Term] = Field(default={})
     """Terms of one's own by name: where their functions stand, see docs/terms.md."""
     privileged: bool = False
     """Must be true when a weighted term uses the truth."""
@@ -116,20 +122,11 @@ class Reward(Part):
         named: dict[str, float] = self.weights.model_dump()
         return {**dict.fromkeys((*REWARD_TERMS.built_in, *self.custom), 0.0), **named}
 
-    @model_validator(mode="before")
-    @classmethod
-    def _terms_exist(cls, given: Any) -> Any:
-        if isinstance(given, dict) and isinstance(given.get("weights"), dict):
-            REWARD_TERMS.check_known(given["weights"], given.get("custom"), "weights.")
-        return given
-
     @model_validator(mode="after")
-    def _privilege_is_declared(self) -> Reward:
-        REWARD_TERMS.check_names(self.custom)
-        known = REWARD_TERMS.known(self.custom)
-        for name, weight in self.by_name.items():
-            if weight != 0.0 and known[name].privileged and not self.privileged:
-                raise ValueError(f"privileged: must be true, because the weighted term '{name}' uses the truth")
+    def _terms_exist(self) -> Reward:
+        weights = self.weights.model_dump()
+        check_known(REWARD_TERMS, weights, self.custom, "weights.")
+        check_privilege(REWARD_TERMS, weights, self)
         return self
 
 
@@ -145,7 +142,7 @@ class Termination(Part):
     """Touching a building or another body ends the vehicle's episode."""
     arrival: bool = True
     """Reaching its goal ends the vehicle's episode."""
-    custom: dict[str, TerminationCondition] = Field(default={})
+    custom: dict[Annotated[str, AfterValidator(TERMINATION_CONDITIONS.free)], Term] = Field(default={})
     """Conditions of one's own by name: where their functions stand, see docs/terms.md."""
     privileged: bool = False
     """Must be true when a condition of one's own that is switched on uses the truth."""
@@ -159,15 +156,12 @@ class Termination(Part):
     @classmethod
     def _conditions_exist(cls, given: Any) -> Any:
         if isinstance(given, dict):
+            custom = given.get("custom")
             names = [name for name in given if name not in cls.model_fields]
-            TERMINATION_CONDITIONS.check_known(names, given.get("custom"))
+            check_known(TERMINATION_CONDITIONS, names, custom if isinstance(custom, dict) else {})
         return given
 
     @model_validator(mode="after")
     def _privilege_is_declared(self) -> Termination:
-        TERMINATION_CONDITIONS.check_names(self.custom)
-        known = TERMINATION_CONDITIONS.known(self.custom)
-        for name in self.own:
-            if known[name].privileged and not self.privileged:
-                raise ValueError(f"privileged: must be true, because the condition '{name}' uses the truth")
+        check_privilege(TERMINATION_CONDITIONS, self.__pydantic_extra__, self)
         return self

@@ -1,16 +1,134 @@
-"""Terms of one's own in the plain data of a scenario: where their files are, and a scenario without them."""
+"""Terms of one's own: made known by name in a program, or by their place in a scenario's file; see docs/terms.md."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import inspect
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from pydantic import ValidationError
+
 from coopenv import user_code
-from coopenv.scenario.term_tables import GROUPS, REWARD_TERMS, TERMINATION_CONDITIONS
+from coopenv.errors import CoopenvError, shown
+from coopenv.scenario.terms import (
+    GROUPS,
+    OBSERVATION_FIELDS,
+    REWARD_TERMS,
+    TERMINATION_CONDITIONS,
+    ObservationField,
+    Per,
+    R,
+    Registry,
+    Scale,
+    Term,
+)
+from coopenv.scenario.validation import one_line
 
 SECTIONS = ("observation", "reward", "termination")
 """Parts of a scenario with a table `custom`."""
+
+
+def register_reward(name: str, function: Callable[..., Any], *, unit: str = "1", meaning: str = "") -> None:
+    """Make a reward term known by name; a scenario weighs it with `reward.weights.<name>`.
+
+    Args:
+        name: an identifier.
+        function: of the record `Ego`, or of `Ego` and `Truth` (`coopenv.api.terms.records`); returns a number. A Warp
+            function, or a plain one that Warp can compile. A term that takes the truth is privileged.
+        unit: of the value.
+        meaning: one line for tables; empty: the first line of the function's docstring.
+
+    Raises:
+        CoopenvError: the name is no identifier or taken, or it is no function of one or two records.
+    """
+    _register(REWARD_TERMS, Term, name, function, (1, 2), unit=unit, meaning=meaning)
+
+
+def register_termination(name: str, function: Callable[..., Any], *, meaning: str = "") -> None:
+    """Make a termination condition known by name; a scenario switches it on with `termination.<name> = true`.
+
+    It is checked after every decision, and `info["outcome"]` of the vehicles whose episodes it ends is its name.
+
+    Args:
+        name: an identifier.
+        function: as for `register_reward`, but returns whether the vehicle's episode ends.
+        meaning: one line for tables; empty: the first line of the function's docstring.
+
+    Raises:
+        CoopenvError: the name is no identifier or taken, or it is no function of one or two records.
+    """
+    _register(TERMINATION_CONDITIONS, Term, name, function, (1, 2), meaning=meaning)
+
+
+def register_observation(
+    name: str,
+    function: Callable[..., Any],
+    *,
+    per: Per = "vehicle",
+    size: int = 1,
+    unit: str = "1",
+    scale: float | Scale = 1.0,
+    low: int = -1,
+    meaning: str = "",
+) -> None:
+    """Make an observation field known by name; a scenario lists it in `observation.include`.
+
+    Args:
+        name: an identifier.
+        function: of the record `Ego`, and of `Target` or `Neighbour` if there is one value for each of these
+            (`coopenv.api.terms.records`); returns a number, or a vector of `size`. A Warp function, or a plain one that
+            Warp can compile. No truth is at hand in these records.
+        per: "vehicle": one value; "target": one for every landmark and vehicle; "neighbour": one for every other
+            vehicle.
+        size: entries of one value.
+        unit: of the value.
+        scale: what the value is divided by: a number, or the name of a scale of `[observation]`.
+        low: -1, or 0 for what is never negative: the lower end of the range.
+        meaning: one line for tables; empty: the first line of the function's docstring.
+
+    Raises:
+        CoopenvError: the name is no identifier or taken, another argument has no such value, or it is no function of
+            these records.
+    """
+    columns = {"per": per, "size": size, "unit": unit, "scale": scale, "low": low, "meaning": meaning}
+    _register(OBSERVATION_FIELDS, ObservationField, name, function, (1 if per == "vehicle" else 2,), **columns)
+
+
+def _register(
+    kind: Registry[R], row: type[R], name: str, function: Any, allowed: tuple[int, ...], **columns: Any
+) -> None:
+    where = f"{kind.kind} {shown(name)}"
+    records = record_count(where, function, allowed)
+    about = inspect.getdoc(getattr(function, "func", function)) or ""
+    columns["meaning"] = columns["meaning"] or about.partition("\n")[0]
+    if row is Term:
+        columns["privileged"] = records == 2
+    try:
+        kind.register(name, row(function=function, **columns))
+    except ValidationError as error:
+        raise CoopenvError(one_line(error, where, row)) from None
+
+
+def record_count(where: str, function: Any, allowed: tuple[int, ...]) -> int:
+    """Return how many records the function of a term takes.
+
+    Args:
+        where: begins an error.
+        function: a Warp function or a plain one.
+        allowed: numbers of records.
+
+    Raises:
+        CoopenvError: it is no function with a name, or takes another number.
+    """
+    plain = getattr(function, "func", function)  # a Warp function holds the plain one
+    if not inspect.isfunction(plain) or plain.__name__ == "<lambda>":
+        raise CoopenvError(f"{where}: expected a function with a name, got {shown(function)}")
+    taken = len(inspect.signature(plain).parameters)
+    if taken not in allowed:
+        expected = " or ".join(map(str, allowed))
+        raise CoopenvError(f"{where}: its function takes {taken} records, expected {expected}; see docs/terms.md")
+    return taken
 
 
 def located(raw: Mapping[str, Any], folder: Path) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Rows of the term tables: what an observation holds, what a reward weighs, what ends a vehicle's episode.
+"""Terms: what an observation holds, what a reward weighs, what ends a vehicle's episode; a row each.
 
 A row says what a term is and names the function that computes it. From the rows come the layout of an observation, the
 weights that a scenario may set, the kernel (`coopenv.api.terms`), and the tables of `coopenv describe`.
@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Generic, Literal, TypeVar
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import ConfigDict, Field, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from coopenv import user_code
-from coopenv.errors import CoopenvError, suggest
-from coopenv.scenario.base import Part, Positive
+from coopenv.errors import CoopenvError, shown, suggest
+from coopenv.scenario.base import Part, Positive, Text
 
 Scale = Literal["position_scale", "velocity_scale", "angular_velocity_scale", "age_scale", "targets"]
 """A setting of `[observation]`, or the number of targets."""
@@ -22,13 +22,22 @@ Per = Literal["vehicle", "target", "neighbour"]
 """One value of the vehicle itself, one of every target (landmarks, then vehicles), or one of every other vehicle."""
 
 
-class Term(Part):
-    """A term of any kind; a text alone is its function."""
+def _or_text(schema: dict[str, Any]) -> None:
+    """Say, for editors, that a row may be the text of its function alone."""
+    row = dict(schema)
+    schema.clear()
+    schema["anyOf"] = [{"type": "string", "description": row["properties"]["function"]["description"]}, row]
+
+
+class Row(Part):
+    """What every term says of itself; a text alone is its function."""
+
+    model_config = ConfigDict(json_schema_extra=_or_text)
 
     function: str | SkipJsonSchema[Callable[..., Any]]
     """`file.py:name`, the file relative to the scenario's, or `package.module:name`."""
-    unit: str = "1"
-    meaning: str = ""
+    unit: Text = "1"
+    meaning: Text = ""
 
     @model_validator(mode="before")
     @classmethod
@@ -39,15 +48,15 @@ class Term(Part):
     @classmethod
     def _names_a_place(cls, function: Any) -> Any:
         if isinstance(function, str) and not user_code.is_reference(function):
-            raise ValueError(f"expected file.py:name or package.module:name, got '{function:.60}'")
+            raise ValueError(f"expected file.py:name or package.module:name, got {shown(function)}")
         return function
 
 
-class TruthTerm(Term):
-    """A term that may read the truth."""
+class Term(Row):
+    """A term of the reward, or a condition that ends a vehicle's episode."""
 
     privileged: bool = False
-    """Whether it reads the truth."""
+    """Whether it uses the truth, as every function of two records does."""
 
     @property
     def described(self) -> str:
@@ -56,18 +65,10 @@ class TruthTerm(Term):
         return f"{self.meaning}{unit}{' (privileged)' if self.privileged else ''}"
 
 
-class RewardTerm(TruthTerm):
-    """A term of the reward."""
-
-
-class TerminationCondition(TruthTerm):
-    """What ends a vehicle's episode, checked after every decision."""
-
-
-class ObservationField(Term):
+class ObservationField(Row):
     """A field of the observation; every entry is value / scale, clipped to [low, 1]."""
 
-    group: str = ""
+    group: Text = ""
     """What `observation.include` calls it; empty: its own name."""
     per: Per = "vehicle"
     size: int = Field(default=1, ge=1, le=64)
@@ -76,73 +77,154 @@ class ObservationField(Term):
     low: Literal[-1, 0] = -1
 
 
-Row = TypeVar("Row", bound=Term)
+R = TypeVar("R", bound=Row)
 
 
-class Registry(Generic[Row]):
+class Registry(Generic[R]):
     """All terms of one kind: those of coopenv and those registered in this program."""
 
-    def __init__(self, kind: str, built_in: Mapping[str, Row]) -> None:
-        self.kind = kind
-        self.built_in = built_in
-        self._registered: dict[str, Row] = {}
+    def __init__(self, kind: str, built_in: Mapping[str, R]) -> None:
+        self.kind, self.built_in = kind, built_in
+        self._taken = {*built_in, *(getattr(row, "group", "") for row in built_in.values()), "custom", "privileged"}
+        self._registered: dict[str, R] = {}
 
-    def known(self, custom: Mapping[str, Row]) -> dict[str, Row]:
+    def known(self, custom: Mapping[str, R]) -> dict[str, R]:
         """Return every term that a scenario may name whose own terms are `custom`."""
         return {**self.built_in, **self._registered, **custom}
 
-    def check_name(self, name: object) -> None:
-        """Check that a new term may have a name.
+    def free(self, name: str) -> str:
+        """Return the name of a new term.
 
         Raises:
             CoopenvError: it is no identifier, or taken by coopenv.
         """
         if not isinstance(name, str) or not name.isidentifier():
-            raise CoopenvError(f"the name of a {self.kind} is an identifier, got {name!r}")
-        if name in self.built_in or name in ("custom", "privileged"):
-            raise CoopenvError(f"a {self.kind} named '{name}' exists already")
+            raise CoopenvError(f"the name of a {self.kind} is an identifier, got {shown(name)}")
+        if name in self._taken:
+            raise CoopenvError(f"a {self.kind} cannot be named '{name}', which coopenv uses")
+        return name
 
-    def check_names(self, names: Iterable[str]) -> None:
-        """Check the names of a scenario's own terms.
-
-        Raises:
-            ValueError: one of them is no identifier, or taken by coopenv.
-        """
-        for name in names:
-            try:
-                self.check_name(name)
-            except CoopenvError as error:
-                raise ValueError(f"custom.{name}: {error}") from None
-
-    def register(self, name: str, row: Row) -> None:
+    def register(self, name: str, row: R) -> None:
         """Make a term known by name in this program; one that is defined anew replaces its former self.
 
         Raises:
             CoopenvError: it is no identifier, or taken by another term.
         """
-        self.check_name(name)
-        former = self._registered.get(name)
-        if former is not None and _home(former.function) != _home(row.function):
-            raise CoopenvError(f"a {self.kind} named '{name}' exists already")
+        former = self._registered.get(self.free(name), row)
+        if _home(former.function) != _home(row.function):
+            raise CoopenvError(f"a {self.kind} named '{name}' is registered already")
         self._registered[name] = row
-
-    def check_known(self, names: Iterable[str], custom: object, where: str = "") -> None:
-        """Check the names that a scenario uses.
-
-        Args:
-            names: which they are.
-            custom: the scenario's own terms, plain data.
-            where: begins the error.
-
-        Raises:
-            ValueError: no term has one of them.
-        """
-        known = {*self.built_in, *self._registered, *(custom if isinstance(custom, dict) else ())}
-        for name in names:
-            if name not in known:
-                near = suggest(name, known) or f"; allowed: {', '.join(sorted(known))}"
-                raise ValueError(f"{where}{name}: unknown key{near}")
 
 
 def _home(function: Any) -> tuple[str, str]:
+    function = getattr(function, "func", function)  # a Warp function holds the plain one
     return function.__module__, function.__qualname__
+
+
+def check_known(kind: Registry[Any], names: Iterable[str], custom: Mapping[str, Any], where: str = "") -> None:
+    """Check that the terms that a scenario names exist; `where` begins the name of a key in an error.
+
+    Raises:
+        ValueError: one does not.
+    """
+    known = kind.known(custom)
+    for name in names:
+        if name not in known:
+            near = suggest(name, known) or f"; allowed: {', '.join(sorted(known))}"
+            raise ValueError(f"{where}{name}: unknown key{near}")
+
+
+def check_privilege(kind: Registry[Term], used: Mapping[str, float], part: Any) -> None:
+    """Check that a part of a scenario, which has `custom` and `privileged`, declares its use of the truth.
+
+    Raises:
+        ValueError: a term whose weight or switch in `used` is on uses the truth, and nothing says so.
+    """
+    known = kind.known(part.custom)
+    for name, weight in used.items():
+        if weight and known[name].privileged and not part.privileged:
+            raise ValueError(f"privileged: must be true, because the {kind.kind} '{name}' uses the truth")
+
+
+LOG_SCALE = 10.0
+"""Decades (or nepers of log det P / 6) that fill the range of a logarithmic entry."""
+
+_COLUMNS = ("per", "size", "unit", "scale", "low", "meaning")
+_FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
+    "estimate": [
+        ("estimate_position", "vehicle", 3, "m", "position_scale", -1, "Rhat phat, map frame"),
+        ("estimate_forward", "vehicle", 3, "1", 1, -1, "first column of Rhat: the body's x axis in the map"),
+        ("estimate_left", "vehicle", 3, "1", 1, -1, "second column of Rhat: the body's y axis in the map"),
+    ],
+    "quality": [
+        ("covariance_diagonal", "vehicle", 6, "log10", LOG_SCALE, -1, "log10 diag P over (2 lambda, p)"),
+        ("log_determinant", "vehicle", 1, "1", LOG_SCALE, -1, "log det P / 6"),
+        ("gramian_min_eigenvalue", "vehicle", 1, "log10", LOG_SCALE, -1, "log10, floor 1e-9, sliding window"),
+        ("targets_in_view", "vehicle", 1, "targets", "targets", 0, "number of targets measured in this frame"),
+    ],
+    "bearings": [
+        ("bearings", "target", 3, "1", 1, -1, "unit vector camera to target, optical frame; 0: never seen"),
+        ("bearing_mask", "target", 1, "bool", 1, 0, "1: measured in this frame"),
+        ("bearing_age", "target", 1, "s", "age_scale", 0,
+         "time since measured; 1: longer ago than the scale, or never"),
+    ],
+    "odometry": [
+        ("velocity", "vehicle", 3, "m/s", "velocity_scale", -1, "last odometry sample, body frame"),
+        ("angular_velocity", "vehicle", 3, "rad/s", "angular_velocity_scale", -1, "last odometry sample, body frame"),
+        ("odometry_age", "vehicle", 1, "s", "age_scale", 0, "age of that sample"),
+    ],
+    "messages": [
+        ("message_position", "neighbour", 3, "m", "position_scale", -1,
+         "neighbour's estimate seen from one's own estimate"),
+        ("message_forward", "neighbour", 3, "1", 1, -1, "neighbour's forward axis in one's own estimated frame"),
+        ("message_mask", "neighbour", 1, "bool", 1, 0, "1: a message is at hand and not stale"),
+        ("message_age", "neighbour", 1, "s", "age_scale", 0, "time since it was sent"),
+    ],
+    "goal": [
+        ("goal", "vehicle", 3, "m", "position_scale", -1,
+         "goal seen from one's own estimate, body frame; 0 without a goal"),
+    ],
+}  # fmt: skip
+
+_REWARDS: list[tuple[str, str, bool, str]] = [  # name, unit, privileged, meaning
+    ("progress", "m", True, "Decrease of the true distance to the goal"),
+    ("arrival", "1", False, "1 in the step of arrival"),
+    ("collision", "1", False, "-1 in the step of a collision"),
+    ("control", "1", False, "-|action|^2"),
+    ("time", "s", False, "Minus the time that has passed"),
+    ("position_error", "m", True, "-|position error|"),
+    ("orientation_error", "rad", True, "-orientation error"),
+    ("uncertainty", "1", False, "-log det P / 6: minus the mean log variance"),
+    ("observability", "1", False, "log10 of the smallest eigenvalue of the sliding Gramian (floor 1e-9)"),
+    ("visibility", "1", False, "Share of its possible targets that the vehicle has in view"),
+]
+
+_CONDITIONS = [  # name, function, meaning
+    ("collision", "touches_anything", "Touching a building or another body, at any camera tick"),
+    ("arrival", "reaches_goal", "Reaching the goal, at any camera tick"),
+]
+
+GROUPS = tuple(_FIELDS)
+"""Groups of fields of coopenv, in their order in an observation."""
+FUNCTIONS = "coopenv.api.terms.functions"
+"""Where the functions of coopenv's fields and reward terms stand, under the names of their rows."""
+
+OBSERVATION_FIELDS = Registry(
+    "observation field",
+    {
+        name: ObservationField(function=f"{FUNCTIONS}:{name}", group=group, **dict(zip(_COLUMNS, row, strict=True)))
+        for group, rows in _FIELDS.items()
+        for name, *row in rows
+    },
+)
+REWARD_TERMS = Registry(
+    "reward term",
+    {
+        name: Term(function=f"{FUNCTIONS}:{name}", unit=unit, privileged=privileged, meaning=about)
+        for name, unit, privileged, about in _REWARDS
+    },
+)
+TERMINATION_CONDITIONS = Registry(
+    "termination condition",
+    {name: Term(function=f"coopenv.world.collision:{place}", meaning=about) for name, place, about in _CONDITIONS},
+)

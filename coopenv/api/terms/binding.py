@@ -1,46 +1,96 @@
-"""The terms that a scenario names, bound to their functions."""
+"""The terms that a scenario names, bound to their Warp functions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import TypeVar
+import inspect
+import linecache
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Any, NamedTuple
 
-from coopenv.api.terms.chains import Bound, Terms
-from coopenv.api.terms.functions import term_function
+import warp as wp
+
+from coopenv import user_code
 from coopenv.api.terms.layout import included_fields
 from coopenv.errors import CoopenvError
 from coopenv.estimation.trajectory import Outcome
 from coopenv.scenario import Scenario
-from coopenv.scenario.term_tables import REWARD_TERMS, TERMINATION_CONDITIONS
-from coopenv.scenario.terms import Registry, TruthTerm
+from coopenv.scenario.own_terms import record_count
+from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS, TERMINATION_CONDITIONS, Registry, Row, Term
 
-Row = TypeVar("Row", bound=TruthTerm)
+
+class Bound(NamedTuple):
+    """A term as a kernel calls it."""
+
+    title: str
+    """Kind and name, for errors."""
+    own: bool
+    """Whether it is not coopenv's."""
+    number: int
+    """Place among the terms of its kind; of a condition: the outcome."""
+    function: wp.Function
+    records: int
+    """How many it takes: `Ego`, and the kind's second one."""
+    size: int = 1
+    """Entries of one value."""
+
+
+class Terms(NamedTuple):
+    """The terms of a scenario: fields of the observation, one value per vehicle, target or neighbour; and others."""
+
+    vehicle_fields: tuple[Bound, ...]
+    target_fields: tuple[Bound, ...]
+    neighbour_fields: tuple[Bound, ...]
+    rewards: tuple[Bound, ...]
+    conditions: tuple[Bound, ...]
 
 
 def bound_terms(scenario: Scenario) -> Terms:
-    """Return the functions of the scenario's observation fields and reward terms.
+    """Return the functions of the scenario's observation fields, reward terms, and conditions of its own.
 
     Raises:
-        CoopenvError: a function does not exist, cannot be loaded, or takes something else than its row says.
+        CoopenvError: a function does not exist, cannot be loaded, takes something else than its row says, or uses the
+            truth where the scenario does not say so.
     """
     fields: dict[str, list[Bound]] = {"vehicle": [], "target": [], "neighbour": []}
-    for i, (name, field) in enumerate(included_fields(scenario).items()):
-        records = 1 if field.per == "vehicle" else 2
-        function = term_function(f"observation field '{name}'", field, records)
-        fields[field.per].append(Bound(i, function, records, field.size))
-    rewards = _bound(REWARD_TERMS, scenario.reward.by_name, scenario.reward.custom, 0)
-    conditions = _bound(TERMINATION_CONDITIONS, scenario.termination.own, scenario.termination.custom, len(Outcome))
-    by_record = (tuple(fields["vehicle"]), tuple(fields["target"]), tuple(fields["neighbour"]))
-    return Terms(*by_record, rewards, conditions)
+    for i, (name, row) in enumerate(included_fields(scenario).items()):
+        bound = _bound(OBSERVATION_FIELDS, name, row, i, (1 if row.per == "vehicle" else 2,))
+        fields[row.per].append(bound._replace(size=row.size))
+    rewards = _all_bound(REWARD_TERMS, scenario.reward.by_name, scenario.reward, 0)
+    switches = dict.fromkeys(scenario.termination.own, True)
+    conditions = _all_bound(TERMINATION_CONDITIONS, switches, scenario.termination, len(Outcome))
+    of_vehicle, of_target, of_neighbour = map(tuple, fields.values())
+    return Terms(of_vehicle, of_target, of_neighbour, rewards, conditions)
 
 
-def _bound(kind: Registry[Row], names: Iterable[str], custom: Mapping[str, Row], first: int) -> tuple[Bound, ...]:
-    known = kind.known(custom)
-    bound = []
-    for i, name in enumerate(names, first):
-        what = f"{kind.kind} '{name}'"
+def _all_bound(kind: Registry[Term], used: Mapping[str, float], part: Any, first: int) -> tuple[Bound, ...]:
+    known, result = kind.known(part.custom), []
+    for i, (name, weight) in enumerate(used.items(), first):
         if name not in known:
-            raise CoopenvError(f"{what} is not registered in this process; see docs/terms.md")
-        records = 2 if known[name].privileged else 1
-        bound.append(Bound(i, term_function(what, known[name], records), records))
-    return tuple(bound)
+            raise CoopenvError(f"{kind.kind} '{name}' is not registered in this process; see docs/terms.md")
+        bound = _bound(kind, name, known[name], i, (1, 2))
+        if weight and bound.records == 2 and not part.privileged:
+            raise CoopenvError(f"{bound.title} uses the truth: {type(part).__name__.lower()}.privileged must be true")
+        result.append(bound)
+    return tuple(result)
+
+
+def _bound(kind: Registry[Any], name: str, row: Row, number: int, records: tuple[int, ...]) -> Bound:
+    title, function = f"{kind.kind} '{name}'", row.function
+    if isinstance(function, str):
+        linecache.checkcache()  # Warp reads the source of a file that may have changed
+        try:
+            function = user_code.load(function)
+        except CoopenvError as error:
+            raise CoopenvError(f"{title}: {error}") from None
+    taken = record_count(title, function, records)
+    return Bound(title, name not in kind.built_in, number, _warp_function(function), taken)
+
+
+@cache
+def _warp_function(function: Callable[..., Any]) -> Any:
+    if isinstance(function, wp.Function):
+        return function
+    for name in inspect.signature(function).parameters:
+        function.__annotations__.setdefault(name, Any)
+    return wp.func(function)

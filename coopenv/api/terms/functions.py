@@ -1,51 +1,166 @@
-"""From the row of a term to its Warp function."""
+"""The fields of coopenv's observation and the terms of its reward, one function for every row of their tables.
+
+They return the value in the row's unit; scaling and clipping, or weights, follow. Those that are given `truth` are
+privileged. Records: see `coopenv.api.terms.records`.
+"""
 
 from __future__ import annotations
 
-import inspect
-import linecache
-from collections.abc import Callable
-from functools import cache
-from typing import Any
-
 import warp as wp
 
-from coopenv import user_code
-from coopenv.errors import CoopenvError
-from coopenv.scenario.terms import Term
+from coopenv.api.terms.records import Ego, Neighbour, Target, Truth
+from coopenv.world.collision import ARRIVED, COLLIDED
+
+EIGENVALUE_FLOOR = wp.constant(1.0e-9)
+LOG10_E = wp.constant(0.4342944819032518)
+DEGREES = wp.constant(57.29577951308232)
 
 
-def term_function(what: str, row: Term, records: int) -> wp.Function:
-    """Return the function of a row, made a Warp function if it is a plain one.
-
-    Args:
-        what: the term, for errors.
-        row: names the function or holds it.
-        records: how many it has to take.
-
-    Raises:
-        CoopenvError: it does not exist, cannot be loaded, or takes something else.
-    """
-    function = row.function
-    if isinstance(function, str):
-        linecache.checkcache()  # Warp reads the source of a file that may have changed
-        try:
-            function = user_code.load(function)
-        except CoopenvError as error:
-            raise CoopenvError(f"{what}: {error}") from None
-    if not isinstance(function, wp.Function):
-        if not inspect.isfunction(function) or function.__name__ == "<lambda>":
-            raise CoopenvError(f"{what}: expected a function with a name, got {function!r:.60}")
-        function = _warp_function(function)
-    taken = len(function.input_types)
-    if taken != records:
-        raise CoopenvError(f"{what}: its function takes {taken} records, expected {records}; see docs/terms.md")
-    return function
+@wp.func
+def log10(value: wp.float32) -> wp.float32:
+    """Return the decimal logarithm."""
+    return wp.log(value) * LOG10_E
 
 
-@cache
-def _warp_function(function: Callable[..., Any]) -> wp.Function:
-    for name in inspect.signature(function).parameters:
-        function.__annotations__.setdefault(name, Any)
-    made: Any = wp.func(function)  # typed as what it wraps
-    return made  # type: ignore[no-any-return]
+@wp.func
+def estimate_position(ego: Ego):
+    return ego.position_estimate
+
+
+@wp.func
+def estimate_forward(ego: Ego):
+    R = ego.rotation_estimate
+    return wp.vec3(R[0, 0], R[1, 0], R[2, 0])
+
+
+@wp.func
+def estimate_left(ego: Ego):
+    R = ego.rotation_estimate
+    return wp.vec3(R[0, 1], R[1, 1], R[2, 1])
+
+
+@wp.func
+def covariance_diagonal(ego: Ego):
+    result = wp.vector(length=6, dtype=wp.float32)
+    for i in range(6):
+        result[i] = log10(ego.covariance[i, i])
+    return result
+
+
+@wp.func
+def log_determinant(ego: Ego):
+    return ego.mean_log_variance
+
+
+@wp.func
+def gramian_min_eigenvalue(ego: Ego):
+    return log10(wp.max(ego.gramian_min_eigenvalue, EIGENVALUE_FLOOR))
+
+
+@wp.func
+def targets_in_view(ego: Ego):
+    return ego.targets_in_view
+
+
+@wp.func
+def bearings(ego: Ego, target: Target):
+    return target.bearing
+
+
+@wp.func
+def bearing_mask(ego: Ego, target: Target):
+    return target.in_view
+
+
+@wp.func
+def bearing_age(ego: Ego, target: Target):
+    return target.age
+
+
+@wp.func
+def velocity(ego: Ego):
+    return ego.velocity
+
+
+@wp.func
+def angular_velocity(ego: Ego):
+    return ego.angular_velocity
+
+
+@wp.func
+def odometry_age(ego: Ego):
+    return ego.odometry_age
+
+
+@wp.func
+def message_position(ego: Ego, neighbour: Neighbour):
+    return neighbour.position
+
+
+@wp.func
+def message_forward(ego: Ego, neighbour: Neighbour):
+    R = neighbour.rotation
+    return wp.vec3(R[0, 0], R[1, 0], R[2, 0])
+
+
+@wp.func
+def message_mask(ego: Ego, neighbour: Neighbour):
+    return neighbour.heard
+
+
+@wp.func
+def message_age(ego: Ego, neighbour: Neighbour):
+    return neighbour.age
+
+
+@wp.func
+def goal(ego: Ego):
+    return ego.goal
+
+
+@wp.func
+def progress(ego: Ego, truth: Truth):
+    return truth.progress
+
+
+@wp.func
+def arrival(ego: Ego):
+    return wp.where(ego.outcome == ARRIVED, 1.0, 0.0)
+
+
+@wp.func
+def collision(ego: Ego):
+    return wp.where(ego.outcome == COLLIDED, -1.0, 0.0)
+
+
+@wp.func
+def control(ego: Ego):
+    return -ego.effort
+
+
+@wp.func
+def time(ego: Ego):
+    return -ego.elapsed
+
+
+@wp.func
+def position_error(ego: Ego, truth: Truth):
+    return -truth.position_error
+
+
+@wp.func
+def orientation_error(ego: Ego, truth: Truth):
+    return -(truth.orientation_error / DEGREES)
+
+
+@wp.func
+def uncertainty(ego: Ego):
+    return -ego.log_determinant / 6.0
+
+
+observability = gramian_min_eigenvalue
+
+
+@wp.func
+def visibility(ego: Ego):
+    return wp.float32(ego.targets_in_view) / wp.float32(wp.max(ego.possible_targets, 1))

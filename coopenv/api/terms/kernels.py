@@ -1,13 +1,14 @@
 """The kernels that terms run in, made for the terms that a scenario names: a term that is not named costs nothing.
 
-Each combination of terms has a Warp module of its own, which is compiled once per machine and precision.
+Each combination of terms has a Warp module of its own, which is compiled once per machine and precision. Loops over
+terms are unrolled by `wp.static`.
 """
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Sequence
-from functools import cache, reduce
+from functools import cache
 from hashlib import sha256
 from itertools import chain
 from typing import Any
@@ -15,29 +16,70 @@ from typing import Any
 import warp as wp
 
 from coopenv.api.step_results import assess, is_over, remember, set_flags
-from coopenv.api.terms.chains import (
-    Bound,
-    Terms,
-    no_condition,
-    no_field,
-    no_reward,
-    with_condition,
-    with_field,
-    with_reward,
-)
-from coopenv.api.terms.records import fill_neighbour, fill_own, fill_target, records
+from coopenv.api.terms.binding import Bound, Terms
+from coopenv.api.terms.records import Ego, Neighbour, Target, Truth, neighbour_record, own_records, target_record
+from coopenv.errors import CoopenvError
+from coopenv.world import kernel_cache
 from coopenv.world.collision import UNDER_WAY, goal_distance
 from coopenv.world.precision import Precision
+
+
+@wp.func
+def clipped(value: wp.float32) -> wp.float32:
+    """Return a value of coopenv's, clipped to [-1, 1]."""
+    return wp.clamp(value, -1.0, 1.0)
+
+
+@wp.func
+def clipped_own(value: wp.float32) -> wp.float32:
+    """Return a value of somebody's own, clipped to [-1, 1]; NaN stays, to be found later."""
+    return wp.where(wp.isnan(value), value, wp.clamp(value, -1.0, 1.0))
+
+
+@cache
+def writer(field: Bound) -> wp.Function:
+    """Return what writes a field's value x factor, clipped, into its place."""
+    function, number, size = field.function, field.number, field.size
+    both, many = field.records == 2, field.size > 1
+    clip = clipped_own if field.own else clipped
+
+    def write(
+        out: wp.array3d(dtype=wp.float32),
+        start: Any,
+        factor: Any,
+        world: int,
+        vehicle: int,
+        n: int,
+        ego: Ego,
+        other: Any,
+    ):
+        value = function(ego, other) if both else function(ego)
+        first = start[number] + n * size
+        if many:
+            for axis in range(size):
+                out[world, vehicle, first + axis] = clip(wp.float32(value[axis]) * factor[number])
+        else:
+            out[world, vehicle, first] = clip(wp.float32(value) * factor[number])
+
+    return wp.func(write)
+
+
+@cache
+def value_of(term: Bound, kind: Any) -> wp.Function:
+    """Return the function of a reward term (`kind`: float32) or a condition (bool) as one of two records."""
+    function, both = term.function, term.records == 2
+
+    def value(ego: Ego, truth: Truth):
+        return kind(function(ego, truth) if both else function(ego))
+
+    return wp.func(value)
 
 
 @cache
 def results_kernel(terms: Terms, p: Precision) -> wp.Kernel:
     """Return the kernel that fills the step results of every vehicle of the chosen worlds."""
-    Ego, Truth, Target, Neighbour = records(p)
-    write_own = reduce(with_field, terms.vehicle_fields, no_field)
-    write_of_target = reduce(with_field, terms.target_fields, no_field)
-    write_of_neighbour = reduce(with_field, terms.neighbour_fields, no_field)
-    add_rewards = reduce(with_reward, terms.rewards, no_reward)
+    own, of_target, of_neighbour = ([writer(field) for field in fields] for fields in terms[:3])
+    rewards = [value_of(term, wp.float32) for term in terms.rewards]
 
     def step_results(
         model: Any,
@@ -63,30 +105,36 @@ def results_kernel(terms: Terms, p: Precision) -> wp.Kernel:
         ended = state.ended[world, vehicle]
         set_flags(results, world, vehicle, ended, is_over(model, state, world), model.horizon_ticks)
         assess(model, state, results, world, vehicle)
-        ego, truth = fill_own(Ego(), Truth(), model, state, results, world, vehicle, distance)
+        ego, truth = own_records(model, state, results, world, vehicle, distance)
         remember(results, world, vehicle, distance, ended, state.tick[world])
-        total = add_rewards(results.terms, weight, world, vehicle, ego, truth)
+        total = float(0.0)
+        for k in range(wp.static(len(rewards))):
+            value = wp.static(rewards[k])(ego, truth)
+            results.terms[world, vehicle, k] = value
+            total += weight[k] * value
         earns = results.alive[world, vehicle] and fresh[world] == 0
         results.reward[world, vehicle] = wp.where(earns, total, 0.0)
 
         out = results.observation
-        write_own(out, start, factor, world, vehicle, 0, ego, ego)
+        for k in range(wp.static(len(own))):
+            wp.static(own[k])(out, start, factor, world, vehicle, 0, ego, ego)
         for n in range(model.agents):
-            target = fill_target(Target(), model, state, world, vehicle, n)
-            write_of_target(out, start, factor, world, vehicle, n, ego, target)
+            target = target_record(model, state, world, vehicle, n)
+            for k in range(wp.static(len(of_target))):
+                wp.static(of_target[k])(out, start, factor, world, vehicle, n, ego, target)
         for n in range(model.vehicles - 1):
             sender = wp.where(n >= vehicle, n + 1, n)
-            neighbour = fill_neighbour(Neighbour(), model, state, world, vehicle, sender)
-            write_of_neighbour(out, start, factor, world, vehicle, n, ego, neighbour)
+            neighbour = neighbour_record(model, state, world, vehicle, sender)
+            for k in range(wp.static(len(of_neighbour))):
+                wp.static(of_neighbour[k])(out, start, factor, world, vehicle, n, ego, neighbour)
 
-    return _kernel(step_results, p, [*chain(*terms[:4])])
+    return _kernel(step_results, p.name, [*chain(*terms[:4])])
 
 
 @cache
 def endings_kernel(conditions: tuple[Bound, ...], p: Precision) -> wp.Kernel:
     """Return the kernel that ends the episodes of vehicles which fulfil a condition of the scenario's own."""
-    Ego, Truth, _, _ = records(p)
-    outcome_of = reduce(with_condition, conditions, no_condition)
+    fulfilled = [value_of(condition, wp.bool) for condition in conditions]
 
     def end_episodes(model: Any, state: Any, results: Any):
         """One thread per (world, vehicle). Conditions count after a decision, not right after a reset."""
@@ -96,16 +144,55 @@ def endings_kernel(conditions: tuple[Bound, ...], p: Precision) -> wp.Kernel:
         if decided and state.ended[world, vehicle] == UNDER_WAY:
             assess(model, state, results, world, vehicle)
             distance = goal_distance(model, state, world, vehicle)
-            ego, truth = fill_own(Ego(), Truth(), model, state, results, world, vehicle, distance)
-            state.ended[world, vehicle] = outcome_of(ego, truth)
+            ego, truth = own_records(model, state, results, world, vehicle, distance)
+            for k in range(wp.static(len(fulfilled))):
+                if state.ended[world, vehicle] == UNDER_WAY and wp.static(fulfilled[k])(ego, truth):
+                    state.ended[world, vehicle] = wp.static(conditions[k].number)
 
-    return _kernel(end_episodes, p, conditions)
+    return _kernel(end_episodes, p.name, conditions)
 
 
-def _kernel(function: Callable[..., None], p: Precision, terms: Sequence[Bound]) -> wp.Kernel:
+def check_own_terms(terms: Terms, device: str) -> None:
+    """Compile every term that is not coopenv's by itself, so that what is wrong with it can be said.
+
+    Raises:
+        CoopenvError: Warp cannot compile its function, or it returns something else than its row says.
+    """
+    for fields, record in zip(terms[:3], (Ego, Target, Neighbour), strict=True):
+        for field in fields:
+            returned = wp.float32 if field.size == 1 else wp.types.vector(field.size, wp.float32)
+            _check(field, record, returned, "a number" if field.size == 1 else f"a vector of {field.size}", device)
+    for term in terms.rewards:
+        _check(term, Truth, wp.float32, "a number", device)
+    for condition in terms.conditions:
+        _check(condition, Truth, wp.bool, "true or false", device)
+
+
+def _check(term: Bound, record: Any, returned: Any, expected: str, device: str) -> None:
+    if not term.own:
+        return
+    function, both = term.function, term.records == 2
+
+    def call(out: wp.array(dtype=returned)):
+        """Call the function."""
+        out[0] = returned(function(Ego(), record()) if both else function(Ego()))
+
+    try:
+        out = wp.empty(1, dtype=returned, device=device)
+        kernel_cache.launch(_kernel(call, record.key, [term]), dim=1, inputs=[out], device=device, record_cmd=True)
+    except kernel_cache.KernelCacheError:
+        raise
+    except Exception as error:  # Warp raises what it has
+        said = [part for part in str(error).split("\n;") if 'function "call"' not in part]
+        raise CoopenvError(
+            f"{term.title}: Warp cannot compile its function to return {expected}: {' '.join(said)}"
+        ) from None
+
+
+def _kernel(function: Callable[..., None], name: str, terms: Sequence[Bound]) -> wp.Kernel:
     """Return a kernel in a module that is named after its terms, the same in every process."""
-    parts = [f"{t.index} {t.size} {t.function.key} {inspect.getsource(t.function.func)}" for t in terms]
+    parts = [f"{t.number} {t.size} {t.own} {t.function.key} {inspect.getsource(t.function.func)}" for t in terms]
     fingerprint = sha256("\n".join(parts).encode()).hexdigest()[:12]
-    module = wp.get_module(f"{__name__}.{function.__name__}.{p.name}.{fingerprint}")
+    module = wp.get_module(f"{__name__}.{function.__name__}.{name}.{fingerprint}")
     module.options["enable_backward"] = False
     return wp.Kernel(func=function, key=function.__name__, module=module)

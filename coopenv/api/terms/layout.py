@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from gymnasium import spaces
 
+from coopenv.errors import CoopenvError
 from coopenv.scenario import Scenario
-from coopenv.scenario.term_tables import OBSERVATION_FIELDS
-from coopenv.scenario.terms import ObservationField
+from coopenv.scenario.terms import GROUPS, OBSERVATION_FIELDS, ObservationField
 
 
 @dataclass(frozen=True)
@@ -64,14 +64,20 @@ class Layout(dict[str, Field]):
 
 
 def included_fields(scenario: Scenario) -> dict[str, ObservationField]:
-    """Return the rows of the fields that a scenario's observation holds: coopenv's, then others as they are listed."""
+    """Return the rows of the fields that a scenario's observation holds: coopenv's, then others as they are listed.
+
+    Raises:
+        CoopenvError: one is not known in this process.
+    """
     wanted = scenario.observation.include
-    known = OBSERVATION_FIELDS.known(scenario.observation.custom)
-    rows = {name: row for name, row in known.items() if (row.group or name) in wanted}
-    others = [name for name in rows if name not in OBSERVATION_FIELDS.built_in]
-    others.sort(key=lambda name: wanted.index(rows[name].group or name))
-    names = [name for name in OBSERVATION_FIELDS.built_in if name in rows] + others
-    return {name: rows[name] for name in names}
+    by_group: dict[str, dict[str, ObservationField]] = {}
+    for name, row in OBSERVATION_FIELDS.known(scenario.observation.custom).items():
+        by_group.setdefault(row.group or name, {})[name] = row
+    for group in wanted:
+        if group not in by_group:
+            raise CoopenvError(f"observation field '{group}' is not registered in this process; see docs/terms.md")
+    first = [group for group in GROUPS if group in wanted]
+    return {name: row for group in (*first, *wanted) for name, row in by_group[group].items()}
 
 
 def observation_layout(scenario: Scenario) -> Layout:

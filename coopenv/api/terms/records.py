@@ -1,94 +1,84 @@
 """What the functions of terms are given: small records of one vehicle at the end of a decision.
 
-A field of the observation gets `Ego`, and `Target` or `Neighbour`: nothing in them depends on the truth but through
-what the vehicle measures, hears and does. Only rewards and terminations may ask for `Truth` too, and are then
-privileged. A term that keeps to its arguments therefore cannot leak truth into an observation.
+Numbers are float32, as observations and rewards are, whatever the precision of the world. A field of the observation
+gets `Ego`, and `Target` or `Neighbour`: nothing in them depends on the truth but through what the vehicle measures,
+hears and does. Only rewards and terminations may ask for `Truth` too, and are then privileged. A term that keeps to its
+arguments therefore cannot leak truth into an observation.
 """
 
-from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import warp as wp
 
 from coopenv.world.camera import VISIBLE
 from coopenv.world.collision import UNDER_WAY
-from coopenv.world.precision import Precision
 from coopenv.world.v2x import fresh
 
 NEVER = wp.constant(wp.float64(1.0e9))
 """Age of what has never been measured or heard, s."""
 
-
-class Records(NamedTuple):
-    """The Warp structs of one precision."""
-
-    Ego: Any
-    Truth: Any
-    Target: Any
-    Neighbour: Any
+mat66 = wp.types.matrix((6, 6), wp.float32)
 
 
-@cache
-def records(p: Precision) -> Records:
-    """Return the records in one precision."""
-    scalar, vec2, vec3, mat33, mat66 = p.scalar, p.vec2, p.vec3, p.mat33, p.mat66
+@wp.struct
+class Ego:
+    """What the vehicle itself knows."""
 
-    @wp.struct
-    class Ego:
-        """What the vehicle itself knows."""
+    time: wp.float32  # s since the reset
+    elapsed: wp.float32  # s since the last decision
+    position_estimate: wp.vec3  # m, map
+    rotation_estimate: wp.mat33  # body to map
+    covariance: mat66  # P over (2 lambda, p): rad^2, rad m, m^2
+    log_determinant: wp.float32  # of P
+    mean_log_variance: wp.float32  # log det P / 6
+    gramian_min_eigenvalue: wp.float32  # of the sliding observability Gramian
+    targets_in_view: wp.int32
+    possible_targets: wp.int32  # targets that may be measured
+    velocity: wp.vec3  # m/s, last odometry sample, body
+    angular_velocity: wp.vec3  # rad/s, last odometry sample, body
+    odometry_age: wp.float32  # s
+    action: wp.vec2  # of this decision, [-1, 1]
+    effort: wp.float32  # |action|^2
+    command: wp.vec3  # what it asked for: speed m/s, steering rad, acceleration m/s^2
+    goal: wp.vec3  # m, seen from the estimate, body; 0 without a goal
+    outcome: wp.int32  # `Outcome` in the step of arrival or collision, else UNDER_WAY
 
-        time: wp.float64  # s since the reset
-        elapsed: wp.float32  # s since the last decision
-        position_estimate: vec3  # m, map
-        rotation_estimate: mat33  # body to map
-        covariance: mat66  # P over (2 lambda, p): rad^2, rad m, m^2
-        log_determinant: scalar  # of P
-        gramian_min_eigenvalue: scalar  # of the sliding observability Gramian
-        targets_in_view: wp.int32
-        possible_targets: wp.int32  # targets that may be measured
-        velocity: vec3  # m/s, last odometry sample, body
-        angular_velocity: vec3  # rad/s, last odometry sample, body
-        odometry_age: wp.float64  # s
-        action: vec2  # of this decision, [-1, 1]
-        command: vec3  # what it asked for: speed m/s, steering rad, acceleration m/s^2
-        goal: vec3  # m, seen from the estimate, body; 0 without a goal
-        outcome: wp.int32  # `Outcome` in the step of arrival or collision, else UNDER_WAY
 
-    @wp.struct
-    class Truth:
-        """What only a simulation knows; NaN (numbers: 0) where a recording does not."""
+@wp.struct
+class Truth:
+    """What only a simulation knows; NaN (numbers: 0) where a recording does not."""
 
-        position: vec3  # m, map
-        rotation: mat33  # body to map
-        velocity: vec3  # m/s, body
-        angular_velocity: vec3  # rad/s, body
-        position_error: wp.float32  # m
-        orientation_error: wp.float32  # deg, geodesic
-        nees: wp.float32
-        goal_distance: wp.float32  # m, horizontal
-        progress: wp.float32  # m nearer to the goal than at the last decision; 0 without a goal
-        contact: wp.bool  # touching a building or another body now
+    position: wp.vec3  # m, map
+    rotation: wp.mat33  # body to map
+    velocity: wp.vec3  # m/s, body
+    angular_velocity: wp.vec3  # rad/s, body
+    position_error: wp.float32  # m
+    orientation_error: wp.float32  # deg, geodesic
+    nees: wp.float32
+    goal_distance: wp.float32  # m, horizontal
+    progress: wp.float32  # m nearer to the goal than at the last decision; 0 without a goal
+    contact: wp.bool  # touching a building or another body now
 
-    @wp.struct
-    class Target:
-        """What the vehicle knows of a landmark or another vehicle by its camera."""
 
-        index: wp.int32  # landmarks first, then vehicles
-        bearing: vec3  # unit vector camera to target, optical frame, last measured; 0: never
-        in_view: wp.bool  # measured in this frame
-        age: wp.float64  # s since measured
+@wp.struct
+class Target:
+    """What the vehicle knows of a landmark or another vehicle by its camera."""
 
-    @wp.struct
-    class Neighbour:
-        """What the vehicle knows of another vehicle by its messages; 0 where none is at hand."""
+    index: wp.int32  # landmarks first, then vehicles
+    bearing: wp.vec3  # unit vector camera to target, optical frame, last measured; 0: never
+    in_view: wp.bool  # measured in this frame
+    age: wp.float32  # s since measured
 
-        index: wp.int32  # of the vehicle
-        heard: wp.bool  # a message is at hand and not stale
-        position: vec3  # m, sender's estimate seen from one's own, body
-        rotation: mat33  # sender's body to one's own estimated body
-        age: wp.float64  # s since it was sent
 
-    return Records(Ego, Truth, Target, Neighbour)
+@wp.struct
+class Neighbour:
+    """What the vehicle knows of another vehicle by its messages; 0 where none is at hand."""
+
+    index: wp.int32  # of the vehicle
+    heard: wp.bool  # a message is at hand and not stale
+    position: wp.vec3  # m, sender's estimate seen from one's own, body
+    rotation: wp.mat33  # sender's body to one's own estimated body
+    age: wp.float32  # s since it was sent
 
 
 @wp.func
@@ -98,85 +88,90 @@ def known(value: Any) -> wp.float32:
 
 
 @wp.func
-def seconds_since(now: int, then: int, rate: wp.float64) -> wp.float64:
+def seconds_since(now: int, then: int, rate: wp.float64) -> wp.float32:
     """Return the age in s of a measurement or message by its tick; very old if there is none."""
-    if then < 0:
-        return NEVER
-    return wp.float64(now - then) / rate
+    return wp.float32(wp.where(then < 0, NEVER, wp.float64(now - then) / rate))
 
 
 @wp.func
-def odometry_age(samples: int, time: wp.float64, rate: wp.float64) -> wp.float64:
+def odometry_age(samples: int, time: wp.float64, rate: wp.float64) -> wp.float32:
     """Return the age in s of the last of so many samples, the first of which was at 0 s."""
-    if samples == 0:
-        return NEVER
-    return wp.max(time - wp.float64(samples - 1) / rate, wp.float64(0.0))
+    age = wp.max(time - wp.float64(samples - 1) / rate, wp.float64(0.0))
+    return wp.float32(wp.where(samples == 0, NEVER, age))
 
 
 @wp.func
-def fill_own(ego: Any, truth: Any, model: Any, state: Any, results: Any, world: int, vehicle: int, goal_distance: Any):
+def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, goal_distance: Any):
     """Return the records of a vehicle: what it knows, and what is true.
 
     `results` holds how good its estimate is, and what was so after the last decision. One function for both, as model,
     state and results are handed over by value, over which compilers take their time.
     """
+    ego = Ego()
     tick = state.tick[world]
-    ego.time = wp.float64(tick) / model.camera_rate
+    time = wp.float64(tick) / model.camera_rate
+    ego.time = wp.float32(time)
     ego.elapsed = wp.float32(wp.float64(tick - results.last_tick[world, vehicle]) / model.camera_rate)
     R = state.estimate_rotation[world, vehicle]
     p = state.estimate_position[world, vehicle]
-    ego.position_estimate = R * p
-    ego.rotation_estimate = R
-    ego.covariance = state.covariance[world, vehicle]
-    ego.log_determinant = results.log_determinant[world, vehicle]
-    ego.gramian_min_eigenvalue = results.gramian_min_eigenvalue[world, vehicle]
+    ego.position_estimate = wp.vec3(R * p)
+    ego.rotation_estimate = wp.mat33(R)
+    ego.covariance = mat66(state.covariance[world, vehicle])
+    ego.log_determinant = wp.float32(results.log_determinant[world, vehicle])
+    ego.mean_log_variance = wp.float32(results.log_determinant[world, vehicle] / p.dtype(6.0))
+    ego.gramian_min_eigenvalue = wp.float32(results.gramian_min_eigenvalue[world, vehicle])
     ego.targets_in_view = results.targets_in_view[world, vehicle]
     ego.possible_targets = model.target_count[vehicle]
-    ego.velocity = state.odometry_velocity[world, vehicle]
-    ego.angular_velocity = state.odometry_angular_velocity[world, vehicle]
-    ego.odometry_age = odometry_age(state.odometry_samples[world, vehicle], ego.time, model.odometry_rate)
-    ego.action = state.action[world, vehicle]
-    ego.command = state.command[world, vehicle]
+    ego.velocity = wp.vec3(state.odometry_velocity[world, vehicle])
+    ego.angular_velocity = wp.vec3(state.odometry_angular_velocity[world, vehicle])
+    ego.odometry_age = odometry_age(state.odometry_samples[world, vehicle], time, model.odometry_rate)
+    action = state.action[world, vehicle]
+    ego.action = wp.vec2(action)
+    ego.effort = wp.float32(wp.dot(action, action))
+    ego.command = wp.vec3(state.command[world, vehicle])
     if model.scene.goal_radius[vehicle] > p.dtype(0.0):
-        ego.goal = wp.transpose(R) * model.scene.goal[vehicle] - p
+        ego.goal = wp.vec3(wp.transpose(R) * model.scene.goal[vehicle] - p)
     ego.outcome = wp.where(results.alive[world, vehicle], state.ended[world, vehicle], UNDER_WAY)
 
+    truth = Truth()
     agent = model.landmarks + vehicle
-    truth.position = state.position[world, agent]
-    truth.rotation = state.rotation[world, agent]
-    truth.velocity = state.velocity[world, agent]
-    truth.angular_velocity = state.angular_velocity[world, agent]
+    truth.position = wp.vec3(state.position[world, agent])
+    truth.rotation = wp.mat33(state.rotation[world, agent])
+    truth.velocity = wp.vec3(state.velocity[world, agent])
+    truth.angular_velocity = wp.vec3(state.angular_velocity[world, agent])
     truth.position_error = known(results.position_error[world, vehicle])
     truth.orientation_error = known(results.orientation_error[world, vehicle])
     truth.nees = known(results.nees[world, vehicle])
     truth.goal_distance = known(goal_distance)
-    if model.scene.goal_radius[vehicle] > goal_distance - goal_distance:
+    if model.scene.goal_radius[vehicle] > p.dtype(0.0):
         truth.progress = known(results.last_goal_distance[world, vehicle] - goal_distance)
     truth.contact = state.collided[world, vehicle] != 0
     return ego, truth
 
 
 @wp.func
-def fill_target(target: Any, model: Any, state: Any, world: int, vehicle: int, index: int):
+def target_record(model: Any, state: Any, world: int, vehicle: int, index: int) -> Target:
     """Return the record of a target."""
+    target = Target()
     target.index = index
-    target.bearing = state.bearing[world, vehicle, index]
+    target.bearing = wp.vec3(state.bearing[world, vehicle, index])
     target.in_view = state.sight[world, vehicle, index] == VISIBLE
     target.age = seconds_since(state.tick[world], state.bearing_tick[world, vehicle, index], model.camera_rate)
     return target
 
 
 @wp.func
-def fill_neighbour(neighbour: Any, model: Any, state: Any, world: int, vehicle: int, sender: int):
+def neighbour_record(model: Any, state: Any, world: int, vehicle: int, sender: int) -> Neighbour:
     """Return the record of another vehicle."""
+    neighbour = Neighbour()
     now = state.tick[world]
     neighbour.index = sender
     neighbour.heard = fresh(model, state, world, vehicle, sender, now)
-    neighbour.age = NEVER
+    neighbour.age = wp.float32(NEVER)
     if neighbour.heard:
         Rt = wp.transpose(state.estimate_rotation[world, vehicle])
         p = state.estimate_position[world, vehicle]
-        neighbour.position = Rt * state.inbox_position[world, vehicle, sender] - p
-        neighbour.rotation = Rt * state.inbox_rotation[world, vehicle, sender]
+        neighbour.position = wp.vec3(Rt * state.inbox_position[world, vehicle, sender] - p)
+        neighbour.rotation = wp.mat33(Rt * state.inbox_rotation[world, vehicle, sender])
         neighbour.age = seconds_since(now, state.inbox_tick[world, vehicle, sender], model.camera_rate)
     return neighbour

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import coopenv
 from coopenv.api.trainers.sb3 import make_sb3_vec_env
-from coopenv.scenario.term_tables import REWARD_TERMS
+from coopenv.scenario.terms import REWARD_TERMS
 
 pytestmark = pytest.mark.train
 torch.set_num_threads(1)  # small networks: torch's threads and the batch's would only wait for one another

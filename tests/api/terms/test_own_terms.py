@@ -1,0 +1,334 @@
+"""Terms from outside the package: registered in a program, or named by their place in a scenario's file."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+import coopenv
+from coopenv.api.terms.records import Ego, Target, Truth
+from coopenv.errors import CoopenvError, ScenarioError
+from coopenv.scenario.files import scenario_path
+from coopenv.scenario.terms import REWARD_TERMS
+
+
+def error_again(ego: Any, truth: Any) -> Any:
+    """Minus the position error, as coopenv's.
+
+    More lines do not stand in tables.
+    """
+    return -truth.position_error
+
+
+def control_again(ego: Any) -> Any:
+    return -wp.dot(ego.action, ego.action)
+
+
+@wp.func
+def velocity_again(ego: Ego):
+    return ego.velocity
+
+
+@wp.func
+def bearing_again(ego: Ego, target: Target):
+    return target.bearing
+
+
+def age_again(ego: Any, neighbour: Any) -> Any:
+    return neighbour.age
+
+
+def second_decision(ego: Any) -> Any:
+    return ego.time > 0.15
+
+
+@wp.func
+def far_off(ego: Ego, truth: Truth):
+    return truth.position_error > 1.0e6
+
+
+@pytest.fixture(scope="module", autouse=True)
+def registered() -> None:
+    coopenv.register_reward("error_again", error_again, unit="m")
+    coopenv.register_reward("control_again", control_again)
+    coopenv.register_observation("velocity_again", velocity_again, size=3, unit="m/s", scale="velocity_scale")
+    coopenv.register_observation("bearing_again", bearing_again, per="target", size=3)
+    coopenv.register_observation("age_again", age_again, per="neighbour", unit="s", scale="age_scale", low=0)
+    coopenv.register_termination("second_decision", second_decision, meaning="Late enough")
+    coopenv.register_termination("far_off", far_off)
+
+
+OWN = {
+    "reward.privileged": True,
+    "reward.weights.error_again": 2.0,
+    "reward.weights.control_again": 0.5,
+    "observation.include": ["velocity_again", "odometry", "bearings", "bearing_again", "messages", "age_again"],
+}
+COPIES = {"velocity_again": "velocity", "bearing_again": "bearings", "age_again": "message_age"}
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_copies_of_built_in_terms_agree_in_one_world(dtype: str) -> None:
+    env = coopenv.parallel_env("urban_crossing", overrides=OWN, dtype=dtype)
+    weights = env.scenario.reward.by_name
+    rng = np.random.default_rng(0)
+    observations, infos = env.reset(seed=0)
+    layout = env.observation_layout
+    assert list(layout)[-3:] == ["velocity_again", "bearing_again", "age_again"]
+    assert layout["bearing_again"].shape == (len(env.scenario.target_names), 3)
+    assert layout["age_again"].shape == (3,) and layout["age_again"].scale == env.scenario.observation.age_scale
+    for _ in range(5):
+        actions = {agent: rng.uniform(-1, 1, 2).astype(np.float32) for agent in env.agents}
+        observations, rewards, _, _, infos = env.step(actions)
+        for agent, info in infos.items():
+            terms = info["reward_terms"]
+            assert terms["error_again"] == terms["position_error"] < 0.0
+            assert terms["control_again"] == pytest.approx(terms["control"], rel=1e-6)
+            assert rewards[agent] == pytest.approx(
+                sum(weights[name] * value for name, value in terms.items()), rel=1e-5
+            )
+            for copy, original in COPIES.items():
+                assert np.array_equal(*(observations[agent][layout[name].slice] for name in (copy, original)))
+    assert np.any(observations[agent][layout["bearing_again"].slice])
+
+
+@pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
+def test_copies_of_built_in_terms_agree_in_a_batch(autoreset: str) -> None:
+    none = dict.fromkeys(REWARD_TERMS.built_in, 0.0)
+    own_weights = {**none, "control_again": 0.0, "error_again": 1.0}
+    options: dict[str, Any] = {"num_worlds": 3, "autoreset": autoreset}
+    own = coopenv.make_vec(
+        "urban_crossing", **options, overrides={**OWN, "horizon": 0.5, "reward.weights": own_weights}
+    )
+    plain = {"reward": {"privileged": True, "weights": {**none, "position_error": 1.0}}, "horizon": 0.5}
+    other = coopenv.make_vec("urban_crossing", **options, overrides=plain)
+    own_layout, layout = own.observation_layout, other.observation_layout
+    rng = np.random.default_rng(0)
+    steps = [(own.reset(seed=0)[0], other.reset(seed=0)[0])]
+    for _ in range(12):
+        actions = rng.uniform(-1, 1, own.action_space.shape).astype(np.float32)
+        one, two = own.step(actions), other.step(actions)
+        assert all(np.array_equal(a, b) for a, b in zip(one[1:4], two[1:4], strict=True))
+        steps.append((one[0], two[0]))
+    for one, two in steps:
+        for copy, original in COPIES.items():
+            assert np.array_equal(one[:, own_layout[copy].slice], two[:, layout[original].slice])
+
+
+@pytest.mark.parametrize("face", ["parallel", "vector"])
+def test_conditions_of_ones_own_end_episodes(face: str) -> None:
+    overrides = {"termination.second_decision": True, "termination.far_off": True, "termination.privileged": True}
+    if face == "parallel":
+        env = coopenv.parallel_env("urban_crossing", overrides=overrides)
+        env.reset(seed=0)
+        for terminates in (False, True):
+            _, _, terminated, truncated, infos = env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
+            assert set(terminated.values()) == {terminates} and not any(truncated.values())
+        assert {info["outcome"] for info in infos.values()} == {"second_decision"} and not env.agents
+        return
+    env = coopenv.make_vec("urban_crossing", num_worlds=2, overrides=overrides)
+    env.reset(seed=0)
+    ended = [env.step(np.zeros(env.action_space.shape, np.float32))[4]["ended"].tolist() for _ in range(3)]
+    assert ended == [[0] * 8, [3] * 8, [0] * 8]  # not of coopenv's outcomes: the first own one; then all over again
+
+
+def test_conditions_that_are_off_and_terms_without_weight_cost_nothing() -> None:
+    scenario = coopenv.load_scenario("crossing_path", {"termination.second_decision": False})
+    assert not scenario.termination.own and "error_again" not in scenario.reward.by_name
+
+
+TERMS = """
+GAIN = 3.0
+
+def error(ego, truth):
+    return -GAIN * truth.position_error
+
+def ahead(ego):
+    return ego.velocity[0]
+
+def nearest(ego, target):
+    return target.age
+
+def heard(ego, neighbour):
+    return neighbour.heard
+
+def late(ego):
+    return ego.time > 0.25
+"""
+TABLES = """
+[reward.custom]
+error = "my_terms.py:error"
+
+[observation.custom]
+ahead = { function = "my_terms.py:ahead", unit = "m/s", scale = "velocity_scale", meaning = "speed [m/s]" }
+nearest = { function = "my_terms.py:nearest", per = "target", scale = "age_scale", low = 0 }
+heard = { function = "my_terms.py:heard", per = "neighbour", low = 0 }
+
+[termination.custom]
+late = "my_terms.py:late"
+"""
+
+
+def scenario_file(folder: Path, tables: str, terms: str = TERMS) -> Path:
+    """Write a scenario with terms of its own, and the file with their functions beside it."""
+    text = scenario_path("overtaking").read_text(encoding="utf-8")
+    (folder / "mine.toml").write_text(f"{text}\n{tables}", encoding="utf-8")
+    (folder / "my_terms.py").write_text(terms, encoding="utf-8")
+    return folder / "mine.toml"
+
+
+SWITCHED_ON = {
+    "reward.weights.error": 1.0,
+    "reward.privileged": True,
+    "observation.include": ["ahead", "nearest", "heard", "odometry", "messages"],
+    "termination.late": True,
+}
+
+
+def test_terms_in_a_file_beside_the_scenario(tmp_path: Path) -> None:
+    (tmp_path / "away").mkdir()
+    path = scenario_file(tmp_path, TABLES)
+    env = coopenv.parallel_env(path, overrides=SWITCHED_ON)
+    env.reset(seed=0)
+    layout, infos = env.observation_layout, {}
+    for _ in range(3):
+        observations, rewards, terminated, _, infos = env.step({a: np.zeros(2, np.float32) for a in env.agents})
+    for agent, info in infos.items():
+        seen = observations[agent]
+        assert info["reward_terms"]["error"] == pytest.approx(-3.0 * info["position_error"], rel=1e-5)
+        assert rewards[agent] == info["reward_terms"]["error"]
+        assert seen[layout["ahead"].slice] == seen[layout["velocity"].slice][0] != 0.0
+        assert np.array_equal(seen[layout["heard"].slice], seen[layout["message_mask"].slice])
+        assert terminated[agent] and info["outcome"] == "late"
+    batch = coopenv.make_vec(path, num_worlds=2, overrides=SWITCHED_ON)
+    batch.reset(seed=0)
+    first = batch.step(np.zeros(batch.action_space.shape, np.float32))
+    assert first[1] == pytest.approx(-3.0 * first[4]["position_error"], rel=1e-5)
+
+
+def test_a_program_needs_one_file_for_a_reward_of_its_own(tmp_path: Path) -> None:
+    program = tmp_path / "program.py"
+    program.write_text(
+        "import json, numpy as np, coopenv\n"
+        "def slow(ego):\n"
+        "    return -ego.time\n"
+        "coopenv.register_reward('slow', slow)\n"
+        "env = coopenv.make_vec('crossing_path', num_worlds=1, overrides={'reward.weights.slow': 1.0})\n"
+        "env.reset(seed=0)\n"
+        "print(json.dumps(env.step(np.zeros((1, 2)))[1].tolist()))\n",
+        encoding="utf-8",
+    )
+    result = subprocess.run([sys.executable, str(program)], capture_output=True, text=True, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout) == [pytest.approx(-0.1)]
+
+
+@pytest.mark.parametrize(
+    ("terms", "message"),
+    [
+        ("def error(ego:\n", "my_terms.py:error' cannot be loaded: SyntaxError"),
+        ("def eror(ego):\n    return 1.0\n", "no 'error' in .*my_terms.py .did you mean 'eror'"),
+        ("error = 3\n", "expected a function with a name, got 3"),
+        ("error = lambda ego: 1.0\n", "expected a function with a name"),
+        ("def error(ego, truth, more):\n    return 1.0\n", "takes 3 records, expected 1 or 2"),
+        ("def error(ego):\n    return ego.poistion\n", "cannot compile .* to return a number: .*poistion"),
+        ("def error(ego):\n    return {1: ego.time}\n", "cannot compile .* to return a number: .*Dict"),
+        ("def error(ego):\n    return ego.velocity\n", "cannot compile .* to return a number: .*vec3f"),
+        ("def error(ego):\n    later = ego.time\n", "cannot compile .* to return a number"),
+        ("import numpy\ndef error(ego):\n    return numpy.median(ego.velocity)\n", "cannot compile .*numpy.median"),
+        ("def error(ego, truth):\n    return truth.nees\n", "uses the truth: reward.privileged must be true"),
+    ],
+)
+def test_errors_of_functions_are_one_line(terms: str, message: str, tmp_path: Path) -> None:
+    path = scenario_file(tmp_path, TABLES, terms)
+    with pytest.raises(CoopenvError, match=f"reward term 'error'.*{message}") as caught:
+        coopenv.parallel_env(path, overrides={"reward.weights.error": 1.0})
+    assert str(caught.value).isprintable()
+
+
+def test_a_field_of_another_size_is_refused(tmp_path: Path) -> None:
+    wrong = TABLES.replace('unit = "m/s"', "size = 2")
+    path = scenario_file(tmp_path, wrong, TERMS.replace("ego.velocity[0]", "ego.velocity"))
+    with pytest.raises(CoopenvError, match=r"'ahead': .* to return a vector of 2: .* length 3"):
+        coopenv.make_vec(path, num_worlds=1, overrides=SWITCHED_ON)
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ('[reward.custom]\nmine = "missing.py:mine"\nweights.mine = 1.0\n', r"mine.toml: reward.custom.weights"),
+        ('[reward.custom]\nmine = "nowhere"\n', r"reward.custom.mine.function: expected file.py:name"),
+        ('[reward.custom]\nprogress = "my_terms.py:error"\n', r"reward.custom.progress: .* cannot be named 'progress'"),
+        ('[observation.custom]\nquality = "my_terms.py:ahead"\n', "cannot be named 'quality', which coopenv uses"),
+        ('[reward.custom]\n"1st" = "my_terms.py:error"\n', "is an identifier, got '1st'"),
+        (
+            '[observation.custom]\na = { function = "a.py:a", per = "car" }\n',
+            "'vehicle', 'target' or 'neighbour'.*'car'",
+        ),
+        ('[observation.custom]\na = { function = "a.py:a", size = 0 }\n', "observation.custom.a.size: .*got 0"),
+        ('[observation.custom]\na = { function = "a.py:a", scal = 1 }\n', r"scal: unknown key .did you mean 'scale'"),
+        (
+            '[termination]\nlaet = true\n[termination.custom]\nlate = "a.py:b"\n',
+            "laet: unknown key .did you mean 'late'",
+        ),
+    ],
+)
+def test_errors_of_tables_are_one_line(tables: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ScenarioError, match=message) as caught:
+        coopenv.load_scenario(scenario_file(tmp_path, tables))
+    assert str(caught.value).isprintable() and "mine.toml" in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    path = scenario_file(tmp_path, '[reward.custom]\nmine = "missing.py:mine"\n')
+    with pytest.raises(CoopenvError, match=f"reward term 'mine': .*no such file: {tmp_path}/missing.py"):
+        coopenv.parallel_env(path)
+
+
+@pytest.mark.parametrize(
+    ("register", "message"),
+    [
+        (lambda: coopenv.register_reward("progress", control_again), "reward term cannot be named 'progress'"),
+        (lambda: coopenv.register_reward("error_again", control_again), "'error_again' is registered already"),
+        (lambda: coopenv.register_reward("my reward", control_again), "is an identifier, got 'my reward'"),
+        (lambda: coopenv.register_reward("mine", 3), "reward term 'mine': expected a function with a name, got 3"),
+        (lambda: coopenv.register_reward("mine", lambda ego: 1.0), "expected a function with a name"),
+        (lambda: coopenv.register_observation("goal", velocity_again), "cannot be named 'goal'"),
+        (lambda: coopenv.register_observation("mine", velocity_again, per="target"), "takes 1 records, expected 2"),
+        (lambda: coopenv.register_observation("mine", velocity_again, size=99), "'mine': size: .*got 99"),
+        (lambda: coopenv.register_termination("collision", far_off), "cannot be named 'collision'"),
+        (lambda: coopenv.register_termination("privileged", far_off), "cannot be named 'privileged'"),
+    ],
+)
+def test_errors_of_registration_are_one_line(register: Any, message: str) -> None:
+    with pytest.raises(CoopenvError, match=message):
+        register()
+
+
+def test_a_function_that_is_defined_anew_replaces_its_former_self() -> None:
+    def make(gain: float) -> Any:
+        def scaled(ego: Any) -> Any:
+            return gain * ego.elapsed
+
+        return scaled
+
+    for gain in (2.0, 5.0):
+        coopenv.register_reward("scaled", make(gain))
+        env = coopenv.parallel_env("crossing_path", overrides={"reward.weights.scaled": 1.0})
+        env.reset(seed=0)
+        rewards = env.step({agent: np.zeros(2, np.float32) for agent in env.agents})[1]
+        assert rewards["vehicle_1"] == pytest.approx(0.1 * gain, rel=1e-6)
+
+
+def test_the_use_of_truth_has_to_be_declared() -> None:
+    with pytest.raises(ScenarioError, match=r"reward.privileged: must be true, because the reward term 'error_again'"):
+        coopenv.load_scenario("crossing_path", {"reward.weights.error_again": 1.0})
+    with pytest.raises(ScenarioError, match=r"termination.privileged: must be true, because the .* 'far_off'"):
+        coopenv.load_scenario("crossing_path", {"termination.far_off": True})
