@@ -45,18 +45,22 @@ def cholesky3(A: Any):
     o = A.dtype(0.0)
     one = A.dtype(1.0)
     tiny = wp.max(A.dtype(PIVOT_FLOOR) * epsilon(one) * wp.trace(A), A.dtype(1.0e-30))
-    i00 = one / wp.sqrt(wp.max(A[0, 0], tiny))
+    # The pivots of L D L^T first: a chain of quotients alone, the roots of which are then taken side by side.
+    d0 = one / wp.max(A[0, 0], tiny)
+    p1 = wp.max(A[1, 1] - A[1, 0] * (A[1, 0] * d0), tiny)
+    d1 = one / p1
+    u = A[2, 1] - A[2, 0] * (A[1, 0] * d0)
+    p2 = wp.max(A[2, 2] - A[2, 0] * (A[2, 0] * d0) - u * (u * d1), tiny)
+    i00 = wp.sqrt(d0)
+    i11 = wp.sqrt(d1)
+    i22 = wp.sqrt(one / p2)
     l10 = A[1, 0] * i00
     l20 = A[2, 0] * i00
-    d11 = wp.max(A[1, 1] - l10 * l10, tiny)
-    i11 = one / wp.sqrt(d11)
-    l21 = (A[2, 1] - l20 * l10) * i11
-    d22 = wp.max(A[2, 2] - l20 * l20 - l21 * l21, tiny)
-    i22 = one / wp.sqrt(d22)
+    l21 = u * i11
     i10 = -l10 * i00 * i11
     i21 = -l21 * i11 * i22
     i20 = -(l20 * i00 + l21 * i10) * i22
-    L = type(A)(A[0, 0] * i00, o, o, l10, d11 * i11, o, l20, l21, d22 * i22)
+    L = type(A)(A[0, 0] * i00, o, o, l10, p1 * i11, o, l20, l21, p2 * i22)
     return L, type(A)(i00, o, o, i10, i11, o, i20, i21, i22)
 
 
@@ -149,30 +153,38 @@ def eigen_symmetric6(M: Any, identity: Any):
 def tridiagonal6(M: Any):
     """Return (diagonal, squared off-diagonal) of Q^T M Q, M symmetric 6x6, by Householder reflections."""
     A = M
+    w = A[0]
+    diagonal = A[0]
+    off = A[0]
     zero = A.dtype(0.0)
     for k in range(4):
         tail = zero
-        for i in range(k + 2, 6):
+        for i in range(wp.static(k + 2), 6):
             tail += A[i, k] * A[i, k]
+        head = A[k + 1, k]
+        off[k] = head * head + tail
         if tail > zero:
-            head = A[k + 1, k]
-            norm = wp.sqrt(head * head + tail)
+            norm = wp.sqrt(off[k])
             if head > zero:
                 norm = -norm
-            v = A[0] - A[0]
-            v[k + 1] = head - norm
-            for i in range(k + 2, 6):
-                v[i] = A[i, k]
-            beta = A.dtype(2.0) / wp.dot(v, v)
-            w = beta * (A * v)
-            w = w - (A.dtype(0.5) * beta * wp.dot(w, v)) * v
-            A = A - wp.outer(v, w) - wp.outer(w, v)
-    diagonal = A[0] - A[0]
-    off = A[0] - A[0]
+            beta = A.dtype(1.0) / (norm * (norm - head))
+            A[k + 1, k] = head - norm  # the column below the diagonal is now the reflection's vector v
+            along = zero
+            for i in range(wp.static(k + 1), 6):
+                total = zero
+                for j in range(wp.static(k + 1), 6):
+                    total += A[i, j] * A[j, k]
+                w[i] = beta * total
+                along += w[i] * A[i, k]
+            along *= A.dtype(0.5) * beta
+            for i in range(wp.static(k + 1), 6):
+                w[i] -= along * A[i, k]
+            for i in range(wp.static(k + 1), 6):
+                for j in range(wp.static(k + 1), 6):
+                    A[i, j] -= A[i, k] * w[j] + w[i] * A[j, k]
     for i in range(6):
         diagonal[i] = A[i, i]
-        if i < 5:
-            off[i] = A[i + 1, i] * A[i + 1, i]
+    off[4] = A[5, 4] * A[5, 4]
     return diagonal, off
 
 
@@ -189,6 +201,7 @@ def smallest_eigenvalue6(M: Any):
     if scale <= zero:
         return zero
     d, e = tridiagonal6(M * (one / scale))
+    rounding = M.dtype(0.1) * epsilon(one)  # of the entries of d, whose sum is 1
     x = zero
     for _ in range(30):
         p0 = one
@@ -214,8 +227,7 @@ def smallest_eigenvalue6(M: Any):
         H = G * G - r / p
         root = wp.sqrt(wp.max(M.dtype(5.0) * (M.dtype(6.0) * H - G * G), zero))
         step = M.dtype(6.0) / (root - G)
-        before = x
         x = x + step
-        if step <= x * M.dtype(1.0e-9) or x == before:  # the latter in single precision: it would stay there
+        if step <= wp.max(x * M.dtype(1.0e-9), rounding):
             return wp.max(x, zero) * scale
     return wp.max(x, zero) * scale
