@@ -35,17 +35,20 @@ def without_camera(model: Any, state: Any, record: Any, world: int, tick: int) -
 
 
 @wp.func
-def without_odometry(model: Any, state: Any, record: Any, world: int, tick: int) -> None:
-    """Move and look for contact."""
+def without_contact(model: Any, state: Any, record: Any, world: int, tick: int) -> None:
+    """Move, and count the odometry samples by which a driven vehicle moves."""
     move(model, state, world, tick)
+    time = wp.float64(tick) * model.camera_period + wp.float64(1.0e-9)
     for vehicle in range(model.vehicles):
-        referee(model, state, world, vehicle)
+        state.odometry_samples[world, vehicle] = int(time / model.odometry_period) + 1
 
 
 @wp.func
-def without_contact(model: Any, state: Any, record: Any, world: int, tick: int) -> None:
-    """Move."""
-    move(model, state, world, tick)
+def without_odometry(model: Any, state: Any, record: Any, world: int, tick: int) -> None:
+    """Move and look for contact."""
+    without_contact(model, state, record, world, tick)
+    for vehicle in range(model.vehicles):
+        referee(model, state, world, vehicle)
 
 
 @wp.func

@@ -97,8 +97,12 @@ def undistort(camera: Any, xd: Any, yd: Any):
     y = yd
     for _ in range(20):
         ex, ey = distort(camera, x, y)
+        last_x = x
+        last_y = y
         x = x + (xd - ex)
         y = y + (yd - ey)
+        if x == last_x and y == last_y:
+            break
     return x, y
 
 
