@@ -49,17 +49,26 @@ def exp_so3(w: Any):
 
 
 @wp.func
-def left_jacobian(w: Any):
-    """Return J_l(w) = int_0^1 Exp(s w) ds, which turns a held velocity into a displacement."""
+def rigid_motion(w: Any, u: Any):
+    """Return (Exp(w), J_l(w) u): the turn and the way of a body twist that is held for as long as it turns by w.
+
+    J_l(w) = int_0^1 Exp(s w) ds turns a held velocity into a displacement.
+    """
     square = wp.dot(w, w)
-    b = w.dtype(0.5) - square * (w.dtype(OVER_24) - square * w.dtype(OVER_720))  # (1-cos(x))/x^2
+    # As in exp_so3.
+    a = w.dtype(1.0) - square * (w.dtype(SIXTH) - square * w.dtype(OVER_120))
+    b = w.dtype(0.5) - square * (w.dtype(OVER_24) - square * w.dtype(OVER_720))
     c = w.dtype(SIXTH) - square * (w.dtype(OVER_120) - square * w.dtype(OVER_5040))  # (x-sin(x))/x^3
     if square > w.dtype(1.0e-4):
         angle = wp.sqrt(square)
+        sine = wp.sin(angle)
         half = wp.sin(angle * w.dtype(0.5))
+        a = sine / angle
         b = w.dtype(2.0) * half * half / square
-        c = (angle - wp.sin(angle)) / (square * angle)
-    return (w.dtype(1.0) - c * square) * identity3(w) + b * skew(w) + c * wp.outer(w, w)
+        c = (angle - sine) / (square * angle)
+    across = wp.cross(w, u)
+    turn = (w.dtype(1.0) - b * square) * identity3(w) + a * skew(w) + b * wp.outer(w, w)
+    return turn, u + b * across + c * wp.cross(w, across)
 
 
 @wp.func
@@ -109,5 +118,5 @@ def quaternion_vector(R: Any, zero: Any):
 @wp.func
 def increment(rotation: Any, translation: Any, v: Any, w: Any, dt: Any):
     """Append a body twist held for dt to the increment (dR, dp)."""
-    step = w * dt
-    return rotation * exp_so3(step), translation + rotation * (left_jacobian(step) * (v * dt))
+    turn, way = rigid_motion(w * dt, v * dt)
+    return rotation * turn, translation + rotation * way

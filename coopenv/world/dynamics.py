@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.so3 import exp_so3, left_jacobian, orthonormalise
+from coopenv.estimation.so3 import increment, orthonormalise, rigid_motion
 from coopenv.world.command import ACCELERATION, SPEED, STEERING
 
 LONGEST_SUBSTEP = wp.constant(wp.float64(0.0100001))
@@ -37,11 +37,11 @@ def prescribe(model: Any, state: Any, world: int, agent: int, t: wp.float64):
     R0 = state.start_rotation[world, agent]
     R = R0 * model.motion.rotation[segment]
     travelled = v * h
+    turned = R
     if wp.dot(w, w) > v.dtype(0.0):
-        travelled = left_jacobian(w * h) * travelled
-        state.rotation[world, agent] = R * exp_so3(w * h)
-    else:
-        state.rotation[world, agent] = R
+        turn, travelled = rigid_motion(w * h, travelled)
+        turned = R * turn
+    state.rotation[world, agent] = turned
     state.position[world, agent] = (
         state.start_position[world, agent] + R0 * model.motion.position[segment] + R * travelled
     )
@@ -76,11 +76,11 @@ def bicycle_step(model: Any, R: Any, position: Any, speed: Any, steering: Any, c
         new_speed = speed - speed
     half = type(speed)(0.5)
     mid_speed = wp.where(parked != 0, new_speed, (speed + new_speed) * half)
-    turn = mid_speed * dt * wp.tan((steering + new_steering) * half) / model.dynamics.wheelbase
+    way = mid_speed * dt
     o = position - position
-    step = type(position)(o[0], o[1], turn)
-    new_position = position + R * (left_jacobian(step) * type(position)(mid_speed * dt, o[1], o[2]))
-    return R * exp_so3(step), new_position, new_speed, new_steering
+    turn = type(position)(o[0], o[1], way * wp.tan((steering + new_steering) * half) / model.dynamics.wheelbase)
+    new_R, new_position = increment(R, position, type(position)(way, o[1], o[2]), turn, type(speed)(1.0))
+    return new_R, new_position, new_speed, new_steering
 
 
 @wp.func
