@@ -57,26 +57,30 @@ def test_small_turns_keep_their_relative_accuracy() -> None:
     assert_allclose((R - R.T)[[2, 0, 1], [1, 2, 0]] / 2, w[0], rtol=1e-14)
 
 
-@given(rotation_vectors)
+@given(rotation_vectors, vectors)
 @settings(max_examples=100, deadline=None)
-def test_left_jacobian_is_the_mean_rotation(w: np.ndarray) -> None:
+def test_a_rigid_motion_turns_and_goes_as_far_as_its_mean_rotation(w: np.ndarray, u: np.ndarray) -> None:
     mean, _ = quad_vec(lambda s: Rotation.from_rotvec(s * w).as_matrix(), 0.0, 1.0, epsabs=1e-13, epsrel=1e-13)
-    assert_allclose(call(so3.left_jacobian, "float64", w[None])[0], mean, atol=3e-13)
+    turn, way = call(so3.rigid_motion, "float64", w[None], u[None])
+    assert_allclose(turn[0], Rotation.from_rotvec(w).as_matrix(), atol=1e-12)
+    assert_allclose(way[0], mean @ u, atol=1e-12)
 
 
-def test_left_jacobian_in_float32_follows_float64() -> None:
+def test_a_rigid_motion_in_float32_follows_float64() -> None:
     w = turns(np.concatenate([ANGLES, LARGE]))[0].astype(np.float32)
-    assert_allclose(call(so3.left_jacobian, "float32", w), call(so3.left_jacobian, "float64", w), atol=1e-6)
+    u = np.broadcast_to(np.float32([1.0, -0.5, 0.3]), w.shape)
+    _, single = call(so3.rigid_motion, "float32", w, u)
+    _, double = call(so3.rigid_motion, "float64", w, u)
+    assert_allclose(single, double, atol=1e-6)
 
 
-@given(rotation_vectors, rotation_vectors)
+@given(rotation_vectors, vectors)
 @settings(max_examples=100, deadline=None)
-def test_left_jacobian_composes(w: np.ndarray, v: np.ndarray) -> None:
-    """Two halves of a held twist are the whole: J(w) v = J(w/2) v/2 + Exp(w/2) J(w/2) v/2."""
-    whole = call(so3.left_jacobian, "float64", w[None])[0] @ v
-    half = call(so3.left_jacobian, "float64", w[None] / 2)[0] @ v / 2
-    turn = call(so3.exp_so3, "float64", w[None] / 2)[0]
-    assert_allclose(half + turn @ half, whole, atol=1e-13 + 1e-13 * np.linalg.norm(v))
+def test_two_halves_of_a_rigid_motion_are_the_whole(w: np.ndarray, u: np.ndarray) -> None:
+    turn, way = call(so3.rigid_motion, "float64", w[None], u[None])
+    half_turn, half_way = call(so3.rigid_motion, "float64", w[None] / 2, u[None] / 2)
+    assert_allclose(half_turn[0] @ half_turn[0], turn[0], atol=1e-13)
+    assert_allclose(half_way[0] + half_turn[0] @ half_way[0], way[0], atol=1e-13)
 
 
 def test_angle_to_a_picoradian_everywhere() -> None:
