@@ -70,7 +70,9 @@ class Exchange:
         return self.owned(self.rows(name))
 
     def owned(self, rows: Any) -> Any:
-        """Return rows that `rows()` gave as an array that the next step does not touch."""
+        """Return rows that `rows()` gave, or dictionaries of them, as what the next step does not touch."""
+        if isinstance(rows, dict):
+            return {name: self.owned(values) for name, values in rows.items()}
         return rows if self.kind == "numpy" else rows.clone()
 
     def set_actions(self, actions: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import warp as wp
 from gymnasium.utils import seeding
 
 from coopenv.api.plugins import PlugIns
+from coopenv.api.reward import RewardFunction, Step, check_finite, reward_of
 from coopenv.api.step_results import MEMORY, results_struct
 from coopenv.api.terms.binding import bound_terms
 from coopenv.api.terms.kernels import check_own_terms, endings_kernel, results_kernel
@@ -18,7 +20,7 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.base import Backend
 from coopenv.backends.simulated import Simulated
 from coopenv.backends.tick_world import open_world
-from coopenv.errors import CoopenvError, check_memory, told
+from coopenv.errors import CoopenvError, check_memory, shown, told
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
@@ -43,6 +45,7 @@ class Engine:
         device: str = "cpu",
         threads: int | None = None,
         backend: Backend | None = None,
+        reward: RewardFunction | None = None,
     ) -> None:
         """Build everything; arguments and errors as for `World`.
 
@@ -53,6 +56,7 @@ class Engine:
             device: "cpu" or a CUDA device.
             threads: shares of the batch on the CPU.
             backend: where ticks come from (None: computed).
+            reward: in place of the scenario's weighted sum; on the CPU only.
         """
         self.backend: Backend = backend or Simulated(scenario)
         self.world = open_world(self.backend, worlds, dtype, device, threads)
@@ -70,6 +74,16 @@ class Engine:
         self.results = allocate(results_struct(p), sizes, device)
         terms = bound_terms(scenario)
         check_own_terms(terms, device)
+        places = [field.slice for field in self.layout.values()]
+        self._own_terms = [
+            *((field.title, "observation", places[field.number]) for field in chain(*terms[:3]) if field.own),
+            *((term.title, "terms", slice(term.number, term.number + 1)) for term in terms.rewards if term.own),
+        ]
+        if reward is not None and not callable(reward):
+            raise CoopenvError(f"reward: expected a function of a step, got {shown(reward)}")
+        if reward is not None and device != "cpu":
+            raise CoopenvError(f"reward: a function in Python runs on the host; use device='cpu' instead of '{device}'")
+        self._reward, self._step = reward, Step(self.view, scenario)
         self._fill = results_kernel(terms, p)
         self._end = endings_kernel(terms.conditions, p) if terms.conditions else None
         fields = self.layout.values()
@@ -141,6 +155,7 @@ class Engine:
         self._advance(self.world.model.ticks_per_decision if ticks is None else ticks)
         self._end_episodes()
         self.refresh()
+        self._reward_anew(self._nowhere)
 
     def step_or_restart(self) -> None:
         """Restart the worlds that are over, advance the others by one decision; nothing leaves the device."""
@@ -152,6 +167,7 @@ class Engine:
         self._restart()
         self._end_episodes()
         self._fill_results("results some fresh", self.world.mask, self._everywhere)
+        self._reward_anew(self.world.mask)
         self.world.mask.zero_()
 
     def restart_finished(self) -> None:
@@ -196,6 +212,16 @@ class Engine:
             PerWorld(chosen),
         ]
         self.world.launch(key, self._fill, arguments, inner=(self.world.model.vehicles,))
+
+        if self.world.device == "cpu":  # to look at a GPU would mean to wait for it
+            for title, name, place in self._own_terms:
+                check_finite(title, self.view(name)[..., place])
+
+    def _reward_anew(self, fresh: Any) -> None:
+        """Replace the reward of the worlds that have not just been reset by that of a function in Python."""
+        if self._reward is not None:
+            earning = self.view("alive") & (fresh.numpy()[:, None] == 0)
+            self.view("reward")[...] = reward_of(self._reward, self._step, earning)
 
     def view(self, name: str) -> np.ndarray:
         """Return a field of the results, the state or the actions on the host."""

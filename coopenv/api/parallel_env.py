@@ -14,6 +14,7 @@ from coopenv.api.actions import ActionReader
 from coopenv.api.engine import Engine
 from coopenv.api.infos import InfoWriter
 from coopenv.api.pictures import Pictures
+from coopenv.api.reward import RewardFunction
 from coopenv.api.state import state_space, state_vector
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
 from coopenv.backends.base import Backend, Health
@@ -39,7 +40,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
     Action (per agent): Box(-1, 1, (2,), float32): speed or acceleration, and steering (positive: left). Values beyond
     are clipped. Vehicles with prescribed motion ignore it.
 
-    Reward: the weighted sum of the named terms in `info["reward_terms"]`.
+    Reward: the weighted sum of the named terms in `info["reward_terms"]`, or what a function in Python returns.
 
     `terminated` on collision or arrival, `truncated` at the horizon, or where the backend has no more ticks. A vehicle
     that has ended leaves `agents` and goes on observing and sending, so that its followers keep their neighbour; a
@@ -60,6 +61,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         observation: Literal["flat", "dict"] = "flat",
         device: str = "cpu",
         dtype: str = "float32",
+        reward: RewardFunction | None = None,
     ) -> None:
         """Build the world; use `coopenv.parallel_env` to build one by name."""
         _one_of("render_mode", render_mode, (None, *RENDER_MODES))
@@ -80,8 +82,9 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             "observation": observation,
             "device": device,
             "dtype": dtype,
+            "reward": reward,
         }
-        self.engine = Engine(scenario, 1, dtype, device, backend=backend)
+        self.engine = Engine(scenario, 1, dtype, device, backend=backend, reward=reward)
         self.possible_agents = list(scenario.vehicle_names)
         self.agents: list[str] = []
         self._index = {agent: i for i, agent in enumerate(self.possible_agents)}
@@ -241,6 +244,7 @@ def parallel_env(
     overrides: Mapping[str, Any] | None = None,
     data: str | Path | None = None,
     variant: str | None = None,
+    reward: RewardFunction | None = None,
 ) -> CooperativeLocalisationEnv:
     """Return an environment by name (`coopenv.list_envs()`), from a TOML file, or from a recording.
 
@@ -260,6 +264,8 @@ def parallel_env(
         overrides: dotted scenario keys, for example {"noise.enabled": False}.
         data: folder of recorded data sets; None: what COOPENV_DATA says.
         variant: of a recorded data set: "landmarks", "landmarks+robots" (the default) or "blind".
+        reward: a function of a `coopenv.api.reward.Step` that returns the rewards (1, vehicles); None: the weighted
+            sum of the scenario's terms.
 
     Raises:
         UnknownEnvironmentError: no such environment.
@@ -278,4 +284,5 @@ def parallel_env(
         observation=observation,
         device=device,
         dtype=dtype,
+        reward=reward,
     )

@@ -17,14 +17,16 @@ from gymnasium.vector.utils import batch_space
 from coopenv.api.array_io import ArrayKind, Exchange
 from coopenv.api.engine import Engine
 from coopenv.api.pictures import Pictures
+from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, flat_space
 from coopenv.backends.sources import open_simulation
 from coopenv.errors import CoopenvError, checked_seed, suggest
 from coopenv.scenario import Scenario
 
 INFO_FIELDS = ("alive", "ended", "position_error", "orientation_error", "nees")
-"""Arrays (num_envs,) in every info: `alive` is false for a vehicle that had ended before this step; `ended` is 0 under
-way, 1 arrived, 2 collided; errors in m and deg."""
+"""Arrays (num_envs,) in every info, beside `reward_terms`, which holds one by the name of each term. `alive` is false
+for vehicles that had ended before this step; `ended` is 0 under way, 1 arrived, 2 collided, from 3 on a condition of
+the scenario's own; errors in m and deg."""
 
 
 class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
@@ -56,12 +58,13 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         arrays: ArrayKind | None = None,
         threads: int | None = None,
         render_mode: str | None = None,
+        reward: RewardFunction | None = None,
     ) -> None:
         """Build the worlds; use `coopenv.make_vec` to build them by name."""
         if render_mode not in (None, "rgb_array"):
             raise CoopenvError(f"unknown render_mode '{render_mode}'; known: None, rgb_array")
         self.scenario = scenario
-        self.engine = Engine(scenario, num_worlds, dtype, device, threads)
+        self.engine = Engine(scenario, num_worlds, dtype, device, threads, reward=reward)
         self._pictures = Pictures(self.engine, scenario)
         self.num_worlds, self.vehicles = self.engine.world.worlds, len(scenario.vehicles)
         self.num_envs = self.num_worlds * self.vehicles
@@ -150,13 +153,14 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if self._exchange.kind == "numpy" and not ended.any():
             return flags, infos
         final = {"final_obs": self._exchange.kept("observation"), "_final_obs": ended}
-        final["final_info"] = {name: self._exchange.owned(value) for name, value in infos.items()}
+        final["final_info"] = self._exchange.owned(infos)
         final["_final_info"] = ended
         self.engine.restart_finished()
         return flags, {**self._infos(), **final}
 
     def _infos(self) -> dict[str, Any]:
-        return {name: self._exchange.rows(name) for name in INFO_FIELDS}
+        terms = dict(zip(self.engine.reward_terms, self._exchange.rows("terms").T, strict=True))
+        return {**{name: self._exchange.rows(name) for name in INFO_FIELDS}, "reward_terms": terms}
 
     def _reset_mask(self, options: Any) -> Any:
         if options is None:
@@ -259,6 +263,7 @@ def make_vec(
     arrays: ArrayKind | None = None,
     threads: int | None = None,
     render_mode: str | None = None,
+    reward: RewardFunction | None = None,
 ) -> CooperativeVectorEnv:
     """Return a batch of worlds as a Gymnasium `VectorEnv` with num_worlds x vehicles rows.
 
@@ -272,6 +277,8 @@ def make_vec(
         arrays: "numpy" (default on the CPU) or "torch" (default on CUDA).
         threads: shares of the batch on the CPU; None: by size and cores.
         render_mode: None or "rgb_array".
+        reward: a function of a `coopenv.api.reward.Step` that returns the rewards (num_worlds, vehicles), on the CPU
+            only; None: the weighted sum of the scenario's terms.
 
     Raises:
         CoopenvError: any argument is not valid.
@@ -286,6 +293,7 @@ def make_vec(
         arrays=arrays,
         threads=threads,
         render_mode=render_mode,
+        reward=reward,
     )
 
 

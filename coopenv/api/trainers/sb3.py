@@ -11,6 +11,7 @@ import numpy as np
 from coopenv.api.array_io import Exchange, host_actions
 from coopenv.api.engine import Engine
 from coopenv.api.pictures import Pictures
+from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, flat_space
 from coopenv.errors import CoopenvError, checked_seed
 from coopenv.scenario import Scenario, load_scenario
@@ -33,11 +34,17 @@ class CooperativeSB3VecEnv(VecEnv):
     """
 
     def __init__(
-        self, scenario: Scenario, *, num_worlds: int, dtype: str = "float32", threads: int | None = None
+        self,
+        scenario: Scenario,
+        *,
+        num_worlds: int,
+        dtype: str = "float32",
+        threads: int | None = None,
+        reward: RewardFunction | None = None,
     ) -> None:
         """Build the worlds; use `make_sb3_vec_env` to build them by name."""
         self.scenario = scenario
-        self.engine = Engine(scenario, num_worlds, dtype, "cpu", threads)
+        self.engine = Engine(scenario, num_worlds, dtype, "cpu", threads, reward=reward)
         self.vehicles = len(scenario.vehicles)
         self.render_mode = "rgb_array"
         self.metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": scenario.rates.decision}
@@ -151,6 +158,7 @@ def make_sb3_vec_env(
     overrides: Mapping[str, Any] | None = None,
     threads: int | None = None,
     seed: int | None = None,
+    reward: RewardFunction | None = None,
 ) -> CooperativeSB3VecEnv:
     """Return num_worlds x vehicles rows as an SB3 `VecEnv`.
 
@@ -161,12 +169,13 @@ def make_sb3_vec_env(
         overrides: dotted scenario keys.
         threads: shares of the batch; None: by size and cores.
         seed: of the first reset; world w gets seed + w.
+        reward: in place of the scenario's weighted sum, see `coopenv.make_vec`.
 
     Raises:
         CoopenvError: any argument is not valid.
     """
     env = CooperativeSB3VecEnv(
-        load_scenario(name_or_path, overrides), num_worlds=num_worlds, dtype=dtype, threads=threads
+        load_scenario(name_or_path, overrides), num_worlds=num_worlds, dtype=dtype, threads=threads, reward=reward
     )
     if seed is not None:
         env.seed(seed)

@@ -332,3 +332,45 @@ def test_the_use_of_truth_has_to_be_declared() -> None:
         coopenv.load_scenario("crossing_path", {"reward.weights.error_again": 1.0})
     with pytest.raises(ScenarioError, match=r"termination.privileged: must be true, because the .* 'far_off'"):
         coopenv.load_scenario("crossing_path", {"termination.far_off": True})
+
+
+@pytest.mark.parametrize("face", ["parallel", "vector"])
+@pytest.mark.parametrize(
+    ("terms", "message"),
+    [
+        (
+            TERMS.replace("truth.position_error", "(ego.time / (ego.time - ego.time))"),
+            "reward term 'error': -?nan for vehicle_1 of world 0",
+        ),
+        (
+            TERMS.replace("ego.velocity[0]", "wp.sqrt(-1.0 - ego.time)"),
+            "observation field 'ahead': -?nan for vehicle_1 of",
+        ),
+    ],
+)
+def test_what_is_no_number_is_found(terms: str, message: str, face: str, tmp_path: Path) -> None:
+    path = scenario_file(tmp_path, TABLES, "import warp as wp\n" + terms)
+    with pytest.raises(CoopenvError, match=message):
+        if face == "parallel":
+            env = coopenv.parallel_env(path, overrides=SWITCHED_ON)
+            env.reset(seed=0)
+            env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
+        else:
+            batch = coopenv.make_vec(path, num_worlds=2, overrides=SWITCHED_ON)
+            batch.reset(seed=0)
+            batch.step(np.zeros(batch.action_space.shape, np.float32))
+
+
+@pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
+def test_infos_of_a_batch_hold_every_term(autoreset: str) -> None:
+    overrides = {**OWN, "horizon": 0.2}
+    envs = coopenv.make_vec("urban_crossing", num_worlds=2, overrides=overrides, autoreset=autoreset)
+    weights = envs.scenario.reward.by_name
+    envs.reset(seed=0)
+    for _ in range(2):
+        _, rewards, _, _, infos = envs.step(np.full(envs.action_space.shape, 0.5, np.float32))
+    if autoreset == "same_step":
+        assert np.abs(infos["reward_terms"]["control_again"]).max() < np.abs(rewards).max()
+        infos = infos["final_info"]
+    assert list(infos["reward_terms"]) == [*REWARD_TERMS.built_in, "error_again", "control_again"]
+    assert rewards == pytest.approx(sum(weights[n] * v for n, v in infos["reward_terms"].items()), rel=1e-5)

@@ -115,3 +115,16 @@ def test_bad_actions(actions: np.ndarray, message: str) -> None:
     env.reset()
     with pytest.raises(coopenv.ActionError, match=message):
         env.step(actions)
+
+
+def test_a_reward_in_python_is_earned_and_starts_anew_with_its_world() -> None:
+    env = make_sb3_vec_env(
+        "urban_crossing",
+        num_worlds=2,
+        overrides={"horizon": 0.5},
+        seed=0,
+        reward=lambda step: step["time"] + step["alive"],
+    )
+    env.reset()
+    rewards = [env.step(np.zeros((8, 2), np.float32))[1].tolist() for _ in range(6)]
+    assert rewards == [[pytest.approx(1.0 + time)] * 8 for time in (0.1, 0.2, 0.3, 0.4, 0.5, 0.1)]
