@@ -139,7 +139,7 @@ def apply_vehicle_defaults(raw: Mapping[str, Any], where: str = "scenario") -> d
 
 
 def _with_defaults(defaults: Mapping[str, Any], vehicle: Mapping[str, Any]) -> dict[str, Any]:
-    result = _merged(defaults, vehicle)
+    result: dict[str, Any] = _merged(defaults, vehicle)
     motion = result.get("motion")
     if isinstance(motion, dict) and motion.get("kind") == "waypoints" and "initial_pose" not in vehicle:
         result.pop("initial_pose", None)  # such a motion starts at its first waypoint
