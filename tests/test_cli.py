@@ -15,6 +15,7 @@ import pytest
 import coopenv
 from coopenv.api.registration import environment_id
 from coopenv.backends.mcap import write_recording
+from coopenv.bench.observers.faults import FAULTS
 from coopenv.cli import main
 from coopenv.cli.options import parse_value
 from coopenv.estimation.trajectory import Trajectory
@@ -69,7 +70,12 @@ def test_list_of_observers_and_agents(capsys: pytest.CaptureFixture[str]) -> Non
 
 @pytest.mark.parametrize(
     ("line", "names"),
-    [("list", coopenv.list_envs()), ("list observers", observer_names()), ("list agents", list_agents())],
+    [
+        ("list", coopenv.list_envs()),
+        ("list observers", observer_names()),
+        ("list agents", list_agents()),
+        ("list variants", [*FAULTS, "landmarks", "landmarks+robots", "blind"]),
+    ],
 )
 def test_list_as_json(line: str, names: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*line.split(), "--json"]) == 0
@@ -195,6 +201,27 @@ def test_figures_in_another_format_replace_the_older_ones(tmp_path: Path) -> Non
     names = {name.replace(".png", ".svg") for name in FIGURES}
     assert {path.name for path in (tmp_path / "here").iterdir()} == names | {"metrics.json", "trajectory.npz"}
     assert "<svg" in (tmp_path / "here" / "errors.svg").read_text()
+
+
+def test_recording_shows_its_progress(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("coopenv.runs.console.LINE_PERIOD", 0.001)
+    assert main(["record", "overtaking", "--set", "horizon=5.0", "--out", "drive.mcap"]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert any(re.fullmatch(r"recording: \d+ % after \d+ s, about \d+ s left", line) for line in lines)
+
+
+def test_results_are_shown_where_asked_for(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    shown: list[str] = []
+    monkeypatch.setattr("typer.launch", lambda path: shown.append(path) or 1)
+    run = ["run", "overtaking", "--steps", "2", "--no-figures", "--out", "here", "--open"]
+    board = ["bench", "observers", "overtaking", "--observers", "dead_reckoning", "--seeds", "1", "--jobs", "1"]
+    assert main(run) == main([*board, "--set", "horizon=0.5", "--out", "board", "--open"]) == 0
+    assert shown == ["here", "board/report.html"] and Path("board/report.html").is_file()
+    assert "note: there is no program to open here" in capsys.readouterr().err
+    assert main([*board, "--open"]) == 2
+    assert capsys.readouterr().err == "error: --open: the report needs a folder, --out DIR\n"
 
 
 def test_a_log_file_runs_and_is_described_like_an_environment(capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from coopenv.cli import complete
-from coopenv.cli.options import (
-    AsJson,
-    DataFolder,
-    Environment,
-    Overrides,
-    Source,
-    SteadyFrom,
-    console,
-    load,
-    parse_overrides,
-    warned,
-)
+from coopenv.cli import complete, options
+from coopenv.errors import CoopenvError
 
 bench = typer.Typer(help="Compare observers, study seeds, score drivers.", no_args_is_help=True)
+First = Annotated[int, typer.Option(min=0, help="The first seed.")]
 
 
 @bench.command("agents")
@@ -32,12 +21,11 @@ def bench_agents(
         typer.Argument(metavar="[AGENT]...", help="Names of agents (default: all).", autocompletion=complete.agents),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Number of episodes, with the seeds 0, 1, ...")] = 20,
-    as_json: AsJson = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Score drivers: who arrives, who collides, who knows its pose."""
     from coopenv.api.parallel_env import parallel_env
     from coopenv.bench.drivers import play, score, score_document, score_table
-    from coopenv.jsonable import json_text
     from coopenv.policies import load_agent, read_card
     from coopenv.runs.console import Progress
     from coopenv.shipped import list_agents
@@ -47,46 +35,45 @@ def bench_agents(
         for name in read_card(agent).environments:
             env = parallel_env(name)
             policy = load_agent(agent, env.scenario)
-            with Progress(console(stderr=True), f"{agent} in {name}") as progress:
+            with Progress(options.console(stderr=True), f"{agent} in {name}") as progress:
                 rows.append((agent, name, score(play(env, policy, seed) for seed in progress.track(range(seeds)))))
     if as_json:
-        sys.stdout.write(json_text(score_document(rows)))
+        options.print_json(score_document(rows))
         return
-    out = console()
+    out = options.console()
     out.print(score_table(rows))
     out.print("Return: sum over the vehicles of an episode, mean ± standard deviation. Errors in m.")
 
 
 @bench.command("seeds")
 def bench_seeds(
-    environment: Environment,
+    environment: options.Environment,
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 20,
-    first: Annotated[int, typer.Option(min=0, help="The first seed.")] = 0,
-    overrides: Overrides = None,
-    steady_from: SteadyFrom = None,
-    as_json: AsJson = False,
+    first: First = 0,
+    overrides: options.Overrides = None,
+    steady_from: options.SteadyFrom = None,
+    as_json: options.AsJson = False,
 ) -> None:
     """Run many seeds at once: who settles, and the steady errors."""
-    scenario = load(environment, parse_overrides(overrides))
+    scenario = options.load(environment, options.parse_overrides(overrides))
     from coopenv.bench.seeds import seed_table, study_seeds
     from coopenv.estimation.metrics import SETTLED, steady_start
-    from coopenv.jsonable import json_text
     from coopenv.runs.console import Progress
 
     start = steady_start(steady_from, scenario.horizon)
-    with Progress(console(stderr=True), f"{seeds} seeds", total=1.0) as progress:
+    with Progress(options.console(stderr=True), f"{seeds} seeds", total=1.0) as progress:
         study = study_seeds(scenario, range(first, first + seeds), start, on_progress=progress.update)
     if as_json:
-        sys.stdout.write(json_text(study.document(Path(environment).stem)))
+        options.print_json(study.document(Path(environment).stem))
         return
-    out = console()
+    out = options.console()
     out.print(seed_table(study))
     out.print(f"Steady: after {start:g} s. Settled: below {SETTLED.text} until the end.")
 
 
 @bench.command("observers")
 def bench_observers(
-    source: Source,
+    source: options.Source,
     observers: Annotated[
         str | None,
         typer.Option(
@@ -102,27 +89,32 @@ def bench_observers(
         ),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 5,
-    first: Annotated[int, typer.Option(min=0, help="The first seed.")] = 0,
+    first: First = 0,
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None,
     engine: Annotated[str, typer.Option(help="Where to compute: `local`, or `ray` (an existing cluster).")] = "local",
     address: Annotated[str | None, typer.Option(help="Address of the Ray cluster, HOST:PORT (default: auto).")] = None,
-    data: DataFolder = None,
+    data: options.DataFolder = None,
     basin: Annotated[int, typer.Option(min=0, help="Random initial estimates for maps of the basins.")] = 0,
-    overrides: Overrides = None,
-    steady_from: SteadyFrom = None,
+    overrides: options.Overrides = None,
+    steady_from: options.SteadyFrom = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the leaderboard and the report.")] = None,
     figures: Annotated[
         str | None, typer.Option("--figures", help="Also write figures as files to the folder: png, pdf or svg.")
     ] = None,
-    as_json: AsJson = False,
+    open_report: Annotated[bool, typer.Option("--open", help="Show the report when it is done; needs --out.")] = False,
+    as_json: options.AsJson = False,
 ) -> None:
     """Compare observers on the same data and with their bound."""
-    from coopenv.bench.observers.command import perform, request_of
+    from coopenv.bench.observers.command import REPORT_FILE, perform, request_of
     from coopenv.bench.observers.executors import find_executor
 
-    printed, log = console(), console(stderr=True)
-    with warned():
-        changes, numbers = parse_overrides(overrides), range(first, first + seeds)
+    if open_report and out is None:
+        raise CoopenvError("--open: the report needs a folder, --out DIR")
+    printed, log = options.console(), options.console(stderr=True)
+    with options.warned():
+        changes, numbers = options.parse_overrides(overrides), range(first, first + seeds)
         request = request_of(source, observers, variants, numbers, steady_from, basin, data, changes, overrides or ())
         request.source.check()
     perform(request, find_executor(engine, jobs, address), out, figures, printed, log, as_json)
+    if open_report and out is not None:
+        options.show(out / REPORT_FILE)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from coopenv.cli import complete
-from coopenv.errors import CoopenvError, DataWarning
+from coopenv.errors import CoopenvError, DataWarning, ScenarioWarning
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -81,6 +81,19 @@ def console(stderr: bool = False) -> Console:
     return made
 
 
+def print_json(result: Any) -> None:
+    """Print a result as JSON."""
+    from coopenv.jsonable import json_text
+
+    sys.stdout.write(json_text(result))
+
+
+def show(path: Path) -> None:
+    """Open a result with the program that the system has for it, or say that there is none."""
+    if typer.launch(str(path)) != 0:
+        print(f"note: there is no program to open {path}", file=sys.stderr)
+
+
 def load(environment: str, overrides: dict[str, Any]) -> Any:
     """Return a scenario, its warnings printed as one line each."""
     from coopenv.scenario import load_scenario
@@ -100,14 +113,14 @@ def open_source(environment: str, overrides: dict[str, Any], data: Path | None, 
 @contextmanager
 def warned() -> Iterator[None]:
     """Print the warnings of scenarios and data that are loaded meanwhile as one line each."""
-    from coopenv.errors import ScenarioWarning
-
+    ours = (ScenarioWarning, DataWarning)
     with warnings.catch_warnings(record=True) as caught:
-        for category in (ScenarioWarning, DataWarning):
+        for category in ours:
             warnings.simplefilter("always", category)
         yield
-    for warning in (w for w in caught if issubclass(w.category, (ScenarioWarning, DataWarning))):
-        print(f"warning: {warning.message}", file=sys.stderr)
+    for warning in caught:
+        if issubclass(warning.category, ours):
+            print(f"warning: {warning.message}", file=sys.stderr)
 
 
 def parse_overrides(assignments: Sequence[str] | None) -> dict[str, Any]:

@@ -2,82 +2,52 @@
 
 from __future__ import annotations
 
-import sys
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from coopenv.cli.options import (
-    AsJson,
-    DataFolder,
-    Overrides,
-    PolicyName,
-    Seed,
-    Source,
-    SteadyFrom,
-    Variant,
-    console,
-    load,
-    open_source,
-    parse_overrides,
-    warned,
-)
+from coopenv.cli import options
 from coopenv.errors import CoopenvError, OutputError
 
-
-class FigureFormat(StrEnum):
-    """Formats of figures."""
-
-    PNG = "png"
-    PDF = "pdf"
-    SVG = "svg"
+FigureFormat = StrEnum("FigureFormat", "png pdf svg")
 
 
 def run(
-    environment: Source,
-    seed: Seed = 0,
-    overrides: Overrides = None,
+    environment: options.Source,
+    seed: options.Seed = 0,
+    overrides: options.Overrides = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Decisions to run (default: up to the horizon).")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the results (default: out/ENV).")] = None,
     device: Annotated[str, typer.Option(help="Device that computes: cpu, cuda, cuda:0, ...")] = "cpu",
     dtype: Annotated[str, typer.Option(help="Precision: float32 or float64.")] = "float64",
-    policy: PolicyName = "zero",
-    steady_from: SteadyFrom = None,
-    figures: Annotated[FigureFormat, typer.Option(help="Format of the figures.")] = FigureFormat.PNG,
+    policy: options.PolicyName = "zero",
+    steady_from: options.SteadyFrom = None,
+    figures: Annotated[FigureFormat, typer.Option(help="Format of the figures.")] = FigureFormat.png,
     no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
     video: Annotated[bool, typer.Option("--video", help="Also write a video of the top view.")] = False,
-    as_json: AsJson = False,
-    data: DataFolder = None,
-    variant: Variant = None,
+    open_out: Annotated[bool, typer.Option("--open", help="Show the folder when it is done.")] = False,
+    as_json: options.AsJson = False,
+    data: options.DataFolder = None,
+    variant: options.Variant = None,
 ) -> None:
     """Run an environment; write metrics, arrays and figures."""
-    from coopenv.jsonable import json_text
-    from coopenv.runs.command import RunRequest, execute, report
+    from coopenv.runs.command import execute, report
+    from coopenv.runs.rollouts import Rollout
 
-    parsed = parse_overrides(overrides)
+    changes, name = options.parse_overrides(overrides), Path(environment).stem
     refuse_for_recordings(environment, seed=seed, policy=policy)
-    name = Path(environment).stem
-    request = RunRequest(
-        name=name,
-        backend=open_source(environment, parsed, data, variant),
-        folder=out if out is not None else Path("out") / name,
-        overrides=parsed,
-        seed=seed,
-        steps=steps,
-        device=device,
-        dtype=dtype,
-        policy=policy,
-        steady_from=steady_from,
-        figures=None if no_figures else figures.value,
-        video=video,
-    )
-    result = execute(request, console(stderr=True))
+    backend = options.open_source(environment, changes, data, variant)
+    rollout = Rollout(backend.scenario, seed, steps, dtype, device, policy, backend)
+    folder, form, log = out or Path("out") / name, None if no_figures else figures.value, options.console(stderr=True)
+    result = execute(name, rollout, folder, log, changes, steady_from, form, video)
     if as_json:
-        sys.stdout.write(json_text(result.document()))
+        options.print_json(result)
     else:
-        report(request, result, console())
+        report(rollout, result, folder, options.console())
+    if open_out:
+        options.show(folder)
 
 
 def refuse_for_recordings(environment: str, seed: int, policy: str) -> None:
@@ -94,13 +64,13 @@ def refuse_for_recordings(environment: str, seed: int, policy: str) -> None:
 
 
 def record_command(
-    environment: Source,
+    environment: options.Source,
     out: Annotated[Path, typer.Option(help="MCAP file to write.")],
-    seed: Seed = 0,
-    policy: PolicyName = "zero",
-    overrides: Overrides = None,
-    data: DataFolder = None,
-    variant: Variant = None,
+    seed: options.Seed = 0,
+    policy: options.PolicyName = "zero",
+    overrides: options.Overrides = None,
+    data: options.DataFolder = None,
+    variant: options.Variant = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
 ) -> None:
     """Write what vehicles sense to an MCAP file.
@@ -109,24 +79,27 @@ def record_command(
     """
     from coopenv.backends.mcap import check_target, write_recording
     from coopenv.backends.sources import is_recorded, open_recording
+    from coopenv.runs.console import Progress
     from coopenv.runs.recorder import record
 
     check_target(out)
     if out.exists() and not force:
         raise OutputError(f"{out}: exists already; --force replaces it")
-    parsed = parse_overrides(overrides)
+    changes, log = options.parse_overrides(overrides), options.console(stderr=True)
     if is_recorded(environment):
         refuse_for_recordings(environment, seed, policy)
-        if parsed:
+        if changes:
             raise CoopenvError(f"--set: is for a simulation, {environment} is recorded")
-        with warned():
+        with options.warned():
             recording = open_recording(environment, data, variant)
     else:
         for option, value in (("--data", data), ("--variant", variant)):
             if value is not None:
                 raise CoopenvError(f"{option} {value}: is for recorded data, {environment} is simulated")
-        recording = record(load(environment, parsed), seed, policy)
-    write_recording(recording, out)
-    console().print(
-        f"{out}: {len(recording.setups)} vehicles, {recording.ticks} ticks, {recording.t[-1]:g} s", soft_wrap=True
-    )
+        scenario = options.load(environment, changes)
+        with Progress(log, "recording", total=1.0) as progress:
+            recording = record(scenario, seed, policy, progress.update)
+    with Progress(log, f"writing {out.name}"):
+        write_recording(recording, out)
+    facts = f"{len(recording.setups)} vehicles, {recording.ticks} ticks, {recording.t[-1]:g} s"
+    options.console().print(f"{out}: {facts}", soft_wrap=True)

@@ -9,65 +9,51 @@ from typing import Annotated
 
 import typer
 
-from coopenv.cli.options import (
-    AsJson,
-    DataFolder,
-    Overrides,
-    Source,
-    Variant,
-    console,
-    load,
-    open_source,
-    parse_overrides,
-)
+from coopenv.cli import options
 
-
-class Kind(StrEnum):
-    """What `coopenv list` lists."""
-
-    ENVS = "envs"
-    OBSERVERS = "observers"
-    AGENTS = "agents"
+Kind = StrEnum("Kind", "envs observers agents variants")
 
 
 def list_command(
-    kind: Annotated[Kind, typer.Argument(help="What to list.")] = Kind.ENVS, as_json: AsJson = False
+    kind: Annotated[Kind, typer.Argument(help="What to list.")] = Kind.envs, as_json: options.AsJson = False
 ) -> None:
-    """List environments, observers or agents."""
-    from coopenv.jsonable import json_text
+    """List environments, observers, agents or variants."""
     from coopenv.runs import listing
     from coopenv.shipped import list_envs
 
-    if kind is Kind.ENVS:
-        rows = listing.environment_rows({name: load(name, {}) for name in list_envs()})
+    if kind is Kind.envs:
+        rows = listing.environment_rows({name: options.load(name, {}) for name in list_envs()})
+    elif kind is Kind.variants:
+        from coopenv.bench.observers.sources import variant_rows
+
+        rows = variant_rows()
     else:
-        rows = listing.observer_rows() if kind is Kind.OBSERVERS else listing.agent_rows()
+        rows = listing.observer_rows() if kind is Kind.observers else listing.agent_rows()
     if as_json:
-        sys.stdout.write(json_text(rows))
+        options.print_json(rows)
     else:
-        console().print(listing.list_table(rows, listing.COLUMNS[kind]))
+        options.console().print(listing.list_table(rows, listing.COLUMNS[kind]))
 
 
 def describe(
-    environment: Source,
-    overrides: Overrides = None,
+    environment: options.Source,
+    overrides: options.Overrides = None,
     everything: Annotated[bool, typer.Option("--all", help="Also every vehicle, setting and field.")] = False,
-    as_json: AsJson = False,
-    data: DataFolder = None,
-    variant: Variant = None,
+    as_json: options.AsJson = False,
+    data: options.DataFolder = None,
+    variant: options.Variant = None,
 ) -> None:
     """Say what an environment is: vehicles, sensors, observer."""
-    from coopenv.jsonable import json_text
     from coopenv.runs.describe import describe_scenario
     from coopenv.runs.summary import document, summary
 
     name = Path(environment).stem
-    backend = open_source(environment, parse_overrides(overrides), data, variant)
+    backend = options.open_source(environment, options.parse_overrides(overrides), data, variant)
     scenario, recorded = backend.scenario, backend.capabilities.recorded
     if as_json:
-        sys.stdout.write(json_text(document(name, scenario)))
+        options.print_json(document(name, scenario))
         return
-    out = console()
+    out = options.console()
     for part in describe_scenario(scenario) if everything else summary(name, scenario, recorded):
         out.print(part)
     if not everything:
@@ -83,5 +69,5 @@ def schema(
 
     if out is None:
         sys.stdout.write(schema_text())
-        return
-    replace_text(out, schema_text())
+    else:
+        replace_text(out, schema_text())

@@ -37,13 +37,11 @@ class GiveWay:
         """
         if scenario.action.longitudinal != "speed":
             raise ValueError("it chooses speeds, so it needs action.longitudinal = 'speed'")
-        layout = observation_layout(scenario)
+        self._layout = observation_layout(scenario)
         needed = ("goal", "message_position", "message_forward", "message_mask")
-        missing = [name for name in needed if name not in layout]
-        if missing:
+        if missing := [name for name in needed if name not in self._layout]:
             raise ValueError(f"the observation lacks {', '.join(missing)}")
-        self._layout = layout
-        self._speed = layout.action[0]
+        self._speed = self._layout.action[0]
         self._cruise, self._clearance = cruise, clearance
         self._times = np.linspace(0.0, foresight, 31)
         self._look_ahead, self._gain = look_ahead, steering_gain
@@ -69,7 +67,5 @@ class GiveWay:
         position = self._read(observation, "message_position")[heard, :2]
         velocity = self._cruise * self._read(observation, "message_forward")[heard, :2]
         going, waiting = (self._closest(position, velocity, speed) for speed in (self._cruise, 0.0))
-        go = going >= self._clearance or going > waiting
-        speed = self._cruise if go else 0.0
-        level = self._speed.level(speed)
-        return np.array([level, np.clip(self._gain * heading, -1.0, 1.0)], dtype=np.float32)
+        speed = self._cruise if going >= self._clearance or going > waiting else 0.0
+        return np.array([self._speed.level(speed), np.clip(self._gain * heading, -1.0, 1.0)], dtype=np.float32)

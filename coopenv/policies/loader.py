@@ -10,8 +10,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coopenv.errors import CoopenvError, suggest
-from coopenv.policies.base import Policy
-from coopenv.policies.plain import PLAIN
+from coopenv.policies.base import PLAIN, Policy
 from coopenv.scenario import Scenario
 from coopenv.shipped import data_directory, list_agents
 
@@ -30,28 +29,16 @@ class AgentCard(BaseModel):
     options: dict[str, Any] = {}
 
 
-def agent_path(name_or_path: str | Path) -> Path:
-    """Return the `agent.toml` of a shipped driver or of a folder.
-
-    Raises:
-        CoopenvError: there is none.
-    """
-    folder = Path(str(name_or_path))
-    if str(name_or_path) in list_agents():
-        folder = data_directory("agents") / str(name_or_path)
-    if not (folder / "agent.toml").is_file():
-        name, names = str(name_or_path), list_agents()
-        raise CoopenvError(f"unknown agent '{name}'{suggest(name, names)}; known: {', '.join(names)}")
-    return folder / "agent.toml"
-
-
 def read_card(name_or_path: str | Path) -> AgentCard:
-    """Read an `agent.toml`.
+    """Read the `agent.toml` of a shipped driver or of a folder.
 
     Raises:
         CoopenvError: no such agent, or the file is not valid.
     """
-    path = agent_path(name_or_path)
+    name, names = str(name_or_path), list_agents()
+    path = (data_directory("agents") / name if name in names else Path(name)) / "agent.toml"
+    if not path.is_file():
+        raise CoopenvError(f"unknown agent '{name}'{suggest(name, names)}; known: {', '.join(names)}")
     try:
         return AgentCard.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
     except tomllib.TOMLDecodeError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 from pydantic import BaseModel
 from rich import box
@@ -34,19 +35,16 @@ def describe_scenario(scenario: Scenario) -> Iterator[RenderableType]:
             yield f"{' '.join(text.split())}\n"
     steps = round(scenario.horizon * scenario.rates.decision)
     yield f"Horizon: {scenario.horizon:g} s, {steps} decisions of {scenario.ticks_per_decision} camera ticks each.\n"
-    yield from _spaced(vehicle_table(scenario))
-    if scenario.landmarks:
-        yield from _spaced(landmark_table(scenario))
-    timed = motion_table(scenario)
-    if timed.row_count:
-        yield from _spaced(timed)
-    if scenario.obstacles:
-        yield from _spaced(obstacle_table(scenario))
+    for table in (vehicle_table, landmark_table, motion_table, obstacle_table):
+        if (shown := table(scenario)).row_count:
+            yield shown
+            yield ""
     yield Text("Settings (* differs from the default)\n", "bold")
     names = [*SECTIONS, *(DRIVEN_SECTIONS if scenario.driven else ())]
     width = max(len(key) for name in names for key, *_ in settings(getattr(scenario, name))) + 2
     for name in names:
-        yield from _spaced(section_table(name, getattr(scenario, name), width))
+        yield section_table(name, getattr(scenario, name), width)
+        yield ""
     yield observation_table(scenario)
 
 
@@ -54,29 +52,19 @@ def vehicle_table(scenario: Scenario) -> Table:
     """Return one row per vehicle: start, initial estimate, motion, neighbours."""
     table = _table("vehicle", "start", "initial estimate", "motion", "may measure", title="Vehicles (m)")
     table.columns[0].no_wrap = True
-    for name, vehicle, neighbours in zip(
-        scenario.vehicle_names, scenario.vehicles, words.neighbours(scenario), strict=True
-    ):
-        table.add_row(
-            name,
-            words.start(vehicle),
-            words.estimate(vehicle.initial_estimate),
-            words.vehicle_motion(vehicle),
-            neighbours,
-        )
+    neighbours = words.neighbours(scenario)
+    for name, vehicle, targets in zip(scenario.vehicle_names, scenario.vehicles, neighbours, strict=True):
+        estimate = words.estimate(vehicle.initial_estimate)
+        table.add_row(name, words.start(vehicle), estimate, words.vehicle_motion(vehicle), targets)
     return table
 
 
 def landmark_table(scenario: Scenario) -> Table:
     """Return one row per landmark."""
     table = _table("landmark", "position", "motion", "body", title="Landmarks (m)")
-    for landmark in scenario.landmarks:
-        table.add_row(
-            landmark.name,
-            words.vector(landmark.position),
-            words.motion(landmark.motion),
-            words.body(landmark.body) or "none",
-        )
+    for mark in scenario.landmarks:
+        motion, body = words.motion(mark.motion), words.body(mark.body) or "none"
+        table.add_row(mark.name, words.vector(mark.position), motion, body)
     return table
 
 
@@ -140,18 +128,6 @@ def observation_table(scenario: Scenario) -> Table:
     return table
 
 
-def _spaced(table: Table) -> Iterator[RenderableType]:
-    yield table
-    yield ""
-
-
 def _table(*columns: str, title: str | None = None) -> Table:
-    return Table(
-        *columns,
-        title=title,
-        title_justify="left",
-        title_style="italic",
-        box=box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-        show_edge=False,
-    )
+    look: dict[str, Any] = {"title_justify": "left", "title_style": "italic"}
+    return Table(*columns, title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, **look)

@@ -18,6 +18,7 @@ COLUMNS = {
     "envs": ("name", "vehicles", "landmarks", "motion", "horizon_s"),
     "observers": ("name", "about"),
     "agents": ("name", "environments", "about"),
+    "variants": ("name", "of", "about"),
 }
 """What the tables show of the rows."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from coopenv.api.engine import Engine
@@ -15,13 +17,19 @@ from coopenv.scenario import Scenario
 SENSED = ("rotation", "translation", "velocity", "angular_velocity", "bearings", "visible", "landmarks")
 
 
-def record(source: Scenario | Backend, seed: int = 0, policy: str | Policy = "zero") -> Recording:
+def record(
+    source: Scenario | Backend,
+    seed: int = 0,
+    policy: str | Policy = "zero",
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> Recording:
     """Drive a backend in float64 to its horizon, or as long as it has ticks, and keep what is sensed.
 
     Args:
         source: where the ticks come from; a scenario is simulated.
         seed: of the episode.
         policy: of driven vehicles: "zero", "random", the name of an agent, or a function of the observations.
+        on_progress: called with the share of the horizon that is done.
 
     Raises:
         CoopenvError: unknown policy or observer, or the backend cannot begin.
@@ -35,6 +43,7 @@ def record(source: Scenario | Backend, seed: int = 0, policy: str | Policy = "ze
     for k in play(engine, [seed], scenario.horizon_ticks, driver if scenario.driven else None):
         views.take()
         ticks.append(engine.world.sensed(0, k))
+        on_progress(k / scenario.horizon_ticks)
     L, briefing = len(scenario.landmarks), engine.world.briefing
     kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in SENSED}
     start_rotation = views["estimate_rotation"][0, 0]

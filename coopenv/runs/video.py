@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from math import ceil
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -17,18 +17,6 @@ from coopenv.scenario import Scenario
 MAX_FPS = 20.0
 GIF_SIZE = 480
 """Largest width or height of a GIF, pixels: its frames are held in memory until the end."""
-
-
-class Film(Protocol):
-    """Takes pictures in order and writes them when it is closed."""
-
-    path: Path
-
-    def add(self, picture: np.ndarray) -> None:
-        """Append an (H, W, 3) uint8 picture."""
-
-    def close(self) -> None:
-        """Finish the file."""
 
 
 def frame_stride(scenario: Scenario) -> int:
@@ -115,3 +103,6 @@ class GifFilm:
             duration = np.diff(ends).astype(int).tolist()  # ms; the format counts in hundredths of a second
             with writing(self.path):
                 first.save(self.path, save_all=True, append_images=rest, duration=duration, loop=0)
+
+
+Film = Mp4Film | GifFilm

@@ -2,3 +2,5 @@
 
 FORMATS = ("png", "pdf", "svg")
 """Of the files that figures are written to."""
+FIGURE_NAMES = ("errors", "trajectories_2d", "trajectories_3d", "topology", "consistency", "observability")
+"""Of a run."""

@@ -9,14 +9,13 @@ from coopenv.estimation.observability import Observability, analyse_observabilit
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.files import writing
 from coopenv.scenario import Scenario
+from coopenv.viz import FIGURE_NAMES
 from coopenv.viz.consistency import consistency_figure
 from coopenv.viz.error_figure import error_figure
 from coopenv.viz.observability import observability_figure
 from coopenv.viz.style import save
 from coopenv.viz.topology import topology_figure
 from coopenv.viz.trajectories import trajectory_figure_2d, trajectory_figure_3d
-
-FIGURE_NAMES = ("errors", "trajectories_2d", "trajectories_3d", "topology", "consistency", "observability")
 
 
 def save_figures(

@@ -16,7 +16,7 @@ from PIL import Image
 
 from coopenv.backends.mcap import read_recording
 from coopenv.estimation.trajectory import Trajectory
-from coopenv.runs.output import result_names
+from coopenv.runs.command import result_names
 from tests.helpers.processes import COOPENV, start
 
 SHORT = ["overtaking", "--set", "horizon=0.5"]

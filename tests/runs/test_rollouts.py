@@ -16,9 +16,9 @@ from coopenv.errors import CoopenvError, DeviceError
 from coopenv.estimation.metrics import settling_time
 from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.trajectory import Sight, Trajectory
+from coopenv.jsonable import json_text
 from coopenv.runs import Rollout, rollout
 from coopenv.runs.metrics import outcome_line, run_metrics, vehicle_metrics
-from coopenv.runs.output import write_results
 from coopenv.runs.table import legend, metrics_table, remarks
 from coopenv.runs.video import GIF_SIZE, GifFilm, frame_stride
 
@@ -153,15 +153,14 @@ def test_an_interrupted_run_keeps_what_was_recorded(tmp_path: Path) -> None:
     assert np.array_equal(Trajectory.load(tmp_path / "run.npz").position, trajectory.position)
 
 
-def test_metrics_file_is_strict_json_with_figures_of_every_vehicle(tmp_path: Path) -> None:
+def test_metrics_are_strict_json_with_figures_of_every_vehicle() -> None:
     recording = Rollout(coopenv.load_scenario("busy_intersection"), seed=3, steps=60)
     for _ in recording.play():
         pass
     trajectory = recording.trajectory()
     vehicles = vehicle_metrics(trajectory, analyse_observability(trajectory), recording.endings(), 35.0)
     metrics = run_metrics("busy_intersection", {"a.b": [1]}, recording, vehicles, 35.0)
-    write_results(tmp_path, trajectory, metrics)
-    text = (tmp_path / "metrics.json").read_text()
+    text = json_text(metrics)
     assert "NaN" not in text
     read = json.loads(text)
     assert read["seed"] == 3

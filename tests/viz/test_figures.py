@@ -25,10 +25,10 @@ from coopenv.errors import OutputError
 from coopenv.estimation.metrics import summarise
 from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.trajectory import Sight, Trajectory
-from coopenv.viz import consistency, style
+from coopenv.viz import FIGURE_NAMES, consistency, style
 from coopenv.viz.clipping import clipped
 from coopenv.viz.error_figure import error_figure
-from coopenv.viz.figures import FIGURE_NAMES, save_figures
+from coopenv.viz.figures import save_figures
 from coopenv.viz.labels import place_names
 from coopenv.viz.observability import observability_figure
 from coopenv.viz.topology import topology_figure

@@ -163,6 +163,12 @@ class LogFile(Source):
         return "" if any(followers(recording, i) for i in recording.order) else NOBODY_FOLLOWS
 
 
+def variant_rows() -> list[dict[str, str]]:
+    """Return what `list variants` says of every variant."""
+    kinds = {"environments, logs": Source.variants, "recorded robots": Robots.variants}
+    return [{"name": n, "of": of, "about": text} for of, variants in kinds.items() for n, text in variants.items()]
+
+
 def _is_planar(recording: Recording) -> bool:
     return all(setup.planar for setup in recording.setups)
 
