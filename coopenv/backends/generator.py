@@ -30,11 +30,7 @@ class TickGenerator(ABC):
         """Return a new episode; arguments as for `Backend.reset`."""
 
     def reset(self, seed: int | None, options: Mapping[str, Any]) -> Sensed:
-        """Begin an episode and return tick 0.
-
-        Raises:
-            CoopenvError: there is no tick.
-        """
+        """Begin an episode and return tick 0. Raises CoopenvError: there is no tick."""
         self.stop("reset")
         self._episode = self.episode(seed, options)
         first = next(self._episode, None)

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coopenv.errors import CoopenvError
 from coopenv.estimation.validity import are_numbers, are_rotations, are_unit_vectors, everywhere
@@ -16,6 +15,10 @@ from coopenv.observers.recording import Briefing, Sensed
 from coopenv.observers.recording_checks import SHAPES
 
 MEASURED = ("rotation", "translation", "velocity", "angular_velocity", "bearings", "visible", "landmarks")
+TICK_SHAPES = {name: shape[1:] for name, shape in SHAPES.items() if shape[0] == "K" and name != "due"}
+TICK_SHAPES |= dict.fromkeys(("odometry_age", "bearing_age", "missing", "late"), ("N",))
+KINDS = {"visible": "b", "missing": "b", "late": "b", "inbox_tick": "iu"}
+"""NumPy's kinds of the arrays that do not hold numbers of any kind."""
 
 
 def check_tick(tick: Sensed, index: int, briefing: Briefing) -> None:
@@ -31,67 +34,56 @@ def check_tick(tick: Sensed, index: int, briefing: Briefing) -> None:
     """
     if tick.index != index:
         raise CoopenvError(f"tick {index}: index: got {tick.index!r:.40}")
-    for field, vehicle, problem in _problems(tick, briefing):
-        whose = "" if vehicle is None else f" of {briefing.setups[vehicle].name}"
-        raise CoopenvError(f"tick {index}: {field}{whose}: {problem}")
-
-
-def _problems(tick: Sensed, briefing: Briefing) -> Iterator[tuple[str, int | None, str]]:
     first = briefing.setups[0]
     sizes = {"N": len(briefing.setups), "T": len(first.target_names), "L": first.landmarks}
-    N = sizes["N"]
-    for name in MEASURED:
-        yield from _misshapen(name, getattr(tick, name), tuple(sizes.get(str(n), n) for n in SHAPES[name][1:]))
-    for name in ("odometry_age", "bearing_age", "missing", "late"):
-        yield from _misshapen(name, getattr(tick, name), (N,))
-    if tick.truth is not None:
-        yield from _misshapen("truth.rotation", tick.truth.rotation, (N, 3, 3))
-        yield from _misshapen("truth.position", tick.truth.position, (N, 3))
-    yield from _misshapen("inbox_tick", tick.inbox_tick, (N, N))
-    if not are_numbers(tick.landmarks).all():
-        yield "landmarks", None, "not finite or too large"
-    for name, valid, problem in _judged(tick):
+    for problem in _misshapen(tick, sizes):
+        raise CoopenvError(f"tick {index}: {problem}")
+    for field, valid, problem in _judged(tick):
         if not valid.all():
-            yield name, int(np.argmin(valid)), problem
-    yield from _wrong_messages(tick, N)
+            whose = f" of {briefing.setups[int(np.argmin(valid))].name}" if valid.ndim else ""
+            raise CoopenvError(f"tick {index}: {field}{whose}: {problem}")
 
 
-def _misshapen(name: str, value: Any, shape: tuple[Any, ...]) -> Iterator[tuple[str, int | None, str]]:
-    kinds = {"visible": "b", "missing": "b", "late": "b", "inbox_tick": "iu"}.get(name, "fiu")
-    if value is not None and not (isinstance(value, np.ndarray) and value.shape == shape and value.dtype.kind in kinds):
-        got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
-        yield name, None, f"expected an array of shape {shape} and kind {kinds}, got {got}"
+def _misshapen(tick: Sensed, sizes: dict[str, int]) -> Iterator[str]:
+    for name, letters in TICK_SHAPES.items():
+        whole, _, part = name.partition(".")
+        value = getattr(tick, whole)
+        value = getattr(value, part) if part and value is not None else value
+        shape, kinds = tuple(sizes.get(str(n), n) for n in letters), KINDS.get(name, "fiu")
+        is_array = isinstance(value, np.ndarray)
+        if (value is not None or name in MEASURED) and not (
+            is_array and value.shape == shape and value.dtype.kind in kinds
+        ):
+            got = f"{value.dtype} {value.shape}" if is_array else type(value).__name__
+            yield f"{name}: expected an array of shape {shape} and kind {kinds}, got {got}"
 
 
-def _judged(tick: Sensed) -> Iterator[tuple[str, NDArray[np.bool_], str]]:
-    """Yield (field, (N,) where it is valid, what it is otherwise)."""
+def _judged(tick: Sensed) -> Iterator[tuple[str, Any, str]]:
+    """Yield (field, whether it is valid, of everybody or (N,), what it is otherwise)."""
     absent = np.zeros(len(tick.rotation), bool) if tick.missing is None else tick.missing
+    yield "landmarks", are_numbers(tick.landmarks).all(), "not finite or too large"
     yield "rotation", are_rotations(tick.rotation) | absent, "not a rotation"
     for name in ("translation", "velocity", "angular_velocity"):
         yield name, everywhere(are_numbers(getattr(tick, name)), -1) | absent, "not finite or too large"
     seen = tick.visible & ~absent[:, None]
     yield "bearings", everywhere(are_unit_vectors(tick.bearings) | ~seen, -1), "not unit vectors"
-    for name, age in (("odometry_age", tick.odometry_age), ("bearing_age", tick.bearing_age)):
-        if age is not None:
+    for name in ("odometry_age", "bearing_age"):
+        if (age := getattr(tick, name)) is not None:
             yield name, (age >= 0.0) | absent, "negative or not a number"
     if tick.truth is not None:
         R, p = tick.truth.rotation, tick.truth.position
         unknown = everywhere(np.isnan(R), -1, -2) & everywhere(np.isnan(p), -1)
         known = are_rotations(R) & everywhere(are_numbers(p), -1)
         yield "truth", known | unknown, "neither a pose nor unknown (NaN)"
-    if tick.inbox_tick is not None:
-        sent = tick.inbox_tick
+    if (sent := tick.inbox_tick) is not None:
         yield "inbox_tick", everywhere((sent >= -1) & (sent <= tick.index), -1), "neither -1 nor a tick up to now"
-
-
-def _wrong_messages(tick: Sensed, N: int) -> Iterator[tuple[str, int | None, str]]:
-    if tick.messages and tick.inbox_tick is None:
-        yield "messages", None, "where some come from elsewhere, inbox_tick says what became of the others"
+    elif tick.messages:
+        yield "messages", np.False_, "where some come from elsewhere, inbox_tick says what became of the others"
+    vehicles = np.arange(len(tick.rotation))
     for (receiver, sender), received in tick.messages.items():
-        if not (0 <= receiver < N and 0 <= sender < N and receiver != sender):
-            yield "messages", None, f"({receiver!r:.20}, {sender!r:.20}) are no two vehicles"
-        if not received.age >= 0.0:
-            yield "messages", receiver, "of negative age"
+        possible = receiver in vehicles and sender in vehicles and receiver != sender
+        yield "messages", np.bool_(possible), f"({receiver!r:.20}, {sender!r:.20}) are no two vehicles"
+        yield "messages", (vehicles != receiver) | (received.age >= 0.0), "of negative age"
 
 
 def is_sound(message: Message) -> bool:

@@ -42,11 +42,7 @@ class TickWorld(SensingWorld):
     source = RECORDED
 
     def __init__(self, backend: Backend, worlds: int, dtype: str, device: str) -> None:
-        """Build the arrays.
-
-        Raises:
-            CoopenvError: more than one world, or not on the CPU.
-        """
+        """Build the arrays. Raises CoopenvError: more than one world, or not on the CPU."""
         self._backend = backend
         self._name = f"backend {type(backend).__name__}"
         if worlds != 1 or device != "cpu":
@@ -129,11 +125,7 @@ class TickWorld(SensingWorld):
         return True
 
     def get_state(self) -> NoReturn:
-        """Refuse.
-
-        Raises:
-            CoopenvError: always.
-        """
+        """Refuse. Raises CoopenvError: always."""
         raise CoopenvError(f"{self._name} gives ticks from elsewhere, so that no state of them can be saved")
 
     def _clear_marks(self) -> None:

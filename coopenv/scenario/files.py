@@ -123,11 +123,7 @@ def _plain(value: Any) -> Any:
 
 
 def apply_vehicle_defaults(raw: Mapping[str, Any], where: str = "scenario") -> dict[str, Any]:
-    """Merge the table `vehicle_defaults` under every entry of `vehicles`.
-
-    Raises:
-        ScenarioError: it is not a table.
-    """
+    """Merge the table `vehicle_defaults` under every entry of `vehicles`. Raises ScenarioError: it is not a table."""
     merged = dict(raw)
     defaults = merged.pop(DEFAULTS_KEY, {})
     if not isinstance(defaults, dict):

@@ -57,11 +57,6 @@ def twist_table(start: np.ndarray, linear: np.ndarray, angular: np.ndarray) -> T
     return TwistTable(start, linear, angular, rotation, position)
 
 
-def standing() -> TwistTable:
-    """Return the table of an agent that does not move by itself."""
-    return twist_table(np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))
-
-
 def compile_motion(motion: object, initial_rotation: np.ndarray, until: float) -> TwistTable:
     """Return the twist table of a motion; static and driven agents stand still in it.
 
@@ -70,17 +65,16 @@ def compile_motion(motion: object, initial_rotation: np.ndarray, until: float) -
         initial_rotation: (3, 3) of the agent at its start, body to map.
         until: s; what comes later is left out.
     """
-    if isinstance(motion, ConstantMotion):
-        return twist_table(np.zeros(1), np.array([motion.linear]), np.array([motion.angular]))
-    if isinstance(motion, SegmentMotion):
-        start = np.array([0.0, *np.cumsum([segment.duration for segment in motion.segments])])
-        linear = np.array([segment.linear for segment in motion.segments] + [(0.0, 0.0, 0.0)])
-        angular = np.array([segment.angular for segment in motion.segments] + [(0.0, 0.0, 0.0)])
-        begun = start <= until
-        return twist_table(start[begun], linear[begun], angular[begun])
     if isinstance(motion, WaypointMotion):
         return _spline_table(motion, initial_rotation, until)
-    return standing()
+    if isinstance(motion, ConstantMotion):
+        return twist_table(np.zeros(1), np.array([motion.linear]), np.array([motion.angular]))
+    segments = motion.segments if isinstance(motion, SegmentMotion) else ()
+    start = np.array([0.0, *np.cumsum([segment.duration for segment in segments])])
+    rest, begun = (0.0, 0.0, 0.0), start <= until
+    linear = np.array([*(segment.linear for segment in segments), rest])
+    angular = np.array([*(segment.angular for segment in segments), rest])
+    return twist_table(start[begun], linear[begun], angular[begun])
 
 
 def path_heading(motion: WaypointMotion) -> float:

@@ -23,11 +23,7 @@ class KernelCacheError(CoopenvError):
 
 
 def start() -> None:
-    """Initialise Warp, which makes the folder of the cache.
-
-    Raises:
-        KernelCacheError: it cannot.
-    """
+    """Initialise Warp, which makes the folder of the cache. Raises KernelCacheError: it cannot."""
     try:
         wp.init()
     except OSError as error:
@@ -62,11 +58,7 @@ def cache_folder() -> Path:
 
 
 def probe() -> None:
-    """Make sure that the cache can be written.
-
-    Raises:
-        KernelCacheError: it cannot.
-    """
+    """Make sure that the cache can be written. Raises KernelCacheError: it cannot."""
     try:
         with tempfile.TemporaryFile(dir=cache_folder()) as stream:
             stream.write(bytes(PROBE_BYTES))

@@ -30,11 +30,7 @@ SCALARS = {"float32": (wp.float32, np.float32), "float64": (wp.float64, np.float
 
 
 def precision(dtype: str) -> Precision:
-    """Return the types for `float32` or `float64`.
-
-    Raises:
-        DeviceError: another name.
-    """
+    """Return the types for `float32` or `float64`. Raises DeviceError: another name."""
     if not isinstance(dtype, str) or dtype not in SCALARS:
         raise DeviceError(f"unknown dtype '{dtype}'{suggest(str(dtype), SCALARS)}; known: float32, float64")
     return _precision(dtype)
@@ -55,11 +51,7 @@ def _precision(dtype: str) -> Precision:
 
 
 def check_device(device: str) -> str:
-    """Return the device's canonical name.
-
-    Raises:
-        DeviceError: Warp knows no such device here.
-    """
+    """Return the device's canonical name. Raises DeviceError: Warp knows no such device here."""
     start_warp()
     if not isinstance(device, str) or device.split(":")[0] not in ("cpu", "cuda"):
         raise DeviceError(f"unknown device '{device}'; known: cpu, cuda, cuda:0, ...")

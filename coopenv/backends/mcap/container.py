@@ -29,11 +29,7 @@ class Container:
     """An MCAP file, read from begin to end; the index behind its data says nothing that its records do not."""
 
     def __init__(self, path: Path) -> None:
-        """Check both ends of a file.
-
-        Raises:
-            DataError: it is no MCAP file, or cut off.
-        """
+        """Check both ends of a file. Raises DataError: it is no MCAP file, or cut off."""
         check_memory(path.stat().st_size, f"{path}:")
         self._data = path.read_bytes()
         if not self._data.startswith(MAGIC):

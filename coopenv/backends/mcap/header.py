@@ -77,11 +77,7 @@ class Header(Part):
 
     @classmethod
     def read(cls, text: bytes, where: str) -> Header:
-        """Return a header from its JSON.
-
-        Raises:
-            DataError: it is no header; `where` begins the line.
-        """
+        """Return a header from its JSON. Raises DataError: it is no header; `where` begins the line."""
         try:
             return cls.model_validate_json(text, strict=True)
         except ValidationError as error:

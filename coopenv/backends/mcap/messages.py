@@ -72,11 +72,7 @@ def topic(vehicle: str, name: str) -> str:
 
 @cache
 def codec() -> Any:
-    """Return the store of message types, with ours in it.
-
-    Raises:
-        CoopenvError: the extra is not installed.
-    """
+    """Return the store of message types, with ours in it. Raises CoopenvError: the extra is not installed."""
     try:
         import mcap  # noqa: F401
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore

@@ -18,11 +18,7 @@ class TickArrays:
     """K ticks of N vehicles and T targets, of which the first L are landmarks."""
 
     def __init__(self, ticks: int, vehicles: Sequence[str], targets: int, landmarks: int) -> None:
-        """Allocate the arrays.
-
-        Raises:
-            CoopenvError: they would not fit into memory.
-        """
+        """Allocate the arrays. Raises CoopenvError: they would not fit into memory."""
         sizes = {"K": ticks, "N": len(vehicles), "T": targets, "L": landmarks}
         shapes = {name: [int(sizes.get(str(n), n)) for n in shape] for name, shape in SHAPES.items() if shape[0] == "K"}
         needed = 8 * sum(math.prod(shape) for shape in shapes.values())

@@ -37,11 +37,7 @@ DRIFT_STD = (0.05, 0.1)  # rad and m per square root of a second without truth b
 
 
 def check_variant(name: str) -> Variant:
-    """Return the variant of that name.
-
-    Raises:
-        DataError: there is none.
-    """
+    """Return the variant of that name. Raises DataError: there is none."""
     for variant in VARIANTS:
         if variant == name:
             return variant

@@ -89,11 +89,7 @@ class Table:
         raise DataError(f"{self.path}:{self.lines[row]}: {why}")
 
     def whole(self, column: int) -> list[int]:
-        """Return a column of whole numbers.
-
-        Raises:
-            DataError: a number is not whole.
-        """
+        """Return a column of whole numbers. Raises DataError: a number is not whole."""
         values = self.values[:, column]
         for row in np.flatnonzero(values != np.round(values)).tolist():
             self.refuse(row, "subject and barcode numbers must be whole")
