@@ -15,8 +15,8 @@ from coopenv.observers.registry import find_embedded
 from coopenv.observers.riccati.kernels import DEAD_RECKONING
 from coopenv.scenario import load_scenario
 from coopenv.world.collision import referee
+from coopenv.world.dynamics import move
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Source, sense_simulation
-from coopenv.world.motion import move
 from coopenv.world.odometry import measure_odometry
 from coopenv.world.world import World
 

@@ -11,8 +11,7 @@ from typing import Any, NoReturn, cast
 import numpy as np
 
 from coopenv.backends.base import Backend, Command, SensingWorld, WorldBackend
-from coopenv.backends.replay.device_recording import record_struct, true_twists
-from coopenv.backends.replay.kernels import BY_RADIO, RECORDED
+from coopenv.backends.replay.kernels import BY_RADIO, RECORDED, record_struct, true_twists
 from coopenv.backends.tick_checks import MEASURED, check_tick, is_sound
 from coopenv.errors import CoopenvError
 from coopenv.estimation.se3 import exp_se3

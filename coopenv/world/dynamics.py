@@ -1,4 +1,4 @@
-"""Stage 1, truth: prescribed motion as a closed form, and the kinematic bicycle with its actuators."""
+"""Stage 1: the truth moves, by prescribed motion as a closed form, or as a kinematic bicycle with its actuators."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.so3 import increment, orthonormalise, rigid_motion
-from coopenv.world.command import ACCELERATION, SPEED, STEERING
+from coopenv.world.command import ACCELERATION, SPEED, STEERING, command_in_force
+from coopenv.world.model import DRIVEN, PRESCRIBED
 
 LONGEST_SUBSTEP = wp.constant(wp.float64(0.0100001))
 """s; the bicycle's twist is held over no longer than this."""
@@ -109,3 +110,38 @@ def drive(model: Any, state: Any, world: int, vehicle: int, command: Any, durati
 def yaw_rate(model: Any, speed: Any, steering: Any):
     """Return the bicycle's yaw rate, rad/s."""
     return speed * wp.tan(steering) / model.dynamics.wheelbase
+
+
+@wp.func
+def drive_through(model: Any, state: Any, world: int, vehicle: int, command: Any, tick: int):
+    """Drive a vehicle through one camera tick, keeping its true twist at every odometry sample on the way.
+
+    Sample m is taken at m / odometry_rate; those in (t_{tick-1}, t_tick] belong to this tick.
+    """
+    agent = model.landmarks + vehicle
+    tick_end = wp.float64(tick) * model.camera_period
+    now = wp.float64(tick - 1) * model.camera_period
+    sample = state.odometry_samples[world, vehicle]
+    taken = int(0)
+    due = wp.float64(sample) * model.odometry_period
+    while due <= tick_end + wp.float64(1.0e-9) and taken < model.samples_per_tick:
+        drive(model, state, world, vehicle, command, wp.max(due - now, wp.float64(0.0)))
+        state.sampled_velocity[world, vehicle, taken] = state.velocity[world, agent]
+        state.sampled_angular_velocity[world, vehicle, taken] = state.angular_velocity[world, agent]
+        taken += 1
+        now = due
+        due = wp.float64(sample + taken) * model.odometry_period
+    drive(model, state, world, vehicle, command, wp.max(tick_end - now, wp.float64(0.0)))
+
+
+@wp.func
+def move(model: Any, state: Any, world: int, tick: int):
+    """Carry all truth of one world to the tick's end."""
+    t = wp.float64(tick) * model.camera_period
+    for agent in range(model.agents):
+        if model.motion.kind[agent] == PRESCRIBED:
+            prescribe(model, state, world, agent, t)
+    for vehicle in range(model.vehicles):
+        if model.motion.kind[model.landmarks + vehicle] == DRIVEN:
+            command = command_in_force(model, state, world, vehicle, tick)
+            drive_through(model, state, world, vehicle, command, tick)

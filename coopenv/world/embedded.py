@@ -14,7 +14,7 @@ import warp as wp
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.world.camera import observe
 from coopenv.world.collision import referee
-from coopenv.world.motion import move
+from coopenv.world.dynamics import move
 from coopenv.world.odometry import measure_odometry
 from coopenv.world.reset import reset_world
 from coopenv.world.saved_state import Rule
@@ -26,6 +26,33 @@ class Nothing:
     """The memory of an observer that has none, and the record of a source that needs none."""
 
     unused: wp.int32
+
+
+@wp.struct
+class Now:
+    """The tick that is under way."""
+
+    tick: wp.int32  # time since the start in units of `model.camera_period`: its number, where ticks come regularly
+    period: wp.float64  # s since the last tick
+    due: wp.bool  # whether the scenario's observer rate asks for a correction
+
+
+@wp.func
+def correction_due(model: Any, tick: int) -> bool:
+    """Return whether the scenario's observer rate (`rates.observer`) asks for a correction at a camera tick."""
+    ratio = model.observer.rate * model.camera_period
+    before = wp.floor(wp.float64(tick - 1) * ratio + wp.float64(1.0e-9))
+    return wp.floor(wp.float64(tick) * ratio + wp.float64(1.0e-9)) > before
+
+
+@wp.func
+def regular_tick(model: Any, tick: int):
+    """Return a tick of a world whose ticks come at the camera's rate."""
+    now = Now()
+    now.tick = tick
+    now.period = model.camera_period
+    now.due = correction_due(model, tick)
+    return now
 
 
 @dataclass(frozen=True)
@@ -53,7 +80,7 @@ class Embedded:
 
     name: str
     estimate: Any
-    """(model, state, memory, world, vehicle, now): take one camera tick, `now` being a `coopenv.world.rates.Now`;
+    """(model, state, memory, world, vehicle, now): take one camera tick, `now` being a `Now`;
     messages have been delivered."""
     start: Any
     """(model, state, memory, world, vehicle): begin an episode at the initial estimate, which stands in the state, its

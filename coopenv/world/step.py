@@ -13,9 +13,8 @@ from typing import Any
 import warp as wp
 
 from coopenv.world.command import decide
-from coopenv.world.embedded import Embedded, Source
-from coopenv.world.gramian import sample_gramian
-from coopenv.world.rates import Now, regular_tick
+from coopenv.world.embedded import Embedded, Now, Source, regular_tick
+from coopenv.world.quality import sample_gramian
 from coopenv.world.v2x import broadcast
 
 Kernel = Callable[..., None]

@@ -11,8 +11,7 @@ import warp as wp
 
 from coopenv.backends.base import Capabilities, SensingWorld
 from coopenv.backends.generator import Episode, TickGenerator
-from coopenv.backends.replay.device_recording import samples_taken, upload
-from coopenv.backends.replay.kernels import RECORDED
+from coopenv.backends.replay.kernels import RECORDED, samples_taken, upload
 from coopenv.backends.replay.scenario import scenario_of
 from coopenv.observers.recording import Briefing, Recording, Sensed
 from coopenv.observers.recording_checks import check_recording

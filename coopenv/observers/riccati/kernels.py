@@ -22,7 +22,7 @@ from coopenv.observers.riccati.equations import (
     predict_pose,
 )
 from coopenv.world.embedded import Embedded, send_nothing, start_nothing
-from coopenv.world.gramian import known_position, usable
+from coopenv.world.quality import known_position, usable
 
 MOST_SUBSTEPS = wp.constant(200)
 """Re-linearisations per tick; the last one takes what remains of the tick."""
