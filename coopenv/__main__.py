@@ -1,7 +1,5 @@
 """The command `coopenv`, also `python -m coopenv`: signals are caught before anything else is loaded."""
 
-from __future__ import annotations
-
 import io
 import sys
 

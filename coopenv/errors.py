@@ -1,7 +1,5 @@
 """Errors that a user can cause, each a `ValueError` with one clear line."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches

@@ -6,8 +6,6 @@ or the whole new one. Two folders change places by Linux's renameat2(RENAME_EXCH
 lacks it, by two renames, between which the place is empty: a run that is killed there is put right by the next one.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import threading

@@ -1,7 +1,5 @@
 """Numbers for people, in tables and pictures; `-` where there is none."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

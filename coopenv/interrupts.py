@@ -1,7 +1,5 @@
 """SIGINT and SIGTERM end a command within two seconds, with one line that says what was written or kept."""
 
-from __future__ import annotations
-
 import atexit
 import os
 import signal

@@ -1,7 +1,5 @@
 """Results as JSON, which knows neither NumPy nor NaN."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

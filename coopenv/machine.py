@@ -1,7 +1,5 @@
 """The machine that the program runs on: cores, versions, environment variables of other processes."""
 
-from __future__ import annotations
-
 import os
 import platform
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """What ships with the package: its version, environments and agents. Light, so that the start-up can use it."""
 
-from __future__ import annotations
-
 from functools import cache
 from importlib import metadata
 from pathlib import Path

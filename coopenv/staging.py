@@ -1,7 +1,5 @@
 """Hidden folders beside a result: made, locked, put in the place of an older one, and found again after a kill."""
 
-from __future__ import annotations
-
 import ctypes
 import os
 import secrets

@@ -1,7 +1,5 @@
 """Classes and functions of the user's own, named by where they stand: `file.py:Name` or `package.module:Name`."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -6,11 +6,9 @@ vehicle it is marked `missing`, what came after its deadline `late`, and a frame
 has nothing visible (`Sensed`). A backend never waits longer than its deadlines; it ends by giving fewer ticks.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
@@ -33,7 +31,7 @@ class Command:
     acceleration: Array  # (N,) m/s^2, at most, on the way to the speed
 
     @classmethod
-    def of(cls, rows: Array) -> Command:
+    def of(cls, rows: Array) -> Self:
         """Return the command whose entries stand in the columns of (N, 3), as in the state of a world."""
         values = np.array(rows, dtype=np.float64)
         return cls(values[:, int(SPEED)], values[:, int(STEERING)], values[:, int(ACCELERATION)])

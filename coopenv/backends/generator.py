@@ -1,7 +1,5 @@
 """Backends whose episodes are Python generators: simulated, recorded, or a test's."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Iterator, Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """The simulated backend."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
@@ -18,40 +16,6 @@ from coopenv.observers.recording import Briefing, Sensed, Truth, is_due
 from coopenv.observers.registry import find_embedded
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST
-
-
-class Simulated(TickGenerator):
-    """Worlds that are computed: many at once on a device, or one of them tick by tick."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        """Simulate a scenario."""
-        driven, ticks = scenario.driven, scenario.horizon_ticks + 1
-        capabilities = Capabilities(truth=True, driven=driven, real_time=False, ticks=ticks, batched=True)
-        super().__init__(scenario, capabilities)
-        self._world: SimulatedWorld | None = None
-
-    def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> SimulatedWorld:
-        """Return the worlds, with the observer that the scenario names."""
-        observer = find_embedded(self.scenario.observer.name) or HOST
-        start = start_covariances(self.scenario)
-        return SimulatedWorld(self.scenario, worlds, dtype, device, threads, observer, start)
-
-    def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
-        """Simulate one world in float64, without an observer: the radio decides on messages, whatever they say."""
-        if self._world is None:
-            self._world = SimulatedWorld(self.scenario, 1, "float64", threads=1)
-        world = self._world
-        world.reset(None if seed is None else [seed])
-        active = wp.ones(1, dtype=wp.int32, device=world.device)
-        command = yield world.told(0)
-        for k in range(1, self.scenario.horizon_ticks + 1):
-            world.view("command")[0] = command.rows
-            world.sense(active)
-            for vehicle in world.briefing.order:
-                world.deliver(active, vehicle)
-                world.broadcast(active, vehicle)
-            world.finish(active)
-            command = yield world.told(k)
 
 
 class SimulatedWorld(SensingWorld):
@@ -120,3 +84,37 @@ class SimulatedWorld(SensingWorld):
 
     def _copy(self, name: str, world: int) -> np.ndarray:
         return np.array(self.view(name)[world], dtype=float)
+
+
+class Simulated(TickGenerator):
+    """Worlds that are computed: many at once on a device, or one of them tick by tick."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Simulate a scenario."""
+        driven, ticks = scenario.driven, scenario.horizon_ticks + 1
+        capabilities = Capabilities(truth=True, driven=driven, real_time=False, ticks=ticks, batched=True)
+        super().__init__(scenario, capabilities)
+        self._world: SimulatedWorld | None = None
+
+    def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> SimulatedWorld:
+        """Return the worlds, with the observer that the scenario names."""
+        observer = find_embedded(self.scenario.observer.name) or HOST
+        start = start_covariances(self.scenario)
+        return SimulatedWorld(self.scenario, worlds, dtype, device, threads, observer, start)
+
+    def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
+        """Simulate one world in float64, without an observer: the radio decides on messages, whatever they say."""
+        if self._world is None:
+            self._world = SimulatedWorld(self.scenario, 1, "float64", threads=1)
+        world = self._world
+        world.reset(None if seed is None else [seed])
+        active = wp.ones(1, dtype=wp.int32, device=world.device)
+        command = yield world.told(0)
+        for k in range(1, self.scenario.horizon_ticks + 1):
+            world.view("command")[0] = command.rows
+            world.sense(active)
+            for vehicle in world.briefing.order:
+                world.deliver(active, vehicle)
+                world.broadcast(active, vehicle)
+            world.finish(active)
+            command = yield world.told(k)

@@ -1,7 +1,5 @@
 """Sources of ticks by name: the only place that knows what a name means."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from enum import Enum

@@ -1,7 +1,5 @@
 """Whether a tick that a source gives can be run on: all that reaches a kernel as index, shape, rotation or time."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A world whose ticks come from a backend, one after the other; estimators and reports run on it as on any other."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property

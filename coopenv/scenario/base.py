@@ -1,7 +1,5 @@
 """What every part of a scenario shares: frozen, typed, and strict about its keys."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Literal
 

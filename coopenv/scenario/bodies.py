@@ -1,10 +1,8 @@
 """Who and what is in the scene: landmarks, vehicles, buildings, and how they move."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -110,7 +108,7 @@ class WaypointMotion(Part):
     """`path` turns the body's x axis along the horizontal velocity, `fixed` keeps the initial orientation."""
 
     @model_validator(mode="after")
-    def _times_increase(self) -> WaypointMotion:
+    def _times_increase(self) -> Self:
         times = [w.time for w in self.waypoints]
         if times[0] != 0.0 or any(b <= a for a, b in pairwise(times)):
             raise ValueError("waypoint times must start at 0 and increase")
@@ -149,7 +147,7 @@ class InitialPose(Part):
     """Half-width of a uniform turn about the body's z axis, rad."""
 
     @model_validator(mode="after")
-    def _one_orientation(self) -> InitialPose:
+    def _one_orientation(self) -> Self:
         if self.yaw is not None and self.quaternion_wxyz is not None:
             raise ValueError("give yaw or quaternion_wxyz, not both")
         return self
@@ -181,7 +179,7 @@ class InitialEstimate(Part):
         return tuple(value) if isinstance(value, list) else value  # what a validator returns is no JSON any more
 
     @model_validator(mode="after")
-    def _one_orientation(self) -> InitialEstimate:
+    def _one_orientation(self) -> Self:
         if self.yaw is not None and self.quaternion_wxyz is not None:
             raise ValueError("give yaw or quaternion_wxyz, not both")
         return self
@@ -226,7 +224,7 @@ class Vehicle(Part):
     goal: Goal | None = None
 
     @model_validator(mode="after")
-    def _has_a_start(self) -> Vehicle:
+    def _has_a_start(self) -> Self:
         if self.motion.kind == "waypoints" and self.initial_pose is not None:
             raise ValueError("initial_pose: a motion by waypoints starts at its first waypoint; leave this out")
         if self.motion.kind != "waypoints" and self.initial_pose is None:

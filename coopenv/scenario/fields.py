@@ -1,7 +1,5 @@
 """Every field of a scenario, typed; `schema.Scenario` checks them against one another."""
 
-from __future__ import annotations
-
 from pydantic import Field
 
 from coopenv.scenario.base import Part, Positive, Text, Vector3

@@ -1,7 +1,5 @@
 """Find, read, override and validate scenario files."""
 
-from __future__ import annotations
-
 import json
 import tomllib
 from collections.abc import Iterable, Mapping

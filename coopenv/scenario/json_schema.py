@@ -1,7 +1,5 @@
 """The JSON schema of scenario files, for editors that complete and check TOML while it is written."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping

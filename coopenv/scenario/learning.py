@@ -1,9 +1,7 @@
 """What a policy sees, does and is rewarded for."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, ConfigDict, Field, create_model, model_validator
 
@@ -43,7 +41,7 @@ class Observation(Part):
     """Fields of one's own by name: where their functions stand, see docs/terms.md."""
 
     @model_validator(mode="after")
-    def _fields_exist(self) -> Observation:
+    def _fields_exist(self) -> Self:
         groups = {row.group or name for name, row in OBSERVATION_FIELDS.known(self.custom).items()}
         for name in self.include:
             if name not in groups:
@@ -123,7 +121,7 @@ class Reward(Part):
         return {**dict.fromkeys((*REWARD_TERMS.built_in, *self.custom), 0.0), **named}
 
     @model_validator(mode="after")
-    def _terms_exist(self) -> Reward:
+    def _terms_exist(self) -> Self:
         weights = self.weights.model_dump()
         check_known(REWARD_TERMS, weights, self.custom, "weights.")
         check_privilege(REWARD_TERMS, weights, self)
@@ -162,6 +160,6 @@ class Termination(Part):
         return given
 
     @model_validator(mode="after")
-    def _privilege_is_declared(self) -> Termination:
+    def _privilege_is_declared(self) -> Self:
         check_privilege(TERMINATION_CONDITIONS, self.__pydantic_extra__, self)
         return self

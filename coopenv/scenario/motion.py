@@ -4,8 +4,6 @@ Every prescribed motion becomes a table of segments: from its start time on, a b
 pose at any time is then a closed form, so truth does not drift and any instant can be evaluated on its own.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,11 +1,10 @@
 """The scenario: everything that defines a world, typed and checked; each failure is one line that names the field."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from typing import Self
 
 import numpy as np
 from pydantic import field_validator, model_validator
@@ -40,7 +39,7 @@ class Scenario(ScenarioFields):
         return landmarks
 
     @model_validator(mode="after")
-    def _is_possible(self) -> Scenario:
+    def _is_possible(self) -> Self:
         vehicles, targets = len(self.vehicles), len(self.target_names)
         if vehicles * targets > MOST_PAIRS:
             raise ValueError(f"vehicles: {vehicles} times {targets} targets are over {MOST_PAIRS:.0e} pairs")

@@ -1,8 +1,6 @@
 """How vehicles sense, talk and estimate: camera, rates, noise, topology, V2X, observer."""
 
-from __future__ import annotations
-
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -69,7 +67,7 @@ class Rates(Part):
     """Rate of the policy's actions; the camera rate must be a multiple."""
 
     @model_validator(mode="after")
-    def _whole_ticks(self) -> Rates:
+    def _whole_ticks(self) -> Self:
         ratio = self.camera / self.decision
         if ratio < 1.0 - 1e-9 or abs(ratio - round(ratio)) > 1e-9:
             raise ValueError(
@@ -93,7 +91,7 @@ class BearingNoise(Part):
     """Camera rate in Hz at which the scale holds (other rates keep its density), or `sample`: at any rate."""
 
     @model_validator(mode="after")
-    def _axis_points_somewhere(self) -> BearingNoise:
+    def _axis_points_somewhere(self) -> Self:
         if sum(x * x for x in self.axis) < 1e-12:
             raise ValueError("axis: must not be zero")
         return self
@@ -157,7 +155,7 @@ class Observer(Part):
     """Length of the sliding window of the observability Gramian, s."""
 
     @model_validator(mode="after")
-    def _gain_is_stable(self) -> Observer:
+    def _gain_is_stable(self) -> Self:
         gains = self.k if isinstance(self.k, tuple) else (self.k,)
         if not gains or min(gains) <= 0.5:
             raise ValueError("k: the observer is stable for k > 0.5 only (paper, definition of K_i)")

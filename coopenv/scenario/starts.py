@@ -1,7 +1,5 @@
 """Where everybody starts, and whether there is room."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from itertools import product

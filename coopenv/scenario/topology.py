@@ -1,7 +1,5 @@
 """Who may measure and hear whom, and in which order vehicles estimate: derived from a scenario."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from graphlib import CycleError, TopologicalSorter
 

@@ -1,7 +1,5 @@
 """What pydantic finds wrong, as one line that names the field."""
 
-from __future__ import annotations
-
 from difflib import get_close_matches
 from typing import Any
 

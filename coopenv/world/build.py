@@ -1,7 +1,5 @@
 """Turn a scenario into the arrays and numbers of a `Model` on a device."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from typing import Any

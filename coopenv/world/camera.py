@@ -3,8 +3,6 @@
 A bearing is stored as the unit vector from the observing camera to the target, in the camera's optical frame.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

@@ -1,7 +1,5 @@
 """Stage 6, contact and arrival: boxes that touch (separating axes in the plane and heights), and goals reached."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

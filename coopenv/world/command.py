@@ -4,8 +4,6 @@ A command says what ROS' AckermannDrive says: the speed to reach (m/s), the stee
 and the acceleration (m/s^2) that the speed changes with at most. It is a vector with these three entries.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

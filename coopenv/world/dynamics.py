@@ -1,7 +1,5 @@
 """Stage 1: the truth moves, by prescribed motion as a closed form, or as a kinematic bicycle with its actuators."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

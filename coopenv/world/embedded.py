@@ -3,8 +3,6 @@
 The world knows neither; `coopenv.world.step` fuses what it is given into one loop over the ticks of a decision.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -93,7 +91,7 @@ class Embedded:
     first."""
     sizes: Mapping[str, int] = field(default_factory=dict, hash=False)
     """Lengths of axes by letter, besides those of the state (`coopenv.world.state.state_sizes`)."""
-    fit: Callable[[Any], Embedded] | None = None
+    fit: Callable[[Any], "Embedded"] | None = None
     """(model): return the variant to compile for a model; None: this one."""
     valid: Mapping[str, Rule] = field(default_factory=dict, hash=False)
     """What a saved memory may hold, by field. Without a rule numbers have to be finite and whole ones may be any: give

@@ -1,7 +1,5 @@
 """Warp's cache of compiled kernels on the disk: what is damaged is built again, what cannot be written is one line."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from glob import escape

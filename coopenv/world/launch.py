@@ -4,8 +4,6 @@ Each kernel gets a Warp module of its own and of its precision, so that it is co
 whatever else a program uses; a generic kernel in a shared module would be rebuilt for every new combination.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Hashable
 from concurrent.futures import ThreadPoolExecutor

@@ -4,8 +4,6 @@ A sample is held until the next one. The increment (dR, dp) over a tick is the e
 so an observer predicts once per tick and loses nothing against predicting at every sample.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

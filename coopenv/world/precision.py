@@ -1,7 +1,5 @@
 """The Warp types of one floating point precision."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from typing import Any

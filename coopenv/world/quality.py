@@ -1,7 +1,5 @@
 """How good an estimate is: errors, NEES, log-determinant, and the sliding observability Gramian of what is measured."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

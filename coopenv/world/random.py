@@ -7,8 +7,6 @@ batch size, the order of execution and the device. `index` is a tick or a sample
 concerned, and `stream` is one of the constants below.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

@@ -1,7 +1,5 @@
 """Records of arrays: every field states its axes once, a letter each, and is allocated by them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from typing import Any

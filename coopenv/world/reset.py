@@ -1,7 +1,5 @@
 """Start an episode: draw poses and initial estimates, take the first frame, send the first messages."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

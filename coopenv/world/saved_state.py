@@ -3,8 +3,6 @@
 The rules stand in tables beside the structs that declare the fields.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 

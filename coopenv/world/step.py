@@ -4,8 +4,6 @@ Each kernel is a closure over the Warp functions that it is made of. Its Warp mo
 observer, so that a pair is compiled once per precision and machine.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Stage 4, V2X: pose estimates travel with delay, period, loss and limited range."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

@@ -1,7 +1,5 @@
 """A batch of worlds on a device: allocate, reset by mask, advance, save and restore."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -3,8 +3,6 @@
 Needs the extra `log`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from io import BytesIO

@@ -1,10 +1,8 @@
 """What a recording says once: who is there, gains, noise, starts, and the scenario it came from (`recording.json`)."""
 
-from __future__ import annotations
-
 import json
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field, ValidationError
@@ -76,7 +74,7 @@ class Header(Part):
     scenario: dict[str, Any] | None
 
     @classmethod
-    def read(cls, text: bytes, where: str) -> Header:
+    def read(cls, text: bytes, where: str) -> Self:
         """Return a header from its JSON. Raises DataError: it is no header; `where` begins the line."""
         try:
             return cls.model_validate_json(text, strict=True)

@@ -4,8 +4,6 @@ Standard ROS 2 messages are there for viewers; what is read back stands in messa
 tick of a message is its sequence number.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The arrays of a recording, filled message by message; a tick that comes twice, or never, is refused by its number."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

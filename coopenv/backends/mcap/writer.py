@@ -1,7 +1,5 @@
 """Write a recording as one MCAP file."""
 
-from __future__ import annotations
-
 import hashlib
 from operator import attrgetter
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One sub-dataset on a common clock: landmarks, and per robot odometry, detections and interpolated truth."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from pathlib import Path

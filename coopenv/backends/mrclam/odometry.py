@@ -1,7 +1,5 @@
 """The held commands of one robot, integrated exactly: dead-reckoned headings and positions at any time."""
 
-from __future__ import annotations
-
 from functools import cached_property
 
 import numpy as np

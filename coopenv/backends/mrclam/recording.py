@@ -6,8 +6,6 @@ that they are what the camera would have seen at the tick. Everybody hears every
 tick k - 1 or before.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, Literal, get_args
 

@@ -1,7 +1,5 @@
 """The files of one MR.CLAM sub-dataset: columns of numbers, comments behind `#`, times in absolute seconds."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

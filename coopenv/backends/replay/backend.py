@@ -1,7 +1,5 @@
 """The replay backend: recorded ticks fill the state, the same estimators and reports run on it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -18,37 +16,6 @@ from coopenv.observers.recording_checks import check_recording
 from coopenv.observers.registry import find_embedded
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST
-
-
-class Replay(TickGenerator):
-    """A recording as a backend. Actions change nothing; every episode is the recording again."""
-
-    def __init__(self, recording: Recording, name: str, overrides: Mapping[str, Any] | None = None) -> None:
-        """Find the recording's scenario; arguments and errors as for `check_recording` and `scenario_of`."""
-        check_recording(recording, name)
-        self.recording = recording
-        known = bool(recording.truth.known.any())
-        scenario = scenario_of(recording, name, overrides or {})
-        ticks = scenario.horizon_ticks + 1
-        capabilities = Capabilities(
-            truth=known, driven=False, real_time=False, ticks=ticks, batched=True, recorded=True
-        )
-        super().__init__(scenario, capabilities)
-
-    def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> ReplayWorld:
-        """Return worlds that go through the recording."""
-        planar = any(setup.planar for setup in self.recording.setups)
-        observer = find_embedded(self.scenario.observer.name, planar) or HOST
-        covariance = self.recording.start_covariance
-        return ReplayWorld(self.recording, self.scenario, worlds, dtype, device, threads, observer, covariance)
-
-    def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
-        """Go through the recording tick by tick."""
-        recording, rate = self.recording, self.scenario.rates.odometry
-        taken = samples_taken(recording.t, rate)
-        age = np.where(taken > 0, recording.t - (taken - 1) / rate, np.inf)
-        for k in range(self.scenario.horizon_ticks + 1):
-            yield replace(recording.at(k), odometry_age=np.full(len(recording.setups), age[k]))
 
 
 class ReplayWorld(SensingWorld):
@@ -80,3 +47,34 @@ class ReplayWorld(SensingWorld):
 
     def _build_record(self) -> Any:
         return upload(self._recording, self.scenario.rates.odometry, self.precision, self.device)
+
+
+class Replay(TickGenerator):
+    """A recording as a backend. Actions change nothing; every episode is the recording again."""
+
+    def __init__(self, recording: Recording, name: str, overrides: Mapping[str, Any] | None = None) -> None:
+        """Find the recording's scenario; arguments and errors as for `check_recording` and `scenario_of`."""
+        check_recording(recording, name)
+        self.recording = recording
+        known = bool(recording.truth.known.any())
+        scenario = scenario_of(recording, name, overrides or {})
+        ticks = scenario.horizon_ticks + 1
+        capabilities = Capabilities(
+            truth=known, driven=False, real_time=False, ticks=ticks, batched=True, recorded=True
+        )
+        super().__init__(scenario, capabilities)
+
+    def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> ReplayWorld:
+        """Return worlds that go through the recording."""
+        planar = any(setup.planar for setup in self.recording.setups)
+        observer = find_embedded(self.scenario.observer.name, planar) or HOST
+        covariance = self.recording.start_covariance
+        return ReplayWorld(self.recording, self.scenario, worlds, dtype, device, threads, observer, covariance)
+
+    def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
+        """Go through the recording tick by tick."""
+        recording, rate = self.recording, self.scenario.rates.odometry
+        taken = samples_taken(recording.t, rate)
+        age = np.where(taken > 0, recording.t - (taken - 1) / rate, np.inf)
+        for k in range(self.scenario.horizon_ticks + 1):
+            yield replace(recording.at(k), odometry_age=np.full(len(recording.setups), age[k]))

@@ -1,7 +1,5 @@
 """The scenario that a recording is replayed in: the recorded one, or for robots one made from their setups."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
