@@ -132,14 +132,14 @@ def _written(path: str | Path, place: Path) -> None:
 
 
 def _check_file(path: str | Path, place: Path) -> None:
-    if not place.parent.is_dir():
-        raise OutputError(f"cannot write to {path}: folder {Path(path).parent} does not exist")
-    if place.is_dir():
-        raise OutputError(f"cannot write to {path}: it is a folder")
-    if os.path.lexists(place) and not place.is_file():
-        raise OutputError(f"cannot write to {path}: it is no plain file")
-    if place.exists() and not os.access(place, os.W_OK):
-        raise OutputError(f"cannot write to {path}: it is read-only")
+    reasons = {
+        f"folder {Path(path).parent} does not exist": not place.parent.is_dir(),
+        "it is a folder": place.is_dir(),
+        "it is no plain file": os.path.lexists(place) and not place.is_file(),
+        "it is read-only": place.exists() and not os.access(place, os.W_OK),
+    }
+    for reason in (reason for reason, applies in reasons.items() if applies):
+        raise OutputError(f"cannot write to {path}: {reason}")
 
 
 def _check_folder(folder: str | Path, place: Path, names: Collection[str]) -> None:
@@ -148,20 +148,17 @@ def _check_folder(folder: str | Path, place: Path, names: Collection[str]) -> No
     if not os.access(place, os.W_OK | os.X_OK):
         raise OutputError(f"cannot write to {folder}: it is read-only")
     folders = [entry for entry in place.iterdir() if entry.is_dir() and not entry.is_symlink()]
-    for entry in folders:
-        if entry.name in names:
-            raise OutputError(f"cannot write to {Path(folder) / entry.name}: it is a folder")
+    for entry in (entry for entry in folders if entry.name in names):
+        raise OutputError(f"cannot write to {Path(folder) / entry.name}: it is a folder")
     fixed = [entry.name for entry in folders if os.path.ismount(entry) or not os.access(entry, os.W_OK)]
-    reason = ""
-    if place.samefile(os.curdir):
-        reason = "it is the current folder"
-    elif os.path.ismount(place):
-        reason = "it is a mount point"
-    elif fixed:
-        reason = f"the folder {fixed[0]} in it cannot be moved"
-    elif folders and not any((place / name).exists() for name in names):
-        reason = f"it holds other folders (such as {folders[0].name}) and no earlier result"
-    if reason:
+    foreign = [entry.name for entry in folders if not any((place / name).exists() for name in names)]
+    reasons = {
+        "it is the current folder": place.samefile(os.curdir),
+        "it is a mount point": os.path.ismount(place),
+        f"the folder {''.join(fixed[:1])} in it cannot be moved": fixed,
+        f"it holds other folders (such as {''.join(foreign[:1])}) and no earlier result": foreign,
+    }
+    for reason in (reason for reason, applies in reasons.items() if applies):
         raise OutputError(f"cannot replace {folder}: {reason}; name a folder within it")
 
 

@@ -132,21 +132,13 @@ def copy_owner(old: Path, new: Path) -> None:
 
 
 def sync(path: Path) -> None:
-    """Wait until a file, or, where that can be asked for, a folder's list of names is on the disk.
-
-    Raises:
-        OSError: a file cannot be written to the end.
-    """
-    if path.is_dir():
-        with suppress(OSError):
-            _sync(path)
-    else:
-        _sync(path)
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
+    """Wait until a file, or, where that can be asked for, a folder's list of names is on the disk; else OSError."""
     try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError:
+        if not path.is_dir():
+            raise
