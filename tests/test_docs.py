@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -11,10 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from coopenv.api.reward import FIELDS, OTHERS
 from coopenv.observers import run
 from coopenv.observers.registry import find
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
+from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -51,3 +54,25 @@ def test_the_tutorials_observer_runs() -> None:
     # vehicles 1 to 3 see two landmarks and more, and turn towards them
     assert (result.orientation_error[-1, :3] < result.orientation_error[0, :3]).all()
     assert np.isfinite(result.position_error).all()
+
+
+def test_the_page_on_terms_lists_every_term() -> None:
+    page = (DOCS / "terms.md").read_text(encoding="utf-8")
+    rows = [line for line in page.splitlines() if line.startswith("| `")]
+    for name, term in REWARD_TERMS.built_in.items():
+        privileged = " (privileged)" if term.privileged else ""
+        assert f"| `{name}` | {term.unit} | {term.meaning}{privileged} |" in rows
+    for name, field in OBSERVATION_FIELDS.built_in.items():
+        (row,) = (row for row in rows if row.startswith(f"| `{field.group}` | `{name}` | {field.per} | {field.size} |"))
+        assert row.endswith(f"| {field.meaning} |") and f"| {field.unit} |" in row
+    assert all(f"`{name}`" in page for name in (*FIELDS, *OTHERS))
+
+
+def test_the_programs_on_terms_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    program: dict[str, Any] = {}
+    for block in python_blocks(DOCS / "terms.md"):
+        (tmp_path / "program.py").write_text(block, encoding="utf-8")
+        program = runpy.run_path(str(tmp_path / "program.py"))
+    assert float(capsys.readouterr().out) < 0.0
+    program["envs"].reset(seed=0)
+    assert np.isfinite(program["envs"].step(np.zeros(program["envs"].action_space.shape))[1]).all()

@@ -58,6 +58,8 @@ class Trajectory:
     target_position: np.ndarray  # (K, T, 3) m, truth
     visible: np.ndarray  # (K, N, T) bool
     sight: np.ndarray  # (K, N, T) uint8, values of `Sight`
+    reward_terms: np.ndarray  # (K, N, R) of the tick: as if each tick were a decision
+    terms: np.ndarray  # (R,) names of the terms
     vehicles: np.ndarray  # (N,) names
     targets: np.ndarray  # (T,) names
     target_moving: np.ndarray  # (T,) bool: vehicles and moving landmarks
@@ -67,7 +69,7 @@ class Trajectory:
         known = np.isfinite(self.position).all(axis=(1, 2)) & np.isfinite(self.rotation).all(axis=(1, 2, 3))
         if known.all():
             return self
-        constant = ("vehicles", "targets", "target_moving")
+        constant = ("terms", "vehicles", "targets", "target_moving")
         return replace(self, **{f.name: getattr(self, f.name)[known] for f in fields(self) if f.name not in constant})
 
     def save(self, path: Path) -> None:

@@ -99,9 +99,13 @@ def settings(part: BaseModel, prefix: str = "") -> Iterator[tuple[str, str, str,
         value = getattr(part, name)
         if isinstance(value, BaseModel):
             yield from settings(value, f"{prefix}{name}.")
+        elif name == "custom":
+            yield from ((f"custom.{key}", words.setting(row.function), row.meaning, True) for key, row in value.items())
         else:
             meaning = " ".join((info.description or "").split())
             yield f"{prefix}{name}", words.setting(value), meaning, value != info.get_default()
+    for name, value in (part.model_extra or {}).items():
+        yield f"{prefix}{name}", words.setting(value), "A term of one's own, see docs/terms.md", True
 
 
 def section_table(name: str, part: BaseModel, key_width: int) -> Table:

@@ -29,6 +29,7 @@ RECORDED = (
     "orientation_error",
     "nees",
     "sight",
+    "terms",
     "ended",
 )
 """Views of the engine that are kept of every camera tick."""
@@ -114,6 +115,8 @@ class Rollout:
             target_position=position,
             visible=sight == Sight.VISIBLE,
             sight=sight,
+            reward_terms=self._recorded("terms"),
+            terms=np.array(self.engine.reward_terms),
             vehicles=np.array(self.scenario.vehicle_names),
             targets=np.array(self.scenario.target_names),
             target_moving=np.array([*moving, *(True for _ in self.scenario.vehicles)]),

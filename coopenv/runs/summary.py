@@ -150,7 +150,8 @@ def _action(scenario: Scenario) -> str:
 
 def _end(scenario: Scenario) -> str:
     steps = round(scenario.horizon * scenario.rates.decision)
-    causes = [word for word in ("collision", "arrival") if scenario.driven and getattr(scenario.termination, word)]
+    ends = scenario.termination
+    causes = [word for word in ("collision", "arrival") if scenario.driven and getattr(ends, word)] + [*ends.own]
     early = f"; for a vehicle at {' or '.join(causes)}" if causes else ""
     return f"after {number(scenario.horizon)} s, {steps} decisions{early}"
 

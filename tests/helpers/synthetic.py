@@ -67,6 +67,8 @@ def make_trajectory(ticks: int = 3001, dt: float = 1 / 60, noise: float = 0.0, y
         target_position=target_position,
         visible=sight == Sight.VISIBLE,
         sight=sight,
+        reward_terms=np.zeros((*shape, 2)),
+        terms=np.array(["control", "time"]),
         vehicles=np.array([f"vehicle_{i}" for i in range(1, 6)]),
         targets=np.array([f"landmark_{i}" for i in range(1, 4)] + [f"vehicle_{i}" for i in range(1, 6)]),
         target_moving=np.array([False] * 3 + [True] * 5),

@@ -84,7 +84,10 @@ def _bound(kind: Registry[Any], name: str, row: Row, number: int, records: tuple
         except CoopenvError as error:
             raise CoopenvError(f"{title}: {error}") from None
     taken = record_count(title, function, records)
-    return Bound(title, name not in kind.built_in, number, _warp_function(function), taken)
+    try:
+        return Bound(title, name not in kind.built_in, number, _warp_function(function), taken)
+    except RuntimeError as error:  # Warp reads the source, which a program of text alone does not have
+        raise CoopenvError(f"{title}: {error}") from None
 
 
 @cache

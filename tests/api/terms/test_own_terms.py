@@ -312,6 +312,14 @@ def test_errors_of_registration_are_one_line(register: Any, message: str) -> Non
         register()
 
 
+def test_a_function_without_a_file_is_refused() -> None:
+    program: dict[str, Any] = {}
+    exec("def typed(ego):\n    return ego.time\n", program)
+    coopenv.register_reward("typed", program["typed"])
+    with pytest.raises(CoopenvError, match=r"reward term 'typed': .* please save it to a file"):
+        coopenv.parallel_env("crossing_path", overrides={"reward.weights.typed": 1.0})
+
+
 def test_a_function_that_is_defined_anew_replaces_its_former_self() -> None:
     def make(gain: float) -> Any:
         def scaled(ego: Any) -> Any:
