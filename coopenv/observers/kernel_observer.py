@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -217,22 +217,40 @@ class KernelFactory:
         return KernelObserver(self.embedded, setup)
 
 
+def write_position(observer: KernelObserver) -> Message:
+    """Return where the vehicle's marker is."""
+    s = observer.state
+    return Message(position=s.estimate_rotation @ (s.estimate_position + observer.setup.marker))
+
+
 def write_pose(observer: KernelObserver) -> Message:
-    """Return the pose estimate as a message, which is all that an observer sends that says nothing else."""
-    R = observer.state.estimate_rotation.copy()
-    return Message(position=R @ (observer.state.estimate_position + observer.setup.marker), rotation=R)
+    """Return the pose estimate as a message."""
+    return replace(write_position(observer), rotation=observer.state.estimate_rotation.copy())
 
 
-def read_pose(observer: KernelObserver, sender: int, message: Message, sent: int) -> None:
-    """Put a pose estimate where the V2X stage puts it; the sender's marker takes the place of its origin.
+def read_position(observer: KernelObserver, sender: int, message: Message, sent: int) -> None:
+    """Put a position where the V2X stage puts it; the sender's marker takes the place of its origin.
 
     Raises:
-        CoopenvError: the message holds no pose.
+        CoopenvError: the message holds none.
     """
-    if message.position is None or message.rotation is None:
-        raise CoopenvError("no pose")
-    observer.state.inbox_rotation[sender] = message.rotation
+    if message.position is None:
+        raise CoopenvError("no position")
     observer.state.inbox_position[sender] = message.position
 
 
+def read_pose(observer: KernelObserver, sender: int, message: Message, sent: int) -> None:
+    """Do the same with a whole pose.
+
+    Raises:
+        CoopenvError: the message holds none.
+    """
+    if message.rotation is None:
+        raise CoopenvError("no rotation")
+    read_position(observer, sender, message, sent)
+    observer.state.inbox_rotation[sender] = message.rotation
+
+
+POSITION = Messages(write_position, read_position)
 POSE = Messages(write_pose, read_pose)
+"""All that an observer sends that says nothing else."""

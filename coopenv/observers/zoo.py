@@ -27,7 +27,7 @@ ZOO = {
     "dead_reckoning": Entry("dead_reckoning:DeadReckoning", "riccati.kernels:DEAD_RECKONING"),
     # on a plane bearings to three points say more than a pose needs
     "p3p": Entry("single_frame:PerspectivePoints", on_a_plane=False),
-    "riccati": Entry("riccati.plugin:Riccati", "riccati.kernels:RICCATI"),
+    "riccati": Entry("riccati.kernels:riccati", "riccati.kernels:RICCATI"),
     "hamel_samson": Entry("hamel_samson:HamelSamson"),
     "mekf": Entry("mekf:Mekf"),
     "mekf_covariance": Entry("mekf_covariance:MekfCovariance"),

@@ -18,8 +18,8 @@ from coopenv import CoopenvError
 from coopenv.api.engine import Engine
 from coopenv.observers import Coordinates, Estimate, Setup, Tick, register, run
 from coopenv.observers.dead_reckoning import DeadReckoning
-from coopenv.observers.riccati.plugin import Riccati
 from coopenv.runs.recorder import record
+from tests.oracles.riccati import Riccati
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "the paper's start": ("busy_intersection", {"horizon": 3.0}),

@@ -1,17 +1,21 @@
-"""The paper's Riccati observer on the measurements of one vehicle.
+"""The paper's decentralised Riccati observer on the measurements of one vehicle.
 
-It reads bearings, odometry increments and received messages only; truth enters through landmarks alone, whose
-positions are known to everybody.
+Source: Wong et al., Beyond Line-of-Sight: Cooperative Localization Using Vision and V2X Communication. P is over
+(2 lambda, p) and no covariance: V and Q are gains. It reads bearings, odometry increments and received messages only;
+truth enters through landmarks alone, whose positions are known to everybody.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import warp as wp
 
 from coopenv.estimation.linalg import block3, cholesky6, join6
 from coopenv.estimation.so3 import exp_so3, identity3, orthonormalise
+from coopenv.observers.contract import Observer, Setup
+from coopenv.observers.kernel_observer import POSITION, KernelObserver
 from coopenv.observers.riccati.equations import (
     accumulate_information,
     correct_kalman,
@@ -184,14 +188,17 @@ def make_estimate(step: Any) -> Any:
     return estimate
 
 
-KALMAN = Embedded("riccati_kalman", make_estimate(kalman_step), start_nothing, send_nothing)
-"""Where every gain k is 1: the eigenvalues that other gains need are not even compiled."""
-
-
 def fitted(model: Any) -> Embedded:
     """Return the variant that the gains of a model need."""
     return KALMAN if (model.observer.k.numpy() == 1.0).all() else RICCATI
 
 
-RICCATI = Embedded("riccati", make_estimate(gain_step), start_nothing, send_nothing, fit=fitted)
+RICCATI = Embedded("riccati", make_estimate(gain_step), start_nothing, send_nothing, fit=fitted, messages=POSITION)
+KALMAN = replace(RICCATI, name="riccati_kalman", estimate=make_estimate(kalman_step))
+"""Where every gain k is 1: the eigenvalues that other gains need are not even compiled."""
 DEAD_RECKONING = Embedded("dead_reckoning", dead_reckon, start_nothing, send_nothing)
+
+
+def riccati(setup: Setup) -> Observer:
+    """The paper's observer, with the scenario's gains."""
+    return KernelObserver(RICCATI, setup)

@@ -1,4 +1,4 @@
-"""The plug-in Riccati observer is the embedded one, tick by tick."""
+"""The plug-in Riccati observer is the embedded one, and one written in NumPy, tick by tick."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from coopenv.observers import run
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from tests.oracles.batch import small_errors
+from tests.oracles.riccati import Riccati
 
 CASES: dict[str, dict[str, Any]] = {
     "the paper's start": {"horizon": 8.0},
@@ -35,12 +36,15 @@ def embedded(scenario: Scenario, seed: int) -> tuple[np.ndarray, np.ndarray, np.
 
 def assert_agrees(scenario: Scenario) -> None:
     R, p, P, nees = embedded(scenario, 5)
-    result = run("riccati", record(scenario, 5))
-    assert not result.failure
-    assert_allclose(result.rotation[1:], R, atol=1e-9)
-    assert_allclose(result.position[1:], (R @ p[..., None])[..., 0], atol=1e-9)
-    assert_allclose(result.covariance[1:], P, atol=1e-9)
-    assert_allclose(result.nees[1:], nees, rtol=1e-6, atol=1e-9)
+    recording = record(scenario, 5)
+    for observer in ("riccati", Riccati):
+        result = run(observer, recording)
+        assert not result.failure
+        assert_allclose(result.rotation[1:], R, atol=1e-9)
+        assert_allclose(result.position[1:], (R @ p[..., None])[..., 0], atol=1e-9)
+        assert_allclose(result.covariance[1:], P, atol=1e-9)
+        assert_allclose(result.nees[1:], nees, rtol=1e-6, atol=1e-9)
+        assert (result.bytes_per_second == 24.0 / recording.dt / recording.period).all()
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -1,9 +1,4 @@
-"""The paper's decentralised Riccati observer, one vehicle at a time, by splitting into exact sub-flows.
-
-Source: Wong et al., Beyond Line-of-Sight: Cooperative Localization Using Vision and V2X Communication. The integration
-is that of the embedded kernels (equations.py): rotation by the odometry, P + h V, and the bearings'
-correction with C frozen, for any gain k. P is over (2 lambda, p) and no covariance: V and Q are gains.
-"""
+"""The paper's Riccati observer in NumPy, for one vehicle: the kernels' integration, through modes for any gain."""
 
 from __future__ import annotations
 
