@@ -14,7 +14,7 @@ import numpy as np
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import orthonormalise, skew
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.mekf import LeftError, innovation, kalman, transition
+from coopenv.observers.mekf import LeftError, innovation, kalman
 
 
 class Centralised:
@@ -51,15 +51,9 @@ class Centralised:
             H, residual, variances = (np.concatenate(parts) for parts in zip(*rows, strict=True))
             dx, self.P, _ = kalman(self.P, H, np.diag(variances), residual)
             self.move(dx)
-        self.sent = [
-            Message(
-                extra={
-                    "odometry": np.concatenate([tick.angular_velocity, tick.velocity]),
-                    "bearings": tick.bearings[tick.valid],
-                }
-            )
-            for tick in ticks
-        ]
+        odometry = [np.concatenate([tick.angular_velocity, tick.velocity]) for tick in ticks]
+        seen = [tick.bearings[tick.valid] for tick in ticks]
+        self.sent = [Message(extra={"odometry": o, "bearings": b}) for o, b in zip(odometry, seen, strict=True)]
         return [
             LeftError(R, p, self.P[self.block(i), self.block(i)].copy()).estimate()
             for i, (R, p) in enumerate(self.poses)
@@ -69,7 +63,7 @@ class Centralised:
         """Carry every pose and the joint covariance through one tick of odometry."""
         F = np.zeros_like(self.P)
         for i, (tick, (R, p)) in enumerate(zip(ticks, self.poses, strict=True)):
-            F[self.block(i), self.block(i)] = transition(tick.rotation, tick.translation)
+            F[self.block(i), self.block(i)] = LeftError.transition(tick.rotation, tick.translation)
             self.poses[i] = orthonormalise(R.dot(tick.rotation)), p + R.dot(tick.translation)
         noise = np.concatenate([tick.noise.odometry(tick.dt) for tick in ticks])
         self.P = F.dot(self.P).dot(F.T) + np.diag(noise)

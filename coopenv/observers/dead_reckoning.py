@@ -18,7 +18,7 @@ class DeadReckoning:
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
-        self.state = LeftError(*initial_pose, initial_covariance)
+        self.state = LeftError.start(*initial_pose, initial_covariance)
 
     def update(self, tick: Tick) -> Estimate:
         """Append the increment."""

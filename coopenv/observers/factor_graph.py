@@ -15,8 +15,8 @@ import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.se3 import adjoint
-from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.mekf import LeftError
+from coopenv.observers.contract import Estimate, Setup, Tick
+from coopenv.observers.mekf import LeftError, PoseObserver
 
 LAG = 1.0
 """s."""
@@ -38,22 +38,22 @@ class Residuals:
     count: int = 0
 
 
-class FactorGraph:
+class FactorGraph(PoseObserver):
     """Factor graph smoothed at key frames; sends covariances.
 
     Between key frames it adds odometry.
     """
 
     def __init__(self, setup: Setup) -> None:
-        """Remember the marker, which is what others measure, and the camera's place."""
-        self.marker, self.lever_arm, self.noise = setup.marker, setup.lever_arm, setup.noise
+        """Remember the camera's place, too."""
+        super().__init__(setup)
+        self.lever_arm, self.noise = setup.lever_arm, setup.noise
         self.to_camera = adjoint(np.eye(3), -setup.lever_arm)
         self.to_body = adjoint(np.eye(3), setup.lever_arm)
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
-        R, p = initial_pose
-        self.state = LeftError(np.array(R, float), np.array(p, float), np.array(initial_covariance, float))
+        super().reset(initial_pose, initial_covariance)
         self.time = 0.0
         self.keys = 0
         self.restart()
@@ -141,12 +141,6 @@ class FactorGraph:
         mean = gtsam.Unit3(unit(line) + self.state.R.T @ seen.total / seen.count)
         noise = gtsam.noiseModel.Isotropic.Sigma(2, self.noise.bearing_std / np.sqrt(seen.count))
         self.graph.add(gtsam.BearingFactor3D(self.pose_key, point, mean, noise))
-
-    def message(self) -> Message:
-        """Return the marker's position and covariance."""
-        return Message(
-            position=self.state.p + self.state.R @ self.marker, covariance=self.state.point_covariance(self.marker)
-        )
 
 
 def gaussian(covariance: Array) -> gtsam.noiseModel.Gaussian:

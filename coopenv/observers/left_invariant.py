@@ -8,14 +8,12 @@ errors of any size. H is that of mekf.py: the errors agree to first order, and t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
 from coopenv.estimation.arrays import Array
-from coopenv.estimation.rotations import orthonormalise
 from coopenv.estimation.se3 import adjoint, exp_se3
-from coopenv.observers.contract import Tick
 from coopenv.observers.mekf import LeftError, Mekf
 
 
@@ -23,23 +21,15 @@ from coopenv.observers.mekf import LeftError, Mekf
 class InvariantError(LeftError):
     """A pose with a covariance over xi, which is also that over the left error to first order."""
 
-    @classmethod
-    def start(cls, R: Array, p: Array, P: Array) -> InvariantError:
-        """Return the state of a pose with a covariance in LEFT coordinates."""
-        return cls(R, p, P)
+    @staticmethod
+    def transition(rotation: Array, translation: Array) -> Array:
+        """Return F (6, 6) of the error over an odometry increment (dR, dp)."""
+        return adjoint(rotation.T, -rotation.T.dot(translation))
 
-    def predicted(self, tick: Tick) -> InvariantError:
-        """Return the state after the tick's odometry."""
-        E = tick.rotation.T
-        F = adjoint(E, -E.dot(tick.translation))
-        P = F.dot(self.P).dot(F.T)
-        P.flat[::7] += tick.noise.odometry(tick.dt)
-        return InvariantError(orthonormalise(self.R.dot(tick.rotation)), self.p + self.R.dot(tick.translation), P)
-
-    def moved(self, dx: Array, P: Array) -> InvariantError:
+    def moved(self, dx: Array, P: Array) -> Self:
         """Return the state moved by an error dx = xi."""
         turn, shift = exp_se3(np.asarray(dx))
-        return InvariantError(self.R.dot(turn), self.p + self.R.dot(shift), P)
+        return type(self)(self.R.dot(turn), self.p + self.R.dot(shift), P)
 
 
 class LeftInvariant(Mekf):

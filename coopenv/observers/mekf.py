@@ -11,7 +11,7 @@ H = B [S(a), -I] / |d|,  residual B b.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -39,16 +39,25 @@ class LeftError:
     P: Array
 
     @classmethod
-    def start(cls, R: Array, p: Array, P: Array) -> LeftError:
+    def start(cls, R: Array, p: Array, P: Array) -> Self:
         """Return the state of a pose with a covariance in LEFT coordinates."""
-        return cls(R, p, P)
+        return cls(np.array(R, float), np.array(p, float), np.array(P, float))
 
-    def predicted(self, tick: Tick) -> LeftError:
+    @staticmethod
+    def transition(rotation: Array, translation: Array) -> Array:
+        """Return F (6, 6) of the error over an odometry increment (dR, dp)."""
+        F = np.zeros((6, 6))
+        E = rotation.T
+        F[:3, :3] = F[3:, 3:] = E
+        F[3:, :3] = E.dot(skew(-translation))
+        return F
+
+    def predicted(self, tick: Tick) -> Self:
         """Return the state after the tick's odometry."""
-        F = transition(tick.rotation, tick.translation)
+        F = self.transition(tick.rotation, tick.translation)
         P = F.dot(self.P).dot(F.T)
         P.flat[::7] += tick.noise.odometry(tick.dt)
-        return LeftError(orthonormalise(self.R.dot(tick.rotation)), self.p + self.R.dot(tick.translation), P)
+        return type(self)(orthonormalise(self.R.dot(tick.rotation)), self.p + self.R.dot(tick.translation), P)
 
     def jacobian(self, positions: Array) -> Array:
         """Return (m, 3, 6) the derivative of the lines to map positions (m, 3)."""
@@ -57,9 +66,9 @@ class LeftError:
         J[:, :, 3:] = -IDENTITY
         return J
 
-    def moved(self, dx: Array, P: Array) -> LeftError:
+    def moved(self, dx: Array, P: Array) -> Self:
         """Return the state moved by an error dx."""
-        return LeftError(self.R.dot(exp_so3(dx[:3])), self.p + self.R.dot(dx[3:]), P)
+        return type(self)(self.R.dot(exp_so3(dx[:3])), self.p + self.R.dot(dx[3:]), P)
 
     def point_covariance(self, marker: Array) -> Array:
         """Return the covariance (3, 3) in map axes of a point of the body."""
@@ -74,15 +83,6 @@ class LeftError:
         return Estimate(self.R, self.p, self.P, Coordinates.LEFT, nis, nis_dof)
 
 
-def transition(rotation: Array, translation: Array) -> Array:
-    """Return F of the left error over an odometry increment (dR, dp)."""
-    F = np.zeros((6, 6))
-    E = rotation.T
-    F[:3, :3] = F[3:, 3:] = E
-    F[3:, :3] = E.dot(skew(-translation))
-    return F
-
-
 def kalman(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array, float]:
     """Return (dx, P+, r^T S^-1 r) of a Kalman update with measurement covariance N, in Joseph's form."""
     PHt = P.dot(H.T)
@@ -94,14 +94,11 @@ def kalman(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array,
     return K.dot(residual), (P + P.T) / 2, float(residual.dot(solved[:, -1]))
 
 
-class Mekf:
-    """Error-state filter; trusts the positions that it hears.
-
-    It sends its position alone.
-    """
+class PoseObserver:
+    """What observers share that believe in one pose and a covariance, and tell where their marker is."""
 
     belief: ClassVar[type[LeftError]] = LeftError
-    sends_covariance = False
+    sends_covariance = True
 
     def __init__(self, setup: Setup) -> None:
         """Remember the marker, which is what others measure."""
@@ -109,14 +106,27 @@ class Mekf:
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
-        R, p = initial_pose
-        self.nis: float | None = None
-        self.nis_dof = 0
-        self.state = self.belief.start(np.array(R, float), np.array(p, float), np.array(initial_covariance, float))
+        self.state = self.belief.start(*initial_pose, initial_covariance)
+
+    def message(self) -> Message:
+        """Return the marker's position, and its covariance if this observer sends it."""
+        covariance = self.state.point_covariance(self.marker) if self.sends_covariance else None
+        return Message(position=self.state.p + self.state.R.dot(self.marker), covariance=covariance)
+
+
+class Mekf(PoseObserver):
+    """Error-state filter; trusts the positions that it hears.
+
+    It sends its position alone.
+    """
+
+    sends_covariance = False
 
     def update(self, tick: Tick) -> Estimate:
         """Predict, then correct by every usable bearing."""
-        self.state, self.nis, self.nis_dof = self.state.predicted(tick), None, 0
+        self.state = self.state.predicted(tick)
+        self.nis: float | None = None
+        self.nis_dof = 0
         seen = tick.usable() if tick.due else []
         if seen:
             b, z = np.array([s[1] for s in seen]), np.array([s[2] for s in seen])
@@ -140,8 +150,3 @@ class Mekf:
                 G = J[n].dot(self.state.R.T)
                 N[2 * n : 2 * n + 2, 2 * n : 2 * n + 2] += G.dot(message.covariance).dot(G.T)
         return N
-
-    def message(self) -> Message:
-        """Return the marker's position, and its covariance if this filter sends it."""
-        covariance = self.state.point_covariance(self.marker) if self.sends_covariance else None
-        return Message(position=self.state.p + self.state.R.dot(self.marker), covariance=covariance)

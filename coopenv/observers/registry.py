@@ -9,11 +9,11 @@ is named by its place: `mine.py:Mine` or `package.module:Mine`.
 from __future__ import annotations
 
 import re
-from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from coopenv.errors import CoopenvError, shown, suggest, told
 from coopenv.observers.contract import Factory
@@ -114,7 +114,6 @@ def named(observer: str | Factory) -> str:
 
 
 def _origin(row: Registered) -> tuple[str, object]:
-    """Return the module and name of what was registered."""
     code = row.factory if row.embedded is None else row.embedded.estimate.func
     return str(getattr(code, "__module__", "")), getattr(code, "__qualname__", code)
 
@@ -134,17 +133,12 @@ def observer_names() -> list[str]:
     return sorted({*ZOO, *_registered, *_installed()})
 
 
-def missing(name: str) -> str:
-    """Return the module that an observer of the zoo needs and that is not installed; empty where nothing is missing."""
-    module = ZOO[name].needs if name in ZOO else ""
-    return module if module and find_spec(module) is None else ""
-
-
 def obstacle(name: str) -> str:
     """Return why a known observer cannot be used here, in one line; empty where it can."""
-    if module := missing(name):
-        return f"needs {module}: pip install '.[bench]'"
-    if name not in ZOO and name not in _registered:
+    if name in ZOO:
+        module = ZOO[name].needs
+        return f"needs {module}: pip install '.[bench]'" if module and find_spec(module) is None else ""
+    if name not in _registered:
         try:
             find(name)
         except CoopenvError as error:
@@ -158,9 +152,8 @@ def available_names(planar: bool | None = None) -> list[str]:
     Args:
         planar: only those that are meant for robots on a plane (True) or for vehicles in space (False).
     """
-    strangers: set[str] = set()
-    if planar is not None:
-        strangers = {name for name, entry in ZOO.items() if not (entry.on_a_plane if planar else entry.in_space)}
+    both = planar is None
+    strangers = {name for name, row in ZOO.items() if not (both or (row.on_a_plane if planar else row.in_space))}
     return [name for name in observer_names() if name not in strangers and not obstacle(name)]
 
 
@@ -171,13 +164,11 @@ def find(name: str | Factory) -> Factory:
         CoopenvError: unknown name, or what it needs is not installed, or it cannot be loaded, or is no factory.
     """
     if isinstance(name, str) and name in ZOO:
-        if missing(name):
-            raise CoopenvError(f"observer '{name}' {obstacle(name)}")
+        if reason := obstacle(name):
+            raise CoopenvError(f"observer '{name}' {reason}")
         return _attribute(ZOO[name].plugin)
     row = _found(name)
-    if row.factory is not None:
-        return row.factory
-    return import_module(f"{__package__}.kernel_observer").KernelFactory(row.embedded)
+    return row.factory or _attribute("kernel_observer:KernelFactory")(row.embedded)
 
 
 def find_embedded(name: str, planar: bool = False) -> Embedded | None:
@@ -192,23 +183,15 @@ def find_embedded(name: str, planar: bool = False) -> Embedded | None:
     """
     if name not in ZOO:
         return _found(name).embedded
-    entry = ZOO[name]
-    if not entry.kernels or (planar and not entry.kernels_on_a_plane):
-        return None
-    return cast("Embedded", _attribute(entry.kernels))
+    row = ZOO[name]
+    return _attribute(row.kernels) if row.kernels and (row.kernels_on_a_plane or not planar) else None
 
 
 def _attribute(place: str) -> Any:
-    module, attribute = place.split(":")
-    return getattr(import_module(f"{__package__}.{module}"), attribute)
+    return resolve_name(f"{__package__}.{place}")
 
 
 def _loaded(reference: str) -> Any:
-    """Return the observer at a place in code.
-
-    Raises:
-        CoopenvError: there is none.
-    """
     found = load(reference)
     if not (callable(found) or _has_kernels(found)):
         raise CoopenvError(f"observer '{reference}': expected a class, a function or an Embedded, got {found!r:.60}")

@@ -8,7 +8,7 @@ G = [Rhat, 0; S(phat) Rhat, Rhat];  H = B Rhat^T [S(z), -I] / |d|, which depends
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -31,21 +31,17 @@ def from_left(R: Array, p: Array) -> Array:
 class RightError(LeftError):
     """A pose with a covariance over its right error."""
 
-    R: Array
-    p: Array  # map frame
-    P: Array
-
     @classmethod
-    def start(cls, R: Array, p: Array, P: Array) -> RightError:
+    def start(cls, R: Array, p: Array, P: Array) -> Self:
         """Return the state of a pose with a covariance in LEFT coordinates."""
         G = from_left(R, p)
-        return cls(R, p, G.dot(P).dot(G.T))
+        return super().start(R, p, G.dot(P).dot(G.T))
 
-    def predicted(self, tick: Tick) -> RightError:
+    def predicted(self, tick: Tick) -> Self:
         """Return the state after the tick's odometry."""
         R, p = orthonormalise(self.R.dot(tick.rotation)), self.p + self.R.dot(tick.translation)
         G = from_left(R, p)
-        return RightError(R, p, self.P + (G * tick.noise.odometry(tick.dt)).dot(G.T))
+        return type(self)(R, p, self.P + (G * tick.noise.odometry(tick.dt)).dot(G.T))
 
     def jacobian(self, positions: Array) -> Array:
         """Return (m, 3, 6) the derivative of the lines to map positions (m, 3)."""
@@ -54,10 +50,10 @@ class RightError(LeftError):
         J[:, :, 3:] = -self.R.T
         return J
 
-    def moved(self, dx: Array, P: Array) -> RightError:
+    def moved(self, dx: Array, P: Array) -> Self:
         """Return the state moved by an error dx."""
         turn = exp_so3(dx[:3])
-        return RightError(turn.dot(self.R), turn.dot(self.p) + dx[3:], P)
+        return type(self)(turn.dot(self.R), turn.dot(self.p) + dx[3:], P)
 
     def point_covariance(self, marker: Array) -> Array:
         """Return the covariance (3, 3) in map axes of a point of the body."""

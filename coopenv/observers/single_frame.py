@@ -1,6 +1,6 @@
 """The pose from the bearings of one frame (P3P, PnP); odometry carries it to the next one, and counts no further.
 
-Source: candidates by perspective.py; among them that which agrees with most bearings, then that nearest to the pose
+Source: candidates by robust/p3p.py; among them that which agrees with most bearings, then that nearest to the pose
 predicted by odometry (Fischler and Bolles, Random sample consensus, Communications of the ACM 24(6), 1981, with all
 triples in place of random ones); then Gauss-Newton over all bearings that agree. Where Gauss-Newton from the predicted
 pose ends at a pose that fits, that is the candidate nearest to it, and the closed form is not needed.
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.small_matrices import solve
-from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.mekf import LeftError, innovation
+from coopenv.observers.contract import Estimate, Tick
+from coopenv.observers.mekf import LeftError, PoseObserver, innovation
 from coopenv.observers.robust.p3p import solve_p3p
 
 MOST_TRIPLES = 20
@@ -46,20 +46,15 @@ Bearings = tuple[Array, Array, Array]
 """Unit bearings (m, 3), positions (m, 3) and covariances of positions (m, 3, 3)."""
 
 
-class PerspectivePoints:
+class PerspectivePoints(PoseObserver):
     """A pose per frame from three bearings, no memory.
 
     With fewer bearings it adds odometry. It sends position and covariance.
     """
 
-    def __init__(self, setup: Setup) -> None:
-        """Remember the marker, which is what others measure."""
-        self.marker = setup.marker
-
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
-        R, p = initial_pose
-        self.state = LeftError(np.array(R, float), np.array(p, float), np.array(initial_covariance, float))
+        super().reset(initial_pose, initial_covariance)
         self.contradicted = 0.0
 
     def update(self, tick: Tick) -> Estimate:
@@ -96,12 +91,6 @@ class PerspectivePoints:
             if pose is not None and (count > most or distance(pose, self.state) < nearest):
                 best, most, nearest = pose, count, distance(pose, self.state)
         return best
-
-    def message(self) -> Message:
-        """Return the marker's position and covariance."""
-        return Message(
-            position=self.state.p + self.state.R.dot(self.marker), covariance=self.state.point_covariance(self.marker)
-        )
 
 
 def candidates(tick: Tick, data: Bearings) -> list[tuple[Array, Array]]:

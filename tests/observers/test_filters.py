@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.observers import Coordinates, Recording, SensorNoise, Tick, run
 from coopenv.observers.covariance_intersection import CovarianceIntersection, best_weight
-from coopenv.observers.mekf import LeftError, innovation, kalman, transition
+from coopenv.observers.mekf import LeftError, innovation, kalman
 from coopenv.observers.right_invariant import RightError, from_left
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
@@ -188,7 +188,7 @@ def test_centralised_filter_is_at_the_most_probable_trajectory_of_all() -> None:
 
 
 def test_transition_of_a_standstill_is_the_identity() -> None:
-    assert_allclose(transition(np.eye(3), np.zeros(3)), np.eye(6))
+    assert_allclose(LeftError.transition(np.eye(3), np.zeros(3)), np.eye(6))
 
 
 def test_covariance_intersection_covers_every_correlation() -> None:

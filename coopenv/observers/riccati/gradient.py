@@ -97,7 +97,6 @@ class DifferentiableWorld:
                 command = self._command(commands, tick)
                 truth, held = self._move(truth, held, command, tick)
                 belief = self._estimate(truth, held, belief, tick, turn)
-                held = self._make(Held, velocity=held.velocity, angular_velocity=held.angular_velocity)
             self._launch(trace_kernel, [belief, total])
         tape.backward(total)
         if float(turn.numpy()[0]) > self.scenario.observer.max_turn:
@@ -106,50 +105,45 @@ class DifferentiableWorld:
                 ScenarioWarning,
                 stacklevel=2,
             )
-        estimate = np.einsum("wnij,wnj->wni", belief.rotation.numpy(), belief.position.numpy())
+        believed = belief.numpy()
         return Rollout(
             float(total.numpy()[0]),
             np.stack([action.grad.numpy() for action in decisions]),
-            belief.covariance.numpy(),
-            truth.position.numpy(),
-            estimate,
+            believed["covariance"],
+            truth.numpy()["position"],
+            np.einsum("wnij,wnj->wni", believed["rotation"], believed["position"]),
         )
 
     def _array(self, values: np.ndarray, dtype: Any) -> Any:
         return wp.array(values, dtype=dtype, device=self._world.device, requires_grad=True)
 
-    def _make(self, struct: Any, **given: Any) -> Any:
-        """Return a record with some arrays given and new ones for the rest; new rotations are identities."""
-        made, shape = struct(), (self._world.worlds, self._world.model.vehicles)
-        for name, var in struct.vars.items():
-            value = given.get(name)
-            if value is None:
-                dtype = var.type.dtype
-                blank = np.zeros((*shape, *getattr(dtype, "_shape_", ())))
-                value = self._array(blank + np.eye(3) if name == "rotation" else blank, dtype)
-            elif isinstance(value, np.ndarray):
-                value = self._array(value, var.type.dtype)
-            setattr(made, name, value)
-        return made
+    def _make(self, struct: Any) -> Any:
+        """Return an array of records of zeros, one per vehicle."""
+        shape = (self._world.worlds, self._world.model.vehicles)
+        return wp.zeros(shape, dtype=struct, device=self._world.device, requires_grad=True)
+
+    def _made(self, struct: Any, **given: np.ndarray) -> Any:
+        """Return an array of records with some fields given and zeros for the rest."""
+        records = np.zeros((self._world.worlds, self._world.model.vehicles), struct.numpy_dtype())
+        for name, values in given.items():
+            records[name] = values
+        return self._array(records, struct)
+
+    def _sums(self) -> Any:
+        """Return a record of arrays of zeros, one entry per vehicle."""
+        sums = Information()
+        for name, var in Information.vars.items():
+            setattr(sums, name, self._make(var.type.dtype))
+        return sums
 
     def _start(self) -> tuple[Any, Any, Any]:
         state, L = self._world.state, self._world.model.landmarks
         speed = state.speed.numpy()
-        truth = self._make(
-            Truth,
-            rotation=np.ascontiguousarray(state.rotation.numpy()[:, L:]),
-            position=np.ascontiguousarray(state.position.numpy()[:, L:]),
-            speed=speed,
-            steering=state.steering.numpy(),
-        )
-        held = self._make(Held, velocity=np.stack([speed, 0 * speed, 0 * speed], axis=-1))
-        belief = self._make(
-            Belief,
-            rotation=state.estimate_rotation.numpy(),
-            position=state.estimate_position.numpy(),
-            covariance=state.covariance.numpy(),
-        )
-        return truth, held, belief
+        R, p = state.rotation.numpy()[:, L:], state.position.numpy()[:, L:]
+        truth = self._made(Truth, rotation=R, position=p, speed=speed, steering=state.steering.numpy())
+        held = self._made(Held, velocity=speed[..., None] * np.eye(3)[0])
+        R, p = state.estimate_rotation.numpy(), state.estimate_position.numpy()
+        return truth, held, self._made(Belief, rotation=R, position=p, covariance=state.covariance.numpy())
 
     def _command_of(self, action: Any) -> Any:
         command = self._array(np.zeros((*action.shape, 3)), vec3)
@@ -164,16 +158,13 @@ class DifferentiableWorld:
         return commands[decision - 1] if decision > 0 else self._world.state.last_command
 
     def _move(self, truth: Any, held: Any, command: Any, tick: int) -> tuple[Any, Any]:
+        world, first = self._world, True
         for duration, sample in tick_intervals(tick, self.scenario.rates.camera, self.scenario.rates.odometry):
             steps = max(1, math.ceil(duration / float(LONGEST_SUBSTEP)))
             for step in range(steps):
-                new_truth, new_held = self._make(Truth), self._make(Held)
-                due = int(sample and step == steps - 1)
-                self._launch(
-                    drive_kernel,
-                    [self._world.model, truth, command, held, due, wp.float64(duration / steps), new_truth, new_held],
-                )
-                truth, held = new_truth, new_held
+                before, due = [world.model, truth, command, held, int(first)], int(sample and step == steps - 1)
+                truth, held, first = self._make(Truth), self._make(Held), False
+                self._launch(drive_kernel, [*before, due, wp.float64(duration / steps), truth, held])
         return truth, held
 
     def _estimate(self, truth: Any, held: Any, belief: Any, tick: int, turn: Any) -> Any:
@@ -186,7 +177,7 @@ class DifferentiableWorld:
             record_tape=False,
         )
         dt = wp.float64(1.0 / rate)
-        predicted, after, sums = self._make(Belief), self._make(Belief), self._make(Information)
+        predicted, after, sums = self._make(Belief), self._make(Belief), self._sums()
         self._launch(predict_kernel, [world.model, held, belief, predicted, dt])
         counts = world.model.target_count.numpy()
         for vehicle in self._order:

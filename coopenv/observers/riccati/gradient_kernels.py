@@ -24,31 +24,31 @@ scalar, vec2, vec3, mat33, mat66 = (
 
 @wp.struct
 class Truth:
-    """True motion at one instant, (W, N)."""
+    """True motion at one instant."""
 
-    rotation: wp.array2d(dtype=mat33)
-    position: wp.array2d(dtype=vec3)
-    speed: wp.array2d(dtype=scalar)
-    steering: wp.array2d(dtype=scalar)
+    rotation: mat33
+    position: vec3
+    speed: scalar
+    steering: scalar
 
 
 @wp.struct
 class Held:
-    """The odometry sample in force, and the increment since the last tick, (W, N)."""
+    """The odometry sample in force, and the increment since the last tick."""
 
-    velocity: wp.array2d(dtype=vec3)
-    angular_velocity: wp.array2d(dtype=vec3)
-    rotation: wp.array2d(dtype=mat33)
-    translation: wp.array2d(dtype=vec3)
+    velocity: vec3
+    angular_velocity: vec3
+    rotation: mat33
+    translation: vec3
 
 
 @wp.struct
 class Belief:
-    """What the observers believe, (W, N)."""
+    """What an observer believes."""
 
-    rotation: wp.array2d(dtype=mat33)
-    position: wp.array2d(dtype=vec3)
-    covariance: wp.array2d(dtype=mat66)
+    rotation: mat33
+    position: vec3
+    covariance: mat66
 
 
 @wp.struct
@@ -73,63 +73,52 @@ def drive_kernel(
     truth: Any,
     command: wp.array2d(dtype=Any),
     held: Any,
+    first: int,
     sample: int,
     dt: wp.float64,
     truth_after: Any,
     held_after: Any,
 ):
-    """Move every vehicle for dt under its command and append the held odometry sample; then take a new one if due."""
+    """Move every vehicle for dt under its command and append the held odometry sample; then take a new one if due.
+
+    The `first` step of a tick begins a new increment.
+    """
     world, vehicle = wp.tid()
+    now = truth[world, vehicle]
     R, position, speed, steering = bicycle_step(
-        model,
-        truth.rotation[world, vehicle],
-        truth.position[world, vehicle],
-        truth.speed[world, vehicle],
-        truth.steering[world, vehicle],
-        command[world, vehicle],
-        dt,
-        0,
+        model, now.rotation, now.position, now.speed, now.steering, command[world, vehicle], dt, 0
     )
-    truth_after.rotation[world, vehicle] = R
-    truth_after.position[world, vehicle] = position
-    truth_after.speed[world, vehicle] = speed
-    truth_after.steering[world, vehicle] = steering
-    v = held.velocity[world, vehicle]
-    w = held.angular_velocity[world, vehicle]
-    rotation, translation = increment(held.rotation[world, vehicle], held.translation[world, vehicle], v, w, dt)
-    held_after.rotation[world, vehicle] = rotation
-    held_after.translation[world, vehicle] = translation
-    o = position - position
-    if sample != 0:
-        held_after.velocity[world, vehicle] = type(o)(speed, o[1], o[2])
-        held_after.angular_velocity[world, vehicle] = type(o)(o[0], o[1], yaw_rate(model, speed, steering))
+    truth_after[world, vehicle] = Truth(R, position, speed, steering)
+    odometry = held[world, vehicle]
+    v = odometry.velocity
+    w = odometry.angular_velocity
+    if first != 0:
+        rotation, translation = increment(wp.identity(3, scalar), vec3(), v, w, dt)
     else:
-        held_after.velocity[world, vehicle] = v
-        held_after.angular_velocity[world, vehicle] = w
+        rotation, translation = increment(odometry.rotation, odometry.translation, v, w, dt)
+    if sample != 0:
+        v = vec3(speed, scalar(0.0), scalar(0.0))
+        w = vec3(scalar(0.0), scalar(0.0), yaw_rate(model, speed, steering))
+    held_after[world, vehicle] = Held(v, w, rotation, translation)
 
 
 def predict_kernel(model: Any, held: Any, before: Any, after: Any, dt: wp.float64):
     """Carry every vehicle's belief through one tick of odometry."""
     world, vehicle = wp.tid()
-    R, p = predict_pose(
-        before.rotation[world, vehicle],
-        before.position[world, vehicle],
-        held.rotation[world, vehicle],
-        held.translation[world, vehicle],
-    )
-    P = before.covariance[world, vehicle]
+    belief = before[world, vehicle]
+    step = held[world, vehicle]
+    R, p = predict_pose(belief.rotation, belief.position, step.rotation, step.translation)
+    P = belief.covariance
     o = R - R
     A, B, D = predict_covariance(
-        wp.transpose(held.rotation[world, vehicle]),
+        wp.transpose(step.rotation),
         block3(P, 0, 0, o),
         block3(P, 0, 3, o),
         block3(P, 3, 3, o),
         model.observer.v1 * dt,
         model.observer.v2 * dt,
     )
-    after.rotation[world, vehicle] = R
-    after.position[world, vehicle] = p
-    after.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D, P - P)
+    after[world, vehicle] = Belief(R, p, join6(A, B, wp.transpose(B), D, P - P))
 
 
 def inform_kernel(model: Any, state: Any, truth: Any, predicted: Any, corrected: Any, vehicle: int, sums: Any):
@@ -139,22 +128,22 @@ def inform_kernel(model: Any, state: Any, truth: Any, predicted: Any, corrected:
     """
     world, n = wp.tid()
     target = model.targets[vehicle, n]
-    own_R = truth.rotation[world, vehicle]
-    origin = truth.position[world, vehicle] + own_R * model.camera.position
+    own = truth[world, vehicle]
+    origin = own.position + own.rotation * model.camera.position
     marker = model.scene.marker[target]
     place = state.position[world, target] + state.rotation[world, target] * marker
     known = place
     if target >= model.landmarks:
         other = target - model.landmarks
-        place = truth.position[world, other] + truth.rotation[world, other] * marker
-        known = corrected.rotation[world, other] * (corrected.position[world, other] + marker)
+        place = truth[world, other].position + truth[world, other].rotation * marker
+        known = corrected[world, other].rotation * (corrected[world, other].position + marker)
     line = place - origin
-    b = wp.transpose(own_R) * wp.normalize(line)
+    b = wp.transpose(own.rotation) * wp.normalize(line)
     in_camera = wp.transpose(model.camera.rotation) * b
     if sight_of(model, state, world, vehicle, target, origin, line, in_camera) == VISIBLE:
-        a = wp.transpose(predicted.rotation[world, vehicle]) * known
-        e = a - model.camera.position - predicted.position[world, vehicle]
-        o = own_R - own_R
+        a = wp.transpose(predicted[world, vehicle].rotation) * known
+        e = a - model.camera.position - predicted[world, vehicle].position
+        o = own.rotation - own.rotation
         M11, M12, M22, r1, r2 = accumulate_information(a, b, e, model.observer.q[target], o, o, o, e - e, e - e)
         wp.atomic_add(sums.M11, world, vehicle, M11)
         wp.atomic_add(sums.M12, world, vehicle, M12)
@@ -166,38 +155,33 @@ def inform_kernel(model: Any, state: Any, truth: Any, predicted: Any, corrected:
 def correct_kernel(predicted: Any, sums: Any, after: Any, vehicle: int, dt: wp.float64, turn: wp.array(dtype=scalar)):
     """Correct one vehicle's belief over one tick."""
     world = wp.tid()
-    R = predicted.rotation[world, vehicle]
-    P = predicted.covariance[world, vehicle]
+    belief = predicted[world, vehicle]
+    R = belief.rotation
+    P = belief.covariance
     o = R - R
     L11, L21, L22, _, _ = cholesky6(block3(P, 0, 0, o), block3(P, 0, 3, o), block3(P, 3, 3, o))
+    M11 = sums.M11[world, vehicle]
+    M12 = sums.M12[world, vehicle]
+    M22 = sums.M22[world, vehicle]
     dx1, dx2, A, B, D = correct_kalman(
-        dt,
-        sums.M11[world, vehicle],
-        sums.M12[world, vehicle],
-        sums.M22[world, vehicle],
-        L11,
-        L21,
-        L22,
-        sums.r1[world, vehicle],
-        sums.r2[world, vehicle],
+        dt, M11, M12, M22, L11, L21, L22, sums.r1[world, vehicle], sums.r2[world, vehicle]
     )
     wp.atomic_max(turn, 0, wp.length(dx1))
-    after.rotation[world, vehicle] = orthonormalise(R * exp_so3(dx1))
-    after.position[world, vehicle] = predicted.position[world, vehicle] + dx2
-    after.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D, P - P)
+    P_after = join6(A, B, wp.transpose(B), D, P - P)
+    after[world, vehicle] = Belief(orthonormalise(R * exp_so3(dx1)), belief.position + dx2, P_after)
 
 
 def trace_kernel(after: Any, total: wp.array(dtype=Any)):
     """Add up trace P over vehicles and worlds."""
     world, vehicle = wp.tid()
-    wp.atomic_add(total, 0, wp.trace(after.covariance[world, vehicle]))
+    wp.atomic_add(total, 0, wp.trace(after[world, vehicle].covariance))
 
 
 def show_kernel(model: Any, truth: Any, state: Any, t: wp.float64):
     """Write the truth of time t into the world's state, where visibility reads it. Grid: (worlds, agents)."""
     world, agent = wp.tid()
     if agent >= model.landmarks:
-        state.rotation[world, agent] = truth.rotation[world, agent - model.landmarks]
-        state.position[world, agent] = truth.position[world, agent - model.landmarks]
+        state.rotation[world, agent] = truth[world, agent - model.landmarks].rotation
+        state.position[world, agent] = truth[world, agent - model.landmarks].position
     elif model.motion.kind[agent] == PRESCRIBED:
         prescribe(model, state, world, agent, t)

@@ -17,7 +17,7 @@ from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import exp_so3, lengths, log_so3, orthonormalise, skew, tangent_basis
 from coopenv.estimation.small_matrices import solve
 from coopenv.observers.contract import SensorNoise
-from coopenv.observers.mekf import transition
+from coopenv.observers.mekf import LeftError
 from coopenv.observers.robust.constants import (
     MAX_LINEARISATIONS,
     RELINEARISATION_ANGLE,
@@ -119,7 +119,7 @@ class Belief:
         member = self.members[n]
         member.p = member.p + member.R.dot(dp)
         member.R = orthonormalise(member.R.dot(dR))
-        F, block = transition(dR, dp), slice(6 * n, 6 * n + 6)
+        F, block = LeftError.transition(dR, dp), slice(6 * n, 6 * n + 6)
         self.P[block] = F.dot(self.P[block])
         self.P[:, block] = self.P[:, block].dot(F.T)
         self.P.flat[6 * n * (len(self.P) + 1) : (6 * n + 6) * len(self.P) : len(self.P) + 1] += noise

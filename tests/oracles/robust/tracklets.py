@@ -17,7 +17,7 @@ import numpy as np
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import exp_so3, log_so3, orthonormalise, skew
 from coopenv.observers.contract import Message, SensorNoise
-from coopenv.observers.mekf import transition
+from coopenv.observers.mekf import LeftError
 from coopenv.observers.robust.constants import MASK_BITS
 from tests.oracles.robust.belief import Belief, Member
 from tests.oracles.robust.matrices import invert_positive
@@ -75,7 +75,7 @@ def tracklet(last: Report, new: Report, noise: SensorNoise) -> Tracklet | None:
     for n in range(m):
         block = slice(6 * n, 6 * n + 6)
         dR, dp = new.motion_since(last, n)
-        F[block, block] = transition(dR, dp)
+        F[block, block] = LeftError.transition(dR, dp)
         Q[block] = noise.odometry(max(new.time[n] - last.time[n], 0.0))
         R[n], p[n] = orthonormalise(last.R[n].dot(dR)), last.p[n] + last.R[n].dot(dp)
         c[block] = left_error(R[n], p[n], new.R[n], new.p[n])
