@@ -77,12 +77,10 @@ def cholesky6(A: Any, B: Any, D: Any):
 def join6(A: Any, B: Any, C: Any, D: Any, zero: Any):
     """Return the 6x6 matrix [[A, B], [C, D]]; `zero` is a 6x6 matrix of the same precision."""
     M = zero
-    for i in range(3):
-        for j in range(3):
-            M[i, j] = A[i, j]
-            M[i, j + 3] = B[i, j]
-            M[i + 3, j] = C[i, j]
-            M[i + 3, j + 3] = D[i, j]
+    M[:3, :3] = A
+    M[:3, 3:] = B
+    M[3:, :3] = C
+    M[3:, 3:] = D
     return M
 
 
@@ -141,11 +139,9 @@ def eigen_symmetric6(M: Any, identity: Any):
                         ukq = U[k, q]
                         U[k, p] = c * ukp - s * ukq
                         U[k, q] = s * ukp + c * ukq
-                    for k in range(6):
-                        apk = A[p, k]
-                        aqk = A[q, k]
-                        A[p, k] = c * apk - s * aqk
-                        A[q, k] = s * apk + c * aqk
+                    row = A[p]
+                    A[p] = c * row - s * A[q]
+                    A[q] = s * row + c * A[q]
     return A, U
 
 

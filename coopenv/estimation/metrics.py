@@ -90,18 +90,12 @@ def live_ticks(t: np.ndarray, vehicles: int, ends: Sequence[float] | None = None
     Args:
         t: (K,) s.
         vehicles: N.
-        ends: s, when each vehicle arrived or collided and was parked; NaN or beyond the record for one that was
-            not (None: no vehicle was).
+        ends: s, when each arrived or collided and was parked; NaN or beyond the record for one that was not (None: no
+            vehicle was).
     """
     if ends is None:
         return np.full(vehicles, len(t))
     return np.maximum(1, np.searchsorted(t, np.asarray(ends, float) + 1e-6, side="right"))
-
-
-def position_error(position: np.ndarray, position_estimate: np.ndarray) -> np.ndarray:
-    """Return |pbar - pbarhat| in m, of positions (..., 3) in the map frame."""
-    result: np.ndarray = np.linalg.norm(np.asarray(position, float) - np.asarray(position_estimate, float), axis=-1)
-    return result
 
 
 def error_rotation(rotation: np.ndarray, rotation_estimate: np.ndarray) -> np.ndarray:
@@ -113,9 +107,8 @@ def error_rotation(rotation: np.ndarray, rotation_estimate: np.ndarray) -> np.nd
 def quaternion_wxyz(rotation: np.ndarray) -> np.ndarray:
     """Return the unit quaternions (..., 4) of rotations (..., 3, 3), scalar part first and never negative.
 
-    Each row of 4 q q^T, which is linear in R, is a multiple of q; the row of the largest component is well
-    conditioned at every angle. For small angles this takes the vector part from the skew part of R, without
-    cancellation.
+    Each row of 4 q q^T, which is linear in R, is a multiple of q; that of the largest component is well conditioned at
+    every angle, and at small ones takes the vector part from the skew part of R, without cancellation.
     """
     R = np.asarray(rotation, float)
     x, y, z = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
@@ -186,10 +179,7 @@ def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def settling_time(
-    t: np.ndarray,
-    position_error: np.ndarray,
-    orientation_error: np.ndarray,
-    tolerance: SettlingTolerance = CONVERGED,
+    t: np.ndarray, position_error: np.ndarray, orientation_error: np.ndarray, tolerance: SettlingTolerance = CONVERGED
 ) -> np.ndarray:
     """Return the first time from which both errors stay below a tolerance until the end of the record.
 
@@ -208,23 +198,12 @@ def settling_time(
 
 
 def settling_times(
-    trajectory: Trajectory,
-    ends: Sequence[float] | None = None,
-    tolerance: SettlingTolerance = CONVERGED,
+    trajectory: Trajectory, ends: Sequence[float] | None = None, tolerance: SettlingTolerance = CONVERGED
 ) -> np.ndarray:
     """Return the settling time (N,) s of every vehicle, judged up to its end; see `settling_time`, `live_ticks`."""
-    count = len(trajectory.vehicles)
-    return np.array(
-        [
-            settling_time(
-                trajectory.t[:ticks],
-                trajectory.position_error[:ticks, vehicle],
-                trajectory.orientation_error[:ticks, vehicle],
-                tolerance,
-            )
-            for vehicle, ticks in enumerate(live_ticks(trajectory.t, count, ends))
-        ]
-    )
+    t, live = trajectory.t, live_ticks(trajectory.t, len(trajectory.vehicles), ends)
+    errors = zip(live, trajectory.position_error.T, trajectory.orientation_error.T, strict=True)
+    return np.array([settling_time(t[:n], position[:n], angle[:n], tolerance) for n, position, angle in errors])
 
 
 def steady_mean(t: np.ndarray, values: np.ndarray, steady_from: float) -> np.ndarray:
@@ -324,10 +303,8 @@ def summarise(trajectory: Trajectory, steady_from: float, ends: Sequence[float] 
     rows = []
     for vehicle, ticks in enumerate(live_ticks(trajectory.t, len(trajectory.vehicles), ends)):
         t = trajectory.t[:ticks]
-        position, orientation = (
-            trajectory.position_error[:ticks, vehicle],
-            trajectory.orientation_error[:ticks, vehicle],
-        )
+        position = trajectory.position_error[:ticks, vehicle]
+        orientation = trajectory.orientation_error[:ticks, vehicle]
         fit, mirror = fit_exponential_rate(t, position), bool(mirrored(orientation))
         rows.append(
             {

@@ -23,6 +23,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from coopenv.estimation.rotations import skew
+
 DEFAULT_WINDOW = 1.0
 DEFAULT_THRESHOLD = 1e-4
 
@@ -46,11 +48,6 @@ class Scene(Protocol):
     @property
     def position(self) -> np.ndarray:
         """(K, N, 3) m, map frame."""
-        ...
-
-    @property
-    def rotation(self) -> np.ndarray:
-        """(K, N, 3, 3) body to map."""
         ...
 
     @property
@@ -159,7 +156,7 @@ def _information_rate(scene: Scene, anchor: np.ndarray) -> np.ndarray:
     bearing = offset / np.where(distance > 0, distance, 1.0)
     seen = scene.visible & (distance[..., 0] > 0)
     projection = (np.eye(3) - bearing[..., :, None] * bearing[..., None, :]) * seen[..., None, None]
-    lever = _skew(scene.target_position[:, None] - anchor[:, None])  # (K, N, T, 3, 3)
+    lever = skew(scene.target_position[:, None] - anchor[:, None])  # (K, N, T, 3, 3)
     cross = lever @ projection  # = (-Pi S)^T Pi
     rate = np.empty((*scene.position.shape[:2], 6, 6))
     rate[..., :3, :3] = -(cross @ lever).sum(axis=2)
@@ -172,7 +169,7 @@ def _information_rate(scene: Scene, anchor: np.ndarray) -> np.ndarray:
 def _move_origin(W: np.ndarray, shift: np.ndarray) -> np.ndarray:
     """Return T^T W T, T = [[I, 0], [S(shift), I]]: W about a point `shift` (m) further in map axes."""
     T = np.broadcast_to(np.eye(6), (*shift.shape[:-1], 6, 6)).copy()
-    T[..., 3:, :3] = _skew(shift)
+    T[..., 3:, :3] = skew(shift)
     result: np.ndarray = np.swapaxes(T, -1, -2) @ W @ T
     return result
 
@@ -186,11 +183,3 @@ def _scaled(W: np.ndarray) -> np.ndarray:
     scale[..., :3] = 1.0 / length[..., None]
     result: np.ndarray = scale[..., :, None] * W * scale[..., None, :]
     return result
-
-
-def _skew(v: np.ndarray) -> np.ndarray:
-    """Return S(v) (..., 3, 3) of vectors (..., 3), with S(v) y = v x y."""
-    S = np.zeros((*v.shape, 3))
-    S[..., 2, 1], S[..., 0, 2], S[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
-    S[..., 1, 2], S[..., 2, 0], S[..., 0, 1] = -v[..., 0], -v[..., 1], -v[..., 2]
-    return S

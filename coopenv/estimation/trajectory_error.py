@@ -11,9 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from coopenv.estimation.arrays import Array
 from coopenv.estimation.metrics import orientation_error_deg
-
-Array = NDArray[np.float64]
 
 
 class RelativeError(NamedTuple):

@@ -38,8 +38,7 @@ class Bound:
 
     def position_rms(self, after: float = 0.0) -> Array:
         """Return (N,) the root mean square of the position's bound from a time on, m."""
-        result: Array = np.sqrt(np.mean(self.position[self.t >= after] ** 2, axis=0))
-        return result
+        return np.asarray(np.sqrt(np.mean(self.position[self.t >= after] ** 2, axis=0)))
 
 
 def cramer_rao(recording: Recording, joint: bool = True) -> Bound:

@@ -88,10 +88,7 @@ class Group:
     def update(self, vehicle: int, sensed: Sensed, inbox_tick: ArrayLike) -> Answer:
         """Let one vehicle's observer take a tick; vehicles come in the order of the briefing.
 
-        Args:
-            vehicle: whose.
-            sensed: the tick.
-            inbox_tick: see `Mail.inbox`.
+        `inbox_tick` is as for `Mailbox.inbox`.
 
         Raises:
             ObserverError: it raised, or returned what is no estimate.
@@ -155,10 +152,9 @@ class Group:
         if not hasattr(self, "mail"):
             return {}
         observers = self.whole if self.joint else self.observers
+        state = {"observers": observers, "coordinates": self.coordinates, "mail": self.mail.get_state()}
         try:
-            return copy.deepcopy(
-                {"observers": observers, "coordinates": self.coordinates, "mail": self.mail.get_state()}
-            )
+            return copy.deepcopy(state)
         except Exception as error:
             raise CoopenvError(f"the observers' state cannot be copied: {told(error)}") from error
 

@@ -51,12 +51,7 @@ class KernelObserver:
     """One vehicle's observer, computed in float64 by the kernels of an embedded one."""
 
     def __init__(self, embedded: Embedded, setup: Setup) -> None:
-        """Allocate its world.
-
-        Args:
-            embedded: whose kernels.
-            setup: what the vehicle knows.
-        """
+        """Allocate the world of a vehicle that knows what is in a setup."""
         p = precision(PRECISION)
         self.embedded, self.setup = embedded, setup
         self._model = model_of(setup, p)

@@ -14,7 +14,7 @@ from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.observers.checks import check_message
 from coopenv.observers.contract import Message, Received
-from coopenv.observers.recording import Briefing
+from coopenv.observers.recording import Briefing, sealed
 
 
 class Mailbox:
@@ -100,30 +100,21 @@ class Mailbox:
 
 def _checked(message: Message) -> Message:
     check_message(message)
-    return _sealed(message)
+    for array in (message.position, message.rotation, message.covariance, *message.extra.values()):
+        if array is not None:
+            sealed(array)
+    return message
 
 
 def _copied(message: Message) -> Message:
     """Return a copy that nobody can change, the sender included."""
-    return _sealed(
-        Message(
-            position=_floats(message.position),
-            rotation=_floats(message.rotation),
-            covariance=_floats(message.covariance),
-            extra={name: np.array(value) for name, value in message.extra.items()},
-        )
-    )
-
-
-def _sealed(message: Message) -> Message:
-    for array in (message.position, message.rotation, message.covariance, *message.extra.values()):
-        if array is not None:
-            array.setflags(write=False)
-    return message
+    position, rotation, covariance = map(_floats, (message.position, message.rotation, message.covariance))
+    extra = {name: sealed(np.array(value)) for name, value in message.extra.items()}
+    return Message(position, rotation, covariance, extra)
 
 
 def _floats(value: Array | None) -> Array | None:
     """Return a copy in double precision, or in single precision if it came so."""
     if value is None:
         return None
-    return np.array(value, np.float32 if getattr(value, "dtype", None) == np.float32 else np.float64)
+    return sealed(np.array(value, np.float32 if getattr(value, "dtype", None) == np.float32 else np.float64))

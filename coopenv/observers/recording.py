@@ -89,20 +89,25 @@ class Sensed:
             translation=self.translation[i],
             velocity=self.velocity[i],
             angular_velocity=self.angular_velocity[i],
-            targets=_sealed(setup.targets[:]),
-            bearings=_sealed(self.bearings[i].take(setup.targets, axis=0)),
-            valid=_sealed(self.visible[i].take(setup.targets)),
+            targets=sealed(setup.targets[:]),
+            bearings=sealed(self.bearings[i].take(setup.targets, axis=0)),
+            valid=sealed(self.visible[i].take(setup.targets)),
             landmarks=self.landmarks,
             messages=messages,
-            lever_arm=_sealed(setup.lever_arm[:]),
+            lever_arm=sealed(setup.lever_arm[:]),
             noise=setup.noise,
             due=self.due,
         )
 
 
-def _sealed(view: NDArray[Any]) -> NDArray[Any]:
+def sealed(view: NDArray[Any]) -> NDArray[Any]:
+    """Return a view that nobody can write to."""
     view.setflags(write=False)
     return view
+
+
+PER_TICK = ("rotation", "translation", "velocity", "angular_velocity", "bearings", "visible", "landmarks", "inbox_tick")
+"""Arrays of a recording that have a row per tick."""
 
 
 @dataclass(frozen=True)
@@ -157,20 +162,9 @@ class Recording:
 
     def at(self, k: int) -> Sensed:
         """Return what all vehicles sense at tick k."""
-        return Sensed(
-            index=k,
-            dt=self.dt,
-            rotation=_sealed(self.rotation[k]),
-            translation=_sealed(self.translation[k]),
-            velocity=_sealed(self.velocity[k]),
-            angular_velocity=_sealed(self.angular_velocity[k]),
-            bearings=_sealed(self.bearings[k]),
-            visible=_sealed(self.visible[k]),
-            landmarks=_sealed(self.landmarks[k]),
-            due=bool(self.due[k]),
-            truth=Truth(self.truth.rotation[k], self.truth.position[k]),
-            inbox_tick=_sealed(self.inbox_tick[k]),
-        )
+        sensed: dict[str, Any] = {name: sealed(getattr(self, name)[k]) for name in PER_TICK}
+        truth = Truth(self.truth.rotation[k], self.truth.position[k])
+        return Sensed(index=k, dt=self.dt, due=bool(self.due[k]), truth=truth, **sensed)
 
     def tick(self, k: int, vehicle: int, messages: Mapping[int, Received]) -> Tick:
         """Return what one vehicle senses at tick k, with the messages that it has."""

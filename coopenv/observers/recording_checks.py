@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from coopenv.errors import DataError, shown
 from coopenv.estimation.validity import are_covariances, are_numbers, are_rotations, are_unit_vectors, everywhere
-from coopenv.observers.contract import Gains, SensorNoise, Setup
+from coopenv.observers.contract import Setup
 from coopenv.observers.recording import Recording, is_due
 from coopenv.scenario.base import LARGEST
 from coopenv.scenario.topology import neighbour_sets, processing_order
@@ -97,26 +98,20 @@ def _check_setup(setup: Setup, vehicle: int, first: Setup, where: str) -> None:
     _require(sensible, f"{where}.targets: not different targets of 0 .. {len(setup.target_names) - 1} without {own}")
     for name in ("lever_arm", "marker"):
         _require(_is_array(getattr(setup, name), (3,)), f"{where}.{name}: not three numbers")
-    _check_noise(setup.noise, f"{where}.noise")
-    _check_gains(setup.gains, len(setup.target_names), f"{where}.gains")
-
-
-def _check_noise(noise: SensorNoise, where: str) -> None:
+    noise, gains = setup.noise, setup.gains
     for name in ("velocity", "angular_velocity", "bearing"):
-        _between(f"{where}.{name}", getattr(noise, name), 0.0, LARGEST)
-    _between(f"{where}.odometry_period", noise.odometry_period, *TICK_LENGTHS_S)
+        _between(f"{where}.noise.{name}", getattr(noise, name), 0.0, LARGEST)
+    _between(f"{where}.noise.odometry_period", noise.odometry_period, *TICK_LENGTHS_S)
     if noise.image_axis is not None:
         axis = np.array(noise.image_axis, float)
-        _require(axis.shape == (3,) and are_unit_vectors(axis), f"{where}.image_axis: not a unit vector")
-
-
-def _check_gains(gains: Gains, targets: int, where: str) -> None:
+        _require(axis.shape == (3,) and are_unit_vectors(axis), f"{where}.noise.image_axis: not a unit vector")
     for name, least in (("k", 0.5), ("max_turn", 0.0)):
         value = getattr(gains, name)
-        _require(least < value <= LARGEST, f"{where}.{name}: {shown(value)} is not in {least:g} .. {LARGEST:g}")
-    for name, count in (("q", targets), ("V", 2), ("P0", 2)):
+        _require(least < value <= LARGEST, f"{where}.gains.{name}: {shown(value)} is not in {least:g} .. {LARGEST:g}")
+    for name, count in (("q", len(setup.target_names)), ("V", 2), ("P0", 2)):
         values = np.asarray(getattr(gains, name))
-        _require(_is_array(values, (count,)) and (values > 0.0).all(), f"{where}.{name}: not {count} positive numbers")
+        positive = _is_array(values, (count,)) and (values > 0.0).all()
+        _require(positive, f"{where}.gains.{name}: not {count} positive numbers")
 
 
 def _is_array(values: Any, shape: tuple[int, ...]) -> bool:
@@ -126,15 +121,10 @@ def _is_array(values: Any, shape: tuple[int, ...]) -> bool:
 
 def _check_arrays(r: Recording) -> None:
     sizes = {"K": r.ticks, "N": len(r.setups), "T": len(r.setups[0].target_names), "L": r.setups[0].landmarks}
-    for name, shape in SHAPES.items():
-        array = getattr(r.truth, name.removeprefix("truth.")) if name.startswith("truth.") else getattr(r, name)
-        _check_array(name, array, tuple(sizes.get(str(n), n) for n in shape))
-
-
-def _check_array(name: str, array: NDArray[Any], shape: tuple[Any, ...]) -> None:
-    kind = KINDS.get(name, "f")
-    fits = array.shape == shape and array.dtype.kind == kind
-    _require(fits, f"{name}: shape {array.shape} of {array.dtype}, expected {shape} of {kind}")
+    for name, axes in SHAPES.items():
+        array, kind, shape = attrgetter(name)(r), KINDS.get(name, "f"), tuple(sizes.get(str(n), n) for n in axes)
+        fits = array.shape == shape and array.dtype.kind == kind
+        _require(fits, f"{name}: shape {array.shape} of {array.dtype}, expected {shape} of {kind}")
 
 
 def _check_radio(r: Recording) -> None:

@@ -8,6 +8,7 @@ period and delivered, lost or delayed as the world's radio delivered its own.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -143,7 +144,8 @@ class _Log:
         if stated.any():
             e = coordinates.error(R[stated], p[stated], R_hat[stated], p_hat[stated])[..., states]
             P = self.covariance[stated][:, states][..., states]
-            nees[stated] = np.einsum("...i,...i", e, _solve(P, e))
+            with suppress(np.linalg.LinAlgError):  # some P is singular
+                nees[stated] = np.einsum("...i,...i", e, np.linalg.solve(P, e[..., None])[..., 0])
         duration = max(r.dt, (r.ticks - 1) * r.dt)
         timed = self.elapsed[1:]
         micro = [1e6 * float(np.median(c[np.isfinite(c)])) if np.isfinite(c).any() else np.nan for c in timed.T]
@@ -164,11 +166,3 @@ class _Log:
             microseconds_per_update=np.array(micro),
             failure=self.failure,
         )
-
-
-def _solve(P: Array, e: Array) -> Array:
-    """Return P^-1 e, NaN throughout where some P is singular."""
-    try:
-        return np.asarray(np.linalg.solve(P, e[..., None])[..., 0], dtype=np.float64)
-    except np.linalg.LinAlgError:
-        return np.full_like(e, np.nan)

@@ -82,8 +82,10 @@ class PerspectivePoints(PoseObserver):
     def chosen(self, tick: Tick, data: Bearings) -> LeftError | None:
         """Return of all candidates that which agrees with most bearings, then that nearest to the predicted pose."""
         best, most, nearest = None, 3, inf
-        for R, p in candidates(tick, data):
-            start = LeftError(R, p, self.state.P)
+        triples = np.array(list(combinations(range(len(data[0])), 3))[:MOST_TRIPLES])
+        turns, cameras, mask = solve_p3p(data[0][triples], data[1][triples])
+        for R, camera in zip(turns[mask], cameras[mask], strict=True):
+            start = LeftError(R, camera - R @ tick.lever_arm, self.state.P)
             agrees = misfits(start, tick, data) < BEARING_GATE
             if (count := int(agrees.sum())) < most:
                 continue
@@ -91,14 +93,6 @@ class PerspectivePoints(PoseObserver):
             if pose is not None and (count > most or distance(pose, self.state) < nearest):
                 best, most, nearest = pose, count, distance(pose, self.state)
         return best
-
-
-def candidates(tick: Tick, data: Bearings) -> list[tuple[Array, Array]]:
-    """Return the poses (R, p) of the body that P3P finds for triples of the bearings."""
-    b, z, _ = data
-    triples = np.array(list(combinations(range(len(b)), 3))[:MOST_TRIPLES])
-    R, camera, mask = solve_p3p(b[triples], z[triples])
-    return [(turn, place - turn @ tick.lever_arm) for turn, place in zip(R[mask], camera[mask], strict=True)]
 
 
 def linearised(pose: LeftError, tick: Tick, data: Bearings) -> tuple[Array, Array, Array]:
@@ -126,21 +120,12 @@ def normalised(residual: Array, N: Array) -> Array:
     """Return (m,) r^T N^-1 r of residuals (m, 2)."""
     x, y = residual.T
     a, b, d = N[:, 0, 0], N[:, 0, 1], N[:, 1, 1]
-    result: Array = (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
-    return result
-
-
-def inverses(N: Array) -> Array:
-    """Return the inverses of symmetric matrices (m, 2, 2)."""
-    a, b, d = N[:, 0, 0], N[:, 0, 1], N[:, 1, 1]
-    result: Array = N[:, ::-1, ::-1] * ADJUGATE / (a * d - b * b)[:, None, None]
-    return result
+    return np.asarray((d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b))
 
 
 def ahead(pose: LeftError, tick: Tick, data: Bearings) -> NDArray[np.bool_]:
     """Return (m,) whether the points are where the bearings point, and not opposite."""
-    result: NDArray[np.bool_] = (((data[1] - pose.p).dot(pose.R) - tick.lever_arm) * data[0]).sum(1) > 0.0
-    return result
+    return np.asarray((((data[1] - pose.p).dot(pose.R) - tick.lever_arm) * data[0]).sum(1) > 0.0)
 
 
 def refined(start: LeftError, tick: Tick, data: Bearings) -> LeftError | None:
@@ -148,26 +133,23 @@ def refined(start: LeftError, tick: Tick, data: Bearings) -> LeftError | None:
     pose = start
     for _ in range(ITERATIONS):
         residual, H, N = linearised(pose, tick, data)
-        weighted = (inverses(N) @ H).reshape(-1, 6)
+        determinants = N[:, 0, 0] * N[:, 1, 1] - N[:, 0, 1] * N[:, 0, 1]
+        weighted = (N[:, ::-1, ::-1] * ADJUGATE / determinants[:, None, None] @ H).reshape(-1, 6)
         try:
             P = solve(H.reshape(-1, 6).T.dot(weighted), ALL)
         except np.linalg.LinAlgError:
             return None
         gradient = residual.ravel().dot(weighted)
         step = P.dot(gradient)
-        if not (step[:3].dot(step[:3]) < LONGEST_TURN**2 and firm(P, pose, data)):  # NaN fails as well
+        nearest = sqrt(((data[1] - pose.p) ** 2).sum(1).min())
+        firm = 0.0 < P[3, 3] + P[4, 4] + P[5, 5] < (LARGEST_STD * nearest) ** 2  # else geometry is too weak
+        if not (step[:3].dot(step[:3]) < LONGEST_TURN**2 and firm):  # NaN fails as well
             return None
         pose = pose.moved(step, (P + P.T) / 2)
         if step.dot(gradient) < CONVERGED:
             fits = ahead(pose, tick, data) & (normalised(residual - H @ step, N) < BEARING_GATE)
             return pose if fits.all() else None
     return None
-
-
-def firm(P: Array, pose: LeftError, data: Bearings) -> bool:
-    """Return whether the geometry holds the position well enough for the covariance P to be meant."""
-    nearest = sqrt(((data[1] - pose.p) ** 2).sum(1).min())
-    return bool(0.0 < P[3, 3] + P[4, 4] + P[5, 5] < (LARGEST_STD * nearest) ** 2)
 
 
 def distance(pose: LeftError, predicted: LeftError) -> float:

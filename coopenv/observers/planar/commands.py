@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,29 +11,22 @@ from coopenv.estimation.arrays import Array
 TURNING_RATE = 1e-6  # rad/s; a smaller command is one to drive straight
 DRIVING_SPEED = 1e-6  # m/s; a smaller command is one to turn on the spot
 TURN, TURNING, PATH, ARC, SLOWING, SWITCHING = range(6)
+"""What the wheels make of commands: commanded turn times gain, rad; commanded turning times gain, s; commanded path, m;
+commanded turning, s; path times rate of turn, m rad/s; squares of the steps in the commanded rate, rad^2/s^2."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wheels:
-    """How a kind of robot follows its commands v and w; the default does at once what it is told.
+    """How a kind of robot follows its commands v and w; the default does at once what it is told."""
 
-    Attributes:
-        delay: s after the lead by which commands are early.
-        share: of the response at these delays; they sum to one.
-        arc: (curvature |w| / v in 1/m, gain): how much it turns against what it is told, between and beyond linear.
-        spot: the same gain of turns on the spot.
-        slow: m/s; below this speed arcs tighter than 1/m gain `slow_gain` more.
-        slow_gain: see there.
-        centre: rad/s, the logged w at which it drives straight, for the curvature.
-    """
-
-    delay: tuple[float, ...] = (0.0,)
-    share: tuple[float, ...] = (1.0,)
+    delay: tuple[float, ...] = (0.0,)  # s after the lead by which commands are early
+    share: tuple[float, ...] = (1.0,)  # of the response at these delays; they sum to one
     arc: tuple[tuple[float, float], ...] = ((0.0, 1.0),)
-    spot: float = 1.0
-    slow: float = 0.0
+    """(curvature |w| / v in 1/m, gain): how much it turns against what it is told, between and beyond linear."""
+    spot: float = 1.0  # the same gain of turns on the spot
+    slow: float = 0.0  # m/s, below which arcs tighter than 1/m gain more, by:
     slow_gain: float = 0.0
-    centre: float = 0.0
+    centre: float = 0.0  # rad/s, the logged w at which it drives straight, for the curvature
 
     def gain(self, v: float, w: float) -> float:
         """Return turn against commanded turn at v in m/s and w in rad/s."""
@@ -46,34 +38,14 @@ class Wheels:
         return float(np.interp(curvature, curvatures, gains)) + more
 
 
-class Response(NamedTuple):
-    """What the wheels made of the commands in one tick.
-
-    Attributes:
-        done: (6,) by TURN: rad, commanded turn times gain; TURNING: s of commanded turning times gain; PATH: m
-            commanded; ARC: s of commanded turning; SLOWING: m rad/s, path times rate of turn; SWITCHING: rad^2/s^2, the
-            squares of the steps in the commanded rate.
-        by_lead: (6,) their derivatives by the lead, per s.
-    """
-
-    done: Array
-    by_lead: Array
-
-
 class CommandHistory:
-    """The last commands of one robot.
+    """The last commands of one robot, for leads up to the longest, s, and ticks down to the shortest, s."""
 
-    Args:
-        wheels: how it follows them.
-        longest: s, the longest lead asked for.
-        dt: s, the shortest tick.
-    """
-
-    def __init__(self, wheels: Wheels, longest: float, dt: float) -> None:
+    def __init__(self, wheels: Wheels, longest: float, shortest: float) -> None:
         self._wheels = wheels
         self._delay, self._share = np.array(wheels.delay), np.array(wheels.share)
-        ticks = int((longest + self._delay.max()) / dt) + 4
-        self._t = np.arange(-ticks, 1) * dt
+        ticks = int((longest + self._delay.max()) / shortest) + 4
+        self._t = np.arange(-ticks, 1) * shortest
         self._sum = np.zeros((6, ticks + 1))
         self._rate = 0.0
 
@@ -88,8 +60,8 @@ class CommandHistory:
         self._sum[:, -1] += gain * turn, gain * turning, path, turning, path * abs(w), (w - self._rate) ** 2
         self._rate = w
 
-    def response(self, dt: float, lead: float) -> Response:
-        """Return what the wheels did in the last dt in s, if commands are early by `lead` in s."""
+    def response(self, dt: float, lead: float) -> tuple[Array, Array]:
+        """Return what the wheels did in the last dt in s (6,), if commands are early by `lead` in s, and d/dlead."""
         now, half = self._t[-1] - lead, dt / 2
         ends = np.array([now - dt - half, now - dt, now - half, now, now + half])
         at = (ends[:, None] - self._delay).ravel()
@@ -98,4 +70,4 @@ class CommandHistory:
         before = self._sum[:, k - 1]
         sums = (before + share * (self._sum[:, k] - before)).reshape(6, len(ends), -1) @ self._share
         earlier, start, middle, end, later = sums.T
-        return Response(end - start, -(later - 2 * middle + earlier) / dt)
+        return end - start, -(later - 2 * middle + earlier) / dt

@@ -24,16 +24,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from coopenv.estimation.arrays import Array
-from coopenv.observers.planar.commands import (
-    ARC,
-    PATH,
-    SLOWING,
-    SWITCHING,
-    TURN,
-    TURNING,
-    CommandHistory,
-    Wheels,
-)
+from coopenv.observers.planar.commands import ARC, PATH, SLOWING, SWITCHING, TURN, TURNING, CommandHistory, Wheels
 
 X, Y, HEADING, TURN_SCALE, SPEED_SCALE, TURN_OFFSET, SPEED_OFFSET, SLOWDOWN, LEAD, BIAS = range(10)
 STATES = 10
@@ -44,42 +35,27 @@ Seven = tuple[float, float, float, float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Tuning:
-    """Noise and choices of the filter; one of them serves all robots.
-
-    Attributes:
-        turn_noise: rad/sqrt(s), plus rad/sqrt(s) per rad/s, plus rad/sqrt(s) per m/s.
-        path_noise: m/sqrt(s), plus m/sqrt(s) per m/s.
-        slide_noise: m/sqrt(s) sideways per m/s.
-        bearing_std: rad.
-        gate: normalised innovation squared above which a bearing is dropped.
-        soft: normalised innovation squared above which a bearing's variance grows with it (a heavy tail).
-        mean: of turn scale, speed scale, turn offset, speed offset, slowdown, lead, bearing bias at the start.
-        std: of the same.
-        walk: of the same, per sqrt(s).
-        jitter: s, by which a step of the commanded rate may take effect sooner or later.
-        wheels: how the robot follows its commands.
-        fusion: how a neighbour's covariance counts: `plain` takes its errors as independent of ours, `intersection`
-            does not (split covariance intersection with the weight that leaves the least variance).
-        dependent: the share of both covariances that `intersection` takes as possibly shared errors.
-        arm_m: m, how far a rad of heading counts in that variance.
-        mutual: a robot that is seen corrects itself with the sighting, too.
-    """
+    """Noise and choices of the filter; one of them serves all robots."""
 
     turn_noise: tuple[float, float, float] = (0.02, 0.3, 0.0)
-    path_noise: tuple[float, float] = (0.01, 0.3)
-    slide_noise: float = 0.0
-    bearing_std: float = 0.03
-    gate: float = 9.0
-    soft: float = math.inf
+    """rad/sqrt(s), plus rad/sqrt(s) per rad/s, plus rad/sqrt(s) per m/s."""
+    path_noise: tuple[float, float] = (0.01, 0.3)  # m/sqrt(s), plus m/sqrt(s) per m/s
+    slide_noise: float = 0.0  # m/sqrt(s) sideways per m/s
+    bearing_std: float = 0.03  # rad
+    gate: float = 9.0  # normalised innovation squared above which a bearing is dropped
+    soft: float = math.inf  # the same above which a bearing's variance grows with it (a heavy tail)
     mean: Seven = (1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    std: Seven = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    walk: Seven = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    jitter: float = 0.0
+    """Of turn scale, speed scale, turn offset, speed offset, slowdown, lead and bearing bias at the start."""
+    std: Seven = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the same
+    walk: Seven = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the same, per sqrt(s)
+    jitter: float = 0.0  # s, by which a step of the commanded rate may take effect sooner or later
     wheels: Wheels = field(default_factory=Wheels)
     fusion: Literal["plain", "intersection"] = "plain"
-    dependent: float = 1.0
-    arm_m: float = 0.0
-    mutual: bool = False
+    """How a neighbour's covariance counts: `plain` takes its errors as independent of ours, `intersection` does not
+    (split covariance intersection with the weight that leaves the least variance)."""
+    dependent: float = 1.0  # the share of both covariances that `intersection` takes as possibly shared errors
+    arm_m: float = 0.0  # m, how far a rad of heading counts in that variance
+    mutual: bool = False  # whether a robot that is seen corrects itself with the sighting, too
 
 
 class PlanarPose(NamedTuple):
@@ -90,13 +66,7 @@ class PlanarPose(NamedTuple):
 
 
 class PlanarFilter:
-    """One robot's estimate.
-
-    Args:
-        tuning: noise and choices.
-        pose: (3,) x m, y m, heading rad at the start.
-        covariance: (3, 3) of it.
-    """
+    """One robot's estimate, which starts at a pose (x m, y m, heading rad) with a covariance (3, 3)."""
 
     def __init__(self, tuning: Tuning, pose: Array, covariance: Array) -> None:
         self.tuning = tuning
@@ -228,15 +198,9 @@ def growth(own: float, gain: float, cost: float, theirs: float, noise: float, de
     """Return by what our and their covariance grow before they are fused, so that less is left (else 0, 0).
 
     Split covariance intersection: Li, Nashashibi, "Cooperative multi-vehicle localization using split covariance
-    intersection filter", IEEE ITS Magazine 5(2), 2013; the weight is searched on a grid.
-
-    Args:
-        own: h P h^T, rad^2.
-        gain: weighted squares of P h^T.
-        cost: weighted trace of P.
-        theirs: rad^2, of the bearing, from the neighbour's covariance.
-        noise: rad^2.
-        dependent: share of both covariances that may come from the same errors.
+    intersection filter", IEEE ITS Magazine 5(2), 2013; the weight is searched on a grid. `own` is h P h^T, `gain` are
+    the weighted squares of P h^T, `cost` is the weighted trace of P, `theirs` and `noise` are variances of the bearing,
+    `dependent` is the share of both covariances that may come from the same errors.
     """
     ours_by, theirs_by = 1 + dependent * (1 / WEIGHTS - 1), 1 + dependent * (1 / (1 - WEIGHTS) - 1)
     left = ours_by * cost - ours_by**2 * gain / (ours_by * own + noise + theirs * theirs_by)

@@ -129,12 +129,12 @@ class DifferentiableWorld:
             records[name] = values
         return self._array(records, struct)
 
-    def _sums(self) -> Any:
+    def _record(self, struct: Any) -> Any:
         """Return a record of arrays of zeros, one entry per vehicle."""
-        sums = Information()
-        for name, var in Information.vars.items():
-            setattr(sums, name, self._make(var.type.dtype))
-        return sums
+        record = struct()
+        for name, var in struct.vars.items():
+            setattr(record, name, self._make(var.type.dtype))
+        return record
 
     def _start(self) -> tuple[Any, Any, Any]:
         state, L = self._world.state, self._world.model.landmarks
@@ -177,7 +177,7 @@ class DifferentiableWorld:
             record_tape=False,
         )
         dt = wp.float64(1.0 / rate)
-        predicted, after, sums = self._make(Belief), self._make(Belief), self._sums()
+        predicted, after, sums = self._make(Belief), self._make(Belief), self._record(Information)
         self._launch(predict_kernel, [world.model, held, belief, predicted, dt])
         counts = world.model.target_count.numpy()
         for vehicle in self._order:

@@ -64,7 +64,7 @@ def test_response_is_the_delayed_and_spread_command():
             total += share * quad(function, a, b, points=inside)[0]
         return total
 
-    done = response.done
+    done = response[0]
     assert done[TURN] == pytest.approx(expected(lambda t: rate(t, 1)), abs=1e-9)
     assert done[PATH] == pytest.approx(expected(lambda t: rate(t, 0)), abs=1e-9)
     assert done[ARC] == pytest.approx(expected(lambda t: float(rate(t, 1) != 0)), abs=1e-9)
@@ -77,7 +77,7 @@ def test_steps_of_the_rate_are_summed():
     total = 0.0
     for w in (0.0, 0.4, 0.4, -0.2, 0.0, 0.0):
         commands.add(DT, w * DT, 0.0)
-        total += commands.response(DT, 0.0).done[SWITCHING]
+        total += commands.response(DT, 0.0)[0][SWITCHING]
     assert total == pytest.approx(0.4**2 + 0.6**2 + 0.2**2)
 
 
@@ -113,8 +113,8 @@ def test_motion_derivatives_agree_with_differences():
 
 def test_derivative_by_the_lead_is_the_slope_across_a_tick():
     commands, lead = history(IROBOT_CREATE), 0.2
-    across = (commands.response(DT, lead + DT / 2).done - commands.response(DT, lead - DT / 2).done) / DT
-    np.testing.assert_allclose(commands.response(DT, lead).by_lead, across, atol=1e-12)
+    across = (commands.response(DT, lead + DT / 2)[0] - commands.response(DT, lead - DT / 2)[0]) / DT
+    np.testing.assert_allclose(commands.response(DT, lead)[1], across, atol=1e-12)
 
 
 @pytest.mark.parametrize("seen", [False, True])
