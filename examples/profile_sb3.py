@@ -8,8 +8,8 @@ from time import perf_counter
 import torch
 from stable_baselines3 import PPO
 
+import coopenv
 from coopenv.api.trainers.sb3 import CooperativeSB3VecEnv
-from coopenv.scenario import load_scenario
 
 torch.set_num_threads(1)
 
@@ -27,7 +27,7 @@ class TimedEnv(CooperativeSB3VecEnv):
         return result
 
 
-env = TimedEnv(load_scenario("urban_crossing"), num_worlds=64)
+env = TimedEnv(coopenv.make_vec("urban_crossing", num_worlds=64, autoreset="same_step"))
 model = PPO("MlpPolicy", env, n_steps=64, seed=0, device="cpu")
 model.learn(2 * 64 * env.num_envs)  # compile and warm up
 env.seconds, start = 0.0, perf_counter()

@@ -120,7 +120,8 @@ class Engine:
                 seeds = [first + world for world in range(self.world.worlds)]
         self.world.reset(seeds, mask, options)
         chosen = np.ones(self.world.worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
-        self._start_plugins(chosen)
+        if self.plugins is not None:
+            self.plugins.start(np.flatnonzero(chosen))
         self._fresh.assign(chosen.astype(np.int32))
         self._fill_results("results fresh", self._fresh, self._fresh)
         self.begun = True
@@ -140,10 +141,6 @@ class Engine:
         (self.plugins or self.world).load()
         self._end_episodes()
         self._fill_results("load", self._nowhere, self._nowhere)
-
-    def _start_plugins(self, chosen: np.ndarray) -> None:
-        if self.plugins is not None:
-            self.plugins.start(np.flatnonzero(chosen))
 
     def _advance(self, ticks: int) -> None:
         (self.plugins or self.world).advance(ticks)

@@ -12,10 +12,9 @@ from pettingzoo import ParallelEnv
 
 from coopenv.api.actions import ActionReader
 from coopenv.api.engine import Engine
-from coopenv.api.infos import InfoWriter
+from coopenv.api.infos import InfoWriter, state_space, state_vector
 from coopenv.api.pictures import Pictures
 from coopenv.api.reward import RewardFunction
-from coopenv.api.state import state_space, state_vector
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
 from coopenv.backends.base import Backend, Health
 from coopenv.backends.simulated import Simulated
@@ -64,6 +63,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         reward: RewardFunction | None = None,
     ) -> None:
         """Build the world; use `coopenv.parallel_env` to build one by name."""
+        self._arguments = {key: value for key, value in locals().items() if key != "self"}
         _one_of("render_mode", render_mode, (None, *RENDER_MODES))
         _one_of("observation", observation, ("flat", "dict"))
         backend = Simulated(source) if isinstance(source, Scenario) else source
@@ -74,15 +74,6 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             "render_modes": list(RENDER_MODES),
             "render_fps": scenario.rates.decision,
             "is_parallelizable": True,
-        }
-        self._arguments = {
-            "source": source,
-            "name": name,
-            "render_mode": render_mode,
-            "observation": observation,
-            "device": device,
-            "dtype": dtype,
-            "reward": reward,
         }
         self.engine = Engine(scenario, 1, dtype, device, backend=backend, reward=reward)
         self.possible_agents = list(scenario.vehicle_names)
@@ -140,18 +131,10 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             return {}, {}, {}, {}, {}
         with self.engine.stopping():
             self.engine.step(self._read_actions(actions, alive))
-        indices = [self._index[agent] for agent in alive]
-        reward = self.engine.view("reward")[0].tolist()
-        terminated = self.engine.view("terminated")[0].tolist()
-        truncated = self.engine.view("truncated")[0].tolist()
-        result = (
-            self._observations(alive),
-            {agent: reward[i] for agent, i in zip(alive, indices, strict=True)},
-            {agent: terminated[i] for agent, i in zip(alive, indices, strict=True)},
-            {agent: truncated[i] for agent, i in zip(alive, indices, strict=True)},
-            self._infos(alive),
-        )
-        self.agents = [agent for agent, i in zip(alive, indices, strict=True) if not (terminated[i] or truncated[i])]
+        values = (self.engine.view(name)[0].tolist() for name in ("reward", "terminated", "truncated"))
+        rewards, terminated, truncated = ({agent: of[self._index[agent]] for agent in alive} for of in values)
+        result = self._observations(alive), rewards, terminated, truncated, self._infos(alive)
+        self.agents = [agent for agent in alive if not (terminated[agent] or truncated[agent])]
         if self.render_mode == "human":
             self.render()
         return result
@@ -171,7 +154,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         return self.engine.backend.health
 
     def state(self) -> np.ndarray:
-        """Return the truth and the estimates of all vehicles as one vector, see `coopenv.api.state`."""
+        """Return the truth and the estimates of all vehicles as one vector, see `coopenv.api.infos.state_vector`."""
         return state_vector(self.engine)
 
     def render(self) -> np.ndarray | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,18 +21,9 @@ class Pictures:
         self._engine, self._scenario = engine, scenario
         self._view: TopView | None = None
 
-    @property
-    def view(self) -> TopView:
-        """What draws, made when it is first asked for."""
-        if self._view is None:
-            from coopenv.viz.topview import TopView
-
-            self._view = TopView(self._scenario)
-        return self._view
-
     def of(self, world: int = 0) -> np.ndarray:
         """Return an (H, W, 3) uint8 picture of a world."""
-        return self.view.draw(_OneWorld(self._engine, world))
+        return self.view.draw(SimpleNamespace(view=lambda name: self._engine.view(name)[world : world + 1]))
 
     def show(self) -> None:
         """Draw the first world in a window."""
@@ -43,13 +35,11 @@ class Pictures:
             self._view.close()
             self._view = None
 
+    @property
+    def view(self) -> TopView:
+        """What draws, made when it is first asked for."""
+        if self._view is None:
+            from coopenv.viz.topview import TopView
 
-class _OneWorld:
-    """An engine's views as if one of its worlds were the only one."""
-
-    def __init__(self, engine: Engine, world: int) -> None:
-        self._engine, self._world = engine, world
-
-    def view(self, name: str) -> np.ndarray:
-        """Return a field with a leading axis of one world."""
-        return self._engine.view(name)[self._world : self._world + 1]
+            self._view = TopView(self._scenario)
+        return self._view

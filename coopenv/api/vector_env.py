@@ -65,7 +65,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             raise CoopenvError(f"unknown render_mode '{render_mode}'; known: None, rgb_array")
         self.scenario = scenario
         self.engine = Engine(scenario, num_worlds, dtype, device, threads, reward=reward)
-        self._pictures = Pictures(self.engine, scenario)
+        self.pictures = Pictures(self.engine, scenario)
         self.num_worlds, self.vehicles = self.engine.world.worlds, len(scenario.vehicles)
         self.num_envs = self.num_worlds * self.vehicles
         self.autoreset = autoreset_mode(autoreset)
@@ -209,7 +209,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Return one (H, W, 3) uint8 picture per row; the rows of a world share the top view of their world."""
         if self.render_mode is None:
             return None
-        pictures = [self._pictures.of(world) for world in range(self.num_worlds)]
+        pictures = [self.pictures.of(world) for world in range(self.num_worlds)]
         return tuple(picture for picture in pictures for _ in range(self.vehicles))
 
     def get_state(self) -> dict[str, Any]:
@@ -234,7 +234,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Close the renderer and end the threads."""
         if hasattr(self, "engine"):
             self.engine.close()
-            self._pictures.close()
+            self.pictures.close()
 
 
 def autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:

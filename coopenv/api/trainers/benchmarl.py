@@ -38,31 +38,22 @@ class CooperativeTask(TaskClass):
         )
 
     def supports_continuous_actions(self) -> bool:
-        """Return True."""
         return True
 
     def supports_discrete_actions(self) -> bool:
-        """Return False."""
         return False
 
     def max_steps(self, env: EnvBase) -> int:
-        """Return the decision steps to the horizon."""
         scenario = env.unwrapped.scenario
-        result: int = round(scenario.horizon * scenario.rates.decision)
-        return result
+        return round(float(scenario.horizon * scenario.rates.decision))
 
     def has_render(self, env: EnvBase) -> bool:
-        """Return whether the world was built to be drawn."""
-        result: bool = env.unwrapped.render_mode == "rgb_array"
-        return result
+        return bool(env.unwrapped.render_mode == "rgb_array")
 
     def group_map(self, env: EnvBase) -> dict[str, list[str]]:
-        """Return {"vehicle": all}."""
-        result: dict[str, list[str]] = env.group_map
-        return result
+        return dict(env.group_map)
 
     def observation_spec(self, env: EnvBase) -> Composite:
-        """Return the spec of what the vehicles see."""
         return _only(env, "observation")
 
     def info_spec(self, env: EnvBase) -> Composite:
@@ -74,16 +65,13 @@ class CooperativeTask(TaskClass):
         return Composite({"state": env.observation_spec["state"].clone()})
 
     def action_spec(self, env: EnvBase) -> Composite:
-        """Return the spec of the actions."""
         return env.full_action_spec
 
     def action_mask_spec(self, env: EnvBase) -> None:
-        """Return None: all actions are possible."""
         return None
 
     @staticmethod
     def env_name() -> str:
-        """Return "coopenv"."""
         return "coopenv"
 
     @staticmethod

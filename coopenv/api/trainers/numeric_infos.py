@@ -25,12 +25,10 @@ class PlainInfos(BaseParallelWrapper[str, Any, np.ndarray]):
         self.state_space = env.state_space
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Start an episode."""
         observations, infos = self.env.reset(seed=seed, options=options)
         return observations, {agent: plain(info) for agent, info in infos.items()}
 
     def step(self, actions: dict[str, np.ndarray]) -> Any:
-        """Drive for one decision period."""
         living = {agent: actions[agent] for agent in self.env.agents if agent in actions}
         *results, infos = self.env.step(living)
         return *results, {agent: plain(info) for agent, info in infos.items()}

@@ -42,13 +42,11 @@ class CooperativeMultiAgentEnv(MultiAgentEnv):
         super().__init__()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]:
-        """Start an episode."""
         observations, infos = self.env.reset(seed=seed, options=options)
         self.agents = list(self.env.agents)
         return observations, infos
 
     def step(self, action_dict: dict[str, np.ndarray]) -> tuple[Any, Any, Any, Any, Any]:
-        """Drive for one decision period."""
         observations, rewards, terminated, truncated, infos = self.env.step(action_dict)
         self.agents = list(self.env.agents)
         horizon = any(truncated.values())
@@ -56,9 +54,7 @@ class CooperativeMultiAgentEnv(MultiAgentEnv):
         return observations, rewards, over, {"__all__": horizon}, infos
 
     def render(self) -> Any:
-        """Draw the top view."""
         return self.env.render()
 
     def close(self) -> None:
-        """Close the window, if any."""
         self.env.close()

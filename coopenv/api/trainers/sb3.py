@@ -1,20 +1,14 @@
 """Stable-Baselines3: the batch as a native `VecEnv`, rows (world, vehicle). Needs the extra `train`."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from coopenv.api.array_io import Exchange, host_actions
-from coopenv.api.engine import Engine
-from coopenv.api.pictures import Pictures
-from coopenv.api.reward import RewardFunction
-from coopenv.api.terms.layout import Layout, action_space, flat_space
+from coopenv.api.terms.layout import Layout
+from coopenv.api.vector_env import CooperativeVectorEnv, make_vec
 from coopenv.errors import CoopenvError, checked_seed
-from coopenv.scenario import Scenario, load_scenario
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -33,67 +27,48 @@ class CooperativeSB3VecEnv(VecEnv):
     worth nothing, when the world is over. `info["alive"]` is False in those rows at every done.
     """
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        *,
-        num_worlds: int,
-        dtype: str = "float32",
-        threads: int | None = None,
-        reward: RewardFunction | None = None,
-    ) -> None:
-        """Build the worlds; use `make_sb3_vec_env` to build them by name."""
-        self.scenario = scenario
-        self.engine = Engine(scenario, num_worlds, dtype, "cpu", threads, reward=reward)
-        self.vehicles = len(scenario.vehicles)
-        self.render_mode = "rgb_array"
-        self.metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": scenario.rates.decision}
-        self._actions = np.zeros((num_worlds, self.vehicles, 2), dtype=np.float32)
-        self._pictures = Pictures(self.engine, scenario)
-        self._rows = Exchange(self.engine, "numpy").rows
-        super().__init__(num_worlds * self.vehicles, flat_space(self.engine.layout), action_space())
+    def __init__(self, envs: CooperativeVectorEnv) -> None:
+        """Show a batch with the autoreset mode SAME_STEP and NumPy arrays; `make_sb3_vec_env` builds one by name."""
+        self.envs = envs
+        self.scenario, self.engine, self.vehicles = envs.scenario, envs.engine, envs.vehicles
+        self.render_mode, self.metadata = "rgb_array", envs.metadata
+        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     @property
     def observation_layout(self) -> Layout:
         """Name, slice, unit and scale of every field of an observation row."""
-        return self.engine.layout.copy()
+        return self.envs.observation_layout
 
     def reset(self) -> np.ndarray:
         """Start a new episode in every world; seeds given by `seed()` count once."""
-        first = self._seeds[0]
-        seeds = None if first is None else [checked_seed(first) + w for w in range(self.engine.world.worlds)]
-        self.engine.reset(seeds)
+        observation: np.ndarray = self.envs.reset(seed=self._seeds[0])[0]
         self._reset_seeds()
         self._reset_options()
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        observation: np.ndarray = self._rows("observation")
         return observation
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions, (num_envs, 2).
-
-        Raises:
-            ActionError: wrong shape, or not finite.
-        """
-        self.engine.check_begun()
-        self._actions[...] = host_actions(actions, self._actions.shape)
+        """Take the actions, (num_envs, 2)."""
+        self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Drive for one decision period and reset the worlds that are over."""
-        self.engine.step(self._actions)
-        rewards, terminated, truncated = (self._rows(n) for n in ("reward", "terminated", "truncated"))
+        """Drive for one decision period and reset the worlds that are over.
+
+        Raises:
+            ActionError: actions of a wrong shape, or not finite.
+        """
+        observation, rewards, terminated, truncated, after = self.envs.step(self._actions)
         dones = terminated | truncated
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if dones.any():
-            alive, final = self._rows("alive"), self.engine.view("observation").reshape(self.num_envs, -1)
+            final, alive = after["final_obs"], after["final_info"]["alive"]
             for row in np.flatnonzero(dones).tolist():
                 infos[row] = {
                     "terminal_observation": final[row].copy(),
                     "TimeLimit.truncated": bool(truncated[row] and alive[row]),
                     "alive": bool(alive[row]),
                 }
-            self.engine.restart_finished()
-        return self._rows("observation"), rewards, dones, infos
+        return observation, rewards, dones, infos
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
         """Set the seed of the next reset: world w gets seed + w.
@@ -101,20 +76,16 @@ class CooperativeSB3VecEnv(VecEnv):
         Raises:
             CoopenvError: not a whole number, or negative.
         """
-        result: Sequence[int | None] = super().seed(None if seed is None else checked_seed(seed))
-        return result
+        return list(super().seed(None if seed is None else checked_seed(seed)))
 
     def close(self) -> None:
-        """Close the renderer and end the threads."""
-        self.engine.world.launch.close()
-        self._pictures.close()
+        self.envs.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Return one picture, the top view of world 0."""
-        return [self._pictures.of()]
+        return [self.envs.pictures.of()]
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """Return an attribute of the batch once per row."""
         return [getattr(self, attr_name)] * len(self._chosen(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
@@ -150,33 +121,18 @@ class CooperativeSB3VecEnv(VecEnv):
             raise CoopenvError(f"{what}: rows share one batch, so it cannot be done for some rows only")
 
 
-def make_sb3_vec_env(
-    name_or_path: str | Path,
-    *,
-    num_worlds: int,
-    dtype: str = "float32",
-    overrides: Mapping[str, Any] | None = None,
-    threads: int | None = None,
-    seed: int | None = None,
-    reward: RewardFunction | None = None,
-) -> CooperativeSB3VecEnv:
+def make_sb3_vec_env(name_or_path: str | Path, *, seed: int | None = None, **options: Any) -> CooperativeSB3VecEnv:
     """Return num_worlds x vehicles rows as an SB3 `VecEnv`.
 
     Args:
         name_or_path: environment or TOML file.
-        num_worlds: how many worlds.
-        dtype: precision of the worlds; observations and rewards are float32.
-        overrides: dotted scenario keys.
-        threads: shares of the batch; None: by size and cores.
         seed: of the first reset; world w gets seed + w.
-        reward: in place of the scenario's weighted sum, see `coopenv.make_vec`.
+        options: `num_worlds` and whatever else `coopenv.make_vec` takes but `autoreset`, `arrays` and `device`.
 
     Raises:
         CoopenvError: any argument is not valid.
     """
-    env = CooperativeSB3VecEnv(
-        load_scenario(name_or_path, overrides), num_worlds=num_worlds, dtype=dtype, threads=threads, reward=reward
-    )
+    env = CooperativeSB3VecEnv(make_vec(name_or_path, **options, autoreset="same_step", arrays="numpy", device="cpu"))
     if seed is not None:
         env.seed(seed)
     return env
