@@ -1,7 +1,5 @@
 """Read a dictionary of actions into one array, or say in one line what is wrong with it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Hand arrays of a batch in and out: NumPy copies on the host, or torch tensors that share memory."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from typing import Any, Literal
 

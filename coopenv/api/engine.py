@@ -1,7 +1,5 @@
 """The batched core under every interface: worlds plus step results, with constant Python work per step."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import chain

@@ -1,7 +1,5 @@
 """What one world tells beside observations: infos of its agents, and the state of everybody."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

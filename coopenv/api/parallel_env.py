@@ -1,7 +1,5 @@
 """The PettingZoo environment: one world, dictionaries keyed by agent."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal

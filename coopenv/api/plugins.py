@@ -1,7 +1,5 @@
 """Observers in NumPy in place of the embedded one: the world goes tick by tick, they estimate in between."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

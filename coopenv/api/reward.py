@@ -1,7 +1,5 @@
 """A reward in Python: what a step came to, of all vehicles of all worlds at once, and a function of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The Gymnasium environment: one vehicle is the agent, the others follow a fixed rule."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The batched Gymnasium environment: rows are (world, vehicle), for policies that all vehicles share."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path

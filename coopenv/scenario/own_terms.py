@@ -1,7 +1,5 @@
 """Terms of one's own: made known by name in a program, or by their place in a scenario's file; see docs/terms.md."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path

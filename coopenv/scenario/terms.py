@@ -4,8 +4,6 @@ A row says what a term is and names the function that computes it. From the rows
 weights that a scenario may set, the kernel (`coopenv.api.terms`), and the tables of `coopenv describe`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Generic, Literal, TypeVar
 

@@ -1,7 +1,5 @@
 """The terms that a scenario names, bound to their Warp functions."""
 
-from __future__ import annotations
-
 import inspect
 import linecache
 from collections.abc import Callable, Mapping

@@ -4,8 +4,6 @@ They return the value in the row's unit; scaling and clipping, or weights, follo
 privileged. Records: see `coopenv.api.terms.records`.
 """
 
-from __future__ import annotations
-
 import warp as wp
 
 from coopenv.api.terms.records import Ego, Neighbour, Target, Truth

@@ -4,8 +4,6 @@ Each combination of terms has a Warp module of its own, which is compiled once p
 terms are unrolled by `wp.static`.
 """
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Sequence
 from functools import cache

@@ -1,7 +1,5 @@
 """BenchMARL: every environment as a task. Needs the extra `benchmarl`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from itertools import count, repeat
 from pathlib import Path

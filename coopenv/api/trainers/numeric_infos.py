@@ -1,7 +1,5 @@
 """A world for trainers that put infos into arrays: numbers only, no truth, and no complaint about the dead."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

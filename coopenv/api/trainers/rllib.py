@@ -1,7 +1,5 @@
 """RLlib, new API stack: one world as a `MultiAgentEnv`. Needs the extra `rllib`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
