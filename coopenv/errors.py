@@ -4,8 +4,7 @@ import os
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
-MAX_MESSAGE = 600
-"""Characters of an error, which is to be one line that can be read."""
+MAX_MESSAGE = 600  # characters of an error, which is to be one line that can be read
 
 
 class CoopenvError(ValueError):

@@ -17,10 +17,8 @@ from coopenv.errors import OutputError
 from coopenv.interrupts import before_a_hard_end, held, note
 from coopenv.staging import PART, abandoned, copy_owner, heal, new_part, put_in_place, sync
 
-PROBE_BYTES = 1 << 16
-"""Written before the work begins, to find a disk that is full already."""
-LAST_WAIT = 0.5
-"""s to wait for a result that is being put in place, before the process is ended."""
+PROBE_BYTES = 1 << 16  # written before the work begins, to find a disk that is full already
+LAST_WAIT = 0.5  # s to wait for a result that is being put in place, before the process is ended
 
 _replacing = threading.Lock()
 _under_way: list[Path] = []

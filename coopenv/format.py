@@ -5,8 +5,7 @@ from collections.abc import Sequence
 
 NONE = "-"
 MOST_DECIMALS = 5
-FINEST_ERROR = 1e-3
-"""Share of its number below which a standard error is no longer told by its first digit."""
+FINEST_ERROR = 1e-3  # share of its number below which a standard error is no longer told by its first digit
 
 
 def number(value: float, digits: int = 4) -> str:

@@ -14,8 +14,7 @@ from typing import NoReturn
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 PATIENCE = 1.0
 """s that a command has to end by itself. One that is within a long call of a library, such as a compiler, cannot."""
-REMINDERS = 10
-"""Signals that are sent again to the main thread meanwhile."""
+REMINDERS = 10  # signals that are sent again to the main thread meanwhile
 HIDDEN_CURSOR_BACK = "\x1b[?25h"
 
 _received = 0

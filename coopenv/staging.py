@@ -15,8 +15,7 @@ try:
 except ImportError:  # no POSIX: nobody can tell whether a hidden folder is still in use, so all of them stay
     fcntl = None  # type: ignore[assignment]
 
-PART, OLD = ".part", ".old"
-"""Suffixes of hidden folders: what is being written, and what has made room for it."""
+PART, OLD = ".part", ".old"  # suffixes of hidden folders: what is being written, and what has made room for it
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 
 

@@ -8,11 +8,13 @@ has nothing visible (`Sensed`). A backend never waits longer than its deadlines;
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
 from coopenv.estimation.arrays import Array
+from coopenv.observers.briefing import briefing_of
 from coopenv.observers.recording import Briefing, Sensed
 from coopenv.scenario import Scenario
 from coopenv.world.command import ACCELERATION, SPEED, STEERING
@@ -133,10 +135,10 @@ class SensingWorld(World):
         self.missing = np.zeros(self.model.vehicles, dtype=np.int64)
         """(N,) ticks of it of which nothing came."""
 
-    @property
+    @cached_property
     def briefing(self) -> Briefing:
         """What observers are told before the first tick."""
-        raise NotImplementedError
+        return briefing_of(self.scenario, self.model)
 
     def sensed(self, world: int, k: int) -> Sensed:
         """Return what the vehicles of one world sense at the present tick k, without truth and messages."""

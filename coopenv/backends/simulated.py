@@ -11,8 +11,8 @@ import warp as wp
 from coopenv.backends.base import Capabilities, SensingWorld
 from coopenv.backends.generator import Episode, TickGenerator
 from coopenv.estimation.trajectory import Sight
-from coopenv.observers.briefing import briefing_of, start_covariances
-from coopenv.observers.recording import Briefing, Sensed, Truth, is_due
+from coopenv.observers.briefing import start_covariances
+from coopenv.observers.recording import Sensed, Truth, is_due
 from coopenv.observers.registry import find_embedded
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST
@@ -20,11 +20,6 @@ from coopenv.world.embedded import HOST
 
 class SimulatedWorld(SensingWorld):
     """A world that reads what vehicles sense from its state: copies in float64, bearings in the body frame."""
-
-    @cached_property
-    def briefing(self) -> Briefing:
-        """What observers are told before the first tick."""
-        return briefing_of(self.scenario, self.model)
 
     @cached_property
     def _camera(self) -> np.ndarray:

@@ -14,8 +14,7 @@ from coopenv.observers.recording import Recording
 from coopenv.scenario import Scenario, load_scenario
 
 BACKENDS = ("simulated", "replay")
-PLANNED = ("svea", "highway")
-"""Backends that there will be."""
+PLANNED = ("svea", "highway")  # backends that there will be
 
 LOG_SUFFIX = ".mcap"
 DATASETS = re.compile(r"mrclam_\d+")

@@ -1,8 +1,7 @@
 """A world whose ticks come from a backend, one after the other; estimators and reports run on it as on any other."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
-from functools import cached_property
 from types import SimpleNamespace
 from typing import Any, NoReturn, cast
 
@@ -13,13 +12,14 @@ from coopenv.backends.replay.kernels import BY_RADIO, RECORDED, record_struct, t
 from coopenv.backends.tick_checks import MEASURED, check_tick, is_sound
 from coopenv.errors import CoopenvError
 from coopenv.estimation.se3 import exp_se3
-from coopenv.observers.briefing import briefing_of, start_covariances
+from coopenv.observers.briefing import start_covariances
 from coopenv.observers.contract import Message
 from coopenv.observers.kernel_world import views_of
 from coopenv.observers.recording import Briefing, Sensed, Truth, is_due
 from coopenv.observers.registry import find_embedded
 from coopenv.world.embedded import HOST
 from coopenv.world.records import allocate, fields
+from coopenv.world.world import Options, Seeds
 
 
 def open_world(backend: Backend, worlds: int, dtype: str, device: str, threads: int | None) -> SensingWorld:
@@ -50,11 +50,6 @@ class TickWorld(SensingWorld):
         self._present = _nothing(self.briefing)
         self._ticks: Iterator[Sensed] = iter(())
 
-    @cached_property
-    def briefing(self) -> Briefing:
-        """What observers are told before the first tick."""
-        return briefing_of(self.scenario, self.model)
-
     def sensed(self, world: int, k: int) -> Sensed:
         """Return the present tick."""
         return self._present
@@ -77,12 +72,7 @@ class TickWorld(SensingWorld):
         self._row = {n: getattr(record, n).numpy()[0] for n, field in fields(struct).items() if field.axes[0] == "K"}
         return record
 
-    def reset(
-        self,
-        seeds: Sequence[int] | np.ndarray | None = None,
-        mask: np.ndarray | None = None,
-        options: Mapping[str, Any] | None = None,
-    ) -> None:
+    def reset(self, seeds: Seeds = None, mask: np.ndarray | None = None, options: Options = None) -> None:
         """Begin an episode of the backend, see `World.reset`."""
         self._ticks = iter(())
         self._present = _nothing(self.briefing)

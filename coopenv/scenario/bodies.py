@@ -83,8 +83,7 @@ class SegmentMotion(Part):
     segments: tuple[TwistSegment, ...] = Field(min_length=1)
 
 
-FASTEST = 1e6
-"""m/s, on average from one waypoint to the next."""
+FASTEST = 1e6  # m/s, on average from one waypoint to the next
 
 
 class Waypoint(Part):

@@ -18,12 +18,10 @@ from coopenv.shipped import data_directory, list_envs
 DEFAULTS_KEY = "vehicle_defaults"
 """A table of the file whose entries every vehicle takes over unless it says otherwise."""
 
-MOST_BYTES = 8 * 2**20
-"""Of a file; 20,000 landmarks take one or two million."""
+MOST_BYTES = 8 * 2**20  # of a file; 20,000 landmarks take one or two million
 
 
-BAGS = (".db3", ".bag")
-"""Suffixes of ROS bags, which are taken for log files by mistake."""
+BAGS = (".db3", ".bag")  # suffixes of ROS bags, which are taken for log files by mistake
 
 
 def scenario_path(name_or_path: str | Path) -> Path:

@@ -18,8 +18,7 @@ MOST_ROWS = 200
 """... but at most so many from one waypoint to the next, so that the table grows with the waypoints and not with time.
 From pose to pose the path is an arc, which strays from the cubic by less than half of its length."""
 
-STANDING = 1e-3
-"""m/s below which a spline's heading is held."""
+STANDING = 1e-3  # m/s below which a spline's heading is held
 
 
 @dataclass(frozen=True)

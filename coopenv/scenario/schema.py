@@ -15,11 +15,9 @@ from coopenv.scenario.fields import ScenarioFields
 from coopenv.scenario.starts import check_room
 from coopenv.scenario.topology import neighbour_sets, processing_order
 
-MOST_TICKS = 1e8
-"""Camera frames or odometry samples of one episode; counters are 32 bits wide."""
+MOST_TICKS = 1e8  # camera frames or odometry samples of one episode; counters are 32 bits wide
 
-MOST_PAIRS = 2e7
-"""Of vehicles and their targets."""
+MOST_PAIRS = 2e7  # of vehicles and their targets
 
 FAR_FROM_ORIGIN = 50.0
 """m; beyond it the paper's observer loses accuracy, because it is not invariant to the map origin."""

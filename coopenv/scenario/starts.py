@@ -15,11 +15,9 @@ from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.fields import ScenarioFields
 from coopenv.scenario.motion import path_heading
 
-SAME_PLACE = 1e-6
-"""m"""
+SAME_PLACE = 1e-6  # m
 
-BLOCK = 200_000
-"""Pairs that are compared at a time; each takes some 400 bytes."""
+BLOCK = 200_000  # pairs that are compared at a time; each takes some 400 bytes
 
 
 def rotation_of(yaw: float | None, quaternion_wxyz: Any) -> np.ndarray:
@@ -53,12 +51,9 @@ def agent_starts(scenario: ScenarioFields) -> tuple[np.ndarray, np.ndarray]:
 class Boxes(NamedTuple):
     """n boxes; a half size of zero makes a point."""
 
-    center: NDArray[np.float64]
-    """(n, 3) m"""
-    rotation: NDArray[np.float64]
-    """(n, 3, 3)"""
-    half: NDArray[np.float64]
-    """(n, 3) half of the edges, m"""
+    center: NDArray[np.float64]  # (n, 3) m
+    rotation: NDArray[np.float64]  # (n, 3, 3)
+    half: NDArray[np.float64]  # (n, 3) half of the edges, m
 
 
 def boxes_overlap(a: Boxes, b: Boxes) -> NDArray[np.bool_]:

@@ -20,8 +20,7 @@ from coopenv.world.precision import Precision
 GRAMIAN_RATE = 20.0
 """Hz at which the sliding Gramian is sampled: it says how the scene is seen over a second, not within a frame."""
 
-GRAMIAN_BLOCKS = 10
-"""Blocks of the sliding window of the observability Gramian; it moves on by one block."""
+GRAMIAN_BLOCKS = 10  # blocks of the sliding window of the observability Gramian; it moves on by one block
 
 NOWHERE = (0.0, 0.0, 0.0)
 

@@ -8,8 +8,7 @@ from coopenv.estimation.so3 import increment, orthonormalise, rigid_motion
 from coopenv.world.command import ACCELERATION, SPEED, STEERING, command_in_force
 from coopenv.world.model import DRIVEN, PRESCRIBED
 
-LONGEST_SUBSTEP = wp.constant(wp.float64(0.0100001))
-"""s; the bicycle's twist is held over no longer than this."""
+LONGEST_SUBSTEP = wp.constant(wp.float64(0.0100001))  # s; the bicycle's twist is held over no longer than this
 
 
 @wp.func

@@ -2,6 +2,8 @@
 
 import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from glob import escape
 from pathlib import Path
 from typing import Any
@@ -12,20 +14,29 @@ from coopenv.errors import CoopenvError
 
 ATTEMPTS = 3
 """Attempts to load a module. The second builds it anew; a third is for two processes that mend the same one."""
-PROBE_BYTES = 5 << 20
-"""As much as the source and the code of a large module have."""
+PROBE_BYTES = 5 << 20  # as much as the source and the code of a large module have
 
 
 class KernelCacheError(CoopenvError):
     """Compiled kernels cannot be kept where they should go."""
 
 
+@contextmanager
+def _written() -> Iterator[None]:
+    """Say where compiled kernels should have gone, and what to do."""
+    try:
+        yield
+    except OSError as error:
+        raise KernelCacheError(
+            f"cannot keep compiled kernels in {cache_folder()}: {error.strerror or error}; set the variable "
+            "WARP_CACHE_PATH to a folder that can be written"
+        ) from None
+
+
 def start() -> None:
     """Initialise Warp, which makes the folder of the cache. Raises KernelCacheError: it cannot."""
-    try:
+    with _written():
         wp.init()
-    except OSError as error:
-        raise unwritable(error) from None
 
 
 def launch(kernel: wp.Kernel, **options: Any) -> Any:
@@ -57,16 +68,5 @@ def cache_folder() -> Path:
 
 def probe() -> None:
     """Make sure that the cache can be written. Raises KernelCacheError: it cannot."""
-    try:
-        with tempfile.TemporaryFile(dir=cache_folder()) as stream:
-            stream.write(bytes(PROBE_BYTES))
-    except OSError as error:
-        raise unwritable(error) from None
-
-
-def unwritable(error: OSError) -> KernelCacheError:
-    """Return the error that says where compiled kernels should have gone, and what to do."""
-    return KernelCacheError(
-        f"cannot keep compiled kernels in {cache_folder()}: {error.strerror or error}; set the variable "
-        "WARP_CACHE_PATH to a folder that can be written"
-    )
+    with _written(), tempfile.TemporaryFile(dir=cache_folder()) as stream:
+        stream.write(bytes(PROBE_BYTES))

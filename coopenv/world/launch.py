@@ -20,8 +20,8 @@ from coopenv.errors import CoopenvError
 from coopenv.machine import available_cores
 from coopenv.world import kernel_cache
 
-WORLDS_PER_THREAD = 32
-"""Smaller shares are not worth the handing over between threads."""
+Function = Callable[..., None] | wp.Kernel
+WORLDS_PER_THREAD = 32  # smaller shares are not worth the handing over between threads
 
 
 @cache
@@ -37,9 +37,9 @@ def start_warp() -> None:
     except OSError:  # no standard error: nothing to mute
         kernel_cache.start()
         return
-    with Path(os.devnull).open("wb") as nothing:
-        os.dup2(nothing.fileno(), 2)
     try:
+        with Path(os.devnull).open("wb") as nothing:
+            os.dup2(nothing.fileno(), 2)
         kernel_cache.start()
     finally:
         os.dup2(saved, 2)
@@ -47,7 +47,7 @@ def start_warp() -> None:
 
 
 @cache
-def kernel(function: Callable[..., None] | wp.Kernel, precision_name: str, differentiable: bool = False) -> wp.Kernel:
+def kernel(function: Function, precision_name: str, differentiable: bool = False) -> wp.Kernel:
     """Return a plain Python function as a Warp kernel whose module serves one precision only.
 
     Options in its attribute `options` hold for it, besides those that its file sets with `wp.set_module_options`.
@@ -110,17 +110,10 @@ class Launcher:
         self._pool: ThreadPoolExecutor | None = None
         self._pool_owner = 0
 
-    def __call__(
-        self,
-        key: Hashable,
-        function: Callable[..., None] | wp.Kernel,
-        arguments: list[Any],
-        inner: tuple[int, ...] = (),
-    ) -> None:
+    def __call__(self, key: Hashable, function: Function, arguments: list[Any], inner: tuple[int, ...] = ()) -> None:
         """Run a kernel over the grid (worlds, *inner)."""
-        commands = self._recorded.get(key)
-        if commands is None:
-            commands = self._recorded[key] = [
+        if key not in self._recorded:
+            self._recorded[key] = [
                 kernel_cache.launch(
                     kernel(function, self._precision),
                     dim=(stop - start, *inner),
@@ -130,12 +123,9 @@ class Launcher:
                 )
                 for start, stop in self._shares
             ]
-        if len(commands) == 1:
-            commands[0].launch()
-            return
-        pool = self._workers()
-        others = [pool.submit(command.launch) for command in commands[1:]]
-        commands[0].launch()
+        first, *rest = self._recorded[key]
+        others = [self._workers().submit(command.launch) for command in rest]
+        first.launch()
         for other in others:
             other.result()
 

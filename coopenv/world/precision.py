@@ -1,10 +1,8 @@
 """The Warp types of one floating point precision."""
 
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from coopenv.errors import DeviceError, suggest
@@ -24,28 +22,20 @@ class Precision:
     mat66: Any
 
 
-SCALARS = {"float32": (wp.float32, np.float32), "float64": (wp.float64, np.float64)}
+def _precision(scalar: Any) -> Precision:
+    vector, matrix, number = wp.types.vector, wp.types.matrix, wp.dtype_to_numpy(scalar)
+    small = vector(2, scalar), vector(3, scalar), matrix((3, 3), scalar)
+    return Precision(scalar.__name__, scalar, number, *small, matrix((6, 6), scalar))
+
+
+PRECISIONS = {"float32": _precision(wp.float32), "float64": _precision(wp.float64)}
 
 
 def precision(dtype: str) -> Precision:
     """Return the types for `float32` or `float64`. Raises DeviceError: another name."""
-    if not isinstance(dtype, str) or dtype not in SCALARS:
-        raise DeviceError(f"unknown dtype '{dtype}'{suggest(str(dtype), SCALARS)}; known: float32, float64")
-    return _precision(dtype)
-
-
-@cache
-def _precision(dtype: str) -> Precision:
-    scalar, numpy_type = SCALARS[dtype]
-    return Precision(
-        name=dtype,
-        scalar=scalar,
-        numpy=numpy_type,
-        vec2=wp.types.vector(2, scalar),
-        vec3=wp.types.vector(3, scalar),
-        mat33=wp.types.matrix((3, 3), scalar),
-        mat66=wp.types.matrix((6, 6), scalar),
-    )
+    if not isinstance(dtype, str) or dtype not in PRECISIONS:
+        raise DeviceError(f"unknown dtype '{dtype}'{suggest(str(dtype), PRECISIONS)}; known: float32, float64")
+    return PRECISIONS[dtype]
 
 
 def check_device(device: str) -> str:

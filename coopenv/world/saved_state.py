@@ -26,17 +26,14 @@ LEAST_EIGENVALUE = {np.dtype(np.float32): -1e-4, np.dtype(np.float64): -1e-9}
 class Rule(NamedTuple):
     """What every element of a field must be."""
 
-    must_be: str
-    """In words, for errors."""
+    must_be: str  # in words, for errors
     holds: Callable[[Array, Fields, Any], Mask]
     """Returns which elements are so, from the field's values, all fields, and the model."""
-    axes: int = 0
-    """How many of the last axes make up an element: 1 for vectors, 2 for matrices."""
+    axes: int = 0  # how many of the last axes make up an element: 1 for vectors, 2 for matrices
     used: str = ""
     """Field that says which elements count, by flags or by how many along the last axis; empty: all do. The others must
     be finite."""
-    of_truth: bool = False
-    """Whether it is truth, which a recording may not know: NaN."""
+    of_truth: bool = False  # whether it is truth, which a recording may not know: NaN
 
 
 def whole(low: int, high: int | str) -> Rule:
@@ -66,8 +63,7 @@ def _odometry_samples(values: Array, fields: Fields, model: Any) -> Mask:
 ANYTHING = Rule("anything", lambda values, fields, model: np.ones(values.shape, dtype=bool))
 FLAG = whole(0, 1)
 NUMBER = numbers()
-TICK = whole(-1, "tick")
-"""A tick of the past or the present one; -1: never."""
+TICK = whole(-1, "tick")  # a tick of the past or the present one; -1: never
 ODOMETRY_SAMPLES = Rule("as many as at this tick", _odometry_samples)
 DIRECTION = Rule(
     "a unit vector, or zero",

@@ -1,6 +1,6 @@
 """A batch of worlds on a device: allocate, reset by mask, advance, save and restore."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from coopenv.world.records import allocate, parts, size_of
 from coopenv.world.saved_state import Rule, checked_state
 from coopenv.world.state import VALID, allocate_state, overwrite, state_fields, state_sizes, state_struct
 from coopenv.world.step import (
+    Kernel,
     advance_kernel,
     broadcast_kernel,
     decide_kernel,
@@ -26,6 +27,9 @@ from coopenv.world.step import (
     sense_kernel,
 )
 
+Seeds = Sequence[int] | np.ndarray | None
+Options = Mapping[str, Any] | None
+
 
 class World:
     """`worlds` copies of one scenario, stepped together.
@@ -34,8 +38,7 @@ class World:
     single world seeded with s + w (on the same device).
     """
 
-    source: Source = SIMULATED
-    """Where its ticks come from."""
+    source: Source = SIMULATED  # where its ticks come from
 
     def __init__(
         self,
@@ -99,12 +102,7 @@ class World:
         """Return what the source of ticks reads."""
         return Nothing()
 
-    def reset(
-        self,
-        seeds: Sequence[int] | np.ndarray | None = None,
-        mask: np.ndarray | None = None,
-        options: Mapping[str, Any] | None = None,
-    ) -> None:
+    def reset(self, seeds: Seeds = None, mask: np.ndarray | None = None, options: Options = None) -> None:
         """Start a new episode in the worlds of `mask` (all by default).
 
         Args:
@@ -125,57 +123,49 @@ class World:
     def restart(self) -> None:
         """Start the next episode in the worlds of `self.mask`, on the device."""
         kernel = restart_kernel(self.source, self.observer)
-        self.launch("restart", kernel, [*self._everything(), PerWorld(self.mask)])
+        self._run("restart", kernel, PerWorld(self.memory), self._record, PerWorld(self.mask))
 
     def advance(self, ticks: int) -> None:
         """Run camera ticks under `self.actions`, stopping each world at its horizon."""
-        kernel = advance_kernel(self.source, self.observer)
-        moving = [PerWorld(self.actions), PerWorld(self.mask), ticks]
-        self.launch(("advance", ticks), kernel, [*self._everything(), *moving])
+        arguments = [PerWorld(self.memory), self._record, PerWorld(self.actions), PerWorld(self.mask), ticks]
+        self._run(("advance", ticks), advance_kernel(self.source, self.observer), *arguments)
 
     def load(self) -> None:
         """Load the kernels, compiling those that this machine has not compiled yet; nothing moves."""
         self.restart()
         World.advance(self, 0)
 
-    def _everything(self) -> list[Any]:
-        return [self.model, PerWorld(self.state), PerWorld(self.memory), self._record]
+    def _run(self, key: Hashable, kernel: Kernel, *arguments: Any) -> None:
+        self.launch(key, kernel, [self.model, PerWorld(self.state), *arguments])
 
     # A decision in stages, for estimators on the host: decide; then per tick sense, per vehicle deliver and broadcast,
     # and finish.
 
     def decide(self) -> None:
         """Make commands of `self.actions` in the worlds that `advance` would move."""
-        moving = [PerWorld(self.actions), PerWorld(self.mask)]
-        self.launch("decide", decide_kernel, [self.model, PerWorld(self.state), *moving])
+        self._run("decide", decide_kernel, PerWorld(self.actions), PerWorld(self.mask))
 
     def sense(self, active: Any) -> None:
         """Move the truth of the active worlds (W,) to the next tick and measure it."""
-        arguments = [self.model, PerWorld(self.state), self._record, PerWorld(active)]
-        self.launch("sense", sense_kernel(self.source), arguments)
+        self._run("sense", sense_kernel(self.source), self._record, PerWorld(active))
 
     def deliver(self, active: Any, vehicle: int) -> None:
         """Let a vehicle of the active worlds receive what arrives at this tick."""
-        arguments = [self.model, PerWorld(self.state), self._record, PerWorld(active), vehicle]
-        self.launch(("deliver", vehicle), deliver_kernel(self.source), arguments)
+        self._run(("deliver", vehicle), deliver_kernel(self.source), self._record, PerWorld(active), vehicle)
 
     def broadcast(self, active: Any, vehicle: int) -> None:
         """Let a vehicle of the active worlds, whose estimate has been written, send it."""
-        arguments = [self.model, PerWorld(self.state), PerWorld(active), vehicle]
-        self.launch(("broadcast", vehicle), broadcast_kernel, arguments)
+        self._run(("broadcast", vehicle), broadcast_kernel, PerWorld(active), vehicle)
 
     def finish(self, active: Any) -> None:
         """End the tick of the active worlds."""
-        self.launch("finish", finish_kernel, [self.model, PerWorld(self.state), PerWorld(active)])
+        self._run("finish", finish_kernel, PerWorld(active))
 
     def view(self, name: str) -> np.ndarray:
         """Return a field of the state on the host, without a copy on the CPU."""
-        view = self._views.get(name)
-        if view is None:
-            view = getattr(self.state, name).numpy()
-            if self.device == "cpu":
-                self._views[name] = view
-        return view
+        if self.device != "cpu" or name not in self._views:
+            self._views[name] = getattr(self.state, name).numpy()
+        return self._views[name]
 
     def get_state(self) -> dict[str, np.ndarray]:
         """Return a copy of everything that changes, random streams included (they are seeds and counters)."""

@@ -17,8 +17,7 @@ from coopenv.errors import DataError, check_memory
 
 MAGIC = b"\x89MCAP0\r\n"
 
-MAX_CHUNK_BYTES = 16 * 2**20
-"""Unpacked; writers make chunks of about 1 MiB."""
+MAX_CHUNK_BYTES = 16 * 2**20  # unpacked; writers make chunks of about 1 MiB
 MAX_EXPANSION = 50
 """Times that a whole file may grow when it is unpacked, beyond one such chunk; recordings expand 3 to 10 times."""
 

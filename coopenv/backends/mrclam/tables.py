@@ -12,8 +12,7 @@ from coopenv.errors import DataError, suggest
 NAMES = tuple(f"mrclam_{number}" for number in range(1, 10))
 ENVIRONMENT_VARIABLE = "COOPENV_DATA"
 
-MAX_PAUSE_S = 3600.0
-"""Between two rows; more is a broken time stamp."""
+MAX_PAUSE_S = 3600.0  # between two rows; more is a broken time stamp
 MAX_LENGTH_S = 6 * 3600.0
 """Longest time that a sub-dataset may span, whose clocks agree; the longest one takes 40 minutes."""
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ class ReplayWorld(SensingWorld):
         self._recording = recording
         super().__init__(scenario, *arguments)
 
-    @property
+    @cached_property
     def briefing(self) -> Briefing:
         """What observers are told before the first tick."""
         return self._recording.briefing

@@ -13,8 +13,7 @@ from coopenv.scenario.files import override, parse_scenario
 CHANGEABLE = ("action", "description", "horizon", "observation", "observer", "reward", "termination", "title")
 """Keys that say how a recording is used; the others say how it came about."""
 
-DECISION_RATE = 10.0
-"""Hz, of the replay of robots, or the next rate at which decisions fall on ticks."""
+DECISION_RATE = 10.0  # Hz, of the replay of robots, or the next rate at which decisions fall on ticks
 
 
 def scenario_of(recording: Recording, name: str, overrides: Mapping[str, Any]) -> Scenario:
