@@ -47,11 +47,7 @@ class DataWarning(UserWarning):
 
 
 def checked_seed(seed: object) -> int:
-    """Return a seed as an int.
-
-    Raises:
-        CoopenvError: it is not a whole number, or negative.
-    """
+    """Return a seed as an int. Raises CoopenvError: it is not a whole number, or negative."""
     if isinstance(seed, bool) or not hasattr(seed, "__index__"):
         raise CoopenvError(f"seed must be a whole number, got {seed!r}")
     number = seed.__index__()
@@ -61,16 +57,7 @@ def checked_seed(seed: object) -> int:
 
 
 def check_memory(size: float, what: str, available: int | None = None) -> None:
-    """Refuse what would not fit into memory, before it is allocated.
-
-    Args:
-        size: bytes that are needed.
-        what: what needs them, to begin the error with.
-        available: bytes there are; None: of this machine.
-
-    Raises:
-        CoopenvError: it needs more.
-    """
+    """Refuse what needs more bytes than are available (None: in this machine); `what` begins the error."""
     if available is None:
         available = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2**34
     if size > available:

@@ -11,6 +11,7 @@ import shutil
 import threading
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 from coopenv.errors import OutputError
@@ -74,14 +75,7 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
         OutputError: it cannot be written or replaced, which is found before anything is yielded where it can be known;
             the old folder is untouched.
     """
-
-    def check(path: str | Path, place: Path) -> None:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        heal(place, names)
-        if os.path.lexists(place):
-            _check_folder(path, place, names)
-
-    with _staging(folder, check) as (place, part):
+    with _staging(folder, partial(_check_folder, names)) as (place, part):
         try:
             yield part
         except OutputError as error:
@@ -140,7 +134,11 @@ def _check_file(path: str | Path, place: Path) -> None:
         raise OutputError(f"cannot write to {path}: {reason}")
 
 
-def _check_folder(folder: str | Path, place: Path, names: Collection[str]) -> None:
+def _check_folder(names: Collection[str], folder: str | Path, place: Path) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    heal(place, names)
+    if not os.path.lexists(place):
+        return
     if not place.is_dir():
         raise OutputError(f"cannot write to {folder}: it is not a folder")
     if not os.access(place, os.W_OK | os.X_OK):

@@ -60,11 +60,7 @@ def lock(folder: Path, wait: bool = False) -> int | None:
 
 
 def put_in_place(part: Path, place: Path, names: Collection[str]) -> None:
-    """Put the folder `part` in its place, together with what is there and not of `names`.
-
-    Raises:
-        OSError: the system refuses; both folders are what and where they were.
-    """
+    """Put the folder `part` in its place, with what is there and not of `names`; after an OSError all is as it was."""
     if not place.exists():
         part.rename(place)
         return
@@ -106,10 +102,7 @@ def heal(place: Path, names: Collection[str]) -> None:
 
 
 def clear(old: Path, place: Path, names: Collection[str]) -> None:
-    """Remove an old folder but for what is not of `names`, which goes to `place`.
-
-    Where `place` has something else under the same name, both stay where they are.
-    """
+    """Remove an old folder but for what is not of `names`, which goes to `place` unless something else is there."""
     with suppress(OSError):
         for entry in old.iterdir():
             with suppress(OSError):

@@ -20,11 +20,7 @@ def is_reference(text: str) -> bool:
 
 
 def absolute(reference: str, folder: Path | None = None) -> str:
-    """Return a reference, in which a file is looked for in a folder (None: the current one), as one for any folder.
-
-    Raises:
-        CoopenvError: no file can have this name.
-    """
+    """Return a reference, in which a file is looked for in a folder (None: the current one), as one for any folder."""
     place, _, name = reference.rpartition(":")
     return f"{_file(place, folder)}:{name}" if place.endswith(".py") else reference
 

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.backends.base import Capabilities, SensingWorld
-from coopenv.backends.generator import Episode, TickGenerator
+from coopenv.backends.base import Capabilities, Episode, SensingWorld, TickGenerator
 from coopenv.estimation.trajectory import Sight
 from coopenv.observers.briefing import start_covariances
 from coopenv.observers.recording import Sensed, Truth, is_due

@@ -20,12 +20,7 @@ KINDS = {"visible": "b", "missing": "b", "late": "b", "inbox_tick": "iu"}
 
 
 def check_tick(tick: Sensed, index: int, briefing: Briefing) -> None:
-    """Refuse a tick that is not the expected one or holds what no kernel may read; rows of the missing are not read.
-
-    Args:
-        tick: from a source.
-        index: of the tick that comes now.
-        briefing: of the world.
+    """Refuse a tick that is not number `index` or holds what no kernel may read; rows of the missing are not read.
 
     Raises:
         CoopenvError: one line that names tick, field and vehicle.

@@ -55,12 +55,9 @@ def twist_table(start: np.ndarray, linear: np.ndarray, angular: np.ndarray) -> T
 
 
 def compile_motion(motion: object, initial_rotation: np.ndarray, until: float) -> TwistTable:
-    """Return the twist table of a motion; static and driven agents stand still in it.
+    """Return the twist table of a motion of `coopenv.scenario.bodies` up to a time in s; driven agents stand in it.
 
-    Args:
-        motion: one of those in `coopenv.scenario.bodies`.
-        initial_rotation: (3, 3) of the agent at its start, body to map.
-        until: s; what comes later is left out.
+    Its poses are in the frame of the agent's start, which `initial_rotation` (3, 3) turns to the map.
     """
     if isinstance(motion, WaypointMotion):
         return _spline_table(motion, initial_rotation, until)

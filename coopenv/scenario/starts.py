@@ -104,11 +104,7 @@ def possible_boxes(vehicle: Vehicle) -> Boxes:
 
 
 def check_room(scenario: ScenarioFields) -> None:
-    """Refuse vehicles that may start inside a building or in one another's place; warn of boxes that overlap.
-
-    Raises:
-        ValueError: names the vehicle and what it would be inside.
-    """
+    """Refuse (ValueError) vehicles that may start inside a building or in one another's place; warn of overlaps."""
     boxes = [possible_boxes(vehicle) for vehicle in scenario.vehicles]
     _check_buildings(scenario, boxes)
     starts = np.array([start_of(vehicle)[0] for vehicle in scenario.vehicles])

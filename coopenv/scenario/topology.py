@@ -35,11 +35,7 @@ def neighbour_sets(scenario: ScenarioFields) -> list[list[int]]:
 
 
 def processing_order(scenario: ScenarioFields, neighbours: Sequence[Sequence[int]]) -> list[int]:
-    """Return vehicle indices so that leaders come before their followers.
-
-    Args:
-        scenario: for who is there, and whether cycles are allowed.
-        neighbours: its `neighbour_sets`.
+    """Return vehicle indices so that leaders come before their followers, from the scenario's `neighbour_sets`.
 
     Raises:
         ValueError: the neighbour sets contain a cycle although `topology.acyclic` is set.

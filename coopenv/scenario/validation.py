@@ -11,13 +11,7 @@ TOO_DEEP = "lists or tables stand too deep in one another"
 
 
 def one_line(error: ValidationError, where: str, model: type[BaseModel]) -> str:
-    """Return the most helpful of the problems, in one line.
-
-    Args:
-        error: what pydantic raised.
-        where: file or other origin of the data, which begins the line.
-        model: what the data should have been, for the nearest valid key.
-    """
+    """Return the most helpful of the problems in one line, which begins with `where`; `model` knows the valid keys."""
     details = error.errors(include_url=False)
     # A misspelt key often also leaves a required one missing: the misspelling is what helps.
     first = min(details, key=lambda d: d["type"] != "extra_forbidden")

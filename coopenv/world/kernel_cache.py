@@ -40,11 +40,7 @@ def start() -> None:
 
 
 def launch(kernel: wp.Kernel, **options: Any) -> Any:
-    """Do what `wp.launch` does with a kernel that is in memory, in the cache, damaged there, or not compiled yet.
-
-    Raises:
-        KernelCacheError: it has to be compiled, and the cache cannot be written.
-    """
+    """Do what `wp.launch` does with a kernel that is in memory, in the cache, damaged there, or not compiled yet."""
     for attempt in range(ATTEMPTS):
         kept = list(cache_folder().glob(f"wp_{escape(kernel.module.name)}_{'[0-9a-f]' * 7}"))
         if not kept:

@@ -26,11 +26,7 @@ WORLDS_PER_THREAD = 32  # smaller shares are not worth the handing over between 
 
 @cache
 def start_warp() -> None:
-    """Initialise Warp without its banner, and without the notice that its library prints where no GPU driver is.
-
-    Raises:
-        KernelCacheError: compiled kernels cannot be kept.
-    """
+    """Initialise Warp without its banner, and without the notice that its library prints where no GPU driver is."""
     wp.config.log_level = wp.LOG_ERROR
     try:
         saved = os.dup(2)
@@ -64,11 +60,7 @@ def kernel(function: Function, precision_name: str, differentiable: bool = False
 
 
 def default_threads(worlds: int, device: str) -> int:
-    """Return how many threads to split a batch over: all cores (or COOPENV_THREADS) on the CPU, if it is large.
-
-    Raises:
-        CoopenvError: COOPENV_THREADS is not a positive number.
-    """
+    """Return how many threads to split a batch over: all cores (or COOPENV_THREADS) on the CPU, if it is large."""
     if device != "cpu":
         return 1
     wanted = os.environ.get("COOPENV_THREADS", "")

@@ -9,12 +9,7 @@ import warp as wp
 
 
 def array(axes: str, dtype: Any) -> Any:
-    """Return the annotation of a struct's field: an array with these axes.
-
-    Args:
-        axes: a letter per axis, for example "WN".
-        dtype: Warp type of an entry.
-    """
+    """Return the annotation of a struct's field: an array with these axes, a letter each, for example "WN"."""
     annotation: Any = wp.array(dtype=dtype, ndim=len(axes))
     annotation.axes = axes
     return annotation
@@ -40,14 +35,10 @@ def size_of(record: Any, sizes: Mapping[str, int]) -> int:
 
 
 def allocate(record: Any, sizes: Mapping[str, int], device: str, shared: str = "") -> Any:
-    """Return a record of zeros.
+    """Return a record of zeros of a struct whose fields are declared with `array`; `sizes` are lengths by letter.
 
-    Args:
-        record: struct whose fields are declared with `array`.
-        sizes: length of every axis by its letter.
-        device: where the arrays are.
-        shared: axis of which, where it comes second, all indices stand for one and the same row: whoever needs the rows
-            of one vehicle alone can then index them by the vehicle without room for the others'.
+    Along the axis `shared`, where it comes second, all indices stand for one and the same row: whoever needs the rows
+    of one vehicle alone can then index them by the vehicle without room for the others'.
     """
     result = record()
     for name, field in fields(record).items():

@@ -79,14 +79,9 @@ COVARIANCE = Rule(
 def checked_state(
     values: Mapping[str, Any], arrays: Mapping[str, Any], rules: Mapping[str, Rule], model: Any, knows_truth: bool
 ) -> dict[str, Array]:
-    """Return copies of what a state holds, in the types of the arrays that it is to be written to.
+    """Return copies of what a state holds, in the types of the Warp arrays, by name, that it is to be written to.
 
-    Args:
-        values: fields by name; others are left out.
-        arrays: Warp arrays by name.
-        rules: by name; numbers without one have to be finite.
-        model: of the world.
-        knows_truth: whether the truth is always there.
+    Numbers of a field without a rule have to be finite; `knows_truth` says whether the truth is always there.
 
     Raises:
         CoopenvError: a field is missing, has another shape or type, or an element is not what its rule says.

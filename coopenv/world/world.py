@@ -172,21 +172,13 @@ class World:
         return {name: array.numpy().copy() for name, array in self.state_arrays().items()}
 
     def set_state(self, values: Mapping[str, np.ndarray]) -> None:
-        """Restore what `get_state` returned.
-
-        Raises:
-            CoopenvError: a field is missing, or does not hold what it may; nothing has changed then.
-        """
+        """Restore what `get_state` returned; a CoopenvError names a field that is not so, and nothing has changed."""
         overwrite(self.state_arrays(), self.checked_state(values, {}, {}))
 
     def checked_state(
         self, values: Mapping[str, Any], more: Mapping[str, Any], rules: Mapping[str, Rule]
     ) -> dict[str, np.ndarray]:
-        """Return copies of a state's fields that fit into `state_arrays`, and into more arrays with rules of their own.
-
-        Raises:
-            CoopenvError: a field is missing, or does not hold what it may.
-        """
+        """Return copies of a state's fields that fit into `state_arrays`, and into more arrays with their own rules."""
         arrays = {**self.state_arrays(), **more}
         return checked_state(values, arrays, {**self.state_rules(), **rules}, self.model, self.source.knows_truth)
 

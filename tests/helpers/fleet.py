@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.base import Capabilities, Command
-from coopenv.backends.generator import Episode, TickGenerator
+from coopenv.backends.base import Capabilities, Command, Episode, TickGenerator
 from coopenv.observers.recording import Sensed, Truth
 from coopenv.scenario import Scenario
 from tests.helpers.builders import landmark, scenario, vehicle

@@ -47,9 +47,7 @@ class Container:
     def messages(self) -> Iterator[tuple[Channel, Schema | None, Message]]:
         """Yield all messages in the order of the file, each with its channel and the schema of that.
 
-        Raises:
-            ValueError: a chunk is damaged or would unpack to too much, or a message has no channel.
-            Exception: any other of the library.
+        A ValueError says that a chunk would unpack to too much or a message has no channel; others are the library's.
         """
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}

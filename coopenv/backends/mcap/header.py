@@ -82,11 +82,7 @@ class Header(Part):
             raise DataError(one_line(error, where, cls)) from None
 
     def constants(self, where: str) -> dict[str, Any]:
-        """Return the arguments of a `Recording` that the header gives.
-
-        Raises:
-            ScenarioError: its scenario describes no possible world.
-        """
+        """Return the arguments of a `Recording` that the header gives; a ScenarioError if its scenario is none."""
         return {
             "setups": tuple(_setup(setup) for setup in self.setups),
             "order": self.order,

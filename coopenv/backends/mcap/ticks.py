@@ -32,11 +32,7 @@ class TickArrays:
         self._seen = {name: np.zeros(ticks, dtype=bool) for name in self._places}
 
     def put(self, name: str, k: int, message: Any) -> None:
-        """Take the message of a topic at a tick.
-
-        Raises:
-            ValueError: there is no such tick, it has been there, or the message has the wrong size.
-        """
+        """Take the message of a topic at a tick; a ValueError says why it does not fit."""
         if k >= self._ticks:
             raise ValueError(f"the recording ends at tick {self._ticks - 1}")
         if self._seen[name][k] if name in self._seen else k in self._landmarks:
@@ -63,11 +59,7 @@ class TickArrays:
         self._arrays["visible"][k, i, targets] = m.visible.reshape(count).view(np.uint8) != 0
 
     def complete(self) -> dict[str, Any]:
-        """Return the arrays as arguments of a `Recording`.
-
-        Raises:
-            ValueError: a topic or tick is missing, or vehicles do not agree on when corrections are due.
-        """
+        """Return the arrays as arguments of a `Recording`; a ValueError names what is missing or contradicts itself."""
         for name, seen in {LANDMARKS: np.array([0 in self._landmarks]), **self._seen}.items():
             if not seen.any():
                 raise ValueError(f"topic '{name}' is missing")

@@ -28,11 +28,7 @@ from coopenv.shipped import version
 
 
 def write_recording(recording: Recording, path: str | Path) -> None:
-    """Write every tick of a recording; `read_recording` gives it back bit for bit.
-
-    Args:
-        recording: from any source.
-        path: of the file, which is replaced.
+    """Write every tick of a recording to a file, which is replaced; `read_recording` gives it back bit for bit.
 
     Raises:
         CoopenvError: the extra `log` is not installed.

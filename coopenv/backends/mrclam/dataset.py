@@ -20,19 +20,12 @@ CORRUPT_HEADING = {("mrclam_9", 3): ((757.0, 1100.0),)}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """Motion capture of one robot.
+    """Motion capture of one robot."""
 
-    Attributes:
-        t: (N,) s since the time origin.
-        position: (N, 2) m, inertial frame.
-        heading: (N,) rad, unwrapped.
-        corrupt_heading: spans of s since the time origin in which the heading is wrong.
-    """
-
-    t: Array
-    position: Array
-    heading: Array
-    corrupt_heading: tuple[tuple[float, float], ...] = ()
+    t: Array  # (N,) s since the time origin
+    position: Array  # (N, 2) m, inertial frame
+    heading: Array  # (N,) rad, unwrapped
+    corrupt_heading: tuple[tuple[float, float], ...] = ()  # spans of s since the origin in which the heading is wrong
 
     def at(self, t: Array) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
         """Interpolate linearly, the heading along the shorter way round.
@@ -57,39 +50,25 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Robot:
-    """One robot on the common clock.
+    """One robot on the common clock."""
 
-    Attributes:
-        subject: 1..5.
-        odometry: (N, 3): s since the time origin, commanded m/s forward, commanded rad/s.
-        detections: (n, 4): s since the time origin, who was seen (1..20), range m, bearing rad, counter-clockwise from
-            the heading. Those of one time are one camera frame.
-        truth: for judging, and for starting where an observer is given its start.
-        skipped: detections left out because nobody carries their barcode (misread by the camera).
-    """
-
-    subject: int
-    odometry: Array
+    subject: int  # 1..5
+    odometry: Array  # (N, 3): s since the time origin, commanded m/s forward, commanded rad/s
     detections: Array
-    truth: Truth
-    skipped: int
+    """(n, 4): s since the time origin, who was seen (1..20), range m, bearing rad, counter-clockwise from the heading;
+    those of one time are one camera frame."""
+    truth: Truth  # for judging, and for starting where an observer is given its start
+    skipped: int  # detections left out because nobody carries their barcode (misread by the camera)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dataset:
-    """One sub-dataset.
+    """One sub-dataset."""
 
-    Attributes:
-        name: such as `mrclam_6`.
-        duration_s: s from the time origin, the first odometry sample of any robot, to the last one.
-        landmarks: subject -> (2,) m, inertial frame, in the order of their subjects.
-        robots: of subjects 1..5.
-    """
-
-    name: str
-    duration_s: float
-    landmarks: dict[int, Array]
-    robots: tuple[Robot, ...]
+    name: str  # such as `mrclam_6`
+    duration_s: float  # from the time origin, the first odometry sample of any robot, to the last one
+    landmarks: dict[int, Array]  # subject -> (2,) m, inertial frame, in the order of their subjects
+    robots: tuple[Robot, ...]  # of subjects 1..5
 
 
 def load_dataset(name: str, data: str | Path | None = None) -> Dataset:

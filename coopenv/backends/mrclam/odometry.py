@@ -12,11 +12,7 @@ MAX_HOLD_S = 2.0
 
 
 class HeldCommands:
-    """One robot's odometry as a function of time. Before its first command a robot stands.
-
-    Args:
-        robot: whose odometry (N, 3) of s, m/s, rad/s counts.
-    """
+    """One robot's odometry as a function of time. Before its first command a robot stands."""
 
     def __init__(self, robot: Robot) -> None:
         t, v, omega = robot.odometry.T

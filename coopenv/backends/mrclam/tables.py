@@ -50,11 +50,7 @@ class Table:
     """A file's rows of finite numbers, which know their lines."""
 
     def __init__(self, path: Path, columns: int, least: int) -> None:
-        """Read a file that has so many columns, and at least so many rows.
-
-        Raises:
-            DataError: it is not there, or a line is not what the format says, or cut off.
-        """
+        """Read a file that has so many columns, and at least so many rows; a DataError names a line that is not so."""
         try:
             lines = path.read_text(encoding="latin-1").split("\n")
         except OSError as error:
@@ -94,11 +90,7 @@ class Table:
 
 
 def timed(path: Path, columns: int, least: int) -> Table:
-    """Return a table whose first column is the time, s.
-
-    Raises:
-        DataError: as for `Table`, or the time runs backwards, or ahead by hours.
-    """
+    """Return a table whose first column is the time, s, which runs neither backwards nor ahead by hours."""
     table = Table(path, columns, least)
     t = table.values[:, 0]
     steps, length = np.diff(t, prepend=t[:1]), t - t[:1]

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.backends.base import Capabilities, SensingWorld
-from coopenv.backends.generator import Episode, TickGenerator
+from coopenv.backends.base import Capabilities, Episode, SensingWorld, TickGenerator
 from coopenv.backends.replay.kernels import RECORDED, samples_taken, upload
 from coopenv.backends.replay.scenario import scenario_of
 from coopenv.observers.recording import Briefing, Recording, Sensed

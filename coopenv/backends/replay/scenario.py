@@ -17,17 +17,11 @@ DECISION_RATE = 10.0  # Hz, of the replay of robots, or the next rate at which d
 
 
 def scenario_of(recording: Recording, name: str, overrides: Mapping[str, Any]) -> Scenario:
-    """Return the scenario of a recording.
-
-    Args:
-        recording: what is replayed.
-        name: for messages, and the title where nothing else is known.
-        overrides: dotted keys below `CHANGEABLE`, and `rates.decision`.
+    """Return the scenario of a recording, whose name is for messages, and the title where nothing else is known.
 
     Raises:
         DataError: the recording holds what no scenario can say.
-        ScenarioError: an override is not valid.
-        CoopenvError: an override would change what was recorded.
+        CoopenvError: an override is not valid, or would change what was recorded.
     """
     if recording.ticks < 2:
         raise DataError(f"{name}: only {recording.ticks} tick recorded, nothing to replay")
