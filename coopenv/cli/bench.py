@@ -114,7 +114,7 @@ def bench_observers(
     with options.warned():
         changes, numbers = options.parse_overrides(overrides), range(first, first + seeds)
         request = request_of(source, observers, variants, numbers, steady_from, basin, data, changes, overrides or ())
-        request.source.check()
+        request.plan.source.check()
     perform(request, find_executor(engine, jobs, address), out, figures, printed, log, as_json)
     if open_report and out is not None:
         options.show(out / REPORT_FILE)

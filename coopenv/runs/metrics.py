@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Mapping
+from platform import python_version
 from typing import Any
 
 import numpy as np
-import warp
+import warp as wp
 
 from coopenv.api.infos import outcome_words
 from coopenv.estimation.metrics import observability_of, summarise
@@ -57,16 +57,15 @@ def observability_metrics(observability: Observability) -> dict[str, Any]:
     }
 
 
-def outcome_line(recording: Rollout) -> str:
+def outcome_line(run: Rollout) -> str:
     """Return how the run ended, in words."""
-    endings = recording.endings()
-    scenario = recording.scenario
-    count = {word: sum(ending.outcome == word for ending in endings) for word in outcome_words(scenario)[1:]}
-    parts = [f"{number} {word}" for word, number in count.items() if number]
-    time = recording.ticks_recorded / scenario.rates.camera
-    if all(ending.outcome != Outcome.UNDER_WAY.words for ending in endings):
-        end = f"all vehicles had ended by {max(ending.time for ending in endings):.4g} s"
-    elif recording.ticks_recorded >= scenario.horizon_ticks:
+    outcomes = [ending.outcome for ending in run.endings()]
+    counts = {word: outcomes.count(word) for word in outcome_words(run.scenario)[1:]}
+    parts = [f"{count} {word}" for word, count in counts.items() if count]
+    time = run.ticks_recorded / run.scenario.rates.camera
+    if Outcome.UNDER_WAY.words not in outcomes:
+        end = f"all vehicles had ended by {max(ending.time for ending in run.endings()):.4g} s"
+    elif run.ticks_recorded >= run.scenario.horizon_ticks:
         end = f"horizon reached at {time:g} s"
     else:
         end = f"stopped after the steps asked for, at {time:g} s"
@@ -76,31 +75,25 @@ def outcome_line(recording: Rollout) -> str:
 def run_metrics(
     name: str,
     overrides: Mapping[str, Any],
-    recording: Rollout,
+    run: Rollout,
     vehicles: list[dict[str, Any]],
     steady_from: float,
 ) -> dict[str, Any]:
     """Return the contents of `metrics.json`."""
-    simulated = recording.ticks_recorded / recording.scenario.rates.camera
-    engine = recording.engine
+    simulated = run.ticks_recorded / run.scenario.rates.camera
     return {
         "environment": name,
-        "title": recording.scenario.title,
-        "seed": recording.seed,
+        "title": run.scenario.title,
+        "seed": run.seed,
         "overrides": dict(overrides),
-        "policy": recording.policy_name,
-        "dtype": engine.world.precision.name,
-        "device": engine.world.device,
-        "versions": {
-            "coopenv": version(),
-            "warp": warp.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
-        "outcome": outcome_line(recording),
+        "policy": run.policy_name,
+        "dtype": run.engine.world.precision.name,
+        "device": run.engine.world.device,
+        "versions": {"coopenv": version(), "warp": wp.__version__, "numpy": np.__version__, "python": python_version()},
+        "outcome": outcome_line(run),
         "simulated_time_s": simulated,
-        "wall_time_s": recording.wall_time,
-        "real_time_factor": simulated / recording.wall_time,
+        "wall_time_s": run.wall_time,
+        "real_time_factor": simulated / run.wall_time,
         "steady_from_s": steady_from,
         "vehicles": vehicles,
     }

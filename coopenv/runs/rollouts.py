@@ -18,19 +18,8 @@ from coopenv.runs.episode import Views, play
 from coopenv.scenario import Scenario
 
 RECORDED = (
-    "position",
-    "rotation",
-    "velocity",
-    "angular_velocity",
-    "estimate_rotation",
-    "estimate_position",
-    "covariance",
-    "position_error",
-    "orientation_error",
-    "nees",
-    "sight",
-    "terms",
-    "ended",
+    *("position", "rotation", "velocity", "angular_velocity", "estimate_rotation", "estimate_position"),
+    *("covariance", "position_error", "orientation_error", "nees", "sight", "terms", "ended"),
 )
 """Views of the engine that are kept of every camera tick."""
 
@@ -58,8 +47,7 @@ class Rollout:
         """Build the world; arguments as for `rollout`, and where the scenario's ticks come from (None: simulated)."""
         if steps is not None and steps < 1:
             raise CoopenvError(f"steps must be at least 1, got {steps}")
-        self.scenario = scenario
-        self.seed = seed
+        self.scenario, self.seed = scenario, seed
         self.engine = Engine(scenario, 1, dtype, device, backend=backend)
         self.policy = load_policy(policy, scenario, seed) if isinstance(policy, str) else policy
         self.policy_name = policy if isinstance(policy, str) else getattr(policy, "__name__", "custom")
@@ -95,43 +83,31 @@ class Rollout:
 
     def trajectory(self) -> Trajectory:
         """Return what has been recorded so far; `play` must have yielded at least once."""
-        L = len(self.scenario.landmarks)
-        position, sight = self._recorded("position"), self._recorded("sight")
-        rotation_estimate = self._recorded("estimate_rotation")
-        position_estimate = np.matmul(rotation_estimate, self._recorded("estimate_position")[..., None])[..., 0]
+        L, recorded = len(self.scenario.landmarks), self._recorded
+        rotation_estimate, sight = recorded("estimate_rotation"), recorded("sight")
         moving = [landmark.motion.kind != "static" for landmark in self.scenario.landmarks]
         return Trajectory(
-            t=np.arange(len(position)) / self.scenario.rates.camera,
-            position=position[:, L:],
-            rotation=self._recorded("rotation")[:, L:],
-            position_estimate=position_estimate,
+            t=np.arange(len(sight)) / self.scenario.rates.camera,
+            position_estimate=(rotation_estimate @ recorded("estimate_position")[..., None])[..., 0],
             rotation_estimate=rotation_estimate,
-            position_error=self._recorded("position_error"),
-            orientation_error=self._recorded("orientation_error"),
-            covariance=self._recorded("covariance"),
-            nees=self._recorded("nees"),
-            velocity=self._recorded("velocity")[:, L:],
-            angular_velocity=self._recorded("angular_velocity")[:, L:],
-            target_position=position,
+            target_position=recorded("position"),
             visible=sight == Sight.VISIBLE,
             sight=sight,
-            reward_terms=self._recorded("terms"),
+            reward_terms=recorded("terms"),
             terms=np.array(self.engine.reward_terms),
             vehicles=np.array(self.scenario.vehicle_names),
             targets=np.array(self.scenario.target_names),
             target_moving=np.array([*moving, *(True for _ in self.scenario.vehicles)]),
+            **{name: recorded(name) for name in ("position_error", "orientation_error", "covariance", "nees")},
+            **{name: recorded(name)[:, L:] for name in ("position", "rotation", "velocity", "angular_velocity")},
         )
 
     def endings(self) -> list[Ending]:
         """Return how each vehicle's run has ended so far."""
         ended = self._recorded("ended")
         first = np.where(ended.any(axis=0), np.argmax(ended != 0, axis=0), len(ended) - 1)
-        rate = self.scenario.rates.camera
-        words = outcome_words(self.scenario)
-        return [
-            Ending(words[outcome], tick / rate)
-            for outcome, tick in zip(ended[-1].tolist(), first.tolist(), strict=True)
-        ]
+        words, times = outcome_words(self.scenario), (first / self.scenario.rates.camera).tolist()
+        return [Ending(words[outcome], time) for outcome, time in zip(ended[-1].tolist(), times, strict=True)]
 
 
 def rollout(

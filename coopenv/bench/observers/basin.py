@@ -19,7 +19,7 @@ from coopenv.estimation.consistency import Interval, wilson_interval
 from coopenv.estimation.metrics import CONVERGED, settling_time
 from coopenv.format import fixed
 from coopenv.observers.contract import Factory
-from coopenv.observers.registry import find, portable
+from coopenv.observers.registry import portable
 from coopenv.observers.runner import run
 from coopenv.runs.table import number_table
 
@@ -118,8 +118,6 @@ def study_basin(
         CoopenvError: an unknown observer, or a source whose geometry is not the question.
     """
     check_source(source)
-    for name in observers:
-        find(name)
     sent = {name: portable(name) for name in observers}
     tasks = [BasinTask(source, (draw,), sent) for draw in range(draws)]
     found = executor.map(draw_starts, tasks, lambda done: on_progress(done / draws))

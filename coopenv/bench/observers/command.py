@@ -6,7 +6,7 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,10 +21,10 @@ from coopenv.bench.observers.basin import (
     check_source,
     study_basin,
 )
-from coopenv.bench.observers.comparison import Comparison, observers_of, run_comparison, work_of
+from coopenv.bench.observers.comparison import Comparison, Plan
 from coopenv.bench.observers.executors import Executor
 from coopenv.bench.observers.exports import csv_text
-from coopenv.bench.observers.sources import ALL, Source, find_source, variants_of
+from coopenv.bench.observers.sources import ALL, find_source
 from coopenv.errors import CoopenvError
 from coopenv.files import replace_text, replacing_folder
 from coopenv.jsonable import json_text, jsonable
@@ -36,34 +36,16 @@ from coopenv.viz import FORMATS
 JSON_FILE, CSV_FILE, REPORT_FILE, BASIN_FILE = "leaderboard.json", "leaderboard.csv", "report.html", "basin.csv"
 
 
-@dataclass(frozen=True)
-class Request:
-    """What is to be compared."""
+class Request(NamedTuple):
+    """What the command line asks for."""
 
-    source: Source
-    source_text: str
-    """As the user named it."""
-    observers: Mapping[str, str]
-    """By name, as the user named them."""
-    variants: tuple[str, ...]
-    seeds: range
-    steady_from: float | None = None
-    basin: int = 0
+    plan: Plan
+    command: str
+    """The one that gives the same table again."""
+    basin: int
     """Draws of initial estimates; 0: no study of basins."""
-    options: tuple[str, ...] = ()
-    """Further options that the result depends on."""
-    left_out: Mapping[str, str] = field(default_factory=dict)
+    left_out: Mapping[str, str]
     """Observers and variants that would have been compared, but for a reason that is told."""
-
-    @property
-    def command(self) -> str:
-        """The command that gives the same table again."""
-        words = ["coopenv", "bench", "observers", self.source_text, "--observers", ",".join(self.observers.values())]
-        words += ["--variants", ",".join(self.variants), "--seeds", str(len(self.seeds))]
-        words += ["--first", str(self.seeds[0])] if self.seeds[0] else []
-        words += [] if self.steady_from is None else ["--steady-from", f"{self.steady_from:g}"]
-        words += ["--basin", str(self.basin)] if self.basin else []
-        return shlex.join([*words, *self.options])
 
 
 def request_of(
@@ -84,18 +66,20 @@ def request_of(
     """
     source = find_source(text, overrides, data)
     given = list(dict.fromkeys(word.strip() for word in observers.split(","))) if observers else None
-    names = observers_of(given, source)
-    left_out = {} if observers else {name: obstacle(name) for name in observer_names()}
+    plan = Plan.of(source, given, variants, seeds, steady_from)
     if basin:
         check_source(source)
-    options = [word for assignment in assignments for word in ("--set", assignment)]
-    options += [] if data is None else ["--data", str(data)]
-    wanted = variants_of(source, variants)
+    left_out = {} if observers else {name: obstacle(name) for name in observer_names()}
     if variants is not None and variants.strip() == ALL:
         left_out |= {name: source.obstacle(name) for name in source.variants}
-    told = {name: reason for name, reason in left_out.items() if reason}
-    written = dict(zip(names, given or names, strict=True))
-    return Request(source, text, written, wanted, seeds, steady_from, basin, tuple(options), told)
+    words = ["coopenv", "bench", "observers", text, "--observers", ",".join(given or plan.observers)]
+    words += ["--variants", ",".join(plan.variants), "--seeds", str(len(seeds))]
+    words += ["--first", str(seeds[0])] if seeds[0] else []
+    words += [] if steady_from is None else ["--steady-from", f"{steady_from:g}"]
+    words += ["--basin", str(basin)] if basin else []
+    words += [word for assignment in assignments for word in ("--set", assignment)]
+    words += [] if data is None else ["--data", str(data)]
+    return Request(plan, shlex.join(words), basin, {name: reason for name, reason in left_out.items() if reason})
 
 
 class Found(NamedTuple):
@@ -122,7 +106,7 @@ def perform(
     log: Console,
     as_json: bool = False,
 ) -> None:
-    """Compare, print the tables and write the files.
+    """Compare, print the tables (or what `leaderboard.json` holds) and write the files.
 
     Args:
         request: what is to be compared.
@@ -131,16 +115,16 @@ def perform(
         figures: format of figures as files of their own; None: the report alone has them.
         printed: for the tables.
         log: for the progress.
-        as_json: print what `leaderboard.json` holds, and nothing else.
+        as_json: print JSON, and nothing else.
 
     Raises:
         CoopenvError: something that was asked for does not exist, or cannot be written.
     """
-    wanted = figure_files(request.variants, figures)
+    wanted = figure_files(request.plan.variants, figures)
     if wanted and out is None:
         raise CoopenvError(f"--figures {figures}: figures need a folder, --out DIR")
     found, names = None, [JSON_FILE, CSV_FILE, REPORT_FILE, BASIN_FILE]
-    names += [name for form in FORMATS for name in figure_files(tuple(request.source.variants), form)]
+    names += [name for form in FORMATS for name in figure_files(tuple(request.plan.source.variants), form)]
     try:
         with nullcontext() if out is None else replacing_folder(out, names) as folder:
             found = _compare(request, executor, log)
@@ -159,14 +143,14 @@ def perform(
 def _compare(request: Request, executor: Executor, log: Console) -> Found:
     for name, reason in request.left_out.items():
         log.print(f"left out: {name} ({reason})", soft_wrap=True, markup=False)
-    source, observers, draws = request.source, tuple(request.observers), []
-    with Progress(log, work_of(observers, request.variants, request.seeds), total=1.0) as progress:
-        wanted = request.seeds, request.variants, request.steady_from
-        comparison = run_comparison(source, observers, *wanted, executor, progress.update)
+    plan, draws = request.plan, []
+    with Progress(log, plan.work, total=1.0) as progress:
+        comparison = plan.run(executor, progress.update)
     if request.basin:
-        with Progress(log, f"{len(observers)} observers, {request.basin} initial estimates", total=1.0) as progress:
-            draws = study_basin(source, observers, request.basin, executor, progress.update)
-    return Found(comparison, draws, basins_of(source.name, draws))
+        work = f"{len(plan.observers)} observers, {request.basin} initial estimates"
+        with Progress(log, work, total=1.0) as progress:
+            draws = study_basin(plan.source, plan.observers, request.basin, executor, progress.update)
+    return Found(comparison, draws, basins_of(plan.source.name, draws))
 
 
 def print_tables(found: Found, printed: Console) -> None:

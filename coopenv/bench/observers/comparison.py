@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields
 from io import StringIO
-from itertools import product
+from itertools import chain, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from rich.table import Table
 
 from coopenv.bench.observers import exports, tables
 from coopenv.bench.observers.executors import Executor, Local
-from coopenv.bench.observers.judge import Sample, Task, judge
+from coopenv.bench.observers.judge import Task, judge
 from coopenv.bench.observers.leaderboard import Leaderboard
 from coopenv.bench.observers.rows import Row
 from coopenv.bench.observers.sources import Source, find_source, variants_of
@@ -163,19 +163,68 @@ def compare(
     """
     source = find_source(str(environment), overrides, None if data is None else Path(data))
     source.check()
-    names = observers_of(observers, source)
-    wanted = variants if variants is None or isinstance(variants, str) else ",".join(variants)
-    chosen, numbers = variants_of(source, wanted), seeds_of(seeds)
-    with Progress(Console(stderr=True), work_of(names, chosen, numbers), total=1.0) as progress:
-        return run_comparison(source, names, numbers, chosen, steady_from, Local(jobs), progress.update)
+    plan = Plan.of(source, observers, variants, seeds, steady_from)
+    with Progress(Console(stderr=True), plan.work, total=1.0) as progress:
+        return plan.run(Local(jobs), progress.update)
 
 
-def observers_of(observers: Iterable[str | Factory] | None, source: Source) -> tuple[str, ...]:
-    """Return the names of observers, each once; None: of all that are meant for the vehicles of a source.
+@dataclass(frozen=True)
+class Plan:
+    """What is compared: names and numbers that are known to exist."""
 
-    Raises:
-        CoopenvError: one does not exist, or two have one name.
-    """
+    source: Source
+    observers: tuple[str, ...]
+    variants: tuple[str, ...]
+    seeds: tuple[int, ...]
+    steady_from: float | None
+    """s; None: the source's own."""
+
+    @classmethod
+    def of(
+        cls,
+        source: Source,
+        observers: Iterable[str | Factory] | None,
+        variants: str | Sequence[str] | None,
+        seeds: int | Iterable[int],
+        steady_from: float | None,
+    ) -> Plan:
+        """Return what somebody asks for; arguments and errors as for `compare`."""
+        wanted = variants if variants is None or isinstance(variants, str) else ",".join(variants)
+        names, chosen = _observers(observers, source), variants_of(source, wanted)
+        given = seeds if isinstance(seeds, Iterable) else range(checked_seed(seeds))
+        numbers = tuple(dict.fromkeys(map(checked_seed, given)))
+        if not numbers:
+            raise CoopenvError("seeds: expected at least one")
+        return cls(source, names, chosen, numbers, steady_from)
+
+    @property
+    def work(self) -> str:
+        """What there is to do, for people who wait."""
+        parts = {"observer": self.observers, "variant": self.variants, "seed": self.seeds}
+        return ", ".join(f"{len(part)} {word}{'s' if len(part) > 1 else ''}" for word, part in parts.items())
+
+    def run(self, executor: Executor, on_progress: Callable[[float], None] = lambda share: None) -> Comparison:
+        """Judge the observers; the result does not depend on the executor.
+
+        Raises:
+            CoopenvError: a record cannot be made, or the steady state would start beyond it.
+        """
+        self.source.steady_from(self.steady_from)
+        # One record serves all observers. Recorded robots are few and long records: their observers are shared out.
+        groups = [self.observers] if self.source.seeded else [(name,) for name in self.observers]
+        sent = [{name: portable(name) for name in group} for group in groups]
+        used = self.seeds if self.source.seeded else (0,)
+        tasks = [Task(self.source, *made, self.steady_from) for made in product(self.variants, used, sent)]
+        judged = executor.map(judge, tasks, lambda done: on_progress(done / len(tasks)))
+        samples = sorted(
+            chain(*judged), key=lambda s: (self.variants.index(s.variant), self.observers.index(s.observer))
+        )
+        told = {variant: self.source.variants[variant] for variant in self.variants}
+        return Comparison(self.source.name, self.observers, told, used, samples)
+
+
+def _observers(observers: Iterable[str | Factory] | None, source: Source) -> tuple[str, ...]:
+    """Return the names of observers, each once; None: of all that are meant for the vehicles of a source."""
     if observers is None:
         return tuple(available_names(source.planar))
     if isinstance(observers, str):
@@ -186,54 +235,3 @@ def observers_of(observers: Iterable[str | Factory] | None, source: Source) -> t
         if find(observer) is not find(name):
             raise CoopenvError(f"two observers are named '{name}': register them under names of their own")
     return tuple(dict.fromkeys(names))
-
-
-def seeds_of(seeds: int | Iterable[int]) -> tuple[int, ...]:
-    """Return the seeds that were asked for, as a number or one by one.
-
-    Raises:
-        CoopenvError: there are none, or one of them is no seed.
-    """
-    given = seeds if isinstance(seeds, Iterable) else range(checked_seed(seeds))
-    numbers = tuple(dict.fromkeys(map(checked_seed, given)))
-    if not numbers:
-        raise CoopenvError("seeds: expected at least one")
-    return numbers
-
-
-def work_of(observers: Sequence[str], variants: Sequence[str], seeds: Sequence[int]) -> str:
-    """Return what there is to do, for people who wait."""
-    return ", ".join(
-        f"{len(things)} {word}{'s' if len(things) > 1 else ''}"
-        for things, word in ((observers, "observer"), (variants, "variant"), (seeds, "seed"))
-    )
-
-
-def run_comparison(
-    source: Source,
-    observers: Sequence[str],
-    seeds: Sequence[int],
-    variants: Sequence[str],
-    steady_from: float | None = None,
-    executor: Executor | None = None,
-    on_progress: Callable[[float], None] = lambda share: None,
-) -> Comparison:
-    """Judge observers on the records of a source; the result does not depend on the executor (None: this process).
-
-    Raises:
-        CoopenvError: an unknown observer, a record that cannot be made, or a start of the steady state beyond it.
-    """
-    source.steady_from(steady_from)
-    for name in observers:
-        find(name)
-    sent = {name: portable(name) for name in observers}
-    # One record serves all observers. Recorded robots are few records and long ones: their observers are shared out.
-    groups = [sent] if source.seeded else [{name: observer} for name, observer in sent.items()]
-    used = tuple(seeds) if source.seeded else (0,)
-    tasks = [Task(source, *made, steady_from) for made in product(variants, used, groups)]
-    judged = (executor or Local(1)).map(judge, tasks, lambda done: on_progress(done / len(tasks)))
-    order: dict[tuple[str, str], list[Sample]] = {(variant, name): [] for variant in variants for name in observers}
-    for sample in (sample for samples in judged for sample in samples):
-        order[sample.variant, sample.observer].append(sample)
-    told = {variant: source.variants[variant] for variant in variants}
-    return Comparison(source.name, tuple(observers), told, used, [s for own in order.values() for s in own])

@@ -49,7 +49,7 @@ def test_observers_are_compared_where_they_are_meant_to_be() -> None:
     """Unless they are asked for by name."""
 
     def names(source: str, observers: str | None = None) -> tuple[str, ...]:
-        return tuple(request_of(source, observers, None, range(1), None, 0, None, {}, ()).observers)
+        return request_of(source, observers, None, range(1), None, 0, None, {}, ()).plan.observers
 
     space, plane = names("overtaking"), names("mrclam_6")
     assert "planar_ekf" not in space and {"p3p", "robust", "robust_joint"} <= {*space}
