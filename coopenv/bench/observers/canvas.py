@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from matplotlib.artist import Artist
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from coopenv.errors import CoopenvError
@@ -52,8 +51,3 @@ def legend(figure: Figure, handles: Sequence[Artist]) -> None:
     columns = fitting(float(figure.get_figwidth()), length / len(handles), len(handles))
     spacing: dict[str, Any] = {"handlelength": 2.2, "columnspacing": 1.6}
     style.legend(figure, handles, "outside upper center", ncols=columns, fontsize=SMALL + 0.5, **spacing)
-
-
-def panels(figure: Figure, rows: int, columns: int) -> list[list[Axes]]:
-    """Return axes by row and column."""
-    return [list(line) for line in figure.subplots(rows, columns, squeeze=False)]

@@ -23,8 +23,8 @@ from coopenv.bench.observers.basin import (
 )
 from coopenv.bench.observers.comparison import Comparison, Plan
 from coopenv.bench.observers.executors import Executor
-from coopenv.bench.observers.exports import csv_text
 from coopenv.bench.observers.sources import ALL, find_source
+from coopenv.bench.observers.tables import csv_text
 from coopenv.errors import CoopenvError
 from coopenv.files import replace_text, replacing_folder
 from coopenv.jsonable import json_text, jsonable

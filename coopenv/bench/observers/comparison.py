@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
-from coopenv.bench.observers import exports, tables
+from coopenv.bench.observers import tables
 from coopenv.bench.observers.executors import Executor, Local
 from coopenv.bench.observers.judge import Task, judge
 from coopenv.bench.observers.leaderboard import Leaderboard
@@ -63,7 +63,7 @@ class Comparison(Leaderboard):
         Raises:
             OutputError: the file cannot be written.
         """
-        text = exports.csv_text(self.rows)
+        text = tables.csv_text(self.rows)
         if path is not None:
             replace_text(path, text)
         return text
@@ -78,7 +78,7 @@ class Comparison(Leaderboard):
         Raises:
             CoopenvError: the variant was not run, or the file cannot be written.
         """
-        text = exports.latex(self, self._checked(variant))
+        text = tables.latex(self, self._checked(variant))
         if path is not None:
             replace_text(path, text)
         return text

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
@@ -14,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from coopenv.bench.observers.canvas import NOTE, PAGE, TEXT, canvas, fitting, legend, panels
+from coopenv.bench.observers.canvas import NOTE, PAGE, TEXT, canvas, fitting, legend
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
 from coopenv.bench.observers.rows import mean_of
@@ -48,7 +47,7 @@ def error_figure(board: Leaderboard, variant: str, width: float | None = None) -
     scene = board.samples[0].scene
     figure, inches = canvas(width, _FRAME + 1.05 * len(groups), f"{board.title}, {variant}")
     shown = _chosen(len(scene.vehicles), fitting(inches, 1.6, MOST_VEHICLES))
-    axes = panels(figure, len(groups), len(shown))
+    axes = figure.subplots(len(groups), len(shown), squeeze=False)
     for (name, own), line in zip(groups.items(), axes, strict=True):
         error = np.median([sample.series.position_error for sample in own], axis=0)
         claimed = 3.0 * np.median([sample.series.position_std for sample in own], axis=0)
@@ -62,7 +61,7 @@ def error_figure(board: Leaderboard, variant: str, width: float | None = None) -
             if scene.steady_from > 0.0:
                 ax.axvline(scene.steady_from, color=INK, linewidth=0.6, linestyle=_DOTTED)
         line[0].set_ylabel(short_name(name), rotation=0, ha="right", va="center", labelpad=4, **TEXT)
-    _share_axes([ax for line in axes for ax in line], len(shown), scene.t)
+    _share_axes(axes.ravel(), len(shown), scene.t)
     for ax, i in zip(axes[0], shown, strict=True):
         ax.set_title(vehicle_label(scene.vehicles[i]), fontsize=NORMAL + 2, color=INK, pad=4)
     figure.supylabel("position error [m]", **TEXT)
@@ -93,7 +92,7 @@ def nees_figure(board: Leaderboard, variant: str, width: float | None = None) ->
     columns = fitting(width or PAGE, 3.0, min(3, len(groups)))
     rows = -(-len(groups) // columns)
     figure, _ = canvas(width, _FRAME + 1.5 * rows, f"{board.title}, {variant}")
-    axes = [ax for line in panels(figure, rows, columns) for ax in line]
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for unused in axes[len(groups) :]:
         unused.set_visible(False)
     shown = _chosen(len(scene.vehicles), MOST_VEHICLES)
@@ -121,7 +120,7 @@ def _chosen(vehicles: int, most: int) -> list[int]:
     return [int(i) for i in np.unique(np.linspace(0, vehicles - 1, min(vehicles, most)).round())]
 
 
-def _share_axes(axes: Sequence[Axes], columns: int, t: np.ndarray) -> None:
+def _share_axes(axes: np.ndarray, columns: int, t: np.ndarray) -> None:
     """Give panels, row by row, the same time and the same whole decades, and label them at the figure's edge."""
     drawn = [np.asarray(line.get_ydata(), float) for ax in axes for line in ax.get_lines()]
     values = np.concatenate([line for line in drawn if line.size > 2])  # and not what marks a level

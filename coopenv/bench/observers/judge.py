@@ -64,28 +64,23 @@ class Series(NamedTuple):
 
 @dataclass(frozen=True)
 class Sample:
-    """One observer on one record; arrays (N,), NaN where it failed."""
+    """One observer on one record."""
 
     variant: str
     observer: str
     scene: Scene
-    position_mse: Array  # m^2, in the steady state
-    orientation_mse: Array  # deg^2
-    anees: Array
-    nis: Array  # sums over the steady state
-    nis_dof: Array
-    settle_time: Array  # s
-    converge_time: Array  # s
-    rate: Array  # 1/s
-    diverged: Array  # bool
-    ate: Array  # m
-    rpe: Array  # m
-    rpe_orientation: Array  # deg
+    measures: Mapping[str, Array]
+    """Arrays (N,) by name, see `_measures`; none where it failed."""
     bytes_per_s: Array
     us_per_update: Array
     nees_dof: int
     failure: str
     series: Series
+
+    def measured(self, name: str, vehicles: int | slice = slice(None)) -> Any:
+        """Return what was measured of some vehicles; NaN where the observer failed, which has diverged."""
+        nothing = np.full(len(self.scene.vehicles), 1.0 if name == "diverged" else np.nan)
+        return self.measures.get(name, nothing)[vehicles]
 
 
 def judge(task: Task) -> list[Sample]:
@@ -152,27 +147,16 @@ def _markers(recording: Recording) -> Array:
 
 def sample_of(variant: str, observer: str, scene: Scene, recording: Recording, result: Run) -> Sample:
     """Judge one run. Where it failed, everything but its costs is NaN."""
-    N = len(scene.vehicles)
     if result.failure:
-        measures: dict[str, Any] = {**dict.fromkeys(_JUDGED, np.full(N, np.nan)), "diverged": np.ones(N, bool)}
-        series = Series(*np.full((3, len(scene.t), N), np.nan))
+        measures, series = {}, Series(*np.full((3, len(scene.t), len(scene.vehicles)), np.nan))
     else:
         measures, series = _measures(scene, recording, result), _series(recording, result)
-    return Sample(
-        variant=variant,
-        observer=observer,
-        scene=scene,
-        **measures,
-        bytes_per_s=result.bytes_per_second,
-        us_per_update=result.microseconds_per_update,
-        nees_dof=result.nees_dof,
-        failure=result.failure,
-        series=series,
-    )
+    costs = result.bytes_per_second, result.microseconds_per_update
+    return Sample(variant, observer, scene, measures, *costs, result.nees_dof, result.failure, series)
 
 
-def _measures(scene: Scene, recording: Recording, result: Run) -> dict[str, Any]:
-    """Return the figures of a run that did not fail, arrays (N,)."""
+def _measures(scene: Scene, recording: Recording, result: Run) -> dict[str, Array]:
+    """Return the figures of a run that did not fail; m and deg and their squares, s, 1/s; NIS summed over time."""
     steady = result.t > scene.steady_from
     told = np.where(steady[:, None], result.nis_dof, 0)
     vehicles = range(len(scene.vehicles))
@@ -191,12 +175,6 @@ def _measures(scene: Scene, recording: Recording, result: Run) -> dict[str, Any]
         "rpe": relative[0],
         "rpe_orientation": relative[1],
     }
-
-
-_JUDGED = (
-    *("position_mse", "orientation_mse", "anees", "nis", "nis_dof", "settle_time", "converge_time", "rate"),
-    *("ate", "rpe", "rpe_orientation"),
-)
 
 
 def _relative(recording: Recording, result: Run, i: int) -> tuple[float, float]:

@@ -1,4 +1,7 @@
-"""The leaderboard's rows: one observer, one vehicle, one variant, summed up over all seeds."""
+"""The leaderboard's rows: one observer, one vehicle, one variant, summed up over all seeds.
+
+Standard errors of root mean squares are to first order (delta method).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,6 @@ import numpy as np
 
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.judge import RELATIVE_DELTA, Sample
-from coopenv.bench.observers.standard_errors import UNKNOWN, Measured, mean_root, ratio
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.consistency import DIVERGED_ORIENTATION, DIVERGED_POSITION, LEVEL, Interval, mean_bounds
 from coopenv.estimation.metrics import CONVERGED, SETTLED
@@ -77,6 +79,51 @@ class Row:
     gramian_local_eigenvalue: float = _column("the same about the vehicle, in units of the targets' range; no unit")
 
 
+class Measured(NamedTuple):
+    """A figure and its standard error over the seeds; NaN where there is one seed."""
+
+    value: float
+    error: float
+
+
+UNKNOWN = Measured(float("nan"), float("nan"))
+
+
+def mean_root(squares: Array) -> Measured:
+    """Return the mean over vehicles of the root of the mean over seeds.
+
+    Args:
+        squares: (S, N) mean squares of S seeds and N vehicles; vehicles of one seed may depend on one another.
+    """
+    value, each = _linearised(squares)
+    return Measured(value, standard_error(each))
+
+
+def ratio(squares: Array, reference: Array) -> Measured:
+    """Return `mean_root(squares)` over `mean_root(reference)`, seed against seed.
+
+    Args:
+        squares: (S, N).
+        reference: (S, N) of the same seeds, whose error partly cancels.
+    """
+    (above, each_above), (below, each_below) = _linearised(squares), _linearised(reference)
+    if not below > 0.0:
+        return UNKNOWN
+    value = above / below
+    return Measured(value, value * standard_error(each_above / above - each_below / below) if above else 0.0)
+
+
+def standard_error(values: Array) -> float:
+    """Return the standard error of the mean of (S,) independent values, NaN of a single one."""
+    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else float("nan")
+
+
+def _linearised(squares: Array) -> tuple[float, Array]:
+    """Return the mean root, and (S,) each seed's share in it: r = sqrt(m), dr = dm / (2 r)."""
+    roots = np.sqrt(squares.mean(axis=0))
+    return float(roots.mean()), (squares / np.where(roots > 0, 2.0 * roots, 1.0)).mean(axis=1)
+
+
 NOWHERE = Interval(float("nan"), float("nan"))
 
 
@@ -119,13 +166,15 @@ def totals_of(samples: Sequence[Sample]) -> dict[tuple[str, str], Total]:
 
 
 def _total(own: Sequence[Sample], nominal: Sequence[Sample], vehicles: slice = slice(None)) -> Total:
-    squares, reference = (np.array([s.position_mse[vehicles] for s in samples]) for samples in (own, nominal))
+    squares, reference = (
+        np.array([s.measured("position_mse", vehicles) for s in samples]) for samples in (own, nominal)
+    )
     return Total(mean_root(squares), ratio(squares, reference) if nominal else UNKNOWN)
 
 
 def _row(environment: str, i: int, own: Sequence[Sample], nominal: Sequence[Sample]) -> Row:
     def over_seeds(name: str) -> Array:
-        return np.array([getattr(sample, name)[i] for sample in own], float)
+        return np.array([sample.measured(name, i) for sample in own], float)
 
     def bound(name: str) -> float:
         return float(np.sqrt(np.mean([getattr(sample.scene, name)[i] for sample in own])))
@@ -151,8 +200,8 @@ def _row(environment: str, i: int, own: Sequence[Sample], nominal: Sequence[Samp
         anees=float(np.mean(anees)),
         settled_fraction=float(np.mean(np.isfinite(settle))),
         settle_time_s=_median(settle),
-        bytes_per_s=float(np.mean(over_seeds("bytes_per_s"))),
-        us_per_update=_median(over_seeds("us_per_update")),
+        bytes_per_s=float(np.mean([sample.bytes_per_s[i] for sample in own])),
+        us_per_update=_median(np.array([sample.us_per_update[i] for sample in own])),
         failure=next((sample.failure for sample in own if sample.failure), ""),
         bound_ancestors_m=family,
         bound_single_m=bound("bound_single_mse"),

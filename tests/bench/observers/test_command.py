@@ -15,7 +15,6 @@ import pytest
 
 from coopenv.bench.observers import compare
 from coopenv.bench.observers.command import figure_files
-from coopenv.bench.observers.judge import _JUDGED
 from coopenv.bench.observers.rows import Row
 from coopenv.cli import main
 from coopenv.observers import registry
@@ -128,11 +127,11 @@ def test_large_numbers_fit_as_well() -> None:
     """Those of an observer that diverges and sends a lot."""
     comparison = compare(["covariance_intersection"], "overtaking", 1, overrides={"horizon": 0.5}, steady_from=0.2)
     (sample,) = comparison.samples
-    wild = {"position_mse": 12345.6**2, "anees": 1.3e-11, "nis": 2814.3e3, "nis_dof": 1e3, "bytes_per_s": 123456.7}
-    far = {name: np.full(5, value) for name, value in (wild | {"us_per_update": 12345.6, "diverged": 1.0}).items()}
+    wild = {"position_mse": 12345.6**2, "anees": 1.3e-11, "nis": 2814.3e3, "nis_dof": 1e3, "diverged": 1.0}
+    measures = {name: np.full(5, wild.get(name, 0.0)) for name in sample.measures}
     scene = replace(sample.scene, vehicles=("a",) * 5, **{name: np.full(5, 1e-3) for name in PER_VEHICLE})
-    rest = {name: np.zeros(5) for name in _JUDGED if name not in far}
-    samples = [replace(sample, scene=scene, **{**rest, **far}), replace(sample, scene=scene, **{**rest, **far})]
+    costs = {"bytes_per_s": np.full(5, 123456.7), "us_per_update": np.full(5, 12345.6)}
+    samples = [replace(sample, scene=scene, measures=measures, **costs)] * 2
     text = str(replace(comparison, samples=samples, seeds=(0, 1)))
     assert "12346" in text and "…" not in text and max(len(line) for line in text.splitlines()) <= 80
 

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 import coopenv
-from coopenv.bench.observers.initial_estimates import random_start, with_start
+from coopenv.bench.observers.basin import random_start, with_start
 from coopenv.observers import Recording, run
 from coopenv.runs.recorder import record
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coopenv.bench.observers.standard_errors import UNKNOWN, mean_root, ratio
+from coopenv.bench.observers.rows import UNKNOWN, mean_root, ratio
 
 EXPERIMENTS, SEEDS, VEHICLES = 2000, 40, 3
 

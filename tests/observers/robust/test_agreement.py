@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from coopenv.bench.observers.basin import random_start, with_start
 from coopenv.bench.observers.faults import FAULTS, Lie
-from coopenv.bench.observers.initial_estimates import random_start, with_start
 from coopenv.observers import Estimate, Recording, Tick, run
 from coopenv.observers.riccati_coordinates import riccati_covariance
 from coopenv.observers.robust.constants import PATIENCE

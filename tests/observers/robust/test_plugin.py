@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from coopenv.bench.observers.basin import random_start
 from coopenv.bench.observers.faults import FAULTS, Lie
-from coopenv.bench.observers.initial_estimates import random_start
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.kernel_observer import KernelObserver
