@@ -54,19 +54,10 @@ def study_seeds(
     scenario: Scenario,
     seeds: range,
     steady_from: float,
-    dtype: str = "float64",
     on_progress: Callable[[float], None] = lambda share: None,
 ) -> SeedStudy:
-    """Run one world per seed, all at once, with action zero, and judge every camera tick.
-
-    Args:
-        scenario: the environment.
-        seeds: consecutive seeds.
-        steady_from: start of the steady state, s.
-        dtype: precision.
-        on_progress: called with the share of the ticks done.
-    """
-    engine, ticks = Engine(scenario, len(seeds), dtype), scenario.horizon_ticks
+    """Run one world per seed, all at once, with action zero, and judge every camera tick; `steady_from` in s."""
+    engine, ticks = Engine(scenario, len(seeds), "float64"), scenario.horizon_ticks
     views = Views(engine, ("position_error", "orientation_error"))
     for tick in play(engine, seeds, ticks):
         views.take()

@@ -67,12 +67,7 @@ def load_agent(name_or_path: str | Path, scenario: Scenario) -> Policy:
 
 
 def load_policy(name: str, scenario: Scenario, seed: int) -> Policy:
-    """Return a policy by name: `zero`, `random`, or an agent.
-
-    Args:
-        name: what `--policy` takes.
-        scenario: whose vehicles it drives.
-        seed: of the policy `random`.
+    """Return a policy by what `--policy` takes: `zero`, `random` (with a seed), or the name of an agent.
 
     Raises:
         CoopenvError: there is no such policy, or the agent cannot drive in this scenario.

@@ -40,20 +40,9 @@ def execute(
     figures: str | None,
     video: bool,
 ) -> dict[str, Any]:
-    """Run and write; a run that does not reach its end writes nothing.
+    """Run, write to the folder `out`, and return what `run --json` prints: the metrics, and the paths of the files.
 
-    Args:
-        name: of what is run.
-        run: which has not begun.
-        out: folder of the results.
-        log: for progress and notes.
-        overrides: of the scenario, as they were given.
-        steady_from: s; None: as `steady_start` says.
-        figures: format of the figures; None: no figures.
-        video: whether to film it.
-
-    Returns:
-        What `run --json` prints: the contents of `metrics.json`, and the paths of the files.
+    A run that does not reach its end writes nothing. `figures` is their format; None: no figures.
 
     Raises:
         CoopenvError: an argument is not valid, or the results cannot be written.

@@ -18,7 +18,7 @@ def play(
     Args:
         engine: what is run, on any backend; it is stopped when something fails meanwhile.
         seeds: one per world.
-        ticks: how many after the start; fewer where the backend has no more.
+        ticks: after the start; fewer where the backend has no more.
         policy: drives the first world; None: action zero.
         to_the_end: go on when all vehicles of the first world have ended.
 

@@ -15,7 +15,6 @@ from coopenv.scenario.bodies import (
     ConstantMotion,
     DrivenMotion,
     InitialEstimate,
-    InitialPose,
     SegmentMotion,
     Vehicle,
     WaypointMotion,
@@ -71,7 +70,7 @@ def start(vehicle: Vehicle) -> str:
     """Return where a vehicle starts, one line per fact."""
     if isinstance(vehicle.motion, WaypointMotion):
         return vector(vehicle.motion.waypoints[0].position)
-    pose: InitialPose | None = vehicle.initial_pose
+    pose = vehicle.initial_pose
     assert pose is not None  # the schema asks for it
     lines = [vector(pose.position), orientation(pose.yaw, pose.quaternion_wxyz) or "yaw 0 deg"]
     if any(pose.position_spread):
@@ -129,21 +128,15 @@ def stages(moves: Any) -> Iterator[tuple[str, str]]:
 
 
 def twist(linear: Sequence[float], angular: Sequence[float]) -> str:
-    """Return a body twist in words."""
-    turning = f", turning at {vector(angular)} rad/s" if any(angular) else ""
-    return f"{velocity(linear)}{turning}"
-
-
-def velocity(linear: Sequence[float]) -> str:
-    """Return a body velocity as `0.6 m/s to the left`, or by its components."""
+    """Return a body twist as `0.6 m/s to the left`, or by its components."""
     directions = (("forward", "backward"), ("to the left", "to the right"), ("up", "down"))
     moving = [axis for axis, value in enumerate(linear) if value]
-    if not moving:
-        return "0 m/s"
-    if len(moving) > 1:
-        return f"{vector(linear)} m/s"
-    value = linear[moving[0]]
-    return f"{number(abs(value))} m/s {directions[moving[0]][value < 0]}"
+    if len(moving) == 1:
+        value = linear[moving[0]]
+        text = f"{number(abs(value))} m/s {directions[moving[0]][value < 0]}"
+    else:
+        text = f"{vector(linear)} m/s" if moving else "0 m/s"
+    return f"{text}, turning at {vector(angular)} rad/s" if any(angular) else text
 
 
 def vehicle_motion(vehicle: Vehicle) -> str:
@@ -161,11 +154,10 @@ def body(box: Body | None) -> str:
 
 def neighbours(scenario: Scenario) -> list[str]:
     """Return, per vehicle, the names of the targets that it may measure."""
-    landmarks = len(scenario.landmarks)
-    result = []
+    L, result = len(scenario.landmarks), []
     for indices in neighbour_sets(scenario):
         names = [scenario.target_names[index] for index in indices]
-        if landmarks >= MANY_LANDMARKS and indices[:landmarks] == list(range(landmarks)):
-            names = [f"all {landmarks} landmarks", *names[landmarks:]]
+        if L >= MANY_LANDMARKS and indices[:L] == list(range(L)):
+            names = [f"all {L} landmarks", *names[L:]]
         result.append(", ".join(names) or "none")
     return result

@@ -22,48 +22,47 @@ DESCRIPTION_LENGTH = 240
 
 
 def summary(name: str, scenario: Scenario, recorded: bool = False) -> Iterator[RenderableType]:
-    """Yield the first screen, part by part.
-
-    Args:
-        name: of the environment or the recording.
-        scenario: what it is.
-        recorded: whether a recording is replayed.
-    """
+    """Yield the first screen of an environment or a recording, part by part."""
     registered = f" ({environment_id(name)})" if name in list_envs() else ""
     yield Text(scenario.title, "bold").append(registered, "not bold")
     if scenario.description:
         yield shorten(scenario.description, DESCRIPTION_LENGTH, placeholder=" ...")
     if recorded:
         yield "Recorded: every episode is the recording, whatever the seed and the actions."
-    yield ""
-    yield fact_table(scenario)
-
-
-def fact_table(scenario: Scenario) -> Table:
-    """Return one line per fact: vehicles, sensors, radio, rates, observer, observation, action, reward, end."""
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True)
-    table.add_column()
-    for name, fact in facts(scenario):
-        table.add_row(name, fact)
-    return table
+    for subject, fact in facts(scenario).items():
+        table.add_row(subject, fact)
+    yield ""
+    yield table
 
 
-def facts(scenario: Scenario) -> Iterator[tuple[str, str]]:
-    """Yield (subject, what is to be said about it)."""
-    yield "Vehicles", _vehicles(scenario)
-    yield "Targets", _targets(scenario)
-    yield "Camera", _camera(scenario)
-    yield "Odometry", _odometry(scenario)
-    yield "V2X", _v2x(scenario)
-    yield "Observer", _observer(scenario)
-    yield "Rates", _rates(scenario)
-    yield "Observation", _observation(scenario)
+def facts(scenario: Scenario) -> dict[str, str]:
+    """Return what is to be said about vehicles, sensors, radio, rates, observer, observation, action, reward, end."""
+    layout, rates, noise, observer = observation_layout(scenario), scenario.rates, scenario.noise, scenario.observer
+    groups = Counter[str]()
+    for field in layout.values():
+        groups[field.group] += field.stop - field.start
+    corrections = "" if rates.observer is None else f", observer {number(rates.observer)}"
+    spread = f"noise {number(noise.velocity)} m/s and {number(noise.angular_velocity)} rad/s"
+    weights = [f"{number(weight)} {name}" for name, weight in scenario.reward.by_name.items() if weight]
+    found = {
+        "Vehicles": _vehicles(scenario),
+        "Targets": _targets(scenario),
+        "Camera": _camera(scenario),
+        "Odometry": f"linear and angular velocity, {spread if noise.enabled else 'no noise'}",
+        "V2X": _v2x(scenario),
+        "Observer": f"{observer.name} (gains k = {_gain(observer.k)}, q = {_gain(observer.q)})",
+        "Rates": f"camera {number(rates.camera)} Hz, odometry {number(rates.odometry)}{corrections}, "
+        f"decisions {number(rates.decision)}",
+        "Observation": f"{groups.total()} numbers per vehicle: "
+        + ", ".join(f"{group} {size}" for group, size in groups.items() if size),
+    }
     if scenario.driven:
-        yield "Action", _action(scenario)
-    weights = [f"{number(w)} {name}" for name, w in scenario.reward.by_name.items() if w]
-    yield "Reward", " + ".join(weights).replace("+ -", "- ") or "none: every weight is 0"
-    yield "Ends", _end(scenario)
+        spans = [f"{entry.name} {number(entry.low)} to {number(entry.high)} {entry.unit}" for entry in layout.action]
+        found["Action"] = f"{len(spans)} numbers in [-1, 1]: {', '.join(spans)}"
+    found["Reward"] = " + ".join(weights).replace("+ -", "- ") or "none: every weight is 0"
+    return found | {"Ends": _end(scenario)}
 
 
 def _vehicles(scenario: Scenario) -> str:
@@ -95,13 +94,6 @@ def _camera(scenario: Scenario) -> str:
     return f"{camera.model}{size}{reach}{misses}; bearings{spread}"
 
 
-def _odometry(scenario: Scenario) -> str:
-    noise = scenario.noise
-    if not noise.enabled:
-        return "linear and angular velocity, no noise"
-    return f"linear and angular velocity, noise {number(noise.velocity)} m/s and {number(noise.angular_velocity)} rad/s"
-
-
 def _v2x(scenario: Scenario) -> str:
     radio = scenario.v2x
     parts = [f"a message every {'frame' if radio.period == 1 else f'{radio.period} frames'}"]
@@ -112,40 +104,10 @@ def _v2x(scenario: Scenario) -> str:
     return ", ".join(parts)
 
 
-def _observer(scenario: Scenario) -> str:
-    observer = scenario.observer
-    return f"{observer.name} (gains k = {_gain(observer.k)}, q = {_gain(observer.q)})"
-
-
 def _gain(value: float | tuple[float, ...] | dict[str, float]) -> str:
     several = value.values() if isinstance(value, dict) else value if isinstance(value, tuple) else (value,)
     low, high = min(several), max(several)
     return number(low) if low == high else f"{number(low)} to {number(high)}"
-
-
-def _rates(scenario: Scenario) -> str:
-    rates = scenario.rates
-    corrections = "" if rates.observer is None else f", observer {number(rates.observer)}"
-    return (
-        f"camera {number(rates.camera)} Hz, odometry {number(rates.odometry)}{corrections}, "
-        f"decisions {number(rates.decision)}"
-    )
-
-
-def _observation(scenario: Scenario) -> str:
-    groups = Counter[str]()
-    for field in observation_layout(scenario).values():
-        groups[field.group] += field.stop - field.start
-    sizes = ", ".join(f"{group} {size}" for group, size in groups.items() if size)
-    return f"{groups.total()} numbers per vehicle: {sizes}"
-
-
-def _action(scenario: Scenario) -> str:
-    spans = [
-        f"{entry.name} {number(entry.low)} to {number(entry.high)} {entry.unit}"
-        for entry in observation_layout(scenario).action
-    ]
-    return f"{len(spans)} numbers in [-1, 1]: {', '.join(spans)}"
 
 
 def _end(scenario: Scenario) -> str:

@@ -45,12 +45,7 @@ def metrics_table(vehicles: list[dict[str, Any]]) -> Table:
 
 
 def legend(steady_from: float, end: float) -> Iterator[str]:
-    """Yield what the columns mean.
-
-    Args:
-        steady_from: start of the steady state, s.
-        end: of the run, s.
-    """
+    """Yield what the columns mean, for a steady state that starts at a time and a run that ends at one, s."""
     yield f"Settles: stays below {SETTLED.text}. Converges: stays below {CONVERGED.text}."
     if steady_from < end:
         yield f"RMSE and NEES: steady state, after {steady_from:g} s. NEES of a consistent estimate: 6."

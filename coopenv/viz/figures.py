@@ -28,19 +28,16 @@ def save_figures(
     steady_from: float | None = None,
     file_format: str = "png",
 ) -> list[Path]:
-    """Write the figures of `FIGURE_NAMES` into `directory`, which is made if need be.
+    """Write the figures of `FIGURE_NAMES` into `directory`, which is made if need be, and return their paths.
 
     Args:
         trajectory: the record of a run.
         directory: where the files go; files of the same names are replaced.
-        observability: evaluated here with the default window and threshold unless given.
+        observability: with the default window and threshold unless given.
         scenario: of the run, for the roads and buildings under its paths.
         ends: s, when each vehicle arrived or collided and was parked, where its lines stop (None: no vehicle was).
         steady_from: s, start of the steady state that mean NEES are over (None: at 70 % of the record).
         file_format: one of `FORMATS`.
-
-    Returns:
-        The paths written.
 
     Raises:
         OutputError: the directory cannot be made or written to.

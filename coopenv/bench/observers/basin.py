@@ -83,11 +83,8 @@ class Basin:
 def with_start(recording: Recording, rotations: Array, positions: Array, covariance: ArrayLike) -> Recording:
     """Return the record with other initial estimates.
 
-    Args:
-        recording: of N vehicles.
-        rotations: (N, 3, 3) body to map.
-        positions: (N, 3) map, m.
-        covariance: (6, 6) for all or (N, 6, 6), in LEFT coordinates, rad and m.
+    Rotations (N, 3, 3) map body to map, positions (N, 3) are in the map, m; the covariance, (6, 6) for all or
+    (N, 6, 6), is in LEFT coordinates, rad and m.
     """
     N = len(recording.setups)
     return changed(
@@ -102,11 +99,6 @@ def random_start(recording: Recording, seed: int, radius: float = RADIUS) -> Rec
     """Return the record with attitudes uniform over SO(3) and positions uniform in a ball about the true ones.
 
     The covariance is that of these distributions: (pi^2 / 3 + 2) / 3 rad^2 and radius^2 / 5 per axis.
-
-    Args:
-        recording: of N vehicles; each gets a draw of its own.
-        seed: of the draw.
-        radius: of the ball, m.
     """
     generator = np.random.default_rng([seed, 3])
     N = len(recording.setups)

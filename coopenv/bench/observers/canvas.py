@@ -21,12 +21,7 @@ _LEGEND_MARK, _LEGEND_LETTER = 0.45, 0.06  # inches
 
 
 def canvas(width: float | None, height: float, note: str) -> tuple[Figure, float]:
-    """Return an empty figure that arranges itself, with a note in small print below, and its width in inches.
-
-    Args:
-        width: inches; None: a page's.
-        height: inches.
-        note: what was compared.
+    """Return an empty figure that arranges itself, with a note in small print below, and its width, inches.
 
     Raises:
         CoopenvError: a width that nothing can be drawn in.

@@ -106,16 +106,9 @@ def perform(
     log: Console,
     as_json: bool = False,
 ) -> None:
-    """Compare, print the tables (or what `leaderboard.json` holds) and write the files.
+    """Compare, print the tables (or what `leaderboard.json` holds) and write the files to the folder `out`, if any.
 
-    Args:
-        request: what is to be compared.
-        executor: where the work is done.
-        out: folder for the files; None: no files.
-        figures: format of figures as files of their own; None: the report alone has them.
-        printed: for the tables.
-        log: for the progress.
-        as_json: print JSON, and nothing else.
+    `figures` is the format of figures as files of their own; None: the report alone has them.
 
     Raises:
         CoopenvError: something that was asked for does not exist, or cannot be written.

@@ -34,14 +34,7 @@ _COORDINATE = re.compile(r"(?<=[ML ])(-?\d+\.\d\d)\d+(?=[ \n])")
 def report_text(
     board: Leaderboard, content: Mapping[str, Any], draws: Sequence[Draw] = (), basins: Sequence[Basin] = ()
 ) -> str:
-    """Return the report as one HTML text.
-
-    Args:
-        board: what it shows.
-        content: of `leaderboard.json`: command and versions.
-        draws: of a study of basins.
-        basins: what comes of them.
-    """
+    """Return the report as one HTML text; `content` of `leaderboard.json` tells the command and versions."""
     variants = [_variant(board, name) for name in board.variants]
     nominal = variants[0]["name"] == NOMINAL
     versions = ", ".join(f"{name} {version}" for name, version in content["versions"].items())

@@ -176,11 +176,6 @@ def _is_planar(recording: Recording) -> bool:
 def find_source(text: str, overrides: Mapping[str, Any] | None = None, data: Path | None = None) -> Source:
     """Return the source of an environment's name, a scenario file, a sub-dataset's name or a log file.
 
-    Args:
-        text: what the user named.
-        overrides: of a scenario, by dotted key.
-        data: folder of recorded data.
-
     Raises:
         CoopenvError: there is none of that name, or an option for what is no such source.
     """
@@ -199,11 +194,7 @@ def find_source(text: str, overrides: Mapping[str, Any] | None = None, data: Pat
 
 
 def variants_of(source: Source, asked: str | None) -> tuple[str, ...]:
-    """Return the variants to run.
-
-    Args:
-        source: which has them.
-        asked: names with commas between, `all` that there can be, or None for the usual ones.
+    """Return the variants to run: names with commas between, `all` that there can be, or None for the usual ones.
 
     Raises:
         CoopenvError: there is none of that name, or the source cannot have it.
