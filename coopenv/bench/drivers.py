@@ -1,7 +1,5 @@
 """Score a driver: what share of vehicles arrives, collides, runs out of time, and how well they know where they are."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass

@@ -1,7 +1,5 @@
 """The same scenario over many seeds: who settles, and how accurate the steady state is, with its spread."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """`coopenv bench ...`: measure."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

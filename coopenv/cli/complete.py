@@ -1,7 +1,5 @@
 """What the shell completes: environments, drivers, observers, keys of a scenario. None of it loads the simulation."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from typing import Any, get_args
 

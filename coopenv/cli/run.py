@@ -1,7 +1,5 @@
 """`coopenv run | record`: simulate an environment, or keep what vehicles sense."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated

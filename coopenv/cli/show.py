@@ -1,7 +1,5 @@
 """`coopenv list | describe | schema`: what there is."""
 
-from __future__ import annotations
-
 import sys
 from enum import StrEnum
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a policy is, and those that look at nothing: the neutral action, and random ones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Protocol
 

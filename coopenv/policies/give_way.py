@@ -1,7 +1,5 @@
 """A scripted driver: towards the goal, giving way to the vehicles that it hears."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from coopenv.api.terms.layout import observation_layout

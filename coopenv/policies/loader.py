@@ -1,7 +1,5 @@
 """Find and load the drivers of `agents/`: one folder each, with an `agent.toml` and a card."""
 
-from __future__ import annotations
-
 import tomllib
 from importlib import import_module
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`coopenv run`: simulate with progress shown, write the results, print the table."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from textwrap import fill

@@ -1,7 +1,5 @@
 """What a command says while it works: how far it is, and what takes so long."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterable, Iterator, Sized
 from contextlib import contextmanager

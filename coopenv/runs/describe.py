@@ -1,7 +1,5 @@
 """Scenarios printed for people, in 80 columns."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

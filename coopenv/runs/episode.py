@@ -1,7 +1,5 @@
 """Go through an episode camera tick by camera tick, and keep what an engine shows at each."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`coopenv list`: environments, observers and agents, one line each."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

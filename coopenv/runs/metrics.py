@@ -1,7 +1,5 @@
 """What a recorded run comes to: the figures of `metrics.json`, one dict per vehicle and one for the run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from platform import python_version
 from typing import Any

@@ -1,7 +1,5 @@
 """Record what every vehicle senses, once per seed, so that all observers see the same ticks."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Run one world by decisions of a policy and record it at every camera tick."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from time import perf_counter
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Parts of a scenario in words."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any

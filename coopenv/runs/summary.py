@@ -1,7 +1,5 @@
 """The first screen of `coopenv describe`: what matters about a scenario, and the same as data."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator
 from textwrap import shorten

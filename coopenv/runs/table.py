@@ -1,7 +1,5 @@
 """Tables that fit a terminal, and the one that `coopenv run` ends with."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """Films of a run: MP4 through ffmpeg where the extra `video` is installed, otherwise an animated GIF."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
 from math import ceil
 from pathlib import Path
@@ -27,12 +25,6 @@ def frame_stride(scenario: Scenario) -> int:
 def film_name() -> str:
     """Return `video.mp4`, or `video.gif` without the extra."""
     return "video.mp4" if find_spec("imageio_ffmpeg") is not None else "video.gif"
-
-
-def open_film(folder: Path, fps: float) -> Film:
-    """Return the film of that name in `folder`."""
-    path = folder / film_name()
-    return Mp4Film(path, fps) if path.suffix == ".mp4" else GifFilm(path, fps)
 
 
 class Mp4Film:
@@ -106,3 +98,9 @@ class GifFilm:
 
 
 Film = Mp4Film | GifFilm
+
+
+def open_film(folder: Path, fps: float) -> Film:
+    """Return the film of that name in `folder`."""
+    path = folder / film_name()
+    return Mp4Film(path, fps) if path.suffix == ".mp4" else GifFilm(path, fps)

@@ -1,7 +1,5 @@
 """Lines cut off at the sides of a box, as three-dimensional axes do not do by themselves."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

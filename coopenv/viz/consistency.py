@@ -1,7 +1,5 @@
 """Does the observer know how wrong it is? NEES with chi-square bounds, and errors beside uncertainties."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

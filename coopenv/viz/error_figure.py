@@ -1,7 +1,5 @@
 """The evolution of the error states, one row per vehicle, as the paper shows them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import product
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """All figures of a run, written under stable names."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Where the names of things go, so that they cover neither marks nor each other."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 

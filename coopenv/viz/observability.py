@@ -1,7 +1,5 @@
 """The smallest eigenvalue of the observability Gramian along a run, and the verdict that follows."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What the figures share: a palette safe for colour-blind readers, the paper's names, time-axis helpers."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from pathlib import Path

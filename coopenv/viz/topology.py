@@ -1,7 +1,5 @@
 """The switching sensing topology: which target each camera measures, and why not."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

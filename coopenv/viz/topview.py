@@ -1,7 +1,5 @@
 """The top view of an environment: who sees whom, and how good each estimate is."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

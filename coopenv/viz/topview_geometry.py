@@ -1,7 +1,5 @@
 """The geometry behind the top view: everything in plan (x east, y north), in the map frame, m."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What stands still under the top view: axes, roads, buildings, landmarks, goals, and the panel's legend."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Artists that are kept and updated, drawn over a background that is drawn once."""
 
-from __future__ import annotations
-
 from typing import Any, cast
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The paths of vehicles and landmarks, in plan and in space: truth dotted, estimate solid."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A window that shows pictures, where there is a display; elsewhere it stays silent."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

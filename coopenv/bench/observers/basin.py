@@ -3,8 +3,6 @@
 One record, and many draws of the initial estimates on it: attitude uniform over SO(3), position uniform in a ball.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The basin map: initial angle against initial distance, and the share that converges by angle."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the figures of a comparison share: a page, a legend above the panels, and below them what was compared."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

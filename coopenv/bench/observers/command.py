@@ -1,7 +1,5 @@
 """`coopenv bench observers`: from what the user asked for to tables and files."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 from collections.abc import Mapping, Sequence

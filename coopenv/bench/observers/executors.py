@@ -3,8 +3,6 @@
 An executor maps one function over tasks. What comes out depends on neither the executor nor its number of workers.
 """
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import pickle

@@ -5,8 +5,6 @@ function of the seed and the fault alone. The one fault that needs the observers
 `Lie` changes them on their way out (see `runner.run`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The figures of a comparison: errors and consistency over time, variants as a heat map, cost against accuracy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """One record, judged: what every observer makes of it, against the truth and the bounds."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple

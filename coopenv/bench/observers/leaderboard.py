@@ -1,7 +1,5 @@
 """What a comparison of observers holds: the samples, and what comes of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property

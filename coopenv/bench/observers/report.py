@@ -1,7 +1,5 @@
 """The report: one HTML file that holds its figures and needs no network."""
 
-from __future__ import annotations
-
 import io
 import math
 import re

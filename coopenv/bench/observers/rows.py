@@ -3,8 +3,6 @@
 Standard errors of root mean squares are to first order (delta method).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple

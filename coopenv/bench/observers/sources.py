@@ -3,8 +3,6 @@
 A source is small and picklable, so that a worker process makes the record itself.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from abc import ABC, abstractmethod

@@ -1,7 +1,5 @@
 """The leaderboard as tables that fit a terminal of 80 columns, as CSV and as LaTeX."""
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Iterator, Sequence
