@@ -152,18 +152,13 @@ def without_own_terms(raw: Mapping[str, Any]) -> dict[str, Any]:
     """Return a scenario with terms of coopenv only, which is what a recording says of it: it must not name code."""
     result = dict(raw)
     for section in SECTIONS:
-        part = result.get(section)
-        if isinstance(part, dict):
-            result[section] = _without(section, {key: value for key, value in part.items() if key != "custom"})
+        if not isinstance(result.get(section), dict):
+            continue
+        part = result[section] = {key: value for key, value in result[section].items() if key != "custom"}
+        if section == "termination":
+            result[section] = {key: on for key, on in part.items() if key in TERMINATION_CONDITIONS.built_in}
+        elif isinstance(weights := part.get("weights"), dict):
+            part["weights"] = {name: weight for name, weight in weights.items() if name in REWARD_TERMS.built_in}
+        elif isinstance(include := part.get("include"), list):
+            part["include"] = [group for group in include if group in GROUPS] or list(GROUPS)
     return result
-
-
-def _without(section: str, part: dict[str, Any]) -> dict[str, Any]:
-    if section == "termination":
-        return {key: value for key, value in part.items() if key in TERMINATION_CONDITIONS.built_in}
-    if section == "reward" and isinstance(part.get("weights"), dict):
-        known = {name: weight for name, weight in part["weights"].items() if name in REWARD_TERMS.built_in}
-        return {**part, "weights": known}
-    if section == "observation" and isinstance(part.get("include"), list):
-        return {**part, "include": [group for group in part["include"] if group in GROUPS] or list(GROUPS)}
-    return part

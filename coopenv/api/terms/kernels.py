@@ -156,35 +156,33 @@ def check_own_terms(terms: Terms, device: str) -> None:
     Raises:
         CoopenvError: Warp cannot compile its function, or it returns something else than its row says.
     """
-    for fields, record in zip(terms[:3], (Ego, Target, Neighbour), strict=True):
-        for field in fields:
-            returned = wp.float32 if field.size == 1 else wp.types.vector(field.size, wp.float32)
-            _check(field, record, returned, "a number" if field.size == 1 else f"a vector of {field.size}", device)
-    for term in terms.rewards:
-        _check(term, Truth, wp.float32, "a number", device)
-    for condition in terms.conditions:
-        _check(condition, Truth, wp.bool, "true or false", device)
+    for of_kind, record in zip(terms, (Ego, Target, Neighbour, Truth, Truth), strict=True):
+        for term in of_kind:
+            if term.own and of_kind is terms.conditions:
+                _check(term, record, wp.bool, "true or false", device)
+            elif term.own and term.size == 1:
+                _check(term, record, wp.float32, "a number", device)
+            elif term.own:
+                _check(term, record, wp.types.vector(term.size, wp.float32), f"a vector of {term.size}", device)
 
 
 def _check(term: Bound, record: Any, returned: Any, expected: str, device: str) -> None:
-    if not term.own:
-        return
-    function, both = term.function, term.records == 2
+    function, both, many = term.function, term.records == 2, term.size > 1
 
     def call(out: wp.array(dtype=returned)):
-        """Call the function."""
-        out[0] = returned(function(Ego(), record()) if both else function(Ego()))
+        """Use the function's value as the kernels do."""
+        value = function(Ego(), record()) if both else function(Ego())
+        out[0] = returned(value)
+        out[1] = returned(value[0] if many else value)
 
     try:
-        out = wp.empty(1, dtype=returned, device=device)
+        out = wp.empty(2, dtype=returned, device=device)
         kernel_cache.launch(_kernel(call, record.key, [term]), dim=1, inputs=[out], device=device, record_cmd=True)
     except kernel_cache.KernelCacheError:
         raise
     except Exception as error:  # Warp raises what it has
-        said = [part for part in str(error).split("\n;") if 'function "call"' not in part]
-        raise CoopenvError(
-            f"{term.title}: Warp cannot compile its function to return {expected}: {' '.join(said)}"
-        ) from None
+        said = " ".join(part for part in str(error).split("\n;") if 'function "call"' not in part)
+        raise CoopenvError(f"{term.title}: Warp cannot compile its function to return {expected}: {said}") from None
 
 
 def _kernel(function: Callable[..., None], name: str, terms: Sequence[Bound]) -> wp.Kernel:

@@ -14,7 +14,9 @@ import warp as wp
 
 import coopenv
 from coopenv.api.terms.records import Ego, Target, Truth
+from coopenv.cli import main
 from coopenv.errors import CoopenvError, ScenarioError
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.scenario.files import scenario_path
 from coopenv.scenario.terms import REWARD_TERMS
 
@@ -253,10 +255,18 @@ def test_errors_of_functions_are_one_line(terms: str, message: str, tmp_path: Pa
     assert str(caught.value).isprintable()
 
 
-def test_a_field_of_another_size_is_refused(tmp_path: Path) -> None:
-    wrong = TABLES.replace('unit = "m/s"', "size = 2")
-    path = scenario_file(tmp_path, wrong, TERMS.replace("ego.velocity[0]", "ego.velocity"))
-    with pytest.raises(CoopenvError, match=r"'ahead': .* to return a vector of 2: .* length 3"):
+@pytest.mark.parametrize(
+    ("size", "value", "message"),
+    [
+        ("2", "ego.velocity", "a vector of 2: .* length 3"),
+        ("3", "ego.velocity[0]", "a vector of 3"),
+        ("1", "ego.velocity", "a number: .*vec3f"),
+    ],
+)
+def test_a_field_of_another_size_is_refused(size: str, value: str, message: str, tmp_path: Path) -> None:
+    wrong = TABLES.replace('unit = "m/s"', f"size = {size}")
+    path = scenario_file(tmp_path, wrong, TERMS.replace("ego.velocity[0]", value))
+    with pytest.raises(CoopenvError, match=f"observation field 'ahead': .* to return {message}"):
         coopenv.make_vec(path, num_worlds=1, overrides=SWITCHED_ON)
 
 
@@ -320,19 +330,62 @@ def test_a_function_without_a_file_is_refused() -> None:
         coopenv.parallel_env("crossing_path", overrides={"reward.weights.typed": 1.0})
 
 
-def test_a_function_that_is_defined_anew_replaces_its_former_self() -> None:
+def test_a_file_that_has_changed_is_read_again(tmp_path: Path) -> None:
+    for gain in (3.0, 4.0):
+        path = scenario_file(tmp_path, TABLES, TERMS.replace("3.0", str(gain)))
+        env = coopenv.parallel_env(path, overrides=SWITCHED_ON)
+        env.reset(seed=0)
+        info = env.step({agent: np.zeros(2, np.float32) for agent in env.agents})[4]["vehicle_1"]
+        assert info["reward_terms"]["error"] == pytest.approx(-gain * info["position_error"], rel=1e-5)
+
+
+def test_a_function_that_is_defined_anew_replaces_its_former_self_in_new_worlds() -> None:
     def make(gain: float) -> Any:
-        def scaled(ego: Any) -> Any:
+        def gained(ego: Any) -> Any:
             return gain * ego.elapsed
 
-        return scaled
+        return gained
 
+    envs = []
     for gain in (2.0, 5.0):
-        coopenv.register_reward("scaled", make(gain))
-        env = coopenv.parallel_env("crossing_path", overrides={"reward.weights.scaled": 1.0})
-        env.reset(seed=0)
-        rewards = env.step({agent: np.zeros(2, np.float32) for agent in env.agents})[1]
-        assert rewards["vehicle_1"] == pytest.approx(0.1 * gain, rel=1e-6)
+        coopenv.register_reward("gained", make(gain))
+        envs.append(coopenv.make_vec("crossing_path", num_worlds=1, overrides={"reward.weights.gained": 1.0}))
+        envs[-1].reset(seed=0)
+    for _ in range(2):
+        earned = [float(env.step(np.zeros((1, 2)))[1][0]) for env in envs]
+        assert earned == pytest.approx([0.2, 0.5], rel=1e-6)
+
+
+def test_recordings_are_judged_by_terms_of_ones_own_and_name_none(tmp_path: Path) -> None:
+    path = scenario_file(tmp_path, TABLES)
+    log = tmp_path / "drive.mcap"
+    assert (
+        main(["record", str(path), "--set", "horizon=0.5", "--set", "reward.weights.error=0", "--out", str(log)]) == 0
+    )
+    assert b"my_terms" not in log.read_bytes()
+    rewards = {"reward.custom.error": f"{tmp_path}/my_terms.py:error"}
+    weighed = {**rewards, "reward.weights.error": 1.0, "reward.privileged": True}
+    env = coopenv.parallel_env(log, overrides=weighed)
+    env.reset()
+    _, earned, _, _, infos = env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
+    for agent, info in infos.items():
+        assert earned[agent] == pytest.approx(-3.0 * info["position_error"], rel=1e-5)
+
+
+def test_describe_and_a_run_show_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = scenario_file(tmp_path, TABLES)
+    changes = [f"--set={key}={json.dumps(value)}" for key, value in SWITCHED_ON.items()]
+    assert main(["describe", str(path), *changes]) == 0
+    summary = " ".join(capsys.readouterr().out.split())
+    assert "Reward 1 error" in summary and "for a vehicle at late" in summary and "nearest 6" in summary
+    assert main(["describe", str(path), "--all", *changes]) == 0
+    whole = capsys.readouterr().out
+    assert all(text in whole for text in ("custom.error *", "weights.error *", "late *", "speed [m/s]"))
+    assert main(["run", str(path), *changes, "--no-figures", "--out", str(tmp_path / "out")]) == 0
+    assert "2 late" in capsys.readouterr().out
+    run = Trajectory.load(tmp_path / "out" / "trajectory.npz")
+    column = run.terms.tolist().index("error")
+    assert np.allclose(run.reward_terms[1:, :, column], -3.0 * run.position_error[1:], rtol=1e-5)
 
 
 def test_the_use_of_truth_has_to_be_declared() -> None:
