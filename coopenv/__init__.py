@@ -8,10 +8,11 @@ Names that need the simulation are loaded when they are first used (PEP 562), so
 start quickly.
 """
 
+import sys
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coopenv.api.registration import register_all
 from coopenv.errors import (
     ActionError,
     CoopenvError,
@@ -85,4 +86,8 @@ __all__ = [
     "register_termination",
 ]
 
-register_all()
+# The command makes environments itself; until it runs, no signal is caught, so that it is to begin at once.
+if sys.orig_argv[1:3] != ["-m", "coopenv"] and Path(sys.argv[0]).name != "coopenv":
+    from coopenv.api.registration import register_all
+
+    register_all()
