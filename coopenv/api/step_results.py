@@ -76,10 +76,10 @@ def assess(model: Any, state: Any, results: Any, world: int, vehicle: int):
     position = state.position[world, agent]
     R_hat = state.estimate_rotation[world, vehicle]
     p_hat = state.estimate_position[world, vehicle]
-    angle = rotation_angle(wp.transpose(R_hat) * R, p_hat)
+    angle = rotation_angle(wp.transpose(R_hat) * R)
     results.position_error[world, vehicle] = wp.length(position - R_hat * p_hat)
     results.orientation_error[world, vehicle] = angle * type(angle)(DEGREES)
-    I11, L21, I22 = cholesky_of(state.covariance[world, vehicle], R - R)
+    I11, L21, I22 = cholesky_of(state.covariance[world, vehicle])
     e1, e2 = observer_error(R, position, R_hat, p_hat)
     results.nees[world, vehicle] = normalised_error_squared(I11, L21, I22, e1, e2)
     results.log_determinant[world, vehicle] = log_determinant(I11, I22)

@@ -74,9 +74,9 @@ def cholesky6(A: Any, B: Any, D: Any):
 
 
 @wp.func
-def join6(A: Any, B: Any, C: Any, D: Any, zero: Any):
-    """Return the 6x6 matrix [[A, B], [C, D]]; `zero` is a 6x6 matrix of the same precision."""
-    M = zero
+def join6(A: Any, B: Any, C: Any, D: Any):
+    """Return the 6x6 matrix [[A, B], [C, D]]."""
+    M = wp.matrix(dtype=A.dtype, shape=(6, 6))
     M[:3, :3] = A
     M[:3, 3:] = B
     M[3:, :3] = C
@@ -85,9 +85,9 @@ def join6(A: Any, B: Any, C: Any, D: Any, zero: Any):
 
 
 @wp.func
-def block3(M: Any, row: int, column: int, zero: Any):
+def block3(M: Any, row: int, column: int):
     """Return the 3x3 block of the 6x6 matrix M that starts at (row, column)."""
-    A = zero
+    A = wp.matrix(dtype=M.dtype, shape=(3, 3))
     for i in range(3):
         for j in range(3):
             A[i, j] = M[row + i, column + j]
@@ -107,7 +107,7 @@ def jacobi_rotation(a_pp: Any, a_qq: Any, a_pq: Any):
 
 
 @wp.func
-def eigen_symmetric6(M: Any, identity: Any):
+def eigen_symmetric6(M: Any):
     """Return (D, U) with M = U D U^T, D diagonal up to rounding, by cyclic Jacobi sweeps.
 
     An entry is annihilated only if |a_pq| > eps sqrt(|a_pp a_qq|) (Demmel and Veselic 1992, Jacobi's method is more
@@ -115,7 +115,7 @@ def eigen_symmetric6(M: Any, identity: Any):
     45 degrees, would undo the ones before it.
     """
     A = M
-    U = identity
+    U = wp.identity(n=6, dtype=M.dtype)
     rounding = epsilon(A[0, 0]) * epsilon(A[0, 0])
     for _ in range(SWEEPS):
         off = A.dtype(0.0)

@@ -79,24 +79,24 @@ def orthonormalise(R: Any):
 
 
 @wp.func
-def rotation_vector_sine(R: Any, zero: Any):
+def rotation_vector_sine(R: Any):
     """Return the axis of R times the sine of its angle: the vector of the skew part of R."""
-    h = zero.dtype(0.5)
-    return type(zero)((R[2, 1] - R[1, 2]) * h, (R[0, 2] - R[2, 0]) * h, (R[1, 0] - R[0, 1]) * h)
+    h = R.dtype(0.5)
+    return wp.vector((R[2, 1] - R[1, 2]) * h, (R[0, 2] - R[2, 0]) * h, (R[1, 0] - R[0, 1]) * h)
 
 
 @wp.func
-def rotation_angle(R: Any, zero: Any):
+def rotation_angle(R: Any):
     """Return the geodesic angle of R in rad, accurate near 0 and near pi."""
-    sine = wp.length(rotation_vector_sine(R, zero))
+    sine = wp.length(rotation_vector_sine(R))
     cosine = (wp.trace(R) - R.dtype(1.0)) * R.dtype(0.5)
     return wp.atan2(sine, cosine)
 
 
 @wp.func
-def quaternion_vector(R: Any, zero: Any):
+def quaternion_vector(R: Any):
     """Return lambda, the vector part of the unit quaternion of R with non-negative scalar part."""
-    sine = rotation_vector_sine(R, zero)  # axis sin(angle) = 2 scalar lambda
+    sine = rotation_vector_sine(R)  # axis sin(angle) = 2 scalar lambda
     scalar_squared = (R.dtype(1.0) + wp.trace(R)) * R.dtype(0.25)
     if scalar_squared > R.dtype(1.0e-2):
         return sine / (R.dtype(2.0) * wp.sqrt(scalar_squared))
@@ -106,7 +106,7 @@ def quaternion_vector(R: Any, zero: Any):
         best = int(1)
     if R[2, 2] > R[best, best]:
         best = int(2)
-    column = type(zero)(R[0, best] + R[best, 0], R[1, best] + R[best, 1], R[2, best] + R[best, 2])
+    column = wp.vector(R[0, best] + R[best, 0], R[1, best] + R[best, 1], R[2, best] + R[best, 2])
     shift = R.dtype(1.0) - wp.trace(R)
     column[best] = column[best] + shift
     axis = wp.normalize(column)

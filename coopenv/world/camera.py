@@ -1,4 +1,4 @@
-"""Stage 3, camera: which targets are in view and not occluded, and their noisy unit bearings.
+"""Camera: which targets are in view and not occluded, and their noisy unit bearings.
 
 A bearing is stored as the unit vector from the observing camera to the target, in the camera's optical frame.
 """
@@ -8,7 +8,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.trajectory import Sight
-from coopenv.world.random import BEARING, draw, gaussian_pair, signed_uniform, uniform
+from coopenv.world.random import BEARING, gaussian_pair, pair, random_words, signed_uniform, uniform
 
 NOT_A_NEIGHBOUR = wp.constant(wp.uint8(Sight.NOT_A_NEIGHBOUR))
 VISIBLE = wp.constant(wp.uint8(Sight.VISIBLE))
@@ -160,9 +160,8 @@ def noisy_bearing(noise: Any, bearing: Any, words: Any):
         y = g[1] / depth + noise.bearing * signed_uniform(words[1], one)
         return wp.normalize(noise.axis * type(bearing)(x, y, one)) * wp.sign(depth)
     n1, n2 = gaussian_pair(words[0], words[1], one)
-    helper = type(bearing)(one, one - one, one - one)
-    if wp.abs(bearing[0]) > bearing.dtype(0.7):
-        helper = type(bearing)(one - one, one, one - one)
+    helper = type(bearing)()
+    helper[wp.where(wp.abs(bearing[0]) > bearing.dtype(0.7), 1, 0)] = one
     first = wp.normalize(wp.cross(bearing, helper))
     second = wp.cross(bearing, first)
     return wp.normalize(bearing + noise.bearing * (n1 * first + n2 * second))
@@ -202,7 +201,7 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
         if sight == VISIBLE:
             b = wp.normalize(ray)
         if sight == VISIBLE and random:
-            words = draw(state.seed[world], state.episode[world], tick, vehicle * 65536 + target, BEARING)
+            words = random_words(state.seed[world], state.episode[world], tick, pair(vehicle, target), BEARING)
             if uniform(words[2], zero) < model.camera.miss:
                 sight = MISSED
             if model.noise.bearing > zero:

@@ -1,4 +1,4 @@
-"""Stage 6, contact and arrival: boxes that touch (separating axes in the plane and heights), and goals reached."""
+"""Contact and arrival: boxes that touch (separating axes in the plane and heights), and goals reached."""
 
 from typing import Any
 
@@ -29,9 +29,9 @@ def boxes_touch(ca: Any, Ra: Any, ha: Any, cb: Any, Rb: Any, hb: Any) -> bool:
     if not (wp.abs(offset[2]) <= ha[2] + hb[2] and wp.dot(offset, offset) <= reach * reach):
         return False
     for k in range(2):
-        if separated_along(type(ca)(Ra[0, k], Ra[1, k], ha[0] - ha[0]), offset, Ra, ha, Rb, hb):
+        if separated_along(type(ca)(Ra[0, k], Ra[1, k], ha.dtype(0.0)), offset, Ra, ha, Rb, hb):
             return False
-        if separated_along(type(ca)(Rb[0, k], Rb[1, k], ha[0] - ha[0]), offset, Ra, ha, Rb, hb):
+        if separated_along(type(ca)(Rb[0, k], Rb[1, k], ha.dtype(0.0)), offset, Ra, ha, Rb, hb):
             return False
     return True
 

@@ -20,7 +20,7 @@ ACCELERATION = wp.constant(2)
 def sanitised(action: Any):
     """Return an action clipped to [-1, 1], zero where it is not finite."""
     one = action.dtype(1.0)
-    result = action - action
+    result = type(action)()
     for axis in range(2):
         if wp.isfinite(action[axis]):
             result[axis] = wp.clamp(action[axis], -one, one)

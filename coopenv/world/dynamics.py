@@ -1,4 +1,4 @@
-"""Stage 1: the truth moves, by prescribed motion as a closed form, or as a kinematic bicycle with its actuators."""
+"""The truth moves, by prescribed motion as a closed form, or as a kinematic bicycle with its actuators."""
 
 from typing import Any
 
@@ -71,11 +71,11 @@ def bicycle_step(model: Any, R: Any, position: Any, speed: Any, steering: Any, c
     """Return (R, position, speed, steering) after dt: rear-axle bicycle, its twist held at the mid-point."""
     new_speed, new_steering = actuate(model, speed, steering, command, dt)
     if parked != 0:
-        new_speed = speed - speed
+        new_speed = type(speed)(0.0)
     half = type(speed)(0.5)
     mid_speed = wp.where(parked != 0, new_speed, (speed + new_speed) * half)
     way = mid_speed * dt
-    o = position - position
+    o = type(position)()
     turn = type(position)(o[0], o[1], way * wp.tan((steering + new_steering) * half) / model.dynamics.wheelbase)
     new_R, new_position = increment(R, position, type(position)(way, o[1], o[2]), turn, type(speed)(1.0))
     return new_R, new_position, new_speed, new_steering
@@ -94,7 +94,7 @@ def drive(model: Any, state: Any, world: int, vehicle: int, command: Any, durati
     dt = type(speed)(duration / wp.float64(wp.max(steps, 1)))
     for _ in range(steps):
         R, position, speed, steering = bicycle_step(model, R, position, speed, steering, command, dt, parked)
-    o = position - position
+    o = type(position)()
     state.rotation[world, agent] = orthonormalise(R)
     state.position[world, agent] = position
     state.speed[world, vehicle] = speed

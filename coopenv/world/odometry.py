@@ -1,4 +1,4 @@
-"""Stage 2, odometry: noisy body twists sampled at their own rate, summed up to one increment per camera tick.
+"""Odometry: noisy body twists sampled at their own rate, summed up to one increment per camera tick.
 
 A sample is held until the next one. The increment (dR, dp) over a tick is the exact composition of the held twists,
 so an observer predicts once per tick and loses nothing against predicting at every sample.
@@ -11,15 +11,15 @@ import warp as wp
 from coopenv.estimation.so3 import identity3, increment
 from coopenv.world.dynamics import segment_at
 from coopenv.world.model import DRIVEN
-from coopenv.world.random import ODOMETRY_FIRST, ODOMETRY_SECOND, draw, gaussian_vectors
+from coopenv.world.random import ODOMETRY_FIRST, ODOMETRY_SECOND, gaussian_vectors, random_words
 
 
 @wp.func
 def noisy_sample(model: Any, state: Any, world: int, vehicle: int, sample: int, v: Any, w: Any):
     """Return the measured (v, omega) of one odometry sample."""
     if model.noise.velocity > v.dtype(0.0) or model.noise.angular_velocity > v.dtype(0.0):
-        first = draw(state.seed[world], state.episode[world], sample, vehicle, ODOMETRY_FIRST)
-        second = draw(state.seed[world], state.episode[world], sample, vehicle, ODOMETRY_SECOND)
+        first = random_words(state.seed[world], state.episode[world], sample, vehicle, ODOMETRY_FIRST)
+        second = random_words(state.seed[world], state.episode[world], sample, vehicle, ODOMETRY_SECOND)
         linear, angular = gaussian_vectors(first, second, v)
         v = v + model.noise.velocity * linear
         w = w + model.noise.angular_velocity * angular
@@ -51,7 +51,7 @@ def measure_odometry(model: Any, state: Any, world: int, vehicle: int, tick: int
     w = state.odometry_angular_velocity[world, vehicle]
     sample = state.odometry_samples[world, vehicle]
     rotation = identity3(v)
-    translation = v - v
+    translation = type(v)()
     taken = int(0)
     due = wp.float64(sample) * model.odometry_period
     while due <= tick_end + wp.float64(1.0e-9) and taken < model.samples_per_tick:

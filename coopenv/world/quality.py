@@ -37,7 +37,7 @@ def normalised_error_squared(I11: Any, L21: Any, I22: Any, e1: Any, e2: Any):
 def observer_error(R: Any, position: Any, R_hat: Any, p_hat: Any):
     """Return (2 lambda, p - phat), the error coordinates of P: Rtilde = Rhat^T R, p = R^T pbar (paper, sec. IV)."""
     R_tilde = wp.transpose(R_hat) * R
-    lam = quaternion_vector(R_tilde, p_hat)
+    lam = quaternion_vector(R_tilde)
     return lam * p_hat.dtype(2.0), wp.transpose(R) * position - p_hat
 
 
@@ -71,10 +71,10 @@ def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: i
     block = (tick // model.observer.block_ticks) % model.observer.blocks
     R = state.estimate_rotation[world, vehicle]
     p = state.estimate_position[world, vehicle]
-    G11 = R - R
-    G12 = R - R
-    G22 = R - R
-    time = dt - dt
+    G11 = type(R)()
+    G12 = type(R)()
+    G22 = type(R)()
+    time = type(dt)(0.0)
     if tick % model.observer.block_ticks != 0:
         G11 = state.gramian_11[world, vehicle, block]
         G12 = state.gramian_12[world, vehicle, block]
@@ -116,17 +116,16 @@ def gramian_smallest_eigenvalue(model: Any, state: Any, world: int, vehicle: int
         G12 += state.gramian_12[world, vehicle, block]
         G22 += state.gramian_22[world, vehicle, block]
         time += state.gramian_time[world, vehicle, block]
-    if time <= time - time:
+    if time <= type(time)(0.0):
         return time
-    zero6 = state.covariance[world, vehicle] - state.covariance[world, vehicle]
-    G = join6(G11, G12, wp.transpose(G12), G22, zero6)
+    G = join6(G11, G12, wp.transpose(G12), G22)
     return smallest_eigenvalue6(G) / time
 
 
 @wp.func
-def cholesky_of(P: Any, zero3: Any):
+def cholesky_of(P: Any):
     """Return (L11^-1, L21, L22^-1) of the Cholesky factor of a 6x6 covariance."""
-    _, L21, _, I11, I22 = cholesky6(block3(P, 0, 0, zero3), block3(P, 0, 3, zero3), block3(P, 3, 3, zero3))
+    _, L21, _, I11, I22 = cholesky6(block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3))
     return I11, L21, I22
 
 

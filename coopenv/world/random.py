@@ -46,10 +46,16 @@ def philox(counter: vec4u, key0: wp.uint32, key1: wp.uint32) -> vec4u:
 
 
 @wp.func
-def draw(seed: wp.uint64, episode: wp.uint32, index: int, subject: int, stream: wp.uint32) -> vec4u:
+def random_words(seed: wp.uint64, episode: wp.uint32, index: int, subject: int, stream: wp.uint32) -> vec4u:
     """Return four random words of one stream."""
     counter = vec4u(wp.uint32(index), wp.uint32(subject), stream, episode)
     return philox(counter, wp.uint32(seed), wp.uint32(seed >> wp.uint64(32)))
+
+
+@wp.func
+def pair(vehicle: int, other: int) -> int:
+    """Return the subject of what concerns a vehicle and another agent."""
+    return vehicle * 65536 + other
 
 
 @wp.func
@@ -74,7 +80,7 @@ def gaussian_pair(word0: wp.uint32, word1: wp.uint32, one: Any):
     radius = wp.sqrt(type(one)(-2.0) * wp.log(uniform(word0, one)))
     angle = (type(one)(word1 >> wp.uint32(2)) + type(one)(0.5)) * type(one)(1.4629180792671596e-09)  # pi/2 / 2^30
     sine = wp.sin(angle)
-    cosine = wp.sqrt(wp.max(one - sine * sine, one - one))
+    cosine = wp.sqrt(wp.max(one - sine * sine, type(one)(0.0)))
     if (word1 & wp.uint32(1)) != wp.uint32(0):
         sine = -sine
     if (word1 & wp.uint32(2)) != wp.uint32(0):

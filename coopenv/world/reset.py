@@ -15,7 +15,7 @@ from coopenv.world.random import (
     RESET_ESTIMATE_ORIENTATION,
     RESET_ESTIMATE_POSITION,
     RESET_POSE,
-    draw,
+    random_words,
     signed_uniform,
     uniform,
     unit_vector,
@@ -29,9 +29,9 @@ def place_agent(model: Any, state: Any, world: int, agent: int):
     position = model.start.position[agent]
     R = model.start.rotation[agent]
     spread = model.start.position_spread[agent]
-    o = position - position
+    o = type(position)()
     one = o.dtype(1.0)
-    words = draw(state.seed[world], state.episode[world], 0, agent, RESET_POSE)
+    words = random_words(state.seed[world], state.episode[world], 0, agent, RESET_POSE)
     offset = type(o)(
         spread[0] * signed_uniform(words[0], one),
         spread[1] * signed_uniform(words[1], one),
@@ -55,7 +55,7 @@ def place_agent(model: Any, state: Any, world: int, agent: int):
 def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
     """Reset the vehicle's actuators, odometry and counters."""
     agent = model.landmarks + vehicle
-    o = state.velocity[world, agent] - state.velocity[world, agent]
+    o = type(state.velocity[world, agent])()
     speed = model.start.speed[vehicle]
     state.speed[world, vehicle] = speed
     state.steering[world, vehicle] = o[0]
@@ -97,9 +97,9 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
         state.inbox_rotation[world, vehicle, sender] = identity3(o)
     for block in range(model.observer.blocks):
         R = state.rotation[world, agent]
-        state.gramian_11[world, vehicle, block] = R - R
-        state.gramian_12[world, vehicle, block] = R - R
-        state.gramian_22[world, vehicle, block] = R - R
+        state.gramian_11[world, vehicle, block] = type(R)()
+        state.gramian_12[world, vehicle, block] = type(R)()
+        state.gramian_22[world, vehicle, block] = type(R)()
         state.gramian_time[world, vehicle, block] = o[0]
 
 
@@ -131,25 +131,24 @@ def believe(model: Any, state: Any, world: int, vehicle: int):
     agent = model.landmarks + vehicle
     seed = state.seed[world]
     episode = state.episode[world]
-    o = state.position[world, agent] - state.position[world, agent]
+    o = type(state.position[world, agent])()
     position = model.start.estimate_position[vehicle]
     if model.start.estimate_fixed[vehicle] == 0:
         position = position + state.position[world, agent]
-    words = draw(seed, episode, 0, vehicle, RESET_ESTIMATE_POSITION)
+    words = random_words(seed, episode, 0, vehicle, RESET_ESTIMATE_POSITION)
     third = o.dtype(1.0) / o.dtype(3.0)
     radius = model.start.estimate_radius[vehicle] * wp.pow(uniform(words[2], third), third)
     position = position + unit_vector(words[0], words[1], o) * radius
     R = model.start.estimate_rotation[vehicle]
     if model.start.orientation_fixed[vehicle] == 0:
         R = state.rotation[world, agent] * R
-    words = draw(seed, episode, 0, vehicle, RESET_ESTIMATE_ORIENTATION)
+    words = random_words(seed, episode, 0, vehicle, RESET_ESTIMATE_ORIENTATION)
     turn = random_turn(model.start.orientation_angle[vehicle], words, o)
     R = orthonormalise(R * exp_so3(turn))
     state.estimate_rotation[world, vehicle] = R
     state.estimate_position[world, vehicle] = wp.transpose(R) * position
-    P = state.covariance[world, vehicle]
     i3 = identity3(o)
-    state.covariance[world, vehicle] = join6(model.observer.p1 * i3, R - R, R - R, model.observer.p2 * i3, P - P)
+    state.covariance[world, vehicle] = join6(model.observer.p1 * i3, type(R)(), type(R)(), model.observer.p2 * i3)
 
 
 @wp.func

@@ -1,10 +1,10 @@
-"""Stage 4, V2X: pose estimates travel with delay, period, loss and limited range."""
+"""V2X: pose estimates travel with delay, period, loss and limited range."""
 
 from typing import Any
 
 import warp as wp
 
-from coopenv.world.random import RADIO, draw, uniform
+from coopenv.world.random import RADIO, pair, random_words, uniform
 
 
 @wp.func
@@ -41,9 +41,8 @@ def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
                 there = state.position[world, model.landmarks + sender]
                 if wp.length(there - here) > model.radio.range:
                     heard = int(0)
-                if model.radio.loss > model.radio.loss - model.radio.loss:
-                    subject = receiver * 65536 + sender
-                    words = draw(state.seed[world], state.episode[world], tick, subject, RADIO)
+                if model.radio.loss > type(model.radio.loss)(0.0):
+                    words = random_words(state.seed[world], state.episode[world], tick, pair(receiver, sender), RADIO)
                     if uniform(words[0], model.radio.loss) < model.radio.loss:
                         heard = int(0)
                 if heard == 1:

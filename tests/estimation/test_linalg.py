@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from scipy.stats import ortho_group
 
 from coopenv.estimation import linalg
-from tests.helpers.warp_calls import DTYPES, EPSILON, IDENTITY66, ZERO33, ZERO66, call
+from tests.helpers.warp_calls import DTYPES, EPSILON, call
 
 SPECTRA = {
     "random": np.random.default_rng(0).uniform(0.1, 10.0, (60, 6)),
@@ -50,7 +50,7 @@ def size(M: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("name", SPECTRA)
 def test_eigenvalues_and_vectors(name: str, dtype: str) -> None:
     M = matrices(name, dtype)
-    D, U = call(linalg.eigen_symmetric6, dtype, M, IDENTITY66)
+    D, U = call(linalg.eigen_symmetric6, dtype, M)
     assert_allclose(np.swapaxes(U, 1, 2) @ U, np.broadcast_to(np.eye(6), U.shape), atol=30 * EPSILON[dtype])
     bound = 30 * EPSILON[dtype] * size(M)
     assert (size(U @ D @ np.swapaxes(U, 1, 2) - M) <= bound).all()
@@ -77,7 +77,7 @@ def test_repeated_eigenvalues_of_many_matrices(name: str, dtype: str) -> None:
     U = np.linalg.qr(rng.normal(size=(20_000, 6, 6)))[0]
     M = U @ (np.array(REPEATED[name])[:, None] * np.swapaxes(U, 1, 2))
     M = ((M + np.swapaxes(M, 1, 2)) / 2).astype(dtype).astype(float)
-    D, U = call(linalg.eigen_symmetric6, dtype, M, IDENTITY66)
+    D, U = call(linalg.eigen_symmetric6, dtype, M)
     diagonal = np.diagonal(D, axis1=1, axis2=2)
     unit = EPSILON[dtype] * size(M)
     assert (size(D - diagonal[:, None] * np.eye(6)) <= 3 * unit).all()
@@ -91,7 +91,7 @@ def test_eigenvalues_of_matrices_with_zeros() -> None:
     block = np.kron(np.diag([1.0, 0.0, 3.0]), np.array([[2.0, 1.0], [1.0, 2.0]]))
     swap = np.fliplr(np.eye(6))
     M = np.array([np.eye(6), np.diag([0.0, 0, 0, 4, 5, 6]), block, swap, np.diag([1e-40, 1, 1, 1, 1, 1e30])])
-    D, _ = call(linalg.eigen_symmetric6, "float64", M, IDENTITY66)
+    D, _ = call(linalg.eigen_symmetric6, "float64", M)
     assert_allclose(np.sort(np.diagonal(D, axis1=1, axis2=2), axis=1), np.linalg.eigvalsh(M), atol=1e-15, rtol=1e-14)
 
 
@@ -124,12 +124,12 @@ def test_smallest_eigenvalue_of_sums_of_squares(seed: int, decades: float) -> No
 
 
 @wp.func
-def cholesky_factor(M: Any, zero3: Any, zero6: Any):
+def cholesky_factor(M: Any):
     """Return L and, in blocks, the inverses of its diagonal blocks."""
-    A = linalg.block3(M, 0, 0, zero3)
-    B = linalg.block3(M, 0, 3, zero3)
-    L11, L21, L22, I11, I22 = linalg.cholesky6(A, B, linalg.block3(M, 3, 3, zero3))
-    return linalg.join6(L11, zero3, L21, L22, zero6), linalg.join6(I11, zero3, zero3, I22, zero6)
+    A = linalg.block3(M, 0, 0)
+    B = linalg.block3(M, 0, 3)
+    L11, L21, L22, I11, I22 = linalg.cholesky6(A, B, linalg.block3(M, 3, 3))
+    return linalg.join6(L11, type(L11)(), L21, L22), linalg.join6(I11, type(I11)(), type(I11)(), I22)
 
 
 DEFINITE = [name for name in SPECTRA if SPECTRA[name].min() > 0.0]
@@ -140,7 +140,7 @@ DEFINITE = [name for name in SPECTRA if SPECTRA[name].min() > 0.0]
 )
 def test_cholesky(name: str, dtype: str) -> None:
     M = matrices(name, dtype)
-    L, inverses = call(cholesky_factor, dtype, M, ZERO33, ZERO66)
+    L, inverses = call(cholesky_factor, dtype, M)
     assert (np.triu(L, 1) == 0.0).all()
     assert (size(L @ np.swapaxes(L, 1, 2) - M) <= 20 * EPSILON[dtype] * size(M)).all()
     condition = np.linalg.cond(M)[:, None, None]
@@ -155,5 +155,5 @@ def test_cholesky_of_a_covariance_in_mixed_units() -> None:
     """Angles of microradians beside positions of 100 m, strongly correlated."""
     scale = np.array([1e-6, 2e-6, 1e-6, 100.0, 50.0, 80.0])
     M = symmetric(SPECTRA["random"]) * scale[:, None] * scale
-    L, _ = call(cholesky_factor, "float64", M, ZERO33, ZERO66)
+    L, _ = call(cholesky_factor, "float64", M)
     assert_allclose(L / scale[:, None], np.linalg.cholesky(M) / scale[:, None], rtol=1e-11, atol=1e-13)

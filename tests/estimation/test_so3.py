@@ -11,7 +11,7 @@ from scipy.integrate import quad_vec
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import so3
-from tests.helpers.warp_calls import DTYPES, EPSILON, ZERO3, call
+from tests.helpers.warp_calls import DTYPES, EPSILON, call
 
 ANGLES = np.concatenate(
     [
@@ -86,13 +86,13 @@ def test_two_halves_of_a_rigid_motion_are_the_whole(w: np.ndarray, u: np.ndarray
 def test_angle_to_a_picoradian_everywhere() -> None:
     w, angle = turns(ANGLES)
     R = Rotation.from_rotvec(w).as_matrix()
-    assert_allclose(call(so3.rotation_angle, "float64", R, ZERO3), angle, atol=1e-12, rtol=0)
+    assert_allclose(call(so3.rotation_angle, "float64", R), angle, atol=1e-12, rtol=0)
 
 
 def test_angle_in_float32() -> None:
     w, angle = turns(ANGLES)
     R = Rotation.from_rotvec(w).as_matrix()
-    assert_allclose(call(so3.rotation_angle, "float32", R, ZERO3), angle, atol=1e-6, rtol=0)
+    assert_allclose(call(so3.rotation_angle, "float32", R), angle, atol=1e-6, rtol=0)
 
 
 def test_angle_between_near_rotations() -> None:
@@ -100,7 +100,7 @@ def test_angle_between_near_rotations() -> None:
     base = Rotation.random(200, np.random.default_rng(1)).as_matrix()
     for angle in (1e-10, 1e-6, np.pi - 1e-10, np.pi - 1e-6):
         other = base @ Rotation.from_rotvec(angle * axes(174)[:200]).as_matrix()
-        between = call(so3.rotation_angle, "float64", np.swapaxes(base, 1, 2) @ other, ZERO3)
+        between = call(so3.rotation_angle, "float64", np.swapaxes(base, 1, 2) @ other)
         assert_allclose(between, angle, atol=1e-14 if angle < 1 else 1e-12, rtol=1e-5)
 
 
@@ -109,7 +109,7 @@ def test_quaternion_vector_near_half_turns(dtype: str) -> None:
     angles = np.concatenate([ANGLES, 2 * np.arccos([0.1 + 1e-9, 0.1 - 1e-9, 0.09, 0.11])])
     w, angle = turns(angles)
     expected = np.sin(angle / 2)[:, None] * w / np.where(angle > 0, angle, 1.0)[:, None]
-    lam = call(so3.quaternion_vector, dtype, Rotation.from_rotvec(w).as_matrix(), ZERO3)
+    lam = call(so3.quaternion_vector, dtype, Rotation.from_rotvec(w).as_matrix())
     sign = np.ones(len(w))
     tiny = angle > np.pi - 20 * EPSILON[dtype]  # the two signs are one rotation there
     sign[tiny] = np.where((lam * expected).sum(axis=1)[tiny] < 0, -1.0, 1.0)
@@ -123,7 +123,7 @@ def test_quaternion_vector_is_scipys(q: tuple[float, float, float, float]) -> No
     if np.linalg.norm(q) < 1e-3:
         return
     rotation = Rotation.from_quat(q)
-    lam = call(so3.quaternion_vector, "float64", rotation.as_matrix()[None], ZERO3)[0]
+    lam = call(so3.quaternion_vector, "float64", rotation.as_matrix()[None])[0]
     scalar, *vector = rotation.as_quat(canonical=True, scalar_first=True)
     near = min(np.abs(lam - vector).max(), np.abs(lam + vector).max() + (np.inf if scalar > 1e-15 else 0.0))
     assert near < 1e-14

@@ -12,10 +12,6 @@ from coopenv.world.launch import start_warp
 
 DTYPES = ("float64", "float32")
 EPSILON = {"float64": np.finfo(np.float64).eps, "float32": np.finfo(np.float32).eps}
-ZERO3 = np.zeros((1, 3))
-ZERO33 = np.zeros((1, 3, 3))
-ZERO66 = np.zeros((1, 6, 6))
-IDENTITY66 = np.eye(6)[None]
 
 start_warp()
 

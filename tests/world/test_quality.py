@@ -12,21 +12,21 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import metrics
 from coopenv.world import quality
-from tests.helpers.warp_calls import DTYPES, ZERO33, call
+from tests.helpers.warp_calls import DTYPES, call
 
 COUNT = 300
 
 
 @wp.func
-def log_determinant(P: Any, zero3: Any):
-    I11, _L21, I22 = quality.cholesky_of(P, zero3)
+def log_determinant(P: Any):
+    I11, _L21, I22 = quality.cholesky_of(P)
     return quality.log_determinant(I11, I22)
 
 
 @wp.func
-def judged(P: Any, R: Any, position: Any, R_hat: Any, p_hat: Any, zero3: Any):
+def judged(P: Any, R: Any, position: Any, R_hat: Any, p_hat: Any):
     """Return the observer's error coordinates and the NEES."""
-    I11, L21, I22 = quality.cholesky_of(P, zero3)
+    I11, L21, I22 = quality.cholesky_of(P)
     e1, e2 = quality.observer_error(R, position, R_hat, p_hat)
     return e1, e2, quality.normalised_error_squared(I11, L21, I22, e1, e2)
 
@@ -43,12 +43,12 @@ def test_log_determinant(dtype: str, tolerance: float) -> None:
     P = covariances(np.random.default_rng(0))
     sign, expected = np.linalg.slogdet(P)
     assert (sign > 0).all()
-    assert_allclose(call(log_determinant, dtype, P, ZERO33), expected, atol=tolerance)
+    assert_allclose(call(log_determinant, dtype, P), expected, atol=tolerance)
 
 
 def test_log_determinant_in_ten_decades() -> None:
     P = np.diag(np.logspace(-8, 2, 6))[None]
-    assert_allclose(call(log_determinant, "float64", P, ZERO33), np.log(np.logspace(-8, 2, 6)).sum(), rtol=1e-13)
+    assert_allclose(call(log_determinant, "float64", P), np.log(np.logspace(-8, 2, 6)).sum(), rtol=1e-13)
 
 
 def draws(seed: int, angle: float | None) -> tuple[np.ndarray, ...]:
@@ -68,7 +68,7 @@ def draws(seed: int, angle: float | None) -> tuple[np.ndarray, ...]:
 def test_error_coordinates_and_nees(angle: float | None) -> None:
     R, position, R_hat, p_hat = draws(1, angle)
     P = covariances(np.random.default_rng(2))
-    e1, e2, value = call(judged, "float64", P, R, position, R_hat, p_hat, ZERO33)
+    e1, e2, value = call(judged, "float64", P, R, position, R_hat, p_hat)
     estimate = np.einsum("nij,nj->ni", R_hat, p_hat)
     expected = metrics.error_coordinates(position, R, estimate, R_hat)
     assert_allclose(np.concatenate([e1, e2], axis=1), expected, atol=1e-13)
@@ -80,7 +80,7 @@ def test_nees_by_hand() -> None:
     turn = Rotation.from_euler("z", np.radians(10)).as_matrix()
     P = np.diag([1.0, 1.0, 0.01, 1.0, 0.09, 1.0])
     truth, estimate = (np.eye(3)[None], np.zeros((1, 3))), (turn[None], [[0.0, -0.3, 0.0]])
-    e1, e2, value = call(judged, "float64", P[None], *truth, *estimate, ZERO33)
+    e1, e2, value = call(judged, "float64", P[None], *truth, *estimate)
     lam = -2 * np.sin(np.radians(5))
     assert_allclose(e1[0], [0, 0, lam], atol=1e-14)
     assert_allclose(e2[0], [0, 0.3, 0], atol=1e-14)
@@ -95,7 +95,7 @@ def test_nees_of_consistent_draws_has_mean_six() -> None:
     e = np.einsum("nij,nj->ni", np.linalg.cholesky(P), rng.normal(size=(COUNT, 6)))
     small = np.linalg.norm(e[:, :3], axis=1) < 0.3
     R_hat = Rotation.from_rotvec(-e[:, :3]).as_matrix()
-    value = call(judged, "float64", P, np.eye(3)[None], np.zeros((1, 3)), R_hat, -e[:, 3:], ZERO33)[2][small]
+    value = call(judged, "float64", P, np.eye(3)[None], np.zeros((1, 3)), R_hat, -e[:, 3:])[2][small]
     assert small.sum() > 250
     assert abs(value.mean() - 6.0) < 4 * np.sqrt(12.0 / len(value)) + 0.05
 
@@ -105,7 +105,7 @@ def test_nothing_is_wrong_with_a_perfect_estimate(dtype: str) -> None:
     R, position, _, _ = draws(5, None)
     R = R.astype(dtype).astype(float)
     p = np.einsum("nji,nj->ni", R, position)
-    e1, e2, value = call(judged, dtype, covariances(np.random.default_rng(6)), R, position, R, p, ZERO33)
+    e1, e2, value = call(judged, dtype, covariances(np.random.default_rng(6)), R, position, R, p)
     tolerance = 1e-13 if dtype == "float64" else 2e-5
     assert np.abs(e1).max() < tolerance
     assert np.abs(e2).max() < tolerance

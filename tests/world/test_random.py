@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from coopenv.world import random
-from tests.helpers.warp_calls import DTYPES, ZERO3, call
+from tests.helpers.warp_calls import DTYPES, call
 from tests.oracles import philox
 
 LARGEST = 2**32 - 1
@@ -53,7 +53,7 @@ def test_draw_packs_what_it_depends_on() -> None:
     counters = np.column_stack([index, subject, stream, episode])
     keys = np.column_stack([seed & np.uint64(LARGEST), seed >> np.uint64(32)])
     np.testing.assert_array_equal(
-        call(random.draw, "float64", seed, *(x.astype(t) for x, t in given)),
+        call(random.random_words, "float64", seed, *(x.astype(t) for x, t in given)),
         philox.philox4x32_array(counters, keys, ROUNDS),
     )
 
@@ -101,7 +101,7 @@ def test_gaussian_is_finite_at_the_extremes(dtype: str) -> None:
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_directions_are_uniform_on_the_sphere(dtype: str) -> None:
-    u = call(random.unit_vector, dtype, *words(50000, 2).T.astype(np.uint32), ZERO3)
+    u = call(random.unit_vector, dtype, *words(50000, 2).T.astype(np.uint32), np.zeros((1, 3)))
     np.testing.assert_allclose(np.linalg.norm(u, axis=1), 1.0, atol=1e-6)
     for axis in ([1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0.0, 0.8]):  # Archimedes: each height is uniform
         assert stats.kstest((u @ axis + 1) / 2, "uniform").pvalue > 1e-3

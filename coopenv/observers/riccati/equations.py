@@ -95,20 +95,19 @@ def gain_factor(k: Any, m: Any, h: Any):
 
 
 @wp.func
-def correction_modes(M11: Any, M12: Any, M22: Any, L11: Any, L21: Any, L22: Any, zero6: Any, identity6: Any):
+def correction_modes(M11: Any, M12: Any, M22: Any, L11: Any, L21: Any, L22: Any):
     """Return (T, m): T = L U and the spectrum m (diagonal) of L^T M L = U diag(m) U^T."""
-    o = M11 - M11
-    L = join6(L11, o, L21, L22, zero6)
-    M = join6(M11, M12, wp.transpose(M12), M22, zero6)
-    spectrum, U = eigen_symmetric6(symmetric_part(wp.transpose(L) * M * L), identity6)
+    L = join6(L11, type(L11)(), L21, L22)
+    M = join6(M11, M12, wp.transpose(M12), M22)
+    spectrum, U = eigen_symmetric6(symmetric_part(wp.transpose(L) * M * L))
     return L * U, spectrum
 
 
 @wp.func
 def correct_modes(k: Any, h: Any, T: Any, spectrum: Any, r1: Any, r2: Any):
     """Return (dx1, dx2) = T diag((1 - (1 + m h)^-k) / m) T^T r, the flow of the estimate for any gain k."""
-    dx1 = r1 - r1
-    dx2 = r2 - r2
+    dx1 = type(r1)()
+    dx2 = type(r2)()
     for i in range(6):
         m = wp.max(spectrum[i, i], type(k)(0.0))
         along = type(k)(0.0)

@@ -109,16 +109,10 @@ def predict_kernel(model: Any, held: Any, before: Any, after: Any, dt: wp.float6
     step = held[world, vehicle]
     R, p = predict_pose(belief.rotation, belief.position, step.rotation, step.translation)
     P = belief.covariance
-    o = R - R
-    A, B, D = predict_covariance(
-        wp.transpose(step.rotation),
-        block3(P, 0, 0, o),
-        block3(P, 0, 3, o),
-        block3(P, 3, 3, o),
-        model.observer.v1 * dt,
-        model.observer.v2 * dt,
-    )
-    after[world, vehicle] = Belief(R, p, join6(A, B, wp.transpose(B), D, P - P))
+    E = wp.transpose(step.rotation)
+    v1, v2 = model.observer.v1 * dt, model.observer.v2 * dt
+    A, B, D = predict_covariance(E, block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3), v1, v2)
+    after[world, vehicle] = Belief(R, p, join6(A, B, wp.transpose(B), D))
 
 
 def inform_kernel(model: Any, state: Any, truth: Any, predicted: Any, corrected: Any, vehicle: int, sums: Any):
@@ -143,8 +137,8 @@ def inform_kernel(model: Any, state: Any, truth: Any, predicted: Any, corrected:
     if sight_of(model, state, world, vehicle, target, origin, line, in_camera) == VISIBLE:
         a = wp.transpose(predicted[world, vehicle].rotation) * known
         e = a - model.camera.position - predicted[world, vehicle].position
-        o = own.rotation - own.rotation
-        M11, M12, M22, r1, r2 = accumulate_information(a, b, e, model.observer.q[target], o, o, o, e - e, e - e)
+        o = type(own.rotation)()
+        M11, M12, M22, r1, r2 = accumulate_information(a, b, e, model.observer.q[target], o, o, o, type(e)(), type(e)())
         wp.atomic_add(sums.M11, world, vehicle, M11)
         wp.atomic_add(sums.M12, world, vehicle, M12)
         wp.atomic_add(sums.M22, world, vehicle, M22)
@@ -158,8 +152,7 @@ def correct_kernel(predicted: Any, sums: Any, after: Any, vehicle: int, dt: wp.f
     belief = predicted[world, vehicle]
     R = belief.rotation
     P = belief.covariance
-    o = R - R
-    L11, L21, L22, _, _ = cholesky6(block3(P, 0, 0, o), block3(P, 0, 3, o), block3(P, 3, 3, o))
+    L11, L21, L22, _, _ = cholesky6(block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3))
     M11 = sums.M11[world, vehicle]
     M12 = sums.M12[world, vehicle]
     M22 = sums.M22[world, vehicle]
@@ -167,7 +160,7 @@ def correct_kernel(predicted: Any, sums: Any, after: Any, vehicle: int, dt: wp.f
         dt, M11, M12, M22, L11, L21, L22, sums.r1[world, vehicle], sums.r2[world, vehicle]
     )
     wp.atomic_max(turn, 0, wp.length(dx1))
-    P_after = join6(A, B, wp.transpose(B), D, P - P)
+    P_after = join6(A, B, wp.transpose(B), D)
     after[world, vehicle] = Belief(orthonormalise(R * exp_so3(dx1)), belief.position + dx2, P_after)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import block3, cholesky6, join6
-from coopenv.estimation.so3 import exp_so3, identity3, orthonormalise
+from coopenv.estimation.so3 import exp_so3, orthonormalise
 from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import POSITION, KernelObserver
 from coopenv.observers.riccati.equations import (
@@ -35,12 +35,11 @@ MOST_SUBSTEPS = wp.constant(200)
 @wp.func
 def information(model: Any, state: Any, world: int, vehicle: int, tick: int, R: Any, p: Any):
     """Return the blocks of M = C^T Q C and r = C^T Q (y - C_2 phat) over all usable targets at (Rhat, phat)."""
-    o = p - p
-    M11 = R - R
-    M12 = R - R
-    M22 = R - R
-    r1 = o
-    r2 = o
+    M11 = type(R)()
+    M12 = type(R)()
+    M22 = type(R)()
+    r1 = type(p)()
+    r2 = type(p)()
     for n in range(model.target_count[vehicle]):
         target = model.targets[vehicle, n]
         if usable(model, state, world, vehicle, target, tick):
@@ -63,18 +62,11 @@ def predict(model: Any, state: Any, world: int, vehicle: int, dt: Any):
     )
     P = state.covariance[world, vehicle]
     E = wp.transpose(rotation)
-    o = R - R
-    A, B, D = predict_covariance(
-        E,
-        block3(P, 0, 0, o),
-        block3(P, 0, 3, o),
-        block3(P, 3, 3, o),
-        model.observer.v1 * dt,
-        model.observer.v2 * dt,
-    )
+    v1, v2 = model.observer.v1 * dt, model.observer.v2 * dt
+    A, B, D = predict_covariance(E, block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3), v1, v2)
     state.estimate_rotation[world, vehicle] = R
     state.estimate_position[world, vehicle] = p
-    state.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D, P - P)
+    state.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D)
 
 
 @wp.func
@@ -116,11 +108,8 @@ def modal_step(
     k: Any, h: Any, limit: Any, last: bool, M11: Any, M12: Any, M22: Any, L11: Any, L21: Any, L22: Any, r1: Any, r2: Any
 ):
     """Return what `kalman_step` does for any gain k, through the modes of L^T M L."""
-    o = M11 - M11
-    one3 = identity3(r1)
-    zero6 = join6(o, o, o, o, wp.matrix(dtype=M11.dtype, shape=(6, 6)))
     taken = h
-    T, spectrum = correction_modes(M11, M12, M22, L11, L21, L22, zero6, join6(one3, o, o, one3, zero6))
+    T, spectrum = correction_modes(M11, M12, M22, L11, L21, L22)
     dx1, dx2 = correct_modes(k, taken, T, spectrum, r1, r2)
     turn = wp.length(dx1)
     while turn > limit and not last:
@@ -128,7 +117,7 @@ def modal_step(
         dx1, dx2 = correct_modes(k, taken, T, spectrum, r1, r2)
         turn = wp.length(dx1)
     P = covariance_modes(taken, T, spectrum)
-    return taken, dx1, dx2, block3(P, 0, 0, o), block3(P, 0, 3, o), block3(P, 3, 3, o)
+    return taken, dx1, dx2, block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3)
 
 
 @wp.func
@@ -152,9 +141,9 @@ def make_estimate(step: Any) -> Any:
         R = state.estimate_rotation[world, vehicle]
         p = state.estimate_position[world, vehicle]
         P = state.covariance[world, vehicle]
-        A = block3(P, 0, 0, R - R)
-        B = block3(P, 0, 3, R - R)
-        D = block3(P, 3, 3, R - R)
+        A = block3(P, 0, 0)
+        B = block3(P, 0, 3)
+        D = block3(P, 3, 3)
         remaining = duration
         substeps = int(0)
         while remaining > duration * type(duration)(1.0e-9):
@@ -172,7 +161,7 @@ def make_estimate(step: Any) -> Any:
         if wp.isfinite(wp.dot(p, p) + wp.trace(A) + wp.trace(D) + wp.trace(R)):
             state.estimate_rotation[world, vehicle] = R
             state.estimate_position[world, vehicle] = p
-            state.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D, P - P)
+            state.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D)
 
     @wp.func
     def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):

@@ -9,7 +9,7 @@ import warp as wp
 from coopenv.estimation.linalg import eigen_symmetric6, symmetric_part
 from coopenv.estimation.so3 import exp_so3, orthonormalise, quaternion_vector, rotation_vector_sine, skew
 from coopenv.observers.robust.constants import KNOWN_ANGLE, KNOWN_POSITION, MIN_ANGULAR_VELOCITY_STD, MIN_VELOCITY_STD
-from coopenv.observers.robust.memory import Estimate, Pose, mat66d, vec2d, vec3d, vec6d
+from coopenv.observers.robust.memory import Estimate, Pose, mat66d, vec2d, vec6d
 
 KNOWN_ANGLE_VARIANCE = KNOWN_ANGLE**2
 KNOWN_POSITION_VARIANCE = KNOWN_POSITION**2
@@ -20,14 +20,14 @@ BEYOND = -0.9
 @wp.func
 def log_so3(R: Any):
     """Return the rotation vector of R, of length 0..pi rad."""
-    v = rotation_vector_sine(R, vec3d())
+    v = rotation_vector_sine(R)
     sine = wp.length(v)
     cosine = wp.float64(0.5) * (wp.trace(R) - wp.float64(1.0))
     if cosine > wp.float64(BEYOND):
         if sine > wp.float64(1.0e-9):
             return v * (wp.atan2(sine, cosine) / sine)
         return v
-    vector = quaternion_vector(R, v)
+    vector = quaternion_vector(R)
     length = wp.length(vector)
     return vector * (wp.float64(2.0) * wp.atan2(length, wp.float64(0.5) * sine / length) / length)
 
@@ -116,7 +116,7 @@ def is_known(P: Any):
 @wp.func
 def is_regular(M: Any, least: Any):
     """Return whether the smallest eigenvalue of a symmetric M exceeds a share of the largest."""
-    D, _ = eigen_symmetric6(M, wp.identity(6, wp.float64))
+    D, _ = eigen_symmetric6(M)
     spectrum = wp.get_diag(D)
     return wp.min(spectrum) > least * wp.max(spectrum)
 

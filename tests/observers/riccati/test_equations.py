@@ -16,52 +16,53 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import linalg
 from coopenv.observers.riccati import equations
-from tests.helpers.warp_calls import IDENTITY66, ZERO33, ZERO66, call
+from tests.helpers.warp_calls import call
 from tests.oracles import splitting
 from tests.oracles.continuous import skew
 
 
 @wp.func
-def blocks(M: Any, zero3: Any):
-    return linalg.block3(M, 0, 0, zero3), linalg.block3(M, 0, 3, zero3), linalg.block3(M, 3, 3, zero3)
+def blocks(M: Any):
+    return linalg.block3(M, 0, 0), linalg.block3(M, 0, 3), linalg.block3(M, 3, 3)
 
 
 @wp.func
-def joined(A: Any, B: Any, D: Any, zero6: Any):
-    return linalg.join6(A, B, wp.transpose(B), D, zero6)
+def joined(A: Any, B: Any, D: Any):
+    return linalg.join6(A, B, wp.transpose(B), D)
 
 
 @wp.func
-def predicted(E: Any, P: Any, v1: Any, v2: Any, zero3: Any, zero6: Any):
-    A, B, D = blocks(P, zero3)
+def predicted(E: Any, P: Any, v1: Any, v2: Any):
+    A, B, D = blocks(P)
     A, B, D = equations.predict_covariance(E, A, B, D, v1, v2)
-    return joined(A, B, D, zero6)
+    return joined(A, B, D)
 
 
 @wp.func
-def information(a: Any, b: Any, e: Any, q: Any, zero3: Any, zero6: Any):
-    r = e - e
-    M11, M12, M22, r1, r2 = equations.accumulate_information(a, b, e, q, zero3, zero3, zero3, r, r)
-    return joined(M11, M12, M22, zero6), r1, r2
+def information(a: Any, b: Any, e: Any, q: Any):
+    r = type(e)()
+    o = wp.matrix(dtype=e.dtype, shape=(3, 3))
+    M11, M12, M22, r1, r2 = equations.accumulate_information(a, b, e, q, o, o, o, r, r)
+    return joined(M11, M12, M22), r1, r2
 
 
 @wp.func
-def kalman(h: Any, P: Any, M: Any, r1: Any, r2: Any, zero3: Any, zero6: Any):
+def kalman(h: Any, P: Any, M: Any, r1: Any, r2: Any):
     """Correct with k = 1."""
-    M11, M12, M22 = blocks(M, zero3)
-    A, B, D = blocks(P, zero3)
+    M11, M12, M22 = blocks(M)
+    A, B, D = blocks(P)
     L11, L21, L22, _I11, _I22 = linalg.cholesky6(A, B, D)
     dx1, dx2, A, B, D = equations.correct_kalman(h, M11, M12, M22, L11, L21, L22, r1, r2)
-    return dx1, dx2, joined(A, B, D, zero6)
+    return dx1, dx2, joined(A, B, D)
 
 
 @wp.func
-def modal(k: Any, h: Any, P: Any, M: Any, r1: Any, r2: Any, zero3: Any, zero6: Any, identity6: Any):
+def modal(k: Any, h: Any, P: Any, M: Any, r1: Any, r2: Any):
     """Correct with any other gain."""
-    M11, M12, M22 = blocks(M, zero3)
-    A, B, D = blocks(P, zero3)
+    M11, M12, M22 = blocks(M)
+    A, B, D = blocks(P)
     L11, L21, L22, _I11, _I22 = linalg.cholesky6(A, B, D)
-    T, spectrum = equations.correction_modes(M11, M12, M22, L11, L21, L22, zero6, identity6)
+    T, spectrum = equations.correction_modes(M11, M12, M22, L11, L21, L22)
     dx1, dx2 = equations.correct_modes(k, h, T, spectrum, r1, r2)
     return dx1, dx2, equations.covariance_modes(h, T, spectrum)
 
@@ -102,7 +103,7 @@ def total_information(seed: int, q: float = 10.0, count: int = 4) -> tuple[np.nd
 @settings(max_examples=60, deadline=None)
 def test_information_is_c_transposed_q_c(seed: int, q: float) -> None:
     a, b, e = view(seed)
-    M, r1, r2 = call(information, "float64", a, b, e, np.full(len(a), q), ZERO33, ZERO66)
+    M, r1, r2 = call(information, "float64", a, b, e, np.full(len(a), q))
     for i in range(len(a)):
         C = output_matrix(a[i], b[i])
         assert_allclose(M[i], q * C.T @ C, atol=1e-12 * q * 100)
@@ -113,8 +114,8 @@ def test_information_is_c_transposed_q_c(seed: int, q: float) -> None:
 def test_information_does_not_know_the_sign_of_a_bearing() -> None:
     a, b, e = view(0)
     for plus, minus in zip(
-        call(information, "float64", a, b, e, [7.0] * 4, ZERO33, ZERO66),
-        call(information, "float64", a, -b, e, [7.0] * 4, ZERO33, ZERO66),
+        call(information, "float64", a, b, e, [7.0] * 4),
+        call(information, "float64", a, -b, e, [7.0] * 4),
         strict=True,
     ):
         assert_allclose(minus, plus, atol=1e-12)
@@ -132,7 +133,7 @@ def test_prediction_solves_the_lyapunov_equation() -> None:
 
     exact = solve_ivp(rate, (0, h), P0.ravel(), rtol=1e-12, atol=1e-12).y[:, -1].reshape(6, 6)
     E = Rotation.from_rotvec(-omega * h).as_matrix()
-    P = call(predicted, "float64", E[None], P0[None], [0.1 * h], [1.0 * h], ZERO33, ZERO66)[0]
+    P = call(predicted, "float64", E[None], P0[None], [0.1 * h], [1.0 * h])[0]
     assert_allclose(P, exact, atol=1e-10)
     assert (P == P.T).all()
 
@@ -160,11 +161,11 @@ def corrected(
     k: float, h: float, P: np.ndarray, M: np.ndarray, r: np.ndarray, dtype: str = "float64"
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return (dx (6,), P+ (6, 6)) of one correction."""
-    given = ([h], P[None], M[None], r[None, :3], r[None, 3:], ZERO33, ZERO66)
+    given = ([h], P[None], M[None], r[None, :3], r[None, 3:])
     if k == 1.0:
         dx1, dx2, after = call(kalman, dtype, *given)
     else:
-        dx1, dx2, after = call(modal, dtype, [k], *given, IDENTITY66)
+        dx1, dx2, after = call(modal, dtype, [k], *given)
     return np.concatenate([dx1[0], dx2[0]]), after[0]
 
 
