@@ -49,10 +49,7 @@ class SeedStudy:
 
 
 def study_seeds(
-    scenario: Scenario,
-    seeds: range,
-    steady_from: float,
-    on_progress: Callable[[float], None] = lambda share: None,
+    scenario: Scenario, seeds: range, steady_from: float, on_progress: Callable[[float], None] = lambda share: None
 ) -> SeedStudy:
     """Run one world per seed, all at once, with action zero, and judge every camera tick; `steady_from` in s."""
     engine, ticks = Engine(scenario, len(seeds), "float64"), scenario.horizon_ticks

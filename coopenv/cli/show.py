@@ -58,9 +58,7 @@ def describe(
         out.print("\nMore: --all (every vehicle, setting and field), --json (all of it as data).")
 
 
-def schema(
-    out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None,
-) -> None:
+def schema(out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None) -> None:
     """Write the JSON schema of scenario files, for editors."""
     from coopenv.files import replace_text
     from coopenv.scenario.json_schema import schema_text

@@ -31,13 +31,7 @@ class Progress:
     """
 
     def __init__(self, log: Console, description: str, total: float | None = None) -> None:
-        """Describe the work.
-
-        Args:
-            log: where to show it.
-            description: what is being done.
-            total: the value of `completed` at the end; None where it is not known.
-        """
+        """Describe the work; `total` is the value of `completed` at the end, None where it is not known."""
         self._log, self._description, self._total = log, description, total
         self._completed = 0.0
         self._over = threading.Event()

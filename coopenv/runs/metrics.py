@@ -71,11 +71,7 @@ def outcome_line(run: Rollout) -> str:
 
 
 def run_metrics(
-    name: str,
-    overrides: Mapping[str, Any],
-    run: Rollout,
-    vehicles: list[dict[str, Any]],
-    steady_from: float,
+    name: str, overrides: Mapping[str, Any], run: Rollout, vehicles: list[dict[str, Any]], steady_from: float
 ) -> dict[str, Any]:
     """Return the contents of `metrics.json`."""
     simulated = run.ticks_recorded / run.scenario.rates.camera

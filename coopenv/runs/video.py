@@ -22,11 +22,6 @@ def frame_stride(scenario: Scenario) -> int:
     return scenario.ticks_per_decision * max(1, ceil(scenario.rates.decision / MAX_FPS - 1e-9))
 
 
-def film_name() -> str:
-    """Return `video.mp4`, or `video.gif` without the extra."""
-    return "video.mp4" if find_spec("imageio_ffmpeg") is not None else "video.gif"
-
-
 class Mp4Film:
     """H.264, written while the pictures come."""
 
@@ -101,6 +96,6 @@ Film = Mp4Film | GifFilm
 
 
 def open_film(folder: Path, fps: float) -> Film:
-    """Return the film of that name in `folder`."""
-    path = folder / film_name()
-    return Mp4Film(path, fps) if path.suffix == ".mp4" else GifFilm(path, fps)
+    """Return a film in `folder`: `video.mp4`, or `video.gif` without the extra."""
+    mp4 = find_spec("imageio_ffmpeg") is not None
+    return Mp4Film(folder / "video.mp4", fps) if mp4 else GifFilm(folder / "video.gif", fps)

@@ -20,24 +20,18 @@ def place_names(
     """Return the offsets (M, 2), in pt, of names' lower left corners from their points.
 
     Each name in turn takes the side of its point that covers the least: first other names, then marks, then lines.
-
-    Args:
-        names: M texts.
-        anchors: (M, 2) pixels.
-        marks: (P, 2) pixels, the points of all marks.
-        lines: (Q, 2) pixels, points along lines.
-        size: of the font, pt.
+    Points of names (M, 2), of all marks (P, 2) and along lines (Q, 2) are in pixels; the font's size is in pt.
     """
     point = DPI / 72.0
     anchors, marks, lines = (np.asarray(a, float).reshape(-1, 2) / point for a in (anchors, marks, lines))
-    taken: list[tuple[np.ndarray, np.ndarray]] = []
+    taken: list[np.ndarray] = []
     offsets = []
     for name, anchor in zip(names, anchors, strict=True):
         extent = np.array([_WIDTH * len(re.sub(r"[${}_\\]", "", name)), _HEIGHT]) * size
         corners = [_corner(direction, extent) for direction in _DIRECTIONS]
         costs = [_cost(anchor + corner, extent, marks, lines, taken) for corner in corners]
         best = corners[int(np.argmin(costs))]
-        taken.append((anchor + best, anchor + best + extent))
+        taken.append(np.stack([anchor + best, anchor + best + extent]))
         offsets.append(best)
     return np.array(offsets).reshape(-1, 2)
 
@@ -49,15 +43,10 @@ def _corner(direction: tuple[int, int], extent: np.ndarray) -> np.ndarray:
     return side * gap + np.where(side > 0, 0.0, np.where(side < 0, -extent, -extent / 2))
 
 
-def _cost(
-    low: np.ndarray,
-    extent: np.ndarray,
-    marks: np.ndarray,
-    lines: np.ndarray,
-    taken: list[tuple[np.ndarray, np.ndarray]],
-) -> float:
+def _cost(low: np.ndarray, extent: np.ndarray, marks: np.ndarray, lines: np.ndarray, taken: list[np.ndarray]) -> float:
+    """Return what a name that covers a box would cost; `taken` are corners (2, 2) of the boxes of others."""
     high = low + extent
-    names = sum(bool(np.all((low < other_high) & (high > other_low))) for other_low, other_high in taken)
+    names = sum(bool(np.all((low < other[1]) & (high > other[0]))) for other in taken)
     on_marks = np.all((marks > low - _MARK) & (marks < high + _MARK), axis=-1).sum()
     on_lines = np.all((lines > low) & (lines < high), axis=-1).any()
     return float(_COST_OF_NAME * names + _COST_OF_MARK * on_marks + _COST_OF_LINE * on_lines)

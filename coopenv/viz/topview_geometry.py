@@ -39,12 +39,7 @@ def position_covariance(rotation: np.ndarray, position: np.ndarray, covariance: 
 
 
 def ellipses(center: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return 3-sigma outlines (N, 97, 2) and major semi-axes (N,); NaN where a covariance is not one.
-
-    Args:
-        center: (N, 2) m.
-        covariance: (N, 2, 2) m^2.
-    """
+    """Return 3-sigma outlines (N, 97, 2) of covariances (N, 2, 2) and major semi-axes (N,); NaN where one is none."""
     finite = np.isfinite(covariance).all(axis=(-1, -2))
     variance, axes = np.linalg.eigh(np.where(finite[:, None, None], covariance, 0.0))
     good = finite & (variance[:, 0] >= 0.0)
@@ -89,12 +84,8 @@ def free_lengths(
 ) -> np.ndarray:
     """Return how far rays (N, K, 3) from cameras (N, 3) get before a building stops them, (N, K) m, up to `reach`.
 
-    Args:
-        origin: map frame, m.
-        rays: unit vectors, map frame.
-        reach: m.
-        obstacles: buildings, in the coordinates of the scenario's file.
-        shift: (3,) the map's origin in these coordinates, m.
+    Rays are unit vectors; they and the cameras are in the map frame, whose origin is at `shift` in the coordinates of
+    the buildings, those of the scenario's file, m.
     """
     length = np.full(rays.shape[:2], reach)
     for obstacle in obstacles:
@@ -172,14 +163,10 @@ def road_corners(start: tuple[float, float], end: tuple[float, float], width: fl
 def pointers(
     origin: np.ndarray, point: np.ndarray, low: np.ndarray, high: np.ndarray, size: float
 ) -> tuple[list[np.ndarray], list[int]]:
-    """Return triangles (3, 2) at the border, pointing to each `point` outside the picture, and the points' indices.
+    """Return triangles (3, 2) at the border, pointing to each `point` (N, 2) outside the picture, and their indices.
 
-    Args:
-        origin: (N, 2) where the pointing lines come from; the picture's middle, for those outside too.
-        point: (N, 2).
-        low: (2,) lower left corner.
-        high: (2,) upper right corner.
-        size: length of a triangle, m.
+    The pointing lines come from `origin` (N, 2), or from the picture's middle where that is outside too. `low` and
+    `high` are corners of the picture, `size` is the length of a triangle, m.
     """
     triangles, which = [], []
     for i, (start, end) in enumerate(zip(origin, point, strict=True)):

@@ -205,11 +205,7 @@ def _marker(marker: str, edge: str, face: str) -> dict[str, Any]:
 
 
 def _legend(
-    figure: Figure,
-    trajectory: Trajectory,
-    place: tuple[float, float],
-    outside: bool,
-    scenario: Scenario | None = None,
+    figure: Figure, trajectory: Trajectory, place: tuple[float, float], outside: bool, scenario: Scenario | None = None
 ) -> None:
     truth = {"color": INK, "linewidth": 1.1, "linestyle": _DOTTED}
     looks: dict[str, dict[str, Any]] = {

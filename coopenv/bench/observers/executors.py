@@ -37,12 +37,7 @@ class Executor(Protocol):
 
 
 def find_executor(name: str, jobs: int | None = None, address: str | None = None) -> Executor:
-    """Return an executor that is ready.
-
-    Args:
-        name: `local` or `ray`.
-        jobs: processes of the local one; None: one per core.
-        address: HOST:PORT of a running cluster, or `auto` for the one of this machine (None: the same).
+    """Return an executor that is ready, by its name and the options of `bench observers`.
 
     Raises:
         CoopenvError: no such executor, an option of the other one, or it is not ready.
@@ -55,8 +50,10 @@ def find_executor(name: str, jobs: int | None = None, address: str | None = None
         return Local(jobs or available_cores())
     if jobs is not None:
         raise CoopenvError(f"--jobs {jobs}: with --engine ray the cluster decides")
+    if address not in (None, AUTO):
+        reach(address)
     executor = Ray(address or AUTO)
-    executor.check()
+    executor.connect()
     return executor
 
 
@@ -130,34 +127,28 @@ class Ray:
 
     address: str
 
-    def check(self) -> None:
-        """Connect, or say in one line why not.
-
-        Raises:
-            CoopenvError: Ray is not installed, or the cluster does not answer in time.
-        """
-        if self.address != AUTO:
-            reach(self.address)
-        self._connect()
-
     def map(self, function: Callable[[T], R], tasks: Sequence[T], on_done: Callable[[int], None]) -> list[R]:
         """Return function(task) of every task; Ray repeats those whose node was lost."""
-        ray = self._connect()
+        ray = self.connect()
         remote = ray.remote(num_cpus=1, max_retries=3)(function)
         work = {remote.remote(task): n for n, task in enumerate(tasks)}
         results: dict[int, R] = {}
         waiting = list(work)
         while waiting:
-            done, waiting = ray.wait(waiting, num_returns=1)
-            for reference in done:
-                try:
-                    results[work[reference]] = ray.get(reference)
-                except ray.exceptions.RayTaskError as error:
-                    raise error.cause or error from None
-                on_done(len(results))
+            (done,), waiting = ray.wait(waiting, num_returns=1)
+            try:
+                results[work[done]] = ray.get(done)
+            except ray.exceptions.RayTaskError as error:
+                raise error.cause or error from None
+            on_done(len(results))
         return [results[n] for n in range(len(tasks))]
 
-    def _connect(self) -> Any:
+    def connect(self) -> Any:
+        """Return Ray, connected to the cluster.
+
+        Raises:
+            CoopenvError: Ray is not installed, or the cluster does not answer in time.
+        """
         os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")  # a failure is told in one line, here
         try:
             import ray

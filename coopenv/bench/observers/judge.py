@@ -104,43 +104,28 @@ def scene_of(recording: Recording, steady_from: float) -> Scene:
     if known and not any(setup.planar for setup in recording.setups):
         bounds = [cramer_rao(recording), cramer_rao_ancestors(recording), cramer_rao(recording, joint=False)]
     steady = recording.t > steady_from
-    squares = [np.mean(bound.position[steady] ** 2, axis=0) for bound in bounds] or [unknown] * 3
-    gramian = gramian_local = unknown
+    mse = [np.mean(bound.position[steady] ** 2, axis=0) for bound in bounds] or [unknown] * 3
+    gramians = [unknown, unknown]
     if known:
-        observability = analyse_observability(_Geometry(recording))
-        gramian, gramian_local = (
-            values.min(axis=0, initial=np.inf)
-            for values in (observability.min_eigenvalue, observability.local_eigenvalue)
-        )
-    return Scene(
-        vehicles=tuple(setup.name for setup in recording.setups),
-        bound_mse=squares[0],
-        bound_ancestors_mse=squares[1],
-        bound_single_mse=squares[2],
-        gramian=gramian,
-        gramian_local=gramian_local,
-        steady_from=steady_from,
-        t=recording.t[kept],
-        bound=bounds[0].position[kept] if bounds else np.full((len(kept), N), np.nan),
-        paper_noise=any(setup.noise.image_axis is not None for setup in recording.setups),
-    )
+        seen = analyse_observability(_Geometry(recording))
+        gramians = [values.min(axis=0, initial=np.inf) for values in (seen.min_eigenvalue, seen.local_eigenvalue)]
+    names = tuple(setup.name for setup in recording.setups)
+    bound = bounds[0].position[kept] if bounds else np.full((len(kept), N), np.nan)
+    paper_noise = any(setup.noise.image_axis is not None for setup in recording.setups)
+    (joint, ancestors, single), (about_map, about_vehicle), t = mse, gramians, recording.t[kept]
+    return Scene(names, joint, ancestors, single, about_map, about_vehicle, steady_from, t, bound, paper_noise)
 
 
 class _Geometry:
     """A record as `analyse_observability` reads it."""
 
     def __init__(self, recording: Recording) -> None:
-        self.t = recording.t
-        self.position, self.rotation = recording.truth.position, recording.truth.rotation
-        self.target_position = np.concatenate([recording.landmarks, _markers(recording)], axis=1)
-        self.visible = recording.visible
+        self.t, self.visible, truth = recording.t, recording.visible, recording.truth
+        self.position, self.rotation = truth.position, truth.rotation
+        marker = np.array([setup.marker for setup in recording.setups])
+        seen = truth.position + (truth.rotation @ marker[..., None])[..., 0]  # the points of vehicles that cameras see
+        self.target_position = np.concatenate([recording.landmarks, seen], axis=1)
         self.vehicles = np.array([setup.name for setup in recording.setups])
-
-
-def _markers(recording: Recording) -> Array:
-    """Return (K, N, 3) the points of the vehicles that cameras see."""
-    marker = np.array([setup.marker for setup in recording.setups])
-    return np.asarray(recording.truth.position + (recording.truth.rotation @ marker[..., None])[..., 0])
 
 
 def sample_of(variant: str, observer: str, scene: Scene, recording: Recording, result: Run) -> Sample:

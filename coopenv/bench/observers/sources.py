@@ -27,7 +27,10 @@ NOBODY_FOLLOWS = "no vehicle has another one as its neighbour"
 
 @dataclass(frozen=True)
 class Source(ABC):
-    """Records of one environment in several variants; by default with faults, and of vehicles in space."""
+    """Records of one environment in several variants; by default with faults, and of vehicles in space.
+
+    Whatever looks at recorded data raises a `CoopenvError` where they are not there or not well-formed.
+    """
 
     name: str
     """As it stands in the rows."""
@@ -40,35 +43,19 @@ class Source(ABC):
 
     @property
     def planar(self) -> bool:
-        """Whether its vehicles are robots on a plane, which some observers are for and others are not.
-
-        Raises:
-            CoopenvError: the data are not there or not well-formed.
-        """
+        """Whether its vehicles are robots on a plane, which some observers are for and others are not."""
         return False
 
     @abstractmethod
     def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
-        """Return a record, and the lie that somebody tells on it.
-
-        Raises:
-            CoopenvError: the data are not there or not well-formed.
-        """
+        """Return a record, and the lie that somebody tells on it."""
 
     def obstacle(self, variant: str) -> str:
-        """Return why it cannot have one of the variants; empty where it can.
-
-        Raises:
-            CoopenvError: the data are not there or not well-formed.
-        """
+        """Return why it cannot have one of the variants; empty where it can."""
         return ""
 
     def check(self) -> None:  # noqa: B027
-        """Look at recorded data, so that errors and warnings come before the work.
-
-        Raises:
-            CoopenvError: they are not there or not well-formed.
-        """
+        """Look at recorded data, so that errors and warnings come before the work."""
 
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
         """Return when the steady state starts, s; without a record only what is asked for is checked.
