@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 
     from coopenv.backends.base import Backend
 
-DEFAULT_WIDTH = 80
-"""Columns of text where the terminal does not say."""
-
 Environment = Annotated[
     str,
     typer.Argument(
@@ -77,7 +74,7 @@ def console(stderr: bool = False) -> Console:
 
     made = Console(stderr=stderr, markup=False, highlight=False, emoji=False)
     if made.width < 1:  # COLUMNS=0
-        made.width = DEFAULT_WIDTH
+        made.width = 80
     return made
 
 

@@ -39,12 +39,8 @@ def environment_rows(scenarios: Mapping[str, Scenario]) -> list[dict[str, Any]]:
 
 def observer_rows() -> list[dict[str, Any]]:
     """Return what `list observers` says of every observer."""
-    return [{"name": name, "about": _about(name)} for name in observer_names()]
-
-
-def _about(name: str) -> str:
-    """Return the first sentence of an observer's docstring, or why it cannot be used here."""
-    return obstacle(name) or _sentence(find(name).__doc__ or "")
+    names = observer_names()
+    return [{"name": name, "about": obstacle(name) or _sentence(find(name).__doc__ or "")} for name in names]
 
 
 def agent_rows() -> list[dict[str, Any]]:

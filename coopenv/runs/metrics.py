@@ -49,7 +49,7 @@ def observability_metrics(observability: Observability) -> dict[str, Any]:
         "not_observable_s": [[gap.start, gap.end] for gap in gaps],
         "gramian_min_eigenvalue_min": float(smallest.min()) if some else np.nan,
         "gramian_min_eigenvalue_median": float(np.median(smallest)) if some else np.nan,
-        "gramian_condition_number_median": (float(np.median(observability.condition_number)) if some else np.nan),
+        "gramian_condition_number_median": float(np.median(observability.condition_number)) if some else np.nan,
         "local_eigenvalue_min": float(local.min()) if some else np.nan,
         "local_eigenvalue_median": float(np.median(local)) if some else np.nan,
     }

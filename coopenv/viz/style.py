@@ -158,12 +158,7 @@ def show_decades(ax: Axes) -> None:
 
 def time_axis(ax: Axes, t: np.ndarray, *, labelled: bool) -> None:
     """Span the record in time, with labels only where asked for."""
-    ax.set_xlim(*time_span(t))
+    ax.set_xlim(float(t[0]), float(t[-1]) if t[-1] > t[0] else float(t[0]) + 1.0)
     ax.tick_params(labelbottom=labelled)
     if labelled:
         ax.set_xlabel("time [s]", fontsize=NORMAL, color=INK)
-
-
-def time_span(t: np.ndarray) -> tuple[float, float]:
-    """Return the ends of a time axis, s."""
-    return float(t[0]), float(t[-1]) if t[-1] > t[0] else float(t[0]) + 1.0

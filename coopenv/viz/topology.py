@@ -34,7 +34,8 @@ def topology_figure(trajectory: Trajectory, ends: Sequence[float] | None = None)
     Targets that are never a vehicle's neighbours have no lane. Blue shading: a moving target is detected, or
     a moving body hides a target. Grey: the vehicle has ended (at `ends`, s) and is parked; others may see it.
     """
-    lanes = [_neighbours(trajectory, vehicle) for vehicle in range(len(trajectory.vehicles))]
+    neighbours = np.any(trajectory.sight != Sight.NOT_A_NEIGHBOUR, axis=0)
+    lanes = [np.flatnonzero(targets) for targets in neighbours]
     rows = [max(1, len(targets)) * _LANE for targets in lanes]
     height = _HEAD + _FOOT + sum(rows) + _PANEL_GAP * (len(rows) - 1)
     figure = style.new_figure(9.0, height)
@@ -55,10 +56,6 @@ def topology_figure(trajectory: Trajectory, ends: Sequence[float] | None = None)
         handles.append(Patch(facecolor=style.ENDED, label="ended, parked"))
     style.legend(figure, handles, "upper center", ncols=7, handlelength=1.8, columnspacing=1.3)
     return figure
-
-
-def _neighbours(trajectory: Trajectory, vehicle: int) -> np.ndarray:
-    return np.flatnonzero(np.any(trajectory.sight[:, vehicle] != Sight.NOT_A_NEIGHBOUR, axis=0))
 
 
 def _draw_lanes(ax: Axes, trajectory: Trajectory, vehicle: int, targets: np.ndarray, ticks: int) -> bool:

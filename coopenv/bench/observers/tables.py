@@ -43,10 +43,10 @@ def everything(board: Leaderboard) -> Iterator[Table | str]:
             yield line
     if len(variants) > 1:
         yield ""
-        yield variant_table(board)
+        yield variant_table(board, "mean RMSE [m]", "rmse", variants)
         if NOMINAL in variants:
             yield ""
-            yield degradation_table(board)
+            yield variant_table(board, "RMSE / nominal", "degradation", [v for v in variants if v != NOMINAL])
     yield from failures(board.rows)
 
 
@@ -105,22 +105,14 @@ def quality_table(board: Leaderboard, variant: str) -> Table:
     return table
 
 
-def variant_table(board: Leaderboard) -> Table:
-    """Return position RMSE in m, mean over the vehicles, of every observer in every variant."""
-    table = number_table(["mean RMSE [m]"], [_heading(name) for name in board.variants], gap=0)
+def variant_table(board: Leaderboard, heading: str, column: str, variants: Sequence[str]) -> Table:
+    """Return a column of the totals, over all vehicles, of every observer in some variants."""
+    table = number_table([heading], ["\n".join(name.replace("+", "_+").split("_")) for name in variants], gap=0)
     for name in board.ranked:
-        rmse = [board.totals[variant, name].rmse for variant in board.variants]
-        table.add_row(short_name(name), *(in_parentheses(*one) if np.isfinite(one.value) else FAILED for one in rmse))
-    return table
-
-
-def degradation_table(board: Leaderboard) -> Table:
-    """Return how much worse than the nominal one every observer is in every other variant."""
-    variants = [name for name in board.variants if name != NOMINAL]
-    table = number_table(["RMSE / nominal"], [_heading(name) for name in variants], gap=0)
-    for name in board.ranked:
-        ratios = [in_parentheses(*board.totals[variant, name].degradation) for variant in variants]
-        table.add_row(short_name(name), *ratios)
+        measured = [getattr(board.totals[variant, name], column) for variant in variants]
+        failed = [column == "rmse" and np.isnan(one.value) for one in measured]
+        cells = [FAILED if bad else in_parentheses(*one) for bad, one in zip(failed, measured, strict=True)]
+        table.add_row(short_name(name), *cells)
     return table
 
 
@@ -148,11 +140,6 @@ def _headings(board: Leaderboard, last: str) -> list[str]:
     if not _few(board):
         return ["mean", "worst"] if last == "mean" else ["mean", "worst", last]
     return [*(f"f{i + 1}" for i in range(len(board.samples[0].scene.vehicles))), last]
-
-
-def _heading(variant: str) -> str:
-    """Return a name with one word per line."""
-    return "\n".join(variant.replace("+", "_+").split("_"))
 
 
 def _add(table: Table, name: str, rows: Sequence[Row], cells: Sequence[str]) -> None:
