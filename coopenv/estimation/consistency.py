@@ -33,12 +33,8 @@ def mean_bounds(dof: int, runs: int = 1, level: float = LEVEL) -> Interval:
     """Return where the mean over independent runs of a chi-square of `dof` degrees, divided by `dof`, lies.
 
     For ANEES the runs are Monte Carlo runs at one instant: ticks of one run are correlated, so the bounds do not hold
-    for a mean over time. For NIS, which is white over time, a run may be a tick.
-
-    Args:
-        dof: degrees of freedom of each.
-        runs: how many.
-        level: probability of lying inside.
+    for a mean over time. For NIS, which is white over time, a run may be a tick. `level` is the probability of lying
+    inside.
     """
     total, tail = dof * runs, (1.0 - level) / 2.0
     return Interval(float(chi2.ppf(tail, total)) / total, float(chi2.ppf(1.0 - tail, total)) / total)
@@ -64,13 +60,7 @@ def position_std(covariance: Array, coordinates: Coordinates, rotation: Array, p
     """Return sqrt(trace) (...) of the covariance of the position in the map that P (..., 6, 6) states, m.
 
     To first order pbar - pbarhat is, up to a rotation, rho in LEFT coordinates, rho - S(pbarhat) theta in RIGHT ones,
-    and dp - S(phat) theta in the paper's, whose phat is in the body frame.
-
-    Args:
-        covariance: P, rad and m.
-        coordinates: that P is about.
-        rotation: (..., 3, 3) estimate.
-        position: (..., 3) estimate, map, m.
+    and dp - S(phat) theta in the paper's, whose phat is in the body frame. The estimate's position is in the map, m.
     """
     if coordinates is Coordinates.LEFT:
         variance = np.trace(covariance[..., 3:, 3:], axis1=-2, axis2=-1)

@@ -66,15 +66,9 @@ class RateFit(NamedTuple):
 
 
 def steady_start(given: float | None, horizon: float, end: float | None = None) -> float:
-    """Return when the steady state starts, s: as given, or after `STEADY_SHARE` of the horizon.
+    """Return when the steady state starts, s: as given by the user, or after `STEADY_SHARE` of the horizon, s.
 
-    Args:
-        given: what the user asked for, s.
-        horizon: of the scenario, s.
-        end: of the run, s, where it is cut short of the horizon.
-
-    Raises:
-        CoopenvError: what was asked for does not lie within the run.
+    What is given has to lie within the run, which ends at `end`, s, where it is cut short of the horizon.
     """
     if given is None:
         return STEADY_SHARE * horizon
@@ -85,13 +79,9 @@ def steady_start(given: float | None, horizon: float, end: float | None = None) 
 
 
 def live_ticks(t: np.ndarray, vehicles: int, ends: Sequence[float] | None = None) -> np.ndarray:
-    """Return (N,) the number of ticks up to each vehicle's end, the tick of its end included.
+    """Return (N,) the number of ticks (K,) up to each vehicle's end, the tick of its end included.
 
-    Args:
-        t: (K,) s.
-        vehicles: N.
-        ends: s, when each arrived or collided and was parked; NaN or beyond the record for one that was not (None: no
-            vehicle was).
+    `ends` is when each arrived or collided and was parked, s: NaN or beyond the record for one that was not.
     """
     if ends is None:
         return np.full(vehicles, len(t))
@@ -181,16 +171,9 @@ def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 def settling_time(
     t: np.ndarray, position_error: np.ndarray, orientation_error: np.ndarray, tolerance: SettlingTolerance = CONVERGED
 ) -> np.ndarray:
-    """Return the first time from which both errors stay below a tolerance until the end of the record.
+    """Return the first time (...), s, from which errors (K, ...) in m and deg stay below a tolerance until the end.
 
-    Args:
-        t: (K,) s.
-        position_error: (K, ...) m.
-        orientation_error: (K, ...) deg.
-        tolerance: what both errors stay below.
-
-    Returns:
-        (...) s; NaN where the last tick is not below both, so that a passing visit does not count as settled.
+    NaN where the last tick is not below both, so that a passing visit does not count as settled.
     """
     below = tolerance.contains(position_error, orientation_error)
     settled = np.logical_and.accumulate(below[::-1], axis=0)[::-1]
@@ -235,16 +218,8 @@ def fit_exponential_rate(t: np.ndarray, error: np.ndarray, noise_floor: float | 
     The fit takes the ticks after the error (its running median) was last above half of its initial value, up to
     the first within three times the noise floor: before, the transient is not exponential (P falls as 1/t);
     after, there is only noise. The bounds assume independent residuals, which neighbouring ticks are not: they
-    are a lower limit of the uncertainty.
-
-    Args:
-        t: (K,) s.
-        error: (K,), any unit, not negative.
-        noise_floor: in the unit of `error`; by default the median over the last fifth of the record.
-
-    Returns:
-        The rate, or NaN and a remark when there is no descent of at least three samples that stands out
-        of the scatter.
+    are a lower limit of the uncertainty. Without a descent of at least three samples that stands out of the scatter the
+    rate is NaN, with a remark. The noise floor is by default the median over the last fifth of the record.
     """
     t, error = np.asarray(t, float), np.asarray(error, float)
     if not np.isfinite(error).all():
@@ -293,10 +268,7 @@ def observability_of(observability: Observability, vehicle: int, end: float = ma
 def summarise(trajectory: Trajectory, steady_from: float, ends: Sequence[float] | None = None) -> list[dict[str, Any]]:
     """Return one dict of plain Python values per vehicle, units in the keys; what does not exist is NaN or None.
 
-    Args:
-        trajectory: the record of a run.
-        steady_from: s; steady RMSE and mean NEES are over the ticks after it.
-        ends: s, when each vehicle was parked, after which nothing counts; see `live_ticks`.
+    Steady RMSE and mean NEES are over the ticks after `steady_from`, s; nothing counts after `ends`, see `live_ticks`.
     """
     settled = settling_times(trajectory, ends, SETTLED)
     converged = settling_times(trajectory, ends, CONVERGED)

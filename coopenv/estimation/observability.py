@@ -108,12 +108,7 @@ def analyse_observability(
 
     True poses and the visibility of the run are used: the question is what could be seen, not what was made
     of it. Neighbours count as known, as in the theorem, which takes the vehicles one after the other along
-    the graph.
-
-    Args:
-        scene: the record of a run.
-        window: s.
-        threshold: verdict on the local eigenvalue, see `Observability`.
+    the graph. The window is in s; the threshold is the verdict on the local eigenvalue, see `Observability`.
     """
     window = min(window, float(scene.t[-1] - scene.t[0]))
     start, W, anchor = _windows_about_anchor(scene, window)

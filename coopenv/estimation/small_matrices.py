@@ -9,11 +9,7 @@ from coopenv.estimation.arrays import Array
 
 
 def solve(A: Array, b: Array) -> Array:
-    """Return A^-1 b.
-
-    Raises:
-        LinAlgError: A is singular.
-    """
+    """Return A^-1 b; a LinAlgError says that A is singular."""
     _, _, x, failed = dgesv(A, b)
     if failed:
         raise np.linalg.LinAlgError("singular matrix")
@@ -22,11 +18,7 @@ def solve(A: Array, b: Array) -> Array:
 
 
 def cholesky(A: Array) -> Array:
-    """Return the lower triangular L of A = L L^T.
-
-    Raises:
-        LinAlgError: A is not positive definite.
-    """
+    """Return the lower triangular L of A = L L^T; a LinAlgError says that A is not positive definite."""
     factor, failed = dpotrf(A, lower=True)
     if failed:
         raise np.linalg.LinAlgError("not positive definite")

@@ -23,12 +23,7 @@ class RelativeError(NamedTuple):
 
 
 def absolute_error(position: Array, position_estimate: Array) -> float:
-    """Return ATE: the root mean square of |p - phat| in m, over the ticks whose truth is known.
-
-    Args:
-        position: (K, 3) map, m; rows with NaN are left out.
-        position_estimate: (K, 3) map, m.
-    """
+    """Return ATE: the root mean square of |p - phat| in m, of positions (K, 3), over the ticks whose truth is known."""
     known = np.isfinite(position).all(axis=-1)
     if not known.any():
         return float("nan")
@@ -41,14 +36,8 @@ def relative_error(
 ) -> RelativeError:
     """Return RPE: the root mean square over pairs (k, k + delta) of E = (P_k^-1 P_k+)^-1 (Phat_k^-1 Phat_k+).
 
-    Pairs do not overlap: k = 0, delta, 2 delta, ...
-
-    Args:
-        rotation: (K, 3, 3) true, body to map; pairs with NaN are left out.
-        position: (K, 3) true, map, m.
-        rotation_estimate: (K, 3, 3).
-        position_estimate: (K, 3) m.
-        delta: ticks, at least 1; relative errors of different deltas cannot be compared.
+    Rotations (K, 3, 3) are body to map, positions (K, 3) in the map, m; pairs whose truth is NaN are left out, and they
+    do not overlap: k = 0, delta, 2 delta, ... Relative errors of different deltas, in ticks, cannot be compared.
     """
     start = np.arange(0, max(len(position) - delta, 0), delta)
     known: NDArray[np.bool_] = np.isfinite(np.concatenate([rotation, position[..., None]], axis=-1)).all(axis=(-1, -2))

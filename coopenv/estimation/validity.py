@@ -43,11 +43,9 @@ def are_rotations(matrices: Array, tolerance: float = MAX_BEND) -> Mask:
 
 
 def are_covariances(matrices: Array, least: float) -> Mask:
-    """Return (...) which matrices (..., n, n) are symmetric and definite enough.
+    """Return (...) which matrices (..., n, n) are symmetric, not too large, and definite enough.
 
-    Args:
-        matrices: variances up to the square of the largest number.
-        least: smallest eigenvalue that their correlations may have; below 0 for those that are singular or rounded.
+    `least` is the smallest eigenvalue that their correlations may have; below 0 for those that are singular or rounded.
     """
     P = np.asarray(matrices, dtype=np.float64)
     bounded = everywhere(np.abs(P) <= LARGEST**2, -1, -2)

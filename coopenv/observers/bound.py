@@ -42,12 +42,10 @@ class Bound:
 
 
 def cramer_rao(recording: Recording, joint: bool = True) -> Bound:
-    """Return the bound of a record with its realised visibility.
+    """Return the bound of a record: of its truth, visible edges, noise and initial covariance.
 
-    Args:
-        recording: of which the truth, the visible edges, the noise and the initial covariance are used.
-        joint: over all vehicles, whose poses are all unknown; False: each vehicle alone, as if its neighbours' poses
-            were known exactly.
+    It is joint, over all vehicles, whose poses are all unknown, or that of each vehicle alone, as if its neighbours'
+    poses were known exactly.
     """
     N = len(recording.setups)
     M, F = information(recording, joint), transitions(recording)
@@ -86,11 +84,7 @@ def ancestors(recording: Recording, vehicle: int) -> tuple[int, ...]:
 def _covariances(recording: Recording, F: Array, M: Array, groups: Sequence[Sequence[int]]) -> Array:
     """Return (K, g, n, 6, 6) the bounds of g groups of n vehicles, those of a group estimated together.
 
-    Args:
-        recording: for the start, the odometry's noise, and when corrections are due.
-        F: (K, 6N, 6N) of all.
-        M: (K, 6N, 6N) information of all.
-        groups: vehicles, equally many in each.
+    F and M (K, 6N, 6N) are the transitions and the information of all.
     """
     part = (6 * np.asarray(groups)[..., None] + np.arange(6)).reshape(len(groups), -1)
     F, M = (A[:, part[:, :, None], part[:, None, :]] for A in (F, M))
@@ -137,10 +131,7 @@ def transitions(recording: Recording) -> Array:
 def information(recording: Recording, joint: bool = True, observers: Collection[int] | None = None) -> Array:
     """Return sum of H^T N^-1 H (K, 6N, 6N) over the visible edges at each tick, linearised at the truth.
 
-    Args:
-        recording: with the truth and the visible edges.
-        joint: whether a neighbour's pose is unknown, too.
-        observers: whose measurements count; None: everybody's.
+    `joint`: a neighbour's pose is unknown, too; `observers`: whose measurements count, None: everybody's.
     """
     R, p = recording.truth.rotation, recording.truth.position
     K, N = R.shape[:2]

@@ -29,11 +29,7 @@ SENT_COVARIANCES = (ROTATION, COVARIANCE)
 
 
 def check_estimate(estimate: Estimate) -> None:
-    """Refuse what is no estimate.
-
-    Raises:
-        CoopenvError: a field has another shape, is not real and finite, or is no rotation or covariance.
-    """
+    """Refuse what is no estimate, with a CoopenvError that names the field and what is wrong with it."""
     _check_array("rotation", estimate.rotation, LARGEST, ROTATION)
     _check_array("position", estimate.position, LARGEST, POSITION)
     _check_rotation(np.asarray(estimate.rotation))
@@ -47,11 +43,7 @@ def check_estimate(estimate: Estimate) -> None:
 
 
 def check_message(message: Message) -> None:
-    """Refuse what is no message; `extra` is the observer's own business, as long as it holds numbers.
-
-    Raises:
-        CoopenvError: a field has another shape, or is not real and finite.
-    """
+    """Refuse what is no message; `extra` is the observer's own business, as long as it holds numbers."""
     if message.position is not None:
         _check_array("message: position", message.position, LARGEST, POSITION)
     if message.rotation is not None:

@@ -50,18 +50,17 @@ class Tamper(Protocol):
 
 
 class Group:
-    """One observer per vehicle, or a joint one of all; `start` comes first and begins anew."""
+    """One observer per vehicle, or a joint one of all; `start` comes first and begins anew.
+
+    What observers raise, or return that is no estimate, becomes an `ObserverError`.
+    """
 
     def __init__(self, factory: Factory, briefing: Briefing, tamper: Tamper | None = None) -> None:
         self.factory, self.briefing, self.tamper = factory, briefing, tamper
         self.joint = is_joint(factory)
 
     def start(self, rotation: Array, position: Array) -> None:
-        """Build the observers and start them at poses (N, 3, 3) and (N, 3), map frame, m.
-
-        Raises:
-            ObserverError: one of them cannot start.
-        """
+        """Build the observers and start them at poses (N, 3, 3) and (N, 3), map frame, m."""
         setups = self.briefing.setups
         self.mail = Mailbox(self.briefing)
         self.coordinates: Coordinates | None = None
@@ -89,9 +88,6 @@ class Group:
         """Let one vehicle's observer take a tick; vehicles come in the order of the briefing.
 
         `inbox_tick` is as for `Mailbox.inbox`.
-
-        Raises:
-            ObserverError: it raised, or returned what is no estimate.
         """
         k = sensed.index
         try:
@@ -112,11 +108,7 @@ class Group:
         return Answer(estimate, elapsed)
 
     def update_all(self, sensed: Sensed) -> list[Answer]:
-        """Let a joint observer take a tick of every vehicle.
-
-        Raises:
-            ObserverError: it raised, or returned what is no estimate.
-        """
+        """Let a joint observer take a tick of every vehicle."""
         setups = self.briefing.setups
         try:
             ticks = [sensed.tick(setup, {}) for setup in setups]
@@ -144,11 +136,7 @@ class Group:
         return ObserverError(f"{whose}at {k * self.briefing.dt:.3f} s: {told(error)}")
 
     def get_state(self) -> dict[str, Any]:
-        """Return a deep copy of the observers and of all messages; empty before the start.
-
-        Raises:
-            CoopenvError: an observer cannot be copied.
-        """
+        """Return a deep copy of the observers and of all messages, if they can be copied; empty before the start."""
         if not hasattr(self, "mail"):
             return {}
         observers = self.whole if self.joint else self.observers
@@ -161,10 +149,8 @@ class Group:
     def checked_state(self, state: Any) -> dict[str, Any]:
         """Return a deep copy of what `get_state` of such a group returned.
 
-        The observers in it are trusted to be what they seem: whoever made the state could run any code in them.
-
-        Raises:
-            CoopenvError: it is of another group.
+        A CoopenvError says that it is of another group. The observers in it are trusted to be what they seem: whoever
+        made the state could run any code in them.
         """
         try:
             copied = copy.deepcopy(state)

@@ -95,11 +95,7 @@ class KernelObserver:
         self._run("start", start_kernel)
 
     def update(self, tick: Tick) -> Estimate:
-        """Take one camera tick.
-
-        Raises:
-            CoopenvError: the first one takes no time, or this one is too long after it for the kernels to count.
-        """
+        """Take one camera tick; a CoopenvError says that the kernels cannot count its time."""
         if self._origin is None:
             self._set_clock(tick.time - tick.dt, tick.dt)
         now = self.units(tick.time - (self._origin or 0.0))
@@ -224,22 +220,14 @@ def write_pose(observer: KernelObserver) -> Message:
 
 
 def read_position(observer: KernelObserver, sender: int, message: Message, sent: int) -> None:
-    """Put a position where the V2X stage puts it; the sender's marker takes the place of its origin.
-
-    Raises:
-        CoopenvError: the message holds none.
-    """
+    """Put a position where the V2X stage puts it; the sender's marker takes the place of its origin."""
     if message.position is None:
         raise CoopenvError("no position")
     observer.state.inbox_position[sender] = message.position
 
 
 def read_pose(observer: KernelObserver, sender: int, message: Message, sent: int) -> None:
-    """Do the same with a whole pose.
-
-    Raises:
-        CoopenvError: the message holds none.
-    """
+    """Do the same with a whole pose."""
     if message.rotation is None:
         raise CoopenvError("no rotation")
     read_position(observer, sender, message, sent)

@@ -56,11 +56,8 @@ class Mailbox:
     ) -> dict[int, Received]:
         """Return what a vehicle has heard by tick k, by target, without what is stale.
 
-        Args:
-            k: now.
-            vehicle: the receiver.
-            inbox_tick: (N,) tick of sending of the last message that the radio delivered of each sender; -1: none.
-            arrived: what came at this tick from vehicles that are estimated elsewhere, see `Sensed.messages`.
+        `inbox_tick` (N,) says when the last message was sent that the radio delivered of each sender, -1: none;
+        `arrived` is what came at this tick from vehicles that are estimated elsewhere, see `Sensed.messages`.
         """
         b, landmarks, heard = self.briefing, self.briefing.setups[vehicle].landmarks, self.heard[vehicle]
         ticks, received = np.asarray(inbox_tick).tolist(), {}
@@ -81,11 +78,7 @@ class Mailbox:
         return {"sent": self.sent, "heard": self.heard, "bytes": self.bytes}
 
     def set_state(self, state: Any) -> None:
-        """Take over what a `get_state` returned; nobody can change the messages any more.
-
-        Raises:
-            Exception: it is something else; which one depends on what it is.
-        """
+        """Take over what `get_state` returned, so that nobody can change it; anything else raises what it raises."""
         senders = range(len(self.briefing.setups))
         sent, heard, count = state["sent"], state["heard"], np.asarray(state["bytes"], np.float64)
         if not (len(sent) == len(heard) == len(senders) == len(count)) or not np.isfinite(count).all():

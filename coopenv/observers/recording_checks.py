@@ -46,12 +46,7 @@ LEAST_EIGENVALUE = 1e-12
 def check_recording(recording: Recording, where: str) -> None:
     """Refuse a recording that contradicts itself or holds what no kernel may read.
 
-    Args:
-        recording: from a file, a data set or a program.
-        where: its name, which begins the error.
-
-    Raises:
-        DataError: one line that names the field, and vehicle and tick where it is about them.
+    The DataError begins with its name and names the field, and vehicle and tick where it is about them.
     """
     try:
         _check_setups(recording.setups)

@@ -82,14 +82,8 @@ def _row(observer: Any) -> Registered:
 def named(observer: str | Factory) -> str:
     """Return the name of an observer; a class or a place in code becomes known by the name of the class.
 
-    Where another observer has that name, the name of its file or module is put before it: `mine.Riccati`.
-
-    Args:
-        observer: name, which is returned as it is, `file.py:Class`, `package.module:Class`, a class or function of a
-            setup, or an `Embedded`.
-
-    Raises:
-        CoopenvError: there is none at that place, it is no observer or has no name, or its names are taken.
+    Where another observer has that name, the name of its file or module is put before it: `mine.Riccati`. A
+    CoopenvError says that there is none at that place, that it is no observer or has no name, or that both are taken.
     """
     if isinstance(observer, str) and not is_reference(observer):
         return observer
@@ -147,11 +141,7 @@ def obstacle(name: str) -> str:
 
 
 def available_names(planar: bool | None = None) -> list[str]:
-    """Return every known name whose modules are installed and, where it is of another package, which can be loaded.
-
-    Args:
-        planar: only those that are meant for robots on a plane (True) or for vehicles in space (False).
-    """
+    """Return the names that can be used here; `planar`: only those for robots on a plane, or for vehicles in space."""
     both = planar is None
     strangers = {name for name, row in ZOO.items() if not (both or (row.on_a_plane if planar else row.in_space))}
     return [name for name in observer_names() if name not in strangers and not obstacle(name)]
@@ -172,14 +162,9 @@ def find(name: str | Factory) -> Factory:
 
 
 def find_embedded(name: str, planar: bool = False) -> Embedded | None:
-    """Return the kernels of an observer, by name; None where it has none.
+    """Return the kernels of an observer by name, None where it has none; errors are those of `find`.
 
-    Args:
-        name: known, or of a package.
-        planar: for robots on a plane whose odometry is their commands.
-
-    Raises:
-        CoopenvError: as for `find`.
+    `planar` is for robots on a plane whose odometry is their commands.
     """
     if name not in ZOO:
         return _found(name).embedded

@@ -55,16 +55,9 @@ CALIBRATING = Tuning(
 class PlanarEkf:
     """Extended Kalman filter of x, y and heading.
 
-    It believes its odometry and its neighbours.
-    A neighbour's covariance is added to the bearing's variance, as if its errors were independent (Roumeliotis, Bekey,
-    "Distributed multirobot localization", IEEE Trans. Robotics and Automation 18(5), 2002, without its
-    cross-correlations).
-
-    Args:
-        setup: of a planar robot.
-
-    Raises:
-        CoopenvError: the robot is none.
+    It believes its odometry and its neighbours, and is for robots on a plane alone. A neighbour's covariance is added
+    to the bearing's variance, as if its errors were independent (Roumeliotis, Bekey, "Distributed multirobot
+    localization", IEEE Trans. Robotics and Automation 18(5), 2002, without its cross-correlations).
     """
 
     tuning: ClassVar[Tuning] = TEXTBOOK
