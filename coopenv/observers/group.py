@@ -157,7 +157,9 @@ class Group:
             if copied == {}:
                 return {}
             observers, coordinates, mail = (copied[name] for name in ("observers", "coordinates", "mail"))
-            fit = isinstance(observers, JointObserver) if self.joint else _are_observers(observers, self.briefing)
+            kind, listed = (JointObserver, [observers]) if self.joint else (Observer, observers)
+            fit = isinstance(listed, list) and all(isinstance(observer, kind) for observer in listed)
+            fit = fit and len(listed) == (1 if self.joint else len(self.briefing.setups))
             if len(copied) != 3 or not fit or not (coordinates is None or isinstance(coordinates, Coordinates)):
                 raise CoopenvError("not one observer per vehicle, or not with their coordinates")
             Mailbox(self.briefing).set_state(mail)
@@ -175,11 +177,3 @@ class Group:
             self.whole = state["observers"]
         else:
             self.observers = state["observers"]
-
-
-def _are_observers(observers: Any, briefing: Briefing) -> bool:
-    return (
-        isinstance(observers, list)
-        and len(observers) == len(briefing.setups)
-        and all(isinstance(observer, Observer) for observer in observers)
-    )

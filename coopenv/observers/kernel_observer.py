@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -37,16 +37,6 @@ MOST_UNITS = 2**31 - 1
 _VISIBLE, _OUT_OF_VIEW = np.uint8(Sight.VISIBLE), np.uint8(Sight.OUT_OF_VIEW)
 
 
-class Heard(NamedTuple):
-    """The last message of a sender."""
-
-    message: Message
-    sent: int
-    """When, in the kernels' units."""
-    valid: bool
-    """Whether it was well-formed."""
-
-
 class KernelObserver:
     """One vehicle's observer, computed in float64 by the kernels of an embedded one."""
 
@@ -72,7 +62,9 @@ class KernelObserver:
         self._now_views = [array.numpy() for array in self._now]
         self._start_covariance = self._model.start.covariance.numpy()[setup.vehicle]
         self._set_clock(None, setup.noise.odometry_period)
-        self._heard: dict[int, Heard] = {}
+        self._heard: dict[
+            int, tuple[Message, int, bool]
+        ] = {}  # by sender: the last one, when it was sent, whether sound
         self.ignored_messages = 0
         """Malformed ones since the start."""
 
@@ -106,7 +98,12 @@ class KernelObserver:
         self._sense(tick, now)
         self._receive(tick.messages, now)
         self._run("estimate", estimate_kernel, *self._now)
-        return self._estimate()
+        s, coordinates = self.state, self._kernels.coordinates
+        R, p, P = s.estimate_rotation.copy(), s.estimate_position.copy(), s.covariance.copy()
+        if coordinates is Coordinates.LEFT:
+            P = left_covariance(p, P)
+        dof = int(s.nis_dof)
+        return Estimate(R, R.dot(p), P, coordinates, float(s.nis) if dof else None, dof)
 
     def message(self) -> Message:
         """Return what the kernels put on the air."""
@@ -130,12 +127,12 @@ class KernelObserver:
         s.inbox_tick[...] = -1
         for target, received in messages.items():
             sender, sent = target - self.setup.landmarks, now - self.units(received.age)
-            last = self._heard.get(sender)
-            if last is None or last.message is not received.message or abs(last.sent - sent) > 1:
-                valid = sent >= 0 and self._read(sender, received.message, sent)
-                last = self._heard[sender] = Heard(received.message, sent, valid)
-            if last.valid:
-                s.inbox_tick[sender] = last.sent
+            message, before, sound = self._heard.get(sender, (None, 0, False))
+            if message is not received.message or abs(before - sent) > 1:
+                before, sound = sent, sent >= 0 and self._read(sender, received.message, sent)
+                self._heard[sender] = received.message, sent, sound
+            if sound:
+                s.inbox_tick[sender] = before
 
     def _read(self, sender: int, message: Message, sent: int) -> bool:
         """Hand a message to the kernels; return whether it is well-formed."""
@@ -146,14 +143,6 @@ class KernelObserver:
             self.ignored_messages += 1
             return False
         return True
-
-    def _estimate(self) -> Estimate:
-        s, coordinates = self.state, self._kernels.coordinates
-        R, p, P = s.estimate_rotation.copy(), s.estimate_position.copy(), s.covariance.copy()
-        dof = int(s.nis_dof)
-        if coordinates is Coordinates.LEFT:
-            P = left_covariance(p, P)
-        return Estimate(R, R.dot(p), P, coordinates, float(s.nis) if dof else None, dof)
 
     def units(self, seconds: float) -> int:
         """Return a time in the kernels' units."""
