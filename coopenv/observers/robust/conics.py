@@ -21,10 +21,7 @@ def unit_matrix(M: Any):
 @wp.func
 def cofactors(M: Any):
     """Return the matrix of cofactors: its scalar product with X is the derivative of det M along X."""
-    a = M[0]
-    b = M[1]
-    c = M[2]
-    return wp.matrix_from_rows(wp.cross(b, c), wp.cross(c, a), wp.cross(a, b))
+    return wp.matrix_from_rows(wp.cross(M[1], M[2]), wp.cross(M[2], M[0]), wp.cross(M[0], M[1]))
 
 
 @wp.func
@@ -96,18 +93,12 @@ def null_vector(M: Any):
 
 
 @wp.func
-def across_to(n: Any):
-    """Return a unit vector across a unit vector."""
-    axis = vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
-    if wp.abs(n[0]) > wp.float64(0.7):
-        axis = vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
-    return wp.normalize(wp.cross(n, axis))
-
-
-@wp.func
 def plane_slopes(M: Any, null: Any):
     """Return the two directions that span, each with the null vector, the planes of a singular symmetric matrix."""
-    u = across_to(null)
+    axis = vec3d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0))
+    if wp.abs(null[0]) > wp.float64(0.7):
+        axis = vec3d(wp.float64(0.0), wp.float64(1.0), wp.float64(0.0))
+    u = wp.normalize(wp.cross(null, axis))
     w = wp.cross(null, u)
     A = wp.dot(u, M * u)
     B = wp.dot(u, M * w)

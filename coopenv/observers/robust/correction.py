@@ -34,12 +34,6 @@ def restore_covariance(memory: Any, world: int, i: int):
 
 
 @wp.func
-def remaining_correction(memory: Any, world: int, k: int):
-    """Return the error of a member at which the lines were linearised, less the correction so far."""
-    return memory.scratch[world, k].last_correction - memory.scratch[world, k].correction
-
-
-@wp.func
 def update_by_line(memory: Any, world: int, i: int, n: int):
     """Update the covariance by a line, and the correction by what the line says beyond those before."""
     members = memory.belief[world, i].members
@@ -50,10 +44,12 @@ def update_by_line(memory: Any, world: int, i: int, n: int):
             C = C + memory.P[world, i, k, line.member] * wp.transpose(line.member_jacobian)
         memory.scratch[world, k].PHt = C
     S = isotropic(line.noise) + line.jacobian * memory.scratch[world, 0].PHt
-    residual = line.residual + line.jacobian * remaining_correction(memory, world, 0)
+    own = memory.scratch[world, 0]  # where the lines were linearised, less the correction so far
+    residual = line.residual + line.jacobian * (own.last_correction - own.correction)
     if line.member > 0:
-        S = S + line.member_jacobian * memory.scratch[world, line.member].PHt
-        residual = residual + line.member_jacobian * remaining_correction(memory, world, line.member)
+        theirs = memory.scratch[world, line.member]
+        S = S + line.member_jacobian * theirs.PHt
+        residual = residual + line.member_jacobian * (theirs.last_correction - theirs.correction)
     weight = wp.inverse(S)
     for k in range(members):
         K = memory.scratch[world, k].PHt * weight

@@ -14,9 +14,9 @@ import warp as wp
 
 from coopenv.estimation.linalg import symmetric_part
 from coopenv.estimation.so3 import orthonormalise, skew
-from coopenv.observers.robust.algebra import is_known, lower_blocks, moved, odometry_noise
+from coopenv.observers.robust.algebra import distance_squared, is_known, lower_blocks, moved, odometry_noise
 from coopenv.observers.robust.belief import begin_belief, own_estimate, propagate
-from coopenv.observers.robust.hypotheses import best_hypothesis
+from coopenv.observers.robust.constants import SAME_PRIOR
 from coopenv.observers.robust.memory import (
     Belief,
     Estimate,
@@ -30,7 +30,7 @@ from coopenv.observers.robust.memory import (
     mat66d,
     vec3d,
 )
-from coopenv.observers.robust.search import advance_search, begin_search, confirms_prior, propagate_search
+from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
 from coopenv.observers.robust.tracklets import possible_dependencies
 from coopenv.observers.robust.update import resect, set_anchor, update
 
@@ -54,18 +54,6 @@ def clear(model: Any, memory: Any, world: int, i: int):
 
 
 @wp.func
-def start_belief(model: Any, state: Any, memory: Any, world: int, i: int):
-    """Start at the initial estimate; one that is too uncertain to linearise about is only a prior for the search."""
-    R = orthonormalise(mat33d(state.estimate_rotation[world, i]))
-    start = Estimate(Pose(R, R * vec3d(state.estimate_position[world, i])), model.start.covariance[i])
-    restart_belief(model, memory, world, i, start)
-    memory.belief[world, i].odometry.R = wp.identity(3, wp.float64)
-    set_anchor(memory, world, i, start.P, 0)
-    if not is_known(start.P):
-        begin_search(memory, world, i, start)
-
-
-@wp.func
 def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: Estimate):
     """Believe in a pose alone."""
     begin_belief(memory, world, i, estimate)
@@ -82,9 +70,8 @@ def write(state: Any, memory: Any, world: int, i: int):
     estimate = own_estimate(memory, world, i)
     if memory.search[world, i].active == 1:
         estimate = memory.search[world, i].prior
-        h = best_hypothesis(memory, world, i)
-        if h >= 0:
-            estimate = memory.hypothesis[world, i, h].estimate
+        if memory.search[world, i].hypotheses > 0:
+            estimate = memory.hypothesis[world, i, 0].estimate
     position = wp.transpose(estimate.pose.R) * estimate.pose.p
     one = wp.identity(3, wp.float64)
     J = lower_blocks(one, skew(position), one)
@@ -104,10 +91,19 @@ def make_start(clear_messages: Any, receive: Any) -> Any:
 
     @wp.func
     def start(model: Any, state: Any, memory: Any, world: int, i: int):
-        """Start the observer of a vehicle, and take what its leaders have sent."""
+        """Start at the initial estimate, and take what the leaders have sent.
+
+        An estimate that is too uncertain to linearise about is only a prior for the search.
+        """
         clear(model, memory, world, i)
         clear_messages(model, memory, world, i)
-        start_belief(model, state, memory, world, i)
+        R = orthonormalise(mat33d(state.estimate_rotation[world, i]))
+        initial = Estimate(Pose(R, R * vec3d(state.estimate_position[world, i])), model.start.covariance[i])
+        restart_belief(model, memory, world, i, initial)
+        memory.belief[world, i].odometry.R = wp.identity(3, wp.float64)
+        set_anchor(memory, world, i, initial.P, 0)
+        if not is_known(initial.P):
+            begin_search(memory, world, i, initial)
         receive(model, state, memory, world, i)
 
     return start
@@ -126,10 +122,11 @@ def make_estimate(receive: Any, fuse_messages: Any) -> Any:
         """Search for the pose; with one hypothesis left, go on with the prior if it is that, else with this frame."""
         if not advance_search(model, state, memory, world, i, now):
             return
-        confirmed = confirms_prior(memory, world, i)
+        prior = memory.search[world, i].prior
         found = memory.hypothesis[world, i, 0].estimate
+        confirmed = is_known(prior.P) and distance_squared(prior, found) < wp.float64(SAME_PRIOR)
         if confirmed:
-            found = memory.search[world, i].prior
+            found = prior
         restart_belief(model, memory, world, i, found)
         fuse_messages(model, state, memory, world, i, now.tick)
         if confirmed:

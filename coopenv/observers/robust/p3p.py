@@ -124,14 +124,6 @@ def distances_of(a: Any, gaps: Any):
 
 
 @wp.func
-def solves(d: Any, gaps: Any, a: Any):
-    """Return whether distances solve the problem."""
-    missed = wp.max(wp.abs(misfit(d, gaps, a)))
-    o = wp.float64(0.0)
-    return d[0] > o and d[1] > o and d[2] > o and missed < wp.float64(TOLERANCE)
-
-
-@wp.func
 def is_sound(b: Any, z: Any, longest: Any):
     """Return whether three points make a triangle and the bearings are unit vectors."""
     area = wp.length(wp.cross(z[1] - z[0], z[2] - z[0]))
@@ -154,7 +146,8 @@ def solve_triangle(b: Any, z: Any):
         rows = distances_of(a, gaps)
         for n in range(4):
             d = polished(rows[n], gaps, a)
-            if solves(d, gaps, a):
+            missed = wp.max(wp.abs(misfit(d, gaps, a)))
+            if wp.min(d) > wp.float64(0.0) and missed < wp.float64(TOLERANCE):
                 place = count
                 while place > 0 and d[0] < result[wp.max(place - 1, 0), 0]:
                     result[place] = result[place - 1]

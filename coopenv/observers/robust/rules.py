@@ -23,9 +23,9 @@ def _joint_covariances(values: Any, fields: Any, model: Any) -> Any:
     return are_covariances(joint, LEAST_EIGENVALUE[values.dtype])
 
 
-def where(used: str, **rules: Rule) -> dict[str, Rule]:
-    """Return rules of fields of `record__field` that count where a field of the memory says so."""
-    return {name.replace("__", "."): rule._replace(used=f"observer_{used}") for name, rule in rules.items()}
+def where(used: str, rules: dict[str, Rule]) -> dict[str, Rule]:
+    """Return rules that count where a field of the memory says so."""
+    return {name: rule._replace(used=f"observer_{used}") for name, rule in rules.items()}
 
 
 def _others(rule: Rule) -> Rule:
@@ -38,37 +38,27 @@ LARGE = numbers(LARGEST**3)
 
 def rules_for(members: int) -> dict[str, Rule]:
     """Return the rules of a memory with so many members; numbers that are not in it have to be finite."""
-    return {
-        "belief.odometry.R": ROTATION,
+    flags = "search.active outbox.valid inbox.valid member.has_twist member.distrusted member.report.valid line.fits"
+    ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick"
+    large = (
+        "hypothesis.cost hypothesis.prior_distance line.variance line.noise scratch.column scratch.PHt scratch_blocks"
+    )
+    rules = {
+        **dict.fromkeys(flags.split(), FLAG),
+        **dict.fromkeys(ticks.split(), TICK),
+        **dict.fromkeys(large.split(), LARGE),
+        **dict.fromkeys(("belief.odometry.R", "anchor.estimate.pose.R", "anchor.odometry.R"), ROTATION),
+        **dict.fromkeys(("search.attempts", "hypothesis.bearings"), whole(0, 10**9)),
         "belief.members": whole(1, members),
         "P": Rule("a covariance", _joint_covariances, axes=4),
-        "member.seen_tick": TICK,
-        "member.report.tick": TICK,
-        "anchor.estimate.pose.R": ROTATION,
         "anchor.estimate.P": COVARIANCE,
-        "anchor.odometry.R": ROTATION,
-        "anchor.tick": TICK,
-        "search.active": FLAG,
         "search.hypotheses": whole(0, MAX_HYPOTHESES),
-        "search.attempts": whole(0, 10**9),
-        "hypothesis.bearings": whole(0, 10**9),
-        "outbox.tick": TICK,
-        "outbox.valid": FLAG,
-        "inbox.valid": FLAG,
-        "inbox.tick": TICK,
         "line.member": whole(-1, members - 1),
-        **dict.fromkeys(("member.has_twist", "member.distrusted", "member.report.valid", "line.fits"), FLAG),
-        **where("belief.members", member__pose__R=ROTATION, member__vehicle=whole(0, "vehicles")),
-        **where(
-            "belief.members",
-            member__report__pose__R=_others(ROTATION),
-            member__report__P=_others(COVARIANCE),
-            member__report__odometry__R=_others(ROTATION),
-        ),
-        **where("search.active", search__prior__pose__R=ROTATION, search__prior__P=COVARIANCE),
-        **where("search.hypotheses", hypothesis__estimate__pose__R=ROTATION, hypothesis__estimate__P=COVARIANCE),
-        **where("outbox.valid", outbox__pose__R=ROTATION, outbox__P=COVARIANCE, outbox__odometry__R=ROTATION),
-        **where("inbox.valid", inbox__pose__R=ROTATION, inbox__P=COVARIANCE, inbox__odometry__R=ROTATION),
-        **dict.fromkeys(("hypothesis.cost", "hypothesis.prior_distance", "line.variance", "line.noise"), LARGE),
-        **dict.fromkeys(("scratch.column", "scratch.PHt", "scratch_blocks"), LARGE),
+        **where("belief.members", {"member.pose.R": ROTATION, "member.vehicle": whole(0, "vehicles")}),
+        **where("search.active", {"search.prior.pose.R": ROTATION, "search.prior.P": COVARIANCE}),
+        **where("search.hypotheses", {"hypothesis.estimate.pose.R": ROTATION, "hypothesis.estimate.P": COVARIANCE}),
     }
+    reports = {"pose.R": ROTATION, "P": COVARIANCE, "odometry.R": ROTATION}
+    for box in ("outbox", "inbox"):
+        rules |= where(f"{box}.valid", {f"{box}.{name}": rule for name, rule in reports.items()})
+    return rules | where("belief.members", {f"member.report.{name}": _others(rule) for name, rule in reports.items()})

@@ -1,7 +1,9 @@
 """Finding one's pose from nothing: solutions of the P3P problem are followed until motion has told them apart.
 
-Each hypothesis is a small filter of its own; one that predicts the bearings much worse than the best is given up. While
-a vehicle searches it believes nothing, so that the belief's arrays serve to correct one hypothesis after the other.
+Each hypothesis is a small filter of its own; one that predicts the bearings much worse than the best is given up. It
+costs its normalised innovations squared, each limited, so that the difference of two costs is twice the logarithm of
+their likelihoods' ratio; those that cost least come first. While a vehicle searches it believes nothing, so that the
+belief's arrays serve to correct one hypothesis after the other.
 """
 
 from __future__ import annotations
@@ -16,17 +18,17 @@ from coopenv.observers.robust.constants import (
     BEARING_GATE,
     CLEAR_TIME,
     MAX_BEARING_COST,
+    MAX_BEST_COST,
     MAX_HYPOTHESES,
     MAX_PRIOR_COST,
     MIN_SEARCH_TIME,
     PATIENCE,
-    SAME_PRIOR,
+    PRUNE_GAP,
 )
 from coopenv.observers.robust.correction import iterated_update
-from coopenv.observers.robust.hypotheses import prune, sort_hypotheses
 from coopenv.observers.robust.measurements import NOTHING, innovation_squared, set_lines
 from coopenv.observers.robust.memory import Estimate, Hypothesis, Pose, Search
-from coopenv.observers.robust.solutions import next_triple, solve_triple
+from coopenv.observers.robust.solutions import is_new, next_triple, solve_triple
 
 
 @wp.func
@@ -46,6 +48,45 @@ def propagate_search(memory: Any, world: int, i: int, step: Pose, noise: Any):
 
 
 @wp.func
+def costs_less(memory: Any, world: int, i: int, h: int, g: int) -> bool:
+    """Return whether a hypothesis costs less than another one, or as much and is nearer to the prior."""
+    a = memory.hypothesis[world, i, h].cost
+    b = memory.hypothesis[world, i, g].cost
+    if a == b:
+        return memory.hypothesis[world, i, h].prior_distance < memory.hypothesis[world, i, g].prior_distance
+    return a < b
+
+
+@wp.func
+def sort_hypotheses(memory: Any, world: int, i: int):
+    """Put those that cost least first."""
+    count = memory.search[world, i].hypotheses
+    for h in range(count):
+        for g in range(h + 1, count):
+            if costs_less(memory, world, i, g, h):
+                other = memory.hypothesis[world, i, h]
+                memory.hypothesis[world, i, h] = memory.hypothesis[world, i, g]
+                memory.hypothesis[world, i, g] = other
+
+
+@wp.func
+def prune(memory: Any, world: int, i: int):
+    """Give up what costs much more than the best, what is the same as a better one, and all if the best is not good."""
+    sort_hypotheses(memory, world, i)
+    least = memory.hypothesis[world, i, 0].cost
+    expected = wp.float64(2.0) * wp.float64(memory.hypothesis[world, i, 0].bearings)
+    kept = int(0)
+    for h in range(memory.search[world, i].hypotheses):
+        near = memory.hypothesis[world, i, h].cost <= least + wp.float64(PRUNE_GAP)
+        if near and is_new(memory, world, i, h, kept):
+            memory.hypothesis[world, i, kept] = memory.hypothesis[world, i, h]
+            kept += 1
+    if least > wp.float64(MAX_BEST_COST) + wp.float64(2.0) * expected:
+        kept = 0
+    memory.search[world, i].hypotheses = kept
+
+
+@wp.func
 def follow_hypothesis(model: Any, memory: Any, world: int, i: int, h: int, used: Any):
     """Add the frame's bearings, but those used already, to the cost of a hypothesis; correct it by those that fit."""
     begin_belief(memory, world, i, memory.hypothesis[world, i, h].estimate)
@@ -62,19 +103,6 @@ def follow_hypothesis(model: Any, memory: Any, world: int, i: int, h: int, used:
     if fitting > 0:
         iterated_update(model, memory, world, i)
         memory.hypothesis[world, i, h].estimate = own_estimate(memory, world, i)
-
-
-@wp.func
-def distance_from_prior(memory: Any, world: int, i: int, h: int):
-    """Return the squared distance of a hypothesis from the prior, in standard deviations."""
-    return distance_squared(memory.search[world, i].prior, memory.hypothesis[world, i, h].estimate)
-
-
-@wp.func
-def confirms_prior(memory: Any, world: int, i: int) -> bool:
-    """Return whether the first hypothesis is the prior, and the prior is certain enough to go on with."""
-    known = is_known(memory.search[world, i].prior.P)
-    return known and distance_from_prior(memory, world, i, 0) < wp.float64(SAME_PRIOR)
 
 
 @wp.func
@@ -123,7 +151,7 @@ def solve_frame(model: Any, memory: Any, world: int, i: int, seen: int, period: 
         following = False
     if following:
         for h in range(memory.search[world, i].hypotheses):
-            distance = distance_from_prior(memory, world, i, h)
+            distance = distance_squared(memory.search[world, i].prior, memory.hypothesis[world, i, h].estimate)
             memory.hypothesis[world, i, h].cost = wp.min(distance, wp.float64(MAX_PRIOR_COST))
             memory.hypothesis[world, i, h].prior_distance = distance
             memory.hypothesis[world, i, h].bearings = 0

@@ -11,10 +11,15 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import symmetric_part
-from coopenv.observers.robust.algebra import inverse6, is_known, is_regular
+from coopenv.observers.robust.algebra import distance_squared, inverse6, is_known, is_regular
 from coopenv.observers.robust.belief import begin_belief
-from coopenv.observers.robust.constants import CORRELATION_FACTOR, MAX_HYPOTHESES, MIN_INFORMATION_RATIO, PERTURBATION
-from coopenv.observers.robust.hypotheses import is_new
+from coopenv.observers.robust.constants import (
+    CORRELATION_FACTOR,
+    MAX_HYPOTHESES,
+    MIN_INFORMATION_RATIO,
+    PERTURBATION,
+    SAME_HYPOTHESIS,
+)
 from coopenv.observers.robust.measurements import NOTHING, bearing_variance, linearise, tangent_basis
 from coopenv.observers.robust.memory import Estimate, Pose, mat33d, mat66d, vec3d
 from coopenv.observers.robust.p3p import camera_pose, solve_triangle
@@ -50,14 +55,6 @@ def next_triple(memory: Any, world: int, count: int, size: Any, number: int):
 
 
 @wp.func
-def information_of(model: Any, memory: Any, world: int, i: int, n: int):
-    """Return the information of a bearing about the pose believed, H^T H over its variance."""
-    linearise(model, memory, world, i, n)
-    H = memory.line[world, n].jacobian
-    return (wp.transpose(H) * H) / memory.line[world, n].noise
-
-
-@wp.func
 def angles_within(P: Any, most: Any) -> bool:
     """Return whether all variances of angles are what an inverse that exists may have, and no larger than `most`."""
     for k in range(3):
@@ -69,13 +66,25 @@ def angles_within(P: Any, most: Any) -> bool:
 @wp.func
 def covariance_of(model: Any, memory: Any, world: int, i: int, lines: Any, patient: bool):
     """Return whether three bearings determine the pose believed well enough, and its covariance."""
-    M = information_of(model, memory, world, i, lines[0])
-    M += information_of(model, memory, world, i, lines[1])
-    M += information_of(model, memory, world, i, lines[2])
+    M = mat66d()
+    for n in range(3):
+        linearise(model, memory, world, i, lines[n])
+        H = memory.line[world, lines[n]].jacobian
+        M += (wp.transpose(H) * H) / memory.line[world, lines[n]].noise
     P = symmetric_part(inverse6(M))
     if patient:  # then the information is far from singular, and needs no costly spectrum
         return is_known(P), P
     return angles_within(P, wp.float64(1.0)) and is_regular(M, wp.float64(MIN_INFORMATION_RATIO)), P
+
+
+@wp.func
+def is_new(memory: Any, world: int, i: int, h: int, count: int) -> bool:
+    """Return whether a hypothesis can be told apart from each of the first `count`."""
+    for g in range(count):
+        distance = distance_squared(memory.hypothesis[world, i, h].estimate, memory.hypothesis[world, i, g].estimate)
+        if distance < wp.float64(SAME_HYPOTHESIS):
+            return False
+    return True
 
 
 @wp.func

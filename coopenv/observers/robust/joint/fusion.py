@@ -15,18 +15,20 @@ from coopenv.observers.robust.belief import (
     remove_member,
 )
 from coopenv.observers.robust.constants import MAX_TOLD
-from coopenv.observers.robust.joint.contacts import (
-    contact_of,
-    forget_contacts,
-    is_superseded,
-    note_contacts,
-    store_contact,
-    tells_of_the_same,
-)
 from coopenv.observers.robust.joint.information import fuse_joint_information, news_of, predict_told, propagate_told
 from coopenv.observers.robust.joint.matrices import AFTER, block_of
 from coopenv.observers.robust.joint.memory import Contact
-from coopenv.observers.robust.joint.radio import dependence, others_told, read_message
+from coopenv.observers.robust.joint.radio import (
+    contact_of,
+    dependence,
+    forget_contacts,
+    is_superseded,
+    note_contacts,
+    others_told,
+    read_message,
+    store_contact,
+    tells_of_the_same,
+)
 from coopenv.observers.robust.measurements import is_heard
 from coopenv.observers.robust.memory import Estimate
 from coopenv.observers.robust.tracklets import bit_of, information_share, test_sender
@@ -48,9 +50,7 @@ def make_joint_room(model: Any, memory: Any, world: int, i: int, tick: int, coun
 
     Return False, with nothing changed, if that does not make room for all that the message tells of.
     """
-    own = int(0)
-    if is_told(memory, world, count, i):
-        own = 1
+    own = wp.where(is_told(memory, world, count, i), 1, 0)
     staying = int(0)
     unseen = int(0)
     for n in range(1, memory.belief[world, i].members):
@@ -126,26 +126,20 @@ def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, send
 
 
 @wp.func
-def tells_of_visible(model: Any, state: Any, memory: Any, world: int, i: int, sender: int) -> bool:
-    """Return whether a received message tells of a vehicle in view."""
-    if state.sight[world, i, model.landmarks + sender] == VISIBLE:
-        return True
-    for n in range(others_told(memory, world, i, sender)):
-        if state.sight[world, i, model.landmarks + memory.inbox_told[world, i, sender, n].vehicle] == VISIBLE:
-            return True
-    return False
+def told_vehicle(memory: Any, world: int, i: int, sender: int, n: int) -> int:
+    """Return the n-th vehicle of which a received message tells, the sender first."""
+    if n == 0:
+        return sender
+    return memory.inbox_told[world, i, sender, n - 1].vehicle
 
 
 @wp.func
-def mark_told_seen(memory: Any, world: int, i: int, sender: int, tick: int):
-    """Note that all that a message tells of count as in view."""
-    n = index_of(memory, world, i, sender)
-    if n > 0:
-        memory.member[world, i, n].seen_tick = tick
-    for k in range(others_told(memory, world, i, sender)):
-        n = index_of(memory, world, i, memory.inbox_told[world, i, sender, k].vehicle)
-        if n > 0:
-            memory.member[world, i, n].seen_tick = tick
+def tells_of_visible(model: Any, state: Any, memory: Any, world: int, i: int, sender: int) -> bool:
+    """Return whether a received message tells of a vehicle in view."""
+    for n in range(others_told(memory, world, i, sender) + 1):
+        if state.sight[world, i, model.landmarks + told_vehicle(memory, world, i, sender, n)] == VISIBLE:
+            return True
+    return False
 
 
 @wp.func
@@ -157,10 +151,7 @@ def fuse_one(model: Any, state: Any, memory: Any, world: int, i: int, sender: in
         if c >= 0:
             store_contact(memory, world, i, c, sender, count)
         return
-    same = bool(False)
-    if c >= 0:
-        same = tells_of_the_same(memory, world, i, c, count)
-    if same:
+    if tells_of_the_same(memory, world, i, c, count):
         fuse_joint_message(model, memory, world, i, c, sender, count)
     elif c >= 0 or tells_of_visible(model, state, memory, world, i, sender):
         add_joint_members(model, memory, world, i, sender, count, tick)
@@ -182,8 +173,11 @@ def fuse_joint_messages(model: Any, state: Any, memory: Any, world: int, i: int,
             c = contact_of(memory, world, i, sender)
             if c >= 0:
                 memory.contact[world, i, c].fused = 0
-                if tells_of_visible(model, state, memory, world, i, sender):
-                    mark_told_seen(memory, world, i, sender, tick)
+                if tells_of_visible(model, state, memory, world, i, sender):  # then all that it tells of count as seen
+                    for k in range(others_told(memory, world, i, sender) + 1):
+                        m = index_of(memory, world, i, told_vehicle(memory, world, i, sender, k))
+                        if m > 0:
+                            memory.member[world, i, m].seen_tick = tick
     for fewer in range(MAX_TOLD):
         for n in range(model.target_count[i]):
             sender = model.targets[i, n] - model.landmarks

@@ -47,7 +47,8 @@ def predict_told(model: Any, memory: Any, world: int, i: int, c: int, count: int
         ticks = wp.max(memory.told[world, a].tick - memory.contact_told[world, i, c, a].tick, 0)
         noise = odometry_noise(model, wp.float64(ticks) * model.camera_period)
         for k in range(6):
-            memory.matrix[world, BEFORE, (6 * a + k) * (DIMENSION + 1)] += noise[k // 3]
+            e = (6 * a + k) * (DIMENSION + 1)
+            memory.matrix[world, BEFORE, e] = memory.matrix[world, BEFORE, e] + noise[k // 3]
 
 
 @wp.func

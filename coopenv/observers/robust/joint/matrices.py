@@ -80,9 +80,8 @@ def invert(memory: Any, world: int, x: int, y: int, count: int):
     for k in range(n):
         best = int(k)
         for j in range(k + 1, n):
-            if wp.abs(memory.matrix[world, x, j * DIMENSION + k]) > wp.abs(
-                memory.matrix[world, x, best * DIMENSION + k]
-            ):
+            size = wp.abs(memory.matrix[world, x, j * DIMENSION + k])
+            if size > wp.abs(memory.matrix[world, x, best * DIMENSION + k]):
                 best = j
         if best != k:
             swap_rows(memory, world, x, k, best, n)

@@ -37,8 +37,7 @@ def joint_rules() -> dict[str, Rule]:
     }
     counts = {"outbox": "outbox_joint.others", "inbox": "inbox_joint.others", "contact": "contact.count"}
     for box, count in counts.items():
-        told = {f"{box}_told__pose__R": ROTATION, f"{box}_told__odometry__R": ROTATION}
-        rules |= where(count, **told)
+        rules |= where(count, {f"{box}_told.pose.R": ROTATION, f"{box}_told.odometry.R": ROTATION})
         rules |= {f"{box}_told.vehicle": VEHICLE, f"{box}_told.tick": TICK}
         if box != "contact":
             rules |= {f"{box}_joint.others": whole(0, MAX_TOLD - 1), f"{box}_joint.complete": FLAG}
