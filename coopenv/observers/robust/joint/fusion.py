@@ -16,7 +16,7 @@ from coopenv.observers.robust.belief import (
 )
 from coopenv.observers.robust.constants import MAX_TOLD
 from coopenv.observers.robust.joint.information import fuse_joint_information, news_of, predict_told, propagate_told
-from coopenv.observers.robust.joint.matrices import AFTER, block_of
+from coopenv.observers.robust.joint.matrices import AFTER
 from coopenv.observers.robust.joint.memory import Contact
 from coopenv.observers.robust.joint.radio import (
     contact_of,
@@ -80,7 +80,7 @@ def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, 
         told = memory.told[world, a]
         if told.vehicle != i:
             n = memory.belief[world, i].members
-            append_member(memory, world, i, told.vehicle, told.pose, block_of(memory, world, AFTER, a, a))
+            append_member(memory, world, i, told.vehicle, told.pose, memory.matrix[world, AFTER, a, a])
             memory.member[world, i, n].report.tick = told.tick
             memory.member[world, i, n].report.odometry = told.odometry
             memory.member[world, i, n].seen_tick = tick
@@ -88,7 +88,7 @@ def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, 
             for b in range(a):
                 m = index_of(memory, world, i, memory.told[world, b].vehicle)
                 if m > 0:
-                    block = block_of(memory, world, AFTER, a, b)
+                    block = memory.matrix[world, AFTER, a, b]
                     memory.P[world, i, n, m] = block
                     memory.P[world, i, m, n] = wp.transpose(block)
     memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
@@ -113,7 +113,7 @@ def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, send
     told = memory.told[world, 0]
     was_distrusted = memory.contact[world, i, c].distrusted
     note_contacts(memory, world, i)
-    now = Estimate(told.pose, block_of(memory, world, AFTER, 0, 0))
+    now = Estimate(told.pose, memory.matrix[world, AFTER, 0, 0])
     test_sender(memory, world, i, n, now, wp.float64(ticks) * model.camera_period)
     memory.contact[world, i, c].distrusted = memory.member[world, i, n].distrusted
     memory.contact[world, i, c].agreement_time = memory.member[world, i, n].agreement_time

@@ -8,19 +8,8 @@ import warp as wp
 
 from coopenv.observers.robust.algebra import between, left_error, moved, odometry_noise, transition
 from coopenv.observers.robust.belief import apply_error, index_of, subtract_block
-from coopenv.observers.robust.constants import MAX_VARIANCE_GROWTH
-from coopenv.observers.robust.joint.matrices import (
-    AFTER,
-    BEFORE,
-    INVERSE,
-    PRODUCT,
-    block_of,
-    invert,
-    multiply,
-    set_block,
-    symmetrise,
-)
-from coopenv.observers.robust.joint.memory import DIMENSION
+from coopenv.observers.robust.constants import MAX_TOLD, MAX_VARIANCE_GROWTH
+from coopenv.observers.robust.joint.matrices import AFTER, BEFORE, INVERSE, entry, invert, multiply, symmetrise
 from coopenv.observers.robust.memory import mat66d, vec6d
 from coopenv.observers.robust.tracklets import propagate_member
 
@@ -34,21 +23,18 @@ def predict_told(model: Any, memory: Any, world: int, i: int, c: int, count: int
         memory.step[world, a] = moved(last.pose, step)
         F = transition(step)
         for b in range(count):
-            block = mat66d()
-            for k in range(6):
-                for j in range(6):
-                    block[k, j] = memory.contact_P[world, i, c, (6 * a + k) * DIMENSION + 6 * b + j]
-            set_block(memory, world, BEFORE, a, b, F * block)
-        set_block(memory, world, PRODUCT, a, 0, F)
+            memory.matrix[world, BEFORE, a, b] = F * memory.contact_P[world, i, c, MAX_TOLD * a + b]
+        memory.scratch[world, a].column = F
     for a in range(count):
         for b in range(count):
-            F = block_of(memory, world, PRODUCT, b, 0)
-            set_block(memory, world, BEFORE, a, b, block_of(memory, world, BEFORE, a, b) * wp.transpose(F))
+            Ft = wp.transpose(memory.scratch[world, b].column)
+            memory.matrix[world, BEFORE, a, b] = memory.matrix[world, BEFORE, a, b] * Ft
         ticks = wp.max(memory.told[world, a].tick - memory.contact_told[world, i, c, a].tick, 0)
         noise = odometry_noise(model, wp.float64(ticks) * model.camera_period)
+        block = memory.matrix[world, BEFORE, a, a]
         for k in range(6):
-            e = (6 * a + k) * (DIMENSION + 1)
-            memory.matrix[world, BEFORE, e] = memory.matrix[world, BEFORE, e] + noise[k // 3]
+            block[k, k] += noise[k // 3]
+        memory.matrix[world, BEFORE, a, a] = block
 
 
 @wp.func
@@ -74,22 +60,20 @@ def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
     Its matrix takes the place of BEFORE, its vector that of the corrections in `scratch`.
     """
     for k in range(6 * count):
-        diagonal = k * DIMENSION + k
-        most = wp.float64(MAX_VARIANCE_GROWTH) * memory.matrix[world, BEFORE, diagonal]
-        if memory.matrix[world, AFTER, diagonal] > most:
+        if entry(memory, world, AFTER, k, k) > wp.float64(MAX_VARIANCE_GROWTH) * entry(memory, world, BEFORE, k, k):
             return False
     invert(memory, world, AFTER, INVERSE, count)
     for a in range(count):
         vector = vec6d()
         for b in range(count):
             news = left_error(memory.step[world, b], memory.told[world, b].pose)
-            vector += block_of(memory, world, INVERSE, a, b) * news
+            vector += memory.matrix[world, INVERSE, a, b] * news
         memory.scratch[world, a].correction = vector
     invert(memory, world, BEFORE, AFTER, count)
     for a in range(count):
         for b in range(count):
-            block = block_of(memory, world, INVERSE, a, b) - block_of(memory, world, AFTER, a, b)
-            set_block(memory, world, BEFORE, a, b, share * block)
+            new = memory.matrix[world, INVERSE, a, b] - memory.matrix[world, AFTER, a, b]
+            memory.matrix[world, BEFORE, a, b] = share * new
     symmetrise(memory, world, BEFORE, count)
     size = wp.float64(0.0)
     for a in range(count):
@@ -97,7 +81,7 @@ def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
         for b in range(count):
             n = index_of(memory, world, i, memory.told[world, b].vehicle)
             offset = left_error(memory.step[world, b], memory.member[world, i, n].pose)
-            vector = vector - block_of(memory, world, BEFORE, a, b) * offset
+            vector = vector - memory.matrix[world, BEFORE, a, b] * offset
         memory.scratch[world, a].correction = vector
         size += wp.dot(vector, vector)
     return wp.isfinite(size)
@@ -119,15 +103,15 @@ def fuse_joint_information(memory: Any, world: int, i: int, count: int):
         for b in range(count):
             block = mat66d()
             for c in range(count):
-                block += memory.blocks[world, n, c] * block_of(memory, world, BEFORE, c, b)
+                block += memory.blocks[world, n, c] * memory.matrix[world, BEFORE, c, b]
             if a == b:
                 block += wp.identity(6, wp.float64)
-            set_block(memory, world, AFTER, a, b, block)
+            memory.matrix[world, AFTER, a, b] = block
     invert(memory, world, AFTER, INVERSE, count)
     for a in range(count):
         along = vec6d()
         for b in range(count):
-            along += wp.transpose(block_of(memory, world, INVERSE, b, a)) * memory.scratch[world, b].correction
+            along += wp.transpose(memory.matrix[world, INVERSE, b, a]) * memory.scratch[world, b].correction
         memory.scratch[world, a].last_correction = along
     multiply(memory, world, BEFORE, INVERSE, AFTER, count)
     symmetrise(memory, world, AFTER, count)
@@ -137,7 +121,7 @@ def fuse_joint_information(memory: Any, world: int, i: int, count: int):
             error += memory.blocks[world, k, b] * memory.scratch[world, b].last_correction
             gain = mat66d()
             for a in range(count):
-                gain += memory.blocks[world, k, a] * block_of(memory, world, AFTER, a, b)
+                gain += memory.blocks[world, k, a] * memory.matrix[world, AFTER, a, b]
             for j in range(k + 1):
                 subtract_block(memory, world, i, k, j, gain * wp.transpose(memory.blocks[world, j, b]))
         apply_error(memory, world, i, k, error)

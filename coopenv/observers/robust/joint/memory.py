@@ -42,8 +42,8 @@ JointMemory = extended(
     "JointMemory",
     """T vehicles that a message tells of, B of them others than its sender.
 
-    Their covariances are matrices of E numbers, row by row, of which as much counts as there are vehicles; as they
-    travel, F numbers of the Cholesky factor, row by row.
+    Of their covariances, matrices of E blocks, as much counts as there are vehicles; they travel as F numbers of the
+    Cholesky factor, row by row.
     """,
     outbox_joint=array("WNS", Joint),
     outbox_told=array("WNSB", Told),
@@ -53,10 +53,10 @@ JointMemory = extended(
     inbox_factor=array("WNNF", wp.float32),
     contact=array("WNK", Contact),
     contact_told=array("WNKT", Told),  # the sender first
-    contact_P=array("WNKE", wp.float64),
+    contact_P=array("WNKE", mat66d),  # blocks, row by row
     told=array("WT", Told),  # scratch: of the message that is read
     step=array("WT", Pose),  # scratch: the last report of each carried on by odometry
-    matrix=array("WXE", wp.float64),  # scratch
+    matrix=array("WXTT", mat66d),  # scratch
     blocks=array("WKT", mat66d),  # scratch: columns of the covariance
 )
 
@@ -66,7 +66,7 @@ JOINT_SIZES = {
     "K": MAX_MEMBERS_JOINT,
     "T": MAX_TOLD,
     "B": MAX_TOLD - 1,
-    "E": DIMENSION**2,
+    "E": MAX_TOLD**2,
     "F": DIMENSION * (DIMENSION + 1) // 2,
-    "X": 4,
+    "X": 3,
 }

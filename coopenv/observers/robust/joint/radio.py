@@ -11,8 +11,8 @@ import warp as wp
 
 from coopenv.observers.robust.belief import index_of
 from coopenv.observers.robust.constants import MAX_TOLD, SAME_TIME, SUPERSEDING_TIME
-from coopenv.observers.robust.joint.matrices import AFTER, factorise, set_block, square_of_factor
-from coopenv.observers.robust.joint.memory import DIMENSION, Contact, Joint, Told
+from coopenv.observers.robust.joint.matrices import AFTER, entry, factorise
+from coopenv.observers.robust.joint.memory import Contact, Joint, Told
 from coopenv.observers.robust.memory import Pose, mat66d
 from coopenv.observers.robust.tracklets import bit_of, clear_messages, marker_jacobian, marker_of, own_report, receive
 
@@ -30,13 +30,13 @@ def clear_joint_messages(model: Any, memory: Any, world: int, i: int):
             memory.contact_told[world, i, c, n] = Told()
             memory.blocks[world, c, n] = mat66d()
         for e in range(memory.contact_P.shape[3]):
-            memory.contact_P[world, i, c, e] = wp.float64(0.0)
+            memory.contact_P[world, i, c, e] = mat66d()
     for n in range(MAX_TOLD):
         memory.told[world, n] = Told()
         memory.step[world, n] = Pose()
-    for x in range(memory.matrix.shape[1]):
-        for e in range(memory.matrix.shape[2]):
-            memory.matrix[world, x, e] = wp.float64(0.0)
+        for x in range(memory.matrix.shape[1]):
+            for k in range(MAX_TOLD):
+                memory.matrix[world, x, n, k] = mat66d()
     for slot in range(model.radio.slots):
         memory.outbox_joint[world, i, slot] = Joint()
         for n in range(MAX_TOLD - 1):
@@ -72,7 +72,7 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
                     block = J * block
                 if b == 0:
                     block = block * wp.transpose(J)
-                set_block(memory, world, AFTER, a, b, block)
+                memory.matrix[world, AFTER, a, b] = block
         if not factorise(memory, world, AFTER, 6 * count):
             report.valid = 0
             joint = Joint()
@@ -83,8 +83,8 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
     if report.valid == 1:
         for k in range(6 * count):
             for j in range(k + 1):
-                entry = memory.matrix[world, AFTER, k * DIMENSION + j]
-                memory.outbox_factor[world, i, slot, (k * (k + 1)) // 2 + j] = wp.float32(entry)
+                number = wp.float32(entry(memory, world, AFTER, k, j))
+                memory.outbox_factor[world, i, slot, (k * (k + 1)) // 2 + j] = number
     memory.outbox[world, i, slot] = report
     memory.outbox_joint[world, i, slot] = joint
 
@@ -135,13 +135,16 @@ def read_message(memory: Any, world: int, i: int, sender: int) -> int:
     for n in range(others):
         memory.told[world, n + 1] = memory.inbox_told[world, i, sender, n]
     if (report.depends_on & bit_of(i)) != wp.uint64(0):
-        set_block(memory, world, AFTER, 0, 0, mat66d(report.P))
+        memory.matrix[world, AFTER, 0, 0] = mat66d(report.P)
     else:
         for k in range(6 * (others + 1)):
             for j in range(k + 1):
-                entry = square_of_factor(memory, world, i, sender, k, j)
-                memory.matrix[world, AFTER, k * DIMENSION + j] = entry
-                memory.matrix[world, AFTER, j * DIMENSION + k] = entry
+                total = wp.float64(0.0)  # the square of the factor
+                for c in range(j + 1):
+                    left = wp.float64(memory.inbox_factor[world, i, sender, (k * (k + 1)) // 2 + c])
+                    total += left * wp.float64(memory.inbox_factor[world, i, sender, (j * (j + 1)) // 2 + c])
+                memory.matrix[world, AFTER, k // 6, j // 6][k % 6, j % 6] = total
+                memory.matrix[world, AFTER, j // 6, k // 6][j % 6, k % 6] = total
     return others + 1
 
 
@@ -162,10 +165,9 @@ def store_contact(memory: Any, world: int, i: int, c: int, sender: int, count: i
     memory.contact[world, i, c].depends_on = dependence(memory, world, i, sender)
     for n in range(count):
         memory.contact_told[world, i, c, n] = memory.told[world, n]
-    for k in range(6 * count):
-        for j in range(6 * count):
-            e = k * DIMENSION + j
-            memory.contact_P[world, i, c, e] = memory.matrix[world, AFTER, e]
+    for a in range(count):
+        for b in range(count):
+            memory.contact_P[world, i, c, MAX_TOLD * a + b] = memory.matrix[world, AFTER, a, b]
 
 
 @wp.func

@@ -14,9 +14,10 @@ from coopenv.world.saved_state import FLAG, LEAST_EIGENVALUE, ROTATION, TICK, Ru
 
 
 def _contact_covariances(values: Any, fields: Any, model: Any) -> Any:
-    """Return (W, N, K) which numbers (W, N, K, E) are covariances of the vehicles that a contact tells of."""
+    """Return (W, N, K) which blocks (W, N, K, E, 6, 6) are covariances of the vehicles that a contact tells of."""
     used = np.arange(DIMENSION) < 6 * fields["observer_contact.count"][..., None]
-    P = values.reshape(*values.shape[:-1], DIMENSION, DIMENSION)
+    P = values.reshape(*values.shape[:3], MAX_TOLD, MAX_TOLD, 6, 6).swapaxes(-3, -2)
+    P = P.reshape(*values.shape[:3], DIMENSION, DIMENSION)
     covariance = np.where(used[..., :, None] & used[..., None, :], P, np.eye(DIMENSION))
     return are_covariances(covariance, LEAST_EIGENVALUE[values.dtype])
 
@@ -31,7 +32,7 @@ def joint_rules() -> dict[str, Rule]:
         **rules_for(MAX_MEMBERS_JOINT),
         "contact.sender": SENDER,
         "contact.count": whole(0, MAX_TOLD),
-        "contact_P": Rule("a covariance", _contact_covariances, axes=1),
+        "contact_P": Rule("a covariance", _contact_covariances, axes=3),
         **dict.fromkeys(("contact.distrusted", "contact.fused"), FLAG),
         **dict.fromkeys(("matrix", "blocks"), LARGE),
     }
