@@ -4,8 +4,6 @@ Source: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking
 with chi-square bounds); Wilson, Probable inference, JASA 22, 1927 (interval of a share).
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Coordinates of the pose error that a covariance is about."""
 
-from __future__ import annotations
-
 from enum import Enum
 
 import numpy as np

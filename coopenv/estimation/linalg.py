@@ -4,8 +4,6 @@ The Riccati equation lives in 6x6 matrices over (2 lambda, p); they are handled 
 [[A, B], [B^T, D]] because that is how the observer's matrices arise and because 3x3 products stay in registers.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

@@ -6,8 +6,6 @@ the mirrored solution (orientation half a turn off), which a bearing-only observ
 fall into.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

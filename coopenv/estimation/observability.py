@@ -16,8 +16,6 @@ whether there is observability at all, but not the eigenvalues: far from the ori
 own position, in a unit of length that the geometry brings along (`Observability.local_eigenvalue`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 

@@ -3,8 +3,6 @@
 Source: Barfoot, State Estimation for Robotics, 2017, chapter 7 (there translations come first).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from coopenv.estimation.arrays import Array

@@ -1,7 +1,5 @@
 """Linear algebra of a few rows, by LAPACK itself: NumPy's own calls take several times as long."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg.lapack import dgesv, dpotrf
 

@@ -4,8 +4,6 @@ R maps body to inertial coordinates; a held body twist (v, omega) moves the pose
 R(t) = R Exp(omega t), pbar(t) = pbar + R J_l(omega t) v t.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

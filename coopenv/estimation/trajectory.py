@@ -1,10 +1,9 @@
 """The record of one run: what was true, what was estimated, and what was in view."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -64,7 +63,7 @@ class Trajectory:
     targets: np.ndarray  # (T,) names
     target_moving: np.ndarray  # (T,) bool: vehicles and moving landmarks
 
-    def where_truth_is_known(self) -> Trajectory:
+    def where_truth_is_known(self) -> Self:
         """Return the ticks at which every vehicle's true pose is known, as it may not be in a recording."""
         known = np.isfinite(self.position).all(axis=(1, 2)) & np.isfinite(self.rotation).all(axis=(1, 2, 3))
         if known.all():
@@ -82,7 +81,7 @@ class Trajectory:
             np.savez_compressed(stream, **{f.name: getattr(self, f.name) for f in fields(self)})
 
     @classmethod
-    def load(cls, path: Path) -> Trajectory:
+    def load(cls, path: Path) -> Self:
         """Read a file written by `save`.
 
         Raises:

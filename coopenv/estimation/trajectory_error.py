@@ -4,8 +4,6 @@ Source: Sturm, Engelhard, Endres, Burgard and Cremers, A benchmark for the evalu
 Maps here are global, so nothing is aligned: an alignment would hide the mirrored solution.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which entries of arrays are numbers, unit vectors, rotations or covariances at all: for what comes from outside."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

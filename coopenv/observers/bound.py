@@ -14,8 +14,6 @@ the orientation, meaningful below about 10 deg, and does not count what "not see
 everybody has all data, whatever was delivered.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What the observers of a world are told before it starts: from the scenario and its model, never from truth."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

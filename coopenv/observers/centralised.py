@@ -5,8 +5,6 @@ Source: Roumeliotis and Bekey, Distributed multirobot localization, IEEE Transac
 vehicle j also has H_j = B Rhat_i^T Rhat_j [-S(m_j), I] / |d|.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Whether what an observer returns is an estimate or a message at all; every tick pays for it, so it is kept cheap."""
 
-from __future__ import annotations
-
 from math import isfinite
 from operator import index
 from typing import Any

@@ -4,8 +4,6 @@ Frames: positions in the map frame, rotations from body to map, bearings as unit
 in the BODY frame (the paper's g_ij is the negative).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable

@@ -6,8 +6,6 @@ correlated in any way. The bearing's own noise is independent and stays whole. w
 price of information.
 """
 
-from __future__ import annotations
-
 from math import log
 
 import numpy as np

@@ -3,8 +3,6 @@
 Source: composition of the increments; covariance as in the prediction of the left-error filter (see mekf.py).
 """
 
-from __future__ import annotations
-
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.mekf import LeftError

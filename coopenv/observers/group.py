@@ -3,8 +3,6 @@
 Whoever has ticks drives a group with them: the runner on a record, the environment on a world or a replay.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from time import perf_counter

@@ -4,8 +4,6 @@ Source: Hamel and Samson, Riccati observers for the nonstationary PnP problem, I
 63(3), 2018; in the coordinates and with the gains of the cooperative observer that builds on it (see riccati/).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -4,8 +4,6 @@ The kernels get a world of their own, in which stands what this vehicle senses a
 vehicle, one row stands for all; truth is not a number.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

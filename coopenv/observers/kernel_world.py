@@ -1,7 +1,5 @@
 """The world of one vehicle on the host: what it knows before it starts, and views of what changes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from types import SimpleNamespace

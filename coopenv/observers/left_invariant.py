@@ -5,8 +5,6 @@ Control 62(4), 2017. Errors: T = That Exp(xi). Odometry T <- T U is group affine
 errors of any size. H is that of mekf.py: the errors agree to first order, and the filters differ by the retraction.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, Self
 

@@ -1,7 +1,5 @@
 """Messages between the plug-in observers of one world: contents on the host, delivery as the radio decided."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from operator import index
 from types import MappingProxyType

@@ -8,8 +8,6 @@ With a = Rhat^T (z - phat), d = a - c the line from the camera c, and B a tangen
 H = B [S(a), -I] / |d|,  residual B b.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, Self
 

@@ -4,8 +4,6 @@ Source: N + H_j P_j H_j^T, as if neighbours' errors were independent of one's ow
 multirobot localization, 2002, keep the cross-correlation that this leaves out). Overconfident down the chain.
 """
 
-from __future__ import annotations
-
 from coopenv.observers.mekf import Mekf
 
 

@@ -1,7 +1,5 @@
 """What vehicles sense, tick by tick: of one tick, and of a whole record."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -133,7 +131,7 @@ class Recording:
     start_position: Array  # (N, 3) map, m
     start_covariance: Array  # (N, 6, 6) LEFT coordinates
     truth: Truth
-    scenario: Scenario | None = None
+    scenario: "Scenario | None" = None
     """The world that was recorded; None for recorded robots."""
 
     @property

@@ -1,7 +1,5 @@
 """Whether a recording, from wherever it comes, can be run on: everything that becomes an index, shape or step size."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from operator import attrgetter

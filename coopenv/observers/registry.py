@@ -6,8 +6,6 @@ A package offers its own under the entry point group `coopenv.observers`. What i
 is named by its place: `mine.py:Mine` or `package.module:Mine`.
 """
 
-from __future__ import annotations
-
 import re
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -32,7 +30,7 @@ class Registered(NamedTuple):
     """What a program has registered under a name, as a class or function, with kernels, or both."""
 
     factory: Factory | None
-    embedded: Embedded | None
+    embedded: "Embedded | None"
 
 
 _registered: dict[str, Registered] = {}
@@ -40,7 +38,7 @@ _places: dict[str, str] = {}
 """Where those of `_registered` stand that are named by their place."""
 
 
-def register(name: str, factory: Factory | None = None, *, embedded: Embedded | None = None) -> None:
+def register(name: str, factory: Factory | None = None, *, embedded: "Embedded | None" = None) -> None:
     """Make an observer known by name in this program.
 
     Args:
@@ -161,7 +159,7 @@ def find(name: str | Factory) -> Factory:
     return row.factory or _attribute("kernel_observer:KernelFactory")(row.embedded)
 
 
-def find_embedded(name: str, planar: bool = False) -> Embedded | None:
+def find_embedded(name: str, planar: bool = False) -> "Embedded | None":
     """Return the kernels of an observer by name, None where it has none; errors are those of `find`.
 
     `planar` is for robots on a plane whose odometry is their commands.

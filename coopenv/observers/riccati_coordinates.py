@@ -1,7 +1,5 @@
 """An estimate as the state of a world holds it: body-frame position, covariance over (2 lambda, p)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from coopenv.estimation.arrays import Array

@@ -5,8 +5,6 @@ Control 62(4), 2017. Errors: R = Exp(theta) Rhat, p = Exp(theta) phat + rho. F =
 G = [Rhat, 0; S(phat) Rhat, Rhat];  H = B Rhat^T [S(z), -I] / |d|, which depends on the map's origin through z.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import ClassVar, Self
 

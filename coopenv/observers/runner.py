@@ -5,8 +5,6 @@ truth only judges them. What neighbours tell each other are the observers' own m
 period and delivered, lost or delayed as the world's radio delivered its own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass

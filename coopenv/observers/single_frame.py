@@ -6,8 +6,6 @@ triples in place of random ones); then Gauss-Newton over all bearings that agree
 pose ends at a pose that fits, that is the candidate nearest to it, and the closed form is not needed.
 """
 
-from __future__ import annotations
-
 from itertools import combinations
 from math import inf, sqrt
 

@@ -6,8 +6,6 @@ unscented prediction has the closed form that is used; the update takes 13 sigma
 compared in the tangent planes at the mean's.
 """
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The observers of this package: one row each."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """What a planar robot was told to do, and what its wheels made of it a moment later."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

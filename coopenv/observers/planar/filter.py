@@ -15,8 +15,6 @@ rate takes effect a jitter sooner or later, which leaves an error in the heading
 numbers it is the textbook filter.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple

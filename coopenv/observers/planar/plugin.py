@@ -4,8 +4,6 @@ Both are planar; in the LEFT coordinates of their covariance only yaw, forward a
 have a millimetre's and milliradian's variance, independent of the rest.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, ClassVar
 

@@ -9,8 +9,6 @@ b the unit bearing from the camera to the target in the body frame (the paper's 
 c the camera's place in the body, z the target's position in the map frame.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

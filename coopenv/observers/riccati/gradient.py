@@ -5,8 +5,6 @@ suffices. Whether a target is in view is taken as it falls out on the way forwar
 vehicles drive on through one another.
 """
 
-from __future__ import annotations
-
 import math
 import warnings
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ Source: Wong et al., Beyond Line-of-Sight: Cooperative Localization Using Vision
 truth enters through landmarks alone, whose positions are known to everybody.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Poses, their errors and how odometry carries them on, and 6x6 systems, in float64."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

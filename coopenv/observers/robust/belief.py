@@ -5,8 +5,6 @@ covariance is kept in blocks of 6x6. A member stands where its last message put 
 one, the member that has been out of view for longest has to leave.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

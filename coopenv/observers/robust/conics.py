@@ -1,7 +1,5 @@
 """Where two cones meet: the planes of their pencil, and the directions in them, see p3p.py."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

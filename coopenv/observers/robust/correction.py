@@ -1,7 +1,5 @@
 """The correction of the belief by a frame's bearings."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

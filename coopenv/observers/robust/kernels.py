@@ -1,7 +1,5 @@
 """The observer as the world is handed it, and as a plug-in."""
 
-from __future__ import annotations
-
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import KernelObserver

@@ -3,8 +3,6 @@
 A line of sight is set once per frame, with the point that the bearing is to, and linearised at the poses believed now.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

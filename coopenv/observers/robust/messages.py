@@ -1,7 +1,5 @@
 """What `robust` sends, as other programs see it: 196 bytes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ nothing that was heard before counts twice, and the neighbour's slowly varying e
 prior, or when most bearings contradict the belief, the pose is searched for; meanwhile the vehicle sends nothing.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

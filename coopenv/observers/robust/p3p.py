@@ -7,8 +7,6 @@ cubic), and in each plane the other cone leaves a quadratic. Newton steps on the
 rounding.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a saved memory may hold, by field, see `coopenv.world.saved_state`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ their likelihoods' ratio; those that cost least come first. While a vehicle sear
 belief's arrays serve to correct one hypothesis after the other.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

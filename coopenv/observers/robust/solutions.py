@@ -4,8 +4,6 @@ Where two solutions of P3P lie close together noise can make both of them vanish
 that is not exactly known, is also perturbed by some standard deviations to each side.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

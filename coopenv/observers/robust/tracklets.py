@@ -7,8 +7,6 @@ tracklets, Drummond, Tracklets and a hybrid fusion with process noise, SPIE 3163
 Durrant-Whyte, Data fusion in decentralized sensor networks, Control Engineering Practice 2(5), 1994.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

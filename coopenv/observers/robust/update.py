@@ -5,8 +5,6 @@ stay. The vehicle's covariance becomes that of the solution, which inherits the 
 G (N + H_o P_o H_o^T) G^T with G = (H^T W H)^-1 H^T W, and so do its covariances with them, -G H_o P_o.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

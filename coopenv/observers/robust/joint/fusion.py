@@ -1,19 +1,10 @@
 """Every message of a tick: whether its vehicles are new, its information is new, or another message has said it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp
 
-from coopenv.observers.robust.belief import (
-    append_member,
-    index_of,
-    is_unseen,
-    longest_unseen,
-    mark_seen,
-    remove_member,
-)
+from coopenv.observers.robust.belief import append_member, index_of, is_unseen, longest_unseen, mark_seen, remove_member
 from coopenv.observers.robust.constants import MAX_TOLD
 from coopenv.observers.robust.joint.information import fuse_joint_information, news_of, predict_told, propagate_told
 from coopenv.observers.robust.joint.matrices import AFTER

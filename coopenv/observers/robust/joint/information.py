@@ -1,7 +1,5 @@
 """The new information between two messages of a sender about the same vehicles, as in `tracklets`, but joint."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

@@ -1,7 +1,5 @@
 """Matrices of up to 4x4 blocks of 6x6 in the memory's scratch: those of the vehicles that a joint message tells of."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

@@ -3,8 +3,6 @@
 A contact is the last message of a sender that tells of members of the belief alone.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import warp as wp

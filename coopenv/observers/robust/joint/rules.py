@@ -1,7 +1,5 @@
 """What a saved memory may hold besides, see `robust.rules`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
