@@ -16,8 +16,7 @@ from coopenv.estimation.rotations import skew
 
 LEVEL = 0.95
 
-DIVERGED_POSITION, DIVERGED_ORIENTATION = 5.0, 30.0
-"""m and deg: a run that ends above either has diverged."""
+DIVERGED_POSITION, DIVERGED_ORIENTATION = 5.0, 30.0  # m and deg: a run that ends above either has diverged
 
 
 class Interval(NamedTuple):

@@ -12,8 +12,7 @@ EPSILON64 = wp.constant(2.0**-52)
 EPSILON32 = wp.constant(2.0**-23)
 PIVOT_FLOOR = wp.constant(2.0**-7)
 """Smallest pivot of a Cholesky factor over the trace, in units of the machine epsilon."""
-SWEEPS = wp.constant(12)
-"""At most; about five are needed."""
+SWEEPS = wp.constant(12)  # at most; about five are needed
 
 
 @wp.func

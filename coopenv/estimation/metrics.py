@@ -19,8 +19,7 @@ from coopenv.errors import CoopenvError
 from coopenv.estimation.observability import Observability
 from coopenv.estimation.trajectory import Trajectory
 
-STEADY_SHARE = 0.7
-"""The steady state is taken to begin after this share of the horizon (35 s of 50 s)."""
+STEADY_SHARE = 0.7  # the steady state is taken to begin after this share of the horizon (35 s of 50 s)
 
 MIRROR_ANGLE_DEG = 150.0
 """An orientation error above this at the end of a run is the mirrored solution, not a slow one."""
@@ -43,8 +42,7 @@ class SettlingTolerance(NamedTuple):
         return (position_error < self.position_m) & (orientation_error < self.orientation_deg)
 
 
-SETTLED = SettlingTolerance("settled", 0.5, 5.0)
-"""What an estimate can keep under measurement noise."""
+SETTLED = SettlingTolerance("settled", 0.5, 5.0)  # what an estimate can keep under measurement noise
 CONVERGED = SettlingTolerance("converged", 0.1, 1.0)
 
 _NOT_CONVERGED = "did not converge, no rate to fit"

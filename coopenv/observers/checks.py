@@ -14,16 +14,12 @@ from coopenv.estimation.coordinates import Coordinates
 from coopenv.observers.contract import Estimate, Message
 from coopenv.scenario.base import LARGEST
 
-MOST_BENT = 1e-6
-"""By how much entries of R^T R may differ from those of I."""
-MOST_LOPSIDED = 1e-6
-"""By how much P and its transpose may differ, relative to P, in Frobenius' norm."""
-MOST_NEGATIVE = 1e-9
-"""How far below zero an eigenvalue of P may lie, relative to the largest one."""
+MOST_BENT = 1e-6  # by how much entries of R^T R may differ from those of I
+MOST_LOPSIDED = 1e-6  # by how much P and its transpose may differ, relative to P, in Frobenius' norm
+MOST_NEGATIVE = 1e-9  # how far below zero an eigenvalue of P may lie, relative to the largest one
 
 POSITION, ROTATION, COVARIANCE = (3,), (3, 3), (6, 6)
-SENT_COVARIANCES = (ROTATION, COVARIANCE)
-"""Shapes: of the marker's position, or of the whole pose."""
+SENT_COVARIANCES = (ROTATION, COVARIANCE)  # shapes: of the marker's position, or of the whole pose
 
 
 def check_estimate(estimate: Estimate) -> None:

@@ -15,20 +15,16 @@ from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
 
 BYTES_PER_NUMBER = 8
-MIN_BEARING_STD = 1e-4
-"""rad; noise-free scenarios would leave a Kalman filter with a singular innovation."""
+MIN_BEARING_STD = 1e-4  # rad; noise-free scenarios would leave a Kalman filter with a singular innovation
 
 
 @dataclass(frozen=True)
 class SensorNoise:
     """Standard deviations at the scenario's rates."""
 
-    velocity: float
-    """m/s, of each component of an odometry sample."""
-    angular_velocity: float
-    """rad/s, of each component of an odometry sample."""
-    odometry_period: float
-    """s, for which a sample is held."""
+    velocity: float  # m/s, of each component of an odometry sample
+    angular_velocity: float  # rad/s, of each component of an odometry sample
+    odometry_period: float  # s, for which a sample is held
     bearing: float
     """rad, of each tangent axis of a bearing. For the paper's noise model this is the standard deviation on the image
     plane, which is reached on the optical axis only and is an upper bound elsewhere."""
@@ -84,14 +80,10 @@ class Setup:
     vehicle: int
     name: str
     target_names: tuple[str, ...]
-    landmarks: int
-    """How many of the targets are landmarks; vehicle j is target `landmarks + j`."""
-    targets: NDArray[np.int64]
-    """(m,) its neighbours."""
-    lever_arm: Array
-    """(3,) the camera's place in the body, m."""
-    marker: Array
-    """(3,) the point of this vehicle that others' cameras measure, in its body, m."""
+    landmarks: int  # how many of the targets are landmarks; vehicle j is target `landmarks + j`
+    targets: NDArray[np.int64]  # (m,) its neighbours
+    lever_arm: Array  # (3,) the camera's place in the body, m
+    marker: Array  # (3,) the point of this vehicle that others' cameras measure, in its body, m
     noise: SensorNoise
     gains: Gains
     planar: bool = False
@@ -134,8 +126,7 @@ class Received:
     """A neighbour's latest message that arrived and is not stale."""
 
     message: Message
-    age: float
-    """s since it was sent."""
+    age: float  # s since it was sent
 
 
 @dataclass(frozen=True)
@@ -145,29 +136,18 @@ class Tick:
     index: int
     time: float  # s
     dt: float  # s since the last tick
-    rotation: Array
-    """(3, 3) odometry dR over the tick: R <- R dR."""
-    translation: Array
-    """(3,) odometry dp over the tick, in the body frame at its start: p <- p + R dp, m."""
-    velocity: Array
-    """(3,) last odometry sample, body frame, m/s."""
-    angular_velocity: Array
-    """(3,) last odometry sample, body frame, rad/s."""
-    targets: NDArray[np.int64]
-    """(m,) indices of the neighbours: landmarks first, then vehicles."""
-    bearings: Array
-    """(m, 3) unit vectors camera -> target in the body frame; NaN where not valid."""
-    valid: NDArray[np.bool_]
-    """(m,) whether the target was measured in this frame."""
-    landmarks: Array
-    """(L, 3) known positions of the landmarks now, map frame, m."""
-    messages: Mapping[int, Received]
-    """By target index."""
-    lever_arm: Array
-    """(3,) the camera's place in the body, m."""
+    rotation: Array  # (3, 3) odometry dR over the tick: R <- R dR
+    translation: Array  # (3,) odometry dp over the tick, in the body frame at its start: p <- p + R dp, m
+    velocity: Array  # (3,) last odometry sample, body frame, m/s
+    angular_velocity: Array  # (3,) last odometry sample, body frame, rad/s
+    targets: NDArray[np.int64]  # (m,) indices of the neighbours: landmarks first, then vehicles
+    bearings: Array  # (m, 3) unit vectors camera -> target in the body frame; NaN where not valid
+    valid: NDArray[np.bool_]  # (m,) whether the target was measured in this frame
+    landmarks: Array  # (L, 3) known positions of the landmarks now, map frame, m
+    messages: Mapping[int, Received]  # by target index
+    lever_arm: Array  # (3,) the camera's place in the body, m
     noise: SensorNoise
-    due: bool = True
-    """Whether the scenario's observer rate (`rates.observer`) asks for a correction at this frame."""
+    due: bool = True  # whether the scenario's observer rate (`rates.observer`) asks for a correction at this frame
 
     def usable(self) -> list[tuple[int, Array, Array, Message | None]]:
         """Return (target, bearing, position, message) of every target measured whose position is known or heard.
@@ -189,8 +169,7 @@ class Tick:
 class Estimate:
     """Where an observer believes its vehicle to be."""
 
-    rotation: Array
-    """(3, 3) body to map."""
+    rotation: Array  # (3, 3) body to map
     position: Array
     """(3,) of the body's origin in the MAP frame, m (the paper's pbar; its p_i is rotation.T @ position)."""
     covariance: Array | None = None
@@ -198,8 +177,7 @@ class Estimate:
     coordinates: Coordinates = Coordinates.LEFT
     nis: float | None = None
     """Normalised innovation squared r^T S^-1 r of this tick's correction; None: there was none, or it is not told."""
-    nis_dof: int = 0
-    """Its degrees of freedom: two per bearing used."""
+    nis_dof: int = 0  # its degrees of freedom: two per bearing used
 
 
 @runtime_checkable
@@ -241,5 +219,4 @@ class JointObserver(Protocol):
         ...
 
 
-Factory = Any
-"""Builds an `Observer` from a `Setup`, or a `JointObserver` from a sequence of them."""
+Factory = Any  # builds an `Observer` from a `Setup`, or a `JointObserver` from a sequence of them

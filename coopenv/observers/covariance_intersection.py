@@ -15,8 +15,7 @@ from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Message, Tick
 from coopenv.observers.mekf import Mekf, innovation, kalman
 
-LOWEST, HIGHEST = 0.02, 1.0 - 1e-6
-"""Limits of w short of 1, which leaves the measurement out."""
+LOWEST, HIGHEST = 0.02, 1.0 - 1e-6  # limits of w short of 1, which leaves the measurement out
 
 
 class CovarianceIntersection(Mekf):

@@ -18,14 +18,10 @@ from coopenv.estimation.se3 import adjoint
 from coopenv.observers.contract import Estimate, Setup, Tick
 from coopenv.observers.mekf import LeftError, PoseObserver
 
-LAG = 1.0
-"""s."""
-KEY_PERIOD = 0.1
-"""s between key frames."""
-RELINEARISE = 0.01
-"""rad and m, by which a variable moves before its factors are linearised anew."""
-EXACT = 1e-10 * np.eye(3)
-"""m^2, of points that are known."""
+LAG = 1.0  # s
+KEY_PERIOD = 0.1  # s between key frames
+RELINEARISE = 0.01  # rad and m, by which a variable moves before its factors are linearised anew
+EXACT = 1e-10 * np.eye(3)  # m^2, of points that are known
 
 
 @dataclass

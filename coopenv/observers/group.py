@@ -24,8 +24,7 @@ class ObserverError(CoopenvError):
     """An observer raised or returned what is no estimate; the message says whose, when and why."""
 
 
-ANYTHING = (Exception, SystemExit)
-"""What may come out of an observer, which is anybody's code."""
+ANYTHING = (Exception, SystemExit)  # what may come out of an observer, which is anybody's code
 
 
 class Answer(NamedTuple):

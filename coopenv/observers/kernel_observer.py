@@ -222,5 +222,4 @@ def read_pose(observer: KernelObserver, sender: int, message: Message, sent: int
 
 
 POSITION = Messages(write_position, read_position)
-POSE = Messages(write_pose, read_pose)
-"""All that an observer sends that says nothing else."""
+POSE = Messages(write_pose, read_pose)  # all that an observer sends that says nothing else

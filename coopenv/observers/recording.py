@@ -19,8 +19,7 @@ class Briefing:
     """What observers are told before the first tick, and how their messages travel."""
 
     setups: tuple[Setup, ...]
-    order: tuple[int, ...]
-    """Vehicles in the order in which they estimate: leaders first."""
+    order: tuple[int, ...]  # vehicles in the order in which they estimate: leaders first
     dt: float  # s
     period: int  # ticks between messages
     staleness: float  # s
@@ -60,14 +59,11 @@ class Sensed:
     visible: NDArray[np.bool_]  # (N, T)
     landmarks: Array  # (L, 3) map, m
     due: bool = True  # whether the scenario's observer rate asks for a correction
-    time: float | None = None
-    """s since the reset on the source's clock; None: index * dt."""
+    time: float | None = None  # s since the reset on the source's clock; None: index * dt
     odometry_age: Array | None = None  # (N,) s since the last odometry sample; None: 0
     bearing_age: Array | None = None  # (N,) s since the frame was exposed; None: 0
-    missing: NDArray[np.bool_] | None = None
-    """(N,) of whom nothing came; None: of nobody."""
-    late: NDArray[np.bool_] | None = None
-    """(N,) whose row came after its deadline; None: nobody's."""
+    missing: NDArray[np.bool_] | None = None  # (N,) of whom nothing came; None: of nobody
+    late: NDArray[np.bool_] | None = None  # (N,) whose row came after its deadline; None: nobody's
     truth: Truth | None = None
     inbox_tick: NDArray[np.int64] | None = None
     """(N receiver, N sender) tick of sending of the last message that arrived, -1: none, where the source knows what
@@ -113,8 +109,7 @@ class Recording:
     """K ticks (t = 0 included) of N vehicles and T targets, of which the first L are landmarks."""
 
     setups: tuple[Setup, ...]
-    order: tuple[int, ...]
-    """Vehicles in the order in which they estimate: leaders first."""
+    order: tuple[int, ...]  # vehicles in the order in which they estimate: leaders first
     dt: float  # s
     rotation: Array  # (K, N, 3, 3) odometry increments
     translation: Array  # (K, N, 3) m
@@ -131,8 +126,7 @@ class Recording:
     start_position: Array  # (N, 3) map, m
     start_covariance: Array  # (N, 6, 6) LEFT coordinates
     truth: Truth
-    scenario: "Scenario | None" = None
-    """The world that was recorded; None for recorded robots."""
+    scenario: "Scenario | None" = None  # the world that was recorded; None for recorded robots
 
     @property
     def ticks(self) -> int:

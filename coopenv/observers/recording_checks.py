@@ -31,14 +31,12 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     "truth.rotation": ("K", "N", 3, 3),
     "truth.position": ("K", "N", 3),
 }
-KINDS = {"visible": "b", "due": "b", "inbox_tick": "i"}
-"""NumPy's kind of the arrays that do not hold floats."""
+KINDS = {"visible": "b", "due": "b", "inbox_tick": "i"}  # NumPy's kind of the arrays that do not hold floats
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
 TICK_LENGTHS_S = (1e-5, 1e3)
 MAX_PERIOD_TICKS = 100_000
-LEAST_EIGENVALUE = 1e-12
-"""Least eigenvalue of the correlations of an initial estimate."""
+LEAST_EIGENVALUE = 1e-12  # least eigenvalue of the correlations of an initial estimate
 
 
 def check_recording(recording: Recording, where: str) -> None:

@@ -34,8 +34,7 @@ class Registered(NamedTuple):
 
 
 _registered: dict[str, Registered] = {}
-_places: dict[str, str] = {}
-"""Where those of `_registered` stand that are named by their place."""
+_places: dict[str, str] = {}  # where those of `_registered` stand that are named by their place
 
 
 def register(name: str, factory: Factory | None = None, *, embedded: "Embedded | None" = None) -> None:

@@ -42,8 +42,7 @@ class Run:
     nis_dof: NDArray[np.int64]  # (K, N)
     bytes_per_second: Array  # (N,) sent, payload
     microseconds_per_update: Array  # (N,) median, message included; a joint observer's time is shared out
-    failure: str = ""
-    """Who failed, when and why; empty where nobody did."""
+    failure: str = ""  # who failed, when and why; empty where nobody did
 
     def position_rmse(self, after: float = 0.0) -> Array:
         """Return (N,) the root mean square of |pbar - pbarhat| from a time on, m."""

@@ -20,16 +20,12 @@ from coopenv.observers.robust.p3p import solve_p3p
 
 MOST_TRIPLES = 20
 ITERATIONS = 8
-CONVERGED = 1e-2
-"""Squared length of a step in standard deviations."""
-LONGEST_TURN = 1.0
-"""rad, of a step."""
-BEARING_GATE = 25.0
-"""Squared residual of a bearing over its variance, (5 sigma)^2."""
+CONVERGED = 1e-2  # squared length of a step in standard deviations
+LONGEST_TURN = 1.0  # rad, of a step
+BEARING_GATE = 25.0  # squared residual of a bearing over its variance, (5 sigma)^2
 POSE_GATE = 45.0
 """Squared distance to the predicted pose over its variance; chi-square with 6 degrees of freedom beyond it: 5e-8."""
-PATIENCE = 1.0
-"""s for which bearings must contradict the predicted pose before a pose far from it is believed."""
+PATIENCE = 1.0  # s for which bearings must contradict the predicted pose before a pose far from it is believed
 NARROW_STD = 0.5
 """rad, of the predicted orientation: below it Gauss-Newton from there finds what is to be found near it."""
 LARGEST_STD = 0.15
@@ -37,11 +33,9 @@ LARGEST_STD = 0.15
 
 ALL, PLANE = np.eye(6), np.eye(2)
 ADJUGATE = np.array([[1.0, -1.0], [-1.0, 1.0]])
-EXACT = np.zeros((3, 3))
-"""Covariance of a point that is known, or whose sender states no covariance."""
+EXACT = np.zeros((3, 3))  # covariance of a point that is known, or whose sender states no covariance
 
-Bearings = tuple[Array, Array, Array]
-"""Unit bearings (m, 3), positions (m, 3) and covariances of positions (m, 3, 3)."""
+Bearings = tuple[Array, Array, Array]  # unit bearings (m, 3), positions (m, 3) and covariances of positions (m, 3, 3)
 
 
 class PerspectivePoints(PoseObserver):

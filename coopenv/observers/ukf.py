@@ -18,12 +18,9 @@ from coopenv.observers.contract import Message, Tick
 from coopenv.observers.left_invariant import InvariantError
 from coopenv.observers.mekf import LeftError, Mekf, innovation
 
-SPREAD = 6.0
-"""Squared distance of the sigma points from the mean in standard deviations: alpha = 1 in six dimensions."""
-WEIGHT = 1.0 / (2.0 * SPREAD)
-"""Weight of every sigma point but the mean."""
-MEAN_WEIGHT = 2.0
-"""Weight of the mean in covariances: 3 - alpha^2. In means it is 0."""
+SPREAD = 6.0  # squared distance of the sigma points from the mean in standard deviations: alpha = 1 in six dimensions
+WEIGHT = 1.0 / (2.0 * SPREAD)  # weight of every sigma point but the mean
+MEAN_WEIGHT = 2.0  # weight of the mean in covariances: 3 - alpha^2. In means it is 0
 
 
 class Ukf(Mekf):

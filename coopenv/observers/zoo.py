@@ -7,18 +7,13 @@ from dataclasses import dataclass
 class Entry:
     """Where an observer stands in this package; nothing is loaded before it is asked for."""
 
-    plugin: str
-    """Module and class, or function of a setup."""
-    kernels: str = ""
-    """Module and `Embedded`; empty: it runs on the host only."""
-    needs: str = ""
-    """Module of the extra `bench` without which it does not run."""
-    in_space: bool = True
-    """Whether it is meant for vehicles in space."""
+    plugin: str  # module and class, or function of a setup
+    kernels: str = ""  # module and `Embedded`; empty: it runs on the host only
+    needs: str = ""  # module of the extra `bench` without which it does not run
+    in_space: bool = True  # whether it is meant for vehicles in space
     on_a_plane: bool = True
     """Whether it is meant for robots on a plane whose odometry is their commands (`Setup.planar`)."""
-    kernels_on_a_plane: bool = True
-    """Whether its kernels are those of the plug-in there."""
+    kernels_on_a_plane: bool = True  # whether its kernels are those of the plug-in there
 
 
 ZOO = {

@@ -15,8 +15,7 @@ from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.planar.commands import Wheels
 from coopenv.observers.planar.filter import HEADING, PlanarFilter, PlanarPose, Tuning, X, Y
 
-PLANE = np.ix_((2, 3, 4), (2, 3, 4))
-"""Indices of the LEFT coordinates in the plane: yaw, forward, left."""
+PLANE = np.ix_((2, 3, 4), (2, 3, 4))  # indices of the LEFT coordinates in the plane: yaw, forward, left
 OUT_OF_PLANE_STD = 1e-3  # rad and m
 LOWER = np.tril_indices(3)
 

@@ -42,16 +42,11 @@ from coopenv.world.world import World
 class Rollout:
     """Result of `DifferentiableWorld.rollout`."""
 
-    uncertainty: float
-    """Sum over worlds and vehicles of trace P at the end (rad^2 + m^2)."""
-    gradient: np.ndarray
-    """Its derivative with respect to the actions, same shape as they."""
-    covariance: np.ndarray
-    """P at the end, (W, N, 6, 6)."""
-    position: np.ndarray
-    """True positions at the end, (W, N, 3) m."""
-    position_estimate: np.ndarray
-    """Estimated positions at the end, (W, N, 3) m."""
+    uncertainty: float  # sum over worlds and vehicles of trace P at the end (rad^2 + m^2)
+    gradient: np.ndarray  # its derivative with respect to the actions, same shape as they
+    covariance: np.ndarray  # P at the end, (W, N, 6, 6)
+    position: np.ndarray  # true positions at the end, (W, N, 3) m
+    position_estimate: np.ndarray  # estimated positions at the end, (W, N, 3) m
 
 
 class DifferentiableWorld:

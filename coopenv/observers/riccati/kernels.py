@@ -26,8 +26,7 @@ from coopenv.observers.riccati.equations import (
 from coopenv.world.embedded import Embedded, send_nothing, start_nothing
 from coopenv.world.quality import known_position, usable
 
-MOST_SUBSTEPS = wp.constant(200)
-"""Re-linearisations per tick; the last one takes what remains of the tick."""
+MOST_SUBSTEPS = wp.constant(200)  # re-linearisations per tick; the last one takes what remains of the tick
 
 
 @wp.func

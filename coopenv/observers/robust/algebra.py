@@ -11,8 +11,7 @@ from coopenv.observers.robust.memory import Estimate, Pose, mat66d, vec2d, vec6d
 
 KNOWN_ANGLE_VARIANCE = KNOWN_ANGLE**2
 KNOWN_POSITION_VARIANCE = KNOWN_POSITION**2
-BEYOND = -0.9
-"""Cosine of an angle from which on the skew part of a rotation says little of its axis."""
+BEYOND = -0.9  # cosine of an angle from which on the skew part of a rotation says little of its axis
 
 
 @wp.func

@@ -7,21 +7,16 @@ MAX_MEMBERS, MAX_MEMBERS_JOINT = 5, 8
 MAX_LINEARISATIONS, RELINEARISATION_ANGLE = 8, 0.01
 """Linearisations of one correction; how far it may turn a line of sight without another one, rad: what is neglected
 then, 0.01^2 / 2, is below `MIN_BEARING_STD`."""
-SAME_TIME = 1e-6
-"""s; times that differ by less differ by rounding only."""
-FORGET_TIME = 1.0
-"""s out of view after which a member may be evicted. Chosen."""
-MAX_ACCELERATION = 1.0
-"""m/s^2 by which a member may leave its last known twist. Chosen: an ordinary start or stop."""
-TWIST_AVERAGING_TIME = 0.3
-"""s, over which a neighbour's twist is averaged. Chosen."""
+SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
+FORGET_TIME = 1.0  # s out of view after which a member may be evicted. Chosen
+MAX_ACCELERATION = 1.0  # m/s^2 by which a member may leave its last known twist. Chosen: an ordinary start or stop
+TWIST_AVERAGING_TIME = 0.3  # s, over which a neighbour's twist is averaged. Chosen
 MIN_VELOCITY_STD, MIN_ANGULAR_VELOCITY_STD = 2e-3, 2e-4
 """m/s and rad/s, of an odometry sample: the increments of a moving vehicle are never exact."""
 
 # Tests
 
-BEARING_GATE = 13.8
-"""Gate of a bearing's normalised innovation squared: chi-square of 2, 0.999."""
+BEARING_GATE = 13.8  # gate of a bearing's normalised innovation squared: chi-square of 2, 0.999
 MESSAGE_GATE = 40.0
 """Gate of the squared distance between a message and the belief about its sender: chi-square of 6, 1 - 5e-7."""
 AGREEMENT_TIME, AGREEMENT_DISTANCE = 1.0, 1.0
@@ -40,45 +35,34 @@ DEPENDENT_SHARE = 0.7
 """Share that counts of the information of a sender that depends on others: some may have arrived already. Tuned."""
 MAX_VARIANCE_GROWTH = 1.01
 """Ratio of a variance to the predicted one; beyond it the sender has lost information, and its message has no news."""
-MASK_BITS = 64
-"""Vehicles in a mask; numbers from 64 on share bits with lower ones."""
-MAX_TOLD = 4
-"""Vehicles in a message of `robust_joint`, the sender included: 1.7 kB."""
-SUPERSEDING_TIME = 1.0
-"""s, for which a joint message stands for the messages of the vehicles that it holds. Chosen."""
+MASK_BITS = 64  # vehicles in a mask; numbers from 64 on share bits with lower ones
+MAX_TOLD = 4  # vehicles in a message of `robust_joint`, the sender included: 1.7 kB
+SUPERSEDING_TIME = 1.0  # s, for which a joint message stands for the messages of the vehicles that it holds. Chosen
 
-MIN_VARIANCE = 1e-14
-"""rad^2 and m^2, below which a message is malformed: nobody knows a pose to 0.1 um."""
+MIN_VARIANCE = 1e-14  # rad^2 and m^2, below which a message is malformed: nobody knows a pose to 0.1 um
 
 # Search
 
 KNOWN_ANGLE, KNOWN_POSITION = 0.2, 2.0
 """rad and m, standard deviation per axis below which a pose is linearised about and sent. Chosen."""
-MAX_HYPOTHESES = 6
-"""Most hypotheses at once: P3P has four solutions at most, the prior is one more. Chosen."""
-PERTURBATION = 2.0
-"""Standard deviations by which measurements are moved to find solutions that noise may hide."""
+MAX_HYPOTHESES = 6  # most hypotheses at once: P3P has four solutions at most, the prior is one more. Chosen
+PERTURBATION = 2.0  # standard deviations by which measurements are moved to find solutions that noise may hide
 MAX_BEARING_COST = 25.0
 """Most that one bearing costs (chi-square of 2, 1 - 4e-6): below `PRUNE_GAP`, so that one wrong association decides
 nothing."""
-MAX_PRIOR_COST = 50.0
-"""Most that being far from the prior costs: that may be wrong altogether."""
-PRUNE_GAP = 30.0
-"""By how much the cost may exceed the least one: odds of exp(-15)."""
+MAX_PRIOR_COST = 50.0  # most that being far from the prior costs: that may be wrong altogether
+PRUNE_GAP = 30.0  # by how much the cost may exceed the least one: odds of exp(-15)
 MAX_BEST_COST = 80.0
 """Most that the best may cost beyond twice what is expected of a true one: `MAX_PRIOR_COST` and one wrong bearing."""
 CLEAR_TIME, PATIENCE = 0.25, 15.0
 """s, for which all solutions must have been well determined, and after which that is asked no more. Chosen."""
-MIN_SEARCH_TIME = 0.5
-"""s, before a hypothesis becomes the belief. Chosen."""
-MAX_SPEED = 1.0
-"""m/s at which a sender may have gone on since a message that is used in the search. Chosen."""
+MIN_SEARCH_TIME = 0.5  # s, before a hypothesis becomes the belief. Chosen
+MAX_SPEED = 1.0  # m/s at which a sender may have gone on since a message that is used in the search. Chosen
 CORRELATION_FACTOR = 4.0
 """Factor of a neighbour's variance in the search: its error changes slowly and does not average out. Tuned."""
 SAME_HYPOTHESIS, SAME_PRIOR = 16.0, 30.0
 """Squared distance, in standard deviations, below which two hypotheses are one (chi-square of 6, 0.986), and one is the
 prior (1 - 4e-5)."""
-GAUSS_NEWTON_STEPS = 6
-"""Steps of the least squares from one frame. Chosen."""
+GAUSS_NEWTON_STEPS = 6  # steps of the least squares from one frame. Chosen
 MIN_INFORMATION_RATIO = 1e-12
 """Ratio of the information in the weakest direction to that in the strongest; below it a frame determines no pose."""

@@ -11,8 +11,7 @@ from coopenv.observers.robust.rules import rules_for
 from coopenv.observers.robust.tracklets import clear_messages, fuse_messages, receive, send
 from coopenv.world.embedded import Embedded
 
-OPTIONS = {"max_unroll": 1}
-"""Of the Warp module; without it there is long straight code, which takes long to compile."""
+OPTIONS = {"max_unroll": 1}  # of the Warp module; without it there is long straight code, which takes long to compile
 
 ROBUST = Embedded(
     "robust",

@@ -19,8 +19,7 @@ from coopenv.world.v2x import fresh
 HALF_ACCELERATION = 0.5 * MAX_ACCELERATION
 THIRD = 1.0 / 3.0
 """Also the variance of a uniform distribution over [-1, 1], which the paper's noise has on the image plane."""
-NOTHING = -1
-"""In place of a member: the bearing cannot be used now."""
+NOTHING = -1  # in place of a member: the bearing cannot be used now
 
 
 @wp.func

@@ -151,5 +151,4 @@ class RobustMemory:
     scratch_blocks: array("WKK", mat66d)  # before the correction
 
 
-SIZES = {"K": MAX_MEMBERS, "H": MAX_HYPOTHESES + 1}
-"""Besides the hypotheses of one frame there is the prior."""
+SIZES = {"K": MAX_MEMBERS, "H": MAX_HYPOTHESES + 1}  # besides the hypotheses of one frame there is the prior

@@ -22,10 +22,8 @@ from coopenv.world.launch import kernel, start_warp
 mat43d: Any = wp.types.matrix((4, 3), wp.float64)
 
 NEWTON_STEPS = 3
-TOLERANCE = 1e-8
-"""What a solution may miss of the squared sides, relative to the longest."""
-FLAT = 1e-9
-"""Twice a triangle's area over its longest squared side: below it the points are on a line."""
+TOLERANCE = 1e-8  # what a solution may miss of the squared sides, relative to the longest
+FLAT = 1e-9  # twice a triangle's area over its longest squared side: below it the points are on a line
 THIRD = 1.0 / 3.0
 EIGHTH_TURN = 0.7853981633974483
 

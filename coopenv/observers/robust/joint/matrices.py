@@ -6,8 +6,7 @@ import warp as wp
 
 from coopenv.observers.robust.memory import mat66d
 
-BEFORE, AFTER, INVERSE = 0, 1, 2
-"""The matrices."""
+BEFORE, AFTER, INVERSE = 0, 1, 2  # the matrices
 
 
 @wp.func

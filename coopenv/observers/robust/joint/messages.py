@@ -12,8 +12,7 @@ from coopenv.observers.robust.messages import from_six, read, six_of, write
 from coopenv.scenario.base import LARGEST
 from coopenv.world.embedded import Messages
 
-JOINT = ("vehicles", "ages", "poses", "odometries", "factor", "complete")
-"""What a joint message has besides."""
+JOINT = ("vehicles", "ages", "poses", "odometries", "factor", "complete")  # what a joint message has besides
 
 
 def write_joint(observer: Any) -> Message:
