@@ -11,7 +11,7 @@ from coopenv.backends.base import Backend, Command, SensingWorld, WorldBackend
 from coopenv.backends.replay.kernels import BY_RADIO, RECORDED, record_struct, true_twists
 from coopenv.backends.tick_checks import MEASURED, check_tick, is_sound
 from coopenv.errors import CoopenvError
-from coopenv.estimation.se3 import exp_se3
+from coopenv.estimation.rotations import exp_se3
 from coopenv.observers.briefing import start_covariances
 from coopenv.observers.contract import Message
 from coopenv.observers.kernel_world import views_of

@@ -86,8 +86,7 @@ def live_ticks(t: np.ndarray, vehicles: int, ends: Sequence[float] | None = None
 
 def error_rotation(rotation: np.ndarray, rotation_estimate: np.ndarray) -> np.ndarray:
     """Return Rtilde = Rhat^T R of rotations (..., 3, 3) that map body to map frame."""
-    result: np.ndarray = np.swapaxes(np.asarray(rotation_estimate, float), -1, -2) @ np.asarray(rotation, float)
-    return result
+    return np.asarray(np.swapaxes(np.asarray(rotation_estimate, float), -1, -2) @ np.asarray(rotation, float))
 
 
 def quaternion_wxyz(rotation: np.ndarray) -> np.ndarray:
@@ -109,8 +108,7 @@ def quaternion_wxyz(rotation: np.ndarray) -> np.ndarray:
     best = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
     q = np.take_along_axis(outer, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    result: np.ndarray = np.where(q[..., :1] < 0, -q, q)
-    return result
+    return np.asarray(np.where(q[..., :1] < 0, -q, q))
 
 
 def orientation_error_deg(rotation: np.ndarray, rotation_estimate: np.ndarray) -> np.ndarray:
@@ -120,8 +118,7 @@ def orientation_error_deg(rotation: np.ndarray, rotation_estimate: np.ndarray) -
     deg is told from zero, and a half turn is 180 deg exactly.
     """
     q = quaternion_wxyz(error_rotation(rotation, rotation_estimate))
-    result: np.ndarray = np.degrees(2 * np.arctan2(np.linalg.norm(q[..., 1:], axis=-1), q[..., 0]))
-    return result
+    return np.asarray(np.degrees(2 * np.arctan2(np.linalg.norm(q[..., 1:], axis=-1), q[..., 0])))
 
 
 def roll_pitch_yaw_deg(rotation: np.ndarray) -> np.ndarray:
@@ -130,8 +127,7 @@ def roll_pitch_yaw_deg(rotation: np.ndarray) -> np.ndarray:
     roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
     pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 0, 0], R[..., 1, 0]))
     yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
-    result: np.ndarray = np.degrees(np.stack([roll, pitch, yaw], axis=-1))
-    return result
+    return np.asarray(np.degrees(np.stack([roll, pitch, yaw], axis=-1)))
 
 
 def error_coordinates(
@@ -193,8 +189,7 @@ def steady_mean(t: np.ndarray, values: np.ndarray, steady_from: float) -> np.nda
 def steady_rmse(t: np.ndarray, error: np.ndarray, steady_from: float) -> np.ndarray:
     """Return the root mean square of errors (K, ...) over the ticks with t > steady_from; NaN if none."""
     with np.errstate(over="ignore"):  # of an observer that has diverged
-        result: np.ndarray = np.sqrt(steady_mean(t, np.square(np.asarray(error, float)), steady_from))
-        return result
+        return np.asarray(np.sqrt(steady_mean(t, np.square(np.asarray(error, float)), steady_from)))
 
 
 def mean_targets_in_view(visible: np.ndarray) -> np.ndarray:
@@ -204,8 +199,7 @@ def mean_targets_in_view(visible: np.ndarray) -> np.ndarray:
 
 def mirrored(orientation_error: np.ndarray) -> np.ndarray:
     """Return whether a run (K, ...) ends with an orientation error above `MIRROR_ANGLE_DEG`."""
-    result: np.ndarray = np.asarray(orientation_error)[-1] > MIRROR_ANGLE_DEG
-    return result
+    return np.asarray(orientation_error[-1] > MIRROR_ANGLE_DEG)
 
 
 def fit_exponential_rate(t: np.ndarray, error: np.ndarray, noise_floor: float | None = None) -> RateFit:

@@ -163,8 +163,7 @@ def _move_origin(W: np.ndarray, shift: np.ndarray) -> np.ndarray:
     """Return T^T W T, T = [[I, 0], [S(shift), I]]: W about a point `shift` (m) further in map axes."""
     T = np.broadcast_to(np.eye(6), (*shift.shape[:-1], 6, 6)).copy()
     T[..., 3:, :3] = skew(shift)
-    result: np.ndarray = np.swapaxes(T, -1, -2) @ W @ T
-    return result
+    return np.asarray(np.swapaxes(T, -1, -2) @ W @ T)
 
 
 def _scaled(W: np.ndarray) -> np.ndarray:
@@ -174,5 +173,4 @@ def _scaled(W: np.ndarray) -> np.ndarray:
     length = np.sqrt(np.where(count > 0, lever, 1.0) / np.where(count > 0, count, 1.0))
     scale = np.ones((*length.shape, 6))
     scale[..., :3] = 1.0 / length[..., None]
-    result: np.ndarray = scale[..., :, None] * W * scale[..., None, :]
-    return result
+    return np.asarray(scale[..., :, None] * W * scale[..., None, :])

@@ -58,7 +58,7 @@ def best_weight(prior: Array, own: Array, theirs: Array) -> float:
     f = det(v own + theirs) and g = det(w v own + w theirs + v prior). It is 0 at w = 1, and convex: the information
     w P^-1 + H^T N^-1 H is concave in w, N^-1 being a parallel sum, and so is log det.
     """
-    o, t, p = _determinant(own), _determinant(theirs), _determinant(prior)
+    o, t, p = (_mixed(A, A) / 2.0 for A in (own, theirs, prior))
     ot, op, tp = _mixed(own, theirs), _mixed(own, prior), _mixed(theirs, prior)
 
     def f_and_g(w: float) -> tuple[float, float]:
@@ -78,12 +78,6 @@ def best_weight(prior: Array, own: Array, theirs: Array) -> float:
         w = LOWEST if slope(LOWEST) >= 0.0 else brentq(slope, LOWEST, HIGHEST, xtol=1e-9, rtol=1e-9)
     f, g = f_and_g(w)
     return w if -4.0 * log(w) + log(f / g) < 0.0 else 1.0
-
-
-def _determinant(A: Array) -> float:
-    """Return det A of a symmetric (2, 2)."""
-    a, b, _, d = A.ravel().tolist()
-    return a * d - b * b
 
 
 def _mixed(A: Array, B: Array) -> float:

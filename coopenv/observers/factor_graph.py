@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from coopenv.estimation.arrays import Array
-from coopenv.estimation.se3 import adjoint
+from coopenv.estimation.rotations import adjoint
 from coopenv.observers.contract import Estimate, Setup, Tick
 from coopenv.observers.mekf import LeftError, PoseObserver
 

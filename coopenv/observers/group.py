@@ -17,7 +17,6 @@ from coopenv.observers.checks import check_estimate, check_message
 from coopenv.observers.contract import Estimate, Factory, JointObserver, Message, Observer
 from coopenv.observers.mailbox import Mailbox
 from coopenv.observers.recording import Briefing, Sensed
-from coopenv.observers.registry import is_joint
 
 
 class ObserverError(CoopenvError):
@@ -54,7 +53,7 @@ class Group:
 
     def __init__(self, factory: Factory, briefing: Briefing, tamper: Tamper | None = None) -> None:
         self.factory, self.briefing, self.tamper = factory, briefing, tamper
-        self.joint = is_joint(factory)
+        self.joint = bool(getattr(factory, "joint", False))
 
     def start(self, rotation: Array, position: Array) -> None:
         """Build the observers and start them at poses (N, 3, 3) and (N, 3), map frame, m."""

@@ -11,7 +11,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from coopenv.estimation.arrays import Array
-from coopenv.estimation.se3 import adjoint, exp_se3
+from coopenv.estimation.rotations import adjoint, exp_se3
 from coopenv.observers.mekf import LeftError, Mekf
 
 

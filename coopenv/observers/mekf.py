@@ -13,10 +13,9 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.arrays import Array, solve
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.estimation.rotations import IDENTITY, exp_so3, lengths, orthonormalise, skew, tangent_basis
-from coopenv.estimation.small_matrices import solve
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 
 
@@ -73,8 +72,7 @@ class LeftError:
         J = np.empty((3, 6))
         J[:, :3] = self.R.dot(skew(-marker))
         J[:, 3:] = self.R
-        result: Array = J.dot(self.P).dot(J.T)
-        return result
+        return np.asarray(J.dot(self.P).dot(J.T))
 
     def estimate(self, nis: float | None = None, nis_dof: int = 0) -> Estimate:
         """Return the pose with its covariance, and the normalised innovation squared of its correction."""

@@ -196,8 +196,3 @@ def _found(observer: str | Factory) -> Registered:
         return _row(point.load())
     except (Exception, SystemExit) as error:  # anybody's code
         raise CoopenvError(f"observer '{observer}' ({point.value}) cannot be loaded: {told(error)}") from error
-
-
-def is_joint(factory: Factory) -> bool:
-    """Return whether a factory builds one observer for all vehicles."""
-    return bool(getattr(factory, "joint", False))

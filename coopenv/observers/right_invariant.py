@@ -56,8 +56,7 @@ class RightError(LeftError):
     def point_covariance(self, marker: Array) -> Array:
         """Return the covariance (3, 3) in map axes of a point of the body."""
         J = np.concatenate([skew(-self.p - self.R.dot(marker)), IDENTITY], axis=1)
-        result: Array = J.dot(self.P).dot(J.T)
-        return result
+        return np.asarray(J.dot(self.P).dot(J.T))
 
     def estimate(self, nis: float | None = None, nis_dof: int = 0) -> Estimate:
         """Return the pose with its covariance, and the normalised innovation squared of its correction."""

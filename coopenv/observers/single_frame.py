@@ -12,8 +12,7 @@ from math import inf, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.small_matrices import solve
+from coopenv.estimation.arrays import Array, solve
 from coopenv.observers.contract import Estimate, Tick
 from coopenv.observers.mekf import LeftError, PoseObserver, innovation
 from coopenv.observers.robust.p3p import solve_p3p

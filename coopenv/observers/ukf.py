@@ -10,10 +10,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.rotations import lengths
-from coopenv.estimation.se3 import exp_se3
-from coopenv.estimation.small_matrices import cholesky, solve
+from coopenv.estimation.arrays import Array, cholesky, solve
+from coopenv.estimation.rotations import exp_se3, lengths
 from coopenv.observers.contract import Message, Tick
 from coopenv.observers.left_invariant import InvariantError
 from coopenv.observers.mekf import LeftError, Mekf, innovation

@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import expm
 
-from coopenv.estimation.se3 import adjoint, exp_se3
+from coopenv.estimation.rotations import adjoint, exp_se3
 
 
 def hat(xi: np.ndarray) -> np.ndarray:

@@ -6,10 +6,9 @@ from math import sqrt
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.arrays import Array, cholesky
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.estimation.rotations import IDENTITY, exp_so3, orthonormalise, skew
-from coopenv.estimation.small_matrices import cholesky
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 
 MOST_SUBSTEPS = 200

@@ -71,8 +71,6 @@ class PlanarFilter:
         self.state: Array = np.array([*pose, *tuning.mean])
         self.covariance: Array = np.diag(np.square([0.0, 0.0, 0.0, *tuning.std]))
         self.covariance[:3, :3] = covariance
-        self.accepted = 0
-        self.rejected = 0
         self._walk = np.square([0.0, 0.0, 0.0, *tuning.walk])
         self._commands: CommandHistory | None = None
 
@@ -175,9 +173,7 @@ class PlanarFilter:
         spread = float(h @ ph)
         ratio = innovation**2 / (spread + noise)
         if ratio > k.gate:
-            self.rejected += 1
             return
-        self.accepted += 1
         if ratio > k.soft:
             noise = max(innovation**2 / k.soft - spread, noise)
         gain = ph / (spread + noise)

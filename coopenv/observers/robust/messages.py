@@ -35,12 +35,7 @@ def from_six(values: Array) -> tuple[Array, Array]:
 
 
 def read(observer: Any, sender: int, message: Message, sent: int) -> None:
-    """Put a message into the inbox.
-
-    Raises:
-        CoopenvError: it is malformed.
-        LookupError: likewise.
-    """
+    """Put a message into the inbox; a CoopenvError or LookupError says that it is malformed."""
     report = observer.memory.inbox[sender]
     report["tick"], report["valid"] = sent, 0
     if message.position is None and not message.extra:  # the sender does not know where it is
@@ -56,11 +51,7 @@ def read(observer: Any, sender: int, message: Message, sent: int) -> None:
 
 
 def check_pose(message: Message) -> None:
-    """Refuse what is no pose with a covariance that can be inverted.
-
-    Raises:
-        CoopenvError: it is not.
-    """
+    """Refuse what is no pose with a covariance that can be inverted."""
     if message.position is None or message.rotation is None or message.covariance is None:
         raise CoopenvError("message: no pose with a covariance")
     P = np.asarray(message.covariance, dtype=np.float64)

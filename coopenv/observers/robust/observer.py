@@ -80,12 +80,7 @@ def write(state: Any, memory: Any, world: int, i: int):
 
 
 def make_start(clear_messages: Any, receive: Any) -> Any:
-    """Return the Warp function that starts an observer.
-
-    Args:
-        clear_messages: (model, memory, world, i): forget what was sent and received.
-        receive: (model, state, memory, world, i): take what the radio has delivered.
-    """
+    """Return the Warp function that starts an observer, given those that forget and take what the radio delivers."""
 
     @wp.func
     def start(model: Any, state: Any, memory: Any, world: int, i: int):
@@ -108,12 +103,7 @@ def make_start(clear_messages: Any, receive: Any) -> Any:
 
 
 def make_estimate(receive: Any, fuse_messages: Any) -> Any:
-    """Return the Warp function of one tick.
-
-    Args:
-        receive: (model, state, memory, world, i): take what the radio has delivered.
-        fuse_messages: (model, state, memory, world, i, tick): fuse what has been received.
-    """
+    """Return the Warp function of one tick, given those that take what the radio delivers and fuse it."""
 
     @wp.func
     def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):

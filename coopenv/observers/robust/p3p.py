@@ -4,7 +4,7 @@ Source: Persson and Nordberg, Lambda Twist: An accurate fast robust perspective 
 distances l (3,) to the points satisfy l^T M_ij l = a_ij, where a_ij = |z_i - z_j|^2 and M_ij holds the cosine between
 the bearings. Two combinations without right hand side are cones; one of their pencil is a pair of planes (a root of a
 cubic), and in each plane the other cone leaves a quadratic. Newton steps on the squared sides bring the solutions to
-rounding.
+rounding; with gaps |b_i - b_j|^2 for the cosines, small angles keep their digits.
 """
 
 from typing import Any
@@ -30,10 +30,7 @@ EIGHTH_TURN = 0.7853981633974483
 
 @wp.func
 def misfit(d: Any, gaps: Any, a: Any):
-    """Return the squared sides that distances make, less those of the triangle: pairs (0, 1), (0, 2), (1, 2).
-
-    With gaps |b_i - b_j|^2 for the cosines, small angles keep their digits.
-    """
+    """Return the squared sides that distances make, less those of the triangle: pairs (0, 1), (0, 2), (1, 2)."""
     return vec3d(
         (d[0] - d[1]) * (d[0] - d[1]) + d[0] * d[1] * gaps[0] - a[0],
         (d[0] - d[2]) * (d[0] - d[2]) + d[0] * d[2] * gaps[1] - a[1],
@@ -193,14 +190,10 @@ def p3p_kernel(
 def solve_p3p(bearings: Array, positions: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return every pose from which three points are seen in three directions, for each of B triples.
 
-    Args:
-        bearings: (B, 3, 3) unit vectors from the camera to the points, body frame, one a row.
-        positions: (B, 3, 3) the points, map frame, m, one a row.
-
-    Returns:
-        Rotations (B, 4, 3, 3) from body to map, camera positions (B, 4, 3) in the map frame, and a mask (B, 4) of what
-        is a solution, ordered by distance from the first point; the rest is NaN. A double one may come twice. None for
-        degenerate input: points on a line, bearings not of length 1, values that are not finite.
+    Bearings and positions (B, 3, 3) have a row each: unit vectors in the body frame, and points in the map, m. Rotations
+    (B, 4, 3, 3) are from body to map, camera positions (B, 4, 3) in the map, and a mask (B, 4) says what is a solution,
+    ordered by distance from the first point; the rest is NaN. A double one may come twice. There are none for points on
+    a line, bearings that are not of length 1, and what is not finite.
     """
     start_warp()
     b, z = (np.ascontiguousarray(given, dtype=np.float64) for given in (bearings, positions))

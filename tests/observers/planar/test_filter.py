@@ -164,9 +164,9 @@ def test_outliers_are_dropped_and_doubtful_ones_count_less():
         own.landmark(innovation, 2.0, 0.0)
         return own
 
-    assert after(0.5).rejected == 1 and after(0.5).state[HEADING] == 0.0
+    assert after(0.5).state[HEADING] == 0.0
     small, large = after(0.02), after(0.09)
-    assert large.accepted == 1
+    assert large.state[HEADING] != 0.0
     assert abs(large.state[HEADING]) < 4.5 * abs(small.state[HEADING])
     assert large.covariance[HEADING, HEADING] > small.covariance[HEADING, HEADING]
 

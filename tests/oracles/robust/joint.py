@@ -13,9 +13,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.arrays import Array, cholesky
 from coopenv.estimation.rotations import exp_so3, log_so3
-from coopenv.estimation.small_matrices import cholesky
 from coopenv.observers.contract import Message
 from coopenv.observers.robust.constants import MAX_MEMBERS_JOINT, MAX_TOLD, SAME_TIME, SUPERSEDING_TIME
 from tests.oracles.robust.belief import Member

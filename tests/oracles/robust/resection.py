@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from coopenv.estimation.small_matrices import solve
+from coopenv.estimation.arrays import solve
 from coopenv.observers.robust.constants import GAUSS_NEWTON_STEPS, MIN_INFORMATION_RATIO
 from tests.oracles.robust.belief import Belief, View
 

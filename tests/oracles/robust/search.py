@@ -13,9 +13,8 @@ from itertools import combinations
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array
+from coopenv.estimation.arrays import Array, solve
 from coopenv.estimation.rotations import tangent_basis
-from coopenv.estimation.small_matrices import solve
 from coopenv.observers.contract import Tick
 from coopenv.observers.robust.constants import (
     BEARING_GATE,

@@ -39,12 +39,7 @@ def write_joint(observer: Any) -> Message:
 
 
 def read_joint(observer: Any, sender: int, message: Message, sent: int) -> None:
-    """Put a message that also tells of other vehicles into the inbox.
-
-    Raises:
-        CoopenvError: it is malformed.
-        LookupError: likewise.
-    """
+    """Put a message that also tells of other vehicles into the inbox; errors are those of `read`."""
     m, extra = observer.memory, message.extra
     read(observer, sender, message, sent)
     if not m.inbox[sender]["valid"]:
