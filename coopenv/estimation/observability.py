@@ -41,27 +41,22 @@ class Scene(Protocol):
     @property
     def t(self) -> np.ndarray:
         """(K,) s."""
-        ...
 
     @property
     def position(self) -> np.ndarray:
         """(K, N, 3) m, map frame."""
-        ...
 
     @property
     def target_position(self) -> np.ndarray:
         """(K, T, 3) m, map frame."""
-        ...
 
     @property
     def visible(self) -> np.ndarray:
         """(K, N, T) bool."""
-        ...
 
     @property
     def vehicles(self) -> np.ndarray:
         """(N,) names."""
-        ...
 
 
 @dataclass(frozen=True)

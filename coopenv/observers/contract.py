@@ -186,15 +186,12 @@ class Observer(Protocol):
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose (rotation (3, 3), map position (3,)) with a covariance (6, 6) in LEFT coordinates."""
-        ...
 
     def update(self, tick: Tick) -> Estimate:
         """Take one camera tick."""
-        ...
 
     def message(self) -> Message:
         """Return what to broadcast now; called after `update` (or `reset`) when a message is due."""
-        ...
 
 
 @runtime_checkable
@@ -208,15 +205,12 @@ class JointObserver(Protocol):
 
     def reset(self, initial_poses: Sequence[tuple[Array, Array]], initial_covariances: Sequence[Array]) -> None:
         """Start at one pose and covariance per vehicle, as for `Observer`."""
-        ...
 
     def update(self, ticks: Sequence[Tick]) -> list[Estimate]:
         """Take one camera tick of every vehicle; received messages in it are empty."""
-        ...
 
     def messages(self) -> list[Message]:
         """Return what each vehicle had to send for this tick."""
-        ...
 
 
 Factory = Any  # builds an `Observer` from a `Setup`, or a `JointObserver` from a sequence of them

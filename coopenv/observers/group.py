@@ -38,11 +38,9 @@ class Tamper(Protocol):
 
     def applies(self, vehicle: int, time: float) -> bool:
         """Return whether it changes the message of a vehicle at a time, s."""
-        ...
 
     def told(self, observer: Observer, message: Message) -> Message:
         """Return what is broadcast in place of a message."""
-        ...
 
 
 class Group:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.estimation.metrics import orientation_error_deg
-from coopenv.observers.contract import Estimate, Factory
+from coopenv.observers.contract import Factory
 from coopenv.observers.group import Answer, Group, ObserverError, Tamper
-from coopenv.observers.recording import Recording
+from coopenv.observers.recording import Recording, Truth
 from coopenv.observers.registry import find
 
 PLANAR_STATES = (2, 3, 4)
@@ -80,17 +80,42 @@ def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = N
         CoopenvError: unknown name.
     """
     factory = find(observer)
-    log = _Log(recording)
-    group = Group(factory, recording.briefing, tamper)
+    r, failure = recording, ""
+    group, shape = Group(factory, r.briefing, tamper), (r.ticks, len(r.setups))
+    R, p, P = (np.full((*shape, *of), np.nan) for of in ((3, 3), (3,), (6, 6)))
+    nis, nis_dof, elapsed = np.full(shape, np.nan), np.zeros(shape, np.int64), np.full(shape, np.nan)
     try:
-        group.start(recording.start_rotation, recording.start_position)
-        for i, pose in enumerate(zip(recording.start_rotation, recording.start_position, strict=True)):
-            log.write(0, i, Answer(Estimate(*pose), 0.0))
-        for k, vehicle, answer in _play(group, recording):
-            log.write(k, vehicle, answer)
-    except ObserverError as failure:  # its row says what went wrong, the others go on
-        log.failure = str(failure)
-    return log.result(group)
+        group.start(r.start_rotation, r.start_position)
+        R[0], p[0] = r.start_rotation, r.start_position
+        for k, i, (estimate, seconds) in _play(group, r):
+            R[k, i], p[k, i], elapsed[k, i] = estimate.rotation, estimate.position, seconds
+            if estimate.covariance is not None:
+                P[k, i] = estimate.covariance
+            if estimate.nis is not None and estimate.nis_dof > 0:
+                nis[k, i], nis_dof[k, i] = estimate.nis, estimate.nis_dof
+    except ObserverError as error:  # its row says what went wrong, the others go on
+        failure = str(error)
+    coordinates = group.coordinates or Coordinates.LEFT
+    states = PLANAR_STATES if all(setup.planar for setup in r.setups) else tuple(range(6))
+    position_error, orientation_error, nees = _errors(r.truth, R, p, P, coordinates, states)
+    timed = [column[np.isfinite(column)] for column in elapsed[1:].T]
+    return Run(
+        t=r.t,
+        rotation=R,
+        position=p,
+        covariance=P,
+        coordinates=coordinates,
+        judged=r.truth.known,
+        position_error=position_error,
+        orientation_error=orientation_error,
+        nees=nees,
+        nees_dof=len(states),
+        nis=nis,
+        nis_dof=nis_dof,
+        bytes_per_second=group.mail.bytes / max(r.dt, (r.ticks - 1) * r.dt),
+        microseconds_per_update=np.array([1e6 * float(np.median(c)) if len(c) else np.nan for c in timed]),
+        failure=failure,
+    )
 
 
 def _play(group: Group, recording: Recording) -> Iterator[tuple[int, int, Answer]]:
@@ -105,61 +130,18 @@ def _play(group: Group, recording: Recording) -> Iterator[tuple[int, int, Answer
                 yield k, i, group.update(i, sensed, recording.inbox_tick[k, i])
 
 
-class _Log:
-    """Collects estimates and judges them at the end."""
-
-    def __init__(self, recording: Recording) -> None:
-        self.recording = recording
-        shape = (recording.ticks, len(recording.setups))
-        self.rotation, self.position = np.full((*shape, 3, 3), np.nan), np.full((*shape, 3), np.nan)
-        self.covariance, self.elapsed = np.full((*shape, 6, 6), np.nan), np.full(shape, np.nan)
-        self.nis, self.nis_dof = np.full(shape, np.nan), np.zeros(shape, np.int64)
-        self.failure = ""
-
-    def write(self, k: int, vehicle: int, answer: Answer) -> None:
-        """Keep one estimate."""
-        estimate = answer.estimate
-        self.rotation[k, vehicle], self.position[k, vehicle] = estimate.rotation, estimate.position
-        if estimate.covariance is not None:
-            self.covariance[k, vehicle] = estimate.covariance
-        if estimate.nis is not None and estimate.nis_dof > 0:
-            self.nis[k, vehicle], self.nis_dof[k, vehicle] = estimate.nis, estimate.nis_dof
-        self.elapsed[k, vehicle] = answer.elapsed
-
-    def result(self, group: Group) -> Run:
-        """Compare with the truth, where it is known."""
-        r, coordinates = self.recording, group.coordinates or Coordinates.LEFT
-        judged = r.truth.known
-        known = judged & np.isfinite(self.position[..., 0])
-        position_error, orientation_error, nees = (np.full(known.shape, np.nan) for _ in range(3))
-        R, p = r.truth.rotation, r.truth.position
-        R_hat, p_hat = self.rotation, self.position
-        position_error[known] = np.linalg.norm(p[known] - p_hat[known], axis=-1)
-        orientation_error[known] = orientation_error_deg(R[known], R_hat[known])
-        states = PLANAR_STATES if all(setup.planar for setup in r.setups) else tuple(range(6))
-        stated = known & np.isfinite(self.covariance[..., 0, 0])
-        if stated.any():
-            e = coordinates.error(R[stated], p[stated], R_hat[stated], p_hat[stated])[..., states]
-            P = self.covariance[stated][:, states][..., states]
-            with suppress(np.linalg.LinAlgError):  # some P is singular
-                nees[stated] = np.einsum("...i,...i", e, np.linalg.solve(P, e[..., None])[..., 0])
-        duration = max(r.dt, (r.ticks - 1) * r.dt)
-        timed = self.elapsed[1:]
-        micro = [1e6 * float(np.median(c[np.isfinite(c)])) if np.isfinite(c).any() else np.nan for c in timed.T]
-        return Run(
-            t=r.t,
-            rotation=self.rotation,
-            position=self.position,
-            covariance=self.covariance,
-            coordinates=coordinates,
-            judged=judged,
-            position_error=position_error,
-            orientation_error=orientation_error,
-            nees=nees,
-            nees_dof=len(states),
-            nis=self.nis,
-            nis_dof=self.nis_dof,
-            bytes_per_second=group.mail.bytes / duration,
-            microseconds_per_update=np.array(micro),
-            failure=self.failure,
-        )
+def _errors(
+    truth: Truth, R_hat: Array, p_hat: Array, P: Array, coordinates: Coordinates, states: tuple[int, ...]
+) -> tuple[Array, Array, Array]:
+    """Return position errors, orientation errors and NEES (K, N) where truth and estimate are known, NaN elsewhere."""
+    R, p, known = truth.rotation, truth.position, truth.known & np.isfinite(p_hat[..., 0])
+    position_error, orientation_error, nees = (np.full(known.shape, np.nan) for _ in range(3))
+    position_error[known] = np.linalg.norm(p[known] - p_hat[known], axis=-1)
+    orientation_error[known] = orientation_error_deg(R[known], R_hat[known])
+    stated = known & np.isfinite(P[..., 0, 0])
+    if stated.any():
+        e = coordinates.error(R[stated], p[stated], R_hat[stated], p_hat[stated])[..., states]
+        with suppress(np.linalg.LinAlgError):  # some P is singular
+            solved = np.linalg.solve(P[stated][:, states][..., states], e[..., None])[..., 0]
+            nees[stated] = np.einsum("...i,...i", e, solved)
+    return position_error, orientation_error, nees

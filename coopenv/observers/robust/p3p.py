@@ -190,10 +190,10 @@ def p3p_kernel(
 def solve_p3p(bearings: Array, positions: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Return every pose from which three points are seen in three directions, for each of B triples.
 
-    Bearings and positions (B, 3, 3) have a row each: unit vectors in the body frame, and points in the map, m. Rotations
-    (B, 4, 3, 3) are from body to map, camera positions (B, 4, 3) in the map, and a mask (B, 4) says what is a solution,
-    ordered by distance from the first point; the rest is NaN. A double one may come twice. There are none for points on
-    a line, bearings that are not of length 1, and what is not finite.
+    Bearings and positions (B, 3, 3) have a row each: unit vectors in the body frame, and points in the map, m.
+    Rotations (B, 4, 3, 3) are from body to map, cameras (B, 4, 3) in the map; a mask (B, 4) says what is a solution,
+    the nearest to the first point first; the rest is NaN. A double one may come twice. There are none for points on a
+    line, bearings that are not of length 1, and what is not finite.
     """
     start_warp()
     b, z = (np.ascontiguousarray(given, dtype=np.float64) for given in (bearings, positions))
