@@ -31,7 +31,7 @@ def scene(position: np.ndarray, targets: np.ndarray, ticks: int = 61) -> Traject
     per_vehicle = {
         field.name: getattr(run, field.name)[:, :1]
         for field in dataclasses.fields(run)
-        if field.name not in ("t", "vehicles", "targets", "target_moving", "target_position")
+        if field.name not in ("t", "terms", "vehicles", "targets", "target_moving", "target_position")
     }
     seen = np.ones((ticks, 1, len(targets)), bool)
     return dataclasses.replace(
@@ -203,7 +203,7 @@ def test_uneven_ticks_weigh_by_their_duration() -> None:
     uneven = {
         f.name: getattr(even, f.name)[keep]
         for f in dataclasses.fields(even)
-        if f.name not in ("vehicles", "targets", "target_moving")
+        if f.name not in ("terms", "vehicles", "targets", "target_moving")
     }
     window = 2.0
     result = analyse_observability(dataclasses.replace(even, **uneven), window)
