@@ -22,24 +22,27 @@ from coopenv.world.collision import UNDER_WAY, goal_distance
 from coopenv.world.precision import Precision
 
 
-@wp.func
-def clipped(value: wp.float32) -> wp.float32:
-    """Return a value of coopenv's, clipped to [-1, 1]."""
-    return wp.clamp(value, -1.0, 1.0)
+@cache
+def put(size: int, own: bool) -> wp.Function:
+    """Return what writes a value of so many entries x factor, clipped to [-1, 1]; NaN of own fields stays."""
+    many = size > 1
 
+    def put_value(
+        out: wp.array3d(dtype=wp.float32), world: int, vehicle: int, first: int, value: Any, factor: wp.float32
+    ):
+        for axis in range(size):
+            entry = wp.float32(value[axis] if many else value) * factor
+            clipped = wp.clamp(entry, -1.0, 1.0)
+            out[world, vehicle, first + axis] = wp.where(wp.isnan(entry), entry, clipped) if own else clipped
 
-@wp.func
-def clipped_own(value: wp.float32) -> wp.float32:
-    """Return a value of somebody's own, clipped to [-1, 1]; NaN stays, to be found later."""
-    return wp.where(wp.isnan(value), value, wp.clamp(value, -1.0, 1.0))
+    return wp.func(put_value)
 
 
 @cache
 def writer(field: Bound) -> wp.Function:
-    """Return what writes a field's value x factor, clipped, into its place."""
-    function, number, size = field.function, field.number, field.size
-    both, many = field.records == 2, field.size > 1
-    clip = clipped_own if field.own else clipped
+    """Return what writes a field's value into its place."""
+    function, number, size, both = field.function, field.number, field.size, field.records == 2
+    put_value = put(size, field.own)
 
     def write(
         out: wp.array3d(dtype=wp.float32),
@@ -52,12 +55,7 @@ def writer(field: Bound) -> wp.Function:
         other: Any,
     ):
         value = function(ego, other) if both else function(ego)
-        first = start[number] + n * size
-        if many:
-            for axis in range(size):
-                out[world, vehicle, first + axis] = clip(wp.float32(value[axis]) * factor[number])
-        else:
-            out[world, vehicle, first] = clip(wp.float32(value) * factor[number])
+        put_value(out, world, vehicle, start[number] + n * size, value, factor[number])
 
     return wp.func(write)
 
