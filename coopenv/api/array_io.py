@@ -63,10 +63,6 @@ class Exchange:
             tensor = self._tensors[name] = whole.reshape(self._rows, *whole.shape[2:])
         return tensor
 
-    def kept(self, name: str) -> Any:
-        """Return a field as an array that the next step does not touch."""
-        return self.owned(self.rows(name))
-
     def owned(self, rows: Any) -> Any:
         """Return rows that `rows()` gave, or dictionaries of them, as what the next step does not touch."""
         if isinstance(rows, dict):

@@ -188,10 +188,9 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             raise CoopenvError(f"{where}: not a mapping, but {type(state).__name__}")
         if state.get("scenario") != self.scenario:
             raise CoopenvError(f"{where}: it is of another scenario")
-        agents = state.get("agents")
-        if not isinstance(agents, list) or not all(isinstance(agent, str) for agent in agents):
-            raise CoopenvError(f"{where}: its agents are {shown(agents)}")
-        if agents != [agent for agent in self.possible_agents if agent in agents]:
+        agents: Any = state.get("agents")
+        plain = isinstance(agents, list) and all(isinstance(agent, str) for agent in agents)
+        if not plain or agents != [agent for agent in self.possible_agents if agent in agents]:
             raise CoopenvError(f"{where}: its agents are {shown(agents)}, not some of {shown(self.possible_agents)}")
         try:
             self.engine.set_state(state)

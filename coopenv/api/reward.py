@@ -1,6 +1,6 @@
 """A reward in Python: what a step came to, of all vehicles of all worlds at once, and a function of it."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ FIELDS = (
 OTHERS = ("truth", "estimate", "reward_terms", "visible", "time")
 
 
-class Step(Mapping[str, Any]):
+class Step:
     """What a step came to: the infos of N vehicles in W worlds as arrays, read-only until the next step.
 
     - `position_error` (m), `orientation_error` (deg), `nees`, `log_determinant`, `gramian_min_eigenvalue`,
@@ -76,9 +76,6 @@ class Step(Mapping[str, Any]):
 
     def __iter__(self) -> Iterator[str]:
         return iter((*FIELDS, *OTHERS))
-
-    def __len__(self) -> int:
-        return len(FIELDS) + len(OTHERS)
 
 
 RewardFunction = Callable[[Step], Any]

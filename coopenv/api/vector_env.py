@@ -111,7 +111,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         Raises:
             CoopenvError: a mask that splits a world, or a sequence of the wrong length.
         """
-        mask = self._world_mask(self._reset_mask(options))
+        mask = self._world_mask(options)
         self._exchange.follow_torch()
         seeds = self.engine.reset(self._world_seeds(seed), mask)
         if seeds is not None:
@@ -150,9 +150,9 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         ended = flags[1] | flags[2]
         if self._exchange.kind == "numpy" and not ended.any():
             return flags, infos
-        final = {"final_obs": self._exchange.kept("observation"), "_final_obs": ended}
+        observation = self._exchange.owned(self._exchange.rows("observation"))
+        final = {"final_obs": observation, "_final_obs": ended, "_final_info": ended}
         final["final_info"] = self._exchange.owned(infos)
-        final["_final_info"] = ended
         self.engine.restart_finished()
         return flags, {**self._infos(), **final}
 
@@ -160,35 +160,29 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         terms = dict(zip(self.engine.reward_terms, self._exchange.rows("terms").T, strict=True))
         return {**{name: self._exchange.rows(name) for name in INFO_FIELDS}, "reward_terms": terms}
 
-    def _reset_mask(self, options: Any) -> Any:
-        if options is None:
-            return None
-        if not isinstance(options, Mapping):
+    def _world_mask(self, options: Any) -> np.ndarray | None:
+        if options is not None and not isinstance(options, Mapping):
             raise CoopenvError(f"options must be a dict, got {type(options).__name__}")
-        for key in options:
+        for key in options or ():
             if key != "reset_mask":
                 raise CoopenvError(f"unknown option '{key}'{suggest(str(key), ['reset_mask'])}; known: reset_mask")
-        return options.get("reset_mask")
-
-    def _world_mask(self, mask: Any) -> np.ndarray | None:
-        if mask is None:
+        if not options or options["reset_mask"] is None:
             return None
         try:
-            chosen = np.asarray(mask)
+            chosen = np.asarray(options["reset_mask"])
         except (TypeError, ValueError, RuntimeError):
             chosen = np.empty(0)
         if chosen.dtype != bool or not chosen.any():
             raise CoopenvError("reset_mask must be an array of bool with at least one True")
         if chosen.shape == (self.num_envs,):
             by_world = self.world_major(chosen)
-            if (by_world.any(axis=1) != by_world.all(axis=1)).any():
-                world = int(np.flatnonzero(by_world.any(axis=1) != by_world.all(axis=1))[0])
-                raise CoopenvError(f"reset_mask splits world {world}: its {self.vehicles} rows are reset together")
+            split = np.flatnonzero(by_world.any(axis=1) != by_world.all(axis=1))
+            if split.size:
+                raise CoopenvError(f"reset_mask splits world {split[0]}: its {self.vehicles} rows are reset together")
             chosen = by_world[:, 0]
         if chosen.shape != (self.num_worlds,):
-            raise CoopenvError(
-                f"reset_mask has shape {chosen.shape}, expected ({self.num_envs},) rows or ({self.num_worlds},) worlds"
-            )
+            expected = f"({self.num_envs},) rows or ({self.num_worlds},) worlds"
+            raise CoopenvError(f"reset_mask has shape {chosen.shape}, expected {expected}")
         return chosen
 
     def _world_seeds(self, seed: int | Sequence[int] | None) -> list[int] | None:
@@ -241,12 +235,11 @@ def autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
     Raises:
         CoopenvError: no such mode.
     """
-    if isinstance(mode, AutoresetMode):
-        return mode
-    known = {m.name.lower(): m for m in AutoresetMode}
-    word = str(mode).lower().replace("-", "_").replace("nextstep", "next_step").replace("samestep", "same_step")
+    known = {word.lower(): m for m in AutoresetMode for word in (m.name, m.value)}
+    word = str(getattr(mode, "name", mode)).lower().replace("-", "_")
     if word not in known:
-        raise CoopenvError(f"unknown autoreset '{mode}'{suggest(word, known)}; known: {', '.join(known)}")
+        names = [m.name.lower() for m in AutoresetMode]
+        raise CoopenvError(f"unknown autoreset '{mode}'{suggest(word, names)}; known: {', '.join(names)}")
     return known[word]
 
 

@@ -6,12 +6,12 @@ privileged. Records: see `coopenv.api.terms.records`.
 
 import warp as wp
 
+from coopenv.api.step_results import DEGREES
 from coopenv.api.terms.records import Ego, Neighbour, Target, Truth
 from coopenv.world.collision import ARRIVED, COLLIDED
 
 EIGENVALUE_FLOOR = wp.constant(1.0e-9)
 LOG10_E = wp.constant(0.4342944819032518)
-DEGREES = wp.constant(57.29577951308232)
 
 
 @wp.func
