@@ -78,15 +78,15 @@ def test_held_commands_are_integrated_exactly(dataset):
     heading = np.concatenate([[0.0], np.cumsum(w[:-1]) * 1e-5])
     x = np.concatenate([[0.0], np.cumsum(v[:-1] * np.cos(heading[:-1])) * 1e-5])
     y = np.concatenate([[0.0], np.cumsum(v[:-1] * np.sin(heading[:-1])) * 1e-5])
-    np.testing.assert_allclose(held.heading(t), np.interp(t, fine, heading), atol=1e-4)
+    np.testing.assert_allclose(held.pose(t)[:, 2], np.interp(t, fine, heading), atol=1e-4)
     np.testing.assert_allclose(
-        held.position(t), np.stack([np.interp(t, fine, x), np.interp(t, fine, y)], -1), atol=1e-5
+        held.pose(t)[:, :2], np.stack([np.interp(t, fine, x), np.interp(t, fine, y)], -1), atol=1e-5
     )
 
 
 def test_a_command_is_not_held_for_ever(dataset):
     held = HeldCommands(replace(dataset.robots[0], odometry=np.array([[0.0, 0.2, 0.5], [9.0, 0.1, 0.0]])))
-    np.testing.assert_allclose(held.heading(np.array([1.0, 5.0, 20.0])), [0.5, 0.5 * MAX_HOLD_S, 0.5 * MAX_HOLD_S])
+    np.testing.assert_allclose(held.pose(np.array([1.0, 5.0, 20.0]))[:, 2], [0.5, 0.5 * MAX_HOLD_S, 0.5 * MAX_HOLD_S])
     v, _ = held.commands(np.array([-1.0, 1.0, 5.0, 9.5, 20.0]))
     assert v.tolist() == [0.0, 0.2, 0.0, 0.1, 0.0]
 

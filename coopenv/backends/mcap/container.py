@@ -6,11 +6,12 @@ Needs the extra `log`.
 from collections.abc import Iterator
 from dataclasses import replace
 from io import BytesIO
+from itertools import takewhile
 from pathlib import Path
 
 import zstandard
 from lz4.frame import LZ4FrameDecompressor
-from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Message, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Message, MessageIndex, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from coopenv.errors import DataError, check_memory
@@ -26,23 +27,22 @@ class Container:
     """An MCAP file, read from begin to end; the index behind its data says nothing that its records do not."""
 
     def __init__(self, path: Path) -> None:
-        """Check both ends of a file. Raises DataError: it is no MCAP file, or cut off."""
+        """Read a file. Raises DataError: it is no MCAP file, or cut off; other errors are the library's."""
         check_memory(path.stat().st_size, f"{path}:")
-        self._data = path.read_bytes()
-        if not self._data.startswith(MAGIC):
+        data = path.read_bytes()
+        if not data.startswith(MAGIC):
             raise DataError(f"{path}: not an MCAP file (it does not begin as one)")
-        if len(self._data) < 2 * len(MAGIC) or not self._data.endswith(MAGIC):
+        if len(data) < 2 * len(MAGIC) or not data.endswith(MAGIC):
             raise DataError(f"{path}: cut off, the end of the MCAP file is missing")
+        records = StreamReader(BytesIO(data), emit_chunks=True, record_size_limit=len(data)).records
+        section = takewhile(lambda record: not isinstance(record, DataEnd), records)
+        self._records = [record for record in section if not isinstance(record, MessageIndex)]
+        self._size = len(data)
 
     def extras(self) -> tuple[dict[str, dict[str, str]], dict[str, bytes]]:
-        """Return the file's metadata and its attachments, by name; errors are those of the library."""
-        metadata, attachments = {}, {}
-        for record in self._records():
-            if isinstance(record, Metadata):
-                metadata[record.name] = record.metadata
-            elif isinstance(record, Attachment):
-                attachments[record.name] = record.data
-        return metadata, attachments
+        """Return the file's metadata and its attachments, by name."""
+        metadata = {record.name: record.metadata for record in self._records if isinstance(record, Metadata)}
+        return metadata, {record.name: record.data for record in self._records if isinstance(record, Attachment)}
 
     def messages(self) -> Iterator[tuple[Channel, Schema | None, Message]]:
         """Yield all messages in the order of the file, each with its channel and the schema of that.
@@ -62,17 +62,10 @@ class Container:
                 channel = channels[record.channel_id]
                 yield channel, schemas.get(channel.schema_id), record
 
-    def _records(self) -> Iterator[McapRecord]:
-        """Yield the records of the data section, chunks as they are."""
-        for record in StreamReader(BytesIO(self._data), emit_chunks=True, record_size_limit=len(self._data)).records:
-            if isinstance(record, DataEnd):
-                return
-            yield record
-
     def _unpacked(self) -> Iterator[McapRecord]:
         """Yield the records inside and outside of chunks."""
-        allowance = MAX_CHUNK_BYTES + MAX_EXPANSION * len(self._data)
-        for record in self._records():
+        allowance = MAX_CHUNK_BYTES + MAX_EXPANSION * self._size
+        for record in self._records:
             if isinstance(record, Chunk):
                 data = _unpack(record, min(MAX_CHUNK_BYTES, allowance))
                 allowance -= len(data)

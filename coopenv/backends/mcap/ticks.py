@@ -29,6 +29,10 @@ class TickArrays:
         self._ticks, self._targets = ticks, targets
         self._landmarks: dict[int, np.ndarray] = {}
         self._places = {topic(name, field): (field, i) for i, name in enumerate(vehicles) for field in EXACT}
+        self._columns = {
+            name: [(part, self._arrays[array][:, i]) for part, array in CONTENTS[field].items()]
+            for name, (field, i) in self._places.items()
+        }
         self._seen = {name: np.zeros(ticks, dtype=bool) for name in self._places}
 
     def put(self, name: str, k: int, message: Any) -> None:
@@ -45,9 +49,8 @@ class TickArrays:
         self._seen[name][k] = True
         if field == "bearings":
             self._put_bearings(k, i, message)
-        for part, array in CONTENTS[field].items():
-            row = self._arrays[array][k, i, ...]
-            row[...] = getattr(message, part).reshape(row.shape)
+        for part, column in self._columns[name]:
+            column[k] = getattr(message, part).reshape(column.shape[1:])
 
     def _put_bearings(self, k: int, i: int, m: Any) -> None:
         targets, count = m.targets, len(m.targets)

@@ -1,6 +1,7 @@
 """Write a recording as one MCAP file."""
 
 import hashlib
+from collections.abc import Iterator
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -82,29 +83,29 @@ class _Log:
         changed = (r.landmarks[1:] != r.landmarks[:-1]).any(axis=(1, 2))
         for k in [0, *(np.flatnonzero(changed) + 1).tolist()]:
             poses = self._poses(r.landmarks[k], np.broadcast_to(np.eye(3), (*r.landmarks[k].shape, 3)))
-            self._send(LANDMARKS, LANDMARKS_TYPE, k, "map", poses=poses)
+            self._send(LANDMARKS, LANDMARKS_TYPE, k, "map", poses=list(poses))
         self.writer.finish()
 
     def _write_vehicle(self, i: int, name: str) -> None:
         r, known = self.recording, np.flatnonzero(self.recording.truth.known[:, i])
+        columns = {
+            field: {part: attrgetter(array)(r)[:, i].reshape(r.ticks, -1) for part, array in CONTENTS[field].items()}
+            for field in EXACT
+        }
         for k, shown in enumerate(self._poses(*_dead_reckoned(r, i))):
-            for field in EXACT:
-                frame = "map" if field == "truth_exact" else name
-                self._send(topic(name, field), EXACT[field], k, frame, **self._row(field, k, i))
+            for field, parts in columns.items():
+                row = {part: column[k] for part, column in parts.items()} or self._bearings(k, i)
+                self._send(topic(name, field), EXACT[field], k, "map" if field == "truth_exact" else name, **row)
             self._show_odometry(k, i, name, shown)
         truth = self._poses(r.truth.position[known, i], r.truth.rotation[known, i])
         for k, pose in zip(known.tolist(), truth, strict=True):
             self._send(topic(name, "truth"), SHOWN["truth"], k, "map", pose=pose)
 
-    def _row(self, field: str, k: int, i: int) -> dict[str, Any]:
-        """Return the entries of a message that is read back."""
+    def _bearings(self, k: int, i: int) -> dict[str, Any]:
         r = self.recording
-        row = {part: attrgetter(array)(r)[k, i].ravel() for part, array in CONTENTS[field].items()}
-        if field == "bearings":
-            seen = np.flatnonzero(r.visible[k, i] | ~np.isnan(r.bearings[k, i]).all(axis=1))
-            row = {"targets": seen.astype(np.uint32), "visible": r.visible[k, i, seen]}
-            row |= {"due": bool(r.due[k]), "vectors": r.bearings[k, i, seen].ravel()}
-        return row
+        seen = np.flatnonzero(r.visible[k, i] | ~np.isnan(r.bearings[k, i]).all(axis=1))
+        row = {"targets": seen.astype(np.uint32), "visible": r.visible[k, i, seen]}
+        return {**row, "due": bool(r.due[k]), "vectors": r.bearings[k, i, seen].ravel()}
 
     def _show_odometry(self, k: int, i: int, name: str, pose: Any) -> None:
         vectors = (self.recording.velocity[k, i], self.recording.angular_velocity[k, i])
@@ -117,18 +118,17 @@ class _Log:
         }
         self._send(topic(name, "odometry"), SHOWN["odometry"], k, "map", **about)
 
-    def _poses(self, positions: np.ndarray, rotations: np.ndarray) -> list[Any]:
+    def _poses(self, positions: np.ndarray, rotations: np.ndarray) -> Iterator[Any]:
         quaternions = Rotation.from_matrix(rotations).as_quat().tolist() if len(rotations) else []
         pose, point, orientation = (self.types[name] for name in ("Pose", "Point", "Quaternion"))
         pairs = zip(positions.tolist(), quaternions, strict=True)
-        return [pose(point(*position), orientation(*quaternion)) for position, quaternion in pairs]
+        return (pose(point(*position), orientation(*quaternion)) for position, quaternion in pairs)
 
     def _send(self, name: str, kind: str, k: int, frame: str, **fields: Any) -> None:
         nanoseconds = round(k * self.recording.dt * 1e9)
         stamp = self.types["builtin_interfaces/msg/Time"](*divmod(nanoseconds, 10**9))
         header = self.types["std_msgs/msg/Header"](stamp, frame)
-        arrays = {key: np.ascontiguousarray(v) if isinstance(v, np.ndarray) else v for key, v in fields.items()}
-        data = bytes(self.codec.serialize_cdr(self.codec.types[kind](header=header, **arrays), kind))
+        data = bytes(self.codec.serialize_cdr(self.codec.types[kind](header=header, **fields), kind))
         self.writer.add_message(self._channel(name, kind), nanoseconds, data, nanoseconds, k)
 
     def _channel(self, name: str, kind: str) -> int:

@@ -1,4 +1,4 @@
-"""The held commands of one robot, integrated exactly: dead-reckoned headings and positions at any time."""
+"""The held commands of one robot, integrated exactly: dead-reckoned poses at any time."""
 
 from functools import cached_property
 
@@ -25,17 +25,13 @@ class HeldCommands:
         k = np.searchsorted(self._t, t, side="right") - 1
         return np.where(k < 0, 0.0, self._v[k]), np.where(k < 0, 0.0, self._omega[k])
 
-    def heading(self, t: Array) -> Array:
-        """Return the turn (K,) in rad since the first command, at times t (K,) in s."""
-        k = np.searchsorted(self._t, t, side="right") - 1
-        return np.where(k < 0, 0.0, self._at_samples[k, 2] + self._omega[k] * (t - self._t[k]))
-
-    def position(self, t: Array) -> Array:
-        """Return the position (K, 2) in m, in the frame of the pose at the first command, at times t (K,) in s."""
+    def pose(self, t: Array) -> Array:
+        """Return x, y in m and heading in rad (K, 3), seen from the pose at the first command, at times t (K,) in s."""
         k = np.searchsorted(self._t, t, side="right") - 1
         start, dt = self._at_samples[k], t - self._t[k]
-        moved = start[:, :2] + _arc(start[:, 2], self._v[k] * dt, self._omega[k] * dt)
-        return np.where((k < 0)[:, None], 0.0, moved)
+        turn = self._omega[k] * dt
+        moved = start[:, :2] + _arc(start[:, 2], self._v[k] * dt, turn)
+        return np.where((k < 0)[:, None], 0.0, np.column_stack([moved, start[:, 2] + turn]))
 
     @cached_property
     def _at_samples(self) -> Array:

@@ -46,11 +46,8 @@ def recording_of(dataset: Dataset, variant: Variant) -> Recording:
     """Put a sub-dataset on ticks.
 
     Truth is NaN where motion capture is not valid. Every robot starts at its true pose; one that motion capture sees
-    later starts where dead reckoning, back from there, says.
-
-    Args:
-        dataset: what was recorded.
-        variant: `landmarks` (no robot sees another), `landmarks+robots`, or `blind` (robots 3 to 5 see robots only).
+    later starts where dead reckoning, back from there, says. In the variant `landmarks` no robot sees another, in
+    `landmarks+robots` everything counts, and in `blind` robots 3 to 5 see robots only.
 
     Raises:
         DataError: unknown variant, motion capture never sees a robot, or its data make no sense.
@@ -72,17 +69,17 @@ def recording_of(dataset: Dataset, variant: Variant) -> Recording:
     pose, start = np.zeros((K, N, 3)), np.zeros((N, 3))
     for i, robot in enumerate(dataset.robots):
         held = HeldCommands(robot)
-        heading, position = held.heading(t), held.position(t)
+        reckoned = held.pose(t)
         arrays["velocity"][:, i, 0], arrays["angular_velocity"][:, i, 2] = held.commands(t)
-        arrays["translation"][1:, i, :2] = _turned(np.diff(position, axis=0), -heading[:-1])
-        arrays["rotation"][1:, i] = _yaw(np.diff(heading))
+        arrays["translation"][1:, i, :2] = _turned(np.diff(reckoned[:, :2], axis=0), -reckoned[:-1, 2])
+        arrays["rotation"][1:, i] = _yaw(np.diff(reckoned[:, 2]))
         k, seen, vectors = _seen(robot, variant, held, t)
         arrays["bearings"][k, i, column[seen]], arrays["visible"][k, i, column[seen]] = vectors, True
         pose[:, i] = _truth(robot, held, t)
         start[i], arrays["start_covariance"][i] = _start(robot, held, pose[:, i], t)
     points = np.array([[*dataset.landmarks[subject], 0.0] for subject in subjects[:L]])
     arrays["landmarks"] = np.broadcast_to(points, (K, L, 3))
-    arrays["start_rotation"], arrays["start_position"] = _yaw(start[:, 2]), start * (1.0, 1.0, 0.0)
+    arrays["start_rotation"], arrays["start_position"] = _yaw(start[:, 2]), np.insert(start[:, :2], 2, 0.0, axis=1)
     for array in arrays.values():
         array.setflags(write=False)  # observers get views
     recording = Recording(
@@ -148,7 +145,7 @@ def _seen(robot: Robot, variant: Variant, held: HeldCommands, t: Array) -> tuple
     k = np.maximum(np.searchsorted(t, time), 1)
     inside = k < len(t)
     k = k[inside]
-    beta = angle[inside] - (held.heading(t[k]) - held.heading(time[inside]))
+    beta = angle[inside] - (held.pose(t[k]) - held.pose(time[inside]))[:, 2]
     vectors = np.array([(math.cos(b), math.sin(b), 0.0) for b in beta.tolist()]).reshape(-1, 3)
     return k, who[inside].astype(np.int64), vectors
 
@@ -165,10 +162,8 @@ def _truth(robot: Robot, held: HeldCommands, t: Array) -> Array:
     alone = np.flatnonzero(gap[:-1] & gap[1:] & (rows >= 0) & (rows <= t[-1]))
     k = np.rint(rows[alone] / TICK_S).astype(int)
     alone, k = alone[k < len(t)], k[k < len(t)]
-    turn = held.heading(t[k]) - held.heading(rows[alone])
-    at_row = robot.truth.heading[alone]
-    moved = _turned(held.position(t[k]) - held.position(rows[alone]), at_row - held.heading(rows[alone]))
-    pose[k] = np.column_stack([robot.truth.position[alone] + moved, at_row + turn])
+    at_rows = np.column_stack([robot.truth.position[alone], robot.truth.heading[alone]])
+    pose[k] = _moved(at_rows, held.pose(rows[alone]), held.pose(t[k]))
     valid[k] = True
     heading_valid[k] = robot.truth.at(rows[alone])[3]
     pose[~valid] = np.nan
@@ -181,12 +176,15 @@ def _start(robot: Robot, held: HeldCommands, pose: Array, t: Array) -> tuple[Arr
     known = np.flatnonzero(np.isfinite(pose).all(axis=1))
     if known.size == 0:
         raise DataError(f"robot {robot.subject}: no ground truth while it records odometry")
-    first = int(known[0])
-    position, heading = held.position(t[[0, first]]), held.heading(t[[0, first]])
-    at_start = pose[first, 2] - heading[1] + heading[0]
-    back = _turned((position[0] - position[1])[None], np.array([pose[first, 2] - heading[1]]))[0]
+    first = known[:1]
     variances = np.square(START_STD) + np.square(DRIFT_STD) * t[first]
-    return np.array([*(pose[first, :2] + back), at_start]), np.diag(np.repeat(variances, 3))
+    return _moved(pose[first], held.pose(t[first]), held.pose(t[:1]))[0], np.diag(np.repeat(variances, 3))
+
+
+def _moved(pose: Array, before: Array, after: Array) -> Array:
+    """Return poses (K, 3) x, y, heading after the motion that leads from some poses to others."""
+    position = pose[:, :2] + _turned(after[:, :2] - before[:, :2], pose[:, 2] - before[:, 2])
+    return np.column_stack([position, pose[:, 2] + (after[:, 2] - before[:, 2])])
 
 
 def _turned(vectors: Array, angle: Array) -> Array:

@@ -2,6 +2,9 @@
 
 import os
 import re
+import warnings
+from functools import cached_property
+from io import StringIO
 from pathlib import Path
 from typing import NoReturn
 
@@ -52,34 +55,51 @@ class Table:
     def __init__(self, path: Path, columns: int, least: int) -> None:
         """Read a file that has so many columns, and at least so many rows; a DataError names a line that is not so."""
         try:
-            lines = path.read_text(encoding="latin-1").split("\n")
+            self.path, self._text = path, path.read_text(encoding="latin-1")
         except OSError as error:
             why = f"cannot be read ({error.strerror})" if path.is_file() else "no such file"
             raise DataError(f"{path}: {why}") from None
-        self.path, self.lines, last, rows = path, list[int](), [""], list[list[float]]()
-        for number, line in enumerate(lines, start=1):
-            if fields := line.partition("#")[0].split():
-                self.lines.append(number)
-                if len(fields) != columns:
-                    self.refuse(-1, f"{len(fields)} columns, expected {columns}")
-                try:
-                    rows.append([float(field) for field in fields])
-                except ValueError as error:
-                    self.refuse(-1, f"{str(error).partition(': ')[2][:42]} is not a number")
-                last = [last[-1], fields[-1]]
-        self.values = np.array(rows, dtype=np.float64).reshape(-1, columns)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # a file without rows
+                self.values = np.loadtxt(StringIO(self._text), dtype=np.float64, ndmin=2)
+        except ValueError:
+            self._explain(columns)
+        if self.values.size == 0:
+            self.values = np.empty((0, columns))
+        if self.values.shape[1] != columns:
+            self._explain(columns)
         for row in np.flatnonzero(~np.isfinite(self.values).all(axis=1)).tolist():
             self.refuse(row, "a value is not finite")
-        if len(rows) < least:
-            end = max(len(lines) - (lines[-1] == ""), 1)
-            raise DataError(f"{path}:{end}: {len(rows)} rows of data, expected at least {least}")
-        above, here = (len(field.partition(".")[2]) for field in last) if len(rows) > 1 else (0, 0)
-        if self.lines[-1:] == [len(lines)] and here < above:  # a last line without an end
-            self.refuse(-1, f"cut off in the middle of the last number {last[-1]!r}")
+        if len(self.values) < least:
+            end = max(len(self._text.rstrip("\n").split("\n")), 1)
+            raise DataError(f"{path}:{end}: {len(self.values)} rows of data, expected at least {least}")
+        if len(self.values) > 1 and not self._text.endswith("\n"):  # cut in the middle of a number?
+            above, (number, last) = self._rows[-2][1][-1], (self._rows[-1][0], self._rows[-1][1][-1])
+            if number == self._text.count("\n") + 1 and len(last.partition(".")[2]) < len(above.partition(".")[2]):
+                self.refuse(-1, f"cut off in the middle of the last number {last!r}")
+
+    @cached_property
+    def _rows(self) -> list[tuple[int, list[str]]]:
+        """Number and fields of each line that holds data."""
+        split = ((number, line.partition("#")[0].split()) for number, line in enumerate(self._text.split("\n"), 1))
+        return [(number, fields) for number, fields in split if fields]
+
+    def _explain(self, columns: int) -> NoReturn:
+        """Blame the line that the fast reader has refused."""
+        for row, (_, fields) in enumerate(self._rows):
+            if len(fields) != columns:
+                self.refuse(row, f"{len(fields)} columns, expected {columns}")
+            for field in fields:
+                try:
+                    float(field)
+                except ValueError:
+                    self.refuse(row, f"{field[:40]!r} is not a number")
+        raise DataError(f"{self.path}: not a table of {columns} columns of numbers")
 
     def refuse(self, row: int, why: str) -> NoReturn:
         """Blame a row of data, by its line in the file."""
-        raise DataError(f"{self.path}:{self.lines[row]}: {why}")
+        raise DataError(f"{self.path}:{self._rows[row][0]}: {why}")
 
     def whole(self, column: int) -> list[int]:
         """Return a column of whole numbers. Raises DataError: a number is not whole."""
