@@ -49,11 +49,7 @@ def run(
 
 
 def refuse_for_recordings(environment: str, seed: int, policy: str) -> None:
-    """Refuse options that only a simulation knows.
-
-    Raises:
-        CoopenvError: one was given for a recording.
-    """
+    """Refuse options that only a simulation knows where they are given for a recording."""
     from coopenv.backends.sources import is_recorded
 
     for option, value in (("--seed", seed), ("--policy", policy)):

@@ -168,17 +168,14 @@ def _without_wraps(angle: np.ndarray) -> np.ndarray:
 def _marks(converged: bool, shaded: bool, ended: bool) -> list[Line2D | Patch]:
     """Return what the legend explains of all that is in the figure."""
     ink, tolerance = style.INK, f"{CONVERGED.position_m:g} m, {CONVERGED.orientation_deg:g} deg"
-    marks: list[Line2D | Patch] = [
-        Line2D([], [], color=ink, linestyle="none", marker="o", markersize=_DOT, label="at t = 0"),
-        Line2D([], [], color=style.GREY, linestyle=_DOTTED, linewidth=0.9, label=tolerance),
+    marks: list[tuple[bool, Line2D | Patch]] = [
+        (True, Line2D([], [], color=ink, linestyle="none", marker="o", markersize=_DOT, label="at t = 0")),
+        (True, Line2D([], [], color=style.GREY, linestyle=_DOTTED, linewidth=0.9, label=tolerance)),
+        (converged, Line2D([], [], color=ink, linestyle=_DASHED, linewidth=0.8, label="below both from here on")),
+        (shaded, Patch(facecolor=style.SHADE, label="moving target detected")),
+        (ended, Patch(facecolor=style.ENDED, label="ended, parked")),
     ]
-    if converged:
-        marks.append(Line2D([], [], color=ink, linestyle=_DASHED, linewidth=0.8, label="below both from here on"))
-    if shaded:
-        marks.append(Patch(facecolor=style.SHADE, label="moving target detected"))
-    if ended:
-        marks.append(Patch(facecolor=style.ENDED, label="ended, parked"))
-    return marks
+    return [mark for occurs, mark in marks if occurs]
 
 
 def _add_legends(figure: Figure, height: float, marks: list[Line2D | Patch]) -> None:

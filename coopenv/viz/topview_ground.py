@@ -109,31 +109,27 @@ def label_landmark(ax: Axes, name: str, place: np.ndarray) -> Annotation:
 
 def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
     """Explain the marks that can occur in this scenario, under a table of `rows` rows."""
-    handles: list[Artist] = [
-        Patch(facecolor=GREY, edgecolor=INK, linewidth=0.7, label="vehicle, true"),
-        Patch(facecolor="white", edgecolor=GREY, linewidth=1.4, label="its estimate"),
-        Line2D([], [], color=GREY, linewidth=1.0, linestyle=DOTTED, label="error of the estimate"),
-        Patch(facecolor="#7F7F7F30", edgecolor=GREY, linewidth=0.8, label="3σ of the estimate"),
+    sensed, end = scenario.topology.mode == "sensed", scenario.termination
+    moving = any(landmark.motion.kind != "static" for landmark in scenario.landmarks)
+    goals, bodies = (any(getattr(vehicle, part) for vehicle in scenario.vehicles) for part in ("goal", "body"))
+    marks: list[tuple[object, Artist]] = [
+        (True, Patch(facecolor=GREY, edgecolor=INK, linewidth=0.7, label="vehicle, true")),
+        (True, Patch(facecolor="white", edgecolor=GREY, linewidth=1.4, label="its estimate")),
+        (True, Line2D([], [], color=GREY, linewidth=1.0, linestyle=DOTTED, label="error of the estimate")),
+        (True, Patch(facecolor="#7F7F7F30", edgecolor=GREY, linewidth=0.8, label="3σ of the estimate")),
+        (sees_a_part(scenario), Patch(facecolor="#7F7F7F24", edgecolor="none", label="field of view")),
+        (True, _sight(Sight.VISIBLE, "sees (its colour)")),
+        (sensed and scenario.obstacles, _sight(Sight.OCCLUDED_BY_BUILDING, "hidden by a building")),
+        (sensed, _sight(Sight.OCCLUDED_BY_BODY, "hidden by a body")),
+        (scenario.camera.miss_probability > 0, _sight(Sight.MISSED, "in view, but missed")),
+        (True, _mark("o", DARK_BLUE, DARK_BLUE, 5, "landmark")),
+        (moving, _mark("D", DARK_BLUE, DARK_BLUE, 4.5, "moving landmark")),
+        (goals, _mark("o", GREY, "white", 7, "goal")),
+        (goals and end.arrival, _mark("*", INK, "white", 9, "arrived")),
+        (bodies and end.collision, _mark("X", "white", INK, 8, "collided")),
+        (True, _mark(">", GREY, "white", 6, "estimate outside")),
     ]
-    if sees_a_part(scenario):
-        handles.append(Patch(facecolor="#7F7F7F24", edgecolor="none", label="field of view"))
-    handles.append(_sight(Sight.VISIBLE, "sees (its colour)"))
-    if scenario.topology.mode == "sensed":
-        if scenario.obstacles:
-            handles.append(_sight(Sight.OCCLUDED_BY_BUILDING, "hidden by a building"))
-        handles.append(_sight(Sight.OCCLUDED_BY_BODY, "hidden by a body"))
-    if scenario.camera.miss_probability > 0:
-        handles.append(_sight(Sight.MISSED, "in view, but missed"))
-    handles.append(_mark("o", DARK_BLUE, DARK_BLUE, 5, "landmark"))
-    if any(landmark.motion.kind != "static" for landmark in scenario.landmarks):
-        handles.append(_mark("D", DARK_BLUE, DARK_BLUE, 4.5, "moving landmark"))
-    if any(vehicle.goal for vehicle in scenario.vehicles):
-        handles.append(_mark("o", GREY, "white", 7, "goal"))
-        if scenario.termination.arrival:
-            handles.append(_mark("*", INK, "white", 9, "arrived"))
-    if scenario.termination.collision and any(vehicle.body for vehicle in scenario.vehicles):
-        handles.append(_mark("X", "white", INK, 8, "collided"))
-    handles.append(_mark(">", GREY, "white", 6, "estimate outside"))
+    handles = [handle for occurs, handle in marks if occurs]
     place = pixels(PANEL - 4, TABLE_TOP - ROW * (rows + 1))
     gaps = {"borderaxespad": 0.0, "borderpad": 0.0, "handlelength": 1.9, "labelspacing": 0.42}
     legend(figure, handles, "upper left", place, labelcolor=INK, **gaps)

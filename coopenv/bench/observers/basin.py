@@ -133,11 +133,7 @@ def draw_starts(task: BasinTask) -> list[Draw]:
 
 
 def check_source(source: Source) -> None:
-    """Make sure that basins can be studied on a source.
-
-    Raises:
-        CoopenvError: they cannot.
-    """
+    """Refuse a source on which basins cannot be studied."""
     if not source.seeded:
         raise CoopenvError(f"--basin: {source.name} is recorded; basins are studied in simulated environments")
 

@@ -147,11 +147,7 @@ def print_tables(found: Found, printed: Console) -> None:
 
 
 def figure_files(variants: Sequence[str], form: str | None) -> dict[str, tuple[str, str]]:
-    """Return the names of figures as files, each with its kind and variant.
-
-    Raises:
-        CoopenvError: no such format.
-    """
+    """Return the names of figures as files in a format, each with its kind and variant."""
     if form is None:
         return {}
     if form not in FORMATS:
@@ -161,11 +157,7 @@ def figure_files(variants: Sequence[str], form: str | None) -> dict[str, tuple[s
 
 
 def write_files(found: Found, command: str, out: Path, figures: Mapping[str, tuple[str, str]]) -> None:
-    """Write the leaderboard as JSON and CSV, the draws as CSV, the report, and figures by name, kind and variant.
-
-    Raises:
-        OutputError: a file cannot be written.
-    """
+    """Write the leaderboard as JSON and CSV, the draws as CSV, the report, and figures by name, kind and variant."""
     from coopenv.bench.observers.figures import KINDS
     from coopenv.bench.observers.report import report_text
     from coopenv.viz.style import save

@@ -14,7 +14,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from coopenv.errors import CoopenvError
 from coopenv.interrupts import end_with_parent, held
@@ -26,35 +26,6 @@ R = TypeVar("R")
 AUTO = "auto"
 EXECUTORS = ("local", "ray")
 PATIENCE = 30.0  # s, to reach a cluster
-
-
-class Executor(Protocol):
-    """Runs tasks somewhere."""
-
-    def map(self, function: Callable[[T], R], tasks: Sequence[T], on_done: Callable[[int], None]) -> list[R]:
-        """Return function(task) of every task, in their order; calls `on_done(count)` whenever one is done."""
-        ...
-
-
-def find_executor(name: str, jobs: int | None = None, address: str | None = None) -> Executor:
-    """Return an executor that is ready, by its name and the options of `bench observers`.
-
-    Raises:
-        CoopenvError: no such executor, an option of the other one, or it is not ready.
-    """
-    if name not in EXECUTORS:
-        raise CoopenvError(f"--engine {name}: known are {', '.join(EXECUTORS)}")
-    if name == "local":
-        if address is not None:
-            raise CoopenvError(f"--address {address}: only --engine ray has an address")
-        return Local(jobs or available_cores())
-    if jobs is not None:
-        raise CoopenvError(f"--jobs {jobs}: with --engine ray the cluster decides")
-    if address not in (None, AUTO):
-        reach(address)
-    executor = Ray(address or AUTO)
-    executor.connect()
-    return executor
 
 
 @dataclass(frozen=True)
@@ -107,11 +78,7 @@ def _deaf_children() -> Iterator[None]:
 
 
 def _check_sendable(task: object) -> None:
-    """Make sure that a task can be sent to another process.
-
-    Raises:
-        CoopenvError: it cannot, most likely because an observer is a lambda or defined within a function.
-    """
+    """Refuse what cannot be sent to another process, most likely an observer that is defined within a function."""
     try:
         pickle.dumps(task)
     except Exception as error:
@@ -177,6 +144,30 @@ class Ray:
                 "RAY_AUTH_TOKEN_PATH)"
             )
         return ray
+
+
+Executor = Local | Ray
+
+
+def find_executor(name: str, jobs: int | None = None, address: str | None = None) -> Executor:
+    """Return an executor that is ready, by its name and the options of `bench observers`.
+
+    Raises:
+        CoopenvError: no such executor, an option of the other one, or it is not ready.
+    """
+    if name not in EXECUTORS:
+        raise CoopenvError(f"--engine {name}: known are {', '.join(EXECUTORS)}")
+    if name == "local":
+        if address is not None:
+            raise CoopenvError(f"--address {address}: only --engine ray has an address")
+        return Local(jobs or available_cores())
+    if jobs is not None:
+        raise CoopenvError(f"--jobs {jobs}: with --engine ray the cluster decides")
+    if address not in (None, AUTO):
+        reach(address)
+    executor = Ray(address or AUTO)
+    executor.connect()
+    return executor
 
 
 def reach(address: str, patience: float = 10.0) -> None:

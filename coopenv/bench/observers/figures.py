@@ -32,12 +32,9 @@ _DASHED, _DOTTED = (0, (4, 1.5)), (0, (1, 1))
 
 
 def error_figure(board: Leaderboard, variant: str, width: float | None = None) -> Figure | None:
-    """Draw position errors against time: a row per observer, a column per vehicle.
+    """Draw position errors against time, a row per observer, a column per vehicle; None where every observer failed.
 
     Median over the seeds of the error and of three standard deviations that the observer claims, beside the bound.
-
-    Returns:
-        None where every observer failed.
     """
     groups = board.samples_in(variant)
     if not groups:
@@ -79,8 +76,7 @@ def error_figure(board: Leaderboard, variant: str, width: float | None = None) -
 def nees_figure(board: Leaderboard, variant: str, width: float | None = None) -> Figure | None:
     """Draw NEES, averaged over the seeds at each instant, with the bounds that hold for it at each instant.
 
-    Returns:
-        None where no observer states a covariance.
+    None where no observer states a covariance.
     """
     groups = {name: own for name, own in board.samples_in(variant).items() if np.isfinite(own[0].series.nees[1:]).any()}
     if not groups:
@@ -139,8 +135,7 @@ def _share_axes(axes: np.ndarray, columns: int, t: np.ndarray) -> None:
 def variant_figure(board: Leaderboard, variant: str, width: float | None = None) -> Figure | None:
     """Draw a heat map of the mean position RMSE: a row per observer, a column per variant (all of them).
 
-    Returns:
-        None where there is one variant only, or everybody failed.
+    None where there is one variant only, or everybody failed.
     """
     variants, names = list(board.variants), board.ranked
     table = np.array([[board.totals[variant, name].rmse.value for variant in variants] for name in names])
@@ -174,8 +169,7 @@ def variant_figure(board: Leaderboard, variant: str, width: float | None = None)
 def cost_figure(board: Leaderboard, variant: str, width: float | None = None) -> Figure | None:
     """Draw the mean position RMSE of a variant against the time of an update; the area tells the bytes sent.
 
-    Returns:
-        None where every observer failed.
+    None where every observer failed.
     """
     names = list(board.samples_in(variant))
     if not names:

@@ -4,7 +4,7 @@ import io
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, fields
+from dataclasses import fields
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -35,15 +35,11 @@ def report_text(
     """Return the report as one HTML text; `content` of `leaderboard.json` tells the command and versions."""
     variants = [_variant(board, name) for name in board.variants]
     nominal = variants[0]["name"] == NOMINAL
-    versions = ", ".join(f"{name} {version}" for name, version in content["versions"].items())
     template = _environment().get_template("report.html.j2")
     return template.render(
-        title=f"Observers in {board.environment}",
-        command=content["command"],
-        facts=f"{board.title}. Versions: {versions}.",
-        runs=len(board.seeds),
+        board=board,
+        content=content,
         vehicles=board.samples[0].scene.vehicles,
-        ranked=board.ranked,
         boards=variants[:1] if nominal else variants,  # faults have one table
         variants=variants,
         nominal=nominal,
@@ -55,7 +51,6 @@ def report_text(
         basin_failures=basin_failures(basins),
         basin_map=_svg(basin_figure(board.environment, draws)) if draws else "",
         basin_caption=BASIN_CAPTION,
-        rows=[asdict(row) for row in board.rows],
         columns=[f.name for f in fields(Row) if f.name not in ("environment", "failure")],
         definitions={f.name: f.metadata["meaning"] for f in fields(Row)},
     )

@@ -88,22 +88,16 @@ UNKNOWN = Measured(float("nan"), float("nan"))
 
 
 def mean_root(squares: Array) -> Measured:
-    """Return the mean over vehicles of the root of the mean over seeds.
+    """Return the mean over vehicles of the root of the mean over seeds, of mean squares (S, N).
 
-    Args:
-        squares: (S, N) mean squares of S seeds and N vehicles; vehicles of one seed may depend on one another.
+    Vehicles of one seed may depend on one another.
     """
     value, each = _linearised(squares)
     return Measured(value, standard_error(each))
 
 
 def ratio(squares: Array, reference: Array) -> Measured:
-    """Return `mean_root(squares)` over `mean_root(reference)`, seed against seed.
-
-    Args:
-        squares: (S, N).
-        reference: (S, N) of the same seeds, whose error partly cancels.
-    """
+    """Return `mean_root(squares)` over `mean_root(reference)`, both (S, N) of the same seeds: errors partly cancel."""
     (above, each_above), (below, each_below) = _linearised(squares), _linearised(reference)
     if not below > 0.0:
         return UNKNOWN
