@@ -33,6 +33,10 @@ SMALL, NORMAL = 7.5, 9.0  # pt
 HALO = (withStroke(linewidth=2.0, foreground="white"),)  # of words that stand on lines
 MAX_POINTS = 1500  # of a line: more than the pixels it crosses
 MERGED_GAP = 0.2  # s, longest gap in a shade that is not drawn: a frame or two without a detection
+PAGE = 10.5  # inches, the width of a figure of a comparison unless another one is asked for
+NOTE = "#595959"  # of small print; its contrast on white is 7
+TEXT: dict[str, Any] = {"fontsize": NORMAL, "color": INK}
+_LEGEND_MARK, _LEGEND_LETTER = 0.45, 0.06  # inches
 _LEAST_DECADES = 1.05  # on a logarithmic axis
 _LARGEST = 1e100  # of a value that is drawn
 
@@ -143,6 +147,34 @@ def legend(
     """Explain marks without a frame, the corner or edge `loc` of the legend at a place in shares of its owner."""
     look = {"loc": loc, "bbox_to_anchor": place, "fontsize": SMALL, "frameon": False, **look}
     owner.legend(handles=handles, **look)
+
+
+def canvas(width: float | None, height: float, note: str) -> tuple[Figure, float]:
+    """Return an empty figure that arranges itself, with a note in small print below, and its width, inches.
+
+    Raises:
+        CoopenvError: a width that nothing can be drawn in.
+    """
+    inches = PAGE if width is None else float(width)
+    if not 2.0 <= inches <= 50.0:
+        raise CoopenvError(f"width {inches:g}: expected 2 to 50 inches")
+    figure = new_figure(inches, height)
+    figure.set_layout_engine("constrained", w_pad=0.03, h_pad=0.03, wspace=0.02, hspace=0.02)
+    figure.supxlabel(note, x=0.99, ha="right", fontsize=SMALL - 1.0, color=NOTE)
+    return figure, inches
+
+
+def fitting(width: float, each: float, most: int) -> int:
+    """Return how many panels of a width stand side by side."""
+    return max(1, min(most, int(width / each)))
+
+
+def legend_above(figure: Figure, handles: Sequence[Artist]) -> None:
+    """Put a legend above the panels."""
+    length = sum(_LEGEND_MARK + _LEGEND_LETTER * len(str(handle.get_label())) for handle in handles)
+    columns = fitting(float(figure.get_figwidth()), length / len(handles), len(handles))
+    spacing: dict[str, Any] = {"handlelength": 2.2, "columnspacing": 1.6}
+    legend(figure, handles, "outside upper center", ncols=columns, fontsize=SMALL + 0.5, **spacing)
 
 
 def show_decades(ax: Axes) -> None:

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from coopenv.bench.observers.basin import ANGLE_BINS, RADIUS, Draw, basins_of, by_angle
-from coopenv.bench.observers.canvas import PAGE, canvas, fitting, legend
 from coopenv.estimation.consistency import wilson_interval
-from coopenv.viz.style import BLUE, INK, NORMAL, SMALL, VERMILION, tidy
+from coopenv.viz import style
+from coopenv.viz.style import BLUE, INK, NORMAL, SMALL, VERMILION
 
 _PANEL, _FRAME = 2.6, 0.6  # inches
 
@@ -18,9 +18,9 @@ _PANEL, _FRAME = 2.6, 0.6  # inches
 def basin_figure(environment: str, draws: Sequence[Draw], width: float | None = None) -> Figure:
     """Draw, per observer, every vehicle of every draw at its initial errors, and the share by angle below."""
     basins = basins_of(environment, draws)
-    columns = fitting(width or PAGE, 3.0, min(3, len(basins)))
+    columns = style.fitting(width or style.PAGE, 3.0, min(3, len(basins)))
     rows = -(-len(basins) // columns)
-    figure, _ = canvas(width, _FRAME + _PANEL * rows, f"{environment}, {basins[0].draws} initial estimates")
+    figure, _ = style.canvas(width, _FRAME + _PANEL * rows, f"{environment}, {basins[0].draws} initial estimates")
     for n, ((cloud, bars), basin) in enumerate(zip(_pairs(figure, rows, columns, len(basins)), basins, strict=True)):
         own = [draw for draw in draws if draw.observer == basin.observer]
         _draw_cloud(cloud, own, first=n % columns == 0)
@@ -32,7 +32,7 @@ def basin_figure(environment: str, draws: Sequence[Draw], width: float | None = 
         Line2D([], [], ls="", marker="o", ms=4, color=BLUE, label="a vehicle that ends below 0.1 m and 1 deg"),
         Line2D([], [], ls="", marker="x", ms=4, color=VERMILION, label="one that does not"),
     ]
-    legend(figure, handles)
+    style.legend_above(figure, handles)
     return figure
 
 
@@ -46,7 +46,7 @@ def _pairs(figure: Figure, rows: int, columns: int, count: int) -> list[tuple[Ax
 
 
 def _draw_cloud(ax: Axes, draws: Sequence[Draw], first: bool) -> None:
-    tidy(ax, y_label="distance [m]" if first else "")
+    style.tidy(ax, y_label="distance [m]" if first else "")
     angle = np.array([draw.initial_orientation_error_deg for draw in draws])
     distance = np.array([draw.initial_position_error_m for draw in draws])
     converged = np.array([draw.converged for draw in draws])
@@ -57,7 +57,7 @@ def _draw_cloud(ax: Axes, draws: Sequence[Draw], first: bool) -> None:
 
 
 def _draw_shares(ax: Axes, draws: Sequence[Draw], first: bool) -> None:
-    tidy(ax, x_label="initial orientation error [deg]", y_label="converged" if first else "")
+    style.tidy(ax, x_label="initial orientation error [deg]", y_label="converged" if first else "")
     ax.xaxis.label.set_fontsize(NORMAL - 1)
     for (converged, count), start, end in zip(by_angle(draws), ANGLE_BINS, ANGLE_BINS[1:], strict=False):
         if count:

@@ -11,7 +11,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from coopenv.bench.observers.canvas import NOTE, PAGE, TEXT, canvas, fitting, legend
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
 from coopenv.bench.observers.rows import mean_of
@@ -40,8 +39,8 @@ def error_figure(board: Leaderboard, variant: str, width: float | None = None) -
     if not groups:
         return None
     scene = board.samples[0].scene
-    figure, inches = canvas(width, _FRAME + 1.05 * len(groups), f"{board.title}, {variant}")
-    shown = _chosen(len(scene.vehicles), fitting(inches, 1.6, MOST_VEHICLES))
+    figure, inches = style.canvas(width, _FRAME + 1.05 * len(groups), f"{board.title}, {variant}")
+    shown = _chosen(len(scene.vehicles), style.fitting(inches, 1.6, MOST_VEHICLES))
     axes = figure.subplots(len(groups), len(shown), squeeze=False)
     for (name, own), line in zip(groups.items(), axes, strict=True):
         error = np.median([sample.series.position_error for sample in own], axis=0)
@@ -55,11 +54,11 @@ def error_figure(board: Leaderboard, variant: str, width: float | None = None) -
             ax.plot(scene.t, style.drawable(error[:, i], positive=True), color=BLUE, lw=0.9)
             if scene.steady_from > 0.0:
                 ax.axvline(scene.steady_from, color=INK, linewidth=0.6, linestyle=_DOTTED)
-        line[0].set_ylabel(short_name(name), rotation=0, ha="right", va="center", labelpad=4, **TEXT)
+        line[0].set_ylabel(short_name(name), rotation=0, ha="right", va="center", labelpad=4, **style.TEXT)
     _share_axes(axes.ravel(), len(shown), scene.t)
     for ax, i in zip(axes[0], shown, strict=True):
         ax.set_title(vehicle_label(scene.vehicles[i]), fontsize=NORMAL + 2, color=INK, pad=4)
-    figure.supylabel("position error [m]", **TEXT)
+    figure.supylabel("position error [m]", **style.TEXT)
     median = ", median over seeds" if len(board.seeds) > 1 else ""
     handles = [
         Line2D([], [], color=BLUE, lw=1.2, label=f"error{median}"),
@@ -69,7 +68,7 @@ def error_figure(board: Leaderboard, variant: str, width: float | None = None) -
         handles.append(Line2D([], [], color=GREY, lw=1.2, label="Cramér-Rao bound (joint)"))
     if scene.steady_from > 0.0:
         handles.append(Line2D([], [], color=INK, lw=0.8, ls=_DOTTED, label="steady state begins"))
-    legend(figure, handles)
+    style.legend_above(figure, handles)
     return figure
 
 
@@ -83,9 +82,9 @@ def nees_figure(board: Leaderboard, variant: str, width: float | None = None) ->
         return None
     first = board.samples[0]
     scene, runs, dof = first.scene, len(board.seeds), first.nees_dof
-    columns = fitting(width or PAGE, 3.0, min(3, len(groups)))
+    columns = style.fitting(width or style.PAGE, 3.0, min(3, len(groups)))
     rows = -(-len(groups) // columns)
-    figure, _ = canvas(width, _FRAME + 1.5 * rows, f"{board.title}, {variant}")
+    figure, _ = style.canvas(width, _FRAME + 1.5 * rows, f"{board.title}, {variant}")
     axes = figure.subplots(rows, columns, squeeze=False).ravel()
     for unused in axes[len(groups) :]:
         unused.set_visible(False)
@@ -101,11 +100,11 @@ def nees_figure(board: Leaderboard, variant: str, width: float | None = None) ->
         ax.set_yscale("log")
         ax.set_title(name, fontsize=NORMAL, color=INK, pad=3)
     _share_axes(axes[: len(groups)], columns, scene.t)
-    figure.supylabel(f"NEES / {dof}" + (", mean over runs" if runs > 1 else ""), **TEXT)
+    figure.supylabel(f"NEES / {dof}" + (", mean over runs" if runs > 1 else ""), **style.TEXT)
     vehicles = [Line2D([], [], color=vehicle_colour(i), lw=1.4, label=vehicle_label(scene.vehicles[i])) for i in shown]
     runs_word = f"{runs} run{'s' if runs > 1 else ''}"
     band = Patch(facecolor=SHADE, label=f"95 % of an honest one ($\\chi^2$, {runs_word}, at one instant)")
-    legend(figure, [*vehicles, band])
+    style.legend_above(figure, [*vehicles, band])
     return figure
 
 
@@ -142,7 +141,7 @@ def variant_figure(board: Leaderboard, variant: str, width: float | None = None)
     finite = table[np.isfinite(table)]
     if len(variants) < 2 or not len(finite):
         return None
-    figure, inches = canvas(width, 0.9 + 0.3 * len(names), board.title)
+    figure, inches = style.canvas(width, 0.9 + 0.3 * len(names), board.title)
     ax = figure.add_subplot()
     norm = LogNorm(finite.min(), max(finite.max(), finite.min() * 1.01))
     image = ax.imshow(table, cmap="viridis_r", norm=norm, aspect="auto")
@@ -174,7 +173,7 @@ def cost_figure(board: Leaderboard, variant: str, width: float | None = None) ->
     names = list(board.samples_in(variant))
     if not names:
         return None
-    figure, _ = canvas(width, 4.6, f"{board.title}, {variant}")
+    figure, _ = style.canvas(width, 4.6, f"{board.title}, {variant}")
     ax = figure.add_subplot()
     style.tidy(ax, x_label="time per update [µs]", y_label="mean position RMSE [m]")
     ax.set(xscale="log", yscale="log")
@@ -186,13 +185,13 @@ def cost_figure(board: Leaderboard, variant: str, width: float | None = None) ->
         bound = float(np.mean(joint))
         ax.axhline(bound, color=GREY, linewidth=1.0)
         place: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
-        ax.annotate(BOUNDS["bound_m"], (0.005, bound), (0, 3), fontsize=SMALL, color=NOTE, **place)
+        ax.annotate(BOUNDS["bound_m"], (0.005, bound), (0, 3), fontsize=SMALL, color=style.NOTE, **place)
     ax.margins(0.16, 0.12)
     _plain(ax.xaxis)
     _plain(ax.yaxis)
     figure.draw_without_rendering()  # which settles the scales
     places = ax.transData.transform(points)
-    look = {**TEXT, "fontsize": _NAME, "textcoords": "offset points", "zorder": 30}
+    look = {**style.TEXT, "fontsize": _NAME, "textcoords": "offset points", "zorder": 30}
     for name, point, offset in zip(names, points, place_names(names, places, places, places[:0], _NAME), strict=True):
         ax.annotate(name, point, offset, **look)
     return figure
