@@ -1,9 +1,8 @@
 """Score a driver: what share of vehicles arrives, collides, runs out of time, and how well they know where they are."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from rich.table import Table
@@ -15,8 +14,10 @@ from coopenv.runs.table import number_table
 
 @dataclass(frozen=True)
 class Score:
-    """Results over episodes; shares are of all vehicles of all episodes."""
+    """Results of a driver in an environment over episodes; shares are of all vehicles of all episodes."""
 
+    agent: str
+    environment: str
     episodes: int
     arrived: float
     collided: float
@@ -41,7 +42,7 @@ def play(env: CooperativeLocalisationEnv, policy: Policy, seed: int) -> tuple[fl
     return total, [info["outcome"] for info in last.values()], errors
 
 
-def score(episodes: Iterator[tuple[float, list[str], list[float]]]) -> Score:
+def score(agent: str, environment: str, episodes: Iterator[tuple[float, list[str], list[float]]]) -> Score:
     """Sum up episodes that `play` returned."""
     returns, outcomes, errors = [], Counter[str](), []
     for total, ends, seen in episodes:
@@ -51,27 +52,16 @@ def score(episodes: Iterator[tuple[float, list[str], list[float]]]) -> Score:
     vehicles = max(1, outcomes.total())
     arrived, collided, under_way = (outcomes[word] / vehicles for word in ("arrived", "collided", "under way"))
     error = float(np.median(errors)), float(np.percentile(errors, 95))
-    return Score(len(returns), arrived, collided, under_way, float(np.mean(returns)), float(np.std(returns)), *error)
+    shares, returned = (arrived, collided, under_way), (float(np.mean(returns)), float(np.std(returns)))
+    return Score(agent, environment, len(returns), *shares, *returned, *error)
 
 
-def score_document(rows: Iterable[tuple[str, str, Score]]) -> list[dict[str, Any]]:
-    """Return what `bench agents --json` prints of (driver, environment, score)."""
-    return [{"agent": agent, "environment": environment, **asdict(s)} for agent, environment, s in rows]
-
-
-def score_table(rows: Iterable[tuple[str, str, Score]]) -> Table:
-    """Return one row per (driver, environment, score)."""
-    outcomes = ("arrived", "collided", "out of\ntime")
-    errors = ("median\nerror", "95 %\nerror")
+def score_table(scores: Sequence[Score]) -> Table:
+    """Return one row per driver and environment."""
+    outcomes, errors = ("arrived", "collided", "out of\ntime"), ("median\nerror", "95 %\nerror")
     table = number_table(("agent", "environment"), ("runs", *outcomes, "return", *errors), gap=0)
-    for agent, environment, s in rows:
-        table.add_row(
-            agent,
-            environment,
-            str(s.episodes),
-            *(f"{100 * share:.0f} %" for share in (s.arrived, s.collided, s.under_way)),
-            f"{s.mean_return:.1f}±{s.std_return:.1f}",
-            f"{s.median_position_error_m:.3f}",
-            f"{s.p95_position_error_m:.3f}",
-        )
+    for s in scores:
+        shares = (f"{100 * share:.0f} %" for share in (s.arrived, s.collided, s.under_way))
+        far = (f"{error:.3f}" for error in (s.median_position_error_m, s.p95_position_error_m))
+        table.add_row(s.agent, s.environment, str(s.episodes), *shares, f"{s.mean_return:.1f}±{s.std_return:.1f}", *far)
     return table

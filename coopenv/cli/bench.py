@@ -23,23 +23,24 @@ def bench_agents(
 ) -> None:
     """Score drivers: who arrives, who collides, who knows its pose."""
     from coopenv.api.parallel_env import parallel_env
-    from coopenv.bench.drivers import play, score, score_document, score_table
+    from coopenv.bench.drivers import play, score, score_table
     from coopenv.policies import load_agent, read_card
     from coopenv.runs.console import Progress
     from coopenv.shipped import list_agents
 
-    rows = []
+    scores = []
     for agent in agents or list_agents():
         for name in read_card(agent).environments:
             env = parallel_env(name)
             policy = load_agent(agent, env.scenario)
             with Progress(options.console(stderr=True), f"{agent} in {name}") as progress:
-                rows.append((agent, name, score(play(env, policy, seed) for seed in progress.track(range(seeds)))))
+                episodes = (play(env, policy, seed) for seed in progress.track(range(seeds)))
+                scores.append(score(agent, name, episodes))
     if as_json:
-        options.print_json(score_document(rows))
+        options.print_json(scores)
         return
     out = options.console()
-    out.print(score_table(rows))
+    out.print(score_table(scores))
     out.print("Return: sum over the vehicles of an episode, mean ± standard deviation. Errors in m.")
 
 

@@ -40,10 +40,10 @@ def test_agent_drives(agent: str, name: str) -> None:
 def test_give_way_arrives_without_touching() -> None:
     env = coopenv.parallel_env("urban_crossing")
     policy = load_agent("give_way", env.scenario)
-    result = score(play(env, policy, seed) for seed in range(500, 520))
+    result = score("give_way", "urban_crossing", (play(env, policy, seed) for seed in range(500, 520)))
     assert result.collided == 0.0
     assert result.arrived >= 0.95
-    still = score(play(env, stand_still, seed) for seed in range(500, 503))
+    still = score("still", "urban_crossing", (play(env, stand_still, seed) for seed in range(500, 503)))
     assert still.mean_return < result.mean_return
 
 

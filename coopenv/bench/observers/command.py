@@ -4,7 +4,6 @@ import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -81,10 +80,9 @@ class Found(NamedTuple):
 
     def document(self, command: str) -> dict[str, Any]:
         """Return what `leaderboard.json` holds."""
-        packages = versions("coopenv", "numpy", "scipy", "warp-lang")
-        rows, basins = ([asdict(entry) for entry in entries] for entries in (self.comparison.rows, self.basins))
-        content = {"command": command, "versions": packages, "seeds": list(self.comparison.seeds), "rows": rows}
-        return dict(jsonable(content | ({"basin": basins} if basins else {})))
+        packages, board = versions("coopenv", "numpy", "scipy", "warp-lang"), self.comparison
+        content = {"command": command, "versions": packages, "seeds": board.seeds, "rows": board.rows}
+        return dict(jsonable(content | ({"basin": self.basins} if self.basins else {})))
 
 
 def perform(

@@ -3,7 +3,6 @@
 import csv
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from io import StringIO
 
 import numpy as np
@@ -153,7 +152,7 @@ def _worst(rows: Sequence[Row], column: str = "position_rmse_m") -> Row:
 
 def csv_text(rows: Sequence[Row] | Sequence[Draw]) -> str:
     """Return rows as CSV; figures that do not exist are empty."""
-    table = [jsonable(asdict(row)) for row in rows]
+    table = [jsonable(row) for row in rows]
     text = StringIO()
     writer = csv.DictWriter(text, fieldnames=list(table[0]), lineterminator="\n")
     writer.writeheader()
