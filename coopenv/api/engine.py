@@ -2,7 +2,6 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -10,15 +9,15 @@ import warp as wp
 from gymnasium.utils import seeding
 
 from coopenv.api.plugins import PlugIns
-from coopenv.api.reward import RewardFunction, Step, check_finite, reward_of
+from coopenv.api.reward import RewardFunction, Step, check_finite, check_function, reward_of
 from coopenv.api.step_results import MEMORY, results_struct
-from coopenv.api.terms.binding import bound_terms
+from coopenv.api.terms.binding import bound_terms, own_places
 from coopenv.api.terms.kernels import check_own_terms, endings_kernel, results_kernel
 from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.base import Backend
 from coopenv.backends.simulated import Simulated
 from coopenv.backends.tick_world import open_world
-from coopenv.errors import CoopenvError, check_memory, shown, told
+from coopenv.errors import CoopenvError, check_memory, told
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
@@ -72,15 +71,8 @@ class Engine:
         self.results = allocate(results_struct(p), sizes, device)
         terms = bound_terms(scenario)
         check_own_terms(terms, device)
-        places = [field.slice for field in self.layout.values()]
-        self._own_terms = [
-            *((field.title, "observation", places[field.number]) for field in chain(*terms[:3]) if field.own),
-            *((term.title, "terms", slice(term.number, term.number + 1)) for term in terms.rewards if term.own),
-        ]
-        if reward is not None and not callable(reward):
-            raise CoopenvError(f"reward: expected a function of a step, got {shown(reward)}")
-        if reward is not None and device != "cpu":
-            raise CoopenvError(f"reward: a function in Python runs on the host; use device='cpu' instead of '{device}'")
+        self._own_terms = own_places(terms, self.layout)
+        check_function(reward, device)
         self._reward, self._step = reward, Step(self.view, scenario)
         self._fill = results_kernel(terms, p)
         self._end = endings_kernel(terms.conditions, p) if terms.conditions else None
@@ -88,9 +80,8 @@ class Engine:
         self._start = _vector(wp.int32, [field.start for field in fields])
         self._factor = _vector(wp.float32, [1.0 / field.scale for field in fields])
         self._weight = _vector(wp.float32, weights.values())
-        self._everywhere: Any = wp.ones(worlds, dtype=wp.int32, device=device)
-        self._nowhere: Any = wp.zeros(worlds, dtype=wp.int32, device=device)
-        self._fresh: Any = wp.zeros(worlds, dtype=wp.int32, device=device)
+        flags: list[Any] = [wp.full(worlds, value, dtype=wp.int32, device=device) for value in (1, 0, 0)]
+        self._everywhere, self._nowhere, self._fresh = flags
         self._state_fields = set(state_fields(self.world.precision))
         self._views: dict[str, np.ndarray] = {}
         self.begun = False
@@ -140,14 +131,11 @@ class Engine:
         self._end_episodes()
         self._fill_results("load", self._nowhere, self._nowhere)
 
-    def _advance(self, ticks: int) -> None:
-        (self.plugins or self.world).advance(ticks)
-
     def step(self, actions: np.ndarray | None = None, ticks: int | None = None) -> None:
         """Advance by one decision (or `ticks` camera ticks) under actions (W, N, 2) in [-1, 1]."""
         if actions is not None:
             self.set_actions(actions)
-        self._advance(self.world.model.ticks_per_decision if ticks is None else ticks)
+        (self.plugins or self.world).advance(self.world.model.ticks_per_decision if ticks is None else ticks)
         self._end_episodes()
         self.refresh()
         self._reward_anew(self._nowhere)
@@ -158,7 +146,7 @@ class Engine:
             self.step()
             return
         wp.copy(self.world.mask, self.results.over)
-        self._advance(self.world.model.ticks_per_decision)
+        (self.plugins or self.world).advance(self.world.model.ticks_per_decision)
         self._restart()
         self._end_episodes()
         self._fill_results("results some fresh", self.world.mask, self._everywhere)
@@ -196,18 +184,9 @@ class Engine:
             self.world.launch("end", self._end, arguments, inner=(self.world.model.vehicles,))
 
     def _fill_results(self, key: str, fresh: Any, chosen: Any) -> None:
-        arguments = [
-            self.world.model,
-            PerWorld(self.world.state),
-            self._start,
-            self._factor,
-            self._weight,
-            PerWorld(self.results),
-            PerWorld(fresh),
-            PerWorld(chosen),
-        ]
-        self.world.launch(key, self._fill, arguments, inner=(self.world.model.vehicles,))
-
+        fixed = [self.world.model, PerWorld(self.world.state), self._start, self._factor, self._weight]
+        changing = [PerWorld(part) for part in (self.results, fresh, chosen)]
+        self.world.launch(key, self._fill, fixed + changing, inner=(self.world.model.vehicles,))
         if self.world.device == "cpu":  # to look at a GPU would mean to wait for it
             for title, name, place in self._own_terms:
                 check_finite(title, self.view(name)[..., place])

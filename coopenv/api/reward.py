@@ -82,6 +82,18 @@ RewardFunction = Callable[[Step], Any]
 """Returns the reward of every vehicle, (W, N), for one decision step."""
 
 
+def check_function(reward: object, device: str) -> None:
+    """Make sure that a reward is a function, if there is one, and that its arrays are at hand.
+
+    Raises:
+        CoopenvError: it is not so.
+    """
+    if reward is not None and not callable(reward):
+        raise CoopenvError(f"reward: expected a function of a step, got {shown(reward)}")
+    if reward is not None and device != "cpu":
+        raise CoopenvError(f"reward: a function in Python runs on the host; use device='cpu' instead of '{device}'")
+
+
 def reward_of(function: RewardFunction, step: Step, earning: np.ndarray) -> np.ndarray:
     """Return the reward (W, N) that somebody's function gives those that earn one, (W, N) bool; 0 to the others.
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import warp as wp
 
 from coopenv import user_code
-from coopenv.api.terms.layout import included_fields
+from coopenv.api.terms.layout import Layout, included_fields
 from coopenv.errors import CoopenvError
 from coopenv.estimation.trajectory import Outcome
 from coopenv.scenario import Scenario
@@ -59,6 +59,13 @@ def bound_terms(scenario: Scenario) -> Terms:
     conditions = _all_bound(TERMINATION_CONDITIONS, switches, scenario.termination, len(Outcome))
     of_vehicle, of_target, of_neighbour = map(tuple, fields.values())
     return Terms(of_vehicle, of_target, of_neighbour, rewards, conditions)
+
+
+def own_places(terms: Terms, layout: Layout) -> list[tuple[str, str, slice]]:
+    """Return (title, field of the step results, entries) of every term that is not coopenv's and has values there."""
+    fields, places = (*terms.vehicle_fields, *terms.target_fields, *terms.neighbour_fields), [*layout.values()]
+    observed = [(field.title, "observation", places[field.number].slice) for field in fields if field.own]
+    return observed + [(t.title, "terms", slice(t.number, t.number + 1)) for t in terms.rewards if t.own]
 
 
 def _all_bound(kind: Registry[Term], used: Mapping[str, float], part: Any, first: int) -> tuple[Bound, ...]:
