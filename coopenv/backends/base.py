@@ -50,18 +50,12 @@ class Command:
 class Capabilities:
     """What a backend can do."""
 
-    truth: bool
-    """Whether poses are known; where not, errors are NaN and privileged rewards 0."""
-    driven: bool
-    """Whether commands have an effect."""
-    real_time: bool
-    """Whether its clock is real time, so that every decision has a deadline."""
-    ticks: int | None
-    """How many there are, the start included; None: no end of its own."""
-    batched: bool
-    """Whether it makes worlds on a device itself (`WorldBackend`)."""
-    recorded: bool = False
-    """Whether its ticks are always the same ones: neither seeds nor commands change anything."""
+    truth: bool  # poses are known; where not, errors are NaN and privileged rewards 0
+    driven: bool  # commands have an effect
+    real_time: bool  # its clock is real time, so that every decision has a deadline
+    ticks: int | None  # how many there are, the start included; None: no end of its own
+    batched: bool  # it makes worlds on a device itself (`WorldBackend`)
+    recorded: bool = False  # its ticks are always the same ones: neither seeds nor commands change anything
 
 
 @dataclass
@@ -72,10 +66,8 @@ class Health:
     late: int = 0
     missing: int = 0
     empty: int = 0
-    received: int = 0
-    """Messages from vehicles or sensors, of any kind."""
-    rejected: int = 0
-    """Those of them that were refused."""
+    received: int = 0  # messages from vehicles or sensors, of any kind
+    rejected: int = 0  # those of them that were refused
 
     def count(self, tick: Sensed) -> None:
         """Count one tick."""

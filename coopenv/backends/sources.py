@@ -97,24 +97,19 @@ def open_backend(
     Raises:
         CoopenvError: any of it does not exist or does not fit.
     """
+    if isinstance(backend, Backend):
+        for key, value in {**overrides, "data": data, "variant": variant}.items():
+            if value is not None:
+                raise CoopenvError(f"{key}: {type(backend).__name__} has its scenario already, choose it there")
+        return backend
+    if backend in PLANNED:
+        raise CoopenvError(f"backend '{backend}' is planned, but not there yet; known: {', '.join(BACKENDS)}")
     if backend is not None and backend not in BACKENDS:
-        return _given(backend, {**overrides, "data": data, "variant": variant})
+        known = f"{suggest(str(backend), BACKENDS)}; known: {', '.join(BACKENDS)}"
+        raise CoopenvError(f"unknown backend '{backend}'{known}")
     if backend == "replay" or (backend is None and is_recorded(name_or_path)):
         return Replay(open_recording(name_or_path, data, variant), Path(name_or_path).name, overrides)
     for what, value in (("data", data), ("variant", variant)):
         if value is not None:
             raise CoopenvError(f"{what} is for recorded data, '{name_or_path}' is simulated")
     return Simulated(load_scenario(name_or_path, overrides))
-
-
-def _given(backend: object, choices: Mapping[str, Any]) -> Backend:
-    """Return a backend that is given as an object, with nothing else to choose."""
-    if isinstance(backend, Backend):
-        for key, value in choices.items():
-            if value is not None:
-                raise CoopenvError(f"{key}: {type(backend).__name__} has its scenario already, choose it there")
-        return backend
-    known = f"known: {', '.join(BACKENDS)}"
-    if backend in PLANNED:
-        raise CoopenvError(f"backend '{backend}' is planned, but not there yet; {known}")
-    raise CoopenvError(f"unknown backend '{backend}'{suggest(str(backend), BACKENDS)}; {known}")

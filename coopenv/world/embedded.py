@@ -78,8 +78,7 @@ class Embedded:
 
     name: str
     estimate: Any
-    """(model, state, memory, world, vehicle, now): take one camera tick, `now` being a `Now`;
-    messages have been delivered."""
+    """(model, state, memory, world, vehicle, now): take one camera tick `Now`; messages have been delivered."""
     start: Any
     """(model, state, memory, world, vehicle): begin an episode at the initial estimate, which stands in the state, its
     covariance in `model.start.covariance` (LEFT coordinates); vehicles come leaders first."""
@@ -109,14 +108,10 @@ class Source:
     """Where the ticks of a world come from."""
 
     name: str
-    begin: Any
-    """(model, state, record, world): go to the start of an episode."""
-    sense: Any
-    """(model, state, record, world, tick): write everything that is sensed at a tick, and the truth."""
-    deliver: Any
-    """(model, state, record, world, vehicle, tick): write the messages that a vehicle receives at a tick."""
-    knows_truth: bool = True
-    """Whether the truth is always there; otherwise it may be NaN."""
+    begin: Any  # (model, state, record, world): go to the start of an episode
+    sense: Any  # (model, state, record, world, tick): write everything that is sensed at a tick, and the truth
+    deliver: Any  # (model, state, record, world, vehicle, tick): write the messages that a vehicle receives at a tick
+    knows_truth: bool = True  # the truth is always there; otherwise it may be NaN
 
 
 @wp.func

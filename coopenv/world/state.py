@@ -129,14 +129,8 @@ VALID: dict[str, Rule] = {
 
 def state_sizes(model: Any, worlds: int) -> dict[str, int]:
     """Return the length of every axis of the state, and of an observer's memory, by its letter."""
-    return {
-        "W": worlds,
-        "A": model.agents,
-        "N": model.vehicles,
-        "M": model.samples_per_tick,
-        "S": model.radio.slots,
-        "B": model.observer.blocks,
-    }
+    ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
+    return {"W": worlds, "A": model.agents, "N": model.vehicles, **ticks}
 
 
 def allocate_state(model: Any, worlds: int, p: Precision, device: str, shared: str = "") -> Any:

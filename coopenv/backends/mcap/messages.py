@@ -1,7 +1,6 @@
-"""The messages of a recording: which topic holds what, and their CDR codec.
+"""The messages of a recording and their CDR codec; a message's tick is its sequence number.
 
-Standard ROS 2 messages are there for viewers; what is read back stands in messages of our own, in full precision. The
-tick of a message is its sequence number.
+Standard ROS 2 messages are there for viewers; what is read back stands in messages of our own, in full precision.
 """
 
 from functools import cache

@@ -28,10 +28,7 @@ class Truth:
     corrupt_heading: tuple[tuple[float, float], ...] = ()  # spans of s since the origin in which the heading is wrong
 
     def at(self, t: Array) -> tuple[Array, Array, NDArray[np.bool_], NDArray[np.bool_]]:
-        """Interpolate linearly, the heading along the shorter way round.
-
-        Args:
-            t: (K,) s since the time origin.
+        """Interpolate linearly at times (K,), the heading along the shorter way round.
 
         Returns:
             Position (K, 2) m, heading (K,) rad in [-pi, pi), and where (K,) position and heading are valid: inside

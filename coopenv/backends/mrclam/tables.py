@@ -21,11 +21,7 @@ MAX_LENGTH_S = 6 * 3600.0
 
 
 def find_folder(name: str, data: str | Path | None = None) -> Path:
-    """Return the folder of a sub-dataset.
-
-    Args:
-        name: `mrclam_1` .. `mrclam_9`.
-        data: the sub-dataset's folder or its parent; by default what COOPENV_DATA says.
+    """Return the folder of a sub-dataset: `data` or a folder in it, by default what COOPENV_DATA says.
 
     Raises:
         DataError: unknown name, nothing said where the data are, or they are not there.
