@@ -19,6 +19,7 @@ from coopenv.observers.recording import Briefing, Sensed, Truth, is_due
 from coopenv.observers.registry import find_embedded
 from coopenv.world.embedded import HOST
 from coopenv.world.records import allocate, fields
+from coopenv.world.state import state_fields
 from coopenv.world.world import Options, Seeds
 
 
@@ -183,8 +184,9 @@ class TickWorld(SensingWorld):
         if self.observer.messages is None:
             return True
         memory = views_of(self.memory, fields(self.observer.memory), receiver)
+        state = views_of(self.state, state_fields(self.precision), receiver)
         try:
-            self.observer.messages.read(SimpleNamespace(memory=memory), sender, message, sent)
+            self.observer.messages.read(SimpleNamespace(memory=memory, state=state), sender, message, sent)
         except (CoopenvError, ValueError, TypeError, LookupError, ArithmeticError):
             return False
         return True
