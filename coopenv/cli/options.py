@@ -7,6 +7,7 @@ import tomllib
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,22 +21,12 @@ if TYPE_CHECKING:
 
     from coopenv.backends.base import Backend
 
+_source = partial(typer.Argument, autocompletion=complete.environments)
 Environment = Annotated[
-    str,
-    typer.Argument(
-        metavar="ENV",
-        help="Name of an environment (see `coopenv list`) or path of a TOML file.",
-        autocompletion=complete.environments,
-    ),
+    str, _source(metavar="ENV", help="Name of an environment (see `coopenv list`) or path of a TOML file.")
 ]
-Source = Annotated[
-    str,
-    typer.Argument(
-        metavar="ENV|DATASET|FILE.mcap",
-        help="Environment (name or TOML file), recorded robots (mrclam_1 .. mrclam_9) or a log file.",
-        autocompletion=complete.environments,
-    ),
-]
+_SOURCES = "Environment (name or TOML file), recorded robots (mrclam_1 .. mrclam_9) or a log file."
+Source = Annotated[str, _source(metavar="ENV|DATASET|FILE.mcap", help=_SOURCES)]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(

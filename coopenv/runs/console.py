@@ -32,8 +32,7 @@ class Progress:
 
     def __init__(self, log: Console, description: str, total: float | None = None) -> None:
         """Describe the work; `total` is the value of `completed` at the end, None where it is not known."""
-        self._log, self._description, self._total = log, description, total
-        self._completed = 0.0
+        self._log, self._description, self._total, self._completed = log, description, total, 0.0
         self._over = threading.Event()
         columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
         self._bar = Bar(*columns, console=log, transient=True)
@@ -57,7 +56,7 @@ class Progress:
         """Say how much is done, and what is being done now."""
         first = self._completed == 0.0
         self._completed, self._description = completed, description or self._description
-        self._bar.update(self._task, completed=completed, description=self._description)
+        self._bar.update(self._task, completed=completed, total=self._total, description=self._description)
         if first and self._left() > HINT_FROM and not self._log.is_terminal:
             self._log.print(self.line(), soft_wrap=True)
 
@@ -69,7 +68,6 @@ class Progress:
         """Yield the items, each of which is one unit of work."""
         if isinstance(items, Sized):
             self._total = len(items)
-            self._bar.update(self._task, total=self._total)
         for item in items:
             yield item
             self.advance()

@@ -63,7 +63,5 @@ def remarks(vehicles: list[dict[str, Any]]) -> Iterator[str]:
             yield f"{vehicle['vehicle']}: not observable at {times} s"
     for vehicle in vehicles:
         if vehicle["mirrored"]:
-            yield (
-                f"{vehicle['vehicle']}: mirrored solution, the orientation ends "
-                f"{vehicle['final_orientation_error_deg']:.4g} deg off"
-            )
+            angle = f"{vehicle['final_orientation_error_deg']:.4g} deg"
+            yield f"{vehicle['vehicle']}: mirrored solution, the orientation ends {angle} off"

@@ -124,20 +124,16 @@ def limits(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 
 def _places(scenario: Scenario) -> list[np.ndarray]:
     origin = np.array(scenario.map.origin)[:2]
-    places = [road_corners(road.start, road.end, road.width) - origin for road in scenario.roads]
-    for vehicle in scenario.vehicles:
-        if vehicle.goal:
-            center = np.array(vehicle.goal.position)[:2] - origin
-            places.append(center + vehicle.goal.radius * np.array([(-1, -1), (1, 1)]))
-    return places
+    goals = [vehicle.goal for vehicle in scenario.vehicles if vehicle.goal]
+    around = [np.array(goal.position)[:2] - origin + goal.radius * np.array([(-1, -1), (1, 1)]) for goal in goals]
+    return [*around, *(road_corners(road.start, road.end, road.width) - origin for road in scenario.roads)]
 
 
 def _paths(scenario: Scenario) -> list[np.ndarray]:
-    positions, rotations = agent_starts(scenario)
     agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
     t = np.linspace(0.0, scenario.horizon, _PATH_SAMPLES)
     paths = []
-    for agent, position, rotation in zip(agents, positions, rotations, strict=True):
+    for agent, position, rotation in zip(agents, *agent_starts(scenario), strict=True):
         still = agent.motion.kind in ("static", "driven")
         relative = _positions(compile_motion(agent.motion, rotation, scenario.horizon), t[:1] if still else t)
         paths.append((position + relative @ rotation.T)[:, :2])

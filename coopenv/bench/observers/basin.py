@@ -84,13 +84,9 @@ def with_start(recording: Recording, rotations: Array, positions: Array, covaria
     Rotations (N, 3, 3) map body to map, positions (N, 3) are in the map, m; the covariance, (6, 6) for all or
     (N, 6, 6), is in LEFT coordinates, rad and m.
     """
-    N = len(recording.setups)
-    return changed(
-        recording,
-        start_rotation=np.array(rotations, float),
-        start_position=np.array(positions, float),
-        start_covariance=np.array(np.broadcast_to(np.asarray(covariance, float), (N, 6, 6))),
-    )
+    P = np.array(np.broadcast_to(np.asarray(covariance, float), (len(recording.setups), 6, 6)))
+    R, p = np.array(rotations, float), np.array(positions, float)
+    return changed(recording, start_rotation=R, start_position=p, start_covariance=P)
 
 
 def random_start(recording: Recording, seed: int, radius: float = RADIUS) -> Recording:
@@ -103,12 +99,9 @@ def random_start(recording: Recording, seed: int, radius: float = RADIUS) -> Rec
     direction = generator.normal(size=(N, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     distance = radius * generator.random((N, 1)) ** (1 / 3)
-    return with_start(
-        recording,
-        np.asarray(Rotation.random(N, generator).as_matrix()),
-        recording.truth.position[0] + distance * direction,
-        np.diag(np.repeat([UNIFORM_ANGLE_VARIANCE, radius**2 / 5.0], 3)),
-    )
+    rotations = np.asarray(Rotation.random(N, generator).as_matrix())
+    covariance = np.diag(np.repeat([UNIFORM_ANGLE_VARIANCE, radius**2 / 5.0], 3))
+    return with_start(recording, rotations, recording.truth.position[0] + distance * direction, covariance)
 
 
 def draw_starts(task: BasinTask) -> list[Draw]:

@@ -5,6 +5,7 @@ Standard errors of root mean squares are to first order (delta method).
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -129,11 +130,8 @@ class Total(NamedTuple):
 
 
 def grouped(samples: Sequence[Sample]) -> dict[tuple[str, str], list[Sample]]:
-    """Return the samples by variant and observer, in the order in which they come."""
-    groups: dict[tuple[str, str], list[Sample]] = {}
-    for sample in samples:
-        groups.setdefault((sample.variant, sample.observer), []).append(sample)
-    return groups
+    """Return samples, which stand by variant and observer, by these."""
+    return {key: list(own) for key, own in groupby(samples, lambda sample: (sample.variant, sample.observer))}
 
 
 def mean_of(rows: Sequence[Row], column: str) -> float:
@@ -158,9 +156,7 @@ def totals_of(samples: Sequence[Sample]) -> dict[tuple[str, str], Total]:
 
 
 def _total(own: Sequence[Sample], nominal: Sequence[Sample], vehicles: slice = slice(None)) -> Total:
-    squares, reference = (
-        np.array([s.measured("position_mse", vehicles) for s in samples]) for samples in (own, nominal)
-    )
+    squares, reference = (np.array([s.measured("position_mse", vehicles) for s in some]) for some in (own, nominal))
     return Total(mean_root(squares), ratio(squares, reference) if nominal else UNKNOWN)
 
 
