@@ -23,15 +23,12 @@ class SeedStudy:
     steady_from: float
     """s"""
     position_rmse_m: np.ndarray
-    """(S, N), over t > steady_from."""
+    """Over t > steady_from."""
     orientation_rmse_deg: np.ndarray
-    """(S, N)"""
     settle_time_s: np.ndarray
-    """(S, N), after which the errors stay within SETTLED; NaN: never."""
+    """After which the errors stay within SETTLED; NaN: never."""
     final_position_error_m: np.ndarray
-    """(S, N)"""
     final_orientation_error_deg: np.ndarray
-    """(S, N)"""
 
     def document(self, environment: str) -> dict[str, Any]:
         """Return what `bench seeds --json` prints: per vehicle, one figure per seed."""

@@ -13,7 +13,6 @@ class Policy(Protocol):
 
     def __call__(self, observations: np.ndarray, /) -> np.ndarray:
         """Return the actions, (N, 2) in [-1, 1], for flat observations, (N, D), one row per vehicle."""
-        ...
 
 
 def decide(policy: Policy, observations: np.ndarray) -> np.ndarray:

@@ -13,12 +13,9 @@ from rich.progress import Progress as Bar
 
 T = TypeVar("T")
 
-LINE_PERIOD = 10.0
-"""s between lines of progress where there is no terminal."""
-HINT_FROM = 20.0
-"""s of work left after the first piece of it, from which on there is a line at once."""
-COMPILE_NOTICE_AFTER = 1.5
-"""s; kernels in the cache load well within it, compiling takes longer."""
+LINE_PERIOD = 10.0  # s between lines of progress where there is no terminal
+HINT_FROM = 20.0  # s of work left after the first piece of it, from which on there is a line at once
+COMPILE_NOTICE_AFTER = 1.5  # s; kernels in the cache load well within it, compiling takes longer
 
 
 class Progress:

@@ -124,9 +124,8 @@ def observation_table(scenario: Scenario) -> Table:
     for column in table.columns[:-1]:
         column.no_wrap = True
     for name, field in layout.items():
-        shape = "x".join(str(n) for n in field.shape)
-        scale = number(field.scale)
-        table.add_row(name, f"{field.start}:{field.stop}", shape, field.unit, scale, field.meaning)
+        shape, part = "x".join(map(str, field.shape)), f"{field.start}:{field.stop}"
+        table.add_row(name, part, shape, field.unit, number(field.scale), field.meaning)
     return table
 
 

@@ -26,9 +26,7 @@ class Mp4Film:
     """H.264, written while the pictures come."""
 
     def __init__(self, path: Path, fps: float) -> None:
-        self.path = path
-        self._fps = fps
-        self._frames = 0
+        self.path, self._fps, self._frames = path, fps, 0
         self._writer: Any = None
 
     def add(self, picture: np.ndarray) -> None:
@@ -72,8 +70,7 @@ class GifFilm:
     """An animated GIF of at most `GIF_SIZE` pixels, written at the end."""
 
     def __init__(self, path: Path, fps: float) -> None:
-        self.path = path
-        self._fps = fps
+        self.path, self._fps = path, fps
         self._frames: list[Image.Image] = []
 
     def add(self, picture: np.ndarray) -> None:

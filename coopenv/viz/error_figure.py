@@ -51,7 +51,8 @@ def error_figure(trajectory: Trajectory, ends: Sequence[float] | None = None) ->
     grid = figure.add_gridspec(count, 2, wspace=_GAP, hspace=0.14, **edges)
     converged = settling_times(trajectory, ends)
     live = live_ticks(trajectory.t, count, ends)
-    shaded = [_moving_seen(trajectory, vehicle, ticks) for vehicle, ticks in enumerate(live)]
+    seen = [style.moving_target_seen(trajectory, vehicle, ticks) for vehicle, ticks in enumerate(live)]
+    shaded = [style.runs(trajectory.t, mask, style.MERGED_GAP) for mask in seen]
     for vehicle, ticks in enumerate(live):
         settled = float(converged[vehicle])
         for column, quantity in enumerate(_quantities(trajectory, vehicle, ticks)):
@@ -73,11 +74,6 @@ def error_figure(trajectory: Trajectory, ends: Sequence[float] | None = None) ->
     marks = _marks(bool(np.isfinite(converged).any()), any(shaded), live.min() < len(trajectory.t))
     _add_legends(figure, height, marks)
     return figure
-
-
-def _moving_seen(trajectory: Trajectory, vehicle: int, ticks: int) -> list[tuple[float, float]]:
-    seen = style.moving_target_seen(trajectory, vehicle) & (np.arange(len(trajectory.t)) < ticks)
-    return style.runs(trajectory.t, seen, style.MERGED_GAP)
 
 
 def _quantities(trajectory: Trajectory, vehicle: int, ticks: int) -> tuple[_Quantity, _Quantity]:

@@ -108,9 +108,10 @@ def runs(t: np.ndarray, mask: np.ndarray, gap: float = 0.0) -> list[tuple[float,
     return list(zip(starts.tolist(), (ends - starts).tolist(), strict=True))
 
 
-def moving_target_seen(trajectory: Trajectory, vehicle: int) -> np.ndarray:
-    """Return (K,) whether a vehicle's camera detects a vehicle or a moving landmark."""
-    return np.asarray(np.any(trajectory.visible[:, vehicle] & trajectory.target_moving, axis=-1))
+def moving_target_seen(trajectory: Trajectory, vehicle: int, ticks: int) -> np.ndarray:
+    """Return (K,) whether a vehicle's camera detects a vehicle or a moving landmark, in the first ticks."""
+    seen = np.any(trajectory.visible[:, vehicle] & trajectory.target_moving, axis=-1)
+    return np.asarray(seen & (np.arange(len(seen)) < ticks))
 
 
 def shade(ax: Axes, stretches: Sequence[tuple[float, float]], colour: str = SHADE) -> None:

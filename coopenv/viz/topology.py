@@ -64,8 +64,8 @@ def _draw_lanes(ax: Axes, trajectory: Trajectory, vehicle: int, targets: np.ndar
     sight = np.where(live[:, None], trajectory.sight[:, vehicle], Sight.NOT_A_NEIGHBOUR)
     style.tidy(ax)
     ax.grid(False, axis="y")
-    seen = style.moving_target_seen(trajectory, vehicle)
-    involved = (seen & live) | np.any(sight == Sight.OCCLUDED_BY_BODY, axis=-1)
+    seen = style.moving_target_seen(trajectory, vehicle, ticks)
+    involved = seen | np.any(sight == Sight.OCCLUDED_BY_BODY, axis=-1)
     style.shade(ax, style.runs(trajectory.t, involved, style.MERGED_GAP))
     style.shade_ended(ax, trajectory.t, ticks)
     for lane, target in enumerate(targets):

@@ -96,7 +96,7 @@ class TopView:
         layers = self._layers
         colours = [vehicle_colour(i) for i in range(len(self.scenario.vehicles))]
         self._rgba = to_rgba_array(colours)
-        self._wedges = layers.polygons(facecolor=_faded(self._rgba, 0.11), edgecolor="none")
+        self._wedges = layers.polygons(facecolor=to_rgba_array(self._rgba, 0.11), edgecolor="none")
         self._ellipses = layers.polygons(linewidth=1.0)
         self._sight = {sight: layers.lines(**look) for sight, look in ground.SIGHT_LOOKS.items()}
         self._still = layers.points("o", DARK_BLUE, "white", 5.5)
@@ -113,32 +113,26 @@ class TopView:
         self._arrived = layers.points("*", "white", INK, 12)
         self._collided = layers.points("X", INK, "white", 11)
         look = {"fontsize": NORMAL, "weight": "bold", "ha": "center", "va": "center", "clip_on": True, **_HALO}
-        self._names = [
-            layers.keep(self._axes.text(0, 0, ground.vehicle_mark(i), color=colour, **look))
-            for i, colour in enumerate(colours)
-        ]
+        names = [self._axes.text(0, 0, ground.vehicle_mark(i), color=c, **look) for i, c in enumerate(colours)]
+        self._names = [layers.keep(name) for name in names]
         self._moving_names = {
-            i: ground.label_landmark(self._axes, m.name, np.zeros(2))
+            i: layers.keep(ground.label_landmark(self._axes, m.name, np.zeros(2)))
             for i, m in enumerate(self.scenario.landmarks)
             if m.motion.kind != "static"
         }
-        for name in self._moving_names.values():
-            layers.keep(name)
 
     def _prepare_table(self) -> None:
         count = len(self.scenario.vehicles)
         shown = min(count, ground.MOST_ROWS)
-        title = self._figure.text(
-            *ground.pixels(ground.PANEL, ground.HEIGHT - 21), "", fontsize=NORMAL + 1.5, weight="bold", color=INK
-        )
+        place = ground.pixels(ground.PANEL, ground.HEIGHT - 21)
+        title = self._figure.text(*place, "", fontsize=NORMAL + 1.5, weight="bold", color=INK)
         self._time = self._layers.keep(title)
         look: dict[str, Any] = {"fontsize": ground.SMALLER, "family": "monospace"}
         head = f"{'':4}{'error':>7}{'error':>7}{'3σ':>7}{'sees':>6}\n{'':4}{'[m]':>7}{'[deg]':>7}{'[m]':>7}"
         self._figure.text(*ground.pixels(ground.PANEL, ground.TABLE_TOP), head, color=INK, va="bottom", **look)
         places = [ground.pixels(ground.PANEL, ground.TABLE_TOP - ground.ROW * (i + 1)) for i in range(shown + 1)]
-        self._rows = [
-            self._layers.keep(self._figure.text(*places[i], "", color=vehicle_colour(i), **look)) for i in range(shown)
-        ]
+        rows = [self._figure.text(*places[i], "", color=vehicle_colour(i), **look) for i in range(shown)]
+        self._rows = [self._layers.keep(row) for row in rows]
         if count > shown:
             self._figure.text(*places[-1], f"and {count - shown} more", color=INK, **look)
         ground.draw_legend(self._figure, self.scenario, shown + 1)
@@ -149,8 +143,8 @@ class TopView:
         drawn = semi <= _LARGEST * self._side
         alpha = np.where(semi[drawn] <= _FILLED * self._side, 0.09, 0.0)
         self._ellipses.set_verts(list(shapes[drawn]))
-        self._ellipses.set_facecolor(_faded(self._rgba[drawn], alpha))
-        self._ellipses.set_edgecolor(_faded(self._rgba[drawn], np.where(alpha > 0, 0.8, 0.35)))
+        self._ellipses.set_facecolor(to_rgba_array(self._rgba[drawn], alpha))
+        self._ellipses.set_edgecolor(to_rgba_array(self._rgba[drawn], np.where(alpha > 0, 0.8, 0.35)))
         return semi
 
     def _place_bodies(self, R: np.ndarray, position: np.ndarray, R_hat: np.ndarray, estimate: np.ndarray) -> None:
@@ -189,7 +183,7 @@ class TopView:
             observer, seen = np.nonzero(sight == kind)
             lines.set_segments(list(np.stack([camera[observer, :2], target[seen]], axis=1)))
             if "color" not in ground.SIGHT_LOOKS[kind]:
-                lines.set_color(_faded(self._rgba[observer], 0.9))
+                lines.set_color(to_rgba_array(self._rgba[observer], 0.9))
         if self._fan is not None:
             rays = self._fan @ np.swapaxes(R[L:], 1, 2)
             length = geometry.free_lengths(camera, rays, self._reach, self.scenario.obstacles, self._origin)
@@ -216,14 +210,5 @@ class TopView:
         possible = np.sum(view["sight"] != Sight.NOT_A_NEIGHBOUR, axis=-1)
         for i, row in enumerate(self._rows):
             error, angle = view["position_error"][i], view["orientation_error"][i]
-            row.set_text(
-                f"{ground.vehicle_mark(i):<4}{fixed(error, 3):>7}{angle:>7.1f}{fixed(sigma[i], 3):>7}"
-                f"{f'{seen[i]}/{possible[i]}':>6}"
-            )
-
-
-def _faded(rgba: np.ndarray, alpha: np.ndarray | float) -> np.ndarray:
-    """Return colours (N, 4) with other opacities."""
-    faded = rgba.copy()
-    faded[:, 3] = alpha
-    return faded
+            mark, sees = ground.vehicle_mark(i), f"{seen[i]}/{possible[i]}"
+            row.set_text(f"{mark:<4}{fixed(error, 3):>7}{angle:>7.1f}{fixed(sigma[i], 3):>7}{sees:>6}")

@@ -9,9 +9,8 @@ class Window:
     """One window, opened by the first picture and reused by the next ones."""
 
     def __init__(self, title: str) -> None:
-        self._title = title
+        self._title, self._silent = title, False
         self._image: Any = None
-        self._silent = False
 
     def show(self, picture: np.ndarray) -> None:
         """Show an (H, W, 3) uint8 picture and let the window react to the user, who may close it for good."""

@@ -17,11 +17,8 @@ from coopenv.observers.contract import Factory
 from coopenv.observers.recording import Recording
 from coopenv.observers.runner import Run, run
 
-RELATIVE_DELTA = 1.0
-"""s between the poses of a pair of the relative trajectory error."""
-
-SERIES_TICKS = 250
-"""Instants that are kept for figures."""
+RELATIVE_DELTA = 1.0  # s between the poses of a pair of the relative trajectory error
+SERIES_TICKS = 250  # instants that are kept for figures
 
 
 @dataclass(frozen=True)

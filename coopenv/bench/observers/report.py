@@ -21,10 +21,6 @@ from coopenv.bench.observers.tables import failures, honest_line
 from coopenv.estimation.metrics import CONVERGED
 from coopenv.format import number, with_error
 
-BASIN_CAPTION = (
-    f"Attitude uniform over SO(3), position uniform in a ball of {RADIUS:g} m. A draw converges if every vehicle ends "
-    f"below {CONVERGED.text}; 95 % intervals after Wilson."
-)
 _COORDINATE = re.compile(r"(?<=[ML ])(-?\d+\.\d\d)\d+(?=[ \n])")
 """A coordinate of a line in SVG, of which hundredths of a point are enough."""
 
@@ -35,24 +31,28 @@ def report_text(
     """Return the report as one HTML text; `content` of `leaderboard.json` tells the command and versions."""
     variants = [_variant(board, name) for name in board.variants]
     nominal = variants[0]["name"] == NOMINAL
-    template = _environment().get_template("report.html.j2")
-    return template.render(
-        board=board,
-        content=content,
-        vehicles=board.samples[0].scene.vehicles,
-        boards=variants[:1] if nominal else variants,  # faults have one table
-        variants=variants,
-        nominal=nominal,
-        honest=honest_line(board.rows),
-        failures=failures(board.rows),
-        heat=_picture(board, "variants", variants[0]["name"]),
-        cost=_picture(board, "cost", variants[0]["name"]),
-        basins=basins,
-        basin_failures=basin_failures(basins),
-        basin_map=_svg(basin_figure(board.environment, draws)) if draws else "",
-        basin_caption=BASIN_CAPTION,
-        columns=[f.name for f in fields(Row) if f.name not in ("environment", "failure")],
-        definitions={f.name: f.metadata["meaning"] for f in fields(Row)},
+    return (
+        _environment()
+        .get_template("report.html.j2")
+        .render(
+            board=board,
+            content=content,
+            vehicles=board.samples[0].scene.vehicles,
+            boards=variants[:1] if nominal else variants,  # faults have one table
+            variants=variants,
+            nominal=nominal,
+            honest=honest_line(board.rows),
+            failures=failures(board.rows),
+            heat=_picture(board, "variants", variants[0]["name"]),
+            cost=_picture(board, "cost", variants[0]["name"]),
+            basins=basins,
+            basin_failures=basin_failures(basins),
+            basin_map=_svg(basin_figure(board.environment, draws)) if draws else "",
+            radius=RADIUS,
+            tolerance=CONVERGED.text,
+            columns=[f.name for f in fields(Row) if f.name not in ("environment", "failure")],
+            definitions={f.name: f.metadata["meaning"] for f in fields(Row)},
+        )
     )
 
 

@@ -80,10 +80,8 @@ def ratio_table(board: Leaderboard, variant: str) -> Table:
 
 def honest_line(rows: Sequence[Row]) -> str:
     """Return where the ANEES of an honest filter lies, empty where nobody states a covariance."""
-    for row in rows:
-        if np.isfinite(row.anees_low):
-            return f"ANEES of an honest filter: 1 ({row.anees_low:.2f} to {row.anees_high:.2f} at 95 % of instants)."
-    return ""
+    known = (f"{row.anees_low:.2f} to {row.anees_high:.2f}" for row in rows if np.isfinite(row.anees_low))
+    return next((f"ANEES of an honest filter: 1 ({ends} at 95 % of instants)." for ends in known), "")
 
 
 def quality_table(board: Leaderboard, variant: str) -> Table:
