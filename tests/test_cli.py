@@ -135,7 +135,7 @@ def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
         ("run busy_intersection --dtype float16", "float16"),
         ("run busy_intersection --device tpu", "tpu"),
         ("run urban_crossing --policy rando", "did you mean 'random'"),
-        ("run busy_intersection --steady-from 50", "--steady-from"),
+        ("run busy_intersection --steady-from 50", "steady_from"),
         ("run busy_intersection --out occupied", "it is not a folder"),
         ("run busy_intersection --out occupied/below", "cannot write to"),
         ("schema --out missing/schema.json", "cannot write to"),

@@ -245,7 +245,7 @@ class Engine:
         memory = {name: getattr(self.results, name) for name in MEMORY}
         checked = self.world.checked_state(values, memory, MEMORY)
         if self.plugins is not None:
-            self.plugins.set_state(values.get("observers"))
+            self.plugins.set_state(values.get("observers"), has_begun(checked["start_rotation"]))
         overwrite(self.world.state_arrays(), checked)
         self.refresh()
         overwrite(memory, checked)

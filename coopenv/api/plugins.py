@@ -128,15 +128,15 @@ class PlugIns:
         """
         return [group.get_state() for group in self.groups]
 
-    def set_state(self, states: Any) -> None:
-        """Go back to what `get_state` returned.
+    def set_state(self, states: Any, begun: np.ndarray) -> None:
+        """Go back to what `get_state` returned, of worlds (W,) of which some have begun.
 
         Raises:
             CoopenvError: it is of other observers; nothing has changed then.
         """
         if not isinstance(states, list) or len(states) != len(self.groups):
             raise CoopenvError(f"state: no observers '{self.name}' in it")
-        copies = [group.checked_state(state) for group, state in zip(self.groups, states, strict=True)]
+        copies = [group.checked_state(*state) for group, *state in zip(self.groups, states, begun, strict=True)]
         for group, state in zip(self.groups, copies, strict=True):
             group.set_state(state)
         self._failures.clear()

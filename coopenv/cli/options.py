@@ -83,11 +83,11 @@ def show(path: Path) -> None:
 
 
 def load(environment: str, overrides: dict[str, Any]) -> Any:
-    """Return a scenario, its warnings printed as one line each."""
-    from coopenv.scenario import load_scenario
+    """Return the scenario of a simulation, its warnings printed as one line each."""
+    from coopenv.backends.sources import open_simulation
 
     with warned():
-        return load_scenario(environment, overrides)
+        return open_simulation(environment, overrides)
 
 
 def open_source(environment: str, overrides: dict[str, Any], data: Path | None, variant: str | None) -> Backend:

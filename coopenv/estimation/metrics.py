@@ -70,7 +70,7 @@ def steady_start(given: float | None, horizon: float, end: float | None = None) 
         return STEADY_SHARE * horizon
     last = horizon if end is None else end
     if not 0.0 <= given < last:
-        raise CoopenvError(f"--steady-from {given:g} is not within the run of {last:g} s")
+        raise CoopenvError(f"steady_from {given:g} is not within the run of {last:g} s")
     return given
 
 
@@ -93,7 +93,8 @@ def quaternion_wxyz(rotation: np.ndarray) -> np.ndarray:
     """Return the unit quaternions (..., 4) of rotations (..., 3, 3), scalar part first and never negative.
 
     Each row of 4 q q^T, which is linear in R, is a multiple of q; that of the largest component is well conditioned at
-    every angle, and at small ones takes the vector part from the skew part of R, without cancellation.
+    every angle, and at small ones takes the vector part from the skew part of R, without cancellation. SciPy's would
+    raise an error over the estimates of an observer that is lost (NaN, or far from a rotation).
     """
     R = np.asarray(rotation, float)
     x, y, z = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]

@@ -140,15 +140,15 @@ class Group:
         except Exception as error:
             raise CoopenvError(f"the observers' state cannot be copied: {told(error)}") from error
 
-    def checked_state(self, state: Any) -> dict[str, Any]:
-        """Return a deep copy of what `get_state` of such a group returned.
+    def checked_state(self, state: Any, begun: bool) -> dict[str, Any]:
+        """Return a deep copy of what `get_state` of such a group returned, before or after the start of an episode.
 
         A CoopenvError says that it is of another group. The observers in it are trusted to be what they seem: whoever
         made the state could run any code in them.
         """
         try:
             copied = copy.deepcopy(state)
-            if copied == {}:
+            if copied == {} and not begun:
                 return {}
             observers, coordinates, mail = (copied[name] for name in ("observers", "coordinates", "mail"))
             kind, listed = (JointObserver, [observers]) if self.joint else (Observer, observers)
@@ -164,6 +164,7 @@ class Group:
     def set_state(self, state: dict[str, Any]) -> None:
         """Go back to what `checked_state` returned."""
         if not state:
+            vars(self).pop("mail", None)
             return
         self.coordinates, self.mail = state["coordinates"], Mailbox(self.briefing)
         self.mail.set_state(state["mail"])

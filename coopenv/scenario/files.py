@@ -1,6 +1,7 @@
 """Find, read, override and validate scenario files."""
 
 import json
+import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -31,7 +32,7 @@ def scenario_path(name_or_path: str | Path) -> Path:
         UnknownEnvironmentError: there is no such environment or file.
     """
     text = str(name_or_path)
-    if text.endswith((".toml", *BAGS)) or "/" in text or "\\" in text:
+    if text.endswith((".toml", *BAGS)) or "/" in text or "\\" in text or os.path.isdir(text):  # noqa: PTH112 (never raises)
         try:
             path = Path(text).expanduser()
             there, is_bag = path.is_file(), path.suffix in BAGS or (path / "metadata.yaml").is_file()

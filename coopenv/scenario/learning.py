@@ -30,11 +30,11 @@ class Observation(Part):
     include: tuple[str, ...] = Field(default=GROUPS, min_length=1, json_schema_extra=_list_groups)
     """Groups of coopenv's fields, and names of registered and custom fields."""
     position_scale: Positive = 50.0
-    """m"""
+    """m, of positions and distances"""
     velocity_scale: Positive = 5.0
-    """m/s"""
+    """m/s, of measured velocities"""
     angular_velocity_scale: Positive = 3.0
-    """rad/s"""
+    """rad/s, of measured angular velocities"""
     age_scale: Positive = 1.0
     """s; older measurements read 1"""
     custom: dict[Annotated[str, AfterValidator(OBSERVATION_FIELDS.free)], ObservationField] = Field(default={})
@@ -54,9 +54,9 @@ class Dynamics(Part):
     """Kinematic bicycle with its actuators; the defaults are a SVEA car's."""
 
     wheelbase: Positive = 0.324
-    """m"""
+    """m, from the rear to the front axle"""
     max_speed: Positive = 1.53
-    """m/s"""
+    """m/s, forwards"""
     reverse: bool = False
     """Whether negative speeds are possible."""
     max_acceleration: Positive = 2.0

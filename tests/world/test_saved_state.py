@@ -149,6 +149,7 @@ def test_every_field_has_a_rule(observer: str) -> None:
         (None, "no observers 'mekf' in it"),
         ([], "no observers 'mekf' in it"),
         ([5], "the observers do not fit"),
+        ([{}], "the observers do not fit"),  # as before a reset
         ([{"observers": 1}], "the observers do not fit: KeyError: 'coordinates'"),
         ([{"observers": [], "coordinates": None, "mail": {}}], "not one observer per vehicle"),
     ],

@@ -24,7 +24,7 @@ class CooperativeSB3VecEnv(VecEnv):
     last observation, and `infos[row]["TimeLimit.truncated"]` says that the value beyond it counts.
 
     A vehicle that ended before its world stays parked with reward 0; its row starts a new "episode" there, which ends,
-    worth nothing, when the world is over. `info["alive"]` is False in those rows at every done.
+    with return 0, when the world is over. `info["alive"]` is False in those rows at every done.
     """
 
     def __init__(self, envs: CooperativeVectorEnv) -> None:

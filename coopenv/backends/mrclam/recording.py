@@ -23,7 +23,7 @@ from coopenv.observers.recording_checks import check_recording
 Variant = Literal["landmarks", "landmarks+robots", "blind"]
 VARIANTS: tuple[Variant, ...] = get_args(Variant)
 BLIND_ROBOTS = (3, 4, 5)
-
+# What follows was tuned on sub-dataset 6 (docs/data.md).
 TICK_S = 0.05
 MESSAGE_PERIOD_TICKS = 2  # 10 Hz, as V2X radios send
 NOISE = SensorNoise(velocity=0.15, angular_velocity=0.3, odometry_period=TICK_S, bearing=0.03)

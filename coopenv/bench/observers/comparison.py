@@ -230,6 +230,8 @@ def _observers(observers: Iterable[str | Factory] | None, source: Source) -> tup
     if isinstance(observers, str):
         raise CoopenvError(f"observers: expected a list such as ['{observers}']")
     given = list(dict.fromkeys(observers))
+    if not given:
+        raise CoopenvError("observers: expected at least one name or class")
     names = [named(observer) for observer in given]
     for observer, name in zip(given, names, strict=True):
         if find(observer) is not find(name):

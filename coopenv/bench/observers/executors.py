@@ -1,6 +1,7 @@
 """Where the work is done: in processes of this machine, or on an existing Ray cluster.
 
 An executor maps one function over tasks. What comes out depends on neither the executor nor its number of workers.
+Processes are of the standard library, not of joblib: they end within two seconds of a signal, or with their parent.
 """
 
 import multiprocessing

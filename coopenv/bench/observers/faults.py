@@ -73,7 +73,7 @@ def without_landmarks(recording: Recording, start: float | None = None, duration
 
 @dataclass(frozen=True)
 class Lie:
-    """One vehicle broadcasts a pose that is off, and swears by it."""
+    """One vehicle broadcasts a pose that is off, and states a small covariance."""
 
     sender: int
     start: float

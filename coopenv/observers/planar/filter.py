@@ -43,7 +43,7 @@ class Tuning:
     gate: float = 9.0  # normalised innovation squared above which a bearing is dropped
     soft: float = math.inf  # the same above which a bearing's variance grows with it (a heavy tail)
     mean: Seven = (1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    """Of turn scale, speed scale, turn offset, speed offset, slowdown, lead and bearing bias at the start."""
+    """Turn scale, speed scale, turn offset, speed offset, slowdown, lead and bearing bias at the start."""
     std: Seven = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the same
     walk: Seven = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the same, per sqrt(s)
     jitter: float = 0.0  # s, by which a step of the commanded rate may take effect sooner or later
