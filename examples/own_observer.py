@@ -10,45 +10,62 @@ from coopenv.observers import Estimate, Message, Setup, Tick, register, run
 from coopenv.runs.recorder import record
 
 
-class Complementary:
-    """Odometry, pulled towards where the bearings' lines meet and turned towards where they point."""
+def cross_matrix(v: np.ndarray) -> np.ndarray:
+    """Return S(v) with S(v) y = v x y."""
+    return np.cross(np.eye(3), v)
+
+
+class Ekf:
+    """An extended Kalman filter of the pose, whose error in the map frame is R = Exp(theta) Rhat, p = phat + d."""
 
     def __init__(self, setup: Setup) -> None:
-        self.marker = setup.marker
+        self.marker, self.noise = setup.marker, setup.noise
 
     def reset(self, initial_pose: tuple[np.ndarray, np.ndarray], initial_covariance: np.ndarray) -> None:
         self.R, self.p = initial_pose
+        turned = np.kron(np.eye(2), self.R)  # from body to map axes
+        self.P = turned @ initial_covariance @ turned.T
 
     def update(self, tick: Tick) -> Estimate:
-        self.p = self.p + self.R @ tick.translation
-        self.R = self.R @ tick.rotation
-        A, y, turn = 1e-3 * np.eye(3), 1e-3 * self.p, np.zeros(3)
-        camera = self.R @ tick.lever_arm
-        for _, bearing, position, _ in tick.usable():  # landmarks, and neighbours that have been heard
-            b = self.R @ bearing
-            across = np.eye(3) - np.outer(b, b)
-            A += across
-            y += across @ (position - camera)
-            line = position - camera - self.p
-            turn += np.cross(b, line / np.linalg.norm(line))
-        self.p = self.p + 0.5 * tick.dt * (np.linalg.solve(A, y) - self.p)
-        S = np.cross(np.eye(3), 5.0 * tick.dt * turn)  # S x = turn x x
-        self.R = np.linalg.solve(np.eye(3) - S / 2, np.eye(3) + S / 2) @ self.R  # a rotation (Cayley)
+        step = self.R @ tick.translation
+        F = np.eye(6)
+        F[3:, :3] = -cross_matrix(step)
+        self.R, self.p = self.R @ tick.rotation, self.p + step
+        self.P = F @ self.P @ F.T + np.diag(self.noise.odometry(tick.dt))
+        for _, bearing, position, message in tick.usable():  # landmarks, and neighbours that have been heard
+            known = message is None or message.covariance is None
+            self.correct(tick, bearing, position, np.zeros((3, 3)) if known else message.covariance)
         return Estimate(self.R, self.p)
 
+    def correct(self, tick: Tick, bearing: np.ndarray, position: np.ndarray, covariance: np.ndarray) -> None:
+        b, arm = self.R @ bearing, self.R @ tick.lever_arm
+        line = position - self.p - arm
+        distance = np.linalg.norm(line)
+        u = line / distance
+        across = (np.eye(3) - np.outer(u, u)) / distance
+        H = np.hstack([-cross_matrix(b) - across @ cross_matrix(arm), across])
+        S = H @ self.P @ H.T + self.noise.bearing**2 * np.eye(3) + across @ covariance @ across
+        K = np.linalg.solve(S, H @ self.P).T
+        dx = K @ (u - b)
+        turn = cross_matrix(dx[:3] / 2)
+        self.R = np.linalg.solve(np.eye(3) - turn, np.eye(3) + turn) @ self.R  # a rotation (Cayley)
+        self.p, self.P = self.p + dx[3:], self.P - K @ H @ self.P
+
     def message(self) -> Message:
-        return Message(position=self.p + self.R @ self.marker)
+        arm = self.R @ self.marker
+        J = np.hstack([-cross_matrix(arm), np.eye(3)])
+        return Message(position=self.p + arm, covariance=J @ self.P @ J.T)
 
 
-register("complementary", Complementary)
-recording = record(load_scenario("busy_intersection"), seed=0)
+register("my_ekf", Ekf)
+recording = record(load_scenario("busy_intersection_tracking"), seed=0)
 print(f"{'observer':16}  position error of the five vehicles at the end [m]      bytes/s")
-for name in ("complementary", "riccati", "dead_reckoning"):
+for name in ("my_ekf", "riccati", "dead_reckoning"):
     result = run(name, recording)
     errors = "  ".join(f"{e:8.3f}" for e in result.position_error[-1])
     print(f"{name:16} {errors}   {result.bytes_per_second[0]:8.0f}   {result.failure}")
 
-env = parallel_env("busy_intersection", observer="complementary")  # the same class in the environment
+env = parallel_env("busy_intersection", observer="my_ekf")  # the same class in the environment
 _, infos = env.reset(seed=0)
 while env.agents:
     _, _, _, _, infos = env.step({agent: env.action_space(agent).sample() for agent in env.agents})

@@ -7,7 +7,7 @@ from gymnasium import spaces
 
 from coopenv.api.engine import Engine
 from coopenv.api.reward import Step
-from coopenv.estimation.trajectory import Outcome
+from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario import Scenario
 
 NUMBERS = ("position_error", "orientation_error", "nees", "log_determinant", "gramian_min_eigenvalue")

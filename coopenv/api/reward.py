@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.errors import CoopenvError, shown, suggest, told
-from coopenv.estimation.trajectory import Sight
+from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario
 
 FIELDS = (

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.backends.base import Capabilities, Episode, SensingWorld, TickGenerator
-from coopenv.estimation.trajectory import Sight
+from coopenv.estimation.outcomes import Sight
 from coopenv.observers.briefing import start_covariances
 from coopenv.observers.recording import Sensed, Truth, is_due
 from coopenv.observers.registry import find_embedded

@@ -1,7 +1,6 @@
 """The record of one run: what was true, what was estimated, and what was in view."""
 
 from dataclasses import dataclass, fields, replace
-from enum import IntEnum
 from pathlib import Path
 from typing import Self
 
@@ -9,30 +8,6 @@ import numpy as np
 
 from coopenv.errors import DataError
 from coopenv.files import replacing_file
-
-
-class Sight(IntEnum):
-    """Why a target is or is not measured by a camera at one tick."""
-
-    NOT_A_NEIGHBOUR = 0
-    VISIBLE = 1
-    OUT_OF_VIEW = 2
-    OCCLUDED_BY_BUILDING = 3
-    OCCLUDED_BY_BODY = 4
-    MISSED = 5
-
-
-class Outcome(IntEnum):
-    """How a vehicle's episode has ended so far."""
-
-    UNDER_WAY = 0
-    ARRIVED = 1
-    COLLIDED = 2
-
-    @property
-    def words(self) -> str:
-        """The name in small letters: "under way", "arrived", "collided"."""
-        return self.name.lower().replace("_", " ")
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import warp as wp
 from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
-from coopenv.estimation.trajectory import Sight
+from coopenv.estimation.outcomes import Sight
 from coopenv.observers.checks import check_message
 from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick
 from coopenv.observers.kernel_world import model_of, views_of

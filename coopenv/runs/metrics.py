@@ -10,7 +10,8 @@ import warp as wp
 from coopenv.api.infos import outcome_words
 from coopenv.estimation.metrics import observability_of, summarise
 from coopenv.estimation.observability import Observability
-from coopenv.estimation.trajectory import Outcome, Trajectory
+from coopenv.estimation.outcomes import Outcome
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.rollouts import Ending, Rollout
 from coopenv.shipped import version
 

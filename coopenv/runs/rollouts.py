@@ -10,7 +10,8 @@ from coopenv.api.engine import Engine
 from coopenv.api.infos import outcome_words
 from coopenv.backends.base import Backend
 from coopenv.errors import CoopenvError
-from coopenv.estimation.trajectory import Sight, Trajectory
+from coopenv.estimation.outcomes import Sight
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.policies import Policy, load_policy
 from coopenv.runs.episode import Views, play
 from coopenv.scenario import Scenario

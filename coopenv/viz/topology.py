@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from coopenv.estimation.metrics import live_ticks, mean_targets_in_view
-from coopenv.estimation.trajectory import Sight, Trajectory
+from coopenv.estimation.outcomes import Sight
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.viz import style
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.colors import to_rgba_array
 from matplotlib.patheffects import withStroke
 
-from coopenv.estimation.trajectory import Outcome, Sight
+from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.format import fixed
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Body, Landmark, Vehicle

@@ -11,7 +11,7 @@ from matplotlib.patches import Circle, Patch, Polygon
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation
 
-from coopenv.estimation.trajectory import Sight
+from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario
 from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, legend, new_figure, vehicle_colour
 from coopenv.viz.topview_geometry import limits, road_corners

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.estimation.trajectory import Outcome
+from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.motion import compile_motion

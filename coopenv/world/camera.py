@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.trajectory import Sight
+from coopenv.estimation.outcomes import Sight
 from coopenv.world.random import BEARING, gaussian_pair, pair, random_words, signed_uniform, uniform
 
 NOT_A_NEIGHBOUR = wp.constant(wp.uint8(Sight.NOT_A_NEIGHBOUR))

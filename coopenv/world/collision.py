@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.trajectory import Outcome
+from coopenv.estimation.outcomes import Outcome
 
 UNDER_WAY = wp.constant(int(Outcome.UNDER_WAY))
 ARRIVED = wp.constant(int(Outcome.ARRIVED))

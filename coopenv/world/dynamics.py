@@ -48,7 +48,7 @@ def prescribe(model: Any, state: Any, world: int, agent: int, t: wp.float64):
 
 
 @wp.func
-def approach(value: Any, target: Any, dt: Any, lag: Any, rate: Any):
+def first_order_lag(value: Any, target: Any, dt: Any, lag: Any, rate: Any):
     """Return the value after a first-order lag towards a target, its rate limited."""
     change = target - value
     if lag > type(lag)(0.0):
@@ -60,9 +60,9 @@ def approach(value: Any, target: Any, dt: Any, lag: Any, rate: Any):
 def actuate(model: Any, speed: Any, steering: Any, command: Any, dt: Any):
     """Return (speed, steering) after dt under a command, see `coopenv.world.command`."""
     d = model.dynamics
-    new_speed = approach(speed, command[SPEED], dt, d.speed_lag, command[ACCELERATION])
+    new_speed = first_order_lag(speed, command[SPEED], dt, d.speed_lag, command[ACCELERATION])
     angle = wp.clamp(command[STEERING], -d.max_steering, d.max_steering)
-    new_steering = approach(steering, angle, dt, d.steering_lag, d.max_steering_rate)
+    new_steering = first_order_lag(steering, angle, dt, d.steering_lag, d.max_steering_rate)
     return wp.clamp(new_speed, d.min_speed, d.max_speed), new_steering
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.estimation.trajectory import Sight
+from coopenv.estimation.outcomes import Sight
 from coopenv.scenario.base import LARGEST
 from coopenv.world.precision import Precision
 from coopenv.world.records import allocate, array, fields

@@ -15,7 +15,8 @@ import coopenv
 from coopenv.errors import CoopenvError, DeviceError
 from coopenv.estimation.metrics import settling_time
 from coopenv.estimation.observability import analyse_observability
-from coopenv.estimation.trajectory import Sight, Trajectory
+from coopenv.estimation.outcomes import Sight
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.jsonable import json_text
 from coopenv.runs import Rollout, rollout
 from coopenv.runs.metrics import outcome_line, run_metrics, vehicle_metrics

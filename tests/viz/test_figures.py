@@ -24,7 +24,8 @@ import coopenv
 from coopenv.errors import OutputError
 from coopenv.estimation.metrics import summarise
 from coopenv.estimation.observability import analyse_observability
-from coopenv.estimation.trajectory import Sight, Trajectory
+from coopenv.estimation.outcomes import Sight
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.viz import FIGURE_NAMES, consistency, style
 from coopenv.viz.clipping import clipped
 from coopenv.viz.error_figure import error_figure

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.estimation.metrics import error_coordinates
-from coopenv.estimation.trajectory import Sight
+from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import load_scenario
 from coopenv.scenario.bodies import Obstacle
 from coopenv.scenario.sensing import Camera

@@ -13,7 +13,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from coopenv.errors import ScenarioError
-from coopenv.estimation.trajectory import Sight
+from coopenv.estimation.outcomes import Sight
 from coopenv.world import camera
 from coopenv.world.model import model_struct
 from coopenv.world.precision import precision

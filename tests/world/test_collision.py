@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.trajectory import Outcome
+from coopenv.estimation.outcomes import Outcome
 from coopenv.world import collision
 from tests.helpers.builders import command, constant, landmark, reset, run, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES, call

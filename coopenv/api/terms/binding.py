@@ -11,7 +11,7 @@ import warp as wp
 from coopenv import user_code
 from coopenv.api.terms.layout import Layout, included_fields
 from coopenv.errors import CoopenvError
-from coopenv.estimation.trajectory import Outcome
+from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario import Scenario
 from coopenv.scenario.own_terms import record_count
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS, TERMINATION_CONDITIONS, Registry, Row, Term
