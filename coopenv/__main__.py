@@ -1,7 +1,9 @@
 """The command `coopenv`, also `python -m coopenv`: signals are caught before anything else is loaded."""
 
 import io
+import os
 import sys
+from pathlib import Path
 
 from coopenv import interrupts
 
@@ -9,6 +11,7 @@ from coopenv import interrupts
 def main() -> int:
     """Run the command line of this process and return its exit status."""
     interrupts.install()
+    sys.stderr = sys.stderr or Path(os.devnull).open("w")  # noqa: SIM115 (libraries write to a closed one too)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # file names need not be text

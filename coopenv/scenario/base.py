@@ -44,5 +44,6 @@ PositiveVector2 = tuple[Positive, Positive]
 PositiveVector3 = tuple[Positive, Positive, Positive]
 NonNegativeVector3 = tuple[NonNegative, NonNegative, NonNegative]
 Sample = Literal["sample"]
+Word = Annotated[str, AfterValidator(_readable)]
 Text = Annotated[str, Field(max_length=10_000), AfterValidator(_readable)]
 """Printed as it is, so that nothing in it may command a terminal."""

@@ -14,9 +14,9 @@ from coopenv.scenario.base import (
     Positive,
     PositiveVector3,
     QuaternionWxyz,
-    Text,
     Vector2,
     Vector3,
+    Word,
 )
 
 
@@ -32,7 +32,7 @@ class Body(Part):
 class Obstacle(Part):
     """A building: a box that stands still."""
 
-    name: Annotated[Text, Field(min_length=1, max_length=64)]
+    name: Word = Field(min_length=1, max_length=64)
     center: Vector3
     """Centre in the coordinates of this file, m."""
     size: PositiveVector3

@@ -365,6 +365,6 @@ def test_the_example_is_better_than_odometry(
     monkeypatch.setattr(registry, "_registered", {})
     runpy.run_path(str(Path(__file__).parents[2] / "examples" / "own_observer.py"))
     rows = {line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines()[1:]}
-    own, odometry = (np.array(rows[name][:5], float) for name in ("complementary", "dead_reckoning"))
-    assert (own < odometry).all() and own[0] < 0.5
-    assert float(rows["complementary"][5]) == 24 * 60
+    own, odometry = (np.array(rows[name][:5], float) for name in ("my_ekf", "dead_reckoning"))
+    assert (own < 0.1).all() and (own < 0.1 * odometry).all()
+    assert float(rows["my_ekf"][5]) == (3 + 6) * 8 * 60

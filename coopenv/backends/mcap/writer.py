@@ -119,7 +119,7 @@ class _Log:
         self._send(topic(name, "odometry"), SHOWN["odometry"], k, "map", **about)
 
     def _poses(self, positions: np.ndarray, rotations: np.ndarray) -> Iterator[Any]:
-        quaternions = Rotation.from_matrix(rotations).as_quat().tolist() if len(rotations) else []
+        quaternions = Rotation.from_matrix(np.array(rotations)).as_quat().tolist() if len(rotations) else []
         pose, point, orientation = (self.types[name] for name in ("Pose", "Point", "Quaternion"))
         pairs = zip(positions.tolist(), quaternions, strict=True)
         return (pose(point(*position), orientation(*quaternion)) for position, quaternion in pairs)
