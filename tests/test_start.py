@@ -53,7 +53,7 @@ def test_make_finds_environments_after_the_import_alone() -> None:
 
 def test_lazy_names_are_those_that_type_checkers_see() -> None:
     tree = ast.parse(Path(coopenv.__file__).read_text(encoding="utf-8"))
-    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
     seen = {
         alias.name: statement.module
         for statement in block.body
