@@ -91,9 +91,8 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
                 rescued = place.with_name(part.stem.removeprefix("."))
                 with writing(folder):
                     part.rename(rescued)
-                raise OutputError(
-                    f"cannot replace {folder}: {error.strerror}; the new result is in {rescued}"
-                ) from None
+                why = f"{error.strerror}; the new result is in {rescued}"
+                raise OutputError(f"cannot replace {folder}: {why}") from None
             _written(folder, place)
         sync(place.parent)
 

@@ -47,9 +47,8 @@ def scenario_path(name_or_path: str | Path) -> Path:
             raise UnknownEnvironmentError(f"no such scenario file: {shortened(str(path), 200)}")
         return path
     if text not in list_envs():
-        raise UnknownEnvironmentError(
-            f"unknown environment {shown(text)}{suggest(text, list_envs())}; known: {', '.join(list_envs())}"
-        )
+        known = f"{suggest(text, list_envs())}; known: {', '.join(list_envs())}"
+        raise UnknownEnvironmentError(f"unknown environment {shown(text)}{known}")
     return data_directory("envs") / f"{text}.toml"
 
 
@@ -182,7 +181,6 @@ def _indices(node: list[Any], head: str, key: str, parent: str) -> Iterable[int]
     whole = number.isascii() and number.isdigit() and len(number) < 10
     index = int(number) - (1 if head != number else 0) if whole else -1
     if not 0 <= index < len(node):
-        raise ScenarioError(
-            f"override {shown(key)}: no entry {shown(head)} (there are {len(node)}; 0..{len(node) - 1} or *)"
-        )
+        there = f"(there are {len(node)}; 0..{len(node) - 1} or *)"
+        raise ScenarioError(f"override {shown(key)}: no entry {shown(head)} {there}")
     return [index]

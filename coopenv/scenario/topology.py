@@ -25,9 +25,8 @@ def neighbour_sets(scenario: ScenarioFields) -> list[list[int]]:
         where = f"vehicles.{i}.neighbours"
         for name in vehicle.neighbours:
             if name not in index:
-                raise ValueError(
-                    f"{where}: unknown target {shown(name)}{suggest(name, index)}; known: {listed([*index])}"
-                )
+                known = f"{suggest(name, index)}; known: {listed([*index])}"
+                raise ValueError(f"{where}: unknown target {shown(name)}{known}")
             if index[name] == own:
                 raise ValueError(f"{where}: a vehicle cannot be its own neighbour")
         result.append(sorted({index[name] for name in vehicle.neighbours}))

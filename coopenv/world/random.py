@@ -1,7 +1,5 @@
 """Counter-based random numbers: Philox4x32-7 (Salmon, Moraes, Dror, Shaw, SC 2011).
 
-Seven rounds are the fewest that the authors found to pass BigCrush; their ten would cost 6 % of a camera tick.
-
 A draw is a pure function of (seed, episode, index, subject, stream), so a world has the same noise whatever the
 batch size, the order of execution and the device. `index` is a tick or a sample number, `subject` packs the agents
 concerned, and `stream` is one of the constants below.
@@ -13,7 +11,7 @@ import warp as wp
 
 vec4u = wp.types.vector(4, wp.uint32)
 
-ROUNDS = wp.constant(7)
+ROUNDS = wp.constant(7)  # the fewest that the authors found to pass BigCrush; their ten cost 6 % of a camera tick
 MULTIPLIER_0 = wp.constant(wp.uint64(0xD2511F53))
 MULTIPLIER_1 = wp.constant(wp.uint64(0xCD9E8D57))
 WEYL_0 = wp.constant(wp.uint32(0x9E3779B9))

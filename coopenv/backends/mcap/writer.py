@@ -43,15 +43,9 @@ def write_recording(recording: Recording, path: str | Path) -> None:
 
 
 def check_target(path: str | Path) -> None:
-    """Say before any work if a recording cannot be written to a path.
-
-    Raises:
-        CoopenvError: the extra `log` is not installed.
-        OutputError: the name does not end in .mcap, or the file cannot be written.
-    """
+    """Refuse before any work a path that no recording can be written to, or to work without the extra `log`."""
     codec()
-    path = Path(path)
-    if path.suffix != ".mcap":
+    if Path(path).suffix != ".mcap":
         raise OutputError(f"{path}: the name must end in .mcap")
     check_file(path)
 

@@ -56,13 +56,10 @@ class Replay(TickGenerator):
         """Find the recording's scenario; arguments and errors as for `check_recording` and `scenario_of`."""
         check_recording(recording, name)
         self.recording = recording
-        known = bool(recording.truth.known.any())
-        scenario = scenario_of(recording, name, overrides or {})
+        scenario, known = scenario_of(recording, name, overrides or {}), bool(recording.truth.known.any())
         ticks = scenario.horizon_ticks + 1
-        capabilities = Capabilities(
-            truth=known, driven=False, real_time=False, ticks=ticks, batched=True, recorded=True
-        )
-        super().__init__(scenario, capabilities)
+        abilities = Capabilities(truth=known, driven=False, real_time=False, ticks=ticks, batched=True, recorded=True)
+        super().__init__(scenario, abilities)
 
     def world(self, worlds: int, dtype: str, device: str, threads: int | None) -> ReplayWorld:
         """Return worlds that go through the recording."""

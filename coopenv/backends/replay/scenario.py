@@ -1,5 +1,6 @@
 """The scenario that a recording is replayed in: the recorded one, or for robots one made from their setups."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -28,9 +29,8 @@ def scenario_of(recording: Recording, name: str, overrides: Mapping[str, Any]) -
     raw = _raw(recording, name)
     for key, value in overrides.items():
         if str(key).split(".")[0] not in CHANGEABLE and key != "rates.decision":
-            raise CoopenvError(
-                f"override '{key}': {name} is recorded; free to choose: {', '.join(CHANGEABLE)}, rates.decision"
-            )
+            free = f"free to choose: {', '.join(CHANGEABLE)}, rates.decision"
+            raise CoopenvError(f"override '{key}': {name} is recorded; {free}")
         override(raw, str(key), value)
     scenario = parse_scenario(raw, name)
     if scenario.horizon_ticks > recording.ticks - 1:
@@ -64,20 +64,20 @@ def _of_robots(recording: Recording, name: str) -> dict[str, Any]:
     corrections = float(recording.due[1:].mean()) * rate
     if not np.array_equal(is_due(np.arange(recording.ticks), corrections / rate)[1:], recording.due[1:]):
         raise DataError(f"{name}: its corrections are not due at a fixed rate")
+    staleness = recording.staleness if math.isfinite(recording.staleness) else None
+    points = zip(targets[: first.landmarks], recording.landmarks[0].tolist(), strict=True)
+    starts = zip(recording.setups, recording.start_position.tolist(), strict=True)
     return {
         "title": name,
         "horizon": (recording.ticks - 1) * recording.dt,
-        "landmarks": [
-            {"name": target, "position": position.tolist()}
-            for target, position in zip(targets[: first.landmarks], recording.landmarks[0], strict=True)
-        ],
+        "landmarks": [{"name": target, "position": position} for target, position in points],
         "vehicles": [
             {
-                "initial_pose": {"position": recording.start_position[i].tolist()},
+                "initial_pose": {"position": position},
                 "marker": setup.marker.tolist(),
                 "neighbours": [targets[n] for n in setup.targets],
             }
-            for i, setup in enumerate(recording.setups)
+            for setup, position in starts
         ],
         "camera": {"position": first.lever_arm.tolist(), "orientation": "body"},
         "rates": {
@@ -92,15 +92,10 @@ def _of_robots(recording: Recording, name: str) -> dict[str, Any]:
             "bearing": {"model": "isotropic", "scale": noise.bearing},
         },
         "topology": {"mode": "sensed", "acyclic": False},
-        "v2x": {
-            "period": recording.period,
-            "staleness": None if np.isinf(recording.staleness) else recording.staleness,
-        },
+        "v2x": {"period": recording.period, "staleness": staleness},
         "observer": {
             "k": [setup.gains.k for setup in recording.setups],
-            "q": {target: float(q) for target, q in zip(targets, gains.q, strict=True)},
-            "V": list(gains.V),
-            "P0": list(gains.P0),
-            "max_turn": gains.max_turn,
+            "q": dict(zip(targets, gains.q.tolist(), strict=True)),
+            **{name: getattr(gains, name) for name in ("V", "P0", "max_turn")},
         },
     }
