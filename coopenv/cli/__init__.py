@@ -18,10 +18,8 @@ from coopenv.cli.run import record_command, run
 from coopenv.errors import CoopenvError
 from coopenv.shipped import version as installed_version
 
-UsageError: Any = typer.BadParameter.__base__
-"""What typer raises for every mistake in the options; it has no public name."""
-INTERRUPTED, PIPE_CLOSED = 130, 141
-"""Exit statuses, 128 plus the number of the signal."""
+UsageError: Any = typer.BadParameter.__base__  # raised for every mistake in the options; it has no public name
+INTERRUPTED, PIPE_CLOSED = 130, 141  # exit statuses, 128 plus the number of the signal
 
 app = typer.Typer(
     name="coopenv",

@@ -20,8 +20,7 @@ from coopenv.scenario.bodies import (
 from coopenv.scenario.schema import Scenario
 from coopenv.scenario.topology import neighbour_sets
 
-MANY_LANDMARKS = 4
-"""From this number on, `all landmarks` stands for their names."""
+MANY_LANDMARKS = 4  # from this number on, `all landmarks` stands for their names
 
 
 def vector(values: Sequence[float]) -> str:

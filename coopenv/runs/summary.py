@@ -15,8 +15,7 @@ from coopenv.format import number
 from coopenv.scenario import Scenario
 from coopenv.shipped import list_envs
 
-DESCRIPTION_LENGTH = 240
-"""Characters of a scenario's description on the first screen."""
+DESCRIPTION_LENGTH = 240  # characters of a scenario's description on the first screen
 
 
 def summary(name: str, scenario: Scenario, recorded: bool = False) -> Iterator[RenderableType]:

@@ -20,8 +20,7 @@ from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.topology import neighbour_sets
 
-ALL = "all"
-"""Asks for every variant that the source can have."""
+ALL = "all"  # asks for every variant that the source can have
 NOBODY_FOLLOWS = "no vehicle has another one as its neighbour"
 
 

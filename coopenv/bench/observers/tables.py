@@ -17,8 +17,7 @@ from coopenv.jsonable import jsonable
 from coopenv.runs.table import number_table
 
 WIDTH = 80
-MOST_COLUMNS = 5
-"""Vehicles shown one by one; more are summed up as mean and worst."""
+MOST_COLUMNS = 5  # vehicles shown one by one; more are summed up as mean and worst
 FAILED = "failed"
 SPREAD_NOTE = "0.0123(4): 0.0123 with a standard error of 0.0004 over the seeds"
 
