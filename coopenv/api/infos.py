@@ -6,11 +6,8 @@ import numpy as np
 from gymnasium import spaces
 
 from coopenv.api.engine import Engine
-from coopenv.api.reward import Step
-from coopenv.estimation.outcomes import Outcome
+from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.scenario import Scenario
-
-NUMBERS = ("position_error", "orientation_error", "nees", "log_determinant", "gramian_min_eigenvalue")
 
 
 def outcome_words(scenario: Scenario) -> tuple[str, ...]:
@@ -22,28 +19,49 @@ class InfoWriter:
     """Builds {agent: info} for world 0 of an engine."""
 
     def __init__(self, engine: Engine, scenario: Scenario) -> None:
-        self._engine, self._step = engine, Step(engine.view, scenario)
+        self._engine = engine
         self._index = {agent: i for i, agent in enumerate(scenario.vehicle_names)}
-        self._targets, self._outcomes = scenario.target_names, outcome_words(scenario)
+        self._targets, self._landmarks = scenario.target_names, len(scenario.landmarks)
+        self._outcomes = outcome_words(scenario)
+        self._tick_length = 1.0 / scenario.rates.camera
 
     def __call__(self, agents: list[str]) -> dict[str, dict[str, Any]]:
         """Return one info per agent, always with the same keys."""
-        step, world = self._step, self._engine.world
-        truth, estimate = ({key: a[0].copy() for key, a in step[part].items()} for part in ("truth", "estimate"))
-        numbers = [step[name][0].tolist() for name in NUMBERS]
-        ended, terms = step["ended"][0].tolist(), self._engine.view("terms")[0].tolist()
-        seen: list[list[str]] = [[] for _ in ended]
-        for i, target in np.argwhere(step["visible"][0]).tolist():
+        view = self._engine.view
+        L = self._landmarks
+        R, position = view("rotation")[0, L:].copy(), view("position")[0, L:].copy()
+        velocity = view("velocity")[0, L:].copy()
+        angular_velocity = view("angular_velocity")[0, L:].copy()
+        R_hat, p_hat = view("estimate_rotation")[0].copy(), view("estimate_position")[0]
+        position_hat = np.matmul(R_hat, p_hat[..., None])[..., 0]
+        covariance = view("covariance")[0].copy()
+        position_error, orientation_error = view("position_error")[0].tolist(), view("orientation_error")[0].tolist()
+        nees, log_determinant = view("nees")[0].tolist(), view("log_determinant")[0].tolist()
+        smallest = view("gramian_min_eigenvalue")[0].tolist()
+        ended, terms = view("ended")[0].tolist(), view("terms")[0].tolist()
+        seen: list[list[str]] = [[] for _ in R]
+        vehicle_seen, target_seen = np.nonzero(view("sight")[0] == Sight.VISIBLE)
+        for i, target in zip(vehicle_seen.tolist(), target_seen.tolist(), strict=True):
             seen[i].append(self._targets[target])
-        late, missing, time = world.late.tolist(), world.missing.tolist(), float(step["time"][0, 0])
+        late, missing = self._engine.world.late.tolist(), self._engine.world.missing.tolist()
+        time = int(view("tick")[0]) * self._tick_length
         infos = {}
         for agent in agents:
             i = self._index[agent]
             infos[agent] = {
-                "truth": {key: values[i] for key, values in truth.items()},
-                "estimate": {key: values[i] for key, values in estimate.items()},
-                **{name: values[i] for name, values in zip(NUMBERS, numbers, strict=True)},
+                "truth": {
+                    "position": position[i],
+                    "rotation": R[i],
+                    "velocity": velocity[i],
+                    "angular_velocity": angular_velocity[i],
+                },
+                "estimate": {"position": position_hat[i], "rotation": R_hat[i], "covariance": covariance[i]},
+                "position_error": position_error[i],
+                "orientation_error": orientation_error[i],
                 "visible": tuple(seen[i]),
+                "nees": nees[i],
+                "log_determinant": log_determinant[i],
+                "gramian_min_eigenvalue": smallest[i],
                 "reward_terms": dict(zip(self._engine.reward_terms, terms[i], strict=True)),
                 "time": time,
                 "outcome": self._outcomes[ended[i]],

@@ -129,8 +129,9 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             return {}, {}, {}, {}, {}
         with self.engine.stopping():
             self.engine.step(self._read_actions(actions, alive))
+        indices = [self._index[agent] for agent in alive]
         values = (self.engine.view(name)[0].tolist() for name in ("reward", "terminated", "truncated"))
-        rewards, terminated, truncated = ({agent: of[self._index[agent]] for agent in alive} for of in values)
+        rewards, terminated, truncated = (dict(zip(alive, [of[i] for i in indices], strict=True)) for of in values)
         result = self._observations(alive), rewards, terminated, truncated, self._infos(alive)
         self.agents = [agent for agent in alive if not (terminated[agent] or truncated[agent])]
         if self.render_mode == "human":
