@@ -54,11 +54,7 @@ def replacing_file(path: str | Path) -> Iterator[Path]:
 
 
 def replace_text(path: str | Path, text: str) -> None:
-    """Write a text that takes the place of the file `path`.
-
-    Raises:
-        OutputError: it cannot be written; the old file is untouched.
-    """
+    """Write a text that takes the place of the file `path`; an OutputError says why not, and the old one stays."""
     with replacing_file(path) as new:
         new.write_text(text, encoding="utf-8")
 
@@ -98,11 +94,7 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
 
 
 def check_file(path: str | Path) -> None:
-    """Find out before any work whether a file can be written.
-
-    Raises:
-        OutputError: it cannot.
-    """
+    """Find out before any work whether a file can be written. Raises OutputError: it cannot."""
     with _staging(path, _check_file):
         pass
 

@@ -43,11 +43,9 @@ def _misshapen(tick: Sensed, sizes: dict[str, int]) -> Iterator[str]:
         value = getattr(tick, whole)
         value = getattr(value, part) if part and value is not None else value
         shape, kinds = tuple(sizes.get(str(n), n) for n in letters), KINDS.get(name, "fiu")
-        is_array = isinstance(value, np.ndarray)
-        if (value is not None or name in MEASURED) and not (
-            is_array and value.shape == shape and value.dtype.kind in kinds
-        ):
-            got = f"{value.dtype} {value.shape}" if is_array else type(value).__name__
+        fits = isinstance(value, np.ndarray) and value.shape == shape and value.dtype.kind in kinds
+        if not fits and (value is not None or name in MEASURED):
+            got = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
             yield f"{name}: expected an array of shape {shape} and kind {kinds}, got {got}"
 
 

@@ -149,11 +149,7 @@ def _merged(under: Any, over: Any) -> Any:
 
 
 def override(raw: Any, key: str, value: Any) -> None:
-    """Set one dotted key in nested plain data, in place; a table is merged into the one that is there.
-
-    Raises:
-        ScenarioError: a list index does not exist, or the path runs through a plain value.
-    """
+    """Set one dotted key in nested plain data, in place; a table is merged into the one that is there."""
     _descend(raw, key.split("."), value, key)
 
 
