@@ -30,8 +30,7 @@ class InfoWriter:
         view = self._engine.view
         L = self._landmarks
         R, position = view("rotation")[0, L:].copy(), view("position")[0, L:].copy()
-        velocity = view("velocity")[0, L:].copy()
-        angular_velocity = view("angular_velocity")[0, L:].copy()
+        v, w = view("velocity")[0, L:].copy(), view("angular_velocity")[0, L:].copy()
         R_hat, p_hat = view("estimate_rotation")[0].copy(), view("estimate_position")[0]
         position_hat = np.matmul(R_hat, p_hat[..., None])[..., 0]
         covariance = view("covariance")[0].copy()
@@ -49,12 +48,7 @@ class InfoWriter:
         for agent in agents:
             i = self._index[agent]
             infos[agent] = {
-                "truth": {
-                    "position": position[i],
-                    "rotation": R[i],
-                    "velocity": velocity[i],
-                    "angular_velocity": angular_velocity[i],
-                },
+                "truth": {"position": position[i], "rotation": R[i], "velocity": v[i], "angular_velocity": w[i]},
                 "estimate": {"position": position_hat[i], "rotation": R_hat[i], "covariance": covariance[i]},
                 "position_error": position_error[i],
                 "orientation_error": orientation_error[i],

@@ -50,7 +50,6 @@ def make_aec(name: str, **options: Any) -> AECEnv[str, Any, Any]:
 
 def register_all() -> None:
     """Register what is not registered yet."""
-    here = __name__
     for name in list_envs():
         identity = environment_id(name)
         if identity not in gymnasium.registry:
@@ -60,9 +59,6 @@ def register_all() -> None:
                 vector_entry_point="coopenv.api.vector_env:make_rows",
                 kwargs={"name_or_path": name},
             )
-        for kind, registry, entry in (
-            ("parallel", parallel_registry, "make_parallel"),
-            ("aec", aec_registry, "make_aec"),
-        ):
+        for kind, registry in (("parallel", parallel_registry), ("aec", aec_registry)):
             if identity not in registry:
-                pettingzoo.register(kind, identity, entry_point=f"{here}:{entry}", kwargs={"name": name})
+                pettingzoo.register(kind, identity, entry_point=f"{__name__}:make_{kind}", kwargs={"name": name})

@@ -27,9 +27,7 @@ def put(size: int, own: bool) -> wp.Function:
     """Return what writes a value of so many entries x factor, clipped to [-1, 1]; NaN of own fields stays."""
     many = size > 1
 
-    def put_value(
-        out: wp.array3d(dtype=wp.float32), world: int, vehicle: int, first: int, value: Any, factor: wp.float32
-    ):
+    def put_value(out: Any, world: int, vehicle: int, first: int, value: Any, factor: wp.float32):
         for axis in range(size):
             entry = wp.float32(value[axis] if many else value) * factor
             clipped = wp.clamp(entry, -1.0, 1.0)
@@ -44,16 +42,7 @@ def writer(field: Bound) -> wp.Function:
     function, number, size, both = field.function, field.number, field.size, field.records == 2
     put_value = put(size, field.own)
 
-    def write(
-        out: wp.array3d(dtype=wp.float32),
-        start: Any,
-        factor: Any,
-        world: int,
-        vehicle: int,
-        n: int,
-        ego: Ego,
-        other: Any,
-    ):
+    def write(out: Any, start: Any, factor: Any, world: int, vehicle: int, n: int, ego: Ego, other: Any):
         value = function(ego, other) if both else function(ego)
         put_value(out, world, vehicle, start[number] + n * size, value, factor[number])
 
