@@ -152,3 +152,21 @@ class RobustMemory:
 
 
 SIZES = {"K": MAX_MEMBERS, "H": MAX_HYPOTHESES + 1}  # besides the hypotheses of one frame there is the prior
+
+
+@wp.func
+def clear(model: Any, memory: Any, world: int, i: int):
+    """Forget an earlier episode, down to what is only used within a tick: equal states are equal in every bit."""
+    memory.belief[world, i] = Belief()
+    memory.search[world, i] = Search()
+    members = memory.member.shape[2]
+    for n in range(members):
+        memory.member[world, i, n] = Member()
+        memory.scratch[world, n] = Scratch()
+        for k in range(members):
+            memory.P[world, i, n, k] = mat66d()
+            memory.scratch_blocks[world, n, k] = mat66d()
+    for h in range(memory.hypothesis.shape[2]):
+        memory.hypothesis[world, i, h] = Hypothesis()
+    for n in range(model.agents):
+        memory.line[world, n] = Line()

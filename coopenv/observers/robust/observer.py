@@ -15,40 +15,10 @@ from coopenv.estimation.so3 import orthonormalise, skew
 from coopenv.observers.robust.algebra import distance_squared, is_known, lower_blocks, moved, odometry_noise
 from coopenv.observers.robust.belief import begin_belief, own_estimate, propagate
 from coopenv.observers.robust.constants import SAME_PRIOR
-from coopenv.observers.robust.memory import (
-    Belief,
-    Estimate,
-    Hypothesis,
-    Line,
-    Member,
-    Pose,
-    Scratch,
-    Search,
-    mat33d,
-    mat66d,
-    vec3d,
-)
+from coopenv.observers.robust.memory import Estimate, Pose, clear, mat33d, vec3d
 from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
 from coopenv.observers.robust.tracklets import possible_dependencies
 from coopenv.observers.robust.update import resect, set_anchor, update
-
-
-@wp.func
-def clear(model: Any, memory: Any, world: int, i: int):
-    """Forget an earlier episode, down to what is only used within a tick: equal states are equal in every bit."""
-    memory.belief[world, i] = Belief()
-    memory.search[world, i] = Search()
-    members = memory.member.shape[2]
-    for n in range(members):
-        memory.member[world, i, n] = Member()
-        memory.scratch[world, n] = Scratch()
-        for k in range(members):
-            memory.P[world, i, n, k] = mat66d()
-            memory.scratch_blocks[world, n, k] = mat66d()
-    for h in range(memory.hypothesis.shape[2]):
-        memory.hypothesis[world, i, h] = Hypothesis()
-    for n in range(model.agents):
-        memory.line[world, n] = Line()
 
 
 @wp.func

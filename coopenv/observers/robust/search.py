@@ -10,19 +10,9 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import carried, distance_squared, is_known
 from coopenv.observers.robust.belief import begin_belief, own_estimate
-from coopenv.observers.robust.constants import (
-    BEARING_GATE,
-    CLEAR_TIME,
-    MAX_BEARING_COST,
-    MAX_BEST_COST,
-    MAX_HYPOTHESES,
-    MAX_PRIOR_COST,
-    MIN_SEARCH_TIME,
-    PATIENCE,
-    PRUNE_GAP,
-)
 from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.measurements import NOTHING, innovation_squared, set_lines
 from coopenv.observers.robust.memory import Estimate, Hypothesis, Pose, Search
@@ -75,11 +65,11 @@ def prune(memory: Any, world: int, i: int):
     expected = wp.float64(2.0) * wp.float64(memory.hypothesis[world, i, 0].bearings)
     kept = int(0)
     for h in range(memory.search[world, i].hypotheses):
-        near = memory.hypothesis[world, i, h].cost <= least + wp.float64(PRUNE_GAP)
+        near = memory.hypothesis[world, i, h].cost <= least + wp.float64(constants.PRUNE_GAP)
         if near and is_new(memory, world, i, h, kept):
             memory.hypothesis[world, i, kept] = memory.hypothesis[world, i, h]
             kept += 1
-    if least > wp.float64(MAX_BEST_COST) + wp.float64(2.0) * expected:
+    if least > wp.float64(constants.MAX_BEST_COST) + wp.float64(2.0) * expected:
         kept = 0
     memory.search[world, i].hypotheses = kept
 
@@ -93,10 +83,10 @@ def follow_hypothesis(model: Any, memory: Any, world: int, i: int, h: int, used:
         memory.line[world, n].fits = 0
         if memory.line[world, n].member != NOTHING and n != used[0] and n != used[1] and n != used[2]:
             nis = innovation_squared(model, memory, world, i, n)
-            if nis < wp.float64(BEARING_GATE):
+            if nis < wp.float64(constants.BEARING_GATE):
                 memory.line[world, n].fits = 1
                 fitting += 1
-            memory.hypothesis[world, i, h].cost += wp.min(nis, wp.float64(MAX_BEARING_COST))
+            memory.hypothesis[world, i, h].cost += wp.min(nis, wp.float64(constants.MAX_BEARING_COST))
             memory.hypothesis[world, i, h].bearings += 1
     if fitting > 0:
         iterated_update(model, memory, world, i)
@@ -142,21 +132,21 @@ def solve_frame(model: Any, memory: Any, world: int, i: int, seen: int, period: 
     lines = chosen_triple(model, memory, world, i, seen)
     waited = memory.search[world, i].waited_time + period
     clear = memory.search[world, i].clear_time + period
-    patient = waited < wp.float64(PATIENCE)
-    following = not patient or clear >= wp.float64(CLEAR_TIME)
+    patient = waited < wp.float64(constants.PATIENCE)
+    following = not patient or clear >= wp.float64(constants.CLEAR_TIME)
     if not solve_triple(model, memory, world, i, lines, patient, following):
         clear = wp.float64(0.0)
         following = False
     if following:
         for h in range(memory.search[world, i].hypotheses):
             distance = distance_squared(memory.search[world, i].prior, memory.hypothesis[world, i, h].estimate)
-            memory.hypothesis[world, i, h].cost = wp.min(distance, wp.float64(MAX_PRIOR_COST))
+            memory.hypothesis[world, i, h].cost = wp.min(distance, wp.float64(constants.MAX_PRIOR_COST))
             memory.hypothesis[world, i, h].prior_distance = distance
             memory.hypothesis[world, i, h].bearings = 0
             follow_hypothesis(model, memory, world, i, h, lines)
         add_prior(model, memory, world, i)
         sort_hypotheses(memory, world, i)
-        memory.search[world, i].hypotheses = wp.min(memory.search[world, i].hypotheses, MAX_HYPOTHESES)
+        memory.search[world, i].hypotheses = wp.min(memory.search[world, i].hypotheses, constants.MAX_HYPOTHESES)
         memory.search[world, i].attempts += 1
         memory.search[world, i].followed_time = wp.float64(0.0)
         clear = wp.float64(0.0)
@@ -177,4 +167,4 @@ def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now:
         follow_hypothesis(model, memory, world, i, h, wp.vec3i(-1, -1, -1))
     prune(memory, world, i)
     alone = memory.search[world, i].hypotheses == 1
-    return alone and memory.search[world, i].followed_time >= wp.float64(MIN_SEARCH_TIME)
+    return alone and memory.search[world, i].followed_time >= wp.float64(constants.MIN_SEARCH_TIME)

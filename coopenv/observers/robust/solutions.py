@@ -9,15 +9,9 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import symmetric_part
+from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import distance_squared, inverse6, is_known, is_regular
 from coopenv.observers.robust.belief import begin_belief
-from coopenv.observers.robust.constants import (
-    CORRELATION_FACTOR,
-    MAX_HYPOTHESES,
-    MIN_INFORMATION_RATIO,
-    PERTURBATION,
-    SAME_HYPOTHESIS,
-)
 from coopenv.observers.robust.measurements import NOTHING, bearing_variance, linearise, tangent_basis
 from coopenv.observers.robust.memory import Estimate, Pose, mat33d, mat66d, vec3d
 from coopenv.observers.robust.p3p import camera_pose, solve_triangle
@@ -72,7 +66,7 @@ def covariance_of(model: Any, memory: Any, world: int, i: int, lines: Any, patie
     P = symmetric_part(inverse6(M))
     if patient:  # then the information is far from singular, and needs no costly spectrum
         return is_known(P), P
-    return angles_within(P, wp.float64(1.0)) and is_regular(M, wp.float64(MIN_INFORMATION_RATIO)), P
+    return angles_within(P, wp.float64(1.0)) and is_regular(M, wp.float64(constants.MIN_INFORMATION_RATIO)), P
 
 
 @wp.func
@@ -80,7 +74,7 @@ def is_new(memory: Any, world: int, i: int, h: int, count: int) -> bool:
     """Return whether a hypothesis can be told apart from each of the first `count`."""
     for g in range(count):
         distance = distance_squared(memory.hypothesis[world, i, h].estimate, memory.hypothesis[world, i, g].estimate)
-        if distance < wp.float64(SAME_HYPOTHESIS):
+        if distance < wp.float64(constants.SAME_HYPOTHESIS):
             return False
     return True
 
@@ -89,7 +83,7 @@ def is_new(memory: Any, world: int, i: int, h: int, count: int) -> bool:
 def add_hypothesis(memory: Any, world: int, i: int, estimate: Estimate):
     """Add a hypothesis, unless there is one like it."""
     h = memory.search[world, i].hypotheses
-    if h < MAX_HYPOTHESES:
+    if h < constants.MAX_HYPOTHESES:
         memory.hypothesis[world, i, h].estimate = estimate
         if is_new(memory, world, i, h, h):
             memory.search[world, i].hypotheses = h + 1
@@ -123,8 +117,8 @@ def solve_perturbed(
 
     To each side there are five: two axes across the bearing, three of the point.
     """
-    variance = memory.line[world, lines[n]].variance / wp.float64(CORRELATION_FACTOR)
-    step = wp.float64(PERTURBATION)
+    variance = memory.line[world, lines[n]].variance / wp.float64(constants.CORRELATION_FACTOR)
+    step = wp.float64(constants.PERTURBATION)
     for _ in range(2):
         for axis in range(5):
             moved_b = b

@@ -13,6 +13,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import symmetric_part
 from coopenv.estimation.so3 import skew
+from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import (
     between,
     carried,
@@ -25,15 +26,6 @@ from coopenv.observers.robust.algebra import (
     odometry_noise,
 )
 from coopenv.observers.robust.belief import append_member, fuse_information, index_of, make_room, mark_seen, propagate
-from coopenv.observers.robust.constants import (
-    AGREEMENT_DISTANCE,
-    AGREEMENT_TIME,
-    DEPENDENT_SHARE,
-    MASK_BITS,
-    MAX_VARIANCE_GROWTH,
-    MESSAGE_GATE,
-    TWIST_AVERAGING_TIME,
-)
 from coopenv.observers.robust.measurements import is_heard
 from coopenv.observers.robust.memory import Estimate, Pose, Report, mat66d, mat66f, vec3d
 from coopenv.world.camera import VISIBLE
@@ -42,7 +34,7 @@ from coopenv.world.camera import VISIBLE
 @wp.func
 def bit_of(vehicle: int) -> wp.uint64:
     """Return a vehicle as a bit; numbers from 64 on share bits with lower ones."""
-    return wp.uint64(1) << wp.uint64(vehicle % MASK_BITS)
+    return wp.uint64(1) << wp.uint64(vehicle % constants.MASK_BITS)
 
 
 @wp.func
@@ -140,7 +132,7 @@ def propagate_member(memory: Any, world: int, i: int, n: int, step: Pose, dt: An
     v = step.p / dt
     w = log_so3(step.R) / dt
     if memory.member[world, i, n].has_twist == 1:
-        share = wp.min(wp.float64(1.0), dt / wp.float64(TWIST_AVERAGING_TIME))
+        share = wp.min(wp.float64(1.0), dt / wp.float64(constants.TWIST_AVERAGING_TIME))
         v = memory.member[world, i, n].v + share * (v - memory.member[world, i, n].v)
         w = memory.member[world, i, n].w + share * (w - memory.member[world, i, n].w)
     memory.member[world, i, n].v = v
@@ -152,14 +144,14 @@ def propagate_member(memory: Any, world: int, i: int, n: int, step: Pose, dt: An
 def test_sender(memory: Any, world: int, i: int, n: int, told: Estimate, dt: Any):
     """Decide whether a sender is trusted, from its new report, dt after the last one, and the belief about it."""
     believed = Estimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
-    agrees = distance_squared(believed, told) < wp.float64(MESSAGE_GATE)
+    agrees = distance_squared(believed, told) < wp.float64(constants.MESSAGE_GATE)
     agreed = wp.float64(0.0)
     distrusted = wp.where(agrees, 0, 1)
     if memory.member[world, i, n].distrusted == 1:
         away = left_error(believed.pose, told.pose)
-        if agrees and wp.length(away[3:]) < wp.float64(AGREEMENT_DISTANCE):
+        if agrees and wp.length(away[3:]) < wp.float64(constants.AGREEMENT_DISTANCE):
             agreed = memory.member[world, i, n].agreement_time + dt
-        distrusted = wp.where(agreed >= wp.float64(AGREEMENT_TIME), 0, 1)
+        distrusted = wp.where(agreed >= wp.float64(constants.AGREEMENT_TIME), 0, 1)
     memory.member[world, i, n].agreement_time = agreed
     memory.member[world, i, n].distrusted = distrusted
 
@@ -175,7 +167,7 @@ def information_share(memory: Any, world: int, i: int, depends_on: wp.uint64):
         return wp.float64(1.0)
     own = bit_of(i)
     if (depends_on & own) == wp.uint64(0):
-        return wp.float64(DEPENDENT_SHARE)
+        return wp.float64(constants.DEPENDENT_SHARE)
     count = int(1)
     for n in range(1, memory.belief[world, i].members):
         if (memory.member[world, i, n].report.depends_on & own) != wp.uint64(0):
@@ -188,7 +180,7 @@ def fuse_tracklet(memory: Any, world: int, i: int, n: int, report: Report, befor
     """Fuse what a sender has learnt since its last report, which odometry has carried on to `before`."""
     after = mat66d(report.P)
     for k in range(6):
-        if after[k, k] > wp.float64(MAX_VARIANCE_GROWTH) * before.P[k, k]:
+        if after[k, k] > wp.float64(constants.MAX_VARIANCE_GROWTH) * before.P[k, k]:
             return
     precision = inverse6(after)
     information = symmetric_part(precision - inverse6(before.P))

@@ -10,19 +10,9 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import symmetric_part
+from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import between, carried, inverse6, is_regular, odometry_noise, with_noise
 from coopenv.observers.robust.belief import apply_error
-from coopenv.observers.robust.constants import (
-    ANCHOR_ANGLE_VARIANCE,
-    ANCHOR_POSITION_VARIANCE,
-    BEARING_GATE,
-    GAUSS_NEWTON_STEPS,
-    HEALTHY_SHARE,
-    HEALTHY_TIME,
-    LOST_SHARE,
-    LOST_TIME,
-    MIN_INFORMATION_RATIO,
-)
 from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.measurements import NOTHING, innovation_squared, isotropic, set_lines
 from coopenv.observers.robust.memory import Anchor, Estimate, mat66d, vec2d, vec6d
@@ -44,7 +34,7 @@ def gate(model: Any, memory: Any, world: int, i: int):
         member = memory.line[world, n].member
         if member != NOTHING:
             nis = innovation_squared(model, memory, world, i, n)
-            if nis < wp.float64(BEARING_GATE):
+            if nis < wp.float64(constants.BEARING_GATE):
                 memory.line[world, n].fits = 1
                 fitting += 1
                 total += nis
@@ -65,15 +55,6 @@ def set_anchor(memory: Any, world: int, i: int, P: Any, tick: int):
 
 
 @wp.func
-def restart_search(model: Any, memory: Any, world: int, i: int, tick: int):
-    """Search anew, from where the vehicle was when most bearings fitted, carried on by its odometry."""
-    anchor = memory.anchor[world, i]
-    elapsed = wp.float64(tick - anchor.tick) * model.camera_period
-    step = between(anchor.odometry, memory.belief[world, i].odometry)
-    begin_search(memory, world, i, carried(anchor.estimate, step, odometry_noise(model, elapsed)))
-
-
-@wp.func
 def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
     """Correct the belief by every bearing that fits it; search anew when most do not."""
     set_lines(model, state, memory, world, i, now.tick, False)
@@ -84,17 +65,20 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
         iterated_update(model, memory, world, i)
     if share < wp.float64(0.0):
         return
-    weight = wp.min(wp.float64(1.0), now.period / wp.float64(LOST_TIME))
+    weight = wp.min(wp.float64(1.0), now.period / wp.float64(constants.LOST_TIME))
     missed = memory.belief[world, i].missed_share + (share - memory.belief[world, i].missed_share) * weight
     healthy = memory.belief[world, i].healthy_time + now.period
-    if missed >= wp.float64(HEALTHY_SHARE):
+    if missed >= wp.float64(constants.HEALTHY_SHARE):
         healthy = wp.float64(0.0)
     memory.belief[world, i].missed_share = missed
     memory.belief[world, i].healthy_time = healthy
-    if missed > wp.float64(LOST_SHARE):
-        restart_search(model, memory, world, i, now.tick)
-    elif healthy > wp.float64(HEALTHY_TIME):
-        noise = vec2d(wp.float64(ANCHOR_ANGLE_VARIANCE), wp.float64(ANCHOR_POSITION_VARIANCE))
+    if missed > wp.float64(constants.LOST_SHARE):
+        anchor = memory.anchor[world, i]  # where most bearings fitted, carried on by odometry since
+        elapsed = wp.float64(now.tick - anchor.tick) * model.camera_period
+        step = between(anchor.odometry, memory.belief[world, i].odometry)
+        begin_search(memory, world, i, carried(anchor.estimate, step, odometry_noise(model, elapsed)))
+    elif healthy > wp.float64(constants.HEALTHY_TIME):
+        noise = vec2d(wp.float64(constants.ANCHOR_ANGLE_VARIANCE), wp.float64(constants.ANCHOR_POSITION_VARIANCE))
         set_anchor(memory, world, i, with_noise(wp.float64(4.0) * memory.P[world, i, 0, 0], noise), now.tick)
 
 
@@ -107,20 +91,6 @@ def weight_of(memory: Any, world: int, i: int, n: int):
         G = memory.line[world, n].member_jacobian
         N = N + (G * memory.P[world, i, member, member]) * wp.transpose(G)
     return wp.inverse(N)
-
-
-@wp.func
-def normal_equations(memory: Any, world: int, i: int, lines: int):
-    """Return (M, b) of the bearings that fit: M = H^T W H, b = H^T W residual."""
-    M = mat66d()
-    b = vec6d()
-    for n in range(lines):
-        if memory.line[world, n].fits == 1:
-            H = memory.line[world, n].jacobian
-            HtW = wp.transpose(H) * weight_of(memory, world, i, n)
-            M += HtW * H
-            b += HtW * memory.line[world, n].residual
-    return M, b
 
 
 @wp.func
@@ -154,13 +124,20 @@ def resect(model: Any, state: Any, memory: Any, world: int, i: int, tick: int) -
     lines = model.target_count[i]
     set_lines(model, state, memory, world, i, tick, False)
     inverse = mat66d()
-    for step in range(GAUSS_NEWTON_STEPS):
+    for step in range(constants.GAUSS_NEWTON_STEPS):
         _, fitting, _ = gate(model, memory, world, i)
-        M, b = normal_equations(memory, world, i, lines)
-        if fitting < 3 or not is_regular(M, wp.float64(MIN_INFORMATION_RATIO)):
+        M = mat66d()
+        b = vec6d()
+        for n in range(lines):
+            if memory.line[world, n].fits == 1:
+                H = memory.line[world, n].jacobian
+                HtW = wp.transpose(H) * weight_of(memory, world, i, n)
+                M += HtW * H
+                b += HtW * memory.line[world, n].residual
+        if fitting < 3 or not is_regular(M, wp.float64(constants.MIN_INFORMATION_RATIO)):
             return False
         inverse = inverse6(M)
-        if step < GAUSS_NEWTON_STEPS - 1:
+        if step < constants.GAUSS_NEWTON_STEPS - 1:
             apply_error(memory, world, i, 0, inverse * b)
     write_resected_covariance(memory, world, i, lines, inverse)
     return True
