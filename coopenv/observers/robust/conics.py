@@ -31,10 +31,8 @@ def cubic_roots(c3: Any, c2: Any, c1: Any, c0: Any):
     discriminant = q * q + p * p * p
     if discriminant <= wp.float64(0.0):
         radius = wp.sqrt(-p)
-        cosine = wp.clamp(
-            -q / wp.max(radius * radius * radius, wp.float64(1.0e-300)), wp.float64(-1.0), wp.float64(1.0)
-        )
-        angle = wp.acos(cosine) * wp.float64(THIRD)
+        cosine = -q / wp.max(radius * radius * radius, wp.float64(1.0e-300))
+        angle = wp.acos(wp.clamp(cosine, wp.float64(-1.0), wp.float64(1.0))) * wp.float64(THIRD)
         radius = wp.float64(2.0) * radius
         return vec3d(
             radius * wp.cos(angle) - b,
@@ -55,11 +53,9 @@ def singular_member(S: Any, T: Any):
 
     Without one, the member's eigenvalues have one sign, and what follows is not a number.
     """
-    adjoint_S = cofactors(S)
-    adjoint_T = cofactors(T)
     c3 = wp.determinant(S)
-    c2 = wp.ddot(adjoint_S, T)
-    c1 = wp.ddot(adjoint_T, S)
+    c2 = wp.ddot(cofactors(S), T)
+    c1 = wp.ddot(cofactors(T), S)
     c0 = wp.determinant(T)
     roots = cubic_roots(c3, c2, c1, c0)
     best = wp.float64(wp.inf)

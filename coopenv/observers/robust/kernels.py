@@ -4,10 +4,9 @@ from coopenv.estimation.coordinates import Coordinates
 from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.planar.plugin import PlanarRobust
-from coopenv.observers.robust.memory import SIZES, RobustMemory
+from coopenv.observers.robust.memory import SIZES, RobustMemory, rules_for
 from coopenv.observers.robust.messages import MESSAGES
 from coopenv.observers.robust.observer import make_estimate, make_start
-from coopenv.observers.robust.rules import rules_for
 from coopenv.observers.robust.tracklets import clear_messages, fuse_messages, receive, send
 from coopenv.world.embedded import Embedded
 

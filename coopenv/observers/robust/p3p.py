@@ -169,13 +169,7 @@ def camera_pose(b: Any, z: Any, distances: Any):
     return R, (z[0] + z[1] + z[2]) * third - R * ((p0 + p1 + p2) * third)
 
 
-def p3p_kernel(
-    bearings: wp.array(dtype=mat33d),
-    positions: wp.array(dtype=mat33d),
-    R: wp.array2d(dtype=mat33d),
-    camera: wp.array2d(dtype=vec3d),
-    mask: wp.array2d(dtype=wp.bool),
-):
+def p3p_kernel(bearings: Any, positions: Any, R: Any, camera: Any, mask: Any):
     """Solve one problem per thread."""
     n = wp.tid()
     count, distances = solve_triangle(bearings[n], positions[n])

@@ -5,10 +5,9 @@ from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.planar.plugin import PlanarRobust
 from coopenv.observers.robust.joint.fusion import fuse_joint_messages
-from coopenv.observers.robust.joint.memory import JOINT_SIZES, JointMemory
+from coopenv.observers.robust.joint.memory import JOINT_SIZES, JointMemory, joint_rules
 from coopenv.observers.robust.joint.messages import JOINT_MESSAGES
 from coopenv.observers.robust.joint.radio import clear_joint_messages, receive_joint, send_joint
-from coopenv.observers.robust.joint.rules import joint_rules
 from coopenv.observers.robust.kernels import OPTIONS
 from coopenv.observers.robust.observer import make_estimate, make_start
 from coopenv.world.embedded import Embedded

@@ -1,10 +1,13 @@
 """What every vehicle's observer remembers besides `robust.memory`, where messages tell of several vehicles."""
 
+from typing import Any
+
 import warp as wp
 
 from coopenv.observers.robust.constants import MAX_MEMBERS_JOINT, MAX_TOLD
-from coopenv.observers.robust.memory import SIZES, Pose, RobustMemory, mat66d
+from coopenv.observers.robust.memory import LARGE, SIZES, Pose, RobustMemory, are_joint, mat66d, rules_for, where
 from coopenv.world.records import array, extended
+from coopenv.world.saved_state import FLAG, ROTATION, TICK, Rule, whole
 
 
 @wp.struct
@@ -70,3 +73,31 @@ JOINT_SIZES = {
     "F": DIMENSION * (DIMENSION + 1) // 2,
     "X": 3,
 }
+
+
+def _are_told(P: Any, fields: Any, model: Any) -> Any:
+    """Return (W, N, K) which blocks (W, N, K, E, 6, 6) are covariances of the vehicles that a contact tells of."""
+    return are_joint(P.reshape(*P.shape[:3], MAX_TOLD, MAX_TOLD, 6, 6), fields["observer_contact.count"])
+
+
+VEHICLE = Rule("a vehicle", lambda values, fields, model: (values >= 0) & (values < model.vehicles))
+SENDER = Rule("a vehicle or -1", lambda values, fields, model: (values >= -1) & (values < model.vehicles))
+
+
+def joint_rules() -> dict[str, Rule]:
+    """Return what a saved memory may hold, see `rules_for`."""
+    rules = {
+        **rules_for(MAX_MEMBERS_JOINT),
+        "contact.sender": SENDER,
+        "contact.count": whole(0, MAX_TOLD),
+        "contact_P": Rule("a covariance", _are_told, axes=3),
+        **dict.fromkeys(("contact.distrusted", "contact.fused"), FLAG),
+        **dict.fromkeys(("matrix", "blocks"), LARGE),
+    }
+    counts = {"outbox": "outbox_joint.others", "inbox": "inbox_joint.others", "contact": "contact.count"}
+    for box, count in counts.items():
+        rules |= where(count, {f"{box}_told.pose.R": ROTATION, f"{box}_told.odometry.R": ROTATION})
+        rules |= {f"{box}_told.vehicle": VEHICLE, f"{box}_told.tick": TICK}
+        if box != "contact":
+            rules |= {f"{box}_joint.others": whole(0, MAX_TOLD - 1), f"{box}_joint.complete": FLAG}
+    return rules | {"told.vehicle": VEHICLE, "told.tick": TICK}
