@@ -24,7 +24,6 @@ class Centralised:
     joint = True
 
     def __init__(self, setups: Sequence[Setup]) -> None:
-        """Take one setup per vehicle."""
         self.landmarks = setups[0].landmarks
         self.markers = [setup.marker for setup in setups]
 

@@ -80,16 +80,11 @@ def _check_covariance(P: Array) -> None:
     lopsided = P - P.T
     if np.vdot(lopsided, lopsided) > MOST_LOPSIDED**2 * np.vdot(P, P):
         raise CoopenvError("covariance is not symmetric")
-    if _has_factor(P) or _has_factor(P + MOST_NEGATIVE * P.diagonal().max() * _IDENTITY):
+    if dpotrf(P)[1] == 0 or dpotrf(P + MOST_NEGATIVE * P.diagonal().max() * _IDENTITY)[1] == 0:
         return  # the second one for those that are singular, as robots' on a plane are
     eigenvalues = np.linalg.eigvalsh(P)
     if eigenvalues[0] < -MOST_NEGATIVE * eigenvalues[-1]:
         raise CoopenvError("covariance is not positive semidefinite")
-
-
-def _has_factor(P: Array) -> bool:
-    """Return whether the Cholesky factor exists."""
-    return bool(dpotrf(P)[1] == 0)
 
 
 _IDENTITY = np.eye(6)

@@ -23,5 +23,4 @@ class HamelSamson(KernelObserver):
         return Message()
 
     def __reduce__(self) -> Any:
-        """Travel as what it is."""
         return HamelSamson, (self.setup,), super().__reduce__()[2]

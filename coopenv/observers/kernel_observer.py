@@ -110,7 +110,6 @@ class KernelObserver:
         return message
 
     def _sense(self, tick: Tick, now: int) -> None:
-        """Write what the vehicle senses."""
         s = self.state
         s.increment_rotation[...], s.increment_translation[...] = tick.rotation, tick.translation
         s.odometry_velocity[...], s.odometry_angular_velocity[...] = tick.velocity, tick.angular_velocity
@@ -158,7 +157,6 @@ class KernelObserver:
         self._launch(key, factory(self._kernels), [self._model, *self._records, self.setup.vehicle, *moving])
 
     def _all_views(self) -> list[Any]:
-        """Return every array that changes."""
         return [*vars(self.state).values(), *vars(self.memory).values(), *self._now_views, self._start_covariance]
 
     def __reduce__(self) -> Any:
@@ -167,7 +165,6 @@ class KernelObserver:
         return _observer, (self.embedded.name, self.setup), (arrays, self._origin, self.unit, self._heard)
 
     def __setstate__(self, state: Any) -> None:
-        """Go on where another one was."""
         arrays, origin, unit, self._heard = state
         for view, values in zip(self._all_views(), arrays, strict=True):
             view[...] = values
@@ -175,7 +172,6 @@ class KernelObserver:
 
 
 def _observer(name: str, setup: Setup) -> KernelObserver:
-    """Return an observer by the name of its kernels."""
     from coopenv.observers.registry import find_embedded
 
     embedded = find_embedded(name)

@@ -97,8 +97,7 @@ class PoseObserver:
     sends_covariance = True
 
     def __init__(self, setup: Setup) -> None:
-        """Remember the marker, which is what others measure."""
-        self.marker = setup.marker
+        self.marker = setup.marker  # what others measure
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""

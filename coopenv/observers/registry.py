@@ -63,7 +63,6 @@ def register(name: str, factory: Factory | None = None, *, embedded: "Embedded |
 
 
 def _has_kernels(observer: Any) -> bool:
-    """Return whether something is an observer with kernels."""
     if observer is None or isinstance(observer, str) or callable(observer):  # so Warp is not loaded for nothing
         return False
     from coopenv.world.embedded import Embedded
@@ -72,7 +71,6 @@ def _has_kernels(observer: Any) -> bool:
 
 
 def _row(observer: Any) -> Registered:
-    """Return something as what it would be registered as."""
     return Registered(None, observer) if _has_kernels(observer) else Registered(observer, None)
 
 

@@ -110,20 +110,18 @@ class DifferentiableWorld:
     def _array(self, values: np.ndarray, dtype: Any) -> Any:
         return wp.array(values, dtype=dtype, device=self._world.device, requires_grad=True)
 
-    def _make(self, struct: Any) -> Any:
-        """Return an array of records of zeros, one per vehicle."""
+    def _make(self, struct: Any, **given: np.ndarray) -> Any:
+        """Return an array with a record per vehicle, some fields given and zeros for the rest."""
         shape = (self._world.worlds, self._world.model.vehicles)
-        return wp.zeros(shape, dtype=struct, device=self._world.device, requires_grad=True)
-
-    def _made(self, struct: Any, **given: np.ndarray) -> Any:
-        """Return an array of records with some fields given and zeros for the rest."""
-        records = np.zeros((self._world.worlds, self._world.model.vehicles), struct.numpy_dtype())
-        for name, values in given.items():
-            records[name] = values
-        return self._array(records, struct)
+        array = wp.zeros(shape, dtype=struct, device=self._world.device, requires_grad=True)
+        if given:
+            records = array.numpy()
+            for name, values in given.items():
+                records[name] = values
+            array.assign(records)
+        return array
 
     def _record(self, struct: Any) -> Any:
-        """Return a record of arrays of zeros, one entry per vehicle."""
         record = struct()
         for name, var in struct.vars.items():
             setattr(record, name, self._make(var.type.dtype))
@@ -133,10 +131,10 @@ class DifferentiableWorld:
         state, L = self._world.state, self._world.model.landmarks
         speed = state.speed.numpy()
         R, p = state.rotation.numpy()[:, L:], state.position.numpy()[:, L:]
-        truth = self._made(Truth, rotation=R, position=p, speed=speed, steering=state.steering.numpy())
-        held = self._made(Held, velocity=speed[..., None] * np.eye(3)[0])
+        truth = self._make(Truth, rotation=R, position=p, speed=speed, steering=state.steering.numpy())
+        held = self._make(Held, velocity=speed[..., None] * np.eye(3)[0])
         R, p = state.estimate_rotation.numpy(), state.estimate_position.numpy()
-        return truth, held, self._made(Belief, rotation=R, position=p, covariance=state.covariance.numpy())
+        return truth, held, self._make(Belief, rotation=R, position=p, covariance=state.covariance.numpy())
 
     def _command_of(self, action: Any) -> Any:
         command = self._array(np.zeros((*action.shape, 3)), vec3)
