@@ -14,22 +14,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.errors import ActionError, ScenarioError, ScenarioWarning, checked_seed
-from coopenv.observers.riccati.gradient_kernels import (
-    Belief,
-    Held,
-    Information,
-    Truth,
-    command_kernel,
-    correct_kernel,
-    drive_kernel,
-    inform_kernel,
-    predict_kernel,
-    scalar,
-    show_kernel,
-    trace_kernel,
-    vec2,
-    vec3,
-)
+from coopenv.observers.riccati import gradient_kernels as kernels
 from coopenv.scenario import Scenario
 from coopenv.scenario.topology import neighbour_sets, processing_order
 from coopenv.world import kernel_cache
@@ -80,8 +65,8 @@ class DifferentiableWorld:
         if len(actions) * self.scenario.ticks_per_decision > self.scenario.horizon_ticks:
             raise ActionError(f"{len(actions)} decisions reach beyond the horizon of {self.scenario.horizon:g} s")
         world.reset([checked_seed(seed) + w for w in range(world.worlds)])
-        decisions = [self._array(action, vec2) for action in actions]
-        total, turn = self._array(np.zeros(1), scalar), wp.zeros(1, dtype=scalar, device=world.device)
+        decisions = [self._array(action, kernels.vec2) for action in actions]
+        total, turn = self._array(np.zeros(1), kernels.scalar), wp.zeros(1, dtype=kernels.scalar, device=world.device)
         truth, held, belief = self._start()
         tape = wp.Tape()
         with tape:
@@ -90,7 +75,7 @@ class DifferentiableWorld:
                 command = self._command(commands, tick)
                 truth, held = self._move(truth, held, command, tick)
                 belief = self._estimate(truth, held, belief, tick, turn)
-            self._launch(trace_kernel, [belief, total])
+            self._launch(kernels.trace_kernel, [belief, total])
         tape.backward(total)
         if float(turn.numpy()[0]) > self.scenario.observer.max_turn:
             warnings.warn(
@@ -131,14 +116,14 @@ class DifferentiableWorld:
         state, L = self._world.state, self._world.model.landmarks
         speed = state.speed.numpy()
         R, p = state.rotation.numpy()[:, L:], state.position.numpy()[:, L:]
-        truth = self._make(Truth, rotation=R, position=p, speed=speed, steering=state.steering.numpy())
-        held = self._make(Held, velocity=speed[..., None] * np.eye(3)[0])
+        truth = self._make(kernels.Truth, rotation=R, position=p, speed=speed, steering=state.steering.numpy())
+        held = self._make(kernels.Held, velocity=speed[..., None] * np.eye(3)[0])
         R, p = state.estimate_rotation.numpy(), state.estimate_position.numpy()
-        return truth, held, self._make(Belief, rotation=R, position=p, covariance=state.covariance.numpy())
+        return truth, held, self._make(kernels.Belief, rotation=R, position=p, covariance=state.covariance.numpy())
 
     def _command_of(self, action: Any) -> Any:
-        command = self._array(np.zeros((*action.shape, 3)), vec3)
-        self._launch(command_kernel, [self._world.model, action, command])
+        command = self._array(np.zeros((*action.shape, 3)), kernels.vec3)
+        self._launch(kernels.command_kernel, [self._world.model, action, command])
         return command
 
     def _command(self, commands: list[Any], tick: int) -> Any:
@@ -154,27 +139,28 @@ class DifferentiableWorld:
             steps = max(1, math.ceil(duration / float(LONGEST_SUBSTEP)))
             for step in range(steps):
                 before, due = [world.model, truth, command, held, int(first)], int(sample and step == steps - 1)
-                truth, held, first = self._make(Truth), self._make(Held), False
-                self._launch(drive_kernel, [*before, due, wp.float64(duration / steps), truth, held])
+                truth, held, first = self._make(kernels.Truth), self._make(kernels.Held), False
+                self._launch(kernels.drive_kernel, [*before, due, wp.float64(duration / steps), truth, held])
         return truth, held
 
     def _estimate(self, truth: Any, held: Any, belief: Any, tick: int, turn: Any) -> Any:
         world, rate = self._world, self.scenario.rates.camera
         kernel_cache.launch(
-            kernel(show_kernel, "float64"),
+            kernel(kernels.show_kernel, "float64"),
             dim=(world.worlds, world.model.agents),
             inputs=[world.model, truth, world.state, wp.float64(tick / rate)],
             device=world.device,
             record_tape=False,
         )
         dt = wp.float64(1.0 / rate)
-        predicted, after, sums = self._make(Belief), self._make(Belief), self._record(Information)
-        self._launch(predict_kernel, [world.model, held, belief, predicted, dt])
+        predicted, after = self._make(kernels.Belief), self._make(kernels.Belief)
+        sums = self._record(kernels.Information)
+        self._launch(kernels.predict_kernel, [world.model, held, belief, predicted, dt])
         counts = world.model.target_count.numpy()
         for vehicle in self._order:
             seen = [world.model, world.state, truth, predicted, after, vehicle, sums]
-            self._launch(inform_kernel, seen, dim=(world.worlds, int(counts[vehicle])))
-            self._launch(correct_kernel, [predicted, sums, after, vehicle, dt, turn], dim=world.worlds)
+            self._launch(kernels.inform_kernel, seen, dim=(world.worlds, int(counts[vehicle])))
+            self._launch(kernels.correct_kernel, [predicted, sums, after, vehicle, dt, turn], dim=world.worlds)
         return after
 
     def _launch(self, function: Any, arguments: list[Any], dim: Any = None) -> None:

@@ -6,20 +6,10 @@ import warp as wp
 
 from coopenv.observers.robust.belief import append_member, index_of, is_unseen, longest_unseen, mark_seen, remove_member
 from coopenv.observers.robust.constants import MAX_TOLD
+from coopenv.observers.robust.joint import radio
 from coopenv.observers.robust.joint.information import fuse_joint_information, news_of, predict_told, propagate_told
 from coopenv.observers.robust.joint.matrices import AFTER
 from coopenv.observers.robust.joint.memory import Contact
-from coopenv.observers.robust.joint.radio import (
-    contact_of,
-    dependence,
-    forget_contacts,
-    is_superseded,
-    note_contacts,
-    others_told,
-    read_message,
-    store_contact,
-    tells_of_the_same,
-)
 from coopenv.observers.robust.measurements import is_heard
 from coopenv.observers.robust.memory import Estimate
 from coopenv.observers.robust.tracklets import bit_of, information_share, test_sender
@@ -66,7 +56,7 @@ def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, 
     """Add all that the message that has been read tells of, if there is room; their errors are as it says."""
     if not make_joint_room(model, memory, world, i, tick, count):
         return
-    depends_on = dependence(memory, world, i, sender)
+    depends_on = radio.dependence(memory, world, i, sender)
     for a in range(count):
         told = memory.told[world, a]
         if told.vehicle != i:
@@ -83,12 +73,12 @@ def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, 
                     memory.P[world, i, n, m] = block
                     memory.P[world, i, m, n] = wp.transpose(block)
     memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
-    c = contact_of(memory, world, i, sender)
+    c = radio.contact_of(memory, world, i, sender)
     if c < 0:
-        c = contact_of(memory, world, i, -1)
+        c = radio.contact_of(memory, world, i, -1)
     memory.contact[world, i, c] = Contact()
-    store_contact(memory, world, i, c, sender, count)
-    forget_contacts(memory, world, i)
+    radio.store_contact(memory, world, i, c, sender, count)
+    radio.forget_contacts(memory, world, i)
 
 
 @wp.func
@@ -98,12 +88,12 @@ def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, send
     if ticks <= 0:
         return
     predict_told(model, memory, world, i, c, count)
-    store_contact(memory, world, i, c, sender, count)
+    radio.store_contact(memory, world, i, c, sender, count)
     propagate_told(model, memory, world, i, count)
     n = index_of(memory, world, i, sender)
     told = memory.told[world, 0]
     was_distrusted = memory.contact[world, i, c].distrusted
-    note_contacts(memory, world, i)
+    radio.note_contacts(memory, world, i)
     now = Estimate(told.pose, memory.matrix[world, AFTER, 0, 0])
     test_sender(memory, world, i, n, now, wp.float64(ticks) * model.camera_period)
     memory.contact[world, i, c].distrusted = memory.member[world, i, n].distrusted
@@ -127,7 +117,7 @@ def told_vehicle(memory: Any, world: int, i: int, sender: int, n: int) -> int:
 @wp.func
 def tells_of_visible(model: Any, state: Any, memory: Any, world: int, i: int, sender: int) -> bool:
     """Return whether a received message tells of a vehicle in view."""
-    for n in range(others_told(memory, world, i, sender) + 1):
+    for n in range(radio.others_told(memory, world, i, sender) + 1):
         if state.sight[world, i, model.landmarks + told_vehicle(memory, world, i, sender, n)] == VISIBLE:
             return True
     return False
@@ -136,17 +126,17 @@ def tells_of_visible(model: Any, state: Any, memory: Any, world: int, i: int, se
 @wp.func
 def fuse_one(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int):
     """Fuse one message, or add those that it tells of, or neither where another message has said it all."""
-    count = read_message(memory, world, i, sender)
-    c = contact_of(memory, world, i, sender)
-    if is_superseded(model, memory, world, i, sender, count):
+    count = radio.read_message(memory, world, i, sender)
+    c = radio.contact_of(memory, world, i, sender)
+    if radio.is_superseded(model, memory, world, i, sender, count):
         if c >= 0:
-            store_contact(memory, world, i, c, sender, count)
+            radio.store_contact(memory, world, i, c, sender, count)
         return
-    if tells_of_the_same(memory, world, i, c, count):
+    if radio.tells_of_the_same(memory, world, i, c, count):
         fuse_joint_message(model, memory, world, i, c, sender, count)
     elif c >= 0 or tells_of_visible(model, state, memory, world, i, sender):
         add_joint_members(model, memory, world, i, sender, count, tick)
-    c = contact_of(memory, world, i, sender)
+    c = radio.contact_of(memory, world, i, sender)
     if c >= 0:
         memory.contact[world, i, c].fused = 1
 
@@ -154,18 +144,18 @@ def fuse_one(model: Any, state: Any, memory: Any, world: int, i: int, sender: in
 @wp.func
 def fuse_joint_messages(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Fuse the messages that tell of members, and add those that vehicles in view tell of; who tells of most first."""
-    forget_contacts(memory, world, i)  # the belief may have begun anew
+    radio.forget_contacts(memory, world, i)  # the belief may have begun anew
     mark_seen(model, state, memory, world, i, tick)
     for c in range(memory.contact.shape[2]):
         memory.contact[world, i, c].fused = 1
     for n in range(model.target_count[i]):
         sender = model.targets[i, n] - model.landmarks
         if sender >= 0 and is_heard(model, state, memory, world, i, wp.max(sender, 0), tick):
-            c = contact_of(memory, world, i, sender)
+            c = radio.contact_of(memory, world, i, sender)
             if c >= 0:
                 memory.contact[world, i, c].fused = 0
                 if tells_of_visible(model, state, memory, world, i, sender):  # then all that it tells of count as seen
-                    for k in range(others_told(memory, world, i, sender) + 1):
+                    for k in range(radio.others_told(memory, world, i, sender) + 1):
                         m = index_of(memory, world, i, told_vehicle(memory, world, i, sender, k))
                         if m > 0:
                             memory.member[world, i, m].seen_tick = tick
@@ -173,7 +163,7 @@ def fuse_joint_messages(model: Any, state: Any, memory: Any, world: int, i: int,
         for n in range(model.target_count[i]):
             sender = model.targets[i, n] - model.landmarks
             if sender >= 0 and is_heard(model, state, memory, world, i, wp.max(sender, 0), tick):
-                if others_told(memory, world, i, sender) == MAX_TOLD - 1 - fewer:
+                if radio.others_told(memory, world, i, sender) == MAX_TOLD - 1 - fewer:
                     fuse_one(model, state, memory, world, i, sender, tick)
-    forget_contacts(memory, world, i)
-    note_contacts(memory, world, i)
+    radio.forget_contacts(memory, world, i)
+    radio.note_contacts(memory, world, i)
