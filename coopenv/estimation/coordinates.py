@@ -12,10 +12,8 @@ from coopenv.estimation.metrics import error_coordinates, error_rotation
 class Coordinates(Enum):
     """The error e that a covariance is about; truth (R, p), estimate (Rhat, phat), positions in the map frame."""
 
-    LEFT = "left"
-    """(theta, rho): R = Rhat Exp(theta), p = phat + Rhat rho."""
-    RIGHT = "right"
-    """(theta, rho): R = Exp(theta) Rhat, p = Exp(theta) phat + rho."""
+    LEFT = "left"  # (theta, rho): R = Rhat Exp(theta), p = phat + Rhat rho
+    RIGHT = "right"  # (theta, rho): R = Exp(theta) Rhat, p = Exp(theta) phat + rho
     RICCATI = "riccati"
     """(2 lambda, R^T p - Rhat^T phat), the paper's; lambda is the vector part of the quaternion of Rhat^T R."""
 

@@ -1,9 +1,8 @@
 """The measures by which an estimate is judged, in NumPy, over any leading axes.
 
-Position errors are in the map frame (m), orientation errors are geodesic angles (deg), and Rtilde = Rhat^T R
-as in the paper. Nothing is aligned before it is compared: the maps are global, and an alignment would hide
-the mirrored solution (orientation half a turn off), which a bearing-only observer without a sign test can
-fall into.
+Position errors are in the map frame (m), orientation errors are geodesic angles (deg), and Rtilde = Rhat^T R as in the
+paper. Nothing is aligned before it is compared: the maps are global, and an alignment would hide the mirrored solution
+(orientation half a turn off), which a bearing-only observer without a sign test can fall into.
 """
 
 import math

@@ -89,7 +89,7 @@ class Group:
             tick = sensed.tick(self.briefing.setups[vehicle], self.mail.inbox(k, vehicle, inbox_tick, sensed.messages))
             begin = perf_counter()
             estimate = observer.update(tick)
-            message = observer.message() if self.mail.due(k) else None
+            message = observer.message() if k % self.briefing.period == 0 else None
             elapsed = perf_counter() - begin
             self._check(estimate)
             if message is not None:

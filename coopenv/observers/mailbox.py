@@ -28,10 +28,6 @@ class Mailbox:
         self._senders = [[int(t) for t in setup.targets if t >= setup.landmarks] for setup in briefing.setups]
         """Per receiver: the targets that are vehicles."""
 
-    def due(self, k: int) -> bool:
-        """Return whether messages are sent at tick k."""
-        return k % self.briefing.period == 0
-
     def post(self, vehicle: int, k: int, message: Message) -> None:
         """Send one message; that of the start is heard but not counted."""
         sent = self.sent[vehicle]

@@ -49,18 +49,6 @@ def possible_dependencies(model: Any, i: int) -> wp.uint64:
 
 
 @wp.func
-def marker_of(model: Any, i: int):
-    """Return the point of a vehicle that others' cameras measure, in its body, m."""
-    return vec3d(model.scene.marker[model.landmarks + i])
-
-
-@wp.func
-def point_of(pose: Pose, point: Any):
-    """Return the pose of a point of the body, with the body's axes."""
-    return Pose(pose.R, pose.p + pose.R * point)
-
-
-@wp.func
 def marker_jacobian(marker: Any):
     """Return the derivative of the left error at a point of the body by that at its origin, 6x6."""
     one = wp.identity(3, wp.float64)
@@ -74,12 +62,14 @@ def own_report(model: Any, memory: Any, world: int, i: int, tick: int):
     report.tick = tick
     P = memory.P[world, i, 0, 0]
     if memory.search[world, i].active == 0 and is_known(P):
-        marker = marker_of(model, i)
+        marker = vec3d(model.scene.marker[model.landmarks + i])
         J = marker_jacobian(marker)
+        pose = memory.member[world, i, 0].pose
+        odometry = memory.belief[world, i].odometry
         report.valid = 1
-        report.pose = point_of(memory.member[world, i, 0].pose, marker)
+        report.pose = Pose(pose.R, pose.p + pose.R * marker)
         report.P = mat66f(J * P * wp.transpose(J))
-        report.odometry = point_of(memory.belief[world, i].odometry, marker)
+        report.odometry = Pose(odometry.R, odometry.p + odometry.R * marker)
         report.depends_on = memory.belief[world, i].depends_on
     return report
 

@@ -11,8 +11,8 @@ from coopenv.observers.robust.belief import index_of
 from coopenv.observers.robust.constants import MAX_TOLD, SAME_TIME, SUPERSEDING_TIME
 from coopenv.observers.robust.joint.matrices import AFTER, entry, factorise
 from coopenv.observers.robust.joint.memory import Contact, Joint, Told
-from coopenv.observers.robust.memory import Pose, mat66d
-from coopenv.observers.robust.tracklets import bit_of, clear_messages, marker_jacobian, marker_of, own_report, receive
+from coopenv.observers.robust.memory import Pose, mat66d, vec3d
+from coopenv.observers.robust.tracklets import bit_of, clear_messages, marker_jacobian, own_report, receive
 
 MAX_AGE = SUPERSEDING_TIME + SAME_TIME
 
@@ -62,7 +62,7 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
     if report.valid == 1:
         joint.others = count - 1
         joint.complete = wp.where(count == members, 1, 0)
-        J = marker_jacobian(marker_of(model, i))
+        J = marker_jacobian(vec3d(model.scene.marker[model.landmarks + i]))
         for a in range(count):
             for b in range(count):
                 block = memory.P[world, i, a, b]
