@@ -14,15 +14,7 @@ from coopenv.estimation.linalg import block3, cholesky6, join6
 from coopenv.estimation.so3 import exp_so3, orthonormalise
 from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import POSITION, KernelObserver
-from coopenv.observers.riccati.equations import (
-    accumulate_information,
-    correct_kalman,
-    correct_modes,
-    correction_modes,
-    covariance_modes,
-    predict_covariance,
-    predict_pose,
-)
+from coopenv.observers.riccati import equations
 from coopenv.world.embedded import Embedded, send_nothing, start_nothing
 from coopenv.world.quality import known_position, usable
 
@@ -43,7 +35,9 @@ def information(model: Any, state: Any, world: int, vehicle: int, tick: int, R: 
             b = model.camera.rotation * state.bearing[world, vehicle, target]
             a = wp.transpose(R) * known_position(model, state, world, vehicle, target)
             e = a - model.camera.position - p
-            M11, M12, M22, r1, r2 = accumulate_information(a, b, e, model.observer.q[target], M11, M12, M22, r1, r2)
+            M11, M12, M22, r1, r2 = equations.accumulate_information(
+                a, b, e, model.observer.q[target], M11, M12, M22, r1, r2
+            )
     return M11, M12, M22, r1, r2
 
 
@@ -51,7 +45,7 @@ def information(model: Any, state: Any, world: int, vehicle: int, tick: int, R: 
 def predict(model: Any, state: Any, world: int, vehicle: int, dt: Any):
     """Carry the estimate and P through one tick of odometry."""
     rotation = state.increment_rotation[world, vehicle]
-    R, p = predict_pose(
+    R, p = equations.predict_pose(
         state.estimate_rotation[world, vehicle],
         state.estimate_position[world, vehicle],
         rotation,
@@ -60,7 +54,7 @@ def predict(model: Any, state: Any, world: int, vehicle: int, dt: Any):
     P = state.covariance[world, vehicle]
     E = wp.transpose(rotation)
     v1, v2 = model.observer.v1 * dt, model.observer.v2 * dt
-    A, B, D = predict_covariance(E, block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3), v1, v2)
+    A, B, D = equations.predict_covariance(E, block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3), v1, v2)
     state.estimate_rotation[world, vehicle] = R
     state.estimate_position[world, vehicle] = p
     state.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D)
@@ -91,11 +85,11 @@ def kalman_step(
     h is shortened until the attitude turns by no more than `limit`, but not in the `last` sub-step.
     """
     taken = h
-    dx1, dx2, A, B, D = correct_kalman(taken, M11, M12, M22, L11, L21, L22, r1, r2)
+    dx1, dx2, A, B, D = equations.correct_kalman(taken, M11, M12, M22, L11, L21, L22, r1, r2)
     turn = wp.length(dx1)
     while turn > limit and not last:
         taken = taken * shrink(turn, limit)
-        dx1, dx2, A, B, D = correct_kalman(taken, M11, M12, M22, L11, L21, L22, r1, r2)
+        dx1, dx2, A, B, D = equations.correct_kalman(taken, M11, M12, M22, L11, L21, L22, r1, r2)
         turn = wp.length(dx1)
     return taken, dx1, dx2, A, B, D
 
@@ -106,14 +100,14 @@ def modal_step(
 ):
     """Return what `kalman_step` does for any gain k, through the modes of L^T M L."""
     taken = h
-    T, spectrum = correction_modes(M11, M12, M22, L11, L21, L22)
-    dx1, dx2 = correct_modes(k, taken, T, spectrum, r1, r2)
+    T, spectrum = equations.correction_modes(M11, M12, M22, L11, L21, L22)
+    dx1, dx2 = equations.correct_modes(k, taken, T, spectrum, r1, r2)
     turn = wp.length(dx1)
     while turn > limit and not last:
         taken = taken * shrink(turn, limit)
-        dx1, dx2 = correct_modes(k, taken, T, spectrum, r1, r2)
+        dx1, dx2 = equations.correct_modes(k, taken, T, spectrum, r1, r2)
         turn = wp.length(dx1)
-    P = covariance_modes(taken, T, spectrum)
+    P = equations.covariance_modes(taken, T, spectrum)
     return taken, dx1, dx2, block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3)
 
 

@@ -13,18 +13,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import symmetric_part
 from coopenv.estimation.so3 import skew
-from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import (
-    between,
-    carried,
-    distance_squared,
-    inverse6,
-    is_known,
-    left_error,
-    log_so3,
-    lower_blocks,
-    odometry_noise,
-)
+from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import append_member, fuse_information, index_of, make_room, mark_seen, propagate
 from coopenv.observers.robust.measurements import is_heard
 from coopenv.observers.robust.memory import Estimate, Pose, Report, mat66d, mat66f, vec3d
@@ -52,7 +41,7 @@ def possible_dependencies(model: Any, i: int) -> wp.uint64:
 def marker_jacobian(marker: Any):
     """Return the derivative of the left error at a point of the body by that at its origin, 6x6."""
     one = wp.identity(3, wp.float64)
-    return lower_blocks(one, -skew(marker), one)
+    return algebra.lower_blocks(one, -skew(marker), one)
 
 
 @wp.func
@@ -61,7 +50,7 @@ def own_report(model: Any, memory: Any, world: int, i: int, tick: int):
     report = Report()
     report.tick = tick
     P = memory.P[world, i, 0, 0]
-    if memory.search[world, i].active == 0 and is_known(P):
+    if memory.search[world, i].active == 0 and algebra.is_known(P):
         marker = vec3d(model.scene.marker[model.landmarks + i])
         J = marker_jacobian(marker)
         pose = memory.member[world, i, 0].pose
@@ -120,7 +109,7 @@ def propagate_member(memory: Any, world: int, i: int, n: int, step: Pose, dt: An
     """Carry a member on to its new message by its odometry over dt, and average its twist."""
     propagate(memory, world, i, n, step, noise)
     v = step.p / dt
-    w = log_so3(step.R) / dt
+    w = algebra.log_so3(step.R) / dt
     if memory.member[world, i, n].has_twist == 1:
         share = wp.min(wp.float64(1.0), dt / wp.float64(constants.TWIST_AVERAGING_TIME))
         v = memory.member[world, i, n].v + share * (v - memory.member[world, i, n].v)
@@ -134,11 +123,11 @@ def propagate_member(memory: Any, world: int, i: int, n: int, step: Pose, dt: An
 def test_sender(memory: Any, world: int, i: int, n: int, told: Estimate, dt: Any):
     """Decide whether a sender is trusted, from its new report, dt after the last one, and the belief about it."""
     believed = Estimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
-    agrees = distance_squared(believed, told) < wp.float64(constants.MESSAGE_GATE)
+    agrees = algebra.distance_squared(believed, told) < wp.float64(constants.MESSAGE_GATE)
     agreed = wp.float64(0.0)
     distrusted = wp.where(agrees, 0, 1)
     if memory.member[world, i, n].distrusted == 1:
-        away = left_error(believed.pose, told.pose)
+        away = algebra.left_error(believed.pose, told.pose)
         if agrees and wp.length(away[3:]) < wp.float64(constants.AGREEMENT_DISTANCE):
             agreed = memory.member[world, i, n].agreement_time + dt
         distrusted = wp.where(agreed >= wp.float64(constants.AGREEMENT_TIME), 0, 1)
@@ -172,10 +161,10 @@ def fuse_tracklet(memory: Any, world: int, i: int, n: int, report: Report, befor
     for k in range(6):
         if after[k, k] > wp.float64(constants.MAX_VARIANCE_GROWTH) * before.P[k, k]:
             return
-    precision = inverse6(after)
-    information = symmetric_part(precision - inverse6(before.P))
-    offset = left_error(before.pose, memory.member[world, i, n].pose)
-    vector = precision * left_error(before.pose, report.pose) - information * offset
+    precision = algebra.inverse6(after)
+    information = symmetric_part(precision - algebra.inverse6(before.P))
+    offset = algebra.left_error(before.pose, memory.member[world, i, n].pose)
+    vector = precision * algebra.left_error(before.pose, report.pose) - information * offset
     share = information_share(memory, world, i, report.depends_on)
     fuse_information(memory, world, i, n, share * information, share * vector)
     memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | report.depends_on
@@ -188,10 +177,10 @@ def fuse_message(model: Any, memory: Any, world: int, i: int, n: int, sender: in
     report = memory.inbox[world, i, sender]
     if report.tick > last.tick:
         dt = wp.float64(report.tick - last.tick) * model.camera_period
-        step = between(last.odometry, report.odometry)
-        noise = odometry_noise(model, dt)
+        step = algebra.between(last.odometry, report.odometry)
+        noise = algebra.odometry_noise(model, dt)
         propagate_member(memory, world, i, n, step, dt, noise)
-        before = carried(Estimate(last.pose, mat66d(last.P)), step, noise)
+        before = algebra.carried(Estimate(last.pose, mat66d(last.P)), step, noise)
         was_distrusted = memory.member[world, i, n].distrusted
         memory.member[world, i, n].report = report
         test_sender(memory, world, i, n, Estimate(report.pose, mat66d(report.P)), dt)
