@@ -56,8 +56,7 @@ def log_so3(R: Array) -> Array:
     x, y, z = 0.5 * (zy - yz), 0.5 * (xz - zx), 0.5 * (yx - xy)
     sine, cosine = math.sqrt(x * x + y * y + z * z), 0.5 * (xx + yy + zz - 1.0)
     if cosine <= -0.9:  # near half a turn the vector part has no direction to speak of
-        result: Array = Rotation.from_matrix(np.array(R)).as_rotvec()  # SciPy 1.14 takes none that is read-only
-        return result
+        return np.asarray(Rotation.from_matrix(np.array(R)).as_rotvec())  # SciPy 1.14 takes none that is read-only
     scale = math.atan2(sine, cosine) / sine if sine > 1e-9 else 1.0
     return np.array([scale * x, scale * y, scale * z])
 

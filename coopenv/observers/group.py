@@ -113,7 +113,7 @@ class Group:
             for i, (estimate, message) in enumerate(zip(estimates, messages, strict=True)):
                 self._check(estimate)
                 check_message(message)
-                self.mail.count(i, message)
+                self.mail.bytes[i] += message.size_bytes
         except ANYTHING as error:
             raise self._blamed(error, sensed.index) from error
         return [Answer(estimate, elapsed) for estimate in estimates]

@@ -7,7 +7,7 @@ vehicle, one row stands for all; truth is not a number.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import warp as wp
@@ -106,8 +106,7 @@ class KernelObserver:
     def message(self) -> Message:
         """Return what the kernels put on the air."""
         self._run("send", send_kernel, self._now[0])
-        message: Message = self._messages.write(self)
-        return message
+        return cast(Message, self._messages.write(self))
 
     def _sense(self, tick: Tick, now: int) -> None:
         s = self.state

@@ -35,11 +35,7 @@ class Mailbox:
         while (oldest := next(iter(sent))) < k - self.briefing.flight - 1:
             del sent[oldest]
         if k > 0:
-            self.count(vehicle, message)
-
-    def count(self, vehicle: int, message: Message) -> None:
-        """Count the bytes of a message."""
-        self.bytes[vehicle] += message.size_bytes
+            self.bytes[vehicle] += message.size_bytes
 
     def inbox(
         self,

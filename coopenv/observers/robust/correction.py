@@ -6,7 +6,7 @@ import warp as wp
 
 from coopenv.observers.robust.belief import apply_error, subtract_block
 from coopenv.observers.robust.constants import MAX_LINEARISATIONS, RELINEARISATION_ANGLE
-from coopenv.observers.robust.measurements import isotropic, linearise
+from coopenv.observers.robust.measurements import linearise
 from coopenv.observers.robust.memory import vec6d
 
 
@@ -41,7 +41,7 @@ def update_by_line(memory: Any, world: int, i: int, n: int):
         if line.member > 0:
             C = C + memory.P[world, i, k, line.member] * wp.transpose(line.member_jacobian)
         memory.scratch[world, k].PHt = C
-    S = isotropic(line.noise) + line.jacobian * memory.scratch[world, 0].PHt
+    S = line.noise * wp.identity(2, wp.float64) + line.jacobian * memory.scratch[world, 0].PHt
     own = memory.scratch[world, 0]  # where the lines were linearised, less the correction so far
     residual = line.residual + line.jacobian * (own.last_correction - own.correction)
     if line.member > 0:

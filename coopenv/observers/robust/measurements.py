@@ -44,12 +44,6 @@ def tangent_basis(b: Any):
 
 
 @wp.func
-def isotropic(variance: Any):
-    """Return variance I, 2x2."""
-    return variance * wp.identity(2, wp.float64)
-
-
-@wp.func
 def set_line(memory: Any, world: int, n: int, member: int, b: Any, point: Any, variance: Any):
     """Let the n-th bearing b be to a point in the body of a member, or (member 0) in the map.
 
@@ -157,7 +151,9 @@ def innovation_squared(model: Any, memory: Any, world: int, i: int, n: int):
     if not linearise(model, memory, world, i, n):
         return wp.float64(wp.inf)
     line = memory.line[world, n]
-    S = isotropic(line.noise) + line.jacobian * (memory.P[world, i, 0, 0] * wp.transpose(line.jacobian))
+    S = line.noise * wp.identity(2, wp.float64) + line.jacobian * (
+        memory.P[world, i, 0, 0] * wp.transpose(line.jacobian)
+    )
     if line.member > 0:
         Gt = wp.transpose(line.member_jacobian)
         cross = line.jacobian * (memory.P[world, i, 0, line.member] * Gt)

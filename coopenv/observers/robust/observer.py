@@ -17,16 +17,20 @@ from coopenv.observers.robust.belief import begin_belief, own_estimate, propagat
 from coopenv.observers.robust.constants import SAME_PRIOR
 from coopenv.observers.robust.memory import Estimate, Pose, clear, mat33d, vec3d
 from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
-from coopenv.observers.robust.tracklets import possible_dependencies
+from coopenv.observers.robust.tracklets import bit_of
 from coopenv.observers.robust.update import resect, set_anchor, update
 
 
 @wp.func
 def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: Estimate):
-    """Believe in a pose alone."""
+    """Believe in a pose alone; on all that may be heard it may depend."""
     begin_belief(memory, world, i, estimate)
-    memory.belief[world, i].depends_on = possible_dependencies(model, i)
     memory.belief[world, i].missed_share = wp.float64(0.0)
+    bits = wp.uint64(0)
+    for n in range(model.target_count[i]):
+        if model.targets[i, n] >= model.landmarks:
+            bits = bits | bit_of(model.targets[i, n] - model.landmarks)
+    memory.belief[world, i].depends_on = bits
 
 
 @wp.func

@@ -27,17 +27,6 @@ def bit_of(vehicle: int) -> wp.uint64:
 
 
 @wp.func
-def possible_dependencies(model: Any, i: int) -> wp.uint64:
-    """Return the vehicles that may be heard, as bits: on them the first belief may depend."""
-    bits = wp.uint64(0)
-    for n in range(model.target_count[i]):
-        sender = model.targets[i, n] - model.landmarks
-        if sender >= 0:
-            bits = bits | bit_of(sender)
-    return bits
-
-
-@wp.func
 def marker_jacobian(marker: Any):
     """Return the derivative of the left error at a point of the body by that at its origin, 6x6."""
     one = wp.identity(3, wp.float64)

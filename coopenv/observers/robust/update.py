@@ -14,7 +14,7 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import between, carried, inverse6, is_regular, odometry_noise, with_noise
 from coopenv.observers.robust.belief import apply_error
 from coopenv.observers.robust.correction import iterated_update
-from coopenv.observers.robust.measurements import NOTHING, innovation_squared, isotropic, set_lines
+from coopenv.observers.robust.measurements import NOTHING, innovation_squared, set_lines
 from coopenv.observers.robust.memory import Anchor, Estimate, mat66d, vec2d, vec6d
 from coopenv.observers.robust.search import begin_search
 
@@ -85,7 +85,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
 @wp.func
 def weight_of(memory: Any, world: int, i: int, n: int):
     """Return the weight of a bearing, to whose variance the error of the member that it is to adds."""
-    N = isotropic(memory.line[world, n].noise)
+    N = memory.line[world, n].noise * wp.identity(2, wp.float64)
     member = memory.line[world, n].member
     if member > 0:
         G = memory.line[world, n].member_jacobian
