@@ -15,7 +15,6 @@ from coopenv.estimation.coordinates import Coordinates
 from coopenv.estimation.rotations import skew
 
 LEVEL = 0.95
-
 DIVERGED_POSITION, DIVERGED_ORIENTATION = 5.0, 30.0  # m and deg: a run that ends above either has diverged
 
 

@@ -19,9 +19,7 @@ from coopenv.estimation.observability import Observability
 from coopenv.estimation.trajectory import Trajectory
 
 STEADY_SHARE = 0.7  # the steady state is taken to begin after this share of the horizon (35 s of 50 s)
-
-MIRROR_ANGLE_DEG = 150.0
-"""An orientation error above this at the end of a run is the mirrored solution, not a slow one."""
+MIRROR_ANGLE_DEG = 150.0  # an orientation error above it at the end of a run is the mirrored solution, not a slow one
 
 
 class SettlingTolerance(NamedTuple):

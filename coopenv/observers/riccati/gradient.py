@@ -70,7 +70,9 @@ class DifferentiableWorld:
         truth, held, belief = self._start()
         tape = wp.Tape()
         with tape:
-            commands = [self._command_of(action) for action in decisions]
+            commands = [self._array(np.zeros((*action.shape, 3)), kernels.vec3) for action in decisions]
+            for action, command in zip(decisions, commands, strict=True):
+                self._launch(kernels.command_kernel, [world.model, action, command])
             for tick in range(1, len(actions) * self.scenario.ticks_per_decision + 1):
                 command = self._command(commands, tick)
                 truth, held = self._move(truth, held, command, tick)
@@ -120,11 +122,6 @@ class DifferentiableWorld:
         held = self._make(kernels.Held, velocity=speed[..., None] * np.eye(3)[0])
         R, p = state.estimate_rotation.numpy(), state.estimate_position.numpy()
         return truth, held, self._make(kernels.Belief, rotation=R, position=p, covariance=state.covariance.numpy())
-
-    def _command_of(self, action: Any) -> Any:
-        command = self._array(np.zeros((*action.shape, 3)), kernels.vec3)
-        self._launch(kernels.command_kernel, [self._world.model, action, command])
-        return command
 
     def _command(self, commands: list[Any], tick: int) -> Any:
         """Return the command in force during a tick, see `coopenv.world.command.command_in_force`."""

@@ -151,12 +151,10 @@ def innovation_squared(model: Any, memory: Any, world: int, i: int, n: int):
     if not linearise(model, memory, world, i, n):
         return wp.float64(wp.inf)
     line = memory.line[world, n]
-    S = line.noise * wp.identity(2, wp.float64) + line.jacobian * (
-        memory.P[world, i, 0, 0] * wp.transpose(line.jacobian)
-    )
+    H = line.jacobian
+    S = line.noise * wp.identity(2, wp.float64) + H * (memory.P[world, i, 0, 0] * wp.transpose(H))
     if line.member > 0:
-        Gt = wp.transpose(line.member_jacobian)
-        cross = line.jacobian * (memory.P[world, i, 0, line.member] * Gt)
-        theirs = line.member_jacobian * (memory.P[world, i, line.member, line.member] * Gt)
-        S = S + cross + wp.transpose(cross) + theirs
+        G = line.member_jacobian
+        cross = H * (memory.P[world, i, 0, line.member] * wp.transpose(G))
+        S = S + cross + wp.transpose(cross) + G * (memory.P[world, i, line.member, line.member] * wp.transpose(G))
     return wp.dot(line.residual, wp.inverse(S) * line.residual)
