@@ -41,7 +41,6 @@ class SettlingTolerance(NamedTuple):
 
 SETTLED = SettlingTolerance("settled", 0.5, 5.0)  # what an estimate can keep under measurement noise
 CONVERGED = SettlingTolerance("converged", 0.1, 1.0)
-
 _NOT_CONVERGED = "did not converge, no rate to fit"
 _FIT_SAMPLES = 400  # Theil-Sen looks at every pair: 80 000 slopes
 _FIT_SAMPLES_MIN = 3
