@@ -21,11 +21,6 @@ class SimulatedWorld(SensingWorld):
     """A world that reads what vehicles sense from its state: copies in float64, bearings in the body frame."""
 
     @cached_property
-    def _camera(self) -> np.ndarray:
-        """(3, 3) camera to body."""
-        return np.array(self.model.camera.rotation, dtype=float).reshape(3, 3)
-
-    @cached_property
     def _markers(self) -> np.ndarray:
         """(L, 3, 1) of the landmarks, m."""
         return np.array([landmark.marker for landmark in self.scenario.landmarks], float).reshape(-1, 3, 1)
@@ -34,7 +29,8 @@ class SimulatedWorld(SensingWorld):
         """Return what the vehicles of one world sense now, at tick k."""
         L, rates = len(self._markers), self.scenario.rates
         visible = self._copy("sight", world) == Sight.VISIBLE
-        bearings = np.where(visible[..., None], self._pointed("bearing", world) @ self._camera.T, np.nan)
+        to_body = np.array(self.model.camera.rotation, dtype=float).reshape(3, 3)
+        bearings = np.where(visible[..., None], self._pointed("bearing", world) @ to_body.T, np.nan)
         R, position = self._copy("rotation", world)[:L], self._copy("position", world)[:L]
         arrays = {
             "rotation": self._turned("increment_rotation", world),

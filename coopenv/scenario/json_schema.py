@@ -20,9 +20,10 @@ def schema_text() -> str:
     schema = Scenario.model_json_schema()
     definitions = schema["$defs"]
     merged = _reachable({"Vehicle"}, json.loads(json.dumps(definitions), object_hook=_without_lists))
+    partial = re.compile(rf"#/\$defs/(?=({'|'.join(merged)})\b)")
     for name in merged:
         text = json.dumps({key: value for key, value in definitions[name].items() if key != "required"})
-        definitions[f"Partial{name}"] = json.loads(REFERENCE.sub(lambda found: _partial(found, merged), text))
+        definitions[f"Partial{name}"] = json.loads(partial.sub("#/$defs/Partial", text))
     schema["properties"]["vehicles"]["items"] = {"$ref": "#/$defs/PartialVehicle"}
     schema["properties"][DEFAULTS_KEY] = {
         "$ref": "#/$defs/PartialVehicle",
@@ -37,10 +38,6 @@ def schema_text() -> str:
 def _without_lists(node: dict[str, Any]) -> dict[str, Any]:
     """Leave out entries of lists, which are never merged."""
     return {key: value for key, value in node.items() if key not in ("items", "prefixItems")}
-
-
-def _partial(reference: re.Match[str], merged: set[str]) -> str:
-    return f"#/$defs/{'Partial' if reference[1] in merged else ''}{reference[1]}"
 
 
 def _references(node: Any) -> set[str]:

@@ -76,12 +76,9 @@ class Part:
 
 def parts(record: Any, struct: Any) -> dict[str, Any]:
     """Return the arrays of a record by name, and of arrays of structs every field by a name with dots."""
-    found: dict[str, Any] = {}
-    for name in fields(struct):
-        array = getattr(record, name)
-        paths = list(_paths(array.numpy().dtype))
-        found |= {".".join((name, *path)): Part(array, path) if path else array for path in paths}
-    return found
+    arrays = {name: getattr(record, name) for name in fields(struct)}
+    paths = [(name, path) for name, array in arrays.items() for path in _paths(array.numpy().dtype)]
+    return {".".join((name, *path)): Part(arrays[name], path) if path else arrays[name] for name, path in paths}
 
 
 def _paths(dtype: np.dtype) -> Iterator[tuple[str, ...]]:
