@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from coopenv.api.reward import FIELDS, OTHERS
-from coopenv.observers import run
+from coopenv.observers import registry, run
 from coopenv.observers.registry import find
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
@@ -44,7 +44,8 @@ def test_the_backend_runs(capsys: pytest.CaptureFixture[str]) -> None:
     assert np.abs(estimates - program["env"].engine.backend.places).max() < 0.05
 
 
-def test_the_tutorials_observer_runs() -> None:
+def test_the_tutorials_observer_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "_registered", {})
     blocks = python_blocks(DOCS / "observers.md")
     assert blocks
     for block in blocks:

@@ -216,9 +216,8 @@ class Plan:
         used = self.seeds if self.source.seeded else (0,)
         tasks = [Task(self.source, *made, self.steady_from) for made in product(self.variants, used, sent)]
         judged = executor.map(judge, tasks, lambda done: on_progress(done / len(tasks)))
-        samples = sorted(
-            chain(*judged), key=lambda s: (self.variants.index(s.variant), self.observers.index(s.observer))
-        )
+        order = list(product(self.variants, self.observers))
+        samples = sorted(chain(*judged), key=lambda sample: order.index((sample.variant, sample.observer)))
         told = {variant: self.source.variants[variant] for variant in self.variants}
         return Comparison(self.source.name, self.observers, told, used, samples)
 

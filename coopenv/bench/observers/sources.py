@@ -141,10 +141,9 @@ class LogFile(Source):
 
     def obstacle(self, variant: str) -> str:
         """Return why no vehicle can lie to another, where that is so."""
-        if not FAULTS[variant].lies:
-            return ""
         recording = open_recording(self.path)
-        return "" if any(followers(recording, i) for i in recording.order) else NOBODY_FOLLOWS
+        followed = any(followers(recording, i) for i in recording.order)
+        return NOBODY_FOLLOWS if FAULTS[variant].lies and not followed else ""
 
 
 def variant_rows() -> list[dict[str, str]]:

@@ -19,7 +19,6 @@ from coopenv.runs.table import number_table
 WIDTH = 80
 MOST_COLUMNS = 5  # vehicles shown one by one; more are summed up as mean and worst
 FAILED = "failed"
-SPREAD_NOTE = "0.0123(4): 0.0123 with a standard error of 0.0004 over the seeds"
 
 _NAMED = 16  # characters of an observer's name on one line
 
@@ -31,7 +30,7 @@ def everything(board: Leaderboard) -> Iterator[Table | str]:
         yield f"\n{board.title}, {variant}"
         yield error_table(board, variant)
         if len(board.seeds) > 1:
-            yield f"{SPREAD_NOTE}."
+            yield "0.0123(4): 0.0123 with a standard error of 0.0004 over the seeds."
         if board.bounds_in(variant):
             yield ""
             yield ratio_table(board, variant)
