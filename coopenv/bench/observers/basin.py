@@ -27,8 +27,7 @@ from coopenv.runs.table import number_table
 
 RADIUS = 15.0  # m
 ANGLE_BINS = tuple(range(0, 181, 30))  # deg
-UNIFORM_ANGLE_VARIANCE = (np.pi**2 / 3.0 + 2.0) / 3.0
-"""rad^2, per axis of the rotation vector of a rotation uniform over SO(3)."""
+UNIFORM_ANGLE_VARIANCE = (np.pi**2 / 3.0 + 2.0) / 3.0  # rad^2, per axis of the vectors of rotations uniform over SO(3)
 
 
 @dataclass(frozen=True)
