@@ -39,7 +39,7 @@ def test_command(capsys: pytest.CaptureFixture[str]) -> None:
     printed = capsys.readouterr().out
     assert "vehicle_2" in printed and "2/2" in printed
     assert main(["bench", "seeds", "overtaking", "--steady-from", "99"]) == 2
-    assert "--steady-from 99 is not within the run of 45 s" in capsys.readouterr().err
+    assert "steady_from 99 is not within the run of 45 s" in capsys.readouterr().err
 
 
 def test_json_has_one_figure_per_seed(capsys: pytest.CaptureFixture[str]) -> None:
