@@ -43,6 +43,7 @@ def test_wheel_contents(wheel: Path) -> None:
     assert "coopenv/py.typed" in names
 
 
+@pytest.mark.slow
 def test_installed_wheel_makes_environments(wheel: Path, tmp_path: Path) -> None:
     venv.create(tmp_path / "venv", with_pip=True)
     python = tmp_path / "venv" / "bin" / "python"

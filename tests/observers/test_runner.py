@@ -359,6 +359,7 @@ def test_observers_of_installed_packages(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "no_such_module" in registry.obstacle("broken") and "\n" not in registry.obstacle("broken")
 
 
+@pytest.mark.slow
 def test_the_example_is_better_than_odometry(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

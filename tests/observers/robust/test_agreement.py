@@ -126,6 +126,7 @@ def test_joint_messages_do_as_in_numpy(case: str) -> None:
     assert (result.bytes_per_second == expected.bytes_per_second).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["small errors", "eviction of those told of"])
 def test_joint_messages_in_a_world_do_as_on_the_host(case: str) -> None:
     recording = JOINT_CASES[case]()

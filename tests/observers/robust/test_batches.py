@@ -65,7 +65,7 @@ def test_threads_change_nothing() -> None:
     assert_same(*(played(world) for world in worlds))
 
 
-@pytest.mark.parametrize("observer", ["robust", "robust_joint"])
+@pytest.mark.parametrize("observer", ["robust", pytest.param("robust_joint", marks=pytest.mark.slow)])
 def test_a_reset_leaves_nothing_of_the_last_episode(observer: str) -> None:
     world = start(noisy(observer=observer), [3, 4])
     fresh = world.get_state()
