@@ -91,8 +91,9 @@ def _bound(kind: Registry[Any], name: str, row: Row, number: int, records: tuple
     taken = record_count(title, function, records)
     try:
         return Bound(title, name not in kind.built_in, number, _warp_function(function), taken)
-    except RuntimeError as error:  # Warp reads the source, which a program of text alone does not have
-        raise CoopenvError(f"{title}: {error}") from None
+    except (RuntimeError, AttributeError):  # Warp reads the source, which a program of text does not have
+        where = function.__code__.co_filename
+        raise CoopenvError(f"{title}: its source is not known ({where}); please save it to a file") from None
 
 
 @cache
