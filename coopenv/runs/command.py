@@ -69,7 +69,8 @@ def execute(
 
                 ends = [ending.time for ending in endings]
                 options: dict[str, Any] = {"scenario": scenario, "steady_from": steady, "file_format": figures}
-                paths += save_figures(judged, folder, observability, ends=ends, **options)
+                note = f"{name}, {scenario.observer.name}, seed {run.seed}"
+                paths += save_figures(judged, folder, observability, ends=ends, note=note, **options)
         if film is not None:
             with Progress(log, f"finishing {film.path.name}"):
                 film.close()

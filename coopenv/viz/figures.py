@@ -25,6 +25,7 @@ def save_figures(
     ends: Sequence[float] | None = None,
     steady_from: float | None = None,
     file_format: str = "png",
+    note: str = "",
 ) -> list[Path]:
     """Write the figures of `FIGURE_NAMES` into `directory`, which is made if need be, and return their paths.
 
@@ -36,6 +37,7 @@ def save_figures(
         ends: s, when each vehicle arrived or collided and was parked, where its lines stop (None: no vehicle was).
         steady_from: s, start of the steady state that mean NEES are over (None: at 70 % of the record).
         file_format: one of `FORMATS`.
+        note: in small print in the corner of each figure: what it is of.
 
     Raises:
         OutputError: the directory cannot be made or written to.
@@ -52,4 +54,4 @@ def save_figures(
     }
     with writing(directory):
         directory.mkdir(parents=True, exist_ok=True)
-    return [save(draw[name](), directory / f"{name}.{file_format}") for name in FIGURE_NAMES]
+    return [save(draw[name](), directory / f"{name}.{file_format}", note=note) for name in FIGURE_NAMES]

@@ -48,8 +48,8 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def save(figure: Figure, path: Path, file_format: str = "") -> Path:
-    """Write a figure in one of `FORMATS` (by default as the path ends), and return the path.
+def save(figure: Figure, path: Path, file_format: str = "", note: str = "") -> Path:
+    """Write a figure in one of `FORMATS` (by default as the path ends), a note in its corner, and return the path.
 
     Raises:
         CoopenvError: no such format, or the file cannot be written; an older one is untouched.
@@ -58,6 +58,7 @@ def save(figure: Figure, path: Path, file_format: str = "") -> Path:
     if form not in FORMATS:
         raise CoopenvError(f"{path}: unknown format '{form}' of a figure; known: {', '.join(FORMATS)}")
     stamp = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}[form]  # the same figure is the same file
+    figure.text(0.995, 0.003, note, ha="right", va="bottom", fontsize=SMALL - 1.0, color=NOTE)
     with replacing_file(path) as new:
         figure.savefig(new, dpi=DPI, format=form, metadata={stamp: None})
     return path

@@ -76,6 +76,13 @@ def test_all_figures_are_written_under_their_stable_names(run: Trajectory, tmp_p
         assert picture[..., :3].std() > 0.05  # not blank
 
 
+def test_every_figure_says_what_it_is_of(run: Trajectory, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    drawn: list[Figure] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **_: (drawn.append(figure), path.touch()))
+    save_figures(run, tmp_path, note="overtaking, robust, seed 3")
+    assert [figure.texts[-1].get_text() for figure in drawn] == len(NAMES) * ["overtaking, robust, seed 3"]
+
+
 @pytest.mark.parametrize("ticks", [1, 2, 40])
 def test_short_runs_are_drawn(ticks: int, tmp_path: Path) -> None:
     assert len(save_figures(make_trajectory(ticks=ticks), tmp_path)) == len(NAMES)
