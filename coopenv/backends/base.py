@@ -172,7 +172,7 @@ class TickGenerator(ABC):
         return tick
 
 
-class SensingWorld(World):
+class SensingWorld(World, ABC):
     """A world that tells observers on the host what its vehicles sense."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
@@ -188,9 +188,9 @@ class SensingWorld(World):
         """What observers are told before the first tick."""
         return briefing_of(self.scenario, self.model)
 
+    @abstractmethod
     def sensed(self, world: int, k: int) -> Sensed:
         """Return what the vehicles of one world sense at the present tick k, without truth and messages."""
-        raise NotImplementedError
 
     def fetch(self) -> bool:
         """Make the next tick ready for `sense`; return False where the source has no more."""

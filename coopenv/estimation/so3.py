@@ -32,41 +32,47 @@ def identity3(v: Any):
 
 
 @wp.func
-def exp_so3(w: Any):
-    """Return Exp(w), the rotation by |w| rad about w (Rodrigues)."""
-    square = wp.dot(w, w)
+def rodrigues(square: Any):
+    """Return (sin x / x, (1 - cos x) / x^2, (x - sin x) / x^3) of an angle x in rad, given x^2."""
+    one = type(square)(1.0)
     # Series up to x^4: exact to rounding below 0.01 rad, where almost all steps lie, and free of trigonometry.
-    a = w.dtype(1.0) - square * (w.dtype(SIXTH) - square * w.dtype(OVER_120))  # sin(x)/x
-    b = w.dtype(0.5) - square * (w.dtype(OVER_24) - square * w.dtype(OVER_720))  # (1-cos(x))/x^2
-    if square > w.dtype(1.0e-4):
+    a = one - square * (type(square)(SIXTH) - square * type(square)(OVER_120))
+    b = type(square)(0.5) - square * (type(square)(OVER_24) - square * type(square)(OVER_720))
+    c = type(square)(SIXTH) - square * (type(square)(OVER_120) - square * type(square)(OVER_5040))
+    if square > type(square)(1.0e-4):
         angle = wp.sqrt(square)
-        a = wp.sin(angle) / angle
-        half = wp.sin(angle * w.dtype(0.5))
-        b = w.dtype(2.0) * half * half / square
+        sine = wp.sin(angle)
+        half = wp.sin(angle * type(square)(0.5))
+        a = sine / angle
+        b = type(square)(2.0) * half * half / square
+        c = (angle - sine) / (square * angle)
+    return a, b, c
+
+
+@wp.func
+def turn_by(w: Any, square: Any, a: Any, b: Any):
+    """Return Exp(w) = (1 - b |w|^2) I + a S(w) + b w w^T, with a and b of `rodrigues`."""
     return (w.dtype(1.0) - b * square) * identity3(w) + a * skew(w) + b * wp.outer(w, w)
 
 
 @wp.func
+def exp_so3(w: Any):
+    """Return Exp(w), the rotation by |w| rad about w (Rodrigues)."""
+    square = wp.dot(w, w)
+    a, b, _ = rodrigues(square)
+    return turn_by(w, square, a, b)
+
+
+@wp.func
 def rigid_motion(w: Any, u: Any):
-    """Return (Exp(w), J_l(w) u): the turn and the way of a body twist that is held for as long as it turns by w.
+    """Return (Exp(w), J_l(w) u): the turn and the way of a body twist held while it turns by w rad and goes u m.
 
     J_l(w) = int_0^1 Exp(s w) ds turns a held velocity into a displacement.
     """
     square = wp.dot(w, w)
-    # As in exp_so3.
-    a = w.dtype(1.0) - square * (w.dtype(SIXTH) - square * w.dtype(OVER_120))
-    b = w.dtype(0.5) - square * (w.dtype(OVER_24) - square * w.dtype(OVER_720))
-    c = w.dtype(SIXTH) - square * (w.dtype(OVER_120) - square * w.dtype(OVER_5040))  # (x-sin(x))/x^3
-    if square > w.dtype(1.0e-4):
-        angle = wp.sqrt(square)
-        sine = wp.sin(angle)
-        half = wp.sin(angle * w.dtype(0.5))
-        a = sine / angle
-        b = w.dtype(2.0) * half * half / square
-        c = (angle - sine) / (square * angle)
+    a, b, c = rodrigues(square)
     across = wp.cross(w, u)
-    turn = (w.dtype(1.0) - b * square) * identity3(w) + a * skew(w) + b * wp.outer(w, w)
-    return turn, u + b * across + c * wp.cross(w, across)
+    return turn_by(w, square, a, b), u + b * across + c * wp.cross(w, across)
 
 
 @wp.func

@@ -18,8 +18,8 @@ from importlib import import_module
 from queue import Empty, Queue
 from threading import Thread
 
-HANG_S = 60.0
-"""Without a word from a case, on a machine that may be busy with other things."""
+HANG_S = 10.0
+"""Without a word from a case."""
 START_S = 900.0
 """Without a word from the preparation: kernels may have to be compiled."""
 
@@ -67,8 +67,9 @@ class Child:
             return stream.read()
 
 
-def run_cases(module: str, numbers: Sequence[int]) -> Outcome:
+def run_cases(module: str, numbers: Sequence[int], hang_s: float | None = None) -> Outcome:
     """Run cases first..last of a module, beginning anew after each one that takes the process along."""
+    patience = HANG_S if hang_s is None else hang_s
     outcome, number, last = Outcome(), numbers[0], numbers[-1]
     while number <= last:
         child = Child(module, number, last)
@@ -76,7 +77,7 @@ def run_cases(module: str, numbers: Sequence[int]) -> Outcome:
         alive = ready == "ready"
         while alive and number <= last:
             begin = time.monotonic()
-            line = child.line(HANG_S)
+            line = child.line(patience)
             if line.startswith("!"):
                 outcome.failures[number] = line[1:].replace("\\n", "\n")
                 alive = line.startswith("!Traceback")

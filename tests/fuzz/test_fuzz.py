@@ -32,7 +32,7 @@ def test_all(kind: str) -> None:
 
 
 def test_large_scenarios_load_at_once() -> None:
-    outcome = run_cases("tests.fuzz.large", range(len(large.CASES)))
+    outcome = run_cases("tests.fuzz.large", range(len(large.CASES)), hang_s=60.0)
     assert outcome.taken == {"accepted": len(large.CASES)}, outcome.failures
 
 

@@ -11,7 +11,7 @@ from coopenv.errors import OutputError
 from coopenv.runs.video import Mp4Film
 from tests.helpers.processes import small_disk
 
-ffmpeg = pytest.importorskip("imageio_ffmpeg")
+ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
 
 
 def pictures(count: int) -> list[np.ndarray]:

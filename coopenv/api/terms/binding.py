@@ -91,15 +91,16 @@ def _bound(kind: Registry[Any], name: str, row: Row, number: int, records: tuple
     taken = record_count(title, function, records)
     try:
         return Bound(title, name not in kind.built_in, number, _warp_function(function), taken)
-    except (RuntimeError, AttributeError):  # Warp reads the source, which a program of text does not have
-        where = function.__code__.co_filename
-        raise CoopenvError(f"{title}: its source is not known ({where}); please save it to a file") from None
+    except RuntimeError as error:  # Warp reads the source, which a program of text does not have
+        raise CoopenvError(f"{title}: {error}") from None
 
 
 @cache
 def _warp_function(function: Callable[..., Any]) -> Any:
     if isinstance(function, wp.Function):
         return function
+    if function.__code__.co_filename == "<string>":  # of which Python 3.13 may find another program's source
+        raise RuntimeError("its source is not known; please save it to a file")
     for name in inspect.signature(function).parameters:
         function.__annotations__.setdefault(name, Any)
     return wp.func(function)

@@ -70,14 +70,22 @@ def send(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
 
 
 @wp.func
+def arrived(state: Any, memory: Any, world: int, i: int, sender: int) -> int:
+    """Return the tick at which the message was sent that the radio has delivered now; -1 where there is none."""
+    if sender < 0:  # a landmark
+        return -1
+    sent = state.inbox_tick[world, i, sender]
+    return wp.where(sent != memory.inbox[world, i, sender].tick, sent, -1)
+
+
+@wp.func
 def receive(model: Any, state: Any, memory: Any, world: int, i: int):
     """Take what the radio has delivered at this tick."""
     for n in range(model.target_count[i]):
         sender = model.targets[i, n] - model.landmarks
-        if sender >= 0:
-            sent = state.inbox_tick[world, i, sender]
-            if sent >= 0 and sent != memory.inbox[world, i, sender].tick:
-                memory.inbox[world, i, sender] = memory.outbox[world, sender, sent % model.radio.slots]
+        sent = arrived(state, memory, world, i, sender)
+        if sent >= 0:
+            memory.inbox[world, i, sender] = memory.outbox[world, sender, sent % model.radio.slots]
 
 
 @wp.func

@@ -12,7 +12,7 @@ from coopenv.observers.robust.constants import MAX_TOLD, SAME_TIME, SUPERSEDING_
 from coopenv.observers.robust.joint.matrices import AFTER, entry, factorise
 from coopenv.observers.robust.joint.memory import Contact, Joint, Told
 from coopenv.observers.robust.memory import Pose, mat66d, vec3d
-from coopenv.observers.robust.tracklets import bit_of, clear_messages, marker_jacobian, own_report, receive
+from coopenv.observers.robust.tracklets import arrived, bit_of, clear_messages, marker_jacobian, own_report, receive
 
 MAX_AGE = SUPERSEDING_TIME + SAME_TIME
 
@@ -92,17 +92,16 @@ def receive_joint(model: Any, state: Any, memory: Any, world: int, i: int):
     """Take what the radio has delivered at this tick."""
     for n in range(model.target_count[i]):
         sender = model.targets[i, n] - model.landmarks
-        if sender >= 0:
-            sent = state.inbox_tick[world, i, sender]
-            if sent >= 0 and sent != memory.inbox[world, i, sender].tick:
-                slot = sent % model.radio.slots
-                joint = memory.outbox_joint[world, sender, slot]
-                memory.inbox_joint[world, i, sender] = joint
-                for k in range(joint.others):
-                    memory.inbox_told[world, i, sender, k] = memory.outbox_told[world, sender, slot, k]
-                size = 6 * (joint.others + 1)
-                for k in range((size * (size + 1)) // 2):
-                    memory.inbox_factor[world, i, sender, k] = memory.outbox_factor[world, sender, slot, k]
+        sent = arrived(state, memory, world, i, sender)
+        if sent >= 0:
+            slot = sent % model.radio.slots
+            joint = memory.outbox_joint[world, sender, slot]
+            memory.inbox_joint[world, i, sender] = joint
+            for k in range(joint.others):
+                memory.inbox_told[world, i, sender, k] = memory.outbox_told[world, sender, slot, k]
+            size = 6 * (joint.others + 1)
+            for k in range((size * (size + 1)) // 2):
+                memory.inbox_factor[world, i, sender, k] = memory.outbox_factor[world, sender, slot, k]
     receive(model, state, memory, world, i)
 
 
