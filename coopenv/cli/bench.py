@@ -24,13 +24,13 @@ def bench_agents(
     """Score drivers: who arrives, who collides, who knows its pose."""
     from coopenv.api.parallel_env import parallel_env
     from coopenv.bench.drivers import play, score, score_table
-    from coopenv.policies import load_agent, read_card
+    from coopenv.policies import find_agent, load_agent
     from coopenv.runs.console import Progress
     from coopenv.shipped import list_agents
 
     scores = []
     for agent in agents or list_agents():
-        for name in read_card(agent).environments:
+        for name in find_agent(agent).environments:
             env = parallel_env(name)
             policy = load_agent(agent, env.scenario)
             with Progress(options.console(stderr=True), f"{agent} in {name}") as progress:

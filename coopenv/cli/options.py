@@ -42,7 +42,8 @@ PolicyName = Annotated[
     str,
     typer.Option(
         "--policy",
-        help="Policy of the driven vehicles: zero, random, or the name of an agent.",
+        help="Policy of the driven vehicles: zero, random, the name of an agent, its folder, or where its class "
+        "stands, mine.py:Mine or package.module:Mine.",
         autocompletion=complete.policies,
     ),
 ]

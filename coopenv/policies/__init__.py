@@ -1,6 +1,16 @@
 """Policies: scripted ones here, and the loader of everything in `agents/`."""
 
-from coopenv.policies.base import Policy, act, decide
-from coopenv.policies.loader import AgentCard, load_agent, load_policy, read_card
+from coopenv.policies.base import Policy, act, decide, restart
+from coopenv.policies.loader import Agent, agents_for, find_agent, load_agent, load_policy
 
-__all__ = ["AgentCard", "Policy", "act", "decide", "load_agent", "load_policy", "read_card"]
+__all__ = [
+    "Agent",
+    "Policy",
+    "act",
+    "agents_for",
+    "decide",
+    "find_agent",
+    "load_agent",
+    "load_policy",
+    "restart",
+]

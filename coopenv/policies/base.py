@@ -9,39 +9,59 @@ from coopenv.errors import CoopenvError
 
 
 class Policy(Protocol):
-    """Maps what vehicles observe to their actions; a function, or an object that can be called."""
+    """Maps what vehicles observe to their actions; a function, or an object that can be called.
+
+    It chooses for all rows of a batch at once, each from its own observation alone. One that remembers something has
+    also a method `reset(mask)`, see `restart`, and is then asked about the same rows, in the same order, every time.
+    """
 
     def __call__(self, observations: np.ndarray, /) -> np.ndarray:
-        """Return the actions, (N, 2) in [-1, 1], for flat observations, (N, D), one row per vehicle."""
+        """Return the actions, (rows, A) in [-1, 1], for flat observations, (rows, D)."""
 
 
-def decide(policy: Policy, observations: np.ndarray) -> np.ndarray:
-    """Return the actions that a policy chooses, (N, 2) in float64, clipped to [-1, 1].
+def restart(policy: Policy, mask: np.ndarray) -> None:
+    """Tell a policy that remembers something in which rows, mask (rows,) of bool, a new episode begins."""
+    reset = getattr(policy, "reset", None)
+    if callable(reset):
+        reset(mask)
+
+
+def decide(policy: Policy, observations: np.ndarray, width: int = 2) -> np.ndarray:
+    """Return the actions that a policy chooses, (rows, width) in float64, clipped to [-1, 1].
 
     Raises:
-        CoopenvError: the policy returned something of another shape.
+        CoopenvError: the policy returned something of another shape, or not finite.
     """
     actions = np.asarray(policy(observations), dtype=np.float64)
-    if actions.shape != (len(observations), 2):
-        raise CoopenvError(f"the policy returned actions of shape {actions.shape}, expected {(len(observations), 2)}")
+    if actions.shape != (len(observations), width):
+        raise CoopenvError(
+            f"the policy returned actions of shape {actions.shape}, expected {(len(observations), width)}"
+        )
+    if not np.isfinite(actions).all():
+        row = int(np.flatnonzero(~np.isfinite(actions).all(axis=1))[0])
+        raise CoopenvError(f"the policy returned an action that is not finite for row {row}: {actions[row].tolist()}")
     return np.clip(actions, -1.0, 1.0)
 
 
 def act(policy: Policy, observations: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the action of every agent of a `ParallelEnv` that a policy chooses from its flat observations."""
+    """Return the action of every agent of a `ParallelEnv` that a policy chooses from its flat observations.
+
+    As agents end, rows vanish, so the policy must remember nothing.
+    """
     actions = policy(np.stack(list(observations.values())))
     return dict(zip(observations, actions, strict=True))
 
 
-def zero_policy(seed: int = 0) -> Policy:
+def zero_policy(seed: int = 0, width: int = 2) -> Policy:
     """Return the policy of action zero: straight on, at half of the speed range (or without acceleration)."""
-    return lambda observations: np.zeros((len(observations), 2))
+    return lambda observations: np.zeros((len(observations), width))
 
 
-def random_policy(seed: int) -> Policy:
+def random_policy(seed: int, width: int = 2) -> Policy:
     """Return a policy that draws every action uniformly from [-1, 1], the same ones for the same seed."""
     generator = np.random.default_rng(seed % 2**64)
-    return lambda observations: generator.uniform(-1.0, 1.0, (len(observations), 2))
+    return lambda observations: generator.uniform(-1.0, 1.0, (len(observations), width))
 
 
-PLAIN: dict[str, Callable[[int], Policy]] = {"zero": zero_policy, "random": random_policy}
+PLAIN: dict[str, Callable[[int, int], Policy]] = {"zero": zero_policy, "random": random_policy}
+"""By name, made from a seed and the length of an action."""

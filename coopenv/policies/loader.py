@@ -1,16 +1,24 @@
-"""Find and load the drivers of `agents/`: one folder each, with an `agent.toml` and a card."""
+"""Find and load drivers: a folder of `agents/`, a folder anywhere, or a place in code."""
 
+import inspect
 import tomllib
-from importlib import import_module
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from coopenv.errors import CoopenvError, suggest
+from coopenv import user_code
+from coopenv.api.terms.layout import action_fields
+from coopenv.errors import CoopenvError, suggest, told
 from coopenv.policies.base import PLAIN, Policy
 from coopenv.scenario import Scenario
 from coopenv.shipped import data_directory, list_agents
+
+Kind = Literal["learned", "scripted", "reference"]
+"""Trained; written by hand; or a yardstick that says what is possible."""
+AGENT_FILE = "agent.toml"
 
 
 class AgentCard(BaseModel):
@@ -21,58 +29,113 @@ class AgentCard(BaseModel):
     title: str
     description: str
     entry: str
-    """`package.module:Class` within coopenv; called with the scenario and the options."""
+    """`package.module:Class`, or `file.py:Class` in the agent's folder; called with the scenario and the options."""
     environments: tuple[str, ...]
     """Environments that it was made for."""
+    kind: Kind = "scripted"
     options: dict[str, Any] = {}
 
 
-def read_card(name_or_path: str | Path) -> AgentCard:
-    """Read the `agent.toml` of a shipped driver or of a folder.
+@dataclass(frozen=True)
+class Agent:
+    """A driver that has been found, not yet built."""
+
+    name: str
+    """What tables call it."""
+    entry: str
+    """A class, which is built with the scenario and the options, or else a policy."""
+    kind: Kind = "scripted"
+    environments: tuple[str, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
+    description: str = ""
+    folder: Path | None = None
+    """Where its `agent.toml` and its card are; None for a place in code."""
+
+    def policy(self, scenario: Scenario) -> Policy:
+        """Return it as a policy for an environment's vehicles (`env.scenario`).
+
+        Raises:
+            CoopenvError: there is no such code, or it cannot drive this environment.
+        """
+        found: Any = user_code.load(self.entry)
+        if not inspect.isclass(found):
+            if self.options or not callable(found):
+                raise CoopenvError(f"agent '{self.name}': {self.entry} is not a class, nor a function without options")
+            policy: Policy = found
+            return policy
+        try:
+            policy = found(scenario, **self.options)
+        except Exception as error:  # anybody's code
+            plain = isinstance(error, ValueError | TypeError | KeyError)
+            raise CoopenvError(f"agent '{self.name}' cannot be built: {error if plain else told(error)}") from error
+        if not callable(policy):
+            raise CoopenvError(f"agent '{self.name}': {self.entry} cannot be called with observations")
+        return policy
+
+
+def read_card(folder: Path) -> AgentCard:
+    """Read the `agent.toml` of a folder.
 
     Raises:
-        CoopenvError: no such agent, or the file is not valid.
+        CoopenvError: the file is not valid.
     """
-    name, names = str(name_or_path), list_agents()
-    path = (data_directory("agents") / name if name in names else Path(name)) / "agent.toml"
-    if not path.is_file():
-        raise CoopenvError(f"unknown agent '{name}'{suggest(name, names)}; known: {', '.join(names)}")
+    path = folder / AGENT_FILE
     try:
         return AgentCard.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise CoopenvError(f"{path}: not valid TOML: {error}") from None
+    except OSError as error:
+        raise CoopenvError(f"{path}: cannot be read: {error.strerror or error}") from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         raise CoopenvError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
-def load_agent(name_or_path: str | Path, scenario: Scenario) -> Policy:
-    """Return a driver for an environment's vehicles (`env.scenario`).
+def find_agent(name_or_place: str | Path) -> Agent:
+    """Return the driver behind a name of `agents/`, a folder, or `file.py:Name` or `package.module:Name`.
+
+    An agent is code that runs: name only those that you trust.
 
     Raises:
-        CoopenvError: no such agent, its entry lies outside coopenv, or it cannot drive this environment.
+        CoopenvError: there is none, or its `agent.toml` is not valid.
     """
-    card = read_card(name_or_path)
-    module, _, attribute = card.entry.partition(":")
-    if not module.startswith("coopenv.") or not attribute:
-        raise CoopenvError(f"agent '{name_or_path}': entry must be 'coopenv.module:Class', got '{card.entry}'")
-    try:
-        factory = getattr(import_module(module), attribute)
-        policy: Policy = factory(scenario, **card.options)
-    except (ImportError, AttributeError, TypeError, ValueError, KeyError) as error:
-        raise CoopenvError(f"agent '{name_or_path}' cannot be built: {error}") from None
-    return policy
+    name, names = str(name_or_place), list_agents()
+    if name not in names and user_code.is_reference(name):
+        return Agent(name.rpartition(":")[2], user_code.absolute(name))
+    folder = data_directory("agents") / name if name in names else Path(name)
+    if not (folder / AGENT_FILE).is_file():
+        raise CoopenvError(f"unknown agent '{name}'{suggest(name, names)}; known: {', '.join(names)}")
+    card = read_card(folder)
+    if not user_code.is_reference(card.entry):
+        raise CoopenvError(f"{folder / AGENT_FILE}: entry: expected file.py:Class or package.module:Class")
+    entry = user_code.absolute(card.entry, folder)
+    known = card.model_dump(exclude={"title", "entry"})
+    return Agent(folder.resolve().name, entry, folder=folder, **known)
+
+
+def agents_for(environment: str) -> list[str]:
+    """Return the names of the shipped drivers that were made for an environment."""
+    return [name for name in list_agents() if environment in find_agent(name).environments]
+
+
+def load_agent(name_or_place: str | Path, scenario: Scenario) -> Policy:
+    """Return a driver for an environment's vehicles (`env.scenario`), by what `find_agent` takes.
+
+    Raises:
+        CoopenvError: no such agent, or it cannot drive this environment.
+    """
+    return find_agent(name_or_place).policy(scenario)
 
 
 def load_policy(name: str, scenario: Scenario, seed: int) -> Policy:
-    """Return a policy by what `--policy` takes: `zero`, `random` (with a seed), or the name of an agent.
+    """Return a policy by what `--policy` takes: `zero`, `random` (with a seed), or what `find_agent` takes.
 
     Raises:
         CoopenvError: there is no such policy, or the agent cannot drive in this scenario.
     """
     if name in PLAIN:
-        return PLAIN[name](seed)
-    if name not in list_agents():
+        return PLAIN[name](seed, len(action_fields(scenario)))
+    if name not in list_agents() and not user_code.is_reference(name) and not (Path(name) / AGENT_FILE).is_file():
         known = [*PLAIN, *list_agents()]
         raise CoopenvError(f"unknown policy '{name}'{suggest(name, known)}; known: {', '.join(known)}")
     return load_agent(name, scenario)

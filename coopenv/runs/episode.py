@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.policies import Policy, decide
+from coopenv.policies import Policy, decide, restart
 
 
 def play(
@@ -26,13 +26,16 @@ def play(
     with engine.stopping():
         engine.reset(seeds)
         engine.set_actions(np.zeros_like(engine.view("actions")))
+        width = engine.view("actions").shape[-1]
+        if policy is not None:
+            restart(policy, np.ones(engine.world.model.vehicles, dtype=bool))
         yield 0
         for tick in range(ticks):
             if tick % engine.world.model.ticks_per_decision == 0:
                 if not to_the_end and engine.view("ended")[0].all():
                     return
                 if policy is not None:
-                    engine.set_actions(decide(policy, engine.view("observation")[0].copy())[None])
+                    engine.set_actions(decide(policy, engine.view("observation")[0].copy(), width)[None])
             engine.step(ticks=1)
             if engine.view("exhausted")[0]:
                 return

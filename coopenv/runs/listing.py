@@ -7,7 +7,7 @@ from rich.table import Table
 
 from coopenv.api.registration import environment_id
 from coopenv.observers.registry import find, observer_names, obstacle
-from coopenv.policies import read_card
+from coopenv.policies import find_agent
 from coopenv.runs.table import number_table
 from coopenv.scenario import Scenario
 from coopenv.shipped import list_agents
@@ -15,7 +15,7 @@ from coopenv.shipped import list_agents
 COLUMNS = {
     "envs": ("name", "vehicles", "landmarks", "motion", "horizon_s"),
     "observers": ("name", "about"),
-    "agents": ("name", "environments", "about"),
+    "agents": ("name", "kind", "environments", "about"),
     "variants": ("name", "of", "about"),
 }
 """What the tables show of the rows."""
@@ -45,10 +45,14 @@ def observer_rows() -> list[dict[str, Any]]:
 
 def agent_rows() -> list[dict[str, Any]]:
     """Return what `list agents` says of every agent."""
-    cards = {name: read_card(name) for name in list_agents()}
     return [
-        {"name": name, "environments": list(card.environments), "about": _sentence(card.description)}
-        for name, card in cards.items()
+        {
+            "name": agent.name,
+            "kind": agent.kind,
+            "environments": list(agent.environments),
+            "about": _sentence(agent.description),
+        }
+        for agent in map(find_agent, list_agents())
     ]
 
 

@@ -9,11 +9,11 @@ import pytest
 
 import coopenv
 from coopenv.bench.drivers import play, score
-from coopenv.policies import act, load_agent, load_policy, read_card
-from coopenv.runs.rollouts import Rollout
+from coopenv.policies import act, agents_for, decide, find_agent, load_agent, load_policy
+from coopenv.runs.rollouts import Rollout, rollout
 from coopenv.shipped import data_directory, list_agents
 
-PAIRS = [(agent, env) for agent in list_agents() for env in read_card(agent).environments]
+PAIRS = [(agent, env) for agent in list_agents() for env in find_agent(agent).environments]
 
 
 def test_there_are_agents() -> None:
@@ -78,17 +78,102 @@ def test_policies_by_name() -> None:
         load_policy("randm", scenario, 0)
 
 
+CARD = 'title = "x"\ndescription = "y"\nenvironments = ["urban_crossing"]\nentry = "{}"\n'
+OWN = """
+import numpy as np
+
+
+class Left:
+    def __init__(self, scenario, speed=0.0):
+        self.speed = speed
+
+    def __call__(self, observations):
+        return np.tile([self.speed, 1.0], (len(observations), 1))
+
+
+def right(observations):
+    return np.tile([0.0, -1.0], (len(observations), 1))
+"""
+
+
+def test_agents_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    scenario, rows = coopenv.load_scenario("urban_crossing"), np.zeros((3, 132), dtype=np.float32)
+    folder = tmp_path / "lefty"
+    folder.mkdir()
+    (folder / "own.py").write_text(OWN)
+    (folder / "agent.toml").write_text(CARD.format("own.py:Left") + 'kind = "reference"\n[options]\nspeed = 0.5\n')
+    agent = find_agent("lefty")
+    assert (agent.name, agent.kind, agent.environments, agent.folder) == (
+        *("lefty", "reference", ("urban_crossing",)),
+        Path("lefty"),
+    )
+    monkeypatch.chdir(tmp_path.parent)  # a policy that has been found stays where it was
+    np.testing.assert_array_equal(find_agent(folder).policy(scenario)(rows), [[0.5, 1.0]] * 3)
+    monkeypatch.chdir(folder)
+    np.testing.assert_array_equal(load_policy("own.py:Left", scenario, 0)(rows), [[0.0, 1.0]] * 3)
+    np.testing.assert_array_equal(load_policy("own:right", scenario, 0)(rows), [[0.0, -1.0]] * 3)
+    assert find_agent("own.py:right").name == "right"
+
+
+def test_agents_made_for_an_environment() -> None:
+    assert "give_way" in agents_for("urban_crossing")
+    assert agents_for("busy_intersection") == []
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("nobody.py:Mine", "no such file"),
+        ("own.py:Lft", r"no 'Lft' in .*own\.py \(did you mean 'Left'\?\)"),
+        ("own.py:np", "is not a class, nor a function"),
+    ],
+)
+def test_agents_in_code_that_are_none(text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("own.py").write_text(OWN)
+    with pytest.raises(coopenv.CoopenvError, match=message):
+        load_policy(text, coopenv.load_scenario("urban_crossing"), 0)
+
+
 def test_bad_agents(tmp_path: Path) -> None:
-    env = coopenv.parallel_env("urban_crossing")
+    scenario = coopenv.load_scenario("urban_crossing")
     with pytest.raises(coopenv.CoopenvError, match=r"unknown agent 'giveway' \(did you mean 'give_way'\?\)"):
-        load_agent("giveway", env.scenario)
-    (tmp_path / "agent.toml").write_text('title = "x"')
-    with pytest.raises(coopenv.CoopenvError, match=r"agent\.toml: description: Field required"):
-        load_agent(str(tmp_path), env.scenario)
-    card = 'title = "x"\ndescription = "y"\nenvironments = []\nentry = "{}"\n'
-    (tmp_path / "agent.toml").write_text(card.format("os:system"))
-    with pytest.raises(coopenv.CoopenvError, match=r"entry must be 'coopenv\.module:Class'"):
-        load_agent(str(tmp_path), env.scenario)
-    (tmp_path / "agent.toml").write_text(card.format("coopenv.policies.give_way:GiveWay") + "[options]\nspeeed = 1\n")
-    with pytest.raises(coopenv.CoopenvError, match="speeed"):
-        load_agent(str(tmp_path), env.scenario)
+        load_agent("giveway", scenario)
+    for text, message in (
+        ('title = "x"', r"agent\.toml: description: Field required"),
+        (CARD.format("GiveWay"), r"agent\.toml: entry: expected file\.py:Class or package\.module:Class"),
+        (CARD.format("coopenv.policies.give_way:GiveWay") + "[options]\nspeeed = 1\n", "cannot be built: .*speeed"),
+        (CARD.format("x:y") + 'kind = "good"\n', r"kind: Input should be 'learned', 'scripted' or 'reference'"),
+        ("title = ", "not valid TOML"),
+    ):
+        (tmp_path / "agent.toml").write_text(text)
+        with pytest.raises(coopenv.CoopenvError, match=message):
+            load_agent(tmp_path, scenario)
+
+
+@pytest.mark.parametrize(
+    ("actions", "message"),
+    [(np.zeros((2, 3)), r"shape \(2, 3\), expected \(2, 2\)"), ([[0, 0], [0, np.nan]], "not finite for row 1")],
+)
+def test_actions_that_are_none(actions: np.ndarray, message: str) -> None:
+    with pytest.raises(coopenv.CoopenvError, match=message):
+        decide(lambda observations: np.asarray(actions), np.zeros((2, 132)))
+
+
+def test_a_policy_that_remembers_is_told_when_an_episode_begins() -> None:
+    class Counting:
+        asked = 0
+
+        def reset(self, mask: np.ndarray) -> None:
+            assert mask.shape == (4,) and mask.all()
+            self.asked = 0
+
+        def __call__(self, observations: np.ndarray) -> np.ndarray:
+            self.asked += 1
+            return np.zeros((len(observations), 2))
+
+    policy = Counting()
+    for _ in range(2):
+        rollout(coopenv.load_scenario("urban_crossing"), policy=policy, steps=3)
+    assert policy.asked == 3
