@@ -1,11 +1,10 @@
 """Find and load drivers: a folder of `agents/`, a folder anywhere, or a place in code."""
 
-import inspect
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -57,14 +56,14 @@ class Agent:
         Raises:
             CoopenvError: there is no such code, or it cannot drive this environment.
         """
-        found: Any = user_code.load(self.entry)
-        if not inspect.isclass(found):
-            if self.options or not callable(found):
+        factory: Any = user_code.load(self.entry)
+        if not isinstance(factory, type):
+            if self.options or not callable(factory):
                 raise CoopenvError(f"agent '{self.name}': {self.entry} is not a class, nor a function without options")
-            policy: Policy = found
-            return policy
+            return cast(Policy, factory)
+        made: Any = factory
         try:
-            policy = found(scenario, **self.options)
+            policy: Policy = made(scenario, **self.options)
         except Exception as error:  # anybody's code
             plain = isinstance(error, ValueError | TypeError | KeyError)
             raise CoopenvError(f"agent '{self.name}' cannot be built: {error if plain else told(error)}") from error
