@@ -63,6 +63,17 @@ class Exchange:
             tensor = self._tensors[name] = whole.reshape(self._rows, *whole.shape[2:])
         return tensor
 
+    def time(self) -> Any:
+        """Return (W N,) s since the start of each row's episode."""
+        engine, vehicles = self._engine, self._shape[1]
+        period = float(engine.world.model.camera_period)
+        if self.kind == "numpy":
+            return np.repeat(engine.view("tick") * period, vehicles)
+        import torch
+
+        ticks = wp.to_torch(engine.array("tick"))
+        return torch.repeat_interleave(ticks * period, vehicles)
+
     def owned(self, rows: Any) -> Any:
         """Return rows that `rows()` gave, or dictionaries of them, as what the next step does not touch."""
         if isinstance(rows, dict):

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 
 from coopenv.api.actions import ActionReader
@@ -75,7 +76,8 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         }
         self.engine = Engine(scenario, 1, dtype, device, backend=backend, reward=reward)
         self.possible_agents = list(scenario.vehicle_names)
-        self.agents: list[str] = []
+        self._agents: list[str] = []
+        self._np_random: np.random.Generator | None = None
         self._index = {agent: i for i, agent in enumerate(self.possible_agents)}
         self._flat = observation == "flat"
         layout = self.engine.layout
@@ -88,17 +90,36 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         self._pictures = Pictures(self.engine, scenario)
 
     @property
+    def agents(self) -> list[str]:
+        """Names of the vehicles that are under way."""
+        return list(self._agents)
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """A generator for wrappers, of the last seed given to `reset`; the world does not draw from it."""
+        if self._np_random is None:
+            self._np_random = seeding.np_random(None)[0]
+        return self._np_random
+
+    @property
     def observation_layout(self) -> Layout:
         """Name, slice, unit and scale of every field of the flat observation."""
         return self.engine.layout.copy()
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Return the agent's observation space, the same object at every call."""
+        self._check_agent(agent)
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
         """Return the agent's action space, the same object at every call."""
+        self._check_agent(agent)
         return self.action_spaces[agent]
+
+    def _check_agent(self, agent: str) -> None:
+        if agent not in self._index:
+            known = ", ".join(self.possible_agents)
+            raise CoopenvError(f"unknown agent {shown(agent)}{suggest(str(agent), self._index)}; known: {known}")
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observations, Infos]:
         """Start an episode.
@@ -107,12 +128,14 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             seed: fixes the episode; None goes on with a new episode of the last seed (a random one at first).
             options: for a backend that takes any; the others need none.
         """
+        if seed is not None:
+            self._np_random = seeding.np_random(checked_seed(seed))[0]
         with self.engine.stopping():
             self.engine.reset(None if seed is None else [checked_seed(seed)], options=options)
-        self.agents = list(self.possible_agents)
+        self._agents = list(self.possible_agents)
         if self.render_mode == "human":
             self.render()
-        return self._observations(self.agents), self._infos(self.agents)
+        return self._observations(self._agents), self._infos(self._agents)
 
     def step(
         self, actions: Mapping[str, np.ndarray]
@@ -124,7 +147,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             CoopenvError: `reset` has not been called.
         """
         self.engine.check_begun()
-        alive = self.agents
+        alive = self._agents
         if not alive:
             return {}, {}, {}, {}, {}
         with self.engine.stopping():
@@ -133,7 +156,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         values = (self.engine.view(name)[0].tolist() for name in ("reward", "terminated", "truncated"))
         rewards, terminated, truncated = (dict(zip(alive, [of[i] for i in indices], strict=True)) for of in values)
         result = self._observations(alive), rewards, terminated, truncated, self._infos(alive)
-        self.agents = [agent for agent in alive if not (terminated[agent] or truncated[agent])]
+        self._agents = [agent for agent in alive if not (terminated[agent] or truncated[agent])]
         if self.render_mode == "human":
             self.render()
         return result
@@ -172,7 +195,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
 
     def get_state(self) -> dict[str, Any]:
         """Return everything that the next step depends on, random streams included; see `set_state`."""
-        own = {"agents": list(self.agents), "scenario": self.scenario}
+        own = {"agents": list(self._agents), "scenario": self.scenario}
         return {**own, **self.engine.get_state()}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -197,7 +220,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             self.engine.set_state(state)
         except CoopenvError as error:
             raise CoopenvError(f"{where}: {error}") from None
-        self.agents = list(agents)
+        self._agents = list(agents)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"arguments": self._arguments, "state": self.get_state()}

@@ -1,11 +1,13 @@
 """The Gymnasium environment: one vehicle is the agent, the others follow a fixed rule."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from coopenv.api.parallel_env import RENDER_MODES, CooperativeLocalisationEnv, parallel_env
 from coopenv.errors import CoopenvError, suggest
@@ -43,6 +45,7 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         Raises:
             CoopenvError: no such vehicle.
         """
+        self._spec: EnvSpec | None = None
         self.world: CooperativeLocalisationEnv = parallel_env(name_or_path, **options)
         names = self.world.possible_agents
         if vehicle not in names:
@@ -53,6 +56,18 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         self.observation_space = self.world.observation_space(vehicle)
         self.action_space = self.world.action_space(vehicle)
         self._observations: dict[str, Any] = {}
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What Gymnasium registered, with the horizon in decisions as `max_episode_steps`."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        if spec is not None and spec.max_episode_steps is None:
+            scenario = self.world.scenario
+            spec = replace(spec, max_episode_steps=round(scenario.horizon * scenario.rates.decision))
+        self._spec = spec
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode, see `CooperativeLocalisationEnv.reset`."""

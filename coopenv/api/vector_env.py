@@ -16,15 +16,20 @@ from coopenv.api.array_io import ArrayKind, Exchange
 from coopenv.api.engine import Engine
 from coopenv.api.pictures import Pictures
 from coopenv.api.reward import RewardFunction
-from coopenv.api.terms.layout import Layout, action_space, flat_space
+from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
 from coopenv.backends.sources import open_simulation
-from coopenv.errors import CoopenvError, checked_seed, suggest
+from coopenv.errors import CoopenvError, ScenarioError, checked_seed, suggest
+from coopenv.observers.contract import Factory
+from coopenv.observers.registry import named
 from coopenv.scenario import Scenario
 
-INFO_FIELDS = ("alive", "ended", "position_error", "orientation_error", "nees")
-"""Arrays (num_envs,) in every info, beside `reward_terms`, which holds one by the name of each term. `alive` is false
-for vehicles that had ended before this step; `ended` is 0 under way, 1 arrived, 2 collided, from 3 on a condition of
-the scenario's own; errors in m and deg."""
+INFO_FIELDS = (
+    *("alive", "ended", "position_error", "orientation_error", "nees"),
+    *("log_determinant", "gramian_min_eigenvalue"),
+)
+"""Arrays (num_envs,) in every info, beside `reward_terms`, which holds one by the name of each term, and `time`, s
+since the start of the episode. `alive` is false for vehicles that had ended before this step; `ended` is 0 under way,
+1 arrived, 2 collided, from 3 on a condition of the scenario's own; errors in m and deg."""
 
 
 class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
@@ -57,24 +62,29 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         threads: int | None = None,
         render_mode: str | None = None,
         reward: RewardFunction | None = None,
+        observation: Literal["flat", "dict"] = "flat",
     ) -> None:
         """Build the worlds; use `coopenv.make_vec` to build them by name."""
+        self._arguments = {key: value for key, value in locals().items() if key != "self"}
         if render_mode not in (None, "rgb_array"):
             raise CoopenvError(f"unknown render_mode '{render_mode}'; known: None, rgb_array")
+        if observation not in ("flat", "dict"):
+            raise CoopenvError(f"unknown observation '{observation}'; known: flat, dict")
         self.scenario = scenario
         self.engine = Engine(scenario, num_worlds, dtype, device, threads, reward=reward)
         self.pictures = Pictures(self.engine, scenario)
         self.num_worlds, self.vehicles = self.engine.world.worlds, len(scenario.vehicles)
         self.num_envs = self.num_worlds * self.vehicles
-        self.autoreset = autoreset_mode(autoreset)
+        self.autoreset_mode = checked_autoreset(autoreset)
         self.render_mode = render_mode
         self.metadata = {
             "name": f"{name}_v0",
-            "autoreset_mode": self.autoreset,
+            "autoreset_mode": self.autoreset_mode,
             "render_modes": ["rgb_array"],
             "render_fps": scenario.rates.decision,
         }
-        self.single_observation_space = flat_space(self.engine.layout)
+        self._flat, layout = observation == "flat", self.engine.layout
+        self.single_observation_space = flat_space(layout) if self._flat else dict_space(layout)
         self.single_action_space = action_space()
         self._exchange = Exchange(self.engine, arrays)
 
@@ -87,6 +97,11 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     def action_space(self) -> spaces.Space[Any]:  # type: ignore[override]
         """The batch of `single_action_space`."""
         return batch_space(self.single_action_space, self.num_envs)
+
+    @property
+    def arrays(self) -> ArrayKind:
+        """What arrays are: "numpy" or "torch"."""
+        return self._exchange.kind
 
     @property
     def observation_layout(self) -> Layout:
@@ -116,7 +131,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         seeds = self.engine.reset(self._world_seeds(seed), mask)
         if seeds is not None:
             self._np_random, self._np_random_seed = seeding.np_random(int(seeds[0]))
-        return self._exchange.rows("observation"), self._infos()
+        return self._observations(), self._infos()
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Drive all worlds for one decision period.
@@ -131,15 +146,22 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         self.engine.check_begun()
         self._exchange.follow_torch()
         self._exchange.set_actions(actions)
-        if self.autoreset == AutoresetMode.NEXT_STEP:
+        if self.autoreset_mode == AutoresetMode.NEXT_STEP:
             self.engine.step_or_restart()
         else:
             self.engine.step()
         flags = [self._exchange.rows(name) for name in ("reward", "terminated", "truncated")]
         infos = self._infos()
-        if self.autoreset == AutoresetMode.SAME_STEP:
+        if self.autoreset_mode == AutoresetMode.SAME_STEP:
             flags, infos = self._restart_at_once(flags, infos)
-        return self._exchange.rows("observation"), flags[0], flags[1], flags[2], infos
+        return self._observations(), flags[0], flags[1], flags[2], infos
+
+    def _observations(self) -> Any:
+        """Return the rows, or a dictionary of their parts by field."""
+        rows = self._exchange.rows("observation")
+        if self._flat:
+            return rows
+        return {name: rows[:, field.slice] for name, field in self.engine.layout.items()}
 
     def _restart_at_once(self, flags: list[Any], infos: dict[str, Any]) -> tuple[list[Any], dict[str, Any]]:
         """Reset what is over; return the flags of the step, and the infos after it with those of the step inside.
@@ -150,7 +172,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         ended = flags[1] | flags[2]
         if self._exchange.kind == "numpy" and not ended.any():
             return flags, infos
-        observation = self._exchange.owned(self._exchange.rows("observation"))
+        observation = self._exchange.owned(self._observations())
         final = {"final_obs": observation, "_final_obs": ended, "_final_info": ended}
         final["final_info"] = self._exchange.owned(infos)
         self.engine.restart_finished()
@@ -158,7 +180,8 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
 
     def _infos(self) -> dict[str, Any]:
         terms = dict(zip(self.engine.reward_terms, self._exchange.rows("terms").T, strict=True))
-        return {**{name: self._exchange.rows(name) for name in INFO_FIELDS}, "reward_terms": terms}
+        fields = {name: self._exchange.rows(name) for name in INFO_FIELDS}
+        return {**fields, "reward_terms": terms, "time": self._exchange.time()}
 
     def _world_mask(self, options: Any) -> np.ndarray | None:
         if options is not None and not isinstance(options, Mapping):
@@ -222,6 +245,18 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         except CoopenvError as error:
             raise CoopenvError(f"{where}: {error}") from None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {
+            "arguments": self._arguments,
+            "state": self.get_state(),
+            "random": (self._np_random, self._np_random_seed),
+        }
+
+    def __setstate__(self, saved: dict[str, Any]) -> None:
+        self.__init__(**saved["arguments"])  # type: ignore[misc]
+        self.set_state(saved["state"])
+        self._np_random, self._np_random_seed = saved["random"]
+
     def close_extras(self, **kwargs: Any) -> None:
         """Close the renderer and end the threads."""
         if hasattr(self, "engine"):
@@ -229,7 +264,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             self.pictures.close()
 
 
-def autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+def checked_autoreset(mode: AutoresetMode | str) -> AutoresetMode:
     """Return a member of Gymnasium's enumeration for it, its name or its value.
 
     Raises:
@@ -255,6 +290,8 @@ def make_vec(
     threads: int | None = None,
     render_mode: str | None = None,
     reward: RewardFunction | None = None,
+    observer: str | Factory | None = None,
+    observation: Literal["flat", "dict"] = "flat",
 ) -> CooperativeVectorEnv:
     """Return a batch of worlds as a Gymnasium `VectorEnv` with num_worlds x vehicles rows.
 
@@ -270,12 +307,17 @@ def make_vec(
         render_mode: None or "rgb_array".
         reward: a function of a `coopenv.api.reward.Step` that returns the rewards (num_worlds, vehicles), on the CPU
             only; None: the weighted sum of the scenario's terms.
+        observer: estimator that every vehicle runs, as for `coopenv.parallel_env`; None: as the scenario says.
+        observation: "flat" rows, or a "dict" of arrays (num_envs, size) by field.
 
     Raises:
         CoopenvError: any argument is not valid.
     """
+    if overrides is not None and not isinstance(overrides, Mapping):
+        raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
+    merged = {**(overrides or {}), **({} if observer is None else {"observer.name": named(observer)})}
     return CooperativeVectorEnv(
-        open_simulation(name_or_path, overrides),
+        open_simulation(name_or_path, merged),
         Path(str(name_or_path)).stem,
         num_worlds=num_worlds,
         device=device,
@@ -285,6 +327,7 @@ def make_vec(
         threads=threads,
         render_mode=render_mode,
         reward=reward,
+        observation=observation,
     )
 
 

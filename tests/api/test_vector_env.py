@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import multiprocessing
+import pickle
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -354,3 +357,56 @@ def test_counts_may_be_of_numpy() -> None:
     env = coopenv.make_vec("busy_intersection", num_worlds=np.int64(2))
     assert type(env.num_envs) is int and env.reset(seed=0)[0].shape[0] == 10
     assert gymnasium.make_vec("coopenv/BusyIntersection-v0", num_envs=np.int64(10)).num_envs == 10
+
+
+@pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_copies_go_on_alike_and_apart(duplicate: Callable[[Any], Any]) -> None:
+    env = coopenv.make_vec("urban_crossing", num_worlds=3, overrides={"horizon": 1.0})
+    env.reset(seed=4)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        env.step(actions_for(env, rng))
+    other = duplicate(env)
+    assert other.np_random.bit_generator.state == env.np_random.bit_generator.state
+    actions = actions_for(env, rng)
+    ours, theirs = ([each.step(actions)[:4] for _ in range(12)] for each in (env, other))
+    for mine, yours in zip(ours, theirs, strict=True):
+        assert all(np.array_equal(a, b) for a, b in zip(mine, yours, strict=True))
+
+
+def test_dict_observations_are_the_flat_ones_by_field() -> None:
+    options = {"num_worlds": 2, "overrides": {"horizon": 0.5}, "autoreset": "same_step"}
+    flat, parts = (coopenv.make_vec("urban_crossing", observation=kind, **options) for kind in ("flat", "dict"))
+    rows, named = flat.reset(seed=1)[0], parts.reset(seed=1)[0]
+    for _ in range(6):
+        assert parts.observation_space.contains(named)
+        assert np.array_equal(np.concatenate(list(named.values()), axis=1), rows)
+        rows, *_, infos = flat.step(np.zeros((8, 2), np.float32))
+        named, *_, told = parts.step(np.zeros((8, 2), np.float32))
+        if "final_obs" in infos:
+            assert np.array_equal(np.concatenate(list(told["final_obs"].values()), axis=1), infos["final_obs"])
+
+
+def test_infos_of_the_batch_are_those_of_the_single_world() -> None:
+    batch, single = coopenv.make_vec("urban_crossing", num_worlds=1), coopenv.parallel_env("urban_crossing")
+    batch.reset(seed=2)
+    single.reset(seed=2)
+    for _ in range(3):
+        *_, infos = batch.step(np.zeros((4, 2), np.float32))
+        *_, told = single.step(dict.fromkeys(single.agents, np.zeros(2, np.float32)))
+    for row, info in enumerate(told.values()):
+        for name in ("position_error", "nees", "log_determinant", "gramian_min_eigenvalue"):
+            assert infos[name][row] == info[name]
+        assert infos["time"][row] == pytest.approx(info["time"])
+        assert {name: values[row] for name, values in infos["reward_terms"].items()} == info["reward_terms"]
+
+
+def test_observer_by_name_and_unknown_words() -> None:
+    assert coopenv.make_vec("urban_crossing", num_worlds=1, observer="robust").scenario.observer.name == "robust"
+    with pytest.raises(coopenv.CoopenvError, match="unknown observation 'box'; known: flat, dict"):
+        coopenv.make_vec("urban_crossing", num_worlds=1, observation="box")  # type: ignore[arg-type]
+
+
+def test_autoreset_mode_is_an_attribute() -> None:
+    env = coopenv.make_vec("urban_crossing", num_worlds=1, autoreset="same_step")
+    assert env.autoreset_mode is AutoresetMode.SAME_STEP

@@ -63,7 +63,35 @@ def test_record_video_of_one_vehicle(tmp_path: Path) -> None:
     assert [path.suffix for path in tmp_path.iterdir()] == [".mp4"]
 
 
+def test_time_aware_observation_knows_the_horizon() -> None:
+    env = gymnasium.make(CROSSING)
+    assert env.spec is not None and env.spec.max_episode_steps == 400
+    aware = gymnasium.wrappers.TimeAwareObservation(env)
+    assert aware.observation_space.contains(aware.reset(seed=0)[0])
+
+
 # PettingZoo
+
+
+def test_agents_are_a_copy_and_unknown_ones_are_named() -> None:
+    env = coopenv.parallel_env("urban_crossing")
+    env.reset(seed=0)
+    env.agents.append("x")
+    assert env.agents == env.possible_agents
+    with pytest.raises(coopenv.CoopenvError, match=r"unknown agent 'vehicle1' \(did you mean 'vehicle_1'"):
+        env.observation_space("vehicle1")
+    with pytest.raises(coopenv.CoopenvError, match="unknown agent 'car'; known: vehicle_1"):
+        env.action_space("car")
+
+
+def test_a_generator_for_wrappers_follows_the_seed() -> None:
+    env = coopenv.parallel_env("urban_crossing")
+    env.reset(seed=3)
+    first = env.np_random.random()
+    env.reset()
+    assert env.np_random.random() != first
+    env.reset(seed=3)
+    assert env.np_random.random() == first
 
 
 @pytest.mark.filterwarnings("ignore:.*Overwriting existing videos")

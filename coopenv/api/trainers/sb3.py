@@ -1,30 +1,50 @@
 """Stable-Baselines3: the batch as a native `VecEnv`, rows (world, vehicle). Needs the extra `train`."""
 
+import copy
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from coopenv.api.infos import outcome_words
+from coopenv.api.statistics import EpisodeSums
 from coopenv.api.terms.layout import Layout
 from coopenv.api.vector_env import CooperativeVectorEnv, make_vec
 from coopenv.errors import CoopenvError, checked_seed
+from coopenv.estimation.outcomes import Outcome
 
 try:
+    from stable_baselines3.common.monitor import Monitor
     from stable_baselines3.common.vec_env import VecEnv
     from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 except ImportError as error:
     raise ImportError("coopenv.api.trainers.sb3 needs stable-baselines3: pip install '.[train]'") from error
 
+AT_THE_END = ("position_error", "orientation_error", "nees", "log_determinant", "gramian_min_eigenvalue", "time")
+"""Fields of the batch's infos that a row's info holds when its episode ends."""
+
 
 class CooperativeSB3VecEnv(VecEnv):
     """All vehicles of all worlds as rows of one batch, for a policy that they share.
 
-    A world that is over is reset in the same step, as SB3 expects: `infos[row]["terminal_observation"]` holds the
-    last observation, and `infos[row]["TimeLimit.truncated"]` says that the value beyond it counts.
+    A row is done when its vehicle's episode truly ends: at its arrival or collision, or under way at the end of its
+    world. `infos[row]` then holds
 
-    A vehicle that ended before its world stays parked with reward 0; its row starts a new "episode" there, which ends,
-    with return 0, when the world is over. `info["alive"]` is False in those rows at every done.
+    - `terminal_observation`, and `TimeLimit.truncated`: whether the value beyond it counts;
+    - `episode`: `r`, the undiscounted return, `l`, decisions, and `t`, s since the environment was made, which SB3
+      shows as `ep_rew_mean` and `ep_len_mean` without a monitor;
+    - `is_success` (arrived; SB3 shows its `success_rate`), `outcome`, `reward_terms` (sums over the episode), and
+      `position_error` (m), `orientation_error` (deg), `nees`, `log_determinant`, `gramian_min_eigenvalue`, `time` (s).
+
+    A vehicle that ended before its world stays parked with reward 0, and its row is not done once more when the world
+    is over: to SB3 the time until then is the beginning of its next episode, in which nothing that it does counts. So
+    every done is an episode, and `VecMonitor` and `evaluate_policy` find the true returns; lengths that they count
+    themselves hold the time parked too. `acted` says which rows were under way in the last step; `ActingRowsBuffer`
+    lets PPO learn from these alone.
+
+    In other steps infos are empty. What the whole batch tells at every step stands in `batch_infos`, arrays by name.
     """
 
     def __init__(self, envs: CooperativeVectorEnv) -> None:
@@ -32,6 +52,12 @@ class CooperativeSB3VecEnv(VecEnv):
         self.envs = envs
         self.scenario, self.engine, self.vehicles = envs.scenario, envs.engine, envs.vehicles
         self.render_mode, self.metadata = "rgb_array", envs.metadata
+        self.acted = np.zeros(envs.num_envs, dtype=bool)
+        """(num_envs,) whether the row's vehicle was under way in the last step."""
+        self.batch_infos: dict[str, Any] = {}
+        """Infos of the last step as `CooperativeVectorEnv` gives them, arrays (num_envs,)."""
+        self._sums = EpisodeSums(envs.num_envs, envs.engine.reward_terms)
+        self._outcomes, self._begin = outcome_words(envs.scenario), time.time()
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     @property
@@ -39,9 +65,10 @@ class CooperativeSB3VecEnv(VecEnv):
         """Name, slice, unit and scale of every field of an observation row."""
         return self.envs.observation_layout
 
-    def reset(self) -> np.ndarray:
+    def reset(self) -> Any:
         """Start a new episode in every world; seeds given by `seed()` count once."""
-        observation: np.ndarray = self.envs.reset(seed=self._seeds[0])[0]
+        observation, self.batch_infos = self.envs.reset(seed=self._seeds[0])
+        self._sums.forget(np.ones(self.num_envs, dtype=bool))
         self._reset_seeds()
         self._reset_options()
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
@@ -51,27 +78,40 @@ class CooperativeSB3VecEnv(VecEnv):
         """Take the actions, (num_envs, 2)."""
         self._actions = actions
 
-    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Drive for one decision period and reset the worlds that are over.
 
         Raises:
             ActionError: actions of a wrong shape, or not finite.
         """
         observation, rewards, terminated, truncated, after = self.envs.step(self._actions)
-        dones = terminated | truncated
+        self.batch_infos = step = after.get("final_info", after)
+        self.acted = step["alive"]
+        dones = (terminated | truncated) & self.acted
+        self._sums.add(rewards, self.acted, step)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         if dones.any():
-            final, alive = after["final_obs"], after["final_info"]["alive"]
+            sums, final = self._sums.take(dones), after["final_obs"]
             for row in np.flatnonzero(dones).tolist():
                 infos[row] = {
-                    "terminal_observation": final[row].copy(),
-                    "TimeLimit.truncated": bool(truncated[row] and alive[row]),
-                    "alive": bool(alive[row]),
+                    "terminal_observation": _row_of(final, row),
+                    "TimeLimit.truncated": bool(truncated[row]),
+                    **self._ending(row, step, sums),
                 }
         return observation, rewards, dones, infos
 
+    def _ending(self, row: int, step: dict[str, Any], sums: dict[str, Any]) -> dict[str, Any]:
+        elapsed = round(time.time() - self._begin, 6)
+        return {
+            "episode": {"r": float(sums["r"][row]), "l": int(sums["l"][row]), "t": elapsed},
+            "is_success": bool(step["ended"][row] == Outcome.ARRIVED),
+            "outcome": self._outcomes[step["ended"][row]],
+            "reward_terms": {name: float(values[row]) for name, values in sums["reward_terms"].items()},
+            **{name: float(step[name][row]) for name in AT_THE_END},
+        }
+
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Set the seed of the next reset: world w gets seed + w.
+        """Set the seed of the next reset, as for `CooperativeVectorEnv.reset`.
 
         Raises:
             CoopenvError: not a whole number, or negative.
@@ -110,8 +150,18 @@ class CooperativeSB3VecEnv(VecEnv):
         return [result] * self.num_envs
 
     def env_is_wrapped(self, wrapper_class: type, indices: VecEnvIndices = None) -> list[bool]:
-        """Return False per row: the batch has no wrappers inside."""
-        return [False] * len(self._chosen(indices))
+        """Return True per row for SB3's `Monitor`, whose `info["episode"]` the rows give themselves; else False."""
+        return [wrapper_class is Monitor] * len(self._chosen(indices))
+
+    def __copy__(self) -> "CooperativeSB3VecEnv":
+        return copy.deepcopy(self)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "engine"}
+
+    def __setstate__(self, saved: dict[str, Any]) -> None:
+        self.__dict__.update(saved)
+        self.engine = self.envs.engine
 
     def _chosen(self, indices: VecEnvIndices) -> list[int]:
         return list(self._get_indices(indices))
@@ -121,18 +171,29 @@ class CooperativeSB3VecEnv(VecEnv):
             raise CoopenvError(f"{what}: rows share one batch, so it cannot be done for some rows only")
 
 
+def _row_of(observations: Any, row: int) -> Any:
+    """Return a copy of one row of flat observations, or of each part."""
+    if isinstance(observations, dict):
+        return {name: part[row].copy() for name, part in observations.items()}
+    return observations[row].copy()
+
+
 def make_sb3_vec_env(name_or_path: str | Path, *, seed: int | None = None, **options: Any) -> CooperativeSB3VecEnv:
     """Return num_worlds x vehicles rows as an SB3 `VecEnv`.
 
     Args:
         name_or_path: environment or TOML file.
-        seed: of the first reset; world w gets seed + w.
-        options: `num_worlds` and whatever else `coopenv.make_vec` takes but `autoreset`, `arrays` and `device`.
+        seed: of the first reset, as for `CooperativeVectorEnv.reset`.
+        options: `num_worlds` and whatever else `coopenv.make_vec` takes but `autoreset` and `arrays`, which are those
+            that SB3 expects.
 
     Raises:
         CoopenvError: any argument is not valid.
     """
-    env = CooperativeSB3VecEnv(make_vec(name_or_path, **options, autoreset="same_step", arrays="numpy", device="cpu"))
+    for name in ("autoreset", "arrays"):
+        if name in options:
+            raise CoopenvError(f"make_sb3_vec_env chooses {name} itself: SB3 resets in the same step and takes NumPy")
+    env = CooperativeSB3VecEnv(make_vec(name_or_path, **options, autoreset="same_step", arrays="numpy"))
     if seed is not None:
         env.seed(seed)
     return env

@@ -1,0 +1,73 @@
+"""Statistics of vehicles' episodes in a batch."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import coopenv
+from coopenv.api.statistics import RecordVehicleEpisodes
+
+DECISIONS = 60
+OPTIONS = {"num_worlds": 6, "overrides": {"horizon": DECISIONS / 10}}
+
+
+def actions_of(env: coopenv.CooperativeVectorEnv) -> np.ndarray:
+    """Return wide turns, which end against a wall or at the horizon."""
+    return np.column_stack([np.ones(env.num_envs), np.linspace(0.0, 0.5, env.num_envs)]).astype(np.float32)
+
+
+def by_hand() -> tuple[np.ndarray, np.ndarray]:
+    """Return (return, decisions) of every vehicle's first episode."""
+    env = coopenv.make_vec("urban_crossing", autoreset="disabled", **OPTIONS)
+    env.reset(seed=5)
+    returned, length, under_way = np.zeros(env.num_envs), np.zeros(env.num_envs), np.ones(env.num_envs, bool)
+    for _ in range(DECISIONS):
+        _, reward, terminated, truncated, _ = env.step(actions_of(env))
+        returned += np.where(under_way, reward, 0.0)
+        length += under_way
+        under_way &= ~(terminated | truncated)
+    assert length.min() < DECISIONS and length.max() == DECISIONS
+    return returned, length
+
+
+@pytest.mark.parametrize("autoreset", ["next_step", "same_step", "disabled"])
+def test_true_episodes_only(autoreset: str) -> None:
+    returned, length = by_hand()
+    env = RecordVehicleEpisodes(coopenv.make_vec("urban_crossing", autoreset=autoreset, **OPTIONS), buffer_length=1000)
+    env.reset(seed=5)
+    weights = env.unwrapped.scenario.reward.by_name
+    first_return, first_length = np.full(env.num_envs, np.nan), np.zeros(env.num_envs)
+    for _ in range(2 * DECISIONS + 2):
+        _, _, terminated, truncated, infos = env.step(actions_of(env.unwrapped))
+        if "episode" in infos:
+            of, told = infos["_episode"], infos["episode"]
+            fresh = of & np.isnan(first_return)
+            first_return[fresh], first_length[fresh] = told["r"][fresh], told["l"][fresh]
+            weighted = sum(weights[name] * total for name, total in told["reward_terms"].items())
+            assert weighted[of] == pytest.approx(told["r"][of], abs=1e-3)
+            assert not told["r"][~of].any()
+        over = env.unwrapped.world_major(terminated | truncated).all(axis=1)
+        if autoreset == "disabled" and over.any():
+            env.reset(options={"reset_mask": over})
+    assert first_return == pytest.approx(returned, abs=1e-3)
+    assert np.array_equal(first_length, length)
+    assert env.episode_count == len(env.return_queue) >= 2 * env.num_envs
+    assert max(env.length_queue) == DECISIONS and min(env.length_queue) > 0
+
+
+def test_a_reset_begins_anew() -> None:
+    env = RecordVehicleEpisodes(coopenv.make_vec("urban_crossing", **OPTIONS))
+    env.reset(seed=5)
+    for _ in range(7):
+        env.step(np.zeros((env.num_envs, 2), np.float32))
+    env.reset()
+    for _ in range(DECISIONS):
+        *_, infos = env.step(np.zeros((env.num_envs, 2), np.float32))
+    assert set(infos["episode"]["l"][infos["_episode"]]) == {DECISIONS}
+
+
+def test_tensors_are_refused() -> None:
+    pytest.importorskip("torch", reason="needs torch")
+    with pytest.raises(coopenv.CoopenvError, match=r"needs NumPy arrays: make_vec\(arrays='numpy'\)"):
+        RecordVehicleEpisodes(coopenv.make_vec("urban_crossing", arrays="torch", **OPTIONS))
