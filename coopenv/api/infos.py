@@ -36,6 +36,7 @@ class InfoWriter:
         covariance = view("covariance")[0].copy()
         position_error, orientation_error = view("position_error")[0].tolist(), view("orientation_error")[0].tolist()
         nees, log_determinant = view("nees")[0].tolist(), view("log_determinant")[0].tolist()
+        position_std = view("position_std")[0].tolist()
         smallest = view("gramian_min_eigenvalue")[0].tolist()
         ended, terms = view("ended")[0].tolist(), view("terms")[0].tolist()
         seen: list[list[str]] = [[] for _ in R]
@@ -55,6 +56,7 @@ class InfoWriter:
                 "visible": tuple(seen[i]),
                 "nees": nees[i],
                 "log_determinant": log_determinant[i],
+                "position_std": position_std[i],
                 "gramian_min_eigenvalue": smallest[i],
                 "reward_terms": dict(zip(self._engine.reward_terms, terms[i], strict=True)),
                 "time": time,

@@ -21,6 +21,7 @@ FIELDS = (
     "orientation_error",
     "nees",
     "log_determinant",
+    "position_std",
     "gramian_min_eigenvalue",
     "targets_in_view",
 )
@@ -31,8 +32,8 @@ OTHERS = ("truth", "estimate", "reward_terms", "visible", "time")
 class Step:
     """What a step came to: the infos of N vehicles in W worlds as arrays, read-only until the next step.
 
-    - `position_error` (m), `orientation_error` (deg), `nees`, `log_determinant`, `gramian_min_eigenvalue`,
-      `targets_in_view`: (W, N);
+    - `position_error` (m), `orientation_error` (deg), `nees`, `log_determinant`, `position_std` (m),
+      `gramian_min_eigenvalue`, `targets_in_view`: (W, N);
     - `truth`: position (m, map frame), velocity and angular_velocity (m/s, rad/s, body frame), each (W, N, 3), and
       rotation (W, N, 3, 3), body to map; `estimate`: position, rotation, and covariance (W, N, 6, 6);
     - `visible`: (W, N, T), the targets measured in this frame; `time`: (W, 1), s since the reset;

@@ -14,6 +14,7 @@ from coopenv.world.quality import (
     log_determinant,
     normalised_error_squared,
     observer_error,
+    position_variance,
     targets_in_view,
 )
 from coopenv.world.records import array
@@ -42,11 +43,14 @@ def results_struct(p: Precision) -> Any:
         orientation_error: array("WN", scalar)  # deg
         nees: array("WN", scalar)
         log_determinant: array("WN", scalar)  # of P
+        position_std: array("WN", scalar)  # m, sqrt of the trace of the position's covariance in the map
         gramian_min_eigenvalue: array("WN", scalar)
         targets_in_view: array("WN", wp.int32)
         last_goal_distance: array("WN", scalar)  # m, at the last step
         last_ended: array("WN", wp.int32)  # at the last step
         last_tick: array("WN", wp.int32)  # of the last step
+        last_log_determinant: array("WN", scalar)  # at the last step
+        furthest: array("WN", scalar)  # m, the farthest along its way that the vehicle has believed to be
 
     return StepResults
 
@@ -55,14 +59,18 @@ MEMORY = {
     "last_goal_distance": NUMBER._replace(of_truth=True),
     "last_ended": whole(0, "last_outcome"),
     "last_tick": whole(0, "tick"),
+    "last_log_determinant": NUMBER,
+    "furthest": NUMBER,
     "over": FLAG,
 }
 """Fields that carry over from one step to the next, and what a saved state may hold of them."""
 
 
 @wp.func
-def remember(results: Any, world: int, vehicle: int, goal_distance: Any, ended: int, tick: int):
-    """Keep what the next step compares with."""
+def remember(results: Any, world: int, vehicle: int, goal_distance: Any, furthest: Any, ended: int, tick: int):
+    """Keep what the next step compares with; `assess` comes before."""
+    results.last_log_determinant[world, vehicle] = results.log_determinant[world, vehicle]
+    results.furthest[world, vehicle] = furthest
     results.last_goal_distance[world, vehicle] = goal_distance
     results.last_ended[world, vehicle] = ended
     results.last_tick[world, vehicle] = tick
@@ -83,6 +91,7 @@ def assess(model: Any, state: Any, results: Any, world: int, vehicle: int):
     e1, e2 = observer_error(R, position, R_hat, p_hat)
     results.nees[world, vehicle] = normalised_error_squared(I11, L21, I22, e1, e2)
     results.log_determinant[world, vehicle] = log_determinant(I11, I22)
+    results.position_std[world, vehicle] = wp.sqrt(position_variance(state.covariance[world, vehicle], p_hat))
     results.gramian_min_eigenvalue[world, vehicle] = gramian_smallest_eigenvalue(model, state, world, vehicle)
     results.targets_in_view[world, vehicle] = targets_in_view(model, state, world, vehicle)
 

@@ -109,6 +109,10 @@ class Reward(Part):
     model_config = ConfigDict(json_schema_extra=_only_those_of_coopenv(REWARD_TERMS.built_in, "weights"))
 
     weights: RewardWeights = RewardWeights()
+    uncertainty_threshold: NonNegative = 0.02
+    """m; what `position_uncertainty` and `position_error_per_metre` count begins above it."""
+    uncertainty_cap: Positive = 1.0
+    """m; and is at most this, which is also the price of a metre that is never driven."""
     custom: dict[Annotated[str, AfterValidator(REWARD_TERMS.free)], Term] = Field(default={})
     """Terms of one's own by name: where their functions stand, see docs/terms.md."""
     privileged: bool = False

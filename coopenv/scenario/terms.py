@@ -192,10 +192,14 @@ _REWARDS: list[tuple[str, str, bool, str]] = [  # name, unit, privileged, meanin
     ("time", "s", False, "Minus the time that has passed"),
     ("position_error", "m", True, "-|position error|"),
     ("orientation_error", "rad", True, "-orientation error"),
+    ("position_uncertainty", "m^2", False,
+     "Per metre gained: minus the part of sqrt(trace P_pos) above the threshold, at most the cap"),
+    ("position_error_per_metre", "m^2", True, "The same of the true position error"),
+    ("information_gain", "1", False, "Decrease of log det P / 6: a difference of potentials"),
     ("uncertainty", "1", False, "-log det P / 6: minus the mean log variance"),
     ("observability", "1", False, "log10 of the smallest eigenvalue of the sliding Gramian (floor 1e-9)"),
     ("visibility", "1", False, "Share of its possible targets that the vehicle has in view"),
-]
+]  # fmt: skip
 
 _CONDITIONS = [  # name, function, meaning
     ("collision", "touches_anything", "Touching a building or another body, at any camera tick"),

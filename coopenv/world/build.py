@@ -37,6 +37,7 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     _fill(model.noise, _noise(scenario), device)
     _fill(model.radio, _radio(scenario), device)
     _fill(model.observer, _observer(scenario), device)
+    _fill(model.judgement, _judgement(scenario), device)
     return model
 
 
@@ -224,3 +225,7 @@ def _observer(scenario: Scenario) -> dict[str, Any]:
         "block_ticks": stride * max(1, block),
         "blocks": GRAMIAN_BLOCKS,
     }
+
+
+def _judgement(scenario: Scenario) -> dict[str, Any]:
+    return {name: getattr(scenario.reward, name) for name in ("uncertainty_threshold", "uncertainty_cap")}

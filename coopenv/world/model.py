@@ -143,6 +143,13 @@ def model_struct(p: Precision) -> Any:
         blocks: wp.int32
 
     @wp.struct
+    class Judgement:
+        """What the terms about an estimate's quality compare with."""
+
+        uncertainty_threshold: scalar  # m
+        uncertainty_cap: scalar  # m
+
+    @wp.struct
     class Model:
         """Everything about a world that never changes."""
 
@@ -171,5 +178,6 @@ def model_struct(p: Precision) -> Any:
         noise: Noise
         radio: Radio
         observer: Observer
+        judgement: Judgement
 
     return Model

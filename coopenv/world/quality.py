@@ -42,6 +42,18 @@ def observer_error(R: Any, position: Any, R_hat: Any, p_hat: Any):
 
 
 @wp.func
+def position_variance(P: Any, p_hat: Any):
+    """Return the trace of the covariance of the position error in the map frame, m^2, to first order in the errors.
+
+    With e = (e1, e2) as above, R p - Rhat phat = Rhat (e2 - [phat]x e1): the lever of the attitude's error belongs to
+    it, and Rhat leaves the trace.
+    """
+    lever = skew(p_hat)
+    own = block3(P, 3, 3) + lever * block3(P, 0, 0) * wp.transpose(lever)
+    return wp.max(wp.trace(own) - p_hat.dtype(2.0) * wp.trace(lever * block3(P, 0, 3)), p_hat.dtype(0.0))
+
+
+@wp.func
 def usable(model: Any, state: Any, world: int, vehicle: int, target: int, tick: int) -> bool:
     """Return whether the observer can use this target now: seen, and its position known or heard."""
     if state.sight[world, vehicle, target] != VISIBLE:

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import metrics
+from coopenv.observers.riccati_coordinates import left_covariance
 from coopenv.world import quality
 from tests.helpers.warp_calls import DTYPES, call
 
@@ -85,6 +86,32 @@ def test_nees_by_hand() -> None:
     assert_allclose(e1[0], [0, 0, lam], atol=1e-14)
     assert_allclose(e2[0], [0, 0.3, 0], atol=1e-14)
     assert_allclose(value[0], lam**2 / 0.01 + 1.0, rtol=1e-13)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-12), ("float32", 1e-4)])
+def test_position_variance_is_that_of_left_coordinates_at_any_attitude(dtype: str, tolerance: float) -> None:
+    rng = np.random.default_rng(7)
+    P, p_hat = covariances(rng), rng.uniform(-20, 20, (COUNT, 3))
+    expected = [np.trace(left_covariance(p, covariance)[3:, 3:]) for p, covariance in zip(p_hat, P, strict=True)]
+    assert_allclose(call(quality.position_variance, dtype, P, p_hat), expected, rtol=tolerance)
+
+
+def test_position_variance_is_that_of_sampled_position_errors() -> None:
+    """Truths drawn about an estimate as NEES assumes them lie about it with this mean square distance in the map."""
+    rng = np.random.default_rng(8)
+    samples = 40_000
+    for angle in (1e-3, 0.03):  # m per m of lever, and m
+        A = rng.normal(size=(6, 6))
+        scale = np.array([angle] * 3 + [0.05] * 3)
+        P = (A @ A.T / 6 + 0.1 * np.eye(6)) * scale * scale[:, None]
+        R_hat, p_hat = Rotation.random(1, rng).as_matrix()[0], rng.uniform(-8, 8, 3)
+        e = rng.multivariate_normal(np.zeros(6), P, samples)
+        half = e[:, :3] / 2  # the vector part of the quaternion of Rtilde = Rhat^T R
+        turn = Rotation.from_quat(np.column_stack([half, np.sqrt(1 - np.sum(half**2, axis=1))]))
+        truth = turn.apply(p_hat + e[:, 3:]) @ R_hat.T  # R p = Rhat Rtilde (phat + e2)
+        squares = np.sum((truth - R_hat @ p_hat) ** 2, axis=1)
+        variance = call(quality.position_variance, "float64", P[None], p_hat[None])[0]
+        assert abs(squares.mean() - variance) < 4 * squares.std() / np.sqrt(samples) + 1e-3 * variance
 
 
 def test_nees_of_consistent_draws_has_mean_six() -> None:

@@ -160,5 +160,27 @@ observability = gramian_min_eigenvalue
 
 
 @wp.func
+def per_metre(ego: Ego, excess: wp.float32, most: wp.float32):
+    """Return minus an excess in [0, most] for every metre gained, and `most` for every metre that is missed."""
+    paid = wp.where(excess < most, wp.max(excess, 0.0), most)  # what is no number is the most
+    return -(paid * ego.metres_gained + most * ego.metres_missed)
+
+
+@wp.func
+def position_uncertainty(ego: Ego):
+    return per_metre(ego, ego.position_std - ego.uncertainty_threshold, ego.uncertainty_cap)
+
+
+@wp.func
+def position_error_per_metre(ego: Ego, truth: Truth):
+    return per_metre(ego, truth.position_error - ego.uncertainty_threshold, ego.uncertainty_cap)
+
+
+@wp.func
+def information_gain(ego: Ego):
+    return ego.information_gained
+
+
+@wp.func
 def visibility(ego: Ego):
     return wp.float32(ego.targets_in_view) / wp.float32(wp.max(ego.possible_targets, 1))

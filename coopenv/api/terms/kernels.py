@@ -16,6 +16,7 @@ import warp as wp
 from coopenv.api.step_results import assess, is_over, remember, set_flags
 from coopenv.api.terms.binding import Bound, Terms
 from coopenv.api.terms.records import Ego, Neighbour, Target, Truth, neighbour_record, own_records, target_record
+from coopenv.api.terms.way import way_made
 from coopenv.errors import CoopenvError
 from coopenv.world import kernel_cache
 from coopenv.world.collision import UNDER_WAY, goal_distance
@@ -85,13 +86,15 @@ def results_kernel(terms: Terms, p: Precision) -> wp.Kernel:
         if chosen[world] == 0:
             return
         distance = goal_distance(model, state, world, vehicle)
+        assess(model, state, results, world, vehicle)
         if fresh[world] != 0:
-            remember(results, world, vehicle, distance, UNDER_WAY, 0)
+            way, _ = way_made(model, state, world, vehicle)
+            remember(results, world, vehicle, distance, way, UNDER_WAY, 0)
         ended = state.ended[world, vehicle]
         set_flags(results, world, vehicle, ended, is_over(model, state, world), model.horizon_ticks)
-        assess(model, state, results, world, vehicle)
         ego, truth = own_records(model, state, results, world, vehicle, distance)
-        remember(results, world, vehicle, distance, ended, state.tick[world])
+        furthest = results.furthest[world, vehicle] + type(distance)(ego.metres_gained)
+        remember(results, world, vehicle, distance, furthest, ended, state.tick[world])
         total = float(0.0)
         for k in range(wp.static(len(rewards))):
             value = wp.static(rewards[k])(ego, truth)

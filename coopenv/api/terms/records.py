@@ -10,6 +10,7 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.api.terms.way import metres
 from coopenv.world.camera import VISIBLE
 from coopenv.world.collision import UNDER_WAY
 from coopenv.world.v2x import fresh
@@ -31,6 +32,12 @@ class Ego:
     covariance: mat66  # P over (2 lambda, p): rad^2, rad m, m^2
     log_determinant: wp.float32  # of P
     mean_log_variance: wp.float32  # log det P / 6
+    information_gained: wp.float32  # decrease of log det P / 6 since the last decision
+    position_std: wp.float32  # m, sqrt of the trace of the position's covariance in the map
+    uncertainty_threshold: wp.float32  # m, of [reward]
+    uncertainty_cap: wp.float32  # m, of [reward]
+    metres_gained: wp.float32  # of its way in this decision, beyond the farthest point so far, by the estimate
+    metres_missed: wp.float32  # of its way never driven, in the step that ends its episode without an arrival; else 0
     gramian_min_eigenvalue: wp.float32  # of the sliding observability Gramian
     targets_in_view: wp.int32
     possible_targets: wp.int32  # targets that may be measured
@@ -119,6 +126,14 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     ego.covariance = mat66(state.covariance[world, vehicle])
     ego.log_determinant = wp.float32(results.log_determinant[world, vehicle])
     ego.mean_log_variance = wp.float32(results.log_determinant[world, vehicle] / p.dtype(6.0))
+    last = results.last_log_determinant[world, vehicle]
+    ego.information_gained = wp.float32((last - results.log_determinant[world, vehicle]) / p.dtype(6.0))
+    ego.position_std = wp.float32(results.position_std[world, vehicle])
+    ego.uncertainty_threshold = wp.float32(model.judgement.uncertainty_threshold)
+    ego.uncertainty_cap = wp.float32(model.judgement.uncertainty_cap)
+    gained, missed = metres(model, state, results, world, vehicle, wp.float64(ego.elapsed))
+    ego.metres_gained = wp.float32(gained)
+    ego.metres_missed = wp.float32(missed)
     ego.gramian_min_eigenvalue = wp.float32(results.gramian_min_eigenvalue[world, vehicle])
     ego.targets_in_view = results.targets_in_view[world, vehicle]
     ego.possible_targets = model.target_count[vehicle]
