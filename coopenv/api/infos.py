@@ -8,6 +8,7 @@ from gymnasium import spaces
 from coopenv.api.engine import Engine
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.scenario import Scenario
+from coopenv.world.state import LASTING_ERRORS
 
 
 def outcome_words(scenario: Scenario) -> tuple[str, ...]:
@@ -23,6 +24,7 @@ class InfoWriter:
         self._index = {agent: i for i, agent in enumerate(scenario.vehicle_names)}
         self._targets, self._landmarks = scenario.target_names, len(scenario.landmarks)
         self._outcomes = outcome_words(scenario)
+        self._lasting = LASTING_ERRORS if scenario.has_lasting_errors else ()
         self._tick_length = 1.0 / scenario.rates.camera
 
     def __call__(self, agents: list[str]) -> dict[str, dict[str, Any]]:
@@ -31,6 +33,7 @@ class InfoWriter:
         L = self._landmarks
         R, position = view("rotation")[0, L:].copy(), view("position")[0, L:].copy()
         v, w = view("velocity")[0, L:].copy(), view("angular_velocity")[0, L:].copy()
+        sensor_errors = {name: view(name)[0].copy() for name in self._lasting}
         R_hat, p_hat = view("estimate_rotation")[0].copy(), view("estimate_position")[0]
         position_hat = np.matmul(R_hat, p_hat[..., None])[..., 0]
         covariance = view("covariance")[0].copy()
@@ -49,7 +52,13 @@ class InfoWriter:
         for agent in agents:
             i = self._index[agent]
             infos[agent] = {
-                "truth": {"position": position[i], "rotation": R[i], "velocity": v[i], "angular_velocity": w[i]},
+                "truth": {
+                    "position": position[i],
+                    "rotation": R[i],
+                    "velocity": v[i],
+                    "angular_velocity": w[i],
+                    **{name: values[i] for name, values in sensor_errors.items()},
+                },
                 "estimate": {"position": position_hat[i], "rotation": R_hat[i], "covariance": covariance[i]},
                 "position_error": position_error[i],
                 "orientation_error": orientation_error[i],
@@ -71,26 +80,33 @@ PER_AGENT = 12
 """position (3), first two columns of R (6), linear velocity (3), all of truth"""
 PER_VEHICLE = 9
 """estimated position (3) and first two columns of Rhat (6)"""
+LASTING = 12
+"""a vehicle's lasting errors, if any: scale (1), gyro bias (3), slip (2), turn and shift of the camera (6)"""
 LIMIT = 1e6
 
 
 def state_space(scenario: Scenario) -> spaces.Box:
     """Return the space of `state_vector`: metres and m/s, clipped far beyond any scene."""
-    size = PER_AGENT * len(scenario.target_names) + PER_VEHICLE * len(scenario.vehicles) + 1
+    per_vehicle = PER_VEHICLE + (LASTING if scenario.has_lasting_errors else 0)
+    size = PER_AGENT * len(scenario.target_names) + per_vehicle * len(scenario.vehicles) + 1
     return spaces.Box(-LIMIT, LIMIT, shape=(size,), dtype=np.float32)
 
 
 def state_vector(engine: Engine) -> np.ndarray:
     """Return the state of world 0: every agent's truth (landmarks first), every vehicle's estimate, episode share.
 
-    Truth that a recording does not know reads 0.
+    Where the scenario has lasting errors of sensors, those of every vehicle come last. Truth that a recording does not
+    know reads 0.
     """
-    R, position, velocity = (engine.view(name)[0] for name in ("rotation", "position", "velocity"))
-    R_hat, p_hat = engine.view("estimate_rotation")[0], engine.view("estimate_position")[0]
+    view = engine.view
+    R, position, velocity = (view(name)[0] for name in ("rotation", "position", "velocity"))
+    R_hat, p_hat = view("estimate_rotation")[0], view("estimate_position")[0]
     position_hat = np.einsum("nij,nj->ni", R_hat, p_hat)
     truth = np.hstack([position, R[:, :, 0], R[:, :, 1], velocity])
     estimate = np.hstack([position_hat, R_hat[:, :, 0], R_hat[:, :, 1]])
-    share = engine.view("tick")[:1] / engine.world.model.horizon_ticks
-    whole = np.concatenate([truth.ravel(), estimate.ravel(), share]).astype(np.float32)
+    share = view("tick")[:1] / engine.world.model.horizon_ticks
+    lasting = [view(name)[0] for name in LASTING_ERRORS] if engine.world.scenario.has_lasting_errors else []
+    errors = np.hstack([part.reshape(len(p_hat), -1) for part in lasting]) if lasting else np.zeros(0)
+    whole = np.concatenate([truth.ravel(), estimate.ravel(), share, errors.ravel()]).astype(np.float32)
     result: np.ndarray = np.nan_to_num(whole.clip(-LIMIT, LIMIT), nan=0.0)
     return result

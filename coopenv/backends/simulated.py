@@ -25,12 +25,17 @@ class SimulatedWorld(SensingWorld):
         """(L, 3, 1) of the landmarks, m."""
         return np.array([landmark.marker for landmark in self.scenario.landmarks], float).reshape(-1, 3, 1)
 
+    @cached_property
+    def _from_body(self) -> np.ndarray:
+        """(N, 3, 3) body to camera."""
+        to_body: np.ndarray = self.model.camera.numpy()["rotation"].astype(float)
+        return to_body.swapaxes(-1, -2)
+
     def sensed(self, world: int, k: int) -> Sensed:
         """Return what the vehicles of one world sense now, at tick k."""
         L, rates = len(self._markers), self.scenario.rates
         visible = self._copy("sight", world) == Sight.VISIBLE
-        to_body = np.array(self.model.camera.rotation, dtype=float).reshape(3, 3)
-        bearings = np.where(visible[..., None], self._pointed("bearing", world) @ to_body.T, np.nan)
+        bearings = np.where(visible[..., None], self._pointed("bearing", world) @ self._from_body, np.nan)
         R, position = self._copy("rotation", world)[:L], self._copy("position", world)[:L]
         arrays = {
             "rotation": self._turned("increment_rotation", world),

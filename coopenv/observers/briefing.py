@@ -16,7 +16,8 @@ UNIFORM_ROTATION = (math.pi**2 / 3.0 + 2.0) / 3.0  # rad^2 per axis, of a rotati
 
 def briefing_of(scenario: Scenario, model: Any) -> Briefing:
     """Return what the observers of a simulated world are told."""
-    s, noise, L = scenario, _noise_of(scenario, model), len(scenario.landmarks)
+    s, L = scenario, len(scenario.landmarks)
+    cameras, noises = model.camera.numpy(), model.noise.numpy()
     targets, counts = model.targets.numpy(), model.target_count.numpy()
     k, q = model.observer.k.numpy(), model.observer.q.numpy().astype(float)
     setups = tuple(
@@ -28,7 +29,7 @@ def briefing_of(scenario: Scenario, model: Any) -> Briefing:
             targets=targets[i, : counts[i]].astype(np.int64),
             lever_arm=np.array(s.camera.position, float),
             marker=np.array(s.vehicles[i].marker, float),
-            noise=noise,
+            noise=_noise_of(scenario, cameras[i], noises[i]),
             gains=Gains(float(k[i]), q, s.observer.V, s.observer.P0, s.observer.max_turn),
         )
         for i, name in enumerate(s.vehicle_names)
@@ -44,16 +45,28 @@ def briefing_of(scenario: Scenario, model: Any) -> Briefing:
     )
 
 
-def _noise_of(scenario: Scenario, model: Any) -> SensorNoise:
-    noise, bearing, axis = model.noise, float(model.noise.bearing), None
-    if noise.bearing_paper:
+def _noise_of(scenario: Scenario, camera: Any, noise: Any) -> SensorNoise:
+    """Return the noise of one vehicle from its entries of the model."""
+    bearing, axis = float(noise["bearing"]), None
+    if noise["bearing_paper"]:
         bearing /= math.sqrt(3.0)
-        turn = np.array(model.camera.rotation, dtype=float).reshape(3, 3)
-        along = turn @ np.array(scenario.noise.bearing.axis, float)
+        along = camera["rotation"].astype(float) @ np.array(scenario.noise.bearing.axis, float)
         x, y, z = (along / np.linalg.norm(along)).tolist()
         axis = x, y, z
+    rate, duration, size, angle = (float(noise[f"slip_{name}"]) for name in ("rate", "duration", "size", "angle"))
     return SensorNoise(
-        float(noise.velocity), float(noise.angular_velocity), 1.0 / scenario.rates.odometry, bearing, axis
+        velocity=float(noise["velocity"]),
+        angular_velocity=float(noise["angular_velocity"]),
+        odometry_scale=float(noise["odometry_scale"]),
+        odometry_scale_walk=float(noise["odometry_scale_walk"]),
+        gyro_bias=tuple(noise["gyro_bias"].tolist()),
+        gyro_bias_walk=tuple(noise["gyro_bias_walk"].tolist()),
+        slip=(rate, duration, size, angle),
+        camera_orientation=float(camera["orientation_std"]),
+        camera_position=float(camera["position_std"]),
+        odometry_period=1.0 / scenario.rates.odometry,
+        bearing=bearing,
+        image_axis=axis,
     )
 
 

@@ -30,6 +30,16 @@ class SensorNoise:
     plane, which is reached on the optical axis only and is an upper bound elsewhere."""
     image_axis: tuple[float, float, float] | None = None
     """Axis of that image plane, unit vector in the body frame; None: the noise is in the tangent plane."""
+    odometry_scale: float = 0.0
+    """Of the lasting errors, see `[noise]` and `[camera]` of a scenario; walks are per square root of a second."""
+    odometry_scale_walk: float = 0.0
+    gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)  # rad/s, body axes
+    gyro_bias_walk: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    slip: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0)
+    """Slips per second, their mean duration in s, the largest share that wheels read too much, and the largest side
+    slip angle in rad."""
+    camera_orientation: float = 0.0  # rad per axis, of the camera's mounting
+    camera_position: float = 0.0  # m per axis
 
     def odometry(self, dt: float) -> Array:
         """Return the variances (6,) of (rotation, translation) of the increment over dt.

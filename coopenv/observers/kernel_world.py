@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.observers.contract import Setup
-from coopenv.world.model import mat66d, model_struct
+from coopenv.world.model import entry_struct, mat66d, model_struct
 from coopenv.world.precision import Precision
 from coopenv.world.records import repeated
 
@@ -35,12 +35,17 @@ def model_of(setup: Setup, p: Precision) -> Any:
     model.target_count = wp.full(N, len(setup.targets), dtype=wp.int32, device="cpu")
     model.order = model.rank = wp.array(np.arange(N, dtype=np.int32), dtype=wp.int32, device="cpu")
     model.start.covariance = wp.zeros(N, dtype=mat66d, device="cpu")
-    model.camera.rotation, model.camera.position = p.mat33(*np.eye(3).ravel()), p.vec3(*setup.lever_arm)
+    camera, noise, known = entry_struct(p, "camera")(), entry_struct(p, "noise")(), setup.noise
+    camera.rotation, camera.position = p.mat33(*np.eye(3).ravel()), p.vec3(*setup.lever_arm)
+    for name in ("velocity", "angular_velocity", "bearing", "odometry_scale", "odometry_scale_walk"):
+        setattr(noise, name, getattr(known, name))
+    noise.gyro_bias, noise.gyro_bias_walk = p.vec3(*known.gyro_bias), p.vec3(*known.gyro_bias_walk)
+    noise.slip_rate, noise.slip_duration, noise.slip_size, noise.slip_angle = known.slip
+    camera.orientation_std, camera.position_std = known.camera_orientation, known.camera_position
+    model.camera, model.noise = _for_everybody(camera, N), _for_everybody(noise, N)
     markers = np.zeros((T, 3))
     markers[L + setup.vehicle] = setup.marker
     model.scene.marker = wp.array(markers, dtype=p.vec3, device="cpu")
-    model.noise.velocity, model.noise.angular_velocity = setup.noise.velocity, setup.noise.angular_velocity
-    model.noise.bearing = setup.noise.bearing
     model.radio.period = model.radio.slots = 1
     model.radio.range = model.radio.staleness = math.inf
     gains = setup.gains
@@ -50,3 +55,8 @@ def model_of(setup: Setup, p: Precision) -> Any:
     model.observer.p1, model.observer.p2 = gains.P0
     model.observer.max_turn = gains.max_turn
     return model
+
+
+def _for_everybody(entry: Any, count: int) -> Any:
+    """Return the array in which every vehicle has the same entry."""
+    return repeated(wp.array([entry], dtype=entry._cls, device="cpu"), 0, count)

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from dataclasses import asdict
 from operator import attrgetter
 from typing import Any
 
@@ -90,8 +91,10 @@ def _check_setup(setup: Setup, vehicle: int, first: Setup, where: str) -> None:
     for name in ("lever_arm", "marker"):
         _require(_is_array(getattr(setup, name), (3,)), f"{where}.{name}: not three numbers")
     noise, gains = setup.noise, setup.gains
-    for name in ("velocity", "angular_velocity", "bearing"):
-        _between(f"{where}.noise.{name}", getattr(noise, name), 0.0, LARGEST)
+    for name, value in asdict(noise).items():
+        if name not in ("odometry_period", "image_axis"):
+            for entry in np.ravel(value):
+                _between(f"{where}.noise.{name}", float(entry), 0.0, LARGEST)
     _between(f"{where}.noise.odometry_period", noise.odometry_period, *TICK_LENGTHS_S)
     if noise.image_axis is not None:
         axis = np.array(noise.image_axis, float)

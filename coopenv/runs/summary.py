@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from textwrap import shorten
 from typing import Any
 
+import numpy as np
 from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -13,6 +14,7 @@ from coopenv.api.registration import environment_id
 from coopenv.api.terms.layout import observation_layout
 from coopenv.format import number
 from coopenv.scenario import Scenario
+from coopenv.scenario.sensing import Noise
 from coopenv.shipped import list_envs
 
 DESCRIPTION_LENGTH = 240  # characters of a scenario's description on the first screen
@@ -47,7 +49,7 @@ def facts(scenario: Scenario) -> dict[str, str]:
         "Vehicles": _vehicles(scenario),
         "Targets": _targets(scenario),
         "Camera": _camera(scenario),
-        "Odometry": f"linear and angular velocity, {spread if noise.enabled else 'no noise'}",
+        "Odometry": f"linear and angular velocity, {spread if noise.enabled else 'no noise'}{_lasting(noise)}",
         "V2X": _v2x(scenario),
         "Observer": f"{observer.name} (gains k = {_gain(observer.k)}, q = {_gain(observer.q)})",
         "Rates": f"camera {number(rates.camera)} Hz, odometry {number(rates.odometry)}{corrections}, "
@@ -88,7 +90,21 @@ def _camera(scenario: Scenario) -> str:
     misses = f", misses {number(100 * camera.miss_probability)} %" if camera.miss_probability else ""
     unit = "rad" if noise.model == "isotropic" else "on the image plane"
     spread = f", {noise.model} noise {number(noise.scale)} {unit}" if scenario.noise.enabled else ", no noise"
-    return f"{camera.model}{size}{reach}{misses}; bearings{spread}"
+    off = [f"{number(camera.extrinsics_error)} rad"] if camera.extrinsics_error else []
+    off += [f"{number(camera.extrinsics_position_error)} m"] if camera.extrinsics_position_error else []
+    place = f"; mounted off by {' and '.join(off)} per axis" if off and scenario.noise.enabled else ""
+    return f"{camera.model}{size}{reach}{misses}; bearings{spread}{place}"
+
+
+def _lasting(noise: Noise) -> str:
+    """Return what is to be said about errors of the odometry that last."""
+    parts = [f"scale error {number(100 * noise.odometry_scale)} %"] if noise.odometry_scale else []
+    bias = np.degrees(np.max(noise.gyro_bias))
+    parts += [f"gyro bias {number(bias)} deg/s"] if bias else []
+    walks = noise.odometry_scale_walk or np.any(noise.gyro_bias_walk)
+    parts += ["walking on"] if walks else []
+    parts += [f"{number(noise.slip.rate)} slips a second"] if noise.slip.rate else []
+    return "".join(f", {part}" for part in parts) if noise.enabled else ""
 
 
 def _v2x(scenario: Scenario) -> str:

@@ -57,6 +57,11 @@ class ScenarioFields(Part):
         return any(vehicle.motion.kind == "driven" for vehicle in self.vehicles)
 
     @property
+    def has_lasting_errors(self) -> bool:
+        """Whether any vehicle's odometry or camera has errors that last, see `[noise]` and `[camera]`."""
+        return self.noise.enabled and (self.noise.lasts or self.camera.is_misplaced)
+
+    @property
     def ticks_per_decision(self) -> int:
         """Camera ticks between two decisions of the policy."""
         return round(self.rates.camera / self.rates.decision)

@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 from coopenv.scenario.base import (
     Loss,
     NonNegative,
+    NonNegativeVector3,
     Number,
     Part,
     Positive,
@@ -19,6 +20,9 @@ from coopenv.scenario.base import (
     Vector2,
     Vector3,
 )
+
+PerAxis = NonNegative | NonNegativeVector3
+"""One number for all axes, or one for each."""
 
 Pixels = Annotated[int, Field(ge=1, le=65_535)]
 
@@ -52,6 +56,16 @@ class Camera(Part):
     """Farthest distance at which a target is detected, m (none: unlimited)."""
     miss_probability: Probability = 0.0
     """Chance that a detection in view is lost, drawn per target and frame."""
+    extrinsics_error: NonNegative = 0.0
+    """Standard deviation per axis of a rotation by which the true camera is turned against `orientation`, rad; drawn
+    per vehicle and episode. Observers know `orientation` alone."""
+    extrinsics_position_error: NonNegative = 0.0
+    """Likewise of where the optical centre is, per axis, m."""
+
+    @property
+    def is_misplaced(self) -> bool:
+        """Whether the true camera is not where observers believe it to be."""
+        return self.extrinsics_error > 0.0 or self.extrinsics_position_error > 0.0
 
 
 class Rates(Part):
@@ -97,11 +111,25 @@ class BearingNoise(Part):
         return self
 
 
+class Slip(Part):
+    """Wheels that slip now and then, so that the odometry reads what the body does not do. Off unless `rate` is set."""
+
+    rate: NonNegative = 0.0
+    """Slips begin so often, 1/s."""
+    duration: Positive = 0.5
+    """Mean duration, s; durations are exponentially distributed."""
+    size: NonNegative = 0.3
+    """Largest share by which the measured speed is too high, drawn uniformly per slip."""
+    angle: NonNegative = 0.0
+    """Largest angle between the measured and the true direction of travel, drawn uniformly per slip, to either side,
+    rad."""
+
+
 class Noise(Part):
-    """Measurement noise."""
+    """Measurement noise, and errors of the odometry that last."""
 
     enabled: bool = True
-    """False switches off all noise of odometry and bearings."""
+    """False switches off all noise and errors of odometry, bearings and cameras."""
     velocity: NonNegative = 0.0
     """Standard deviation of each component of a linear velocity sample, m/s."""
     angular_velocity: NonNegative = 0.0
@@ -109,6 +137,22 @@ class Noise(Part):
     odometry_rate: Rate | Sample = "sample"
     """Odometry rate in Hz at which these hold (other rates keep their density), or `sample`: at any rate."""
     bearing: BearingNoise = BearingNoise()
+    odometry_scale: NonNegative = 0.0
+    """Standard deviation of a scale error s, drawn per vehicle and episode: measured is (1 + s) times the velocity."""
+    odometry_scale_walk: NonNegative = 0.0
+    """It walks on by this standard deviation per square root of a second."""
+    gyro_bias: PerAxis = 0.0
+    """Standard deviation of a bias of the measured angular velocity, drawn per vehicle and episode, rad/s: of each
+    component, or of the three body axes ([0, 0, x]: a car whose roll and pitch rates an accelerometer corrects)."""
+    gyro_bias_walk: PerAxis = 0.0
+    """It walks on by this standard deviation, rad/s per square root of a second."""
+    slip: Slip = Slip()
+
+    @property
+    def lasts(self) -> bool:
+        """Whether the odometry has errors that last."""
+        errors = (self.odometry_scale, self.odometry_scale_walk, self.gyro_bias, self.gyro_bias_walk, self.slip.rate)
+        return any(np.any(error) for error in errors)
 
 
 class Topology(Part):

@@ -1,7 +1,7 @@
 """Turn a scenario into the arrays and numbers of a `Model` on a device."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,10 +11,10 @@ from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.motion import compile_motion
-from coopenv.scenario.sensing import ROTATION_OF_CAMERA
+from coopenv.scenario.sensing import ROTATION_OF_CAMERA, Noise
 from coopenv.scenario.starts import agent_starts, rotation_of
 from coopenv.scenario.topology import neighbour_sets, processing_order
-from coopenv.world.model import DRIVEN, PRESCRIBED, STATIC, model_struct
+from coopenv.world.model import DRIVEN, PRESCRIBED, STATIC, entry_struct, model_struct
 from coopenv.world.precision import Precision
 
 GRAMIAN_RATE = 20.0
@@ -33,8 +33,8 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     _fill(model.motion, _motion(scenario), device)
     _fill(model.dynamics, _dynamics(scenario), device)
     _fill(model.scene, _scene(scenario), device)
-    _fill(model.camera, _camera(scenario), device)
-    _fill(model.noise, _noise(scenario), device)
+    model.camera = _structs(p, "camera", [_camera(scenario)] * len(scenario.vehicles), device)
+    model.noise = _structs(p, "noise", [_noise(scenario)] * len(scenario.vehicles), device)
     _fill(model.radio, _radio(scenario), device)
     _fill(model.observer, _observer(scenario), device)
     _fill(model.judgement, _judgement(scenario), device)
@@ -53,6 +53,15 @@ def _fill(struct: Any, values: Mapping[str, Any], device: str) -> None:
         elif hasattr(kind, "_shape_"):
             value = kind(*np.ravel(value).tolist())
         setattr(struct, name, value)
+
+
+def _structs(p: Precision, name: str, rows: Sequence[Mapping[str, Any]], device: str) -> Any:
+    """Return one of the model's arrays of structs, filled."""
+    kind = entry_struct(p, name)
+    entries = [kind() for _ in rows]
+    for entry, values in zip(entries, rows, strict=True):
+        _fill(entry, values, device)
+    return wp.array(entries, dtype=kind, device=device)
 
 
 def _world(scenario: Scenario) -> dict[str, Any]:
@@ -155,7 +164,7 @@ def _scene(scenario: Scenario) -> dict[str, Any]:
 
 
 def _camera(scenario: Scenario) -> dict[str, Any]:
-    c = scenario.camera
+    c, on = scenario.camera, float(scenario.noise.enabled)
     named = ROTATION_OF_CAMERA.get(c.orientation) if isinstance(c.orientation, str) else None
     same = ("position", "image_size", "focal_length", "principal_point")
     return {
@@ -168,6 +177,8 @@ def _camera(scenario: Scenario) -> dict[str, Any]:
         "quantise": int(c.quantise),
         "range": math.inf if c.range is None else c.range,
         "miss": c.miss_probability,
+        "orientation_std": on * c.extrinsics_error,
+        "position_std": on * c.extrinsics_position_error,
     }
 
 
@@ -193,6 +204,23 @@ def _noise(scenario: Scenario) -> dict[str, Any]:
         "bearing_paper": int(n.bearing.model == "paper"),
         "bearing": on * _at_rate(n.bearing.scale, n.bearing.rate, rates.camera),
         "axis": np.column_stack([first, np.cross(axis, first), axis]),
+        **_lasting(n),
+    }
+
+
+def _lasting(n: Noise) -> dict[str, Any]:
+    """Return the errors of the odometry that last."""
+    on, slip = float(n.enabled), n.slip
+    return {
+        "lasting": int(n.enabled and n.lasts),
+        "odometry_scale": on * n.odometry_scale,
+        "odometry_scale_walk": on * n.odometry_scale_walk,
+        "gyro_bias": on * np.broadcast_to(n.gyro_bias, 3),
+        "gyro_bias_walk": on * np.broadcast_to(n.gyro_bias_walk, 3),
+        "slip_rate": on * slip.rate,
+        "slip_duration": slip.duration,
+        "slip_size": slip.size,
+        "slip_angle": slip.angle,
     }
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.outcomes import Sight
+from coopenv.estimation.so3 import exp_so3
 from coopenv.world.random import BEARING, gaussian_pair, pair, random_words, signed_uniform, uniform
 
 NOT_A_NEIGHBOUR = wp.constant(wp.uint8(Sight.NOT_A_NEIGHBOUR))
@@ -22,6 +23,18 @@ MISSED = wp.constant(wp.uint8(Sight.MISSED))
 def marker_position(model: Any, state: Any, world: int, agent: int):
     """Return the point of an agent that cameras see, map frame."""
     return state.position[world, agent] + state.rotation[world, agent] * model.scene.marker[agent]
+
+
+@wp.func
+def camera_to_body(model: Any, state: Any, world: int, vehicle: int):
+    """Return the rotation of a vehicle's camera in its body, as the vehicle knows it."""
+    return model.camera[vehicle].rotation
+
+
+@wp.func
+def body_bearing(model: Any, state: Any, world: int, vehicle: int, target: int):
+    """Return the last measured unit bearing of a target in the body frame."""
+    return camera_to_body(model, state, world, vehicle) * state.bearing[world, vehicle, target]
 
 
 @wp.func
@@ -171,12 +184,13 @@ def noisy_bearing(noise: Any, bearing: Any, words: Any):
 def sight_of(model: Any, state: Any, world: int, vehicle: int, target: int, origin: Any, line: Any, ray: Any):
     """Return whether a neighbour is in view now, and if not, why; `ray` is `line` in the optical frame."""
     if model.sensed == 1:
-        if wp.dot(line, line) > model.camera.range * model.camera.range:
+        camera = model.camera[vehicle]
+        if wp.dot(line, line) > camera.range * camera.range:
             return OUT_OF_VIEW
-        if model.camera.pinhole == 1:
+        if camera.pinhole == 1:
             if ray[2] <= ray.dtype(0.0):
                 return OUT_OF_VIEW
-            _, _, inside = project(model.camera, ray)
+            _, _, inside = project(camera, ray)
             if inside == 0:
                 return OUT_OF_VIEW
         return occlusion(model, state, world, model.landmarks + vehicle, target, origin, line)
@@ -187,11 +201,18 @@ def sight_of(model: Any, state: Any, world: int, vehicle: int, target: int, orig
 def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Take one camera frame of one vehicle; the truth of this tick is already in place."""
     agent = model.landmarks + vehicle
+    camera = model.camera[vehicle]
+    noise = model.noise[vehicle]
     R = state.rotation[world, agent]
-    origin = state.position[world, agent] + R * model.camera.position
-    to_camera = wp.transpose(R * model.camera.rotation)
-    zero = origin.dtype(0.0)
-    random = model.camera.miss > zero or model.noise.bearing > zero
+    place = camera.position
+    turned = camera_to_body(model, state, world, vehicle)
+    zero = place.dtype(0.0)
+    if camera.orientation_std > zero or camera.position_std > zero:
+        place = place + state.camera_shift[world, vehicle]
+        turned = turned * exp_so3(state.camera_turn[world, vehicle])
+    origin = state.position[world, agent] + R * place
+    to_camera = wp.transpose(R * turned)
+    random = camera.miss > zero or noise.bearing > zero
     for n in range(model.target_count[vehicle]):
         target = model.targets[vehicle, n]
         line = marker_position(model, state, world, target) - origin
@@ -202,13 +223,13 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
             b = wp.normalize(ray)
         if sight == VISIBLE and random:
             words = random_words(state.seed[world], state.episode[world], tick, pair(vehicle, target), BEARING)
-            if uniform(words[2], zero) < model.camera.miss:
+            if uniform(words[2], zero) < camera.miss:
                 sight = MISSED
-            if model.noise.bearing > zero:
-                b = noisy_bearing(model.noise, b, words)
+            if noise.bearing > zero:
+                b = noisy_bearing(noise, b, words)
         if sight == VISIBLE:
-            if model.camera.pinhole == 1 and model.sensed == 1:
-                b = through_pixels(model.camera, b)
+            if camera.pinhole == 1 and model.sensed == 1:
+                b = through_pixels(camera, b)
             state.bearing[world, vehicle, target] = b
             state.bearing_tick[world, vehicle, target] = tick
         state.sight[world, vehicle, target] = sight

@@ -86,7 +86,7 @@ def model_struct(p: Precision) -> Any:
 
     @wp.struct
     class Camera:
-        """The camera that every vehicle carries."""
+        """The camera of one vehicle."""
 
         rotation: mat33  # camera to body
         position: vec3  # body frame, m
@@ -104,16 +104,27 @@ def model_struct(p: Precision) -> Any:
         quantise: wp.int32
         range: scalar  # m; infinity: unlimited
         miss: scalar
+        orientation_std: scalar  # rad, per axis, of the error of `rotation`
+        position_std: scalar  # m, per axis, of the error of `position`
 
     @wp.struct
     class Noise:
-        """Standard deviations per sample at this scenario's rates."""
+        """Noise of a vehicle's sensors: standard deviations per sample at this scenario's rates, and lasting errors."""
 
         velocity: scalar  # m/s
         angular_velocity: scalar  # rad/s
         bearing_paper: wp.int32
         bearing: scalar
         axis: mat33  # columns: image-plane axes and optical axis of the paper's formula, camera frame
+        lasting: wp.int32  # 1: any of the errors below is on
+        odometry_scale: scalar
+        odometry_scale_walk: scalar  # per sqrt s
+        gyro_bias: vec3  # rad/s, body axes
+        gyro_bias_walk: vec3  # rad/s per sqrt s
+        slip_rate: scalar  # 1/s
+        slip_duration: scalar  # s
+        slip_size: scalar
+        slip_angle: scalar  # rad
 
     @wp.struct
     class Radio:
@@ -174,10 +185,15 @@ def model_struct(p: Precision) -> Any:
         motion: Motion
         dynamics: Dynamics
         scene: Scene
-        camera: Camera
-        noise: Noise
+        camera: wp.array(dtype=Camera)  # (N,)
+        noise: wp.array(dtype=Noise)  # (N,)
         radio: Radio
         observer: Observer
         judgement: Judgement
 
     return Model
+
+
+def entry_struct(p: Precision, name: str) -> Any:
+    """Return the struct of the entries of one of the model's arrays of structs."""
+    return model_struct(p).vars[name].type.dtype

@@ -10,19 +10,19 @@ import warp as wp
 
 from coopenv.estimation.so3 import identity3, increment
 from coopenv.world.dynamics import segment_at
+from coopenv.world.lasting_errors import drift, with_errors
 from coopenv.world.model import DRIVEN
-from coopenv.world.random import ODOMETRY_FIRST, ODOMETRY_SECOND, gaussian_vectors, random_words
+from coopenv.world.random import ODOMETRY, six_gaussians
 
 
 @wp.func
 def noisy_sample(model: Any, state: Any, world: int, vehicle: int, sample: int, v: Any, w: Any):
     """Return the measured (v, omega) of one odometry sample."""
-    if model.noise.velocity > v.dtype(0.0) or model.noise.angular_velocity > v.dtype(0.0):
-        first = random_words(state.seed[world], state.episode[world], sample, vehicle, ODOMETRY_FIRST)
-        second = random_words(state.seed[world], state.episode[world], sample, vehicle, ODOMETRY_SECOND)
-        linear, angular = gaussian_vectors(first, second, v)
-        v = v + model.noise.velocity * linear
-        w = w + model.noise.angular_velocity * angular
+    noise = model.noise[vehicle]
+    if noise.velocity > v.dtype(0.0) or noise.angular_velocity > v.dtype(0.0):
+        linear, angular = six_gaussians(state.seed[world], state.episode[world], sample, vehicle, ODOMETRY, v)
+        v = v + noise.velocity * linear
+        w = w + noise.angular_velocity * angular
     return v, w
 
 
@@ -45,6 +45,7 @@ def true_twist(model: Any, state: Any, world: int, vehicle: int, taken: int, t: 
 @wp.func
 def measure_odometry(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Take the odometry samples of one camera tick, whose motion is over, and sum them up to its increment."""
+    drift(model, state, world, vehicle, tick)
     tick_end = wp.float64(tick) * model.camera_period
     now = wp.float64(tick - 1) * model.camera_period
     v = state.odometry_velocity[world, vehicle]
@@ -58,6 +59,7 @@ def measure_odometry(model: Any, state: Any, world: int, vehicle: int, tick: int
         if due > now:
             rotation, translation = increment(rotation, translation, v, w, v.dtype(due - now))
         true_v, true_w = true_twist(model, state, world, vehicle, taken, due)
+        true_v, true_w = with_errors(model, state, world, vehicle, true_v, true_w)
         v, w = noisy_sample(model, state, world, vehicle, sample, true_v, true_w)
         now = due
         taken += 1

@@ -6,7 +6,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, cholesky6, join6, smallest_eigenvalue6
 from coopenv.estimation.so3 import identity3, quaternion_vector, skew
-from coopenv.world.camera import VISIBLE, marker_position
+from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.v2x import fresh
 
 
@@ -96,7 +96,7 @@ def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: i
     for n in range(model.target_count[vehicle]):
         target = model.targets[vehicle, n]
         if usable(model, state, world, vehicle, target, tick):
-            b = R * (model.camera.rotation * state.bearing[world, vehicle, target])
+            b = R * body_bearing(model, state, world, vehicle, target)
             z = known_position(model, state, world, vehicle, target)
             m = wp.cross(z, b)
             G11 += dt * (wp.dot(z, z) * i3 - wp.outer(z, z) - wp.outer(m, m))

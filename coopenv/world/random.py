@@ -20,10 +20,14 @@ WEYL_1 = wp.constant(wp.uint32(0xBB67AE85))
 RESET_POSE = wp.constant(wp.uint32(1))
 RESET_ESTIMATE_POSITION = wp.constant(wp.uint32(2))
 RESET_ESTIMATE_ORIENTATION = wp.constant(wp.uint32(3))
-ODOMETRY_FIRST = wp.constant(wp.uint32(4))
-ODOMETRY_SECOND = wp.constant(wp.uint32(5))
+ODOMETRY = wp.constant(wp.uint32(4))
 BEARING = wp.constant(wp.uint32(6))
 RADIO = wp.constant(wp.uint32(7))
+RESET_ODOMETRY = wp.constant(wp.uint32(32))
+RESET_CAMERA = wp.constant(wp.uint32(34))
+ODOMETRY_WALK = wp.constant(wp.uint32(36))
+SLIP = wp.constant(wp.uint32(38))
+"""Where six normal numbers are drawn, the next stream gives the second half."""
 
 
 @wp.func
@@ -94,6 +98,14 @@ def gaussian_vectors(a: vec4u, b: vec4u, zero: Any):
     z1, x2 = gaussian_pair(a[2], a[3], one)
     y2, z2 = gaussian_pair(b[0], b[1], one)
     return type(zero)(x1, y1, z1), type(zero)(x2, y2, z2)
+
+
+@wp.func
+def six_gaussians(seed: wp.uint64, episode: wp.uint32, index: int, subject: int, stream: wp.uint32, zero: Any):
+    """Return two vectors of three standard normal numbers each, drawn from a stream and the next one."""
+    first = random_words(seed, episode, index, subject, stream)
+    second = random_words(seed, episode, index, subject, stream + wp.uint32(1))
+    return gaussian_vectors(first, second, zero)
 
 
 @wp.func

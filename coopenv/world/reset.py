@@ -10,6 +10,7 @@ from coopenv.world.camera import NOT_A_NEIGHBOUR, observe
 from coopenv.world.collision import touches_anything
 from coopenv.world.command import command_of
 from coopenv.world.dynamics import prescribe
+from coopenv.world.lasting_errors import draw_errors
 from coopenv.world.model import DRIVEN, PRESCRIBED
 from coopenv.world.random import (
     RESET_ESTIMATE_ORIENTATION,
@@ -161,6 +162,7 @@ def reset_world(model: Any, state: Any, world: int):
     for vehicle in range(model.vehicles):
         place_vehicle(model, state, world, vehicle)
         believe(model, state, world, vehicle)
+        draw_errors(model, state, world, vehicle)
     for vehicle in range(model.vehicles):
         state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
     for place in range(model.vehicles):

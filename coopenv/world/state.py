@@ -61,6 +61,12 @@ def state_struct(p: Precision) -> Any:
         sampled_velocity: array("WNM", vec3)  # truth at the odometry samples of the last tick, m/s, body
         sampled_angular_velocity: array("WNM", vec3)  # likewise, rad/s; of driven vehicles
 
+        odometry_scale: array("WN", scalar)  # truth: the wheels read (1 + this) times the speed
+        gyro_bias: array("WN", vec3)  # truth, rad/s
+        slip: array("WN", vec2)  # truth: share that the wheels read too much, side slip angle in rad; zero: none
+        camera_turn: array("WN", vec3)  # truth: rotation vector of the camera in its frame, beside the nominal one
+        camera_shift: array("WN", vec3)  # truth: of the camera in the body frame, beside the nominal place, m
+
         odometry_velocity: array("WN", vec3)  # last sample, m/s
         odometry_angular_velocity: array("WN", vec3)  # last sample, rad/s
         odometry_samples: array("WN", wp.int32)  # samples taken; sample m is at m / rate
@@ -93,6 +99,9 @@ def state_struct(p: Precision) -> Any:
     return State
 
 
+LASTING_ERRORS = ("odometry_scale", "gyro_bias", "slip", "camera_turn", "camera_shift")
+"""Fields with the true errors of a vehicle's sensors, see `coopenv.world.lasting_errors`."""
+
 VALID: dict[str, Rule] = {
     "seed": ANYTHING,
     "episode": ANYTHING,
@@ -103,6 +112,7 @@ VALID: dict[str, Rule] = {
     "position": NUMBER._replace(of_truth=True),
     "velocity": NUMBER._replace(of_truth=True),
     "angular_velocity": NUMBER._replace(of_truth=True),
+    **dict.fromkeys(LASTING_ERRORS, NUMBER._replace(of_truth=True)),
     "steering": numbers(1.6),
     "action": numbers(1.001),
     "ended": whole(0, "last_outcome"),

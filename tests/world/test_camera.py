@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from coopenv.errors import ScenarioError
 from coopenv.estimation.outcomes import Sight
 from coopenv.world import camera
-from coopenv.world.model import model_struct
+from coopenv.world.model import entry_struct
 from coopenv.world.precision import precision
 from tests.helpers.builders import landmark, quaternion_wxyz, run, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES, call
@@ -283,7 +283,7 @@ def there_and_back(lens: Any, xy: wp.array(dtype=Any), out: wp.array(dtype=Any),
 def through_lens(dtype: str, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return image coordinates (K, 2) distorted by the kernels, and these undistorted again."""
     types = precision(dtype)
-    lens = model_struct(types).vars["camera"].type()
+    lens = entry_struct(types, "camera")()
     lens.k1, lens.k2, lens.p1, lens.p2, lens.k3 = PLUMB_BOB
     given = wp.array(xy, dtype=types.vec2, device="cpu")
     results = [wp.zeros_like(given), wp.zeros_like(given)]

@@ -31,6 +31,13 @@ class NoiseHeader(Part):
     odometry_period: Number
     bearing: Number
     image_axis: Vector3 | None
+    odometry_scale: Number = 0.0
+    odometry_scale_walk: Number = 0.0
+    gyro_bias: Vector3 = (0.0, 0.0, 0.0)
+    gyro_bias_walk: Vector3 = (0.0, 0.0, 0.0)
+    slip: tuple[Number, Number, Number, Number] = (0.0, 1.0, 0.0, 0.0)
+    camera_orientation: Number = 0.0
+    camera_position: Number = 0.0
 
 
 class GainsHeader(Part):

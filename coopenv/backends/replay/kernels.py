@@ -8,7 +8,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers.recording import Recording, Truth
-from coopenv.world.camera import NOT_A_NEIGHBOUR, OUT_OF_VIEW, VISIBLE
+from coopenv.world.camera import NOT_A_NEIGHBOUR, OUT_OF_VIEW, VISIBLE, camera_to_body
 from coopenv.world.collision import referee, touches_anything
 from coopenv.world.embedded import Source
 from coopenv.world.precision import Precision
@@ -37,6 +37,19 @@ def recall_truth(model: Any, state: Any, record: Any, world: int, vehicle: int, 
 
 
 @wp.func
+def forget_errors(state: Any, world: int, vehicle: int):
+    """Make the lasting errors of a vehicle's sensors unknown: nobody recorded them."""
+    unknown = type(state.gyro_bias[world, vehicle])()
+    for axis in range(3):
+        unknown[axis] = unknown.dtype(wp.nan)
+    state.odometry_scale[world, vehicle] = unknown[0]
+    state.gyro_bias[world, vehicle] = unknown
+    state.slip[world, vehicle] = type(state.slip[world, vehicle])(unknown[0], unknown[1])
+    state.camera_turn[world, vehicle] = unknown
+    state.camera_shift[world, vehicle] = unknown
+
+
+@wp.func
 def recall(model: Any, state: Any, record: Any, world: int, tick: int):
     """Write what was sensed at a tick, and the truth that is known."""
     row = row_of(record, tick)
@@ -49,13 +62,14 @@ def recall(model: Any, state: Any, record: Any, world: int, tick: int):
         state.odometry_velocity[world, vehicle] = record.velocity[row, vehicle]
         state.odometry_angular_velocity[world, vehicle] = record.angular_velocity[row, vehicle]
         state.odometry_samples[world, vehicle] = record.samples[row, vehicle]
+        to_camera = wp.transpose(camera_to_body(model, state, world, vehicle))
         for target in range(model.agents):
             state.sight[world, vehicle, target] = NOT_A_NEIGHBOUR
         for n in range(model.target_count[vehicle]):
             target = model.targets[vehicle, n]
             state.sight[world, vehicle, target] = OUT_OF_VIEW
             if record.visible[row, vehicle, target] != wp.uint8(0):
-                bearing = wp.transpose(model.camera.rotation) * record.bearings[row, vehicle, target]
+                bearing = to_camera * record.bearings[row, vehicle, target]
                 state.bearing[world, vehicle, target] = bearing
                 state.bearing_tick[world, vehicle, target] = tick - record.bearing_lag[row, vehicle]
                 state.sight[world, vehicle, target] = VISIBLE
@@ -94,6 +108,7 @@ def rewind(model: Any, state: Any, record: Any, world: int):
         place_agent(model, state, world, agent)
     for vehicle in range(model.vehicles):
         place_vehicle(model, state, world, vehicle)
+        forget_errors(state, world, vehicle)
         position = record.true_position[0, vehicle]
         if wp.isfinite(position[0]):
             recall_truth(model, state, record, world, vehicle, 0)

@@ -123,7 +123,8 @@ def inform_kernel(model: Any, state: Any, truth: Any, predicted: Any, corrected:
     world, n = wp.tid()
     target = model.targets[vehicle, n]
     own = truth[world, vehicle]
-    origin = own.position + own.rotation * model.camera.position
+    camera = model.camera[vehicle]
+    origin = own.position + own.rotation * camera.position
     marker = model.scene.marker[target]
     place = state.position[world, target] + state.rotation[world, target] * marker
     known = place
@@ -133,10 +134,10 @@ def inform_kernel(model: Any, state: Any, truth: Any, predicted: Any, corrected:
         known = corrected[world, other].rotation * (corrected[world, other].position + marker)
     line = place - origin
     b = wp.transpose(own.rotation) * wp.normalize(line)
-    in_camera = wp.transpose(model.camera.rotation) * b
+    in_camera = wp.transpose(camera.rotation) * b
     if sight_of(model, state, world, vehicle, target, origin, line, in_camera) == VISIBLE:
         a = wp.transpose(predicted[world, vehicle].rotation) * known
-        e = a - model.camera.position - predicted[world, vehicle].position
+        e = a - camera.position - predicted[world, vehicle].position
         o = type(own.rotation)()
         M11, M12, M22, r1, r2 = accumulate_information(a, b, e, model.observer.q[target], o, o, o, type(e)(), type(e)())
         wp.atomic_add(sums.M11, world, vehicle, M11)

@@ -15,6 +15,7 @@ from coopenv.estimation.so3 import exp_so3, orthonormalise
 from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import POSITION, KernelObserver
 from coopenv.observers.riccati import equations
+from coopenv.world.camera import body_bearing
 from coopenv.world.embedded import Embedded, send_nothing, start_nothing
 from coopenv.world.quality import known_position, usable
 
@@ -32,9 +33,9 @@ def information(model: Any, state: Any, world: int, vehicle: int, tick: int, R: 
     for n in range(model.target_count[vehicle]):
         target = model.targets[vehicle, n]
         if usable(model, state, world, vehicle, target, tick):
-            b = model.camera.rotation * state.bearing[world, vehicle, target]
+            b = body_bearing(model, state, world, vehicle, target)
             a = wp.transpose(R) * known_position(model, state, world, vehicle, target)
-            e = a - model.camera.position - p
+            e = a - model.camera[vehicle].position - p
             M11, M12, M22, r1, r2 = equations.accumulate_information(
                 a, b, e, model.observer.q[target], M11, M12, M22, r1, r2
             )

@@ -76,11 +76,11 @@ def transition(step: Pose):
 
 
 @wp.func
-def odometry_noise(model: Any, dt: Any):
-    """Return the variances (rotation, translation) per axis of an increment of odometry over dt."""
+def odometry_noise(model: Any, i: int, dt: Any):
+    """Return the variances (rotation, translation) per axis of an increment of vehicle i's odometry over dt."""
     scale = model.odometry_period * dt
-    angular = wp.max(wp.float64(model.noise.angular_velocity), wp.float64(MIN_ANGULAR_VELOCITY_STD))
-    linear = wp.max(wp.float64(model.noise.velocity), wp.float64(MIN_VELOCITY_STD))
+    angular = wp.max(wp.float64(model.noise[i].angular_velocity), wp.float64(MIN_ANGULAR_VELOCITY_STD))
+    linear = wp.max(wp.float64(model.noise[i].velocity), wp.float64(MIN_VELOCITY_STD))
     return vec2d(angular * angular * scale, linear * linear * scale)
 
 

@@ -13,7 +13,7 @@ from coopenv.observers.robust.algebra import odometry_noise
 from coopenv.observers.robust.belief import index_of
 from coopenv.observers.robust.constants import CORRELATION_FACTOR, MAX_ACCELERATION, MAX_SPEED
 from coopenv.observers.robust.memory import mat26d, vec3d
-from coopenv.world.camera import VISIBLE, marker_position
+from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.v2x import fresh
 
 HALF_ACCELERATION = 0.5 * MAX_ACCELERATION
@@ -23,11 +23,11 @@ NOTHING = -1  # in place of a member: the bearing cannot be used now
 
 
 @wp.func
-def bearing_variance(model: Any):
-    """Return the variance of a bearing per tangent axis."""
-    std = wp.float64(model.noise.bearing)
+def bearing_variance(model: Any, i: int):
+    """Return the variance of a bearing of vehicle i per tangent axis."""
+    std = wp.float64(model.noise[i].bearing)
     variance = std * std
-    if model.noise.bearing_paper == 1:
+    if model.noise[i].bearing_paper == 1:
         variance = variance * wp.float64(THIRD)
     return wp.max(variance, wp.float64(MIN_BEARING_STD) * wp.float64(MIN_BEARING_STD))
 
@@ -79,7 +79,7 @@ def set_line_to_member(model: Any, memory: Any, world: int, i: int, n: int, memb
     variance = wp.float64(0.0)
     if age > wp.float64(0.0):
         away = wp.float64(HALF_ACCELERATION) * age * age
-        variance = odometry_noise(model, age)[1] + away * away
+        variance = odometry_noise(model, i, age)[1] + away * away
         if memory.member[world, i, member].has_twist == 1:
             half_turn = memory.member[world, i, member].w * (wp.float64(0.5) * age)
             gone = exp_so3(half_turn) * memory.member[world, i, member].v * age
@@ -97,7 +97,7 @@ def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
         target = model.targets[i, n]
         memory.line[world, n].member = NOTHING
         if state.sight[world, i, target] == VISIBLE:
-            b = vec3d(model.camera.rotation * state.bearing[world, i, target])
+            b = vec3d(body_bearing(model, state, world, i, target))
             sender = target - model.landmarks
             if sender < 0:
                 z = vec3d(marker_position(model, state, world, target))
@@ -125,7 +125,7 @@ def linearise(model: Any, memory: Any, world: int, i: int, n: int):
         theirs = memory.member[world, i, line.member].pose
         z = theirs.p + theirs.R * line.point
     a = wp.transpose(own.R) * (z - own.p)
-    d = a - vec3d(model.camera.position)
+    d = a - vec3d(model.camera[i].position)
     distance = wp.max(wp.length(d), wp.float64(1.0e-9))
     u = d / distance
     T = tangent_basis(u)
@@ -141,7 +141,7 @@ def linearise(model: Any, memory: Any, world: int, i: int, n: int):
         memory.line[world, n].member_jacobian = H
     memory.line[world, n].residual = T * line.bearing
     memory.line[world, n].distance = distance
-    memory.line[world, n].noise = bearing_variance(model) + line.variance / (distance * distance)
+    memory.line[world, n].noise = bearing_variance(model, i) + line.variance / (distance * distance)
     return wp.dot(u, line.bearing) > wp.float64(0.0)
 
 

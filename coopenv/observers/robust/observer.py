@@ -106,7 +106,7 @@ def make_estimate(receive: Any, fuse_messages: Any) -> Any:
         R = orthonormalise(mat33d(state.increment_rotation[world, i]))
         step = Pose(R, vec3d(state.increment_translation[world, i]))
         memory.belief[world, i].odometry = moved(memory.belief[world, i].odometry, step)
-        noise = odometry_noise(model, now.period)
+        noise = odometry_noise(model, i, now.period)
         if memory.search[world, i].active == 1:
             propagate_search(memory, world, i, step, noise)
             if now.due:

@@ -99,7 +99,7 @@ def solve(model: Any, memory: Any, world: int, i: int, lines: Any, b: Any, z: An
     for n in range(count):
         R, camera = camera_pose(b, z, distances[n])
         if wp.isfinite(wp.ddot(R, R) + wp.dot(camera, camera)):
-            pose = Pose(R, camera - R * vec3d(model.camera.position))
+            pose = Pose(R, camera - R * vec3d(model.camera[i].position))
             begin_belief(memory, world, i, Estimate(pose, mat66d()))
             determined, P = covariance_of(model, memory, world, i, lines, patient)
             if patient and not determined:
@@ -124,7 +124,7 @@ def solve_perturbed(
             moved_b = b
             moved_z = z
             if axis < 2:
-                across = step * wp.sqrt(bearing_variance(model))
+                across = step * wp.sqrt(bearing_variance(model, i))
                 moved_b[n] = wp.normalize(b[n] + across * tangent_basis(b[n])[axis])
             else:
                 moved_z[n, axis - 2] = z[n, axis - 2] + step * wp.sqrt(variance)

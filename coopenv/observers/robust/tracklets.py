@@ -175,7 +175,7 @@ def fuse_message(model: Any, memory: Any, world: int, i: int, n: int, sender: in
     if report.tick > last.tick:
         dt = wp.float64(report.tick - last.tick) * model.camera_period
         step = algebra.between(last.odometry, report.odometry)
-        noise = algebra.odometry_noise(model, dt)
+        noise = algebra.odometry_noise(model, i, dt)
         propagate_member(memory, world, i, n, step, dt, noise)
         before = algebra.carried(Estimate(last.pose, mat66d(last.P)), step, noise)
         was_distrusted = memory.member[world, i, n].distrusted

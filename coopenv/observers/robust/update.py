@@ -76,7 +76,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
         anchor = memory.anchor[world, i]  # where most bearings fitted, carried on by odometry since
         elapsed = wp.float64(now.tick - anchor.tick) * model.camera_period
         step = between(anchor.odometry, memory.belief[world, i].odometry)
-        begin_search(memory, world, i, carried(anchor.estimate, step, odometry_noise(model, elapsed)))
+        begin_search(memory, world, i, carried(anchor.estimate, step, odometry_noise(model, i, elapsed)))
     elif healthy > wp.float64(constants.HEALTHY_TIME):
         noise = vec2d(wp.float64(constants.ANCHOR_ANGLE_VARIANCE), wp.float64(constants.ANCHOR_POSITION_VARIANCE))
         set_anchor(memory, world, i, with_noise(wp.float64(4.0) * memory.P[world, i, 0, 0], noise), now.tick)

@@ -28,7 +28,7 @@ def predict_told(model: Any, memory: Any, world: int, i: int, c: int, count: int
             Ft = wp.transpose(memory.scratch[world, b].column)
             memory.matrix[world, BEFORE, a, b] = memory.matrix[world, BEFORE, a, b] * Ft
         ticks = wp.max(memory.told[world, a].tick - memory.contact_told[world, i, c, a].tick, 0)
-        noise = odometry_noise(model, wp.float64(ticks) * model.camera_period)
+        noise = odometry_noise(model, i, wp.float64(ticks) * model.camera_period)
         block = memory.matrix[world, BEFORE, a, a]
         for k in range(6):
             block[k, k] += noise[k // 3]
@@ -46,7 +46,7 @@ def propagate_told(model: Any, memory: Any, world: int, i: int, count: int):
             if told.tick > last.tick:
                 dt = wp.float64(told.tick - last.tick) * model.camera_period
                 step = between(last.odometry, told.odometry)
-                propagate_member(memory, world, i, n, step, dt, odometry_noise(model, dt))
+                propagate_member(memory, world, i, n, step, dt, odometry_noise(model, i, dt))
                 memory.member[world, i, n].report.tick = told.tick
                 memory.member[world, i, n].report.odometry = told.odometry
 
