@@ -20,6 +20,7 @@ ROOMS = (
     ("viz",),
     ("api",),
     ("policies",),
+    ("evaluation",),
     ("runs",),
     ("bench",),
     ("cli", "__init__"),

@@ -1,4 +1,4 @@
-"""The command line: `coopenv list | describe | schema | run | record | bench`.
+"""The command line: `coopenv list | describe | schema | run | record | evaluate | bench`.
 
 Commands import what they need when they run, so that `--help` and completion are quick.
 """
@@ -14,6 +14,7 @@ import typer
 from coopenv import interrupts
 from coopenv.cli import show
 from coopenv.cli.bench import bench
+from coopenv.cli.evaluate import evaluate
 from coopenv.cli.run import record_command, run
 from coopenv.errors import CoopenvError
 from coopenv.shipped import version as installed_version
@@ -33,6 +34,7 @@ app.command()(show.describe)
 app.command()(show.schema)
 app.command()(run)
 app.command("record")(record_command)
+app.command()(evaluate)
 app.add_typer(bench, name="bench")
 
 

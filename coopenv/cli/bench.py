@@ -8,40 +8,8 @@ import typer
 from coopenv.cli import complete, options
 from coopenv.errors import CoopenvError
 
-bench = typer.Typer(help="Compare observers, study seeds, score drivers.", no_args_is_help=True)
+bench = typer.Typer(help="Compare observers, study seeds.", no_args_is_help=True)
 First = Annotated[int, typer.Option(min=0, help="The first seed.")]
-
-
-@bench.command("agents")
-def bench_agents(
-    agents: Annotated[
-        list[str] | None,
-        typer.Argument(metavar="[AGENT]...", help="Names of agents (default: all).", autocompletion=complete.agents),
-    ] = None,
-    seeds: Annotated[int, typer.Option(min=1, help="Number of episodes, with the seeds 0, 1, ...")] = 20,
-    as_json: options.AsJson = False,
-) -> None:
-    """Score drivers: who arrives, who collides, who knows its pose."""
-    from coopenv.api.parallel_env import parallel_env
-    from coopenv.bench.drivers import play, score, score_table
-    from coopenv.policies import find_agent, load_agent
-    from coopenv.runs.console import Progress
-    from coopenv.shipped import list_agents
-
-    scores = []
-    for agent in agents or list_agents():
-        for name in find_agent(agent).environments:
-            env = parallel_env(name)
-            policy = load_agent(agent, env.scenario)
-            with Progress(options.console(stderr=True), f"{agent} in {name}") as progress:
-                episodes = (play(env, policy, seed) for seed in progress.track(range(seeds)))
-                scores.append(score(agent, name, episodes))
-    if as_json:
-        options.print_json(scores)
-        return
-    out = options.console()
-    out.print(score_table(scores))
-    out.print("Return: sum over the vehicles of an episode, mean ± standard deviation. Errors in m.")
 
 
 @bench.command("seeds")

@@ -16,6 +16,11 @@ def agents(incomplete: str) -> list[str]:
     return _matching(list_agents(), incomplete)
 
 
+def agent_lists(incomplete: str) -> list[str]:
+    """Return lists of drivers, names with commas between, that continue this one."""
+    return _lists(list_agents(), incomplete)
+
+
 def policies(incomplete: str) -> list[str]:
     """Return what `--policy` takes and begins so."""
     return _matching(["zero", "random", *list_agents()], incomplete)
@@ -25,8 +30,7 @@ def observers(incomplete: str) -> list[str]:
     """Return lists of observers, names with commas between, that continue this one."""
     from coopenv.observers.registry import observer_names
 
-    done, comma, last = incomplete.rpartition(",")
-    return [f"{done}{comma}{name}" for name in _matching(observer_names(), last) if name not in done.split(",")]
+    return _lists(observer_names(), incomplete)
 
 
 def override_keys(incomplete: str) -> list[str]:
@@ -56,3 +60,8 @@ def _models_in(annotation: Any, in_list: bool = False) -> Iterator[tuple[type[An
 
 def _matching(names: Iterable[str], incomplete: str) -> list[str]:
     return [name for name in names if name.startswith(incomplete)]
+
+
+def _lists(names: Iterable[str], incomplete: str) -> list[str]:
+    done, comma, last = incomplete.rpartition(",")
+    return [f"{done}{comma}{name}" for name in _matching(names, last) if name not in done.split(",")]

@@ -1,0 +1,89 @@
+"""The card of an agent: its figures per environment, as `card.json` for programs and `card.md` for people."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from coopenv.bench.agents.contest import IDEAL, Entrant, Evaluation
+from coopenv.bench.agents.table import COLUMNS, shown
+from coopenv.errors import CoopenvError
+from coopenv.files import check_file, replace_text
+from coopenv.jsonable import json_text
+from coopenv.shipped import version
+
+JSON_FILE, TEXT_FILE = "card.json", "card.md"
+
+
+def check(entrants: Sequence[Entrant]) -> None:
+    """Find out before any work whether every agent has a folder for its card, with a readable card or none.
+
+    Raises:
+        CoopenvError: one has not.
+    """
+    for entrant in entrants:
+        if entrant.name == IDEAL:
+            continue
+        if entrant.agent.folder is None:
+            raise CoopenvError(f"--write-card: {entrant.name} is a place in code; a card needs an agent's folder")
+        read(entrant.agent.folder)
+        for name in (JSON_FILE, TEXT_FILE):
+            check_file(entrant.agent.folder / name)
+
+
+def read(folder: Path) -> dict[str, Any]:
+    """Return what a card says by environment; empty without one.
+
+    Raises:
+        CoopenvError: `card.json` is not one.
+    """
+    path = folder / JSON_FILE
+    if not path.exists():
+        return {}
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8"))["environments"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CoopenvError(f"{path}: not a card: {error}") from None
+
+
+def write(evaluation: Evaluation, command: str) -> list[Path]:
+    """Write the results of an evaluation to the cards of its agents; those of other environments stay."""
+    written = []
+    for entrant in evaluation.entrants:
+        folder = entrant.agent.folder
+        if folder is None or entrant.name == IDEAL:
+            continue
+        known = read(folder)
+        rows = [row for row in evaluation.rows() if row["agent"] == entrant.name]
+        known[evaluation.environment] = {
+            "command": command,
+            "coopenv": version(),
+            "worlds": evaluation.worlds,
+            "seed_block": evaluation.block,
+            "results": {row["metric"]: {key: row[key] for key in ("mean", "ci_low", "ci_high", "n")} for row in rows},
+        }
+        card = {"agent": entrant.name, "kind": entrant.kind, "environments": dict(sorted(known.items()))}
+        replace_text(folder / JSON_FILE, json_text(card))
+        replace_text(folder / TEXT_FILE, text(entrant, card))
+        written.append(folder / TEXT_FILE)
+    return written
+
+
+def text(entrant: Entrant, card: dict[str, Any]) -> str:
+    """Return a card for people, in Markdown."""
+    headings = [heading.strip().replace("\n", " ") for heading, _ in COLUMNS.values()]
+    lines = [f"# {entrant.name}", "", " ".join(entrant.agent.description.split()), ""]
+    lines += [f"| environment | worlds | {' | '.join(headings)} |", "|---" * (len(headings) + 2) + "|"]
+    for name, entry in card["environments"].items():
+        cells = [_cell(entry["results"][metric], factor) for metric, (_, factor) in COLUMNS.items()]
+        lines.append(f"| {name} | {entry['worlds']} | {' | '.join(cells)} |")
+    lines += ["", "With 95 % intervals over worlds; errors from 3 s on, of vehicles under way. Measured with", ""]
+    commands = dict.fromkeys((entry["command"], entry["coopenv"]) for entry in card["environments"].values())
+    lines += [f"    {command} --write-card  # coopenv {number}" for command, number in commands]
+    return "\n".join(lines) + "\n"
+
+
+def _cell(result: dict[str, Any], factor: float) -> str:
+    values = [float("nan") if result[key] is None else factor * result[key] for key in ("mean", "ci_low", "ci_high")]
+    mean, low, high = shown(*values)
+    return f"{mean} [{low}, {high}]"

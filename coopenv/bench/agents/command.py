@@ -1,0 +1,133 @@
+"""`coopenv evaluate`: from what the user asked for to tables and files."""
+
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rich.console import Console
+
+from coopenv.bench.agents.contest import Entrant, Evaluation, contest, enter
+from coopenv.bench.agents.table import differences_table, explanations, results_table
+from coopenv.errors import OutputError
+from coopenv.evaluation import METRICS
+from coopenv.files import replace_text, replacing_folder
+from coopenv.jsonable import json_text
+from coopenv.machine import versions
+from coopenv.runs.console import Progress, compile_notice
+from coopenv.shipped import version
+from coopenv.viz import FORMATS
+
+JSON_FILE = "evaluation.json"
+FIGURES = ("error_along_the_way", "time_against_error", "looking")
+FILMS = ("video.mp4", "video.gif")
+WIDTH = 100
+"""Characters that the tables are wide where no terminal says otherwise."""
+
+
+class Request(NamedTuple):
+    """What the command line asks for."""
+
+    environment: str
+    agents: Sequence[str]
+    worlds: int
+    block: int
+    assignments: Sequence[str]
+    overrides: Mapping[str, Any]
+    ideal: bool
+
+    @property
+    def name(self) -> str:
+        """What the environment is called."""
+        return Path(self.environment).stem
+
+    def entrants(self) -> list[Entrant]:
+        """Return the drivers, built."""
+        return enter(self.environment, self.name, self.overrides, self.agents, self.ideal)
+
+    def command(self) -> str:
+        """Return the command that gives the same figures again."""
+        words = ["coopenv", "evaluate", self.environment]
+        words += ["--agents", ",".join(self.agents)] if self.agents else []
+        words += ["--worlds", str(self.worlds), "--seed-block", str(self.block)]
+        words += [word for assignment in self.assignments for word in ("--set", assignment)]
+        return shlex.join([*words, *(["--ideal"] if self.ideal else [])])
+
+
+def document(request: Request, evaluation: Evaluation) -> dict[str, Any]:
+    """Return what `evaluation.json` holds."""
+    return {
+        "command": request.command(),
+        "coopenv": version(),
+        "versions": versions("numpy", "warp-lang"),
+        "environment": evaluation.environment,
+        "overrides": dict(request.overrides),
+        "worlds": evaluation.worlds,
+        "seed_block": evaluation.block,
+        "metrics": {name: {"unit": metric.unit, "meaning": metric.meaning} for name, metric in METRICS.items()},
+        "rows": evaluation.rows(),
+        "reference": evaluation.reference,
+        "differences": evaluation.difference_rows(),
+    }
+
+
+def run(request: Request, entrants: Sequence[Entrant], log: Console) -> Evaluation:
+    """Evaluate, with progress shown."""
+    with Progress(log, "driving", total=len(entrants)) as progress, compile_notice(log):
+        return contest(
+            request.name,
+            entrants,
+            request.worlds,
+            request.block,
+            lambda done, name: progress.update(done, f"driving: {name}"),
+        )
+
+
+def write(
+    folder: Path,
+    request: Request,
+    entrants: Sequence[Entrant],
+    figures: str | None,
+    film: bool,
+    force: bool,
+    log: Console,
+) -> Evaluation:
+    """Evaluate and write everything to a folder, which is replaced as a whole.
+
+    Raises:
+        OutputError: it holds an earlier evaluation and `force` is false, or it cannot be written.
+    """
+    if (folder / JSON_FILE).exists() and not force:
+        raise OutputError(f"{folder / JSON_FILE}: exists already; --force replaces it")
+    with replacing_folder(folder, result_names()) as new:
+        evaluation = run(request, entrants, log)
+        replace_text(new / JSON_FILE, json_text(document(request, evaluation)))
+        if figures is not None:
+            from coopenv.bench.agents.figures import save_figures
+
+            with Progress(log, "drawing figures"):
+                save_figures(evaluation, new, figures)
+        if film:
+            from coopenv.bench.agents.film import write_film
+
+            write_film(evaluation, new, log)
+    return evaluation
+
+
+def result_names() -> list[str]:
+    """Return the names of all files that an evaluation can write."""
+    return [JSON_FILE, *(f"{name}.{form}" for name in FIGURES for form in FORMATS), *FILMS]
+
+
+def report(evaluation: Evaluation, out: Console) -> None:
+    """Print the tables."""
+    seeds = f"{evaluation.worlds} held-out worlds, block {evaluation.block} of the seeds"
+    out.print(f"{evaluation.environment}: {seeds}, the same for all.", soft_wrap=True)
+    out.print()
+    out.print(results_table(evaluation))
+    if evaluation.differences:
+        out.print()
+        out.print(differences_table(evaluation))
+    out.print()
+    for words, meaning in explanations(evaluation).items():
+        out.print(f"{words}: {meaning}.")

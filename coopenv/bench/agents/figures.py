@@ -1,0 +1,119 @@
+"""Figures of an evaluation: error along the way, time against error, where drivers looked."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from coopenv.bench.agents.contest import Evaluation
+from coopenv.evaluation.bootstrap import Quantile, interval, resamples
+from coopenv.evaluation.episodes import Episodes
+from coopenv.viz import style
+from coopenv.viz.style import INK, NORMAL, SMALL
+
+BINS = 24
+_RESAMPLES, _FINE = 300, 300
+_PANEL = 2.0  # inches
+_MARKS = "osD^vPX*"
+
+
+def save_figures(evaluation: Evaluation, folder: Path, file_format: str) -> list[Path]:
+    """Write all figures of an evaluation to a folder."""
+    figures = {
+        "error_along_the_way": error_figure(evaluation),
+        "time_against_error": pareto_figure(evaluation),
+        "looking": looking_figure(evaluation),
+    }
+    return [style.save(figure, folder / f"{name}.{file_format}") for name, figure in figures.items()]
+
+
+def error_figure(evaluation: Evaluation, width: float | None = None) -> Figure:
+    """Draw median and 95th percentile of the position error over the distance driven, with their intervals."""
+    figure, _ = style.canvas(width, 3.9, _note(evaluation, "bands: 95 % intervals over worlds"))
+    panels = figure.subplots(1, 2)
+    farthest = max(float(np.quantile(own.distance[-1], 0.9)) for own in evaluation.episodes.values())
+    edges = np.linspace(0.0, max(farthest, 1e-3), BINS + 1)
+    for ax, share, words in zip(panels, (0.5, 0.95), ("median", "95th percentile"), strict=True):
+        style.tidy(ax, x_label="distance driven [m]", y_label="position error [m]" if share == 0.5 else "")
+        ax.set_title(words, fontsize=NORMAL, color=INK)
+        ax.set_yscale("log")
+        for look, episodes in zip(_looks(evaluation), evaluation.episodes.values(), strict=True):
+            _draw_error(ax, episodes, share, edges, look["color"])
+        style.show_decades(ax)
+    low, high = zip(*(ax.get_ylim() for ax in panels), strict=True)
+    for ax in panels:
+        ax.set_ylim(min(low), max(high))
+    style.legend_above(figure, [Line2D([], [], lw=1.5, **look) for look in _looks(evaluation, marks=False)])
+    return figure
+
+
+def _draw_error(ax: Axes, episodes: Episodes, share: float, edges: np.ndarray, colour: str) -> None:
+    counts = resamples(episodes.worlds, 0, _RESAMPLES)
+    place = np.where(episodes.under_way, np.searchsorted(edges, episodes.distance, side="right") - 1, -1)
+    found = []
+    for number in range(len(edges) - 1):
+        chosen = place == number
+        quantile = Quantile(episodes.position_error[chosen], np.nonzero(chosen)[1], episodes.worlds, share, _FINE)
+        found.append((quantile.value, *interval(quantile.resampled(counts))))
+    middle, (value, low, high) = (edges[1:] + edges[:-1]) / 2, style.drawable(np.array(found).T, positive=True)
+    ax.plot(middle, value, color=colour, linewidth=style.LINE)
+    ax.fill_between(middle, low, high, color=colour, alpha=0.18, linewidth=0)
+
+
+def pareto_figure(evaluation: Evaluation, width: float | None = None) -> Figure:
+    """Draw travel time against the 95th percentile of the position error, with the intervals of both."""
+    figure, _ = style.canvas(width or 5.2, 3.9, _note(evaluation, "bars: 95 % intervals over worlds"))
+    ax = figure.subplots()
+    style.tidy(ax, x_label="travel time [s]", y_label="95th percentile of the position error [m]")
+    ax.set_yscale("log")
+    for look, results in zip(_looks(evaluation), evaluation.results.values(), strict=True):
+        known = {result.metric: result for result in results}
+        time, error = known["travel_time_s"], known["e95_m"]
+        bars = [[[max(0.0, r.mean - r.ci_low)], [max(0.0, r.ci_high - r.mean)]] for r in (time, error)]
+        if np.isfinite([time.mean, error.mean]).all() and error.mean > 0:
+            ax.errorbar([time.mean], [error.mean], xerr=bars[0], yerr=bars[1], ms=6, lw=1.0, capsize=2, **look)
+    style.show_decades(ax)
+    style.legend_above(figure, [Line2D([], [], ls="", ms=6, **look) for look in _looks(evaluation)])
+    return figure
+
+
+def looking_figure(evaluation: Evaluation, width: float | None = None) -> Figure:
+    """Draw how often each driver looked in which direction, 0 being straight ahead along its way."""
+    columns = min(4, len(evaluation.episodes))
+    rows = -(-len(evaluation.episodes) // columns)
+    note = _note(evaluation, "share of time; 0: along the way, positive: to the left")
+    figure, _ = style.canvas(width, 0.5 + _PANEL * rows, note)
+    edges = np.radians(np.arange(-93, 94, 6))
+    shares = [_shares(episodes, edges) for episodes in evaluation.episodes.values()]
+    most = max(0.05, *(float(share.max()) for share in shares))
+    for number, (look, share) in enumerate(zip(_looks(evaluation), shares, strict=True)):
+        ax: Any = figure.add_subplot(rows, columns, number + 1, projection="polar")
+        ax.set_theta_zero_location("N")
+        ax.set(thetamin=-93, thetamax=93, rlim=(0, most))
+        ax.tick_params(labelsize=SMALL, pad=1)
+        ax.set_rticks([most / 2, most], [f"{50 * most:.0f} %", f"{100 * most:.0f} %"], fontsize=SMALL - 1)
+        ax.bar(edges[:-1], share, width=np.diff(edges), align="edge", color=look["color"], alpha=0.75, linewidth=0)
+        ax.set_title(look["label"], fontsize=NORMAL, color=INK, pad=6)
+    return figure
+
+
+def _shares(episodes: Episodes, edges: np.ndarray) -> np.ndarray:
+    """Return the share of the time of vehicles under way that they look between edges, rad; beyond: at the ends."""
+    offset = episodes.looking[episodes.under_way]
+    offset = np.clip(offset[np.isfinite(offset)], edges[0], edges[-1])
+    return np.asarray(np.histogram(offset, edges)[0] / max(1, len(offset)))
+
+
+def _looks(evaluation: Evaluation, marks: bool = True) -> list[dict[str, Any]]:
+    """Return colour, mark and label of every driver, the same in every figure."""
+    return [
+        {"color": style.vehicle_colour(i), "label": name, **({"marker": _MARKS[i % len(_MARKS)]} if marks else {})}
+        for i, name in enumerate(evaluation.episodes)
+    ]
+
+
+def _note(evaluation: Evaluation, words: str) -> str:
+    return f"{evaluation.environment}, {evaluation.worlds} held-out worlds (block {evaluation.block}); {words}"

@@ -1,0 +1,6 @@
+"""What a driver achieves on held-out worlds, with intervals over worlds."""
+
+from coopenv.evaluation.episodes import Episodes, drive, held_out_seeds
+from coopenv.evaluation.metrics import METRICS, Difference, Result, compare_paired, score
+
+__all__ = ["METRICS", "Difference", "Episodes", "Result", "compare_paired", "drive", "held_out_seeds", "score"]

@@ -1,0 +1,142 @@
+"""Drive one episode in every world of a batch and keep what drivers are judged by."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from coopenv.api.engine import Engine
+from coopenv.estimation.outcomes import Outcome
+from coopenv.policies import Policy, decide, restart
+from coopenv.scenario import Scenario
+
+FIRST_HELD_OUT = 2**31
+"""Seeds from here on are for evaluation; training takes those below."""
+DIVERGED = 1e9  # m or deg: stands for an error that is not a number
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """What the driven vehicles did; K decisions, W worlds, N driven vehicles. Row k is the end of decision k."""
+
+    vehicles: tuple[str, ...]
+    period: float
+    """Of a decision, s."""
+    under_way: np.ndarray
+    """(K, W, N) bool: the vehicle had not ended before this decision."""
+    position_error: np.ndarray
+    """(K, W, N), m."""
+    orientation_error: np.ndarray
+    """(K, W, N), deg."""
+    targets_in_view: np.ndarray
+    """(K, W, N), measured in the last frame of the decision."""
+    reward: np.ndarray
+    """(K, W, N)."""
+    position: np.ndarray
+    """(K + 1, W, N, 2), true, m, map; row 0 is the start."""
+    heading: np.ndarray
+    """(K, W, N), true, rad from the map's x axis."""
+    goal: np.ndarray
+    """(W, N, 2), m, map; NaN for vehicles without a goal."""
+    outcome: np.ndarray
+    """(W, N), an `Outcome`, or a condition of the scenario's own."""
+
+    @property
+    def worlds(self) -> int:
+        """How many worlds there are."""
+        return int(self.outcome.shape[0])
+
+    @property
+    def time(self) -> np.ndarray:
+        """(K,) s since the start, at the end of every decision."""
+        return np.asarray(self.period * np.arange(1, len(self.under_way) + 1))
+
+    @property
+    def travel_time(self) -> np.ndarray:
+        """(W, N) s from the start to the end of the decision in which a vehicle arrived; NaN for those that did not."""
+        return np.where(self.outcome == Outcome.ARRIVED, self.under_way.sum(axis=0) * self.period, np.nan)
+
+    @property
+    def looking(self) -> np.ndarray:
+        """(K, W, N) rad in [-pi, pi): heading from the direction of the way, start to goal; NaN without a goal."""
+        way = self.goal - self.position[0]
+        return np.asarray((self.heading - np.arctan2(way[..., 1], way[..., 0]) + np.pi) % (2 * np.pi) - np.pi)
+
+    @property
+    def distance(self) -> np.ndarray:
+        """(K, W, N) m that were driven until the end of every decision."""
+        return np.asarray(np.cumsum(np.linalg.norm(np.diff(self.position, axis=0), axis=-1), axis=0))
+
+
+def held_out_seeds(block: int, worlds: int) -> list[int]:
+    """Return the seeds of so many worlds that no training has seen; blocks 0, 1, ... share none."""
+    return [FIRST_HELD_OUT + block * worlds + world for world in range(worlds)]
+
+
+def driven_vehicles(scenario: Scenario) -> list[int]:
+    """Return the indices of the vehicles that actions drive."""
+    return [i for i, vehicle in enumerate(scenario.vehicles) if vehicle.motion.kind == "driven"]
+
+
+def drive(
+    engine: Engine,
+    policy: Policy,
+    seeds: Sequence[int],
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> Episodes:
+    """Drive an episode in every world of an engine, until all are over.
+
+    Args:
+        engine: the worlds.
+        policy: drives every vehicle; its rows are (world, vehicle).
+        seeds: one per world.
+        on_progress: called with the share of the horizon that is done.
+
+    Raises:
+        CoopenvError: the policy returns something else than actions.
+    """
+    scenario, view = engine.backend.scenario, engine.view
+    chosen, first = driven_vehicles(scenario), len(scenario.landmarks)
+    rows, width = view("alive").size, view("actions").shape[-1]
+    steps = -(-scenario.horizon_ticks // scenario.ticks_per_decision)
+    kept: dict[str, list[np.ndarray]] = {name: [] for name in KEPT}
+    agents = [first + i for i in chosen]
+    with engine.stopping():
+        engine.reset(seeds)
+        restart(policy, np.ones(rows, dtype=bool))
+        place = [view("position")[:, agents, :2].astype(np.float32)]
+        headings = []
+        for step in range(steps):
+            observations = view("observation").reshape(rows, -1).copy()
+            engine.step(decide(policy, observations, width).reshape(view("actions").shape))
+            for name, values in kept.items():
+                values.append(view(name)[:, chosen])
+            forward = view("rotation")[:, agents][..., :2, 0]
+            headings.append(np.arctan2(forward[..., 1], forward[..., 0]).astype(np.float32))
+            place.append(view("position")[:, agents, :2].astype(np.float32))
+            on_progress((step + 1) / steps)
+            if view("over").all():
+                break
+    record = {name: np.stack(values) for name, values in kept.items()}
+    errors = {name: np.nan_to_num(record.pop(name), nan=DIVERGED, posinf=DIVERGED) for name in ERRORS}
+    return Episodes(
+        vehicles=tuple(scenario.vehicle_names[i] for i in chosen),
+        period=scenario.ticks_per_decision / scenario.rates.camera,
+        under_way=record.pop("alive"),
+        **errors,
+        **record,
+        position=np.stack(place),
+        heading=np.stack(headings),
+        goal=_goals(scenario, len(seeds))[:, chosen],
+        outcome=view("ended")[:, chosen].copy(),
+    )
+
+
+ERRORS = ("position_error", "orientation_error")
+KEPT = ("alive", *ERRORS, "targets_in_view", "reward")
+
+
+def _goals(scenario: Scenario, worlds: int) -> np.ndarray:
+    origin = np.array(scenario.map.origin)[:2]
+    goals = [v.goal.position[:2] if v.goal else (np.nan, np.nan) for v in scenario.vehicles]
+    return np.tile(np.array(goals, float) - origin, (worlds, 1, 1))
