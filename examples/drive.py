@@ -7,7 +7,7 @@ import coopenv
 from coopenv.policies import act, load_agent
 
 env = coopenv.parallel_env("urban_crossing")
-driver = load_agent("give_way", env.scenario)
+driver = load_agent("route_follower", env.scenario)
 observations, infos = env.reset(seed=1)
 total = dict.fromkeys(env.possible_agents, 0.0)
 while env.agents:

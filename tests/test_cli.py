@@ -265,7 +265,7 @@ def test_results_that_cannot_be_written_are_found_before_the_run(
 @pytest.mark.parametrize(
     "options",
     [
-        ["urban_crossing", "--set", "observer.name=dead_reckoning", "--policy", "give_way"],
+        ["urban_crossing", "--set", "observer.name=dead_reckoning", "--policy", "route_follower"],
         ["busy_intersection", "--set", "observer.q=1e9", "--dtype", "float32"],
     ],
 )

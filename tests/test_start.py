@@ -15,7 +15,7 @@ from coopenv.cli import complete
 
 HEAVY = {"warp", "scipy", "matplotlib", "PIL", "pandas", "mcap", "torch", "joblib", "jinja2"}
 LIGHT = {"errors", "shipped", "interrupts", "api", "api.registration"}
-LIGHT |= {"cli", *(f"cli.{name}" for name in ("bench", "complete", "options", "run", "show"))}
+LIGHT |= {"cli", *(f"cli.{name}" for name in ("bench", "complete", "evaluate", "options", "run", "show"))}
 
 
 def modules_after(statement: str) -> set[str]:
@@ -81,7 +81,8 @@ def test_the_shell_completes_without_the_simulation() -> None:
 
 def test_completions() -> None:
     assert complete.environments("busy") == [name for name in coopenv.list_envs() if name.startswith("busy")]
-    assert complete.agents("give") == ["give_way"]
+    assert complete.agents("route") == ["route_follower"]
+    assert complete.agent_lists("mine.py:Mine,route") == ["mine.py:Mine,route_follower"]
     assert complete.policies("") == ["zero", "random", *complete.agents("")]
     assert complete.observers("riccati,mek") == ["riccati,mekf", "riccati,mekf_covariance"]
     assert "mekf" not in complete.observers("mekf,me")

@@ -64,6 +64,7 @@ def evaluate(
         printed.width = max(printed.width, command.WIDTH)
     command.report(result, printed)
     if out is not None:
-        printed.print(f"Files in {out}: {', '.join(sorted(path.name for path in out.iterdir()))}", soft_wrap=True)
+        printed.print(f"Files in {out}:", soft_wrap=True)
+        printed.print(f"  {', '.join(sorted(path.name for path in out.iterdir()))}")
     for path in written:
         printed.print(f"Card: {path}", soft_wrap=True)

@@ -2,49 +2,65 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import coopenv
-from coopenv.bench.drivers import play, score
-from coopenv.policies import act, agents_for, decide, find_agent, load_agent, load_policy
-from coopenv.runs.rollouts import Rollout, rollout
+from coopenv.api.engine import Engine
+from coopenv.estimation.outcomes import Outcome
+from coopenv.evaluation import METRICS, drive
+from coopenv.policies import agents_for, decide, find_agent, load_agent, load_policy, restart
+from coopenv.policies.route_follower import RouteFollower
+from coopenv.runs.rollouts import rollout
 from coopenv.shipped import data_directory, list_agents
 
 PAIRS = [(agent, env) for agent in list_agents() for env in find_agent(agent).environments]
 
 
 def test_there_are_agents() -> None:
-    assert "give_way" in list_agents()
+    assert "route_follower" in list_agents()
 
 
-@pytest.mark.parametrize("agent", list_agents())
-def test_agent_has_a_card_with_results(agent: str) -> None:
-    card = (data_directory("agents") / agent / "README.md").read_text(encoding="utf-8")
-    assert f"coopenv bench agents {agent}" in card
+@pytest.mark.parametrize(("agent", "name"), PAIRS)
+def test_agent_has_a_card_with_results(agent: str, name: str) -> None:
+    folder = data_directory("agents") / agent
+    entry = json.loads((folder / "card.json").read_text(encoding="utf-8"))["environments"][name]
+    assert set(entry["results"]) == set(METRICS)
+    assert entry["command"].startswith(f"coopenv evaluate {name}")
+    assert f"| {name} |" in (folder / "card.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(("agent", "name"), PAIRS)
 def test_agent_drives(agent: str, name: str) -> None:
-    env = coopenv.parallel_env(name)
-    policy = load_agent(agent, env.scenario)
-    observations, _ = env.reset(seed=1000)
-    for _ in range(60):
-        actions = act(policy, {a: observations[a] for a in env.agents})
-        assert all(env.action_space(a).contains(action) for a, action in actions.items())
-        observations, *_ = env.step(actions)
+    """Actions are within the space, the same for the same seed, and each row's its own affair."""
+    scenario = coopenv.load_scenario(name)
+    envs = coopenv.make_vec(name, num_worlds=2)
+    policy, again, alone = (load_agent(agent, scenario) for _ in range(3))
+    rows = np.arange(envs.num_envs)
+    observations, _ = envs.reset(seed=1000)
+    for each, count in ((policy, len(rows)), (again, len(rows)), (alone, 1)):
+        restart(each, np.ones(count, dtype=bool))
+    for _ in range(30):
+        actions = np.asarray(policy(observations))
+        assert envs.action_space.contains(actions.astype(np.float32))
+        np.testing.assert_array_equal(again(observations), actions)
+        np.testing.assert_allclose(alone(observations[3:4])[0], actions[3], atol=1e-5)
+        observations, *_ = envs.step(actions)
 
 
-def test_give_way_arrives_without_touching() -> None:
-    env = coopenv.parallel_env("urban_crossing")
-    policy = load_agent("give_way", env.scenario)
-    result = score("give_way", "urban_crossing", (play(env, policy, seed) for seed in range(500, 520)))
-    assert result.collided == 0.0
-    assert result.arrived >= 0.95
-    still = score("still", "urban_crossing", (play(env, stand_still, seed) for seed in range(500, 503)))
-    assert still.mean_return < result.mean_return
+def test_the_route_follower_arrives_without_touching() -> None:
+    scenario = coopenv.load_scenario("urban_crossing")
+    worlds = range(500, 520)
+    engine = Engine(scenario, len(worlds))
+    follower, still = (
+        drive(engine, policy, worlds) for policy in (load_agent("route_follower", scenario), stand_still)
+    )
+    assert not (follower.outcome == Outcome.COLLIDED).any()
+    assert (follower.outcome == Outcome.ARRIVED).mean() >= 0.95
+    assert still.reward.sum() < follower.reward.sum()
 
 
 def stand_still(observations: np.ndarray) -> np.ndarray:
@@ -52,20 +68,18 @@ def stand_still(observations: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("top", "reverse"), [(1.0, False), (1.53, False), (2.0, True)])
-def test_give_way_drives_at_its_speed_whatever_the_car_can_do(top: float, reverse: bool) -> None:
+def test_the_route_follower_drives_at_its_speed_whatever_the_car_can_do(top: float, reverse: bool) -> None:
     overrides = {"dynamics.max_speed": top, "dynamics.reverse": reverse, "observer.name": "robust"}
     scenario = coopenv.load_scenario("urban_crossing", overrides)
-    rollout = Rollout(scenario, seed=1, policy="give_way", steps=60)
-    for _ in rollout.play():
-        pass
-    fastest = np.abs(rollout.trajectory().velocity[:, :, 0]).max()
-    assert fastest == pytest.approx(0.6, abs=0.02)
+    for cruise, expected in ((0.6, 0.6), (None, top)):
+        trajectory = rollout(scenario, seed=1, policy=RouteFollower(scenario, cruise=cruise), steps=60)
+        assert np.abs(trajectory.velocity[:, :, 0]).max() == pytest.approx(expected, abs=0.02)
 
 
-def test_give_way_refuses_to_choose_accelerations() -> None:
+def test_the_route_follower_refuses_to_choose_accelerations() -> None:
     scenario = coopenv.load_scenario("urban_crossing", {"action.longitudinal": "acceleration"})
-    with pytest.raises(coopenv.CoopenvError, match=r"agent 'give_way' cannot be built: it chooses speeds"):
-        load_agent("give_way", scenario)
+    with pytest.raises(coopenv.CoopenvError, match=r"agent 'route_follower' cannot be built: it chooses speeds"):
+        load_agent("route_follower", scenario)
 
 
 def test_policies_by_name() -> None:
@@ -117,7 +131,7 @@ def test_agents_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_agents_made_for_an_environment() -> None:
-    assert "give_way" in agents_for("urban_crossing")
+    assert "route_follower" in agents_for("urban_crossing")
     assert agents_for("busy_intersection") == []
 
 
@@ -138,12 +152,17 @@ def test_agents_in_code_that_are_none(text: str, message: str, tmp_path: Path, m
 
 def test_bad_agents(tmp_path: Path) -> None:
     scenario = coopenv.load_scenario("urban_crossing")
-    with pytest.raises(coopenv.CoopenvError, match=r"unknown agent 'giveway' \(did you mean 'give_way'\?\)"):
-        load_agent("giveway", scenario)
+    with pytest.raises(
+        coopenv.CoopenvError, match=r"unknown agent 'routefollower' \(did you mean 'route_follower'\?\)"
+    ):
+        load_agent("routefollower", scenario)
     for text, message in (
         ('title = "x"', r"agent\.toml: description: Field required"),
-        (CARD.format("GiveWay"), r"agent\.toml: entry: expected file\.py:Class or package\.module:Class"),
-        (CARD.format("coopenv.policies.give_way:GiveWay") + "[options]\nspeeed = 1\n", "cannot be built: .*speeed"),
+        (CARD.format("RouteFollower"), r"agent\.toml: entry: expected file\.py:Class or package\.module:Class"),
+        (
+            CARD.format("coopenv.policies.route_follower:RouteFollower") + "[options]\nspeeed = 1\n",
+            "cannot be built: .*speeed",
+        ),
         (CARD.format("x:y") + 'kind = "good"\n', r"kind: Input should be 'learned', 'scripted' or 'reference'"),
         ("title = ", "not valid TOML"),
     ):

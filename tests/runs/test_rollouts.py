@@ -212,7 +212,7 @@ def vehicles_of(name: str, policy: str = "zero", **overrides: Any) -> tuple[Roll
 
 
 def test_figures_of_a_vehicle_end_with_it() -> None:
-    recording, vehicles = vehicles_of("urban_crossing", "give_way")
+    recording, vehicles = vehicles_of("urban_crossing", "route_follower")
     run, endings = recording.trajectory(), recording.endings()
     assert min(ending.time for ending in endings) < run.t[-1] - 1.0
     for i, (vehicle, ending) in enumerate(zip(vehicles, endings, strict=True)):

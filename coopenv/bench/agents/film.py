@@ -19,6 +19,7 @@ from coopenv.viz.topview_ground import PANEL
 
 COLUMNS = 3
 WIDEST = 1920  # px
+MARGIN = 6  # px, by which the legend beside the map stands out
 
 
 def write_film(evaluation: Evaluation, folder: Path, log: Console) -> Path:
@@ -41,7 +42,7 @@ def pictures_of(entrant: Entrant, seed: int) -> Iterator[np.ndarray]:
     try:
         for tick in play(engine, [seed], scenario.horizon_ticks, entrant.policy, to_the_end=False):
             if tick % frame_stride(scenario) == 0:
-                yield view.draw(engine)[:, :PANEL]
+                yield view.draw(engine)[:, : PANEL - MARGIN]
     finally:
         engine.close()
         view.close()

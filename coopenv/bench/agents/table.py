@@ -49,7 +49,7 @@ def shown(mean: float, low: float, high: float) -> tuple[str, str, str]:
     width = high - low
     decimals = 1
     if np.isfinite(width) and width > 0.0:
-        decimals = int(np.clip(-np.floor(np.log10(width)), 0, 3))
+        decimals = int(np.clip(-np.floor(np.log10(width)), 0, 2))
     first, second, third = (f"{v + 0.0:.{decimals}f}" if np.isfinite(v) else NONE for v in (mean, low, high))
     return first, second, third
 

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from coopenv.policies.give_way import GiveWay
 
 import coopenv
-from coopenv.policies.give_way import GiveWay
 from coopenv.scenario import Scenario, load_scenario
 
 QUALITY = ("position_uncertainty", "position_error_per_metre")

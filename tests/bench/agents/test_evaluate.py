@@ -1,0 +1,133 @@
+"""`coopenv evaluate`: tables, files, film and cards."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from coopenv.bench.agents.film import tiled
+from coopenv.bench.agents.table import shown
+from coopenv.cli import main
+from coopenv.evaluation import METRICS
+from coopenv.shipped import data_directory
+
+SHORT = ["urban_crossing", "--worlds", "3", "--set", "horizon=5.0"]
+OWN = """
+import numpy as np
+
+
+def still(observations):
+    return np.tile([-1.0, 0.0], (len(observations), 1))
+"""
+
+
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("own.py").write_text(OWN)
+
+
+def test_tables_and_files(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("coopenv.runs.video.find_spec", lambda name: None)
+    command = ["evaluate", *SHORT, "--agents", "own.py:still,route_follower", "--ideal", "--out", "eval"]
+    assert main([*command, "--film"]) == 0
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= 100 and "…" not in out
+    assert "3 held-out worlds, block 0" in out and "against route_follower" in out
+    files = {"evaluation.json", "video.gif", "error_along_the_way.png", "time_against_error.png", "looking.png"}
+    assert {path.name for path in Path("eval").iterdir()} == files
+    found = json.loads(Path("eval/evaluation.json").read_text())
+    keys = {"agent", "kind", "environment", "metric", "mean", "ci_low", "ci_high", "n"}
+    assert all(set(row) == keys for row in found["rows"])
+    agents = [("still", "scripted"), ("route_follower", "scripted"), ("ideal_sensing", "reference")]
+    assert [(row["agent"], row["kind"]) for row in found["rows"]] == [a for a in agents for _ in METRICS]
+    assert {row["agent"] for row in found["differences"]} == {"still", "ideal_sensing"}
+    assert found["reference"] == "route_follower"
+    assert found["overrides"] == {"horizon": 5.0}
+    with Image.open("eval/video.gif") as film:
+        assert film.n_frames > 30
+    assert main(command) == 2
+    assert capsys.readouterr().err.endswith("eval/evaluation.json: exists already; --force replaces it\n")
+    assert main([*found["command"].split()[1:], "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again == found
+
+
+def test_a_block_of_seeds_is_other_worlds(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = []
+    for block in ("0", "1"):
+        assert main(["evaluate", *SHORT, "--agents", "own.py:still", "--seed-block", block, "--json"]) == 0
+        rows.append(json.loads(capsys.readouterr().out)["rows"])
+    assert rows[0] != rows[1]
+
+
+def test_cards(capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(data_directory("agents") / "route_follower", "mine", ignore=shutil.ignore_patterns("card.*"))
+    assert main(["evaluate", *SHORT, "--agents", "mine", "--write-card"]) == 0
+    assert "Card: mine/card.md" in capsys.readouterr().out
+    card = json.loads(Path("mine/card.json").read_text())
+    entry = card["environments"]["urban_crossing"]
+    assert set(entry["results"]) == set(METRICS) and entry["worlds"] == 3
+    shutil.copy(data_directory("envs") / "urban_crossing.toml", "elsewhere.toml")
+    assert main(["evaluate", "elsewhere.toml", *SHORT[1:], "--agents", "mine", "--write-card"]) == 0
+    again = json.loads(Path("mine/card.json").read_text())
+    assert set(again["environments"]) == {"urban_crossing", "elsewhere"}
+    assert again["environments"]["urban_crossing"] == entry
+    text = Path("mine/card.md").read_text()
+    assert "| urban_crossing | 3 |" in text and f"{entry['command']} --write-card" in text
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["busy_intersection"], "all motion here is prescribed, there is nothing to drive"),
+        (["mine.toml"], "no agent of agents/ was made for mine; name some with --agents A,B"),
+        ([*SHORT, "--agents", "nobody"], "unknown agent 'nobody'; known: "),
+        ([*SHORT, "--agents", "own.py:still,own.py:still"], "--agents: two are called 'still'"),
+        (
+            [*SHORT, "--agents", "own.py:still", "--write-card"],
+            "still is a place in code; a card needs an agent's folder",
+        ),
+        ([*SHORT, "--film"], "--film: the film needs a folder, --out DIR"),
+        ([*SHORT, "--worlds", "1"], "Invalid value for '--worlds'"),
+    ],
+)
+def test_mistakes_are_one_line(options: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copy(data_directory("envs") / "urban_crossing.toml", "mine.toml")
+    assert main(["evaluate", *options]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_a_card_that_is_none(capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(data_directory("agents") / "route_follower", "mine")
+    Path("mine/card.json").write_text("[]")
+    assert main(["evaluate", *SHORT, "--agents", "mine", "--write-card"]) == 2
+    assert "mine/card.json: not a card" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ((11.73, 11.41, 12.02), ("11.7", "11.4", "12.0")),
+        ((100.0, 94.3, 100.0), ("100", "94", "100")),
+        ((0.3652, 0.3618, 0.3691), ("0.37", "0.36", "0.37")),
+        ((0.0, 0.0, 0.0), ("0.0", "0.0", "0.0")),
+        ((np.nan, np.nan, np.nan), ("-", "-", "-")),
+    ],
+)
+def test_figures_have_the_digits_that_their_interval_allows(values: tuple[float, ...], expected: object) -> None:
+    assert shown(*values) == expected
+
+
+def test_pictures_stand_in_rows_of_three() -> None:
+    pictures = [np.full((10, 20, 3), shade, np.uint8) for shade in (10, 20, 30, 40)]
+    whole = tiled(pictures)
+    assert whole.shape == (20, 60, 3)
+    assert (whole[:10, 40:] == 30).all() and (whole[10:, :20] == 40).all() and (whole[10:, 20:] == 255).all()
+    assert tiled([np.zeros((672, 1300, 3), np.uint8)] * 2).shape[1] == 1920

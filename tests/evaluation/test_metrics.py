@@ -1,0 +1,100 @@
+"""Episodes of a batch are those of single worlds, and figures are what they say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import coopenv
+from coopenv.api.engine import Engine
+from coopenv.estimation.outcomes import Outcome
+from coopenv.evaluation import METRICS, Episodes, compare_paired, drive, held_out_seeds, score
+from coopenv.policies import load_agent
+from coopenv.runs import rollout
+
+SCENARIO = coopenv.load_scenario("urban_crossing", {"horizon": 16.0})
+
+
+@pytest.fixture(scope="module")
+def episodes() -> Episodes:
+    return drive(Engine(SCENARIO, 6), load_agent("route_follower", SCENARIO), held_out_seeds(2, 6))
+
+
+def test_a_world_of_the_batch_is_that_world_alone(episodes: Episodes) -> None:
+    seed = held_out_seeds(2, 6)[4]
+    run = rollout(SCENARIO, seed=seed, dtype="float32", policy="route_follower")
+    every = SCENARIO.ticks_per_decision
+    K = min(len(episodes.under_way), (len(run.t) - 1) // every)
+    np.testing.assert_allclose(
+        episodes.position_error[:K, 4], run.position_error[every::every][:K], rtol=1e-3, atol=1e-5
+    )
+    np.testing.assert_allclose(episodes.position[: K + 1, 4], run.position[::every, :, :2][: K + 1], atol=1e-4)
+    np.testing.assert_array_equal(episodes.targets_in_view[:K, 4], run.visible[every::every].sum(axis=-1)[:K])
+    heading = np.arctan2(run.rotation[..., 1, 0], run.rotation[..., 0, 0])[every::every]
+    np.testing.assert_allclose(np.exp(1j * episodes.heading[:K, 4]), np.exp(1j * heading[:K]), atol=1e-4)
+
+
+def test_figures_by_hand(episodes: Episodes) -> None:
+    found = {result.metric: result for result in score(episodes)}
+    assert list(found) == list(METRICS)
+    counted = episodes.under_way & (episodes.time >= 3.0)[:, None, None]
+    errors = episodes.position_error[counted]
+    assert found["e50_m"].mean == pytest.approx(np.median(errors))
+    assert found["e95_m"].mean == pytest.approx(np.quantile(errors, 0.95))
+    assert found["rmse_m"].mean == pytest.approx(np.sqrt(np.mean(errors.astype(float) ** 2)))
+    whole = episodes.orientation_error[episodes.under_way]
+    assert found["orientation_e50_episode_deg"].mean == pytest.approx(np.median(whole))
+    assert found["few_targets_share"].mean == pytest.approx((episodes.targets_in_view[counted] < 3).mean())
+    assert found["return"].mean == pytest.approx(episodes.reward.sum() / 24, rel=1e-4)
+    arrived = episodes.outcome == Outcome.ARRIVED
+    assert found["arrival_rate"].mean == pytest.approx(arrived.mean())
+    assert found["travel_time_s"].mean == pytest.approx(np.nanmean(episodes.travel_time))
+    for result in found.values():
+        assert result.ci_low <= result.mean <= result.ci_high and 0 < result.n <= 6
+
+
+def test_a_share_that_is_the_same_everywhere_has_an_interval_all_the_same(episodes: Episodes) -> None:
+    never = replace(episodes, outcome=np.zeros_like(episodes.outcome))
+    arrived = next(result for result in score(never) if result.metric == "arrival_rate")
+    assert (arrived.mean, arrived.ci_low) == (0.0, 0.0) and 0.2 < arrived.ci_high < 0.5  # Wilson, 0 of 6
+    time = next(result for result in score(never) if result.metric == "travel_time_s")
+    assert np.isnan([time.mean, time.ci_low, time.ci_high]).all() and time.n == 0
+
+
+def test_paired_differences(episodes: Episodes) -> None:
+    worse = replace(episodes, position_error=1.25 * episodes.position_error)
+    differences = {difference.metric: difference for difference in compare_paired(worse, episodes)}
+    e95 = differences["e95_m"]
+    for value in (e95.relative, e95.relative_ci_low, e95.relative_ci_high):
+        assert value == pytest.approx(0.25, abs=1e-3)  # of the pair, although the worlds differ
+    same = differences["orientation_e95_deg"]
+    assert (same.difference, same.ci_low, same.ci_high) == (0.0, 0.0, 0.0)
+
+
+def test_travel_times_are_compared_over_those_who_arrive_with_both(episodes: Episodes) -> None:
+    lost = episodes.outcome.copy()
+    slowest = np.unravel_index(np.nanargmax(episodes.travel_time), lost.shape)
+    lost[slowest] = Outcome.COLLIDED
+    fewer = replace(episodes, outcome=lost)
+    difference = next(d for d in compare_paired(fewer, episodes) if d.metric == "travel_time_s")
+    assert difference.difference == 0.0
+    assert np.nanmean(fewer.travel_time) < np.nanmean(episodes.travel_time)
+
+
+def test_an_error_that_is_no_number_counts_as_a_huge_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = Engine(SCENARIO, 2)
+    view = engine.view
+    monkeypatch.setattr(engine, "view", lambda name: view(name) * np.nan if name == "position_error" else view(name))
+    found = drive(engine, _still, [1, 2])
+    assert (found.position_error > 1e8).all() and (found.orientation_error < 1e3).all()
+
+
+def _still(observations: np.ndarray) -> np.ndarray:
+    return np.tile([-1.0, 0.0], (len(observations), 1))
+
+
+def test_held_out_seeds_are_shared_by_no_two_blocks() -> None:
+    seeds = [seed for block in range(3) for seed in held_out_seeds(block, 5)]
+    assert len(set(seeds)) == 15 and min(seeds) >= 2**31
