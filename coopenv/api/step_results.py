@@ -46,7 +46,7 @@ def results_struct(p: Precision) -> Any:
         position_std: array("WN", scalar)  # m, sqrt of the trace of the position's covariance in the map
         gramian_min_eigenvalue: array("WN", scalar)
         targets_in_view: array("WN", wp.int32)
-        last_goal_distance: array("WN", scalar)  # m, at the last step
+        last_way: array("WN", scalar)  # m left to the goal, at the last step
         last_ended: array("WN", wp.int32)  # at the last step
         last_tick: array("WN", wp.int32)  # of the last step
         last_log_determinant: array("WN", scalar)  # at the last step
@@ -56,7 +56,7 @@ def results_struct(p: Precision) -> Any:
 
 
 MEMORY = {
-    "last_goal_distance": NUMBER._replace(of_truth=True),
+    "last_way": NUMBER._replace(of_truth=True),
     "last_ended": whole(0, "last_outcome"),
     "last_tick": whole(0, "tick"),
     "last_log_determinant": NUMBER,
@@ -67,11 +67,11 @@ MEMORY = {
 
 
 @wp.func
-def remember(results: Any, world: int, vehicle: int, goal_distance: Any, furthest: Any, ended: int, tick: int):
+def remember(results: Any, world: int, vehicle: int, way: Any, furthest: Any, ended: int, tick: int):
     """Keep what the next step compares with; `assess` comes before."""
     results.last_log_determinant[world, vehicle] = results.log_determinant[world, vehicle]
     results.furthest[world, vehicle] = furthest
-    results.last_goal_distance[world, vehicle] = goal_distance
+    results.last_way[world, vehicle] = way
     results.last_ended[world, vehicle] = ended
     results.last_tick[world, vehicle] = tick
 

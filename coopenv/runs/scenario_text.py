@@ -13,6 +13,7 @@ from coopenv.scenario.bodies import (
     ConstantMotion,
     DrivenMotion,
     InitialEstimate,
+    InitialPose,
     SegmentMotion,
     Vehicle,
     WaypointMotion,
@@ -67,9 +68,11 @@ def start(vehicle: Vehicle) -> str:
     """Return where a vehicle starts, one line per fact."""
     if isinstance(vehicle.motion, WaypointMotion):
         return vector(vehicle.motion.waypoints[0].position)
-    pose = vehicle.initial_pose
-    assert pose is not None  # the schema asks for it
-    lines = [vector(pose.position), orientation(pose.yaw, pose.quaternion_wxyz) or "yaw 0 deg"]
+    pose = vehicle.initial_pose or InitialPose()
+    if pose.position is None:
+        lines = ["start of its route"]
+    else:
+        lines = [vector(pose.position), orientation(pose.yaw, pose.quaternion_wxyz) or "yaw 0 deg"]
     if any(pose.position_spread):
         lines.append(f"+- {vector(pose.position_spread)}")
     if pose.yaw_spread:
@@ -138,10 +141,13 @@ def twist(linear: Sequence[float], angular: Sequence[float]) -> str:
 
 def vehicle_motion(vehicle: Vehicle) -> str:
     """Return a vehicle's motion and goal in words."""
-    if vehicle.goal is None:
+    radius = number(vehicle.goal_radius)
+    if vehicle.routes:
+        routes = " or ".join(vehicle.routes)
+        return f"{motion(vehicle.motion)}\ngoal: within {radius} m of the end of its route: {routes}"
+    if vehicle.goal is None or vehicle.goal.position is None:
         return motion(vehicle.motion)
-    goal = f"goal: within {number(vehicle.goal.radius)} m of {vector(vehicle.goal.position)}"
-    return f"{motion(vehicle.motion)}\n{goal}"
+    return f"{motion(vehicle.motion)}\ngoal: within {radius} m of {vector(vehicle.goal.position)}"
 
 
 def body(box: Body | None) -> str:

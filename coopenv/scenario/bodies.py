@@ -132,10 +132,10 @@ VehicleMotion = Annotated[
 
 
 class InitialPose(Part):
-    """Where an agent starts, fixed or drawn anew at each reset."""
+    """Where an agent starts, fixed or drawn anew at each reset; one with routes starts on that which it draws."""
 
-    position: Vector3
-    """In the coordinates of this file, m."""
+    position: Vector3 | None = None
+    """In the coordinates of this file, m; needed without routes."""
     yaw: Number | None = None
     """Rotation about z, rad (0 when neither yaw nor a quaternion is given)."""
     quaternion_wxyz: QuaternionWxyz | None = None
@@ -185,10 +185,10 @@ class InitialEstimate(Part):
 
 
 class Goal(Part):
-    """Where a driven vehicle wants to go."""
+    """Where a driven vehicle wants to go; one with routes to the end of that which it draws."""
 
-    position: Vector3
-    """In the coordinates of this file, m."""
+    position: Vector3 | None = None
+    """In the coordinates of this file, m; needed without routes."""
     radius: Positive = 0.5
     """The vehicle has arrived within this horizontal distance, m."""
 
@@ -212,7 +212,7 @@ class Vehicle(Part):
     """A connected vehicle that estimates its own pose; named vehicle_1, vehicle_2, ... in file order."""
 
     initial_pose: InitialPose | None = None
-    """Needed unless the motion is by waypoints, which start at the first waypoint."""
+    """Needed unless the motion is by waypoints, which start at the first waypoint, or the vehicle has routes."""
     initial_estimate: InitialEstimate = InitialEstimate()
     motion: VehicleMotion = StaticMotion()
     body: Body | None = None
@@ -221,11 +221,36 @@ class Vehicle(Part):
     neighbours: tuple[str, ...] | None = None
     """Targets it may measure: landmark names and vehicle names (default: every landmark and every leader)."""
     goal: Goal | None = None
+    routes: tuple[str, ...] = Field(default=(), max_length=1000)
+    """Names of routes, one of which is drawn at each reset: the vehicle starts at its beginning and goes to its end."""
+
+    @property
+    def goal_radius(self) -> float:
+        """How near to its goal the vehicle has arrived, m; 0 without a goal."""
+        return (self.goal or Goal()).radius if self.goal or self.routes else 0.0
 
     @model_validator(mode="after")
-    def _has_a_start(self) -> Self:
-        if self.motion.kind == "waypoints" and self.initial_pose is not None:
+    def _has_a_start_and_a_goal(self) -> Self:
+        pose, waypoints = self.initial_pose, self.motion.kind == "waypoints"
+        if waypoints and pose is not None:
             raise ValueError("initial_pose: a motion by waypoints starts at its first waypoint; leave this out")
-        if self.motion.kind != "waypoints" and self.initial_pose is None:
+        if self.routes:
+            self._check_routes()
+            return self
+        if pose is None and not waypoints:
             raise ValueError("initial_pose: needed, with at least a position")
+        if pose is not None and pose.position is None:
+            raise ValueError("initial_pose.position: needed by a vehicle without routes")
+        if self.goal is not None and self.goal.position is None:
+            raise ValueError("goal.position: needed by a vehicle without routes")
         return self
+
+    def _check_routes(self) -> None:
+        if self.motion.kind != "driven":
+            raise ValueError(f"routes: for driven vehicles; the motion of this one is '{self.motion.kind}'")
+        pose = self.initial_pose or InitialPose()
+        for key in ("position", "yaw", "quaternion_wxyz"):
+            if getattr(pose, key) is not None:
+                raise ValueError(f"initial_pose.{key}: a vehicle with routes starts on its route; leave this out")
+        if self.goal is not None and self.goal.position is not None:
+            raise ValueError("goal.position: a vehicle with routes goes to the end of its route; leave this out")

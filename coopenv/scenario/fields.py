@@ -5,6 +5,7 @@ from pydantic import Field
 from coopenv.scenario.base import Part, Positive, Text, Vector3
 from coopenv.scenario.bodies import Landmark, Obstacle, Road, Vehicle
 from coopenv.scenario.learning import Action, Dynamics, Observation, Reward, Termination
+from coopenv.scenario.routes import Route
 from coopenv.scenario.sensing import Camera, Noise, Observer, Rates, Topology, V2x
 
 
@@ -25,6 +26,7 @@ class ScenarioFields(Part):
     horizon: Positive
     """Length of an episode, s."""
     map: Map = Map()
+    routes: tuple[Route, ...] = Field(default=(), max_length=1_000)
     roads: tuple[Road, ...] = Field(default=(), max_length=10_000)
     obstacles: tuple[Obstacle, ...] = Field(default=(), max_length=10_000)
     landmarks: tuple[Landmark, ...] = Field(max_length=50_000)

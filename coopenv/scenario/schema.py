@@ -43,9 +43,9 @@ class Scenario(ScenarioFields):
             raise ValueError(f"vehicles: {vehicles} times {targets} targets are over {MOST_PAIRS:.0e} pairs")
         neighbours = neighbour_sets(self)
         processing_order(self, neighbours)
-        check_room(self)
         for problem in _problems(self):
             raise ValueError(problem)
+        check_room(self)
         for doubt in _doubts(self, neighbours):
             warnings.warn(doubt, ScenarioWarning, stacklevel=2)
         return self
@@ -58,6 +58,7 @@ def _problems(s: ScenarioFields) -> Iterator[str]:
         yield f"observer.k: {len(k)} values for {len(s.vehicles)} vehicles"
     for name in [name for name in q if name not in targets] if isinstance(q, dict) else ():
         yield f"observer.q: unknown target {shown(name)}{suggest(name, targets)}"
+    yield from _problems_of_routes(s)
     for name, rate in (("camera", s.rates.camera), ("odometry", s.rates.odometry)):
         if s.horizon * rate > MOST_TICKS:
             yield f"horizon: {s.horizon:g} s at rates.{name} = {rate:g} Hz are over {MOST_TICKS:.0e} samples"
@@ -70,6 +71,17 @@ def _problems(s: ScenarioFields) -> Iterator[str]:
         yield f"dynamics.latency: {s.dynamics.latency:g} s is longer than one decision ({decision:g} s)"
     if steering is not None and steering > s.dynamics.max_steering:
         yield f"action.steering: {steering:g} rad is above dynamics.max_steering ({s.dynamics.max_steering:g} rad)"
+
+
+def _problems_of_routes(s: ScenarioFields) -> Iterator[str]:
+    names = [route.name for route in s.routes]
+    for name, times in Counter(names).items():
+        if times > 1:
+            yield f"routes: the name '{name}' is used twice"
+    for i, vehicle in enumerate(s.vehicles):
+        for name in vehicle.routes:
+            if name not in names:
+                yield f"vehicles.{i}.routes: unknown route {shown(name)}{suggest(name, names)}; known: {listed(names)}"
 
 
 def _doubts(s: ScenarioFields, neighbours: Sequence[Sequence[int]]) -> Iterator[str]:

@@ -14,6 +14,7 @@ from coopenv.errors import ScenarioWarning
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.fields import ScenarioFields
 from coopenv.scenario.motion import path_heading
+from coopenv.scenario.routes import Route, route_points
 
 SAME_PLACE = 1e-6  # m
 
@@ -29,22 +30,39 @@ def rotation_of(yaw: float | None, quaternion_wxyz: Any) -> np.ndarray:
     return np.asarray(rotation.as_matrix())
 
 
-def start_of(agent: Landmark | Vehicle) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nominal start of an agent: position (3,) in the file's coordinates, rotation (3, 3)."""
+def start_of(agent: Landmark | Vehicle, routes: Sequence[Route]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the nominal start of an agent: position (3,) in the file's coordinates, rotation (3, 3).
+
+    Of a vehicle with routes it is on the first of them.
+    """
     if agent.motion.kind == "waypoints":
         heading = Rotation.from_euler("z", path_heading(agent.motion)).as_matrix()
         return np.array(agent.motion.waypoints[0].position), heading
     if isinstance(agent, Landmark):
         return np.array(agent.position), rotation_of(agent.yaw, None)
-    assert agent.initial_pose is not None
+    if agent.routes:
+        return _on_route(_routes_of(agent, routes)[0], 0.0, 0.0)
     pose = agent.initial_pose
+    assert pose is not None and pose.position is not None
     return np.array(pose.position), rotation_of(pose.yaw, pose.quaternion_wxyz)
+
+
+def _routes_of(vehicle: Vehicle, routes: Sequence[Route]) -> list[Route]:
+    by_name = {route.name: route for route in routes}
+    return [by_name[name] for name in vehicle.routes]
+
+
+def _on_route(route: Route, s: float, aside: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pose at an arc length of a route as designed, and so far to its left."""
+    x, y, heading = route_points(route, np.array([s]))[0]
+    position = np.array([x - aside * np.sin(heading), y + aside * np.cos(heading), 0.0])
+    return position, rotation_of(heading, None)
 
 
 def agent_starts(scenario: ScenarioFields) -> tuple[np.ndarray, np.ndarray]:
     """Return nominal start positions (A, 3) in the map frame and rotations (A, 3, 3), landmarks first."""
     agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
-    starts = [start_of(agent) for agent in agents]
+    starts = [start_of(agent, scenario.routes) for agent in agents]
     return np.array([p for p, _ in starts]) - np.array(scenario.map.origin), np.array([R for _, R in starts])
 
 
@@ -89,9 +107,17 @@ def overlapping_pairs(a: Boxes, b: Boxes) -> NDArray[np.int64]:
     return np.concatenate(found)
 
 
-def possible_boxes(vehicle: Vehicle) -> Boxes:
+def possible_boxes(vehicle: Vehicle, routes: Sequence[Route]) -> Boxes:
     """Return the boxes of a vehicle at its nominal start, which comes first, and at the corners of its spread."""
-    position, rotation = start_of(vehicle)
+    nominal = [start_of(vehicle, routes)]
+    for route in _routes_of(vehicle, routes):
+        spread = {0.0, route.lateral_spread, -route.lateral_spread}
+        nominal += [_on_route(route, s, aside) for s in {0.0, route.start_spread} for aside in spread]
+    parts = [_spread_boxes(vehicle, *pose) for pose in nominal]
+    return Boxes(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def _spread_boxes(vehicle: Vehicle, position: np.ndarray, rotation: np.ndarray) -> Boxes:
     pose = vehicle.initial_pose
     spread = np.array(pose.position_spread if pose else (0.0, 0.0, 0.0))
     turn = pose.yaw_spread if pose else 0.0
@@ -104,17 +130,25 @@ def possible_boxes(vehicle: Vehicle) -> Boxes:
 
 
 def check_room(scenario: ScenarioFields) -> None:
-    """Refuse (ValueError) vehicles that may start inside a building or in one another's place; warn of overlaps."""
-    boxes = [possible_boxes(vehicle) for vehicle in scenario.vehicles]
+    """Refuse (ValueError) vehicles that may start inside a building or in one another's place; warn of overlaps.
+
+    Vehicles with routes are drawn such that they do not touch, and need not be apart here.
+    """
+    boxes = [possible_boxes(vehicle, scenario.routes) for vehicle in scenario.vehicles]
     _check_buildings(scenario, boxes)
-    starts = np.array([start_of(vehicle)[0] for vehicle in scenario.vehicles])
+    fixed = [i for i, vehicle in enumerate(scenario.vehicles) if not vehicle.routes]
+    if not fixed:
+        return
+    starts = np.array([start_of(scenario.vehicles[i], scenario.routes)[0] for i in fixed])
     if same := cKDTree(starts).query_pairs(SAME_PLACE):
-        raise ValueError(_in_place(*min(pair[::-1] for pair in same)))
-    nominal = Boxes(*(np.array([part[0] for part in parts]) for parts in zip(*boxes, strict=True)))
+        second, first = min(pair[::-1] for pair in same)
+        raise ValueError(_in_place(fixed[second], fixed[first]))
+    nominal = Boxes(*(np.array([part[0] for part in parts]) for parts in zip(*(boxes[i] for i in fixed), strict=True)))
     overlaps = overlapping_pairs(nominal, nominal)
     if len(overlaps):
         more = f" (and those of {len(overlaps) - 1} more pairs)" if len(overlaps) > 1 else ""
-        warnings.warn(f"{_in_place(*overlaps[0].tolist())}: their boxes overlap{more}", ScenarioWarning, stacklevel=2)
+        second, first = (fixed[i] for i in overlaps[0].tolist())
+        warnings.warn(f"{_in_place(second, first)}: their boxes overlap{more}", ScenarioWarning, stacklevel=2)
 
 
 def _in_place(second: int, first: int) -> str:

@@ -185,7 +185,7 @@ _FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
 }  # fmt: skip
 
 _REWARDS: list[tuple[str, str, bool, str]] = [  # name, unit, privileged, meaning
-    ("progress", "m", True, "Decrease of the true distance to the goal"),
+    ("progress", "m", True, "Decrease of the true way to the goal: along the drawn route, else as the crow flies"),
     ("arrival", "1", False, "1 in the step of arrival"),
     ("collision", "1", False, "-1 in the step of a collision"),
     ("control", "1", False, "-|action|^2"),
@@ -203,7 +203,7 @@ _REWARDS: list[tuple[str, str, bool, str]] = [  # name, unit, privileged, meanin
 
 _CONDITIONS = [  # name, function, meaning
     ("collision", "touches_anything", "Touching a building or another body, at any camera tick"),
-    ("arrival", "reaches_goal", "Reaching the goal, at any camera tick"),
+    ("arrival", "reaches_goal", "Reaching the goal, or passing the end of a drawn route, at any camera tick"),
 ]
 
 GROUPS = tuple(_FIELDS)

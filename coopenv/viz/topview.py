@@ -13,6 +13,8 @@ from coopenv.scenario.bodies import Body, Landmark, Vehicle
 from coopenv.viz import topview_geometry as geometry
 from coopenv.viz import topview_ground as ground
 from coopenv.viz.style import DARK_BLUE, INK, NORMAL, vehicle_colour
+from coopenv.viz.topview_goals import FIELDS as GOAL_FIELDS
+from coopenv.viz.topview_goals import Goals
 from coopenv.viz.topview_layers import Layers
 from coopenv.viz.window import Window
 
@@ -27,7 +29,7 @@ _FARTHEST = 10.0  # pictures' sides from the middle, of an estimate as drawn
 _POINT = Body(size=(2e-3, 1e-3, 1e-3))  # stands in for a vehicle without a body, drawn at the least size
 _FIELDS = (
     *("rotation", "position", "estimate_rotation", "estimate_position", "covariance"),
-    *("sight", "ended", "position_error", "orientation_error"),
+    *("sight", "ended", "position_error", "orientation_error", *GOAL_FIELDS),
 )
 
 
@@ -60,6 +62,7 @@ class TopView:
         R_hat, p_hat = view["estimate_rotation"], view["estimate_position"]
         estimate = (R_hat @ p_hat[..., None])[..., 0]
         sigma = self._place_ellipses(estimate, geometry.position_covariance(R_hat, p_hat, view["covariance"]))
+        self._goals.place(view)
         self._place_bodies(R, position, R_hat, estimate)
         self._place_sight(R, position, view["sight"])
         self._place_marks(R, position, view["ended"])
@@ -94,6 +97,7 @@ class TopView:
 
     def _prepare_artists(self) -> None:
         layers = self._layers
+        self._goals = Goals(self.scenario, self._axes, layers)
         colours = [vehicle_colour(i) for i in range(len(self.scenario.vehicles))]
         self._rgba = to_rgba_array(colours)
         self._wedges = layers.polygons(facecolor=to_rgba_array(self._rgba, 0.11), edgecolor="none")

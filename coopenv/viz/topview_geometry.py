@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Obstacle, Vehicle
 from coopenv.scenario.motion import TwistTable, compile_motion, left_jacobian
+from coopenv.scenario.routes import even_points
 from coopenv.scenario.sensing import ROTATION_OF_CAMERA, Camera
 from coopenv.scenario.starts import agent_starts
 
@@ -124,8 +125,13 @@ def limits(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
 
 def _places(scenario: Scenario) -> list[np.ndarray]:
     origin = np.array(scenario.map.origin)[:2]
-    goals = [vehicle.goal for vehicle in scenario.vehicles if vehicle.goal]
-    around = [np.array(goal.position)[:2] - origin + goal.radius * np.array([(-1, -1), (1, 1)]) for goal in goals]
+    corners = np.array([(-1, -1), (1, 1)])
+    goals = [(v.goal.position[:2], v.goal.radius) for v in scenario.vehicles if v.goal and v.goal.position]
+    around = [np.array(place) - origin + radius * corners for place, radius in goals]
+    followed = {name: vehicle.goal_radius for vehicle in scenario.vehicles for name in vehicle.routes}
+    for route in scenario.routes:
+        margin = followed.get(route.name, 0.0) + route.breadth
+        around += [point - origin + margin * corners for point in even_points(route)[:, :2]]
     return [*around, *(road_corners(road.start, road.end, road.width) - origin for road in scenario.roads)]
 
 

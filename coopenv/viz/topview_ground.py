@@ -1,4 +1,4 @@
-"""What stands still under the top view: axes, roads, buildings, landmarks, goals, and the panel's legend."""
+"""What stands still under the top view: axes, roads, buildings, names of landmarks, and the panel's legend."""
 
 from typing import Any
 
@@ -7,13 +7,13 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle, Patch, Polygon
+from matplotlib.patches import Patch, Polygon
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation
 
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario
-from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, legend, new_figure, vehicle_colour
+from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, legend, new_figure
 from coopenv.viz.topview_geometry import limits, road_corners
 
 WIDTH, HEIGHT = 896, 672  # px; multiples of 16, as video codecs like them
@@ -64,7 +64,7 @@ def new_ground(scenario: Scenario) -> tuple[Figure, Axes]:
     ax.set_autoscale_on(False)
     figure.text(*pixels(_LEFT, HEIGHT - 21), scenario.title, fontsize=NORMAL + 1.5, color=INK)
     draw_site(ax, scenario)
-    _draw_goals(ax, scenario)
+    _name_landmarks(ax, scenario)
     return figure, ax
 
 
@@ -84,16 +84,9 @@ def draw_site(ax: Axes, scenario: Scenario) -> None:
         ax.add_patch(Polygon(corners, facecolor=ROOF, edgecolor=WALL, linewidth=1.2, hatch="//", zorder=1))
 
 
-def _draw_goals(ax: Axes, scenario: Scenario) -> None:
-    """Draw goals and the names of static landmarks."""
+def _name_landmarks(ax: Axes, scenario: Scenario) -> None:
+    """Write the names of static landmarks."""
     origin = np.array(scenario.map.origin)[:2]
-    for i, vehicle in enumerate(scenario.vehicles):
-        if vehicle.goal:
-            center, colour = np.array(vehicle.goal.position)[:2] - origin, vehicle_colour(i)
-            ax.add_patch(Circle(center, vehicle.goal.radius, facecolor="white", edgecolor="none", alpha=0.6))
-            ax.add_patch(Circle(center, vehicle.goal.radius, fill=False, edgecolor=colour, linestyle=DOTTED, lw=1.6))
-            x, y = center.tolist()
-            ax.text(x, y, vehicle_mark(i), color=colour, fontsize=SMALL, ha="center", va="center", clip_on=True)
     for landmark in scenario.landmarks:
         if landmark.motion.kind == "static":
             place = np.array(landmark.position)[:2] + np.array(landmark.marker)[:2] - origin
@@ -111,7 +104,7 @@ def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
     """Explain the marks that can occur in this scenario, under a table of `rows` rows."""
     sensed, end = scenario.topology.mode == "sensed", scenario.termination
     moving = any(landmark.motion.kind != "static" for landmark in scenario.landmarks)
-    goals, bodies = (any(getattr(vehicle, part) for vehicle in scenario.vehicles) for part in ("goal", "body"))
+    goals, bodies = (any(getattr(vehicle, part) for vehicle in scenario.vehicles) for part in ("goal_radius", "body"))
     marks: list[tuple[object, Artist]] = [
         (True, Patch(facecolor=GREY, edgecolor=INK, linewidth=0.7, label="vehicle, true")),
         (True, Patch(facecolor="white", edgecolor=GREY, linewidth=1.4, label="its estimate")),

@@ -11,6 +11,7 @@ from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.motion import compile_motion
+from coopenv.scenario.routes import even_points, point_count
 from coopenv.scenario.sensing import ROTATION_OF_CAMERA, Noise
 from coopenv.scenario.starts import agent_starts, rotation_of
 from coopenv.scenario.topology import neighbour_sets, processing_order
@@ -33,6 +34,7 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     _fill(model.motion, _motion(scenario), device)
     _fill(model.dynamics, _dynamics(scenario), device)
     _fill(model.scene, _scene(scenario), device)
+    _fill(model.routes, _routes(scenario), device)
     model.camera = _structs(p, "camera", [_camera(scenario)] * len(scenario.vehicles), device)
     model.noise = _structs(p, "noise", [_noise(scenario)] * len(scenario.vehicles), device)
     _fill(model.radio, _radio(scenario), device)
@@ -148,7 +150,7 @@ def _dynamics(scenario: Scenario) -> dict[str, Any]:
 def _scene(scenario: Scenario) -> dict[str, Any]:
     origin = np.array(scenario.map.origin)
     everyone: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
-    bodies, goals = [agent.body for agent in everyone], [vehicle.goal for vehicle in scenario.vehicles]
+    bodies = [agent.body for agent in everyone]
     return {
         "body_half": [np.array(body.size) / 2 if body else NOWHERE for body in bodies],
         "body_center": [body.center if body else NOWHERE for body in bodies],
@@ -156,10 +158,30 @@ def _scene(scenario: Scenario) -> dict[str, Any]:
         "obstacle_rotation": [rotation_of(obstacle.yaw, None) for obstacle in scenario.obstacles],
         "obstacle_center": [np.array(obstacle.center) - origin for obstacle in scenario.obstacles],
         "obstacle_half": [np.array(obstacle.size) / 2 for obstacle in scenario.obstacles],
-        "goal": [np.array(goal.position) - origin if goal else NOWHERE for goal in goals],
-        "goal_radius": [goal.radius if goal else 0.0 for goal in goals],
+        "goal_radius": [vehicle.goal_radius for vehicle in scenario.vehicles],
         "end_on_collision": int(scenario.termination.collision),
         "end_on_arrival": int(scenario.termination.arrival),
+    }
+
+
+def _routes(scenario: Scenario) -> dict[str, Any]:
+    origin, routes = np.array(scenario.map.origin), scenario.routes
+    number = {route.name: i for i, route in enumerate(routes)}
+    choices = [[number[name] for name in vehicle.routes] for vehicle in scenario.vehicles]
+    places = [vehicle.goal and vehicle.goal.position for vehicle in scenario.vehicles]
+    counts = [point_count(route) for route in routes]
+    points = np.zeros((len(routes), max(counts, default=0), 3))
+    for route, row in zip(routes, points, strict=True):
+        row[: point_count(route)] = even_points(route) - [*origin[:2], 0.0]
+    return {
+        "first": np.cumsum([0, *(len(own) for own in choices)]),
+        "choice": [i for own in choices for i in own],
+        "goal": [np.array(place) - origin if place else NOWHERE for place in places],
+        "points": max([*counts, 2]),
+        "count": counts,
+        "point": points,
+        **{name: [getattr(route, name) for route in routes] for name in ("lateral_spread", "wander", "start_spread")},
+        "height": -origin[2],
     }
 
 

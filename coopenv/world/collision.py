@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.outcomes import Outcome
+from coopenv.world.route import goal_distance, has_routes, is_past_end
 
 UNDER_WAY = wp.constant(int(Outcome.UNDER_WAY))
 ARRIVED = wp.constant(int(Outcome.ARRIVED))
@@ -39,6 +40,12 @@ def boxes_touch(ca: Any, Ra: Any, ha: Any, cb: Any, Rb: Any, hb: Any) -> bool:
 @wp.func
 def touches_anything(model: Any, state: Any, world: int, vehicle: int) -> int:
     """Return 1 when a vehicle's box overlaps a building or another body."""
+    return touches_one_of(model, state, world, vehicle, model.agents)
+
+
+@wp.func
+def touches_one_of(model: Any, state: Any, world: int, vehicle: int, count: int) -> int:
+    """Return 1 when a vehicle's box overlaps a building or the body of another one of the first `count` agents."""
     agent = model.landmarks + vehicle
     half = model.scene.body_half[agent]
     if half[0] <= half.dtype(0.0):
@@ -55,7 +62,7 @@ def touches_anything(model: Any, state: Any, world: int, vehicle: int) -> int:
             model.scene.obstacle_half[k],
         ):
             return 1
-    for other in range(model.agents):
+    for other in range(count):
         other_half = model.scene.body_half[other]
         if other != agent and other_half[0] > half.dtype(0.0):
             other_R = state.rotation[world, other]
@@ -66,17 +73,14 @@ def touches_anything(model: Any, state: Any, world: int, vehicle: int) -> int:
 
 
 @wp.func
-def goal_distance(model: Any, state: Any, world: int, vehicle: int):
-    """Return the horizontal distance to the vehicle's goal, m."""
-    to_goal = model.scene.goal[vehicle] - state.position[world, model.landmarks + vehicle]
-    return wp.sqrt(to_goal[0] * to_goal[0] + to_goal[1] * to_goal[1])
-
-
-@wp.func
 def reaches_goal(model: Any, state: Any, world: int, vehicle: int) -> bool:
-    """Return whether a vehicle has a goal and is within its radius."""
+    """Return whether a vehicle has a goal and is within its radius, or past the end of the route that it drew."""
     radius = model.scene.goal_radius[vehicle]
-    return radius > radius.dtype(0.0) and goal_distance(model, state, world, vehicle) < radius
+    if radius <= radius.dtype(0.0):
+        return False
+    if goal_distance(model, state, world, vehicle) < radius:
+        return True
+    return has_routes(model, vehicle) and is_past_end(model, state, world, vehicle, radius)
 
 
 @wp.func

@@ -79,10 +79,27 @@ def model_struct(p: Precision) -> Any:
         obstacle_rotation: wp.array(dtype=mat33)  # (O,)
         obstacle_center: wp.array(dtype=vec3)  # (O,) m
         obstacle_half: wp.array(dtype=vec3)  # (O,) m
-        goal: wp.array(dtype=vec3)  # (N,) m
         goal_radius: wp.array(dtype=scalar)  # (N,) m; 0: no goal
         end_on_collision: wp.int32
         end_on_arrival: wp.int32
+
+    @wp.struct
+    class Routes:
+        """Where vehicles go: vehicle i draws one of the routes choice[first[i]] .. choice[first[i + 1] - 1].
+
+        One without routes goes straight to its goal.
+        """
+
+        first: wp.array(dtype=wp.int32)  # (N + 1,)
+        choice: wp.array(dtype=wp.int32)  # (C,)
+        goal: wp.array(dtype=vec3)  # (N,) m, of vehicles without routes
+        points: wp.int32  # of the route that has most
+        count: wp.array(dtype=wp.int32)  # (R,) points
+        point: wp.array2d(dtype=vec3)  # (R, P) as designed: x, y in m, map; heading in rad
+        lateral_spread: wp.array(dtype=scalar)  # (R,) m
+        wander: wp.array(dtype=scalar)  # (R,) m
+        start_spread: wp.array(dtype=scalar)  # (R,) m
+        height: scalar  # m, of the ground that routes lie on, map
 
     @wp.struct
     class Camera:
@@ -185,6 +202,7 @@ def model_struct(p: Precision) -> Any:
         motion: Motion
         dynamics: Dynamics
         scene: Scene
+        routes: Routes
         camera: wp.array(dtype=Camera)  # (N,)
         noise: wp.array(dtype=Noise)  # (N,)
         radio: Radio

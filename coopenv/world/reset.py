@@ -7,8 +7,9 @@ import warp as wp
 from coopenv.estimation.linalg import join6
 from coopenv.estimation.so3 import exp_so3, identity3, orthonormalise
 from coopenv.world.camera import NOT_A_NEIGHBOUR, observe
-from coopenv.world.collision import touches_anything
+from coopenv.world.collision import touches_anything, touches_one_of
 from coopenv.world.command import command_of
+from coopenv.world.draw_route import draw_route, go_straight, start_on_route
 from coopenv.world.dynamics import prescribe
 from coopenv.world.lasting_errors import draw_errors
 from coopenv.world.model import DRIVEN, PRESCRIBED
@@ -21,31 +22,54 @@ from coopenv.world.random import (
     uniform,
     unit_vector,
 )
+from coopenv.world.route import has_routes
 from coopenv.world.v2x import broadcast, deliver
+
+ATTEMPTS = wp.constant(16)
+"""How often the start of a vehicle with routes is drawn until it touches nothing that is there already."""
 
 
 @wp.func
 def place_agent(model: Any, state: Any, world: int, agent: int):
-    """Draw the true start pose of one agent and set its motion going."""
-    position = model.start.position[agent]
-    R = model.start.rotation[agent]
+    """Draw the true start pose of one agent, and its route, and set its motion going; those before it are in place."""
+    vehicle = agent - model.landmarks
+    if vehicle < 0:
+        place_at(model, state, world, agent, model.start.position[agent], model.start.rotation[agent], 0)
+        return
+    state.ended[world, vehicle] = 0
+    if not has_routes(model, vehicle):
+        place_at(model, state, world, agent, model.start.position[agent], model.start.rotation[agent], 0)
+        go_straight(model, state, world, vehicle)
+        return
+    for attempt in range(ATTEMPTS):
+        s = draw_route(model, state, world, vehicle, attempt)
+        position, R = start_on_route(model, state, world, vehicle, s)
+        place_at(model, state, world, agent, position, R, attempt)
+        if touches_one_of(model, state, world, vehicle, agent) == 0:
+            break
+
+
+@wp.func
+def place_at(model: Any, state: Any, world: int, agent: int, position: Any, R: Any, attempt: int):
+    """Draw the true start pose of one agent about a given one and set its motion going."""
     spread = model.start.position_spread[agent]
     o = type(position)()
     one = o.dtype(1.0)
-    words = random_words(state.seed[world], state.episode[world], 0, agent, RESET_POSE)
+    words = random_words(state.seed[world], state.episode[world], attempt, agent, RESET_POSE)
     offset = type(o)(
         spread[0] * signed_uniform(words[0], one),
         spread[1] * signed_uniform(words[1], one),
         spread[2] * signed_uniform(words[2], one),
     )
     turn = model.start.yaw_spread[agent] * signed_uniform(words[3], one)
-    position = position + R * offset
+    place = position + R * offset
+    turned = R
     if turn != o[0]:
-        R = R * exp_so3(type(o)(o[0], o[0], turn))
-    state.start_position[world, agent] = position
-    state.start_rotation[world, agent] = R
-    state.position[world, agent] = position
-    state.rotation[world, agent] = R
+        turned = R * exp_so3(type(o)(o[0], o[0], turn))
+    state.start_position[world, agent] = place
+    state.start_rotation[world, agent] = turned
+    state.position[world, agent] = place
+    state.rotation[world, agent] = turned
     state.velocity[world, agent] = o
     state.angular_velocity[world, agent] = o
     if model.motion.kind[agent] == PRESCRIBED:
@@ -72,7 +96,6 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
     state.last_command[world, vehicle] = command
     if model.motion.kind[agent] == DRIVEN:
         state.velocity[world, agent] = type(o)(speed, o[0], o[0])
-    state.ended[world, vehicle] = 0
     state.odometry_velocity[world, vehicle] = o
     state.odometry_angular_velocity[world, vehicle] = o
     state.odometry_samples[world, vehicle] = 0

@@ -65,6 +65,10 @@ FLAG = whole(0, 1)
 NUMBER = numbers()
 TICK = whole(-1, "tick")  # a tick of the past or the present one; -1: never
 ODOMETRY_SAMPLES = Rule("as many as at this tick", _odometry_samples)
+ROUTE_COUNT = Rule(
+    "0, or how many points a route may have",
+    lambda values, fields, model: (values == 0) | ((values >= 2) & (values <= model.routes.points)),
+)
 DIRECTION = Rule(
     "a unit vector, or zero",
     lambda values, fields, model: are_unit_vectors(values, TOLERANCE[values.dtype]) | everywhere(values == 0.0, -1),

@@ -1,7 +1,7 @@
 """The changing side of a world: one record of arrays with leading axes (world, agent or vehicle).
 
 W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders), M odometry samples a tick, S slots of
-the radio's outbox, B blocks of the sliding Gramian.
+the radio's outbox, B blocks of the sliding Gramian, P points of a route.
 """
 
 from collections.abc import Mapping
@@ -23,6 +23,7 @@ from coopenv.world.saved_state import (
     NUMBER,
     ODOMETRY_SAMPLES,
     ROTATION,
+    ROUTE_COUNT,
     TICK,
     Rule,
     numbers,
@@ -43,6 +44,11 @@ def state_struct(p: Precision) -> Any:
         episode: array("W", wp.uint32)
         tick: array("W", wp.int32)  # camera ticks since the reset
         exhausted: array("W", wp.int32)  # 1: its source has no more ticks, the episode is over
+
+        route: array("WNP", vec3)  # x, y in m, map; arc length s from the first point, m
+        route_count: array("WN", wp.int32)  # points of it; 0: no goal
+        route_drawn: array("WN", wp.int32)  # number of the scenario's route that it is drawn from; -1: of none
+        goal: array("WN", vec3)  # m, map
 
         start_rotation: array("WA", mat33)
         start_position: array("WA", vec3)  # map
@@ -107,6 +113,8 @@ VALID: dict[str, Rule] = {
     "episode": ANYTHING,
     "tick": whole(0, "horizon_ticks"),
     "exhausted": FLAG,
+    "route_count": ROUTE_COUNT,
+    "route_drawn": whole(-1, 10**6),
     "start_rotation": ROTATION,
     "rotation": ROTATION._replace(of_truth=True),
     "position": NUMBER._replace(of_truth=True),
@@ -140,7 +148,7 @@ VALID: dict[str, Rule] = {
 def state_sizes(model: Any, worlds: int) -> dict[str, int]:
     """Return the length of every axis of the state, and of an observer's memory, by its letter."""
     ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
-    return {"W": worlds, "A": model.agents, "N": model.vehicles, **ticks}
+    return {"W": worlds, "A": model.agents, "N": model.vehicles, "P": model.routes.points, **ticks}
 
 
 def allocate_state(model: Any, worlds: int, p: Precision, device: str, shared: str = "") -> Any:

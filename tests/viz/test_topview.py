@@ -33,6 +33,7 @@ from coopenv.viz.topview_geometry import (
     position_covariance,
 )
 from coopenv.viz.topview_ground import HEIGHT, PANEL, ROW, TABLE_TOP, WIDTH
+from tests.helpers.builders import scenario
 
 
 @pytest.fixture(scope="module")
@@ -313,3 +314,23 @@ def test_window_is_reused_and_stays_away_once_closed_by_the_user(monkeypatch: py
     assert len(plt.get_fignums()) == len(already) + 1
     view.close()
     assert set(plt.get_fignums()) == already
+
+
+def test_drawn_routes_and_goals_are_where_the_state_says() -> None:
+    """A thin line of the vehicle's colour, and the white disc of its goal, in two episodes with other draws."""
+    route = {"name": "way", "waypoints": [[-6, 0], [0, 0], [0, 6]], "corner_radius": 3.0, "lateral_spread": 2.0}
+    made = scenario([{"routes": ["way"], "motion": {"kind": "driven"}, "goal": {"radius": 0.6}}], routes=[route])
+    engine, view = Engine(made), TopView(made)
+    seen = []
+    for seed in (0, 1):
+        engine.reset([seed])
+        picture = view.draw(engine)
+        x, y, _ = engine.view("route")[0, 0, int(0.6 * engine.view("route_count")[0, 0])]
+        around = [at(picture, view, x + dx, y) for dx in np.linspace(-0.05, 0.05, 5)]
+        colour = 255 * np.array(to_rgb(vehicle_colour(0)))
+        assert min(np.abs(pixel - colour).max() for pixel in around) < 130
+        assert at(picture, view, x + 0.4, y + 0.4).min() > 230
+        goal_x, goal_y = engine.view("goal")[0, 0, :2]
+        assert at(picture, view, goal_x + 0.35, goal_y).min() > 245
+        seen.append(picture)
+    assert (seen[0] != seen[1]).any()

@@ -19,8 +19,9 @@ from coopenv.api.terms.records import Ego, Neighbour, Target, Truth, neighbour_r
 from coopenv.api.terms.way import way_made
 from coopenv.errors import CoopenvError
 from coopenv.world import kernel_cache
-from coopenv.world.collision import UNDER_WAY, goal_distance
+from coopenv.world.collision import UNDER_WAY
 from coopenv.world.precision import Precision
+from coopenv.world.route import remaining_way
 
 
 @cache
@@ -85,16 +86,16 @@ def results_kernel(terms: Terms, p: Precision) -> wp.Kernel:
         world, vehicle = wp.tid()
         if chosen[world] == 0:
             return
-        distance = goal_distance(model, state, world, vehicle)
+        way = remaining_way(model, state, world, vehicle)
         assess(model, state, results, world, vehicle)
         if fresh[world] != 0:
-            way, _ = way_made(model, state, world, vehicle)
-            remember(results, world, vehicle, distance, way, UNDER_WAY, 0)
+            made, _ = way_made(model, state, world, vehicle)
+            remember(results, world, vehicle, way, made, UNDER_WAY, 0)
         ended = state.ended[world, vehicle]
         set_flags(results, world, vehicle, ended, is_over(model, state, world), model.horizon_ticks)
-        ego, truth = own_records(model, state, results, world, vehicle, distance)
-        furthest = results.furthest[world, vehicle] + type(distance)(ego.metres_gained)
-        remember(results, world, vehicle, distance, furthest, ended, state.tick[world])
+        ego, truth = own_records(model, state, results, world, vehicle, way)
+        furthest = results.furthest[world, vehicle] + type(way)(ego.metres_gained)
+        remember(results, world, vehicle, way, furthest, ended, state.tick[world])
         total = float(0.0)
         for k in range(wp.static(len(rewards))):
             value = wp.static(rewards[k])(ego, truth)
@@ -131,8 +132,8 @@ def endings_kernel(conditions: tuple[Bound, ...], p: Precision) -> wp.Kernel:
         decided = tick > 0 and (tick % model.ticks_per_decision == 0 or tick == model.horizon_ticks)
         if decided and state.ended[world, vehicle] == UNDER_WAY:
             assess(model, state, results, world, vehicle)
-            distance = goal_distance(model, state, world, vehicle)
-            ego, truth = own_records(model, state, results, world, vehicle, distance)
+            way = remaining_way(model, state, world, vehicle)
+            ego, truth = own_records(model, state, results, world, vehicle, way)
             for k in range(wp.static(len(fulfilled))):
                 if state.ended[world, vehicle] == UNDER_WAY and wp.static(fulfilled[k])(ego, truth):
                     state.ended[world, vehicle] = wp.static(conditions[k].number)

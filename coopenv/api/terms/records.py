@@ -13,6 +13,7 @@ import warp as wp
 from coopenv.api.terms.way import metres
 from coopenv.world.camera import VISIBLE
 from coopenv.world.collision import UNDER_WAY
+from coopenv.world.route import goal_distance
 from coopenv.world.v2x import fresh
 
 NEVER = wp.constant(wp.float64(1.0e9))
@@ -63,7 +64,7 @@ class Truth:
     orientation_error: wp.float32  # deg, geodesic
     nees: wp.float32
     goal_distance: wp.float32  # m, horizontal
-    progress: wp.float32  # m nearer to the goal than at the last decision; 0 without a goal
+    progress: wp.float32  # m less way to the goal, along a drawn route, than at the last decision; 0 without a goal
     contact: wp.bool  # touching a building or another body now
 
 
@@ -108,11 +109,11 @@ def odometry_age(samples: int, time: wp.float64, rate: wp.float64) -> wp.float32
 
 
 @wp.func
-def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, goal_distance: Any):
+def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, way: Any):
     """Return the records of a vehicle: what it knows, and what is true.
 
-    `results` holds how good its estimate is, and what was so after the last decision. One function for both, as model,
-    state and results are handed over by value, over which compilers take their time.
+    `results` holds how good its estimate is, and what was so after the last decision; `way` is left to its goal, m.
+    One function for both, as model, state and results are handed over by value, over which compilers take their time.
     """
     ego = Ego()
     tick = state.tick[world]
@@ -145,7 +146,7 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     ego.effort = wp.float32(wp.dot(action, action))
     ego.command = wp.vec3(state.command[world, vehicle])
     if model.scene.goal_radius[vehicle] > p.dtype(0.0):
-        ego.goal = wp.vec3(wp.transpose(R) * model.scene.goal[vehicle] - p)
+        ego.goal = wp.vec3(wp.transpose(R) * state.goal[world, vehicle] - p)
     ego.outcome = wp.where(results.alive[world, vehicle], state.ended[world, vehicle], UNDER_WAY)
 
     truth = Truth()
@@ -157,9 +158,9 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     truth.position_error = known(results.position_error[world, vehicle])
     truth.orientation_error = known(results.orientation_error[world, vehicle])
     truth.nees = known(results.nees[world, vehicle])
-    truth.goal_distance = known(goal_distance)
+    truth.goal_distance = known(goal_distance(model, state, world, vehicle))
     if model.scene.goal_radius[vehicle] > p.dtype(0.0):
-        truth.progress = known(results.last_goal_distance[world, vehicle] - goal_distance)
+        truth.progress = known(results.last_way[world, vehicle] - way)
     truth.contact = state.collided[world, vehicle] != 0
     return ego, truth
 

@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.world.collision import ARRIVED
+from coopenv.world.route import place_on_route, route_length
 
 FASTEST = wp.constant(wp.float64(2.0))
 """A vehicle's way grows at most by so many times its top speed (a bend's inside is shorter): a jump is no driving."""
@@ -13,16 +14,10 @@ FASTEST = wp.constant(wp.float64(2.0))
 @wp.func
 def way_made(model: Any, state: Any, world: int, vehicle: int):
     """Return (how far along its way the vehicle believes to be, how long that is), m; (0, 0) without a goal."""
-    agent = model.landmarks + vehicle
     p = state.estimate_rotation[world, vehicle] * state.estimate_position[world, vehicle]
-    zero = p.dtype(0.0)
-    if model.scene.goal_radius[vehicle] <= zero:
-        return zero, zero
-    start = model.start.position[agent]
-    line = model.scene.goal[vehicle] - start
-    length = wp.sqrt(line[0] * line[0] + line[1] * line[1])
-    along = (p[0] - start[0]) * line[0] + (p[1] - start[1]) * line[1]
-    return wp.clamp(along / wp.max(length, p.dtype(1.0e-6)), zero, length), length
+    s, _, _ = place_on_route(state, world, vehicle, p[0], p[1])
+    length = route_length(state, world, vehicle)
+    return wp.clamp(s, p.dtype(0.0), length), length
 
 
 @wp.func

@@ -1,0 +1,145 @@
+"""Routes that vehicles follow: lines through waypoints with rounded corners, as points at even arc length."""
+
+import math
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
+from typing import NamedTuple, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from coopenv.scenario.base import NonNegative, Part, Vector2
+
+SPACING = 0.25  # m between the points of a route that is not straight ...
+MOST_POINTS = 64  # ... and how many there are at most
+
+STRAIGHT = 1e-6  # rad; a smaller turn at a waypoint is no corner
+
+
+class Route(Part):
+    """A way that vehicles are to go, of which every reset draws a variant."""
+
+    name: str = Field(min_length=1, max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
+    waypoints: tuple[Vector2, ...] = Field(min_length=2, max_length=1000)
+    """x and y in the coordinates of this file, m; the route lies at z = 0 and must not come near itself."""
+    corner_radius: NonNegative = 0.0
+    """Radius of the arcs that round the corners, m."""
+    lateral_spread: NonNegative = 0.0
+    """Half-width of a uniform sideways shift of the whole route, m."""
+    wander: NonNegative = 0.0
+    """Largest further sideways deviation, m: two waves with random phases, which vanish at both ends."""
+    start_spread: NonNegative = 0.0
+    """The start is drawn uniformly along the first so many metres."""
+
+    @property
+    def breadth(self) -> float:
+        """Farthest that a drawn route is from the waypoints' line, m."""
+        return self.lateral_spread + self.wander
+
+    @model_validator(mode="after")
+    def _is_possible(self) -> Self:
+        for problem in _problems(self):
+            raise ValueError(problem)
+        return self
+
+
+class Piece(NamedTuple):
+    """A straight line, or an arc."""
+
+    position: np.ndarray  # (2,) m, where it begins
+    heading: float  # rad, there
+    curvature: float  # 1/m, positive to the left
+    length: float  # m
+
+
+def route_length(route: Route) -> float:
+    """Return the length of a route as designed, m."""
+    return math.fsum(piece.length for piece in _pieces(route))
+
+
+def point_count(route: Route) -> int:
+    """Return how many points describe a route; those of a straight line are its ends."""
+    straight = len(_turns(route)) == 0 and route.wander == 0.0
+    return 2 if straight else min(MOST_POINTS, math.ceil(route_length(route) / SPACING) + 1)
+
+
+def route_points(route: Route, s: np.ndarray) -> np.ndarray:
+    """Return (x, y, heading), (K, 3) in m and rad, of a route as designed at arc lengths s (K,), m."""
+    pieces = list(_pieces(route))
+    begin = np.concatenate([[0.0], np.cumsum([piece.length for piece in pieces])[:-1]])
+    which = np.clip(np.searchsorted(begin, s, side="right") - 1, 0, None)
+    position = np.array([piece.position for piece in pieces])[which]
+    heading, curvature = (np.array([piece[k] for piece in pieces])[which] for k in (1, 2))
+    h = np.asarray(s) - begin[which]
+    turn = curvature * h
+    chord, middle = h * np.sinc(turn / (2 * np.pi)), heading + turn / 2
+    return np.column_stack([position + chord[:, None] * _direction(middle), heading + turn])
+
+
+def even_points(route: Route) -> np.ndarray:
+    """Return the points (K, 3) of `point_count` at even arc length from end to end."""
+    return route_points(route, np.linspace(0.0, route_length(route), point_count(route)))
+
+
+def _direction(heading: np.ndarray) -> np.ndarray:
+    return np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+
+
+def _legs(route: Route) -> tuple[np.ndarray, np.ndarray]:
+    """Return lengths and headings (L,) of the lines between the waypoints."""
+    leg = np.diff(np.array(route.waypoints), axis=0)
+    return np.linalg.norm(leg, axis=1), np.arctan2(leg[:, 1], leg[:, 0])
+
+
+def _turns(route: Route) -> dict[int, float]:
+    """Return the turns at the corners by the number of the waypoint, rad, positive to the left."""
+    _, heading = _legs(route)
+    turns = (np.diff(heading) + np.pi) % (2 * np.pi) - np.pi
+    return {i + 1: float(turn) for i, turn in enumerate(turns) if abs(turn) > STRAIGHT}
+
+
+def _cuts(route: Route) -> Sequence[float]:
+    """Return how far before and behind each waypoint its arc begins and ends, m."""
+    turns = _turns(route)
+    return [route.corner_radius * math.tan(abs(turns.get(i, 0.0)) / 2) for i in range(len(route.waypoints))]
+
+
+def _problems(route: Route) -> Iterator[str]:
+    lengths, _ = _legs(route)
+    for i, length in enumerate(lengths):
+        if length < 1e-6:
+            yield f"waypoints.{i + 1}: the same place as the waypoint before"
+    turns = _turns(route)
+    for i, turn in turns.items():
+        if abs(turn) > math.pi - 1e-3:
+            yield f"waypoints.{i}: the route turns back on itself there"
+    cuts = _cuts(route)
+    for i, ((a, b), length) in enumerate(zip(pairwise(cuts), lengths, strict=True)):
+        if a + b > length + 1e-9:
+            corner = i if a > b else i + 1
+            yield (
+                f"corner_radius: {route.corner_radius:g} m is too large for the corner at waypoints.{corner}: its arc "
+                f"does not fit into the {length:g} m between waypoints.{i} and waypoints.{i + 1}"
+            )
+    if turns and route.breadth > 0.0 and route.breadth >= route.corner_radius:
+        yield (
+            f"corner_radius: {route.corner_radius:g} m must be above lateral_spread + wander ({route.breadth:g} m), or "
+            "the route would fold in its corners"
+        )
+    if route.start_spread >= (total := route_length(route)):
+        yield f"start_spread: {route.start_spread:g} m must be below the route's length ({total:g} m)"
+
+
+def _pieces(route: Route) -> Iterator[Piece]:
+    lengths, headings = _legs(route)
+    turns, cuts = _turns(route), _cuts(route)
+    for i, (length, heading) in enumerate(zip(lengths, headings, strict=True)):
+        ahead = _direction(heading)
+        straight = length - cuts[i] - cuts[i + 1]
+        if straight > 1e-9:
+            yield Piece(np.array(route.waypoints[i]) + cuts[i] * ahead, float(heading), 0.0, float(straight))
+        if cuts[i + 1] > 0.0:
+            turn = turns[i + 1]
+            begin = np.array(route.waypoints[i + 1]) - cuts[i + 1] * ahead
+            arc = route.corner_radius * abs(turn)
+            yield Piece(begin, float(heading), math.copysign(1.0 / route.corner_radius, turn), arc)

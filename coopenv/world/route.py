@@ -1,0 +1,139 @@
+"""The route of a vehicle: a line of points (x, y, s) in the map frame, s the arc length from its first point, m.
+
+Beyond its ends a route goes on straight: s is negative before the first point and above the length behind the last.
+"""
+
+from typing import Any
+
+import warp as wp
+
+
+@wp.func
+def has_routes(model: Any, vehicle: int) -> bool:
+    """Return whether a vehicle's route is drawn among the scenario's (otherwise it leads straight to its goal)."""
+    return model.routes.first[vehicle + 1] > model.routes.first[vehicle]
+
+
+@wp.func
+def route_length(state: Any, world: int, vehicle: int):
+    """Return the length of a vehicle's route, m; 0 without one."""
+    length = type(state.speed[world, vehicle])(0.0)
+    if state.route_count[world, vehicle] > 0:
+        length = state.route[world, vehicle, state.route_count[world, vehicle] - 1][2]
+    return length
+
+
+@wp.func
+def route_tangent(state: Any, world: int, vehicle: int, segment: int, share: Any):
+    """Return the horizontal direction of a route, of length 1, at a share in [0, 1] of the way along a segment.
+
+    At a point it is parallel to the chord of its neighbours, along a segment it turns evenly.
+    """
+    last = state.route_count[world, vehicle] - 1
+    before = state.route[world, vehicle, wp.max(segment - 1, 0)]
+    begin = state.route[world, vehicle, segment]
+    end = state.route[world, vehicle, segment + 1]
+    after = state.route[world, vehicle, wp.min(segment + 2, last)]
+    zero = share - share
+    first = wp.normalize(type(begin)(end[0] - before[0], end[1] - before[1], zero))
+    second = wp.normalize(type(begin)(after[0] - begin[0], after[1] - begin[1], zero))
+    return wp.normalize(first + (second - first) * share)
+
+
+@wp.func
+def place_on_route(state: Any, world: int, vehicle: int, x: Any, y: Any):
+    """Return (s, lateral offset, heading) of the place of a vehicle's route that is nearest to a point of the map.
+
+    Arguments and results in m and rad; the offset of the point is positive to the left of the route. All are 0
+    without a route.
+    """
+    count = state.route_count[world, vehicle]
+    zero = x - x
+    if count < 2:
+        return zero, zero, zero
+    one = zero + type(zero)(1.0)
+    nearest = one * type(zero)(1.0e18)
+    segment = int(0)
+    share = zero
+    for k in range(count - 1):
+        a = state.route[world, vehicle, k]
+        b = state.route[world, vehicle, k + 1]
+        dx = b[0] - a[0]
+        dy = b[1] - a[1]
+        along = ((x - a[0]) * dx + (y - a[1]) * dy) / (dx * dx + dy * dy)
+        inside = wp.clamp(along, zero, one)
+        ex = x - a[0] - inside * dx
+        ey = y - a[1] - inside * dy
+        distance = ex * ex + ey * ey
+        if distance < nearest:
+            nearest = distance
+            segment = k
+            share = along
+    a = state.route[world, vehicle, segment]
+    b = state.route[world, vehicle, segment + 1]
+    if segment > 0:
+        share = wp.max(share, zero)
+    if segment < count - 2:
+        share = wp.min(share, one)
+    inside = wp.clamp(share, zero, one)
+    tangent = route_tangent(state, world, vehicle, segment, inside)
+    ex = x - a[0] - share * (b[0] - a[0])
+    ey = y - a[1] - share * (b[1] - a[1])
+    side = tangent[0] * ey - tangent[1] * ex
+    lateral = wp.sqrt(ex * ex + ey * ey) * wp.where(side < zero, -one, one)
+    return a[2] + share * (b[2] - a[2]), lateral, wp.atan2(tangent[1], tangent[0])
+
+
+@wp.func
+def point_on_route(state: Any, world: int, vehicle: int, s: Any):
+    """Return (x, y, heading) of a vehicle's route at an arc length, m and rad; 0 without a route."""
+    count = state.route_count[world, vehicle]
+    zero = s - s
+    if count < 2:
+        return zero, zero, zero
+    segment = int(0)
+    beyond = count - 1
+    while segment + 1 < beyond:
+        middle = (segment + beyond) // 2
+        if state.route[world, vehicle, middle][2] <= s:
+            segment = middle
+        else:
+            beyond = middle
+    a = state.route[world, vehicle, segment]
+    b = state.route[world, vehicle, segment + 1]
+    share = (s - a[2]) / (b[2] - a[2])
+    tangent = route_tangent(state, world, vehicle, segment, wp.clamp(share, zero, zero + type(zero)(1.0)))
+    return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), wp.atan2(tangent[1], tangent[0])
+
+
+@wp.func
+def goal_distance(model: Any, state: Any, world: int, vehicle: int):
+    """Return the horizontal distance to the vehicle's goal, m."""
+    to_goal = state.goal[world, vehicle] - state.position[world, model.landmarks + vehicle]
+    return wp.sqrt(to_goal[0] * to_goal[0] + to_goal[1] * to_goal[1])
+
+
+@wp.func
+def remaining_way(model: Any, state: Any, world: int, vehicle: int):
+    """Return the way left to the goal, m: along the route that was drawn, or as the crow flies where none was."""
+    if has_routes(model, vehicle):
+        p = state.position[world, model.landmarks + vehicle]
+        s, _, _ = place_on_route(state, world, vehicle, p[0], p[1])
+        return wp.max(route_length(state, world, vehicle) - s, p.dtype(0.0))
+    return goal_distance(model, state, world, vehicle)
+
+
+@wp.func
+def is_past_end(model: Any, state: Any, world: int, vehicle: int, radius: Any) -> bool:
+    """Return whether a vehicle has left its drawn route behind, no farther than `radius` beside its prolongation."""
+    count = state.route_count[world, vehicle]
+    if count < 2:
+        return False
+    p = state.position[world, model.landmarks + vehicle]
+    end = state.route[world, vehicle, count - 1]
+    before = state.route[world, vehicle, count - 2]
+    # Nearly always a look at the last segment is enough.
+    if (p[0] - end[0]) * (end[0] - before[0]) + (p[1] - end[1]) * (end[1] - before[1]) < p.dtype(0.0):
+        return False
+    s, lateral, _ = place_on_route(state, world, vehicle, p[0], p[1])
+    return s >= end[2] and wp.abs(lateral) < radius

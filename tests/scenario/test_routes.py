@@ -1,0 +1,129 @@
+"""Routes as designed: lines and arcs against closed forms, and routes that cannot be."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from coopenv import ScenarioError
+from coopenv.scenario.files import apply_vehicle_defaults, parse_scenario
+from coopenv.scenario.routes import MOST_POINTS, Route, even_points, point_count, route_length, route_points
+from tests.helpers.builders import raw, scenario, vehicle
+
+LEFT_TURN = {"name": "left", "waypoints": [[-6.0, -0.5], [0.5, -0.5], [0.5, 7.0]], "corner_radius": 2.0}
+DRIVEN = {"kind": "driven"}
+
+
+def route(**values: Any) -> Route:
+    return Route.model_validate({**LEFT_TURN, **values})
+
+
+def test_a_corner_is_an_arc() -> None:
+    made = route()
+    assert route_length(made) == pytest.approx(4.5 + np.pi + 5.5)
+    s = np.linspace(0.0, 4.5 + np.pi + 5.5, 101)
+    x, y, heading = route_points(made, s).T
+    on_arc = (s > 4.5) & (s < 4.5 + np.pi)
+    angle = (s - 4.5) / 2.0
+    np.testing.assert_allclose(x, np.where(on_arc, -1.5 + 2 * np.sin(angle), np.minimum(-6 + s, 0.5)), atol=1e-12)
+    late = np.maximum(-0.5, 1.5 + s - 4.5 - np.pi)
+    np.testing.assert_allclose(y, np.where(on_arc, 1.5 - 2 * np.cos(angle), late), atol=1e-12)
+    np.testing.assert_allclose(heading, np.clip(angle, 0.0, np.pi / 2), atol=1e-12)
+
+
+@given(
+    turn=st.floats(-2.8, 2.8).filter(lambda angle: abs(angle) > 1e-3),
+    radius=st.floats(0.0, 1.5),
+    heading=st.floats(-3.0, 3.0),
+)
+@settings(max_examples=50, deadline=None)
+def test_a_route_is_smooth_and_as_long_as_it_says(turn: float, radius: float, heading: float) -> None:
+    """By the chords of a fine division; headings are those of the chords."""
+    legs = 10.0 * np.array([[np.cos(a), np.sin(a)] for a in (heading, heading + turn)])
+    waypoints = np.vstack([np.zeros(2), np.cumsum(legs, axis=0)])
+    made = route(waypoints=waypoints.tolist(), corner_radius=radius if np.tan(abs(turn) / 2) * radius < 10 else 0.0)
+    length = route_length(made)
+    points = route_points(made, np.linspace(0.0, length, 4001))
+    step = np.diff(points[:, :2], axis=0)
+    assert np.linalg.norm(step, axis=1).sum() == pytest.approx(length, rel=1e-3)
+    np.testing.assert_allclose(points[[0, -1], :2], waypoints[[0, 2]], atol=1e-9)
+    if made.corner_radius > 0.1:
+        ahead = np.exp(1j * points[:-1, 2]) + np.exp(1j * points[1:, 2])
+        chord = step @ [1, 1j]
+        np.testing.assert_allclose(ahead / np.abs(ahead), chord / np.abs(chord), atol=5e-3 / radius)
+
+
+def test_points_are_at_even_arc_length_and_few() -> None:
+    assert point_count(route(waypoints=[[0, 0], [100, 0]])) == 2
+    assert point_count(route(waypoints=[[0, 0], [4, 0]], wander=0.1)) == 17
+    long = route(waypoints=[[0, 0], [500, 0], [500, 500]], corner_radius=100)
+    assert point_count(long) == MOST_POINTS
+    steps = np.linalg.norm(np.diff(even_points(route())[:, :2], axis=0), axis=1)
+    assert steps.max() < 0.25
+    np.testing.assert_allclose(steps, steps.max(), rtol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"corner_radius": 7.0}, r"routes.0.corner_radius: 7 m is too large for the corner at waypoints.1"),
+        ({"waypoints": [[0, 0], [0, 0]]}, r"routes.0.waypoints.1: the same place as the waypoint before"),
+        ({"waypoints": [[0, 0], [5, 0], [1, 0]]}, r"routes.0.waypoints.1: the route turns back on itself there"),
+        ({"waypoints": [[0, 0]]}, r"routes.0.waypoints: too few entries, number 2 is missing|at least 2"),
+        ({"lateral_spread": 1.5, "wander": 0.5}, r"routes.0.corner_radius: 2 m must be above lateral_spread \+ wander"),
+        ({"start_spread": 14.0}, r"routes.0.start_spread: 14 m must be below the route's length \(13.1416 m\)"),
+        ({"name": "1st"}, r"routes.0.name"),
+        ({"wonder": 0.1}, r"routes.0.wonder: unknown key \(did you mean 'wander'\?\)"),
+    ],
+)
+def test_impossible_routes(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(ScenarioError, match=message):
+        scenario([{"routes": ["left"], "motion": DRIVEN}], routes=[{**LEFT_TURN, **wrong}])
+
+
+@pytest.mark.parametrize(
+    ("car", "message"),
+    [
+        ({"routes": ["lift"], "motion": DRIVEN}, r"vehicles.0.routes: unknown route 'lift' \(did you mean 'left'\?\)"),
+        ({"routes": ["left"]}, r"vehicles.0.routes: for driven vehicles; the motion of this one is 'static'"),
+        (vehicle(routes=["left"], motion=DRIVEN), r"vehicles.0.initial_pose.position: .* starts on its route"),
+        (
+            {"routes": ["left"], "motion": DRIVEN, "goal": {"position": [0, 0, 0]}},
+            r"vehicles.0.goal.position: .* goes to the end of its route",
+        ),
+        ({"motion": DRIVEN, "initial_pose": {"yaw": 1.0}}, r"vehicles.0.initial_pose.position: needed by a vehicle"),
+        (vehicle(goal={"radius": 1.0}), r"vehicles.0.goal.position: needed by a vehicle without routes"),
+        ({"motion": DRIVEN}, r"vehicles.0.initial_pose: needed, with at least a position"),
+    ],
+)
+def test_vehicles_that_do_not_fit_their_routes(car: dict[str, Any], message: str) -> None:
+    with pytest.raises(ScenarioError, match=message):
+        scenario([car], routes=[LEFT_TURN])
+
+
+def test_names_of_routes_are_free() -> None:
+    with pytest.raises(ScenarioError, match="routes: the name 'left' is used twice"):
+        scenario(**{"routes": [LEFT_TURN, LEFT_TURN]})
+
+
+def test_a_route_must_not_begin_in_a_building() -> None:
+    wall = {"name": "wall", "center": [-5.0, 0.7, 0.5], "size": [2.0, 1.0, 1.0]}
+    body = {"size": [0.5, 0.3, 0.3]}
+    car = {"routes": ["left"], "motion": DRIVEN, "body": body}
+    scenario([car], routes=[LEFT_TURN], obstacles=[wall])
+    for spread in ({"lateral_spread": 0.6}, {"lateral_spread": 0.6, "start_spread": 1.0}):
+        with pytest.raises(ScenarioError, match="vehicle_1 starts inside obstacle 'wall'"):
+            scenario([car], routes=[{**LEFT_TURN, **spread}], obstacles=[wall])
+
+
+def test_defaults_may_give_the_spreads() -> None:
+    plain = raw([{"routes": ["left"]}], routes=[LEFT_TURN])
+    plain["vehicle_defaults"] = {"motion": DRIVEN, "initial_pose": {"yaw_spread": 0.1}, "goal": {"radius": 0.7}}
+    made = parse_scenario(apply_vehicle_defaults(plain), "test").vehicles[0]
+    assert made.initial_pose is not None
+    assert (made.initial_pose.yaw_spread, made.goal_radius) == (0.1, 0.7)
+    assert scenario([{"routes": ["left"], "motion": DRIVEN}], routes=[LEFT_TURN]).vehicles[0].goal_radius == 0.5
