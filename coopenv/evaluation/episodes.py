@@ -103,6 +103,7 @@ def drive(
     agents = [first + i for i in chosen]
     with engine.stopping():
         engine.reset(seeds)
+        goal = np.where(view("route_count")[:, chosen, None] > 0, view("goal")[:, chosen, :2], np.nan)
         restart(policy, np.ones(rows, dtype=bool))
         place = [view("position")[:, agents, :2].astype(np.float32)]
         headings = []
@@ -127,16 +128,10 @@ def drive(
         **record,
         position=np.stack(place),
         heading=np.stack(headings),
-        goal=_goals(scenario, len(seeds))[:, chosen],
+        goal=goal,
         outcome=view("ended")[:, chosen].copy(),
     )
 
 
 ERRORS = ("position_error", "orientation_error")
 KEPT = ("alive", *ERRORS, "targets_in_view", "reward")
-
-
-def _goals(scenario: Scenario, worlds: int) -> np.ndarray:
-    origin = np.array(scenario.map.origin)[:2]
-    goals = [v.goal.position[:2] if v.goal else (np.nan, np.nan) for v in scenario.vehicles]
-    return np.tile(np.array(goals, float) - origin, (worlds, 1, 1))
