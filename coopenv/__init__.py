@@ -22,6 +22,7 @@ from coopenv.errors import (
     ScenarioError,
     UnknownEnvironmentError,
 )
+from coopenv.seeds import EVALUATION_SEEDS, evaluation_seed
 from coopenv.shipped import list_envs
 
 if TYPE_CHECKING:
@@ -65,6 +66,7 @@ else:
 
 
 __all__ = [
+    "EVALUATION_SEEDS",
     "ActionError",
     "Comparison",
     "CoopenvError",
@@ -77,6 +79,7 @@ __all__ = [
     "ScenarioError",
     "UnknownEnvironmentError",
     "compare",
+    "evaluation_seed",
     "list_envs",
     "load_scenario",
     "make_vec",

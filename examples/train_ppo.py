@@ -131,7 +131,7 @@ def evaluate(act: Callable[[Tensor], Tensor], args: Arguments) -> dict[str, floa
     env = coopenv.make_vec(
         args.env, num_worlds=args.evaluation_worlds, device=args.device, autoreset="disabled", arrays="torch"
     )
-    observation, _ = env.reset(seed=args.seed + 1_000_000)
+    observation, _ = env.reset(seed=coopenv.evaluation_seed(args.seed))
     tally = Tally(env.num_envs, args.device)
     over = torch.zeros(env.num_envs, dtype=torch.bool, device=args.device)
     for _ in range(round(env.scenario.horizon * env.scenario.rates.decision)):

@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parents[1] / "coopenv"
 
 ROOMS = (
-    ("errors", "shipped", "machine", "files", "staging", "interrupts", "format", "jsonable", "user_code"),
+    ("errors", "shipped", "machine", "files", "staging", "interrupts", "format", "jsonable", "user_code", "seeds"),
     ("scenario",),
     ("estimation",),
     ("world",),

@@ -1,12 +1,11 @@
 """The batched core under every interface: worlds plus step results, with constant Python work per step."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import warp as wp
-from gymnasium.utils import seeding
 
 from coopenv.api.plugins import PlugIns
 from coopenv.api.reward import RewardFunction, Step, check_finite, check_function, reward_of
@@ -19,12 +18,14 @@ from coopenv.backends.simulated import Simulated
 from coopenv.backends.tick_world import open_world
 from coopenv.errors import CoopenvError, check_memory, told
 from coopenv.scenario import Scenario
+from coopenv.seeds import training_seed, world_keys
 from coopenv.world.embedded import HOST
 from coopenv.world.launch import PerWorld
 from coopenv.world.precision import device_memory
 from coopenv.world.records import allocate, size_of
 from coopenv.world.saved_state import has_begun
 from coopenv.world.state import overwrite, state_fields
+from coopenv.world.world import Keys
 
 
 class Engine:
@@ -89,24 +90,23 @@ class Engine:
 
     def reset(
         self,
-        seeds: Sequence[int] | np.ndarray | None = None,
+        seeds: Keys = None,
         mask: np.ndarray | None = None,
         options: Mapping[str, Any] | None = None,
-    ) -> Sequence[int] | np.ndarray | None:
+    ) -> Keys:
         """Start new episodes, see `World.reset`; the results of the other worlds stay.
 
-        The first reset is of all worlds, and draws a seed unless one is given.
+        The first reset is of all worlds, and draws a seed for training where none is given.
 
         Returns:
-            The seeds of the worlds, or None where they go on from their last ones.
+            The keys of the worlds, or None where they go on from their last ones.
         """
         if self.backend.capabilities.real_time:
             self.load()  # before anybody waits for a command
         if not self.begun:
             mask = None
-            if seeds is None:
-                first = seeding.np_random(None)[1]
-                seeds = [first + world for world in range(self.world.worlds)]
+            drawn = world_keys(training_seed(), self.world.worlds)
+            seeds = drawn if seeds is None else [b if a is None else a for a, b in zip(seeds, drawn, strict=True)]
         self.world.reset(seeds, mask, options)
         chosen = np.ones(self.world.worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
         if self.plugins is not None:

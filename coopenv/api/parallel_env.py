@@ -12,16 +12,18 @@ from pettingzoo import ParallelEnv
 from coopenv.api.actions import ActionReader
 from coopenv.api.engine import Engine
 from coopenv.api.infos import InfoWriter, state_space, state_vector
+from coopenv.api.options import checked_options, world_number
 from coopenv.api.pictures import Pictures
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
 from coopenv.backends.base import Backend, Health
 from coopenv.backends.simulated import Simulated
 from coopenv.backends.sources import open_backend
-from coopenv.errors import CoopenvError, ScenarioError, checked_seed, shown, suggest
+from coopenv.errors import CoopenvError, ScenarioError, shown, suggest
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import named
 from coopenv.scenario import Scenario
+from coopenv.seeds import world_keys
 
 Observations = dict[str, Any]
 Infos = dict[str, dict[str, Any]]
@@ -126,13 +128,22 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         """Start an episode.
 
         Args:
-            seed: fixes the episode; None goes on with a new episode of the last seed (a random one at first).
-            options: for a backend that takes any; the others need none.
+            seed: fixes the episode; None goes on with a new episode of the last seed (at first one for training is
+                drawn). `coopenv.EVALUATION_SEEDS` are reserved for evaluation.
+            options: `{"world": w}`: with a seed, be world w of a batch with that seed. A backend that takes options of
+                its own is given all of them instead.
+
+        Raises:
+            CoopenvError: the seed or an option is not what it must be.
         """
-        if seed is not None:
-            self._np_random = seeding.np_random(checked_seed(seed))[0]
+        first, own = 0, options or {}
+        if self.engine.backend.capabilities.batched:
+            first, own = world_number(checked_options(options, ("world",)).get("world", 0)), {}
+        keys = None if seed is None else world_keys(seed, 1, first)
+        if keys is not None:
+            self._np_random = seeding.np_random(keys[0])[0]
         with self.engine.stopping():
-            self.engine.reset(None if seed is None else [checked_seed(seed)], options=options)
+            self.engine.reset(keys, options=own)
         self._agents = list(self.possible_agents)
         if self.render_mode == "human":
             self.render()

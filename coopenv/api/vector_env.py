@@ -14,14 +14,16 @@ from gymnasium.vector.utils import batch_space
 
 from coopenv.api.array_io import ArrayKind, Exchange
 from coopenv.api.engine import Engine
+from coopenv.api.options import checked_options, world_mask
 from coopenv.api.pictures import Pictures
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
 from coopenv.backends.sources import open_simulation
-from coopenv.errors import CoopenvError, ScenarioError, checked_seed, suggest
+from coopenv.errors import CoopenvError, ScenarioError, suggest
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import named
 from coopenv.scenario import Scenario
+from coopenv.seeds import world_keys
 
 INFO_FIELDS = (
     *("alive", "ended", "position_error", "orientation_error", "nees"),
@@ -113,23 +115,26 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         return rows.reshape(self.num_worlds, self.vehicles, *rows.shape[1:])
 
     def reset(
-        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Start new episodes.
 
         Args:
-            seed: world w gets seed + w, or the w-th of a sequence of one per world (one per row: that of the world's
-                first row counts); None goes on from the last seeds.
+            seed: that of the batch, of which no other seed below 2^32 has a world; or a sequence of one per world (one
+                per row: that of the world's first row counts), whose worlds are then those of `parallel_env` with
+                these seeds. None, for all or for one, goes on from the last (at first one for training is drawn).
+                `coopenv.EVALUATION_SEEDS` are reserved for evaluation.
             options: `{"reset_mask": bool array}` of one per row or per world restricts the reset to whole worlds (not
                 the first one).
 
         Raises:
             CoopenvError: a mask that splits a world, or a sequence of the wrong length.
         """
-        mask = self._world_mask(options)
+        wanted = checked_options(options, ("reset_mask",))
+        mask = world_mask(wanted["reset_mask"], self.num_worlds, self.vehicles) if "reset_mask" in wanted else None
         self._exchange.follow_torch()
         seeds = self.engine.reset(self._world_seeds(seed), mask)
-        if seeds is not None:
+        if seeds is not None and seeds[0] is not None:
             self._np_random, self._np_random_seed = seeding.np_random(int(seeds[0]))
         return self._observations(), self._infos()
 
@@ -183,42 +188,18 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         fields = {name: self._exchange.rows(name) for name in INFO_FIELDS}
         return {**fields, "reward_terms": terms, "time": self._exchange.time()}
 
-    def _world_mask(self, options: Any) -> np.ndarray | None:
-        if options is not None and not isinstance(options, Mapping):
-            raise CoopenvError(f"options must be a dict, got {type(options).__name__}")
-        for key in options or ():
-            if key != "reset_mask":
-                raise CoopenvError(f"unknown option '{key}'{suggest(str(key), ['reset_mask'])}; known: reset_mask")
-        if not options or options["reset_mask"] is None:
-            return None
-        try:
-            chosen = np.asarray(options["reset_mask"])
-        except (TypeError, ValueError, RuntimeError):
-            chosen = np.empty(0)
-        if chosen.dtype != bool or not chosen.any():
-            raise CoopenvError("reset_mask must be an array of bool with at least one True")
-        if chosen.shape == (self.num_envs,):
-            by_world = self.world_major(chosen)
-            split = np.flatnonzero(by_world.any(axis=1) != by_world.all(axis=1))
-            if split.size:
-                raise CoopenvError(f"reset_mask splits world {split[0]}: its {self.vehicles} rows are reset together")
-            chosen = by_world[:, 0]
-        if chosen.shape != (self.num_worlds,):
-            expected = f"({self.num_envs},) rows or ({self.num_worlds},) worlds"
-            raise CoopenvError(f"reset_mask has shape {chosen.shape}, expected {expected}")
-        return chosen
-
-    def _world_seeds(self, seed: int | Sequence[int] | None) -> list[int] | None:
+    def _world_seeds(self, seed: Any) -> list[int | None] | None:
+        """Return the keys of the worlds, None where one goes on from its last."""
         if seed is None:
             return None
         if not isinstance(seed, Sequence | np.ndarray) or isinstance(seed, str) or np.ndim(seed) == 0:
-            return [checked_seed(seed) + world for world in range(self.num_worlds)]
-        seeds = [checked_seed(s) for s in seed]
-        if len(seeds) == self.num_envs:
-            seeds = seeds[:: self.vehicles]
-        if len(seeds) != self.num_worlds:
-            raise CoopenvError(f"{len(seeds)} seeds for {self.num_worlds} worlds")
-        return seeds
+            return [*world_keys(seed, self.num_worlds)]
+        keys = [None if s is None else world_keys(s)[0] for s in seed]
+        if len(keys) == self.num_envs:
+            keys = keys[:: self.vehicles]
+        if len(keys) != self.num_worlds:
+            raise CoopenvError(f"{len(keys)} seeds for {self.num_worlds} worlds")
+        return keys
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Return one (H, W, 3) uint8 picture per row; the rows of a world share the top view of their world."""

@@ -20,7 +20,7 @@ from coopenv.observers.registry import find_embedded
 from coopenv.world.embedded import HOST
 from coopenv.world.records import allocate, fields
 from coopenv.world.state import state_fields
-from coopenv.world.world import Options, Seeds
+from coopenv.world.world import Keys, Options
 
 
 def open_world(backend: Backend, worlds: int, dtype: str, device: str, threads: int | None) -> SensingWorld:
@@ -73,13 +73,13 @@ class TickWorld(SensingWorld):
         self._row = {n: getattr(record, n).numpy()[0] for n, field in fields(struct).items() if field.axes[0] == "K"}
         return record
 
-    def reset(self, seeds: Seeds = None, mask: np.ndarray | None = None, options: Options = None) -> None:
+    def reset(self, keys: Keys = None, mask: np.ndarray | None = None, options: Options = None) -> None:
         """Begin an episode of the backend, see `World.reset`."""
         self._ticks = iter(())
         self._present = _nothing(self.briefing)
         self._clear_marks()
-        self._take(self._backend.reset(None if seeds is None else int(seeds[0]), options or {}), 0)
-        super().reset(seeds, mask)
+        self._take(self._backend.reset(None if keys is None or keys[0] is None else int(keys[0]), options or {}), 0)
+        super().reset(keys, mask)
         self._receive()
 
     def load(self) -> None:

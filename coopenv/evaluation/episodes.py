@@ -9,9 +9,8 @@ from coopenv.api.engine import Engine
 from coopenv.estimation.outcomes import Outcome
 from coopenv.policies import Policy, decide, restart
 from coopenv.scenario import Scenario
+from coopenv.seeds import evaluation_seed, world_keys
 
-FIRST_HELD_OUT = 2**31
-"""Seeds from here on are for evaluation; training takes those below."""
 DIVERGED = 1e9  # m or deg: stands for an error that is not a number
 
 
@@ -70,7 +69,7 @@ class Episodes:
 
 def held_out_seeds(block: int, worlds: int) -> list[int]:
     """Return the seeds of so many worlds that no training has seen; blocks 0, 1, ... share none."""
-    return [FIRST_HELD_OUT + block * worlds + world for world in range(worlds)]
+    return [evaluation_seed(block * worlds + world) for world in range(worlds)]
 
 
 def driven_vehicles(scenario: Scenario) -> list[int]:
@@ -102,7 +101,7 @@ def drive(
     kept: dict[str, list[np.ndarray]] = {name: [] for name in KEPT}
     agents = [first + i for i in chosen]
     with engine.stopping():
-        engine.reset(seeds)
+        engine.reset([world_keys(seed)[0] for seed in seeds])
         goal = np.where(view("route_count")[:, chosen, None] > 0, view("goal")[:, chosen, :2], np.nan)
         restart(policy, np.ones(rows, dtype=bool))
         place = [view("position")[:, agents, :2].astype(np.float32)]

@@ -6,6 +6,7 @@ import numpy as np
 
 from coopenv.api.engine import Engine
 from coopenv.policies import Policy, decide, restart
+from coopenv.seeds import world_keys
 
 
 def play(
@@ -24,7 +25,7 @@ def play(
         CoopenvError: the policy returns actions of another shape.
     """
     with engine.stopping():
-        engine.reset(seeds)
+        engine.reset([world_keys(seed)[0] for seed in seeds])
         engine.set_actions(np.zeros_like(engine.view("actions")))
         width = engine.view("actions").shape[-1]
         if policy is not None:

@@ -27,15 +27,15 @@ from coopenv.world.step import (
     sense_kernel,
 )
 
-Seeds = Sequence[int] | np.ndarray | None
+Keys = Sequence[int | None] | np.ndarray | None
 Options = Mapping[str, Any] | None
 
 
 class World:
     """`worlds` copies of one scenario, stepped together.
 
-    World w of a batch seeded with s has seed s + w, and its noise depends on that seed alone: it is bit for bit the
-    single world seeded with s + w (on the same device).
+    What is drawn in a world depends on its key alone (`coopenv.seeds`): it is bit for bit the single world with that
+    key (on the same device).
     """
 
     source: Source = SIMULATED  # where its ticks come from
@@ -102,20 +102,22 @@ class World:
         """Return what the source of ticks reads."""
         return Nothing()
 
-    def reset(self, seeds: Seeds = None, mask: np.ndarray | None = None, options: Options = None) -> None:
+    def reset(self, keys: Keys = None, mask: np.ndarray | None = None, options: Options = None) -> None:
         """Start a new episode in the worlds of `mask` (all by default).
 
         Args:
-            seeds: one per world, reduced modulo 2^64; None keeps each world's seed and draws a new episode from it.
+            keys: of the random streams, one per world, reduced modulo 2^64; None (for all or for one) keeps a world's
+                key and draws a new episode from it.
             mask: (W,) bool.
             options: for a source of ticks that is not on the device; others need none.
         """
         chosen = np.ones(self.worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
-        if seeds is not None:
-            wanted = np.array([int(s) % 2**64 for s in seeds], dtype=np.uint64)
-            self.state.seed.assign(np.where(chosen, wanted, self.state.seed.numpy()))
-            # restart() raises the episode's number by one: the first one of a seed is 0
-            self.state.episode.assign(np.where(chosen, np.uint32(2**32 - 1), self.state.episode.numpy()))
+        if keys is not None:
+            wanted = np.array([int(key or 0) % 2**64 for key in keys], dtype=np.uint64)
+            new = chosen & np.array([key is not None for key in keys])
+            self.state.seed.assign(np.where(new, wanted, self.state.seed.numpy()))
+            # restart() raises the episode's number by one: the first one of a key is 0
+            self.state.episode.assign(np.where(new, np.uint32(2**32 - 1), self.state.episode.numpy()))
         self.mask.assign(chosen.astype(np.int32))
         self.restart()
         self.mask.zero_()

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.errors import ActionError, ScenarioError, ScenarioWarning, checked_seed
+from coopenv.errors import ActionError, ScenarioError, ScenarioWarning
 from coopenv.observers.riccati import gradient_kernels as kernels
 from coopenv.scenario import Scenario
 from coopenv.scenario.topology import neighbour_sets, processing_order
+from coopenv.seeds import world_keys
 from coopenv.world import kernel_cache
 from coopenv.world.dynamics import LONGEST_SUBSTEP
 from coopenv.world.launch import kernel
@@ -64,7 +65,7 @@ class DifferentiableWorld:
             raise ActionError("actions are not finite")
         if len(actions) * self.scenario.ticks_per_decision > self.scenario.horizon_ticks:
             raise ActionError(f"{len(actions)} decisions reach beyond the horizon of {self.scenario.horizon:g} s")
-        world.reset([checked_seed(seed) + w for w in range(world.worlds)])
+        world.reset(world_keys(seed, world.worlds))
         decisions = [self._array(action, kernels.vec2) for action in actions]
         total, turn = self._array(np.zeros(1), kernels.scalar), wp.zeros(1, dtype=kernels.scalar, device=world.device)
         truth, held, belief = self._start()
