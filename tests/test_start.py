@@ -15,7 +15,7 @@ from coopenv.cli import complete
 
 HEAVY = {"warp", "scipy", "matplotlib", "PIL", "pandas", "mcap", "torch", "joblib", "jinja2"}
 LIGHT = {"errors", "shipped", "interrupts", "api", "api.registration"}
-LIGHT |= {"cli", *(f"cli.{name}" for name in ("bench", "complete", "evaluate", "options", "run", "show"))}
+LIGHT |= {"cli", *(f"cli.{name}" for name in ("bench", "complete", "evaluate", "live", "options", "run", "show"))}
 
 
 def modules_after(statement: str) -> set[str]:

@@ -12,20 +12,30 @@ class Window:
         self._title, self._silent = title, False
         self._image: Any = None
 
+    @property
+    def canvas(self) -> Any:
+        """Matplotlib's canvas, which tells of keys; None before the first picture and without a display."""
+        return None if self._image is None else self._image.figure.canvas
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a window that the user has not closed."""
+        if self._image is None:
+            return False
+        from matplotlib import pyplot as plt
+
+        return bool(plt.fignum_exists(self._image.figure.number))
+
     def show(self, picture: np.ndarray) -> None:
         """Show an (H, W, 3) uint8 picture and let the window react to the user, who may close it for good."""
         if self._image is None and not self._silent:
             self._image = _opened(self._title, picture)
         if self._image is None:
             self._silent = True
-            return
-        from matplotlib import pyplot as plt
-
-        figure = self._image.figure
-        if plt.fignum_exists(figure.number):
+        elif self.is_open:
             self._image.set_data(picture)
-            figure.canvas.draw_idle()
-            figure.canvas.flush_events()
+            self.canvas.draw_idle()
+            self.canvas.flush_events()
 
     def close(self) -> None:
         """Close the window; the next picture opens a new one."""
@@ -51,6 +61,7 @@ def _opened(title: str, picture: np.ndarray) -> Any:
     ax = figure.add_axes((0, 0, 1, 1))
     ax.set_axis_off()
     manager: Any = figure.canvas.manager
+    figure.canvas.mpl_disconnect(manager.key_press_handler_id)  # keys are not matplotlib's here
     manager.set_window_title(title)
     manager.show()
     return ax.imshow(picture)
