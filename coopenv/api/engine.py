@@ -79,6 +79,7 @@ class Engine:
         self._end = endings_kernel(terms.conditions, p) if terms.conditions else None
         fields = self.layout.values()
         self._start = _vector(wp.int32, [field.start for field in fields])
+        self._center = _vector(wp.float32, [field.center for field in fields])
         self._factor = _vector(wp.float32, [1.0 / field.scale for field in fields])
         self._weight = _vector(wp.float32, weights.values())
         flags: list[Any] = [wp.full(worlds, value, dtype=wp.int32, device=device) for value in (1, 0, 0)]
@@ -184,7 +185,8 @@ class Engine:
             self.world.launch("end", self._end, arguments, inner=(self.world.model.vehicles,))
 
     def _fill_results(self, key: str, fresh: Any, chosen: Any) -> None:
-        fixed = [self.world.model, PerWorld(self.world.state), self._start, self._factor, self._weight]
+        vectors = [self._start, self._center, self._factor, self._weight]
+        fixed = [self.world.model, PerWorld(self.world.state), *vectors]
         changing = [PerWorld(part) for part in (self.results, fresh, chosen)]
         self.world.launch(key, self._fill, fixed + changing, inner=(self.world.model.vehicles,))
         if self.world.device == "cpu":  # to look at a GPU would mean to wait for it

@@ -119,13 +119,14 @@ def section_table(name: str, part: BaseModel, key_width: int) -> Table:
 def observation_table(scenario: Scenario) -> Table:
     """Return one row per field of the flat observation."""
     layout = observation_layout(scenario)
-    title = f"Observation: {layout.size} entries per vehicle, each value / scale, clipped"
+    title = f"Observation: {layout.size} entries per vehicle, each (value - center) / scale, clipped"
     table = _table("field", "slice", "shape", "unit", "scale", "meaning", title=title)
     for column in table.columns[:-1]:
         column.no_wrap = True
     for name, field in layout.items():
         shape, part = "x".join(map(str, field.shape)), f"{field.start}:{field.stop}"
-        table.add_row(name, part, shape, field.unit, number(field.scale), field.meaning)
+        meaning = f"{field.meaning}; center {number(field.center)}" if field.center else field.meaning
+        table.add_row(name, part, shape, field.unit, number(field.scale), meaning)
     return table
 
 

@@ -12,6 +12,7 @@ from coopenv.scenario.terms import (
     OBSERVATION_FIELDS,
     REWARD_TERMS,
     TERMINATION_CONDITIONS,
+    USUAL_GROUPS,
     ObservationField,
     Term,
     check_known,
@@ -25,10 +26,12 @@ def _list_groups(schema: dict[str, Any]) -> None:
 
 
 class Observation(Part):
-    """Contents and scales of the observation; every entry is divided by its scale and clipped to [-1, 1]."""
+    """Contents and scales of the observation; every entry is (value - center) / scale, clipped to [-1, 1]."""
 
-    include: tuple[str, ...] = Field(default=GROUPS, min_length=1, json_schema_extra=_list_groups)
-    """Groups of coopenv's fields, and names of registered and custom fields."""
+    include: tuple[str, ...] = Field(default=USUAL_GROUPS, min_length=1, json_schema_extra=_list_groups)
+    """Groups of coopenv's fields, and names of single fields: coopenv's, registered and custom ones."""
+    planar: bool = False
+    """Whether to leave out what a vehicle on a plane cannot change: heights, roll and pitch."""
     position_scale: Positive = 50.0
     """m, of positions and distances"""
     velocity_scale: Positive = 5.0
@@ -37,16 +40,32 @@ class Observation(Part):
     """rad/s, of measured angular velocities"""
     age_scale: Positive = 1.0
     """s; older measurements read 1"""
+    map_scale: Positive = 10.0
+    """m, of landmarks of the map"""
+    map_size: int = Field(default=8, ge=1, le=256)
+    """Landmarks of the map that fields per landmark tell of: those nearest by the vehicle's own estimate."""
+    route_step: Positive = 0.5
+    """m; `route_ahead` tells of the way so far ahead, and twice, four and eight times as far"""
+    scales: dict[str, Positive] = Field(default={})
+    """Scales of single fields by name, in place of their own."""
+    centers: dict[str, Number] = Field(default={})
+    """Values of single fields, by name, that read 0, in place of their own."""
     custom: dict[Annotated[str, AfterValidator(OBSERVATION_FIELDS.free)], ObservationField] = Field(default={})
     """Fields of one's own by name: where their functions stand, see docs/terms.md."""
 
     @model_validator(mode="after")
     def _fields_exist(self) -> Self:
-        groups = {row.group or name for name, row in OBSERVATION_FIELDS.known(self.custom).items()}
-        for name in self.include:
-            if name not in groups:
-                near = suggest(name, groups) or f"; known: {', '.join(sorted(groups))}"
-                raise ValueError(f"include: unknown group or field '{name}'{near}")
+        fields = OBSERVATION_FIELDS.known(self.custom)
+        groups = {*fields, *(row.group for row in fields.values() if row.group)}
+        for key, names, allowed in (
+            ("include: unknown group or field", self.include, groups),
+            ("scales: unknown field", self.scales, {*fields}),
+            ("centers: unknown field", self.centers, {*fields}),
+        ):
+            for name in names:
+                if name not in allowed:
+                    near = suggest(name, allowed) or f"; known: {', '.join(sorted(allowed))}"
+                    raise ValueError(f"{key} '{name}'{near}")
         return self
 
 
@@ -110,9 +129,9 @@ class Reward(Part):
 
     weights: RewardWeights = RewardWeights()
     uncertainty_threshold: NonNegative = 0.02
-    """m; what `position_uncertainty` and `position_error_per_metre` count begins above it."""
+    """m; terms per metre count what is above it"""
     uncertainty_cap: Positive = 1.0
-    """m; and is at most this, which is also the price of a metre that is never driven."""
+    """m; and at most this, which is also the price of a metre that is never driven"""
     custom: dict[Annotated[str, AfterValidator(REWARD_TERMS.free)], Term] = Field(default={})
     """Terms of one's own by name: where their functions stand, see docs/terms.md."""
     privileged: bool = False

@@ -14,6 +14,7 @@ from coopenv.scenario.terms import (
     OBSERVATION_FIELDS,
     REWARD_TERMS,
     TERMINATION_CONDITIONS,
+    USUAL_GROUPS,
     ObservationField,
     Per,
     R,
@@ -68,28 +69,30 @@ def register_observation(
     unit: str = "1",
     scale: float | Scale = 1.0,
     low: int = -1,
+    center: float = 0.0,
     meaning: str = "",
 ) -> None:
     """Make an observation field known by name; a scenario lists it in `observation.include`.
 
     Args:
         name: an identifier.
-        function: of the record `Ego`, and of `Target` or `Neighbour` if there is one value for each of these
-            (`coopenv.api.terms.records`); returns a number, or a vector of `size`. A Warp function, or a plain one that
-            Warp can compile. No truth is at hand in these records.
+        function: of the record `Ego`, and of `Target`, `Neighbour` or `MapLandmark` if there is one value for each of
+            these (`coopenv.api.terms.records`, `map_view`); returns a number, or a vector of `size`. A Warp function,
+            or a plain one that Warp can compile. No truth is at hand in these records.
         per: "vehicle": one value; "target": one for every landmark and vehicle; "neighbour": one for every other
-            vehicle.
+            vehicle; "landmark": one for each of the landmarks of the map that are nearest by the vehicle's estimate.
         size: entries of one value.
         unit: of the value.
         scale: what the value is divided by: a number, or the name of a scale of `[observation]`.
         low: -1, or 0 for what is never negative: the lower end of the range.
+        center: the value that reads 0.
         meaning: one line for tables; empty: the first line of the function's docstring.
 
     Raises:
         CoopenvError: the name is no identifier or taken, another argument has no such value, or it is no function of
             these records.
     """
-    columns = {"per": per, "size": size, "unit": unit, "scale": scale, "low": low, "meaning": meaning}
+    columns = {"per": per, "size": size, "unit": unit, "scale": scale, "low": low, "center": center, "meaning": meaning}
     _register(OBSERVATION_FIELDS, ObservationField, name, function, (1 if per == "vehicle" else 2,), **columns)
 
 
@@ -159,6 +162,18 @@ def without_own_terms(raw: Mapping[str, Any]) -> dict[str, Any]:
             result[section] = {key: on for key, on in part.items() if key in TERMINATION_CONDITIONS.built_in}
         elif isinstance(weights := part.get("weights"), dict):
             part["weights"] = {name: weight for name, weight in weights.items() if name in REWARD_TERMS.built_in}
-        elif isinstance(include := part.get("include"), list):
-            part["include"] = [group for group in include if group in GROUPS] or list(GROUPS)
+        elif section == "observation":
+            result[section] = _observation_of_coopenv(part)
+    return result
+
+
+def _observation_of_coopenv(part: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the section of an observation without fields of anybody's own."""
+    result = dict(part)
+    for key in ("scales", "centers"):
+        if isinstance(of_field := result.get(key), dict):
+            result[key] = {name: value for name, value in of_field.items() if name in OBSERVATION_FIELDS.built_in}
+    if isinstance(include := result.get("include"), list):
+        kept = [name for name in include if name in GROUPS or name in OBSERVATION_FIELDS.built_in]
+        result["include"] = kept or list(USUAL_GROUPS)
     return result

@@ -5,19 +5,23 @@ weights that a scenario may set, the kernel (`coopenv.api.terms`), and the table
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Generic, Literal, TypeVar
+from typing import Annotated, Any, Generic, Literal, TypeVar
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
 from coopenv import user_code
 from coopenv.errors import CoopenvError, shown, suggest
-from coopenv.scenario.base import Part, Positive, Text
+from coopenv.scenario.base import Number, Part, Positive, Text
+from coopenv.scenario.term_rows import COLUMNS, CONDITIONS, FIELDS, REWARDS
 
-Scale = Literal["position_scale", "velocity_scale", "angular_velocity_scale", "age_scale", "targets"]
-"""A setting of `[observation]`, or the number of targets."""
-Per = Literal["vehicle", "target", "neighbour"]
-"""One value of the vehicle itself, one of every target (landmarks, then vehicles), or one of every other vehicle."""
+Scale = Literal[
+    "position_scale", "velocity_scale", "angular_velocity_scale", "age_scale", "map_scale", "steering", "targets"
+]
+"""A setting of `[observation]`, the steering angle at action 1, or the number of targets."""
+Per = Literal["vehicle", "target", "neighbour", "landmark"]
+"""One value of the vehicle itself, one of every target (landmarks, then vehicles), one of every other vehicle, or one
+of each of the landmarks that are nearest by the vehicle's own estimate."""
 
 
 def _or_text(schema: dict[str, Any]) -> None:
@@ -64,7 +68,7 @@ class Term(Row):
 
 
 class ObservationField(Row):
-    """A field of the observation; every entry is value / scale, clipped to [low, 1]."""
+    """A field of the observation; every entry is (value - center) / scale, clipped to [low, 1]."""
 
     group: Text = ""
     """What `observation.include` calls it; empty: its own name."""
@@ -73,6 +77,10 @@ class ObservationField(Row):
     """Entries of one value."""
     scale: Positive | Scale = 1.0
     low: Literal[-1, 0] = -1
+    center: Number = 0.0
+    """The value that reads 0."""
+    planar: tuple[Annotated[int, Field(ge=0, lt=64)], ...] | None = None
+    """Entries of a value that `observation.planar` keeps (none: all); an empty list drops the field."""
 
 
 R = TypeVar("R", bound=Row)
@@ -144,78 +152,18 @@ def check_privilege(kind: Registry[Term], used: Mapping[str, float], part: Any) 
             raise ValueError(f"privileged: must be true, because the {kind.kind} '{name}' uses the truth")
 
 
-LOG_SCALE = 10.0
-"""Decades (or nepers of log det P / 6) that fill the range of a logarithmic entry."""
-
-_COLUMNS = ("per", "size", "unit", "scale", "low", "meaning")
-_FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
-    "estimate": [
-        ("estimate_position", "vehicle", 3, "m", "position_scale", -1, "Rhat phat, map frame"),
-        ("estimate_forward", "vehicle", 3, "1", 1, -1, "first column of Rhat: the body's x axis in the map"),
-        ("estimate_left", "vehicle", 3, "1", 1, -1, "second column of Rhat: the body's y axis in the map"),
-    ],
-    "quality": [
-        ("covariance_diagonal", "vehicle", 6, "log10", LOG_SCALE, -1, "log10 diag P over (2 lambda, p)"),
-        ("log_determinant", "vehicle", 1, "1", LOG_SCALE, -1, "log det P / 6"),
-        ("gramian_min_eigenvalue", "vehicle", 1, "log10", LOG_SCALE, -1, "log10, floor 1e-9, sliding window"),
-        ("targets_in_view", "vehicle", 1, "targets", "targets", 0, "number of targets measured in this frame"),
-    ],
-    "bearings": [
-        ("bearings", "target", 3, "1", 1, -1, "unit vector camera to target, optical frame; 0: never seen"),
-        ("bearing_mask", "target", 1, "bool", 1, 0, "1: measured in this frame"),
-        ("bearing_age", "target", 1, "s", "age_scale", 0,
-         "time since measured; 1: longer ago than the scale, or never"),
-    ],
-    "odometry": [
-        ("velocity", "vehicle", 3, "m/s", "velocity_scale", -1, "last odometry sample, body frame"),
-        ("angular_velocity", "vehicle", 3, "rad/s", "angular_velocity_scale", -1, "last odometry sample, body frame"),
-        ("odometry_age", "vehicle", 1, "s", "age_scale", 0, "age of that sample"),
-    ],
-    "messages": [
-        ("message_position", "neighbour", 3, "m", "position_scale", -1,
-         "neighbour's estimate seen from one's own estimate"),
-        ("message_forward", "neighbour", 3, "1", 1, -1, "neighbour's forward axis in one's own estimated frame"),
-        ("message_mask", "neighbour", 1, "bool", 1, 0, "1: a message is at hand and not stale"),
-        ("message_age", "neighbour", 1, "s", "age_scale", 0, "time since it was sent"),
-    ],
-    "goal": [
-        ("goal", "vehicle", 3, "m", "position_scale", -1,
-         "goal seen from one's own estimate, body frame; 0 without a goal"),
-    ],
-}  # fmt: skip
-
-_REWARDS: list[tuple[str, str, bool, str]] = [  # name, unit, privileged, meaning
-    ("progress", "m", True, "Decrease of the true way to the goal: along the drawn route, else as the crow flies"),
-    ("arrival", "1", False, "1 in the step of arrival"),
-    ("collision", "1", False, "-1 in the step of a collision"),
-    ("control", "1", False, "-|action|^2"),
-    ("time", "s", False, "Minus the time that has passed"),
-    ("position_error", "m", True, "-|position error|"),
-    ("orientation_error", "rad", True, "-orientation error"),
-    ("position_uncertainty", "m^2", False,
-     "Per metre gained: minus the part of sqrt(trace P_pos) above the threshold, at most the cap"),
-    ("position_error_per_metre", "m^2", True, "The same of the true position error"),
-    ("information_gain", "1", False, "Decrease of log det P / 6: a difference of potentials"),
-    ("uncertainty", "1", False, "-log det P / 6: minus the mean log variance"),
-    ("observability", "1", False, "log10 of the smallest eigenvalue of the sliding Gramian (floor 1e-9)"),
-    ("visibility", "1", False, "Share of its possible targets that the vehicle has in view"),
-]  # fmt: skip
-
-_CONDITIONS = [  # name, function, meaning
-    ("collision", "touches_anything", "Touching a building or another body, at any camera tick"),
-    ("arrival", "reaches_goal", "Reaching the goal, or passing the end of a drawn route, at any camera tick"),
-]
-
-GROUPS = tuple(_FIELDS)
+GROUPS = tuple(FIELDS)
 """Groups of fields of coopenv, in their order in an observation."""
+USUAL_GROUPS = ("estimate", "quality", "bearings", "odometry", "messages", "goal")
+"""Those of a scenario that does not name any."""
 FUNCTIONS = "coopenv.api.terms.functions"
 """Where the functions of coopenv's fields and reward terms stand, under the names of their rows."""
 
 OBSERVATION_FIELDS = Registry(
     "observation field",
     {
-        name: ObservationField(function=f"{FUNCTIONS}:{name}", group=group, **dict(zip(_COLUMNS, row, strict=True)))
-        for group, rows in _FIELDS.items()
+        name: ObservationField(function=f"{FUNCTIONS}:{name}", group=group, **dict(zip(COLUMNS, row, strict=False)))
+        for group, rows in FIELDS.items()
         for name, *row in rows
     },
 )
@@ -223,10 +171,10 @@ REWARD_TERMS = Registry(
     "reward term",
     {
         name: Term(function=f"{FUNCTIONS}:{name}", unit=unit, privileged=privileged, meaning=about)
-        for name, unit, privileged, about in _REWARDS
+        for name, unit, privileged, about in REWARDS
     },
 )
 TERMINATION_CONDITIONS = Registry(
     "termination condition",
-    {name: Term(function=f"coopenv.world.collision:{place}", meaning=about) for name, place, about in _CONDITIONS},
+    {name: Term(function=f"coopenv.world.collision:{place}", meaning=about) for name, place, about in CONDITIONS},
 )

@@ -85,6 +85,8 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "ticks_per_decision": scenario.ticks_per_decision,
         "horizon_ticks": scenario.horizon_ticks,
         "last_outcome": max(Outcome) + len(scenario.termination.own),
+        "map_size": scenario.observation.map_size,
+        "route_step": scenario.observation.route_step,
         "targets": [targets + [-1] * (agents - len(targets)) for targets in sets],
         "target_count": [len(targets) for targets in sets],
         "order": order,

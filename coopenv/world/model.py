@@ -194,6 +194,8 @@ def model_struct(p: Precision) -> Any:
         ticks_per_decision: wp.int32
         horizon_ticks: wp.int32
         last_outcome: wp.int32  # largest value of `ended`
+        map_size: wp.int32  # landmarks of the map that an observation tells of
+        route_step: scalar  # m ahead on the way that an observation tells of, and twice, four and eight times
         targets: wp.array2d(dtype=wp.int32)  # (N, A) agents that may be measured and heard, ascending, then -1
         target_count: wp.array(dtype=wp.int32)  # (N,)
         order: wp.array(dtype=wp.int32)  # (N,) leaders first

@@ -42,15 +42,22 @@ def observer_error(R: Any, position: Any, R_hat: Any, p_hat: Any):
 
 
 @wp.func
-def position_variance(P: Any, p_hat: Any):
-    """Return the trace of the covariance of the position error in the map frame, m^2, to first order in the errors.
+def position_covariance(P: Any, p_hat: Any):
+    """Return the covariance of the error of the position in the map, along the estimated body's axes, m^2.
 
-    With e = (e1, e2) as above, R p - Rhat phat = Rhat (e2 - [phat]x e1): the lever of the attitude's error belongs to
-    it, and Rhat leaves the trace.
+    To first order in the errors e = (e1, e2), see `observer_error`: R p - Rhat phat = Rhat (e2 - [phat]x e1), so that
+    the attitude's error counts with its lever.
     """
     lever = skew(p_hat)
+    cross = lever * block3(P, 0, 3)
     own = block3(P, 3, 3) + lever * block3(P, 0, 0) * wp.transpose(lever)
-    return wp.max(wp.trace(own) - p_hat.dtype(2.0) * wp.trace(lever * block3(P, 0, 3)), p_hat.dtype(0.0))
+    return own - cross - wp.transpose(cross)
+
+
+@wp.func
+def position_variance(P: Any, p_hat: Any):
+    """Return the trace of the covariance of the position error in the map, m^2: that along any axes."""
+    return wp.max(wp.trace(position_covariance(P, p_hat)), p_hat.dtype(0.0))
 
 
 @wp.func

@@ -8,13 +8,18 @@ import pytest
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.scenario import Scenario, load_scenario
+from coopenv.scenario.terms import GROUPS
 
 OBSERVERS = ("riccati", "robust")
 
 
+EVERYTHING = {"observation.include": list(GROUPS)}
+
+
 def silent(name: str, observer: str) -> Scenario:
     """An environment whose cameras see nothing, so that no measurement can depend on where anybody is."""
-    return load_scenario(name, {"topology.mode": "sensed", "camera.range": 1e-6, "observer.name": observer})
+    blind = {"topology.mode": "sensed", "camera.range": 1e-6, "observer.name": observer}
+    return load_scenario(name, {**EVERYTHING, **blind})
 
 
 @pytest.mark.parametrize("observer", OBSERVERS)
@@ -40,7 +45,7 @@ def test_observation_does_not_move_with_hidden_truth(name: str, observer: str) -
 def test_observation_does_not_move_when_everything_moves_together(name: str, observer: str) -> None:
     """Other vehicles' truth reaches a vehicle through bearings alone: scaling a scene about a camera keeps them."""
     plain = {"noise.enabled": False, "topology.mode": "fixed", "camera.miss_probability": 0.0}
-    scenario = load_scenario(name, {**plain, "observer.name": observer})
+    scenario = load_scenario(name, {**EVERYTHING, **plain, "observer.name": observer})
     engine = Engine(scenario, 2, "float64")
     engine.reset([5, 5])
     L = len(scenario.landmarks)
@@ -53,6 +58,35 @@ def test_observation_does_not_move_when_everything_moves_together(name: str, obs
     for _ in range(10):
         engine.step(np.zeros((2, len(scenario.vehicles), 2)))
         assert np.array_equal(engine.view("observation")[0, 0], engine.view("observation")[1, 0])
+
+
+def explained(inputs: np.ndarray, outputs: np.ndarray, fit: int) -> np.ndarray:
+    """Return the share of the variance of each output that a linear regression on the first `fit` rows explains."""
+    inputs = np.column_stack([inputs, np.ones(len(inputs))])
+    inputs = inputs[:, np.append(np.ptp(inputs[:, :-1], axis=0) > 1e-6, True)]
+    weights = np.linalg.lstsq(inputs[:fit], outputs[:fit], rcond=1e-6)[0]
+    residual = outputs[fit:] - inputs[fit:] @ weights
+    return np.asarray(1.0 - residual.var(axis=0) / outputs[fit:].var(axis=0))
+
+
+def test_the_blind_cannot_tell_their_own_error_beyond_what_their_estimate_tells() -> None:
+    """Of a start box all know that estimates outside it are wrong; nothing else in an observation tells an error."""
+    blind = {"camera.range": 1e-6, "observer.name": "robust", "observation.planar": True}
+    envs = coopenv.make_vec("urban_crossing", num_worlds=1500, overrides={**EVERYTHING, **blind})
+    own = slice(0, None, len(envs.scenario.vehicles))  # one vehicle of every world
+    observations, _ = envs.reset(seed=0)
+    for steps in (0, 20):
+        for _ in range(steps):
+            observations = envs.step(np.tile([0.0, 0.0], (len(observations), 1)))[0]
+        engine = envs.engine
+        estimate = np.einsum(
+            "wij,wj->wi", engine.view("estimate_rotation")[:, 0], engine.view("estimate_position")[:, 0]
+        )
+        error = (engine.view("position")[:, len(envs.scenario.landmarks)] - estimate)[:, :2]
+        heading = engine.view("estimate_rotation")[:, 0, :2, 0]
+        prior = explained(np.column_stack([estimate, heading]), error, 1000)
+        everything = explained(observations[own].astype(float), error, 1000)
+        assert (everything < prior + 0.1).all(), (prior, everything)
 
 
 @pytest.mark.parametrize("observer", OBSERVERS)

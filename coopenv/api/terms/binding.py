@@ -4,12 +4,13 @@ import inspect
 import linecache
 from collections.abc import Callable, Mapping
 from functools import cache
+from itertools import chain
 from typing import Any, NamedTuple
 
 import warp as wp
 
 from coopenv import user_code
-from coopenv.api.terms.layout import Layout, included_fields
+from coopenv.api.terms.layout import Layout, entries_of, included_fields
 from coopenv.errors import CoopenvError
 from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario import Scenario
@@ -31,14 +32,17 @@ class Bound(NamedTuple):
     """How many it takes: `Ego`, and the kind's second one."""
     size: int = 1
     """Entries of one value."""
+    entries: tuple[int, ...] = (0,)
+    """Those of them that the observation holds."""
 
 
 class Terms(NamedTuple):
-    """The terms of a scenario: fields of the observation, one value per vehicle, target or neighbour; and others."""
+    """The terms of a scenario: fields of the observation, with one value per vehicle, target, ...; and others."""
 
     vehicle_fields: tuple[Bound, ...]
     target_fields: tuple[Bound, ...]
     neighbour_fields: tuple[Bound, ...]
+    landmark_fields: tuple[Bound, ...]
     rewards: tuple[Bound, ...]
     conditions: tuple[Bound, ...]
 
@@ -50,20 +54,20 @@ def bound_terms(scenario: Scenario) -> Terms:
         CoopenvError: a function does not exist, cannot be loaded, takes something else than its row says, or uses the
             truth where the scenario does not say so.
     """
-    fields: dict[str, list[Bound]] = {"vehicle": [], "target": [], "neighbour": []}
+    fields: dict[str, list[Bound]] = {"vehicle": [], "target": [], "neighbour": [], "landmark": []}
     for i, (name, row) in enumerate(included_fields(scenario).items()):
         bound = _bound(OBSERVATION_FIELDS, name, row, i, (1 if row.per == "vehicle" else 2,))
-        fields[row.per].append(bound._replace(size=row.size))
+        fields[row.per].append(bound._replace(size=row.size, entries=entries_of(row, scenario)))
     rewards = _all_bound(REWARD_TERMS, scenario.reward.by_name, scenario.reward, 0)
     switches = dict.fromkeys(scenario.termination.own, True)
     conditions = _all_bound(TERMINATION_CONDITIONS, switches, scenario.termination, len(Outcome))
-    of_vehicle, of_target, of_neighbour = map(tuple, fields.values())
-    return Terms(of_vehicle, of_target, of_neighbour, rewards, conditions)
+    of_vehicle, of_target, of_neighbour, of_landmark = map(tuple, fields.values())
+    return Terms(of_vehicle, of_target, of_neighbour, of_landmark, rewards, conditions)
 
 
 def own_places(terms: Terms, layout: Layout) -> list[tuple[str, str, slice]]:
     """Return (title, field of the step results, entries) of every term that is not coopenv's and has values there."""
-    fields, places = (*terms.vehicle_fields, *terms.target_fields, *terms.neighbour_fields), [*layout.values()]
+    fields, places = [*chain(*terms[:4])], [*layout.values()]
     observed = [(field.title, "observation", places[field.number].slice) for field in fields if field.own]
     return observed + [(t.title, "terms", slice(t.number, t.number + 1)) for t in terms.rewards if t.own]
 

@@ -7,6 +7,7 @@ privileged. Records: see `coopenv.api.terms.records`.
 import warp as wp
 
 from coopenv.api.step_results import DEGREES
+from coopenv.api.terms.map_view import MapLandmark
 from coopenv.api.terms.records import Ego, Neighbour, Target, Truth
 from coopenv.world.collision import ARRIVED, COLLIDED
 
@@ -18,6 +19,12 @@ LOG10_E = wp.constant(0.4342944819032518)
 def log10(value: wp.float32) -> wp.float32:
     """Return the decimal logarithm."""
     return wp.log(value) * LOG10_E
+
+
+@wp.func
+def log10_of_std(std: wp.float32) -> wp.float32:
+    """Return the decimal logarithm of a standard deviation, at least a micrometre or a microradian."""
+    return log10(wp.max(std, 1.0e-6))
 
 
 @wp.func
@@ -114,6 +121,92 @@ def message_age(ego: Ego, neighbour: Neighbour):
 @wp.func
 def goal(ego: Ego):
     return ego.goal
+
+
+@wp.func
+def position_std(ego: Ego):
+    return log10_of_std(ego.position_std)
+
+
+@wp.func
+def axis_std(ego: Ego):
+    std = ego.axis_std
+    return wp.vec3(log10_of_std(std[0]), log10_of_std(std[1]), log10_of_std(std[2]))
+
+
+@wp.func
+def heading_std(ego: Ego):
+    return log10_of_std(ego.heading_std)
+
+
+@wp.func
+def sighting(ego: Ego, neighbour: Neighbour):
+    return neighbour.bearing
+
+
+@wp.func
+def sighting_mask(ego: Ego, neighbour: Neighbour):
+    return neighbour.in_view
+
+
+@wp.func
+def sighting_age(ego: Ego, neighbour: Neighbour):
+    return neighbour.bearing_age
+
+
+@wp.func
+def map_position(ego: Ego, landmark: MapLandmark):
+    return landmark.position
+
+
+@wp.func
+def map_mask(ego: Ego, landmark: MapLandmark):
+    return landmark.exists
+
+
+@wp.func
+def map_in_view(ego: Ego, landmark: MapLandmark):
+    return landmark.expected
+
+
+@wp.func
+def map_age(ego: Ego, landmark: MapLandmark):
+    return landmark.age
+
+
+@wp.func
+def route_offset(ego: Ego):
+    return ego.route_offset
+
+
+@wp.func
+def route_heading(ego: Ego):
+    return ego.route_heading
+
+
+@wp.func
+def route_left(ego: Ego):
+    return ego.route_left
+
+
+@wp.func
+def route_ahead(ego: Ego):
+    return ego.route_ahead
+
+
+@wp.func
+def steering(ego: Ego):
+    return ego.steering
+
+
+@wp.func
+def last_action(ego: Ego):
+    return ego.action
+
+
+@wp.func
+def time_left(ego: Ego):
+    return ego.time_left
 
 
 @wp.func

@@ -15,6 +15,7 @@ import warp as wp
 
 from coopenv.api.step_results import assess, is_over, remember, set_flags
 from coopenv.api.terms.binding import Bound, Terms
+from coopenv.api.terms.map_view import MapLandmark, Nearest, map_record, next_nearest
 from coopenv.api.terms.records import Ego, Neighbour, Target, Truth, neighbour_record, own_records, target_record
 from coopenv.api.terms.way import way_made
 from coopenv.errors import CoopenvError
@@ -25,15 +26,19 @@ from coopenv.world.route import remaining_way
 
 
 @cache
-def put(size: int, own: bool) -> wp.Function:
-    """Return what writes a value of so many entries x factor, clipped to [-1, 1]; NaN of own fields stays."""
-    many = size > 1
+def put(size: int, entries: tuple[int, ...], own: bool) -> wp.Function:
+    """Return what writes entries of a value of `size`, (entry - center) factor, clipped to [-1, 1].
 
-    def put_value(out: Any, world: int, vehicle: int, first: int, value: Any, factor: wp.float32):
-        for axis in range(size):
-            entry = wp.float32(value[axis] if many else value) * factor
+    NaN of own fields stays.
+    """
+    many, count = size > 1, len(entries)
+
+    def put_value(out: Any, world: int, vehicle: int, first: int, value: Any, center: wp.float32, factor: wp.float32):
+        for place in range(wp.static(count)):
+            entry = wp.float32(value[wp.static(entries[place])] if many else value)
+            entry = (entry - center) * factor
             clipped = wp.clamp(entry, -1.0, 1.0)
-            out[world, vehicle, first + axis] = wp.where(wp.isnan(entry), entry, clipped) if own else clipped
+            out[world, vehicle, first + place] = wp.where(wp.isnan(entry), entry, clipped) if own else clipped
 
     return wp.func(put_value)
 
@@ -41,12 +46,12 @@ def put(size: int, own: bool) -> wp.Function:
 @cache
 def writer(field: Bound) -> wp.Function:
     """Return what writes a field's value into its place."""
-    function, number, size, both = field.function, field.number, field.size, field.records == 2
-    put_value = put(size, field.own)
+    function, number, size, both = field.function, field.number, len(field.entries), field.records == 2
+    put_value = put(field.size, field.entries, field.own)
 
-    def write(out: Any, start: Any, factor: Any, world: int, vehicle: int, n: int, ego: Ego, other: Any):
+    def write(out: Any, start: Any, center: Any, factor: Any, world: int, vehicle: int, n: int, ego: Ego, other: Any):
         value = function(ego, other) if both else function(ego)
-        put_value(out, world, vehicle, start[number] + n * size, value, factor[number])
+        put_value(out, world, vehicle, start[number] + n * size, value, center[number], factor[number])
 
     return wp.func(write)
 
@@ -65,13 +70,14 @@ def value_of(term: Bound, kind: Any) -> wp.Function:
 @cache
 def results_kernel(terms: Terms, p: Precision) -> wp.Kernel:
     """Return the kernel that fills the step results of every vehicle of the chosen worlds."""
-    own, of_target, of_neighbour = ([writer(field) for field in fields] for fields in terms[:3])
+    own, of_target, of_neighbour, of_landmark = ([writer(field) for field in fields] for fields in terms[:4])
     rewards = [value_of(term, wp.float32) for term in terms.rewards]
 
     def step_results(
         model: Any,
         state: Any,
         start: Any,
+        center: Any,
         factor: Any,
         weight: Any,
         results: Any,
@@ -80,8 +86,8 @@ def results_kernel(terms: Terms, p: Precision) -> wp.Kernel:
     ):
         """One thread per (world, vehicle).
 
-        Vectors: `start` and `factor`, a field's first entry and 1 / scale; `weight` of the reward terms. `fresh` marks
-        worlds that have just been reset: they forget the last episode and earn no reward.
+        Vectors: `start`, `center` and `factor`, a field's first entry, what reads 0, and 1 / scale; `weight` of the
+        reward terms. `fresh` marks worlds that have just been reset: they forget the last episode and earn no reward.
         """
         world, vehicle = wp.tid()
         if chosen[world] == 0:
@@ -106,18 +112,24 @@ def results_kernel(terms: Terms, p: Precision) -> wp.Kernel:
 
         out = results.observation
         for k in range(wp.static(len(own))):
-            wp.static(own[k])(out, start, factor, world, vehicle, 0, ego, ego)
-        for n in range(model.agents):
+            wp.static(own[k])(out, start, center, factor, world, vehicle, 0, ego, ego)
+        for n in range(wp.static(int(len(of_target) > 0)) * model.agents):
             target = target_record(model, state, world, vehicle, n)
             for k in range(wp.static(len(of_target))):
-                wp.static(of_target[k])(out, start, factor, world, vehicle, n, ego, target)
-        for n in range(model.vehicles - 1):
+                wp.static(of_target[k])(out, start, center, factor, world, vehicle, n, ego, target)
+        for n in range(wp.static(int(len(of_neighbour) > 0)) * (model.vehicles - 1)):
             sender = wp.where(n >= vehicle, n + 1, n)
             neighbour = neighbour_record(model, state, world, vehicle, sender)
             for k in range(wp.static(len(of_neighbour))):
-                wp.static(of_neighbour[k])(out, start, factor, world, vehicle, n, ego, neighbour)
+                wp.static(of_neighbour[k])(out, start, center, factor, world, vehicle, n, ego, neighbour)
+        nearest = Nearest(-1, -1.0)
+        for n in range(wp.static(int(len(of_landmark) > 0)) * model.map_size):
+            nearest = next_nearest(model, state, world, vehicle, nearest)
+            landmark = map_record(model, state, world, vehicle, nearest)
+            for k in range(wp.static(len(of_landmark))):
+                wp.static(of_landmark[k])(out, start, center, factor, world, vehicle, n, ego, landmark)
 
-    return _kernel(step_results, p.name, [*chain(*terms[:4])])
+    return _kernel(step_results, p.name, [*chain(*terms[:5])])
 
 
 @cache
@@ -147,7 +159,7 @@ def check_own_terms(terms: Terms, device: str) -> None:
     Raises:
         CoopenvError: Warp cannot compile its function, or it returns something else than its row says.
     """
-    for of_kind, record in zip(terms, (Ego, Target, Neighbour, Truth, Truth), strict=True):
+    for of_kind, record in zip(terms, (Ego, Target, Neighbour, MapLandmark, Truth, Truth), strict=True):
         for term in of_kind:
             if term.own and of_kind is terms.conditions:
                 _check(term, record, wp.bool, "true or false", device)
@@ -176,9 +188,13 @@ def _check(term: Bound, record: Any, returned: Any, expected: str, device: str) 
         raise CoopenvError(f"{term.title}: Warp cannot compile its function to return {expected}: {said}") from None
 
 
+def _source(term: Bound) -> str:
+    return inspect.getsource(term.function.func)
+
+
 def _kernel(function: Callable[..., None], name: str, terms: Sequence[Bound]) -> wp.Kernel:
     """Return a kernel in a module that is named after its terms, the same in every process."""
-    parts = [f"{t.number} {t.size} {t.own} {t.function.key} {inspect.getsource(t.function.func)}" for t in terms]
+    parts = [f"{t.number} {t.size} {t.entries} {t.own} {t.function.key} {_source(t)}" for t in terms]
     fingerprint = sha256("\n".join(parts).encode()).hexdigest()[:12]
     module = wp.get_module(f"{__name__}.{function.__name__}.{name}.{fingerprint}")
     module.options["enable_backward"] = False

@@ -11,11 +11,12 @@ from gymnasium import spaces
 from coopenv.errors import CoopenvError
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import GROUPS, OBSERVATION_FIELDS, ObservationField
+from coopenv.world.command import STEERING
 
 
 @dataclass(frozen=True)
 class Field:
-    """One named part of the flat observation; every entry is (value / scale), clipped to [low, 1]."""
+    """One named part of the flat observation; every entry is (value - center) / scale, clipped to [low, 1]."""
 
     start: int
     stop: int
@@ -25,11 +26,17 @@ class Field:
     scale: float
     low: float
     meaning: str
+    center: float = 0.0
 
     @property
     def slice(self) -> slice:
         """The field's place in the flat vector."""
         return slice(self.start, self.stop)
+
+    def values(self, observation: np.ndarray) -> np.ndarray:
+        """Return the values in the field's unit, (..., *shape), of flat observations (..., D)."""
+        entries = observation[..., self.slice]
+        return np.asarray(self.center + self.scale * entries).reshape(*observation.shape[:-1], *self.shape)
 
 
 @dataclass(frozen=True)
@@ -70,30 +77,49 @@ def included_fields(scenario: Scenario) -> dict[str, ObservationField]:
         CoopenvError: one is not known in this process.
     """
     wanted = scenario.observation.include
+    known = OBSERVATION_FIELDS.known(scenario.observation.custom)
     by_group: dict[str, dict[str, ObservationField]] = {}
-    for name, row in OBSERVATION_FIELDS.known(scenario.observation.custom).items():
+    for name, row in known.items():
         by_group.setdefault(row.group or name, {})[name] = row
+    for name, row in known.items():
+        by_group.setdefault(name, {name: row})  # a group of one, unless a group has its name
     for group in wanted:
         if group not in by_group:
             raise CoopenvError(f"observation field '{group}' is not registered in this process; see docs/terms.md")
     first = [group for group in GROUPS if group in wanted]
-    return {name: row for group in (*first, *wanted) for name, row in by_group[group].items()}
+    fields = {name: row for group in (*first, *wanted) for name, row in by_group[group].items()}
+    return {name: row for name, row in fields.items() if entries_of(row, scenario)}
+
+
+def entries_of(row: ObservationField, scenario: Scenario) -> tuple[int, ...]:
+    """Return which entries of a field's value a scenario's observation holds."""
+    if scenario.observation.planar and row.planar is not None:
+        return row.planar
+    return tuple(range(row.size))
 
 
 def observation_layout(scenario: Scenario) -> Layout:
     """Return the fields in their order in the flat observation, the same for every vehicle.
 
     Other vehicles are listed in ascending order without the vehicle itself; targets are all landmarks, then all
-    vehicles, the vehicle itself included (always masked).
+    vehicles, the vehicle itself included (always masked); landmarks of the map are those nearest, nearest first.
     """
-    counts = {"target": len(scenario.target_names), "neighbour": len(scenario.vehicles) - 1}
+    observation = scenario.observation
+    counts = {
+        "target": len(scenario.target_names),
+        "neighbour": len(scenario.vehicles) - 1,
+        "landmark": observation.map_size,
+    }
     layout, start = {}, 0
     for name, row in included_fields(scenario).items():
-        each = () if row.size == 1 and row.per != "vehicle" else (row.size,)
+        size = len(entries_of(row, scenario))
+        each = () if row.size == 1 and row.per != "vehicle" else (size,)
         shape = each if row.per == "vehicle" else (counts[row.per], *each)
         stop = start + int(np.prod(shape))
+        scale = observation.scales.get(name) or _scale(row, scenario)
+        center = observation.centers.get(name, row.center)
         group, low = row.group or name, float(row.low)
-        layout[name] = Field(start, stop, shape, group, row.unit, _scale(row, scenario), low, row.meaning)
+        layout[name] = Field(start, stop, shape, group, row.unit, scale, low, row.meaning, center)
         start = stop
     return Layout(layout, action_fields(scenario))
 
@@ -101,6 +127,8 @@ def observation_layout(scenario: Scenario) -> Layout:
 def _scale(row: ObservationField, scenario: Scenario) -> float:
     if row.scale == "targets":
         return float(len(scenario.target_names))
+    if row.scale == "steering":
+        return float(action_fields(scenario)[STEERING].high)
     return float(getattr(scenario.observation, row.scale) if isinstance(row.scale, str) else row.scale)
 
 

@@ -10,9 +10,10 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.api.terms.way import metres
-from coopenv.world.camera import VISIBLE
+from coopenv.api.terms.way import metres, seen_from_estimate
+from coopenv.world.camera import VISIBLE, body_bearing
 from coopenv.world.collision import UNDER_WAY
+from coopenv.world.quality import position_covariance
 from coopenv.world.route import goal_distance
 from coopenv.world.v2x import fresh
 
@@ -35,6 +36,8 @@ class Ego:
     mean_log_variance: wp.float32  # log det P / 6
     information_gained: wp.float32  # decrease of log det P / 6 since the last decision
     position_std: wp.float32  # m, sqrt of the trace of the position's covariance in the map
+    axis_std: wp.vec3  # m, of the position along the estimated body's axes
+    heading_std: wp.float32  # rad, of the turn about the body's z axis
     uncertainty_threshold: wp.float32  # m, of [reward]
     uncertainty_cap: wp.float32  # m, of [reward]
     metres_gained: wp.float32  # of its way in this decision, beyond the farthest point so far, by the estimate
@@ -48,6 +51,12 @@ class Ego:
     action: wp.vec2  # of this decision, [-1, 1]
     effort: wp.float32  # |action|^2
     command: wp.vec3  # what it asked for: speed m/s, steering rad, acceleration m/s^2
+    steering: wp.float32  # rad, positive to the left
+    time_left: wp.float32  # share of the horizon
+    route_offset: wp.float32  # m to the left of its way, by the estimate
+    route_heading: wp.float32  # rad, estimated heading less that of its way
+    route_left: wp.float32  # m of its way to the goal
+    route_ahead: wp.vec4  # rad to the left, where its way is 1, 2, 4 and 8 steps ahead
     goal: wp.vec3  # m, seen from the estimate, body; 0 without a goal
     outcome: wp.int32  # `Outcome` in the step of arrival or collision, else UNDER_WAY
 
@@ -80,13 +89,16 @@ class Target:
 
 @wp.struct
 class Neighbour:
-    """What the vehicle knows of another vehicle by its messages; 0 where none is at hand."""
+    """What the vehicle knows of another vehicle by its messages, 0 where none is at hand, and by its camera."""
 
     index: wp.int32  # of the vehicle
     heard: wp.bool  # a message is at hand and not stale
     position: wp.vec3  # m, sender's estimate seen from one's own, body
     rotation: wp.mat33  # sender's body to one's own estimated body
     age: wp.float32  # s since it was sent
+    bearing: wp.vec3  # unit vector camera to the vehicle, body, last measured; 0: never
+    in_view: wp.bool  # measured in this frame
+    bearing_age: wp.float32  # s since measured
 
 
 @wp.func
@@ -130,6 +142,10 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     last = results.last_log_determinant[world, vehicle]
     ego.information_gained = wp.float32((last - results.log_determinant[world, vehicle]) / p.dtype(6.0))
     ego.position_std = wp.float32(results.position_std[world, vehicle])
+    spread = position_covariance(state.covariance[world, vehicle], p)
+    for axis in range(3):
+        ego.axis_std[axis] = wp.float32(wp.sqrt(wp.max(spread[axis, axis], p.dtype(0.0))))
+    ego.heading_std = wp.float32(wp.sqrt(wp.max(state.covariance[world, vehicle][2, 2], p.dtype(0.0))))
     ego.uncertainty_threshold = wp.float32(model.judgement.uncertainty_threshold)
     ego.uncertainty_cap = wp.float32(model.judgement.uncertainty_cap)
     gained, missed = metres(model, state, results, world, vehicle, wp.float64(ego.elapsed))
@@ -145,6 +161,13 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     ego.action = wp.vec2(action)
     ego.effort = wp.float32(wp.dot(action, action))
     ego.command = wp.vec3(state.command[world, vehicle])
+    ego.steering = wp.float32(state.steering[world, vehicle])
+    ego.time_left = 1.0 - wp.float32(tick) / wp.float32(model.horizon_ticks)
+    offset, turn, left, ahead = seen_from_estimate(model, state, world, vehicle)
+    ego.route_offset = wp.float32(offset)
+    ego.route_heading = wp.float32(turn)
+    ego.route_left = wp.float32(left)
+    ego.route_ahead = ahead
     if model.scene.goal_radius[vehicle] > p.dtype(0.0):
         ego.goal = wp.vec3(wp.transpose(R) * state.goal[world, vehicle] - p)
     ego.outcome = wp.where(results.alive[world, vehicle], state.ended[world, vehicle], UNDER_WAY)
@@ -190,4 +213,8 @@ def neighbour_record(model: Any, state: Any, world: int, vehicle: int, sender: i
         neighbour.position = wp.vec3(Rt * state.inbox_position[world, vehicle, sender] - p)
         neighbour.rotation = wp.mat33(Rt * state.inbox_rotation[world, vehicle, sender])
         neighbour.age = seconds_since(now, state.inbox_tick[world, vehicle, sender], model.camera_rate)
+    target = model.landmarks + sender
+    neighbour.bearing = wp.vec3(body_bearing(model, state, world, vehicle, target))
+    neighbour.in_view = state.sight[world, vehicle, target] == VISIBLE
+    neighbour.bearing_age = seconds_since(now, state.bearing_tick[world, vehicle, target], model.camera_rate)
     return neighbour

@@ -280,7 +280,7 @@ def test_a_field_of_another_size_is_refused(size: str, value: str, message: str,
         ('[reward.custom]\n"1st" = "my_terms.py:error"\n', "is an identifier, got '1st'"),
         (
             '[observation.custom]\na = { function = "a.py:a", per = "car" }\n',
-            "'vehicle', 'target' or 'neighbour'.*'car'",
+            "'vehicle', 'target', 'neighbour' or 'landmark'.*'car'",
         ),
         ('[observation.custom]\na = { function = "a.py:a", size = 0 }\n', "observation.custom.a.size: .*got 0"),
         ('[observation.custom]\na = { function = "a.py:a", scal = 1 }\n', r"scal: unknown key .did you mean 'scale'"),

@@ -1,0 +1,220 @@
+"""The observation's groups of the map, the way and the vehicle itself: what they say against geometry in NumPy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import coopenv
+from coopenv.api.engine import Engine
+from coopenv.api.terms.layout import observation_layout
+from coopenv.estimation.outcomes import Sight
+from coopenv.scenario import Scenario, load_scenario
+from tests.oracles.geometry import in_field_of_view, is_occluded, point_in_camera
+
+GROUPS = ["uncertainty", "sightings", "map", "route", "self"]
+
+
+def scenario_with(**more: Any) -> Scenario:
+    far = {"position_scale": 50.0, "map_scale": 50.0, "age_scale": 1000.0, "include": GROUPS}
+    return load_scenario("urban_crossing", {f"observation.{key}": value for key, value in {**far, **more}.items()})
+
+
+def driven(scenario: Scenario, steps: int = 12, worlds: int = 4) -> Engine:
+    engine = Engine(scenario, worlds, "float64")
+    engine.reset(list(range(worlds)))
+    rng = np.random.default_rng(0)
+    for _ in range(steps):
+        engine.step(rng.uniform([0.2, -1.0], 1.0, (worlds, len(scenario.vehicles), 2)))
+    return engine
+
+
+def seen(engine: Engine, scenario: Scenario, name: str) -> np.ndarray:
+    """Return a field's values, (W, N, *shape)."""
+    return observation_layout(scenario)[name].values(engine.view("observation").astype(float))
+
+
+def estimates(engine: Engine) -> tuple[np.ndarray, np.ndarray]:
+    """Return (R, position in the map) as estimated, (W, N, 3, 3) and (W, N, 3)."""
+    R = engine.view("estimate_rotation")
+    return R, np.einsum("wnij,wnj->wni", R, engine.view("estimate_position"))
+
+
+def predicted(scenario: Scenario, point: np.ndarray, R: np.ndarray, p: np.ndarray) -> bool:
+    """Tell by the oracle whether a point is to be seen from a pose."""
+    camera = scenario.camera
+    ray = point_in_camera(point, R, p, camera.position)
+    intrinsics = (*camera.focal_length, *camera.principal_point, *camera.image_size)
+    if camera.range is not None and np.linalg.norm(ray) > camera.range:
+        return False
+    if not in_field_of_view(ray, *intrinsics):
+        return False
+    origin = p + R @ np.array(camera.position)
+    boxes = [(np.array(o.center), np.eye(3), np.array(o.size) / 2) for o in scenario.obstacles]
+    return not any(is_occluded(origin, point, center, turn, half) for center, turn, half in boxes)
+
+
+def test_the_map_is_that_of_the_nearest_landmarks_by_ones_own_estimate() -> None:
+    scenario = scenario_with(map_size=14)
+    engine = driven(scenario)
+    places = np.array([landmark.position for landmark in scenario.landmarks])  # 12
+    R, p = estimates(engine)
+    position, mask = seen(engine, scenario, "map_position"), seen(engine, scenario, "map_mask")
+    in_view, age = seen(engine, scenario, "map_in_view"), seen(engine, scenario, "map_age")
+    now = engine.view("tick")[0]
+    found = []
+    for w, i in np.ndindex(*p.shape[:2]):
+        order = np.argsort(np.linalg.norm((places - p[w, i])[:, :2], axis=1))
+        np.testing.assert_allclose(position[w, i, :12], (places[order] - p[w, i]) @ R[w, i], atol=1e-4)
+        assert mask[w, i].tolist() == [1] * 12 + [0] * 2
+        assert not position[w, i, 12:].any() and not in_view[w, i, 12:].any() and (age[w, i, 12:] == 1000.0).all()
+        expected = [predicted(scenario, places[n], R[w, i], p[w, i]) for n in order]
+        assert in_view[w, i, :12].tolist() == expected
+        found += expected
+        then = engine.view("bearing_tick")[w, i, order]
+        np.testing.assert_allclose(age[w, i, :12], np.where(then < 0, 1000.0, (now - then) / 60.0), atol=1e-3)
+    assert 0.2 < np.mean(found) < 0.8
+
+
+def test_what_is_expected_in_view_mostly_is() -> None:
+    scenario = scenario_with(map_size=12)
+    engine = driven(scenario, steps=30)
+    _, p = estimates(engine)
+    places = np.array([landmark.position for landmark in scenario.landmarks])
+    order = np.argsort(np.linalg.norm((places - p[..., None, :])[..., :2], axis=-1), axis=-1)
+    visible = np.take_along_axis(engine.view("sight")[..., :12] == Sight.VISIBLE, order, axis=-1)
+    assert (visible == (seen(engine, scenario, "map_in_view") == 1.0)).mean() > 0.9  # the others: cars, misses, errors
+
+
+def test_every_landmark_is_expected_where_the_topology_is_fixed() -> None:
+    name = "busy_intersection"
+    scenario = load_scenario(name, {"observation.include": ["map"], "observation.map_size": 2})
+    engine = driven(scenario, 1)
+    assert seen(engine, scenario, "map_in_view").all()
+
+
+def test_the_way_is_seen_from_ones_own_estimate() -> None:
+    scenario = scenario_with(route_step=1.0)
+    engine = driven(scenario)
+    R, p = estimates(engine)
+    for i, vehicle in enumerate(scenario.vehicles):
+        assert vehicle.goal is not None
+        start, goal = np.array(vehicle.initial_pose.position), np.array(vehicle.goal.position)
+        length = np.linalg.norm((goal - start)[:2])
+        along = (goal - start)[:2] / length
+        left = np.array([-along[1], along[0]])
+        offset = (p[:, i] - start)[:, :2]
+        way = offset @ along
+        ahead = np.add([[1.0], [2.0], [4.0], [8.0]], way)
+        points = start[:2] + ahead[..., None] * along - p[:, i, :2]
+        heading = np.arctan2(R[:, i, 1, 0], R[:, i, 0, 0])
+        directions = np.angle(np.exp(1j * (np.arctan2(points[..., 1], points[..., 0]) - heading)))
+        turn = np.angle(np.exp(1j * (heading - np.arctan2(along[1], along[0]))))
+        for name, expected in (
+            ("route_offset", offset @ left),
+            ("route_heading", turn),
+            ("route_left", length - way),
+        ):
+            np.testing.assert_allclose(seen(engine, scenario, name)[:, i, 0], np.clip(expected, -1, 50), atol=1e-4)
+        np.testing.assert_allclose(seen(engine, scenario, "route_ahead")[:, i], np.clip(directions.T, -1, 1), atol=1e-4)
+
+
+def test_a_vehicle_knows_itself_and_whom_it_sees() -> None:
+    scenario = scenario_with(map_size=1)
+    engine = driven(scenario, steps=40)
+    np.testing.assert_allclose(seen(engine, scenario, "steering")[..., 0], engine.view("steering"), atol=1e-5)
+    np.testing.assert_allclose(seen(engine, scenario, "last_action"), engine.view("action"), atol=1e-6)
+    np.testing.assert_allclose(seen(engine, scenario, "time_left"), 1.0 - 4.0 / 40.0, atol=1e-6)
+    L = len(scenario.landmarks)
+    body = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # camera to body
+    for i in range(4):
+        others = [L + j for j in range(4) if j != i]
+        bearing = engine.view("bearing")[:, i, others] @ body.T
+        np.testing.assert_allclose(seen(engine, scenario, "sighting")[:, i], bearing, atol=1e-6)
+        visible = engine.view("sight")[:, i, others] == Sight.VISIBLE
+        assert np.array_equal(seen(engine, scenario, "sighting_mask")[:, i] == 1.0, visible)
+    assert seen(engine, scenario, "sighting_mask").any()
+
+
+def test_deviations_are_those_of_the_covariance_that_the_observer_states() -> None:
+    scenario = scenario_with(map_size=1)
+    engine = driven(scenario)
+    P, p_hat = engine.view("covariance"), engine.view("estimate_position")
+    for w, i in np.ndindex(*p_hat.shape[:2]):
+        x, y, z = p_hat[w, i]
+        J = np.hstack([-np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]), np.eye(3)])
+        cov = J @ P[w, i] @ J.T
+        for name, expected in (
+            ("position_std", np.sqrt(np.trace(cov))),
+            ("axis_std", np.sqrt(np.diag(cov))),
+            ("heading_std", np.sqrt(P[w, i, 2, 2])),
+        ):
+            np.testing.assert_allclose(seen(engine, scenario, name)[w, i], np.log10(expected), atol=1e-5)
+
+
+def nearness(ego: Any, landmark: Any) -> Any:
+    """How near a landmark is that the camera has in view, 0 if it has not."""
+    if landmark.in_view and landmark.exists:
+        return 1.0 / (1.0 + landmark.distance)
+    return 0.0
+
+
+def test_fields_of_ones_own_per_landmark() -> None:
+    coopenv.register_observation("nearness", nearness, per="landmark", low=0)
+    envs = coopenv.make_vec("urban_crossing", num_worlds=2, overrides={"observation.include": ["map", "nearness"]})
+    envs.reset(seed=0)
+    observations = envs.step(np.zeros(envs.action_space.shape))[0]
+    layout = envs.observation_layout
+    assert layout["nearness"].shape == (8,)
+    distance = np.linalg.norm(layout["map_position"].values(observations)[..., :2], axis=-1)
+    near = layout["nearness"].values(observations)
+    assert near.any()
+    np.testing.assert_allclose(near[near > 0], 1.0 / (1.0 + distance[near > 0]), rtol=0.02)
+
+
+def test_a_planar_observation_leaves_out_what_a_car_cannot_change() -> None:
+    whole, planar = ({"observation.include": ["estimate", "odometry", "map", "goal"]} for _ in range(2))
+    planar["observation.planar"] = True
+    a, b = (coopenv.make_vec("urban_crossing", num_worlds=2, overrides=o) for o in (whole, planar))
+    one, two = a.reset(seed=0)[0], b.reset(seed=0)[0]
+    for name, kept in {
+        "estimate_position": [0, 1],
+        "estimate_forward": [0, 1],
+        "velocity": [0],
+        "angular_velocity": [2],
+        "map_position": [0, 1],
+        "goal": [0, 1],
+        "odometry_age": [0],
+    }.items():
+        np.testing.assert_array_equal(
+            b.observation_layout[name].values(two), a.observation_layout[name].values(one)[..., kept]
+        )
+    assert "estimate_left" not in b.observation_layout
+
+
+def test_scales_and_centers_of_single_fields() -> None:
+    names = {"observation.include": ["position_std", "odometry_age", "log_determinant", "goal"]}
+    changed = {**names, "observation.scales.log_determinant": 20.0, "observation.centers.log_determinant": -4.0}
+    a, b = (coopenv.make_vec("urban_crossing", num_worlds=2, overrides=o) for o in (names, changed))
+    one, two = a.reset(seed=0)[0], b.reset(seed=0)[0]
+    assert list(a.observation_layout) == ["goal", "position_std", "odometry_age", "log_determinant"]
+    value = a.observation_layout["log_determinant"].values(one)
+    np.testing.assert_allclose(two[:, b.observation_layout["log_determinant"].slice], (value + 4.0) / 20.0, rtol=1e-5)
+    np.testing.assert_allclose(b.observation_layout["log_determinant"].values(two), value, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("scales.goall", 1.0, "observation.scales: unknown field 'goall' .did you mean 'goal'"),
+        ("centers.progress", 1.0, "observation.centers: unknown field 'progress'"),
+        ("scales.goal", 0.0, "observation.scales.goal: "),
+        ("map_size", 0, "observation.map_size: "),
+        ("include", ["mapp"], "unknown group or field 'mapp' .did you mean 'map'"),
+    ],
+)
+def test_errors_are_one_line(key: str, value: Any, message: str) -> None:
+    with pytest.raises(coopenv.ScenarioError, match=message):
+        load_scenario("urban_crossing", {f"observation.{key}": value})
