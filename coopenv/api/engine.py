@@ -14,7 +14,7 @@ from coopenv.api.terms.binding import bound_terms, own_places
 from coopenv.api.terms.kernels import check_own_terms, endings_kernel, results_kernel
 from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.base import Backend
-from coopenv.backends.simulated import Simulated
+from coopenv.backends.sources import simulation_of
 from coopenv.backends.tick_world import open_world
 from coopenv.errors import CoopenvError, check_memory, told
 from coopenv.scenario import Scenario
@@ -56,7 +56,7 @@ class Engine:
             backend: where ticks come from (None: computed).
             reward: in place of the scenario's weighted sum; on the CPU only.
         """
-        self.backend: Backend = backend or Simulated(scenario)
+        self.backend: Backend = backend or simulation_of(scenario)
         self.world = open_world(self.backend, worlds, dtype, device, threads)
         on_host = self.world.observer is HOST
         self.plugins = PlugIns(scenario.observer.name, self.world) if on_host else None
@@ -236,7 +236,7 @@ class Engine:
         """
         memory = {name: getattr(self.results, name).numpy().copy() for name in MEMORY}
         own = {} if self.plugins is None else {"observers": self.plugins.get_state()}
-        return {**self.world.get_state(), **memory, **own}
+        return {**self.world.get_state(), **self.world.source_state(), **memory, **own}
 
     def set_state(self, values: Mapping[str, Any]) -> None:
         """Restore what `get_state` returned.
@@ -246,6 +246,7 @@ class Engine:
         """
         memory = {name: getattr(self.results, name) for name in MEMORY}
         checked = self.world.checked_state(values, memory, MEMORY)
+        self.world.set_source_state(values)
         if self.plugins is not None:
             self.plugins.set_state(values.get("observers"), has_begun(checked["start_rotation"]))
         overwrite(self.world.state_arrays(), checked)

@@ -17,8 +17,7 @@ from coopenv.api.pictures import Pictures
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
 from coopenv.backends.base import Backend, Health
-from coopenv.backends.simulated import Simulated
-from coopenv.backends.sources import open_backend
+from coopenv.backends.sources import open_backend, simulation_of
 from coopenv.errors import CoopenvError, ScenarioError, shown, suggest
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import named
@@ -68,7 +67,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         self._arguments = {key: value for key, value in locals().items() if key != "self"}
         _one_of("render_mode", render_mode, (None, *RENDER_MODES))
         _one_of("observation", observation, ("flat", "dict"))
-        backend = Simulated(source) if isinstance(source, Scenario) else source
+        backend = simulation_of(source) if isinstance(source, Scenario) else source
         self.scenario = scenario = backend.scenario
         self.render_mode = render_mode
         self.metadata = {
@@ -272,8 +271,8 @@ def parallel_env(
         render_mode: None, "rgb_array" or "human".
         observer: estimator that every vehicle runs, embedded or a plug-in: a name, a class, or where one stands
             (`mine.py:Mine`, `package.module:Mine`); None: as the scenario says.
-        backend: where measurements come from, "simulated" or "replay", or a `coopenv.backends.base.Backend`, which
-            has its own scenario; None: as the name says.
+        backend: where measurements come from, "simulated", "highway" or "replay", or a `coopenv.backends.base.Backend`,
+            which has its own scenario; None: as the name says.
         observation: "flat" Box or one-level "dict".
         device: "cpu" or a CUDA device.
         dtype: "float32" or "float64" (of the world; observations are float32).

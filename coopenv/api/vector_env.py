@@ -72,8 +72,8 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
             raise CoopenvError(f"unknown render_mode '{render_mode}'; known: None, rgb_array")
         if observation not in ("flat", "dict"):
             raise CoopenvError(f"unknown observation '{observation}'; known: flat, dict")
-        self.scenario = scenario
         self.engine = Engine(scenario, num_worlds, dtype, device, threads, reward=reward)
+        self.scenario = scenario = self.engine.backend.scenario
         self.pictures = Pictures(self.engine, scenario)
         self.num_worlds, self.vehicles = self.engine.world.worlds, len(scenario.vehicles)
         self.num_envs = self.num_worlds * self.vehicles

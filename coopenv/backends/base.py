@@ -196,6 +196,13 @@ class SensingWorld(World, ABC):
         """Make the next tick ready for `sense`; return False where the source has no more."""
         return True
 
+    def source_state(self) -> dict[str, Any]:
+        """Return a copy of what the source remembers outside the arrays, by name."""
+        return {}
+
+    def set_source_state(self, values: Mapping[str, Any]) -> None:
+        """Restore it from the saved state; a CoopenvError says what does not fit, and nothing has changed then."""
+
 
 class WorldBackend(Backend, Protocol):
     """A backend whose ticks come about on the device, in any number of worlds."""

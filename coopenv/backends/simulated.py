@@ -84,6 +84,8 @@ class SimulatedWorld(SensingWorld):
 class Simulated(TickGenerator):
     """Worlds that are computed: many at once on a device, or one of them tick by tick."""
 
+    kind: type[SimulatedWorld] = SimulatedWorld
+
     def __init__(self, scenario: Scenario) -> None:
         """Simulate a scenario."""
         driven, ticks = scenario.driven, scenario.horizon_ticks + 1
@@ -95,18 +97,19 @@ class Simulated(TickGenerator):
         """Return the worlds, with the observer that the scenario names."""
         observer = find_embedded(self.scenario.observer.name) or HOST
         start = start_covariances(self.scenario)
-        return SimulatedWorld(self.scenario, worlds, dtype, device, threads, observer, start)
+        return self.kind(self.scenario, worlds, dtype, device, threads, observer, start)
 
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
         """Simulate one world in float64, without an observer: the radio decides on messages, whatever they say."""
         if self._world is None:
-            self._world = SimulatedWorld(self.scenario, 1, "float64", threads=1)
+            self._world = self.kind(self.scenario, 1, "float64", threads=1)
         world = self._world
         world.reset(None if seed is None else [seed])
         active = wp.ones(1, dtype=wp.int32, device=world.device)
         command = yield world.told(0)
         for k in range(1, self.scenario.horizon_ticks + 1):
             world.view("command")[0] = command.rows
+            world.fetch()
             world.sense(active)
             for vehicle in world.briefing.order:
                 world.deliver(active, vehicle)

@@ -13,8 +13,8 @@ from coopenv.errors import CoopenvError, DataError, suggest
 from coopenv.observers.recording import Recording
 from coopenv.scenario import Scenario, load_scenario
 
-BACKENDS = ("simulated", "replay")
-PLANNED = ("svea", "highway")  # backends that there will be
+BACKENDS = ("simulated", "highway", "replay")
+PLANNED = ("svea",)  # backends that there will be
 
 LOG_SUFFIX = ".mcap"
 DATASETS = re.compile(r"mrclam_\d+")
@@ -78,6 +78,19 @@ def open_simulation(name_or_path: str | Path, overrides: Mapping[str, Any] | Non
     return load_scenario(name_or_path, overrides)
 
 
+def simulation_of(scenario: Scenario) -> Simulated:
+    """Return what simulates a scenario, as its key `backend` says.
+
+    Raises:
+        CoopenvError: an extra is missing, or the section of the backend is not valid.
+    """
+    if scenario.backend == "simulated":
+        return Simulated(scenario)
+    from coopenv.backends.highway import Highway
+
+    return Highway(scenario)
+
+
 def open_backend(
     name_or_path: str | Path,
     backend: str | Backend | None,
@@ -112,4 +125,7 @@ def open_backend(
     for what, value in (("data", data), ("variant", variant)):
         if value is not None:
             raise CoopenvError(f"{what} is for recorded data, '{name_or_path}' is simulated")
-    return Simulated(load_scenario(name_or_path, overrides))
+    scenario = load_scenario(name_or_path, overrides)
+    if backend not in (None, scenario.backend):
+        raise CoopenvError(f"backend '{backend}': {name_or_path} says backend = \"{scenario.backend}\"")
+    return simulation_of(scenario)

@@ -6,7 +6,7 @@ import numpy as np
 
 from coopenv.api.engine import Engine
 from coopenv.backends.base import Backend
-from coopenv.backends.simulated import Simulated
+from coopenv.backends.sources import simulation_of
 from coopenv.observers.recording import Recording, Truth, is_due
 from coopenv.policies import Policy, load_policy
 from coopenv.runs.episode import Views, play
@@ -32,7 +32,7 @@ def record(
     Raises:
         CoopenvError: unknown policy or observer, or the backend cannot begin.
     """
-    backend: Backend = Simulated(source) if isinstance(source, Scenario) else source
+    backend: Backend = simulation_of(source) if isinstance(source, Scenario) else source
     scenario = backend.scenario
     driver = load_policy(policy, scenario, seed) if isinstance(policy, str) else policy
     engine = Engine(scenario, 1, "float64", backend=backend)

@@ -46,8 +46,8 @@ class Rollout:
         """Build the world; arguments as for `rollout`, and where the scenario's ticks come from (None: simulated)."""
         if steps is not None and steps < 1:
             raise CoopenvError(f"steps must be at least 1, got {steps}")
-        self.scenario, self.seed = scenario, seed
         self.engine = Engine(scenario, 1, dtype, device, backend=backend)
+        self.scenario, self.seed = self.engine.backend.scenario, seed
         self.policy = load_policy(policy, scenario, seed) if isinstance(policy, str) else policy
         self.policy_name = policy if isinstance(policy, str) else getattr(policy, "__name__", "custom")
         self.ticks_planned = scenario.horizon_ticks

@@ -15,6 +15,7 @@ from coopenv.scenario.bodies import (
     InitialEstimate,
     InitialPose,
     SegmentMotion,
+    TrafficMotion,
     Vehicle,
     WaypointMotion,
 )
@@ -68,6 +69,8 @@ def start(vehicle: Vehicle) -> str:
     """Return where a vehicle starts, one line per fact."""
     if isinstance(vehicle.motion, WaypointMotion):
         return vector(vehicle.motion.waypoints[0].position)
+    if vehicle.initial_pose is None and not vehicle.routes:
+        return "drawn by highway-env"
     pose = vehicle.initial_pose or InitialPose()
     if pose.position is None:
         lines = ["start of its route"]
@@ -109,6 +112,8 @@ def motion(moves: Any) -> str:
         return f"spline through {len(moves.waypoints)} waypoints over {number(moves.waypoints[-1].time)} s"
     if isinstance(moves, DrivenMotion):
         return f"driven by actions, starts at {number(moves.initial_speed)} m/s"
+    if isinstance(moves, TrafficMotion):
+        return "driven by highway-env's traffic"
     return "stands still"
 
 

@@ -68,7 +68,8 @@ def _vehicles(scenario: Scenario) -> str:
     driven = sum(vehicle.motion.kind == "driven" for vehicle in scenario.vehicles)
     goals = sum(vehicle.goal_radius > 0 for vehicle in scenario.vehicles)
     parts = [f"{driven} driven by actions, up to {number(scenario.dynamics.max_speed)} m/s"] if driven else []
-    parts += [f"{len(scenario.vehicles) - driven} with prescribed motion"] if driven < len(scenario.vehicles) else []
+    others = f"{len(scenario.vehicles) - driven} " + ("in traffic" if scenario.highway else "with prescribed motion")
+    parts += [others] if driven < len(scenario.vehicles) else []
     return "; ".join([*parts, *([f"{goals} with a goal"] if goals else [])])
 
 

@@ -47,6 +47,8 @@ class Road(Part):
     start: Vector2
     end: Vector2
     width: Positive
+    marked: bool = True
+    """Whether a dashed line marks its middle."""
 
 
 class StaticMotion(Part):
@@ -125,9 +127,16 @@ class DrivenMotion(Part):
     """m/s"""
 
 
+class TrafficMotion(Part):
+    """Driven by the traffic of a backend that has one (`backend = "highway"`), not by actions."""
+
+    kind: Literal["traffic"] = "traffic"
+
+
 LandmarkMotion = Annotated[StaticMotion | ConstantMotion | SegmentMotion | WaypointMotion, Field(discriminator="kind")]
 VehicleMotion = Annotated[
-    StaticMotion | ConstantMotion | SegmentMotion | WaypointMotion | DrivenMotion, Field(discriminator="kind")
+    StaticMotion | ConstantMotion | SegmentMotion | WaypointMotion | DrivenMotion | TrafficMotion,
+    Field(discriminator="kind"),
 ]
 
 
@@ -212,7 +221,8 @@ class Vehicle(Part):
     """A connected vehicle that estimates its own pose; named vehicle_1, vehicle_2, ... in file order."""
 
     initial_pose: InitialPose | None = None
-    """Needed unless the motion is by waypoints, which start at the first waypoint, or the vehicle has routes."""
+    """Needed unless the motion is by waypoints, which start at the first waypoint, the vehicle has routes, or
+    highway-env draws the start."""
     initial_estimate: InitialEstimate = InitialEstimate()
     motion: VehicleMotion = StaticMotion()
     body: Body | None = None
@@ -230,15 +240,13 @@ class Vehicle(Part):
         return (self.goal or Goal()).radius if self.goal or self.routes else 0.0
 
     @model_validator(mode="after")
-    def _has_a_start_and_a_goal(self) -> Self:
+    def _has_one_start_and_goal(self) -> Self:
         pose, waypoints = self.initial_pose, self.motion.kind == "waypoints"
         if waypoints and pose is not None:
             raise ValueError("initial_pose: a motion by waypoints starts at its first waypoint; leave this out")
         if self.routes:
             self._check_routes()
             return self
-        if pose is None and not waypoints:
-            raise ValueError("initial_pose: needed, with at least a position")
         if pose is not None and pose.position is None:
             raise ValueError("initial_pose.position: needed by a vehicle without routes")
         if self.goal is not None and self.goal.position is None:

@@ -1,9 +1,12 @@
 """Every field of a scenario, typed; `schema.Scenario` checks them against one another."""
 
+from typing import Literal
+
 from pydantic import Field
 
 from coopenv.scenario.base import Part, Positive, Text, Vector3
 from coopenv.scenario.bodies import Landmark, Obstacle, Road, Vehicle
+from coopenv.scenario.highway import Highway
 from coopenv.scenario.learning import Action, Dynamics, Observation, Reward, Termination
 from coopenv.scenario.routes import Route
 from coopenv.scenario.sensing import Camera, Noise, Observer, Rates, Topology, V2x
@@ -25,6 +28,9 @@ class ScenarioFields(Part):
     """Where the figures come from."""
     horizon: Positive
     """Length of an episode, s."""
+    backend: Literal["simulated", "highway"] = "simulated"
+    """What moves the vehicles: coopenv itself, or highway-env as the section `[highway]` says."""
+    highway: Highway | None = None
     map: Map = Map()
     routes: tuple[Route, ...] = Field(default=(), max_length=1_000)
     roads: tuple[Road, ...] = Field(default=(), max_length=10_000)

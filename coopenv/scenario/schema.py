@@ -19,6 +19,9 @@ MOST_TICKS = 1e8  # camera frames or odometry samples of one episode; counters a
 
 MOST_PAIRS = 2e7  # of vehicles and their targets
 
+LIMITS = {"max_acceleration", "max_speed", "max_steering", "reverse"}
+"""Keys of `[dynamics]` that are limits of commands; the others describe this project's own bicycle."""
+
 FAR_FROM_ORIGIN = 50.0
 """m; beyond it the paper's observer loses accuracy, because it is not invariant to the map origin."""
 
@@ -43,12 +46,38 @@ class Scenario(ScenarioFields):
             raise ValueError(f"vehicles: {vehicles} times {targets} targets are over {MOST_PAIRS:.0e} pairs")
         neighbours = neighbour_sets(self)
         processing_order(self, neighbours)
-        for problem in _problems(self):
+        for problem in (*_misplaced(self), *_problems(self)):
             raise ValueError(problem)
-        check_room(self)
+        if self.backend == "simulated":
+            check_room(self)
         for doubt in _doubts(self, neighbours):
             warnings.warn(doubt, ScenarioWarning, stacklevel=2)
         return self
+
+
+def _misplaced(s: ScenarioFields) -> Iterator[str]:
+    """Yield what does not fit to what moves the vehicles."""
+    elsewhere = s.backend == "highway"
+    if elsewhere != (s.highway is not None):
+        yield "highway: needed" if elsewhere else 'highway: only with backend = "highway"'
+    for i, vehicle in enumerate(s.vehicles):
+        kind = vehicle.motion.kind
+        if elsewhere and kind not in ("driven", "traffic"):
+            yield f"vehicles.{i}.motion.kind: '{kind}' is not known to highway-env; known: driven, traffic"
+        speed = getattr(vehicle.motion, "initial_speed", 0.0)
+        drawn = {"initial_pose": vehicle.initial_pose is not None, "motion.initial_speed": speed != 0.0}
+        for key in [key for key, given in drawn.items() if given] if elsewhere else ():
+            yield f"vehicles.{i}.{key}: highway-env draws it; leave this out"
+        if not elsewhere and kind == "traffic":
+            yield f"vehicles.{i}.motion.kind: 'traffic' needs backend = \"highway\""
+        if not elsewhere and kind != "waypoints" and vehicle.initial_pose is None and not vehicle.routes:
+            yield f"vehicles.{i}.initial_pose: needed, with at least a position"
+    for name in sorted(s.dynamics.model_fields_set - LIMITS) if elsewhere else ():
+        yield f"dynamics.{name}: highway-env has its own; allowed: {', '.join(sorted(LIMITS))}"
+    if elsewhere and s.rates.camera % 1.0:
+        yield f"rates.camera: highway-env steps a whole number of times a second, not {s.rates.camera:g}"
+    if elsewhere and not s.driven:
+        yield "vehicles: highway-env needs at least one that is driven"
 
 
 def _problems(s: ScenarioFields) -> Iterator[str]:

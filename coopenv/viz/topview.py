@@ -26,10 +26,12 @@ _FILLED = 0.3  # of the picture's side, largest semi-axis of an ellipse that is 
 _LARGEST = 2.0  # of the picture's side, largest semi-axis of an ellipse that is drawn
 _HALO: dict[str, Any] = {"path_effects": [withStroke(linewidth=2.2, foreground="white")]}
 _FARTHEST = 10.0  # pictures' sides from the middle, of an estimate as drawn
+_BOX = ("rotation", "position", "half")
 _POINT = Body(size=(2e-3, 1e-3, 1e-3))  # stands in for a vehicle without a body, drawn at the least size
 _FIELDS = (
     *("rotation", "position", "estimate_rotation", "estimate_position", "covariance"),
     *("sight", "ended", "position_error", "orientation_error", *GOAL_FIELDS),
+    *("traffic_rotation", "traffic_position", "traffic_half"),
 )
 
 
@@ -64,6 +66,8 @@ class TopView:
         sigma = self._place_ellipses(estimate, geometry.position_covariance(R_hat, p_hat, view["covariance"]))
         self._goals.place(view)
         self._place_bodies(R, position, R_hat, estimate)
+        there = view["traffic_half"][:, 0] > 0.0
+        self._traffic.set_verts(geometry.box_outlines(*(view[f"traffic_{part}"][there] for part in _BOX)))
         self._place_sight(R, position, view["sight"])
         self._place_marks(R, position, view["ended"])
         self._write(view, sigma, float(engine.view("tick")[0]) / self.scenario.rates.camera)
@@ -106,6 +110,7 @@ class TopView:
         self._still = layers.points("o", DARK_BLUE, "white", 5.5)
         self._other = layers.polygons(facecolor=DARK_BLUE, edgecolor="white", linewidth=0.8)
         self._moving = layers.points("D", DARK_BLUE, "white", 5.5)
+        self._traffic = layers.polygons(facecolor=ground.TRAFFIC, edgecolor="white", linewidth=0.8)
         self._truth = layers.polygons(facecolor=self._rgba, edgecolor=INK, linewidth=0.8)
         self._truth_nose = layers.polygons(facecolor="white", edgecolor="none")
         self._links = layers.lines(color=colours, linewidth=1.0, linestyle=ground.DOTTED)

@@ -54,6 +54,12 @@ def outlines(rotation: np.ndarray, position: np.ndarray, shape: np.ndarray) -> n
     return np.asarray(position[:, None] + shape @ np.swapaxes(rotation[:, :2, :2], 1, 2))
 
 
+def box_outlines(rotation: np.ndarray, center: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Return the corners (n, 4, 2) in plan of boxes of rotations (n, 3, 3), centres and half sizes (n, 3)."""
+    corners = half[:, None, :2] * [(-1, -1), (1, -1), (1, 1), (-1, 1)]
+    return np.asarray(center[:, None, :2] + corners @ np.swapaxes(rotation[:, :2, :2], 1, 2))
+
+
 def box_shape(size: tuple[float, ...], center: tuple[float, ...], shortest: float) -> np.ndarray:
     """Return a box's four corners (4, 2) in the body frame, enlarged to at least `shortest` m long."""
     half = np.array(size[:2]) / 2
@@ -140,7 +146,7 @@ def _paths(scenario: Scenario) -> list[np.ndarray]:
     t = np.linspace(0.0, scenario.horizon, _PATH_SAMPLES)
     paths = []
     for agent, position, rotation in zip(agents, *agent_starts(scenario), strict=True):
-        still = agent.motion.kind in ("static", "driven")
+        still = agent.motion.kind in ("static", "driven", "traffic")
         relative = _positions(compile_motion(agent.motion, rotation, scenario.horizon), t[:1] if still else t)
         paths.append((position + relative @ rotation.T)[:, :2])
     return paths

@@ -24,7 +24,7 @@ ROW = 16  # px
 TABLE_TOP = HEIGHT - 66  # px
 MOST_ROWS = 16
 
-GROUND, ASPHALT, WALL, ROOF = "#F4F2EC", "#E2E2E2", "#8A8172", "#C9C2B4"
+GROUND, ASPHALT, WALL, ROOF, TRAFFIC = "#F4F2EC", "#E2E2E2", "#8A8172", "#C9C2B4", "#6E6E6E"
 DASHED, DOTTED = (0, (4, 2.5)), (0, (1, 1.8))
 
 SIGHT_LOOKS: dict[Sight, dict[str, object]] = {
@@ -73,7 +73,7 @@ def draw_site(ax: Axes, scenario: Scenario) -> None:
     origin = np.array(scenario.map.origin)[:2]
     for road in scenario.roads:
         ax.add_patch(Polygon(road_corners(road.start, road.end, road.width) - origin, color=ASPHALT, zorder=0.5))
-    for road in scenario.roads:
+    for road in (road for road in scenario.roads if road.marked):
         line = np.array([road.start, road.end]) - origin
         ax.plot(*line.T, color="white", linewidth=1.2, linestyle=(0, (7, 6)), zorder=0.6)
     for obstacle in scenario.obstacles:
@@ -117,6 +117,7 @@ def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
         (scenario.camera.miss_probability > 0, _sight(Sight.MISSED, "in view, but missed")),
         (True, _mark("o", DARK_BLUE, DARK_BLUE, 5, "landmark")),
         (moving, _mark("D", DARK_BLUE, DARK_BLUE, 4.5, "moving landmark")),
+        (scenario.highway, Patch(facecolor=TRAFFIC, edgecolor="white", linewidth=0.8, label="other traffic")),
         (goals, _mark("o", GREY, "white", 7, "goal")),
         (goals and end.arrival, _mark("*", INK, "white", 9, "arrived")),
         (bodies and end.collision, _mark("X", "white", INK, 8, "collided")),

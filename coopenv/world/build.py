@@ -76,6 +76,7 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "vehicles": vehicles,
         "agents": agents,
         "obstacles": len(scenario.obstacles),
+        "traffic": scenario.highway.most_vehicles if scenario.highway else 0,
         "sensed": int(scenario.topology.mode == "sensed"),
         "camera_rate": rates.camera,
         "odometry_rate": rates.odometry,
@@ -126,7 +127,7 @@ def _motion(scenario: Scenario) -> dict[str, Any]:
     motions = [agent.motion for agent in everyone]
     until = scenario.horizon + 1.0 / scenario.rates.camera
     tables = [compile_motion(motion, R, until) for motion, R in zip(motions, rotations, strict=True)]
-    kinds = {"static": STATIC, "driven": DRIVEN}
+    kinds = {"static": STATIC, "driven": DRIVEN, "traffic": DRIVEN}
     columns = ("start", "linear", "angular", "rotation", "position")
     return {
         "kind": [kinds.get(motion.kind, PRESCRIBED) for motion in motions],

@@ -87,6 +87,13 @@ def occlusion(model: Any, state: Any, world: int, observer: int, target: int, or
             center = state.position[world, agent] + R * model.scene.body_center[agent]
             if segment_hits_box(origin, direction, inverse_square, R, center, half):
                 return OCCLUDED_BY_BODY
+    for k in range(model.traffic):
+        half = state.traffic_half[world, k]
+        if half[0] > half.dtype(0.0):
+            R = state.traffic_rotation[world, k]
+            center = state.traffic_position[world, k]
+            if segment_hits_box(origin, direction, inverse_square, R, center, half):
+                return OCCLUDED_BY_BODY
     return VISIBLE
 
 

@@ -69,6 +69,13 @@ def touches_one_of(model: Any, state: Any, world: int, vehicle: int, count: int)
             other_center = state.position[world, other] + other_R * model.scene.body_center[other]
             if boxes_touch(center, R, half, other_center, other_R, other_half):
                 return 1
+    for k in range(model.traffic):
+        other_half = state.traffic_half[world, k]
+        if other_half[0] > half.dtype(0.0):
+            if boxes_touch(
+                center, R, half, state.traffic_position[world, k], state.traffic_rotation[world, k], other_half
+            ):
+                return 1
     return 0
 
 

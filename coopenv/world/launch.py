@@ -82,7 +82,8 @@ class PerWorld:
         part = type(self.value)()
         for name in self.value._cls.vars:
             value = getattr(self.value, name)
-            setattr(part, name, value[start:stop] if isinstance(value, wp.array) else value)
+            cut = isinstance(value, wp.array) and value.size > 0  # Warp cannot slice what is empty
+            setattr(part, name, value[start:stop] if cut else value)
         return part
 
 

@@ -185,6 +185,7 @@ def model_struct(p: Precision) -> Any:
         vehicles: wp.int32
         agents: wp.int32
         obstacles: wp.int32
+        traffic: wp.int32  # bodies that move and are nobody's target, at most
         sensed: wp.int32
         camera_rate: wp.float64  # Hz
         odometry_rate: wp.float64  # Hz

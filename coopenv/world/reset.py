@@ -176,6 +176,16 @@ def believe(model: Any, state: Any, world: int, vehicle: int):
 
 
 @wp.func
+def sense_first(model: Any, state: Any, world: int):
+    """Take the first frame and send the first messages; everybody is in place."""
+    for place in range(model.vehicles):
+        vehicle = model.order[place]
+        observe(model, state, world, vehicle, 0)
+        deliver(model, state, world, vehicle, 0)
+        broadcast(model, state, world, vehicle, 0)
+
+
+@wp.func
 def reset_world(model: Any, state: Any, world: int):
     """Start a new episode in one world; its seed and episode number are already set."""
     state.tick[world] = 0
@@ -188,8 +198,4 @@ def reset_world(model: Any, state: Any, world: int):
         draw_errors(model, state, world, vehicle)
     for vehicle in range(model.vehicles):
         state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
-    for place in range(model.vehicles):
-        vehicle = model.order[place]
-        observe(model, state, world, vehicle, 0)
-        deliver(model, state, world, vehicle, 0)
-        broadcast(model, state, world, vehicle, 0)
+    sense_first(model, state, world)

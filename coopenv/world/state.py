@@ -1,7 +1,8 @@
 """The changing side of a world: one record of arrays with leading axes (world, agent or vehicle).
 
 W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders), M odometry samples a tick, S slots of
-the radio's outbox, B blocks of the sliding Gramian, P points of a route.
+the radio's outbox, B blocks of the sliding Gramian, P points of a route, Z bodies of
+the traffic.
 """
 
 from collections.abc import Mapping
@@ -64,6 +65,10 @@ def state_struct(p: Precision) -> Any:
         ended: array("WN", wp.int32)  # values of `Outcome`, then one per condition of the scenario's own
         collided: array("WN", wp.int32)  # touching something now
 
+        traffic_position: array("WZ", vec3)  # centres of boxes that are nobody's target, map
+        traffic_rotation: array("WZ", mat33)  # body to map
+        traffic_half: array("WZ", vec3)  # half of their edges, m; zero: not there
+
         sampled_velocity: array("WNM", vec3)  # truth at the odometry samples of the last tick, m/s, body
         sampled_angular_velocity: array("WNM", vec3)  # likewise, rad/s; of driven vehicles
 
@@ -125,6 +130,7 @@ VALID: dict[str, Rule] = {
     "action": numbers(1.001),
     "ended": whole(0, "last_outcome"),
     "collided": FLAG,
+    "traffic_rotation": ROTATION,
     "odometry_samples": ODOMETRY_SAMPLES,
     "increment_rotation": ROTATION,
     "bearing": DIRECTION,
@@ -148,7 +154,7 @@ VALID: dict[str, Rule] = {
 def state_sizes(model: Any, worlds: int) -> dict[str, int]:
     """Return the length of every axis of the state, and of an observer's memory, by its letter."""
     ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
-    return {"W": worlds, "A": model.agents, "N": model.vehicles, "P": model.routes.points, **ticks}
+    return {"W": worlds, "A": model.agents, "N": model.vehicles, "P": model.routes.points, "Z": model.traffic, **ticks}
 
 
 def allocate_state(model: Any, worlds: int, p: Precision, device: str, shared: str = "") -> Any:

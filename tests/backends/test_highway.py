@@ -1,0 +1,303 @@
+"""highway-env moves the cars, and this project's sensors, radio and observers are on them."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import coopenv
+from coopenv import CoopenvError
+from coopenv.api.engine import Engine
+from coopenv.backends.sources import simulation_of
+from coopenv.estimation.outcomes import Sight
+
+pytest.importorskip("highway_env", reason="needs the extra highway")
+
+CROSSING, ROUNDABOUT = "highway_intersection", "highway_roundabout"
+EXACT = {"noise.enabled": False, "vehicles.*.initial_estimate": {"position_radius": 0.0, "orientation_angle": 0.0}}
+
+
+def engine_of(name: str, worlds: int = 1, **overrides: Any) -> Engine:
+    scenario = coopenv.load_scenario(name, {key.replace("__", "."): value for key, value in overrides.items()})
+    return Engine(scenario, worlds, "float64")
+
+
+def road_of(engine: Engine, world: int = 0) -> Any:
+    return engine.world._simulations[world].environment.road
+
+
+def test_cars_are_where_highway_env_has_them_with_y_up() -> None:
+    engine = engine_of(CROSSING)
+    engine.reset([5])
+    engine.set_actions(np.full((1, 4, 2), [0.6, 0.1]))
+    for _ in range(10):
+        engine.step()
+    L = engine.world.model.landmarks
+    everybody = road_of(engine).vehicles
+    places = {(round(float(car.position[0]), 6), round(float(-car.position[1]), 6)): car for car in everybody}
+    assert len(everybody) > 4
+    for i in range(4):
+        x, y, z = engine.view("position")[0, L + i].tolist()
+        car = places.pop((round(x, 6), round(y, 6)))
+        R = engine.view("rotation")[0, L + i]
+        assert z == 0.0 and np.arctan2(R[1, 0], R[0, 0]) == pytest.approx(
+            np.arctan2(*-np.sin([car.heading]), np.cos(car.heading))
+        )
+        assert engine.view("speed")[0, i] == pytest.approx(car.speed)
+    half, seen = engine.view("traffic_half")[0], engine.view("traffic_position")[0]
+    assert (half[:, 0] > 0.0).sum() == len(places)
+    for (x, y), car in places.items():
+        k = int(np.argmin(np.linalg.norm(seen[:, :2] - (x, y), axis=1)))
+        assert_allclose(seen[k], [x, y, 0.75], atol=1e-6)
+        assert_allclose(half[k], [car.LENGTH / 2, car.WIDTH / 2, 0.75])
+
+
+@pytest.mark.parametrize("dynamical", [False, True])
+def test_odometry_is_that_of_the_motion(dynamical: bool) -> None:
+    overrides = {
+        **EXACT,
+        "observer.name": "dead_reckoning",
+        "highway.dynamical": dynamical,
+        "termination.collision": False,
+    }
+    env = coopenv.parallel_env(ROUNDABOUT, dtype="float64", overrides=overrides)
+    env.reset(seed=1)
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        *_, infos = env.step({agent: rng.uniform(-1.0, 1.0, 2) for agent in env.agents})
+        for info in infos.values():
+            assert info["position_error"] < 1e-7 and info["orientation_error"] < 1e-5
+
+
+def test_commands_are_speeds_and_steering_to_the_left() -> None:
+    env = coopenv.parallel_env(ROUNDABOUT, dtype="float64", overrides=EXACT)
+    _, infos = env.reset(seed=1)
+    assert infos["vehicle_1"]["truth"]["position"][1] < -40.0
+    for _ in range(12):
+        env.step({agent: np.array([-0.5, 0.0]) for agent in env.agents})
+    assert env.engine.view("speed")[0, 0] == pytest.approx(4.0, abs=1e-6)
+    *_, infos = env.step({agent: np.array([-0.5, 1.0]) for agent in env.agents})
+    assert infos["vehicle_1"]["truth"]["angular_velocity"][2] > 0.2
+    assert env.engine.view("steering")[0, 0] == pytest.approx(0.5)
+
+
+def test_traffic_drives_itself_whatever_it_is_told() -> None:
+    moved = []
+    for action in (-1.0, 1.0):
+        env = coopenv.parallel_env(ROUNDABOUT, dtype="float64")
+        env.reset(seed=4)
+        for _ in range(5):
+            *_, infos = env.step({a: np.array([0.0, 0.0] if a == "vehicle_1" else [action] * 2) for a in env.agents})
+        moved.append([infos[f"vehicle_{i}"]["truth"]["position"] for i in (2, 3, 4)])
+    assert_allclose(*moved)
+
+
+@pytest.mark.parametrize("name", [CROSSING, ROUNDABOUT])
+def test_worlds_of_a_batch_are_those_of_their_seeds(name: str) -> None:
+    batch = engine_of(name, 2)
+    batch.reset([7, 8])
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (15, 1, 4, 2))
+    for action in actions:
+        batch.step(np.tile(action, (2, 1, 1)))
+    for world, seed in enumerate((7, 8)):
+        single = engine_of(name)
+        single.reset([seed])
+        for action in actions:
+            single.step(action)
+        for field in ("position", "estimate_position", "observation", "traffic_position"):
+            assert np.array_equal(single.view(field)[0], batch.view(field)[world]), field
+    assert not np.array_equal(batch.view("position")[0, -4:], batch.view("position")[1, -4:])
+
+
+def test_the_next_episode_is_another_one_and_a_mask_leaves_the_others() -> None:
+    engine = engine_of(CROSSING, 2)
+    engine.reset([7, 8])
+    first = engine.view("position").copy()
+    engine.reset(None, np.array([False, True]))
+    assert np.array_equal(engine.view("position")[0], first[0])
+    assert not np.array_equal(engine.view("position")[1], first[1])
+
+
+def test_batches_train_like_any_other() -> None:
+    envs = coopenv.make_vec(CROSSING, num_worlds=2, overrides={"horizon": 2.0})
+    envs.reset(seed=0)
+    ended = 0
+    for _ in range(25):
+        _, _, terminated, truncated, _ = envs.step(envs.action_space.sample())
+        ended += int((terminated | truncated).sum())
+    assert ended >= 2 * 8
+
+
+def put_a_car(engine: Engine, x: float, y: float) -> None:
+    """Put a car of highway-env's that stands across the road; x and y as on our map."""
+    from highway_env.vehicle.kinematics import Vehicle
+
+    road = road_of(engine)
+    road.vehicles.append(Vehicle(road, [x, -y], heading=0.0, speed=0.0))
+
+
+def test_other_traffic_hides_what_is_behind_it() -> None:
+    overrides = {
+        "landmarks": [{"name": n, "position": [2.0 + x, -29.0, 1.0]} for n, x in (("A", 0), ("B", -9), ("C", 9))]
+    }
+    seen = []
+    for hidden in (False, True):
+        engine = engine_of(ROUNDABOUT, camera__range=200.0, obstacles=[], camera__miss_probability=0.0, **overrides)
+        engine.reset([1])
+        if hidden:
+            put_a_car(engine, *(engine.view("position")[0, 3, :2] + (0.0, 8.0)))
+        engine.set_actions(np.full((1, 4, 2), [-1.0, 0.0]))
+        engine.step(ticks=1)
+        seen.append(Sight(int(engine.view("sight")[0, 0, 0])))
+    assert seen == [Sight.VISIBLE, Sight.OCCLUDED_BY_BODY]
+
+
+def test_to_touch_other_traffic_is_a_collision() -> None:
+    engine = engine_of(ROUNDABOUT)
+    engine.reset([1])
+    L = engine.world.model.landmarks
+    put_a_car(engine, *(engine.view("position")[0, L, :2] + (0.0, 12.0)))
+    engine.set_actions(np.full((1, 4, 2), [1.0, 0.0]))
+    while engine.view("ended")[0, 0] == 0:
+        engine.step()
+    assert engine.view("ended")[0, 0] == 2 and engine.view("tick")[0] < 20
+
+
+def test_who_leaves_the_road_has_arrived() -> None:
+    env = coopenv.parallel_env(
+        CROSSING,
+        overrides={
+            "horizon": 40.0,
+            "vehicles": [{"motion": {"kind": "driven"}}] + [{"motion": {"kind": "traffic"}}] * 2,
+        },
+    )
+    outcomes = {}
+    for seed in range(3):
+        env.reset(seed=seed)
+        while env.agents:
+            *_, infos = env.step({agent: np.array([-1.0, 0.0]) for agent in env.agents})
+            outcomes |= {(seed, agent): info["outcome"] for agent, info in infos.items()}
+    assert "arrived" in {outcome for (_, agent), outcome in outcomes.items() if agent != "vehicle_1"}
+
+
+@pytest.mark.parametrize("observer", ["riccati", "mekf"])
+def test_any_observer_runs_on_it(observer: str) -> None:
+    env = coopenv.parallel_env(CROSSING, observer=observer, dtype="float64")
+    env.reset(seed=2)
+    for _ in range(15):
+        *_, infos = env.step({agent: np.array([-0.5, 0.0]) for agent in env.agents})
+    assert all(info["position_error"] < 0.6 for info in infos.values())
+
+
+def test_a_plain_environment_in_the_same_program_changes_nothing() -> None:
+    from highway_env.envs.intersection_env import IntersectionEnv
+    from highway_env.vehicle.behavior import IDMVehicle
+
+    places = []
+    before = IDMVehicle.COMFORT_ACC_MAX
+    for other in (False, True):
+        if other:
+            IntersectionEnv()
+            assert before != IDMVehicle.COMFORT_ACC_MAX
+        engine = engine_of(ROUNDABOUT)
+        engine.reset([3])
+        for _ in range(20):
+            engine.step(np.zeros((1, 4, 2)))
+        places.append(engine.view("position")[0].copy())
+    assert np.array_equal(*places)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "why"),
+    [
+        ({"backend": "simulated"}, 'highway: only with backend = "highway"'),
+        ({"backend": "higway"}, "backend: Input should be 'simulated' or 'highway'"),
+        ({"highway.id": "intersection-v9"}, r"highway\.id: highway-env has no environment 'intersection-v9' \(did you"),
+        (
+            {"highway.config.initial_vehicle_cout": 3},
+            r"highway\.config\.initial_vehicle_cout: unknown key \(did you mean",
+        ),
+        (
+            {"highway.config.initial_vehicle_count": "many"},
+            r"initial_vehicle_count: expected a value like 10, got 'many'",
+        ),
+        (
+            {"highway.config.policy_frequency": 5},
+            r"config\.policy_frequency: follows from rates\.decision; leave this out",
+        ),
+        ({"highway.config.other_vehicles_type": "no.such.Class"}, "highway: intersection-v0 cannot be made"),
+        ({"highway.speed": 5}, r"highway\.speed: unknown key; allowed: config, dynamical, id, most_vehicles"),
+        ({"rates.camera": 12.5, "rates.decision": 12.5}, r"rates\.camera: highway-env steps a whole number"),
+        ({"dynamics.wheelbase": 2.7}, r"dynamics\.wheelbase: highway-env has its own; allowed: max_acceleration"),
+        ({"vehicles.3.initial_pose.position": [0.0, 0.0, 0.0]}, r"vehicles\.3\.initial_pose: highway-env draws it"),
+        ({"vehicles.0.motion.initial_speed": 3.0}, r"vehicles\.0\.motion\.initial_speed: highway-env draws it"),
+        ({"vehicles.3.motion": {"kind": "static"}}, r"vehicles\.3\.motion\.kind: 'static' is not known to highway-env"),
+        ({"vehicles": [{"motion": {"kind": "traffic"}}]}, "vehicles: highway-env needs at least one that is driven"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(overrides: dict[str, Any], why: str) -> None:
+    with pytest.raises(CoopenvError, match=why):
+        coopenv.parallel_env(CROSSING, overrides=overrides)
+
+
+def test_what_is_missing_shows_when_it_begins() -> None:
+    two = [{"motion": {"kind": "driven"}}] * 2
+    crowd = [{"motion": {"kind": "driven"}}] + [{"motion": {"kind": "traffic"}}] * 9
+    for name, overrides, why in (
+        (ROUNDABOUT, {"vehicles": two}, "vehicles: 2 are driven, but highway-env drives 1 there"),
+        (ROUNDABOUT, {"vehicles": crowd}, "vehicles: 9 are in traffic, but highway-env has fewer there"),
+        (CROSSING, {"highway.most_vehicles": 0}, r"highway\.most_vehicles: 0 are too few"),
+    ):
+        env = coopenv.parallel_env(name, overrides=overrides)
+        with pytest.raises(CoopenvError, match=why):
+            env.reset(seed=5)
+
+
+def test_other_environments_know_no_traffic() -> None:
+    for overrides, why in (  # of an environment without defaults of vehicles
+        ({"vehicles.0.motion": {"kind": "traffic"}}, r"vehicles\.0\.motion\.kind: 'traffic' needs backend"),
+        ({"backend": "highway"}, "highway: needed"),
+        ({"vehicles": [{}]}, r"vehicles\.0\.initial_pose: needed"),
+    ):
+        with pytest.raises(CoopenvError, match=why):
+            coopenv.load_scenario("busy_intersection", overrides)
+    with pytest.raises(CoopenvError, match="backend 'simulated': highway_roundabout says backend = \"highway\""):
+        coopenv.parallel_env(ROUNDABOUT, backend="simulated")
+
+
+def test_without_highway_env_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "highway_env", None)
+    with pytest.raises(CoopenvError, match=r"needs highway-env, which is not installed: pip install '\.\[highway\]'"):
+        simulation_of(coopenv.load_scenario(CROSSING))
+    assert CROSSING in coopenv.list_envs()
+
+
+def test_states_of_others_are_refused() -> None:
+    env, other = coopenv.parallel_env(CROSSING), coopenv.parallel_env(CROSSING)
+    env.reset(seed=1)
+    other.reset(seed=2)
+    state = other.get_state()
+    before = env.engine.view("position").copy()
+    for wrong in (None, [], [1]):
+        with pytest.raises(CoopenvError, match="no environments of highway-env in it"):
+            env.set_state({**state, "highway": wrong})
+        assert np.array_equal(env.engine.view("position"), before)
+    env.set_state(state)
+    assert np.array_equal(env.engine.view("position"), other.engine.view("position"))
+
+
+def test_its_roads_are_drawn() -> None:
+    env = coopenv.parallel_env(ROUNDABOUT, render_mode="rgb_array")
+    roads = env.scenario.roads
+    assert len(roads) > 50 and not any(road.marked for road in roads)
+    on_the_ring = [road for road in roads if abs(np.hypot(*road.start) - 20.0) < 0.01]
+    assert len(on_the_ring) > 40
+    env.reset(seed=1)
+    picture = env.render()
+    assert picture is not None
+    asphalt = (picture == np.array([0xE2, 0xE2, 0xE2])).all(axis=-1)
+    assert asphalt.mean() > 0.01
