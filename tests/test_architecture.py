@@ -21,6 +21,7 @@ ROOMS = (
     ("api",),
     ("policies",),
     ("evaluation",),
+    ("training",),
     ("runs",),
     ("bench",),
     ("cli", "__init__"),

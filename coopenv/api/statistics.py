@@ -46,6 +46,17 @@ class EpisodeSums:
         terms = {name: sums.pop(name) for name in self._names[2:]}
         return {"r": sums["r"], "l": sums["l"].astype(int), "reward_terms": terms}
 
+    @property
+    def under_way(self) -> np.ndarray:
+        """The sums so far, (2 + terms, rows), for a checkpoint; what is assigned replaces them."""
+        return self._sums.copy()
+
+    @under_way.setter
+    def under_way(self, sums: np.ndarray) -> None:
+        if sums.shape != self._sums.shape or not np.isfinite(sums).all():
+            raise CoopenvError(f"sums of episodes: expected finite numbers of shape {self._sums.shape}")
+        self._sums[...] = sums
+
     def forget(self, rows: np.ndarray) -> None:
         """Begin anew in rows of a mask."""
         self._sums[:, rows] = 0.0

@@ -1,4 +1,4 @@
-"""The command line: `coopenv list | describe | schema | run | record | evaluate | watch | play | bench`.
+"""The command line: `coopenv list | describe | schema | run | record | train | evaluate | watch | play | bench`.
 
 Commands import what they need when they run, so that `--help` and completion are quick.
 """
@@ -17,6 +17,7 @@ from coopenv.cli.bench import bench
 from coopenv.cli.evaluate import evaluate
 from coopenv.cli.live import play, watch
 from coopenv.cli.run import record_command, run
+from coopenv.cli.train import train
 from coopenv.errors import CoopenvError
 from coopenv.shipped import version as installed_version
 
@@ -35,6 +36,7 @@ app.command()(show.describe)
 app.command()(show.schema)
 app.command()(run)
 app.command("record")(record_command)
+app.command()(train)
 app.command()(evaluate)
 app.command()(watch)
 app.command()(play)

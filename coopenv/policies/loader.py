@@ -12,6 +12,7 @@ from coopenv import user_code
 from coopenv.api.terms.layout import action_fields
 from coopenv.errors import CoopenvError, suggest, told
 from coopenv.policies.base import PLAIN, Policy
+from coopenv.policies.network import NetworkCard
 from coopenv.scenario import Scenario
 from coopenv.shipped import data_directory, list_agents
 
@@ -33,6 +34,12 @@ class AgentCard(BaseModel):
     """Environments that it was made for."""
     kind: Kind = "scripted"
     options: dict[str, Any] = {}
+    network: NetworkCard | None = None
+    """Of a learned one: its weights, and the observation and action that it was trained with."""
+    training: dict[str, Any] = {}
+    """How it was trained: command, seed, versions."""
+    results: dict[str, Any] = {}
+    """What it reached on held-out maps when it was trained."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +115,9 @@ def find_agent(name_or_place: str | Path) -> Agent:
     if not user_code.is_reference(card.entry):
         raise CoopenvError(f"{folder / AGENT_FILE}: entry: expected file.py:Class or package.module:Class")
     entry = user_code.absolute(card.entry, folder)
-    known = card.model_dump(exclude={"title", "entry"})
+    known = card.model_dump(exclude={"title", "entry", "network", "training", "results"})
+    if card.network is not None:
+        known["options"] |= {"folder": folder, "network": card.network}
     return Agent(folder.resolve().name, entry, folder=folder, **known)
 
 

@@ -2,7 +2,7 @@
 
 import copy
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +73,20 @@ class CooperativeSB3VecEnv(VecEnv):
         self._reset_options()
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         return observation
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Return what the next step depends on as arrays, for `set_state`; plug-in observers cannot be among it."""
+        return {**self.engine.get_state(), "episode_sums": self._sums.under_way}
+
+    def set_state(self, state: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Go on from what `get_state` returned, and return the observations that came with it.
+
+        Raises:
+            CoopenvError: it does not fit.
+        """
+        self.engine.set_state({name: values for name, values in state.items() if name != "episode_sums"})
+        self._sums.under_way = state["episode_sums"]
+        return self.engine.view("observation").reshape(self.num_envs, -1).copy()
 
     def step_async(self, actions: np.ndarray) -> None:
         """Take the actions, (num_envs, 2)."""

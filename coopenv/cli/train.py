@@ -1,0 +1,113 @@
+"""`coopenv train`: learn to drive."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from coopenv.cli import complete, options
+from coopenv.errors import CoopenvError
+
+Settings = Annotated[Path | None, typer.Option(help="TOML file of the settings (default: those of docs/trainers.md).")]
+Agent = Annotated[
+    str | None,
+    typer.Option(help="Agent beside which the settings stand, as train.toml.", autocompletion=complete.agents),
+]
+Onnx = Annotated[bool, typer.Option("--onnx", help="Also write the policy as an ONNX model.")]
+
+
+def train(
+    environment: options.Environment,
+    agent: Agent = None,
+    settings: Settings = None,
+    arm: Annotated[str | None, typer.Option(help="Table under `arms` of the settings that changes them.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, max=2**31 - 1, help="Seed of worlds, weights and exploration (default: 0).")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(min=1, help="Decisions of vehicles to learn from.")] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.0, help="Minutes to learn, instead of --steps.")] = None,
+    overrides: options.Overrides = None,
+    out: Annotated[Path | None, typer.Option(help="The agent's folder (default: out/train/ENV).")] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the checkpoint in the folder; options are those it began with.")
+    ] = False,
+    threads: Annotated[int | None, typer.Option(min=1, help="Threads of the simulation (default: by cores).")] = None,
+    logs: Annotated[Path | None, typer.Option(help="Folder for TensorBoard (default: tensorboard/ in --out).")] = None,
+    onnx: Onnx = False,
+    as_json: options.AsJson = False,
+) -> None:
+    """Train one policy for all vehicles with PPO, and write it as an agent.
+
+    The agent drives with `coopenv run ENV --policy DIR`. After an interruption go on with --resume.
+    """
+    from dataclasses import asdict
+
+    from coopenv.runs.console import Progress
+    from coopenv.training.settings import Plan
+
+    try:
+        from coopenv.training.command import Reports, resumed_plan
+        from coopenv.training.command import train as perform
+    except ImportError as error:
+        needs = "torch, stable-baselines3, tensorboard and tomlkit: pip install '.[train]'"
+        raise CoopenvError(f"coopenv train needs {needs} ({error})") from None
+    folder = out or Path("out", "train", Path(environment).stem)
+    if resume:
+        given: dict[str, Any] = {
+            "--agent": agent,
+            "--settings": settings,
+            "--arm": arm,
+            "--seed": seed,
+            "--steps": steps,
+        }
+        given |= {"--minutes": minutes, "--set": overrides}
+        if named := [name for name, value in given.items() if value is not None]:
+            raise CoopenvError(f"--resume goes on with what the training began with: leave out {', '.join(named)}")
+        plan = resumed_plan(folder)
+        if plan.environment != environment:
+            raise CoopenvError(f"{folder} holds a training of {plan.environment}, not of {environment}")
+    else:
+        chosen = _settings(agent, settings, arm, steps, minutes)
+        plan = Plan(environment, chosen, seed or 0, arm, options.parse_overrides(overrides))
+    log = options.console(stderr=True)
+    with options.warned():
+        options.load(environment, plan.all_overrides)
+
+    def judged(at: int, figures: dict[str, Any]) -> None:
+        log.print(f"{at:>10,} steps, held-out maps: {_told(figures)}", soft_wrap=True)
+
+    with Progress(log, "starting", total=1.0) as progress:
+        reports = Reports(lambda status: progress.update(status.share, status.line), judged)
+        results = perform(plan, folder, resume=resume, threads=threads, onnx=onnx, logs=logs, reports=reports)
+    if as_json:
+        options.print_json({"agent": str(folder), "results": {name: asdict(each) for name, each in results.items()}})
+        return
+    options.console().print(f"Agent in {folder}: coopenv run {environment} --policy {folder}", soft_wrap=True)
+
+
+def _settings(agent: str | None, path: Path | None, arm: str | None, steps: int | None, minutes: float | None) -> Any:
+    from coopenv.policies import find_agent
+    from coopenv.training.settings import SETTINGS_FILE, read_settings
+
+    if agent is not None:
+        if path is not None:
+            raise CoopenvError("--agent and --settings: give one of them")
+        folder = find_agent(agent).folder
+        if folder is None or not (folder / SETTINGS_FILE).is_file():
+            raise CoopenvError(f"--agent {agent}: there is no {SETTINGS_FILE} beside it, so it was not learnt")
+        path = folder / SETTINGS_FILE
+    return read_settings(path, arm, steps=steps, minutes=minutes)
+
+
+def _told(figures: dict[str, Any]) -> str:
+    """Return figures on one line, each with its interval."""
+    percent = {"arrival_rate": "arrived", "collision_rate": "hit"}
+    parts = [f"{word} {_interval(figures[name], 100, 0)} %" for name, word in percent.items()]
+    parts.append(f"e95 {_interval(figures['e95_m'], 100, 0)} cm")
+    parts.append(f"return {_interval(figures['return'], 1, 1)}")
+    return ", ".join(parts)
+
+
+def _interval(figure: Any, factor: float, digits: int) -> str:
+    mean, low, high = (f"{factor * value:.{digits}f}" for value in (figure.mean, figure.ci_low, figure.ci_high))
+    return f"{mean} [{low}, {high}]"

@@ -1,0 +1,164 @@
+"""A learned policy: normalisation and a multilayer perceptron, in NumPy, from weights without pickle."""
+
+import json
+from collections.abc import Mapping
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+from safetensors import SafetensorError
+from safetensors.numpy import load
+
+from coopenv.api.terms.layout import Layout, observation_layout
+from coopenv.errors import CoopenvError
+from coopenv.scenario import Scenario
+
+ENTRY = f"{__name__}:Network"
+"""The `entry` of learned agents."""
+
+
+class Entry(BaseModel):
+    """A field of the observation or of the action that a network was trained with."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    start: int
+    stop: int
+    low: float
+    high: float
+    scale: float
+    unit: str
+
+    def told(self) -> dict[str, float | str]:
+        """Return what must be the same wherever the field stands."""
+        size = {"size": self.stop - self.start}
+        return {**size, "low": self.low, "high": self.high, "scale": self.scale, "unit": self.unit}
+
+
+class NetworkCard(BaseModel):
+    """The table `network` of an `agent.toml`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    weights: str
+    """File in the agent's folder."""
+    sha256: str
+    """Of the file."""
+    layout: str
+    """`layout_hash` of the two tables below."""
+    clip: float
+    """Normalised observations are clipped to it."""
+    observation: dict[str, Entry]
+    action: dict[str, Entry]
+
+
+def layout_tables(layout: Layout) -> tuple[dict[str, Entry], dict[str, Entry]]:
+    """Return what a network depends on: fields of the observation, and those of the action, by name in their order."""
+    observation = {
+        name: Entry(start=f.start, stop=f.stop, low=f.low, high=1.0, scale=f.scale, unit=f.unit)
+        for name, f in layout.items()
+    }
+    action = {
+        f.name: Entry(start=i, stop=i + 1, low=f.low, high=f.high, scale=1.0, unit=f.unit)
+        for i, f in enumerate(layout.action)
+    }
+    return observation, action
+
+
+def layout_hash(observation: Mapping[str, Entry], action: Mapping[str, Entry]) -> str:
+    """Return the first 16 hexadecimal digits of SHA-256 over both tables as JSON."""
+    tables = [{name: entry.model_dump() for name, entry in table.items()} for table in (observation, action)]
+    return sha256(json.dumps(tables).encode()).hexdigest()[:16]
+
+
+class Network:
+    """The mean action of a network that `coopenv train` exported; agrees with torch's to rounding.
+
+    It finds the fields that it was trained with by their names, so that it drives in environments that show more.
+    """
+
+    def __init__(self, scenario: Scenario, *, folder: Path, network: NetworkCard) -> None:
+        """Load the weights.
+
+        Args:
+            scenario: of the environment that it is to drive in.
+            folder: of the agent.
+            network: what its `agent.toml` says.
+
+        Raises:
+            CoopenvError: the environment's observation or action is not what it was trained with, or the weights cannot
+                be read or are not those that the agent was saved with.
+        """
+        observation, action = layout_tables(observation_layout(scenario))
+        _compare("observation", network.observation, observation)
+        _compare("action", network.action, action)
+        _check_order(network.action, action)
+        fields = [observation[name] for name in network.observation]
+        self._columns = np.concatenate([np.arange(field.start, field.stop) for field in fields])
+        path = folder / network.weights
+        if network.layout != layout_hash(network.observation, network.action):
+            raise CoopenvError(f"{folder / 'agent.toml'}: network.layout is not the hash of its tables")
+        self._clip = np.float32(network.clip)
+        tensors = _load(path, network.sha256)
+        self._mean, self._std = tensors.pop("observation.mean"), tensors.pop("observation.std")
+        depth = len([name for name in tensors if name.endswith(".weight")])
+        self._layers = [(tensors[f"layers.{i}.weight"].T.copy(), tensors[f"layers.{i}.bias"]) for i in range(depth)]
+        _check_shapes(path, len(self._columns), len(action), self._mean, self._std, self._layers)
+
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        """Return the actions, (rows, A) in [-1, 1], for flat observations, (rows, D)."""
+        scaled = (observations[:, self._columns] - self._mean) / self._std
+        values = np.clip(scaled, -self._clip, self._clip).astype(np.float32)
+        for weight, bias in self._layers[:-1]:
+            values = np.tanh(values @ weight + bias)
+        weight, bias = self._layers[-1]
+        actions: np.ndarray = np.clip(values @ weight + bias, -1.0, 1.0)
+        return actions
+
+
+def _compare(what: str, trained: Mapping[str, Entry], here: Mapping[str, Entry]) -> None:
+    """Name the first field that differs; where it stands does not matter, nor what else there is here."""
+    for name, entry in trained.items():
+        before = f"it was trained with another {what}: '{name}'"
+        if name not in here:
+            raise CoopenvError(f"{before} is not in this environment")
+        pairs = zip(entry.told().items(), here[name].told().values(), strict=True)
+        for (key, value), now in pairs:
+            if value != now if isinstance(value, str) else not np.isclose(value, now, rtol=1e-9):
+                raise CoopenvError(f"{before} had {key} {value!r} and has {now!r} here")
+
+
+def _check_order(trained: Mapping[str, Entry], here: Mapping[str, Entry]) -> None:
+    if list(trained) != list(here):
+        raise CoopenvError(f"it was trained with other actions: {', '.join(trained)} and not {', '.join(here)}")
+
+
+def _load(path: Path, digest: str) -> dict[str, np.ndarray]:
+    try:
+        data = path.read_bytes()
+        tensors: dict[str, np.ndarray] = load(data)
+    except OSError as error:
+        raise CoopenvError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise CoopenvError(f"{path}: damaged, or no weights: {error}") from None
+    if sha256(data).hexdigest() != digest:
+        raise CoopenvError(f"{path}: not the weights that agent.toml was written with (another SHA-256)")
+    names = {"observation.mean", "observation.std", "log_std"}
+    depth = (len(tensors) - len(names)) // 2
+    expected = names | {f"layers.{i}.{part}" for i in range(depth) for part in ("weight", "bias")}
+    if set(tensors) != expected or depth < 1:
+        raise CoopenvError(f"{path}: not the weights of a policy: {', '.join(sorted(set(tensors) ^ expected))[:80]}")
+    if not all(values.dtype == np.float32 and np.isfinite(values).all() for values in tensors.values()):
+        raise CoopenvError(f"{path}: weights are not finite numbers in float32")
+    return tensors
+
+
+def _check_shapes(path: Path, inputs: int, outputs: int, mean: Any, std: Any, layers: list[Any]) -> None:
+    widths = [inputs, *(weight.shape[-1] for weight, _ in layers)]
+    fits = mean.shape == std.shape == (inputs,) and widths[-1] == outputs and bool((std > 0).all())
+    for (weight, bias), before, after in zip(layers, widths[:-1], widths[1:], strict=True):
+        fits = fits and weight.shape == (before, after) and bias.shape == (after,)
+    if not fits:
+        raise CoopenvError(f"{path}: shapes do not fit {inputs} observations and {outputs} entries of an action")

@@ -1,0 +1,130 @@
+"""`coopenv train`: learn, judge on held-out maps, keep checkpoints, and write the agent's folder. Needs `train`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from coopenv import interrupts
+from coopenv.backends.sources import open_simulation
+from coopenv.errors import CoopenvError
+from coopenv.files import check_file, replacing_folder
+from coopenv.training import checkpoint
+from coopenv.training.export import EXPORTED, export
+from coopenv.training.judging import Figure, judge
+from coopenv.training.settings import Plan
+from coopenv.training.trainer import Trainer
+from coopenv.training.watch import Status
+
+NAMES = (*EXPORTED, checkpoint.CHECKPOINT_FILE)
+LOGS = "tensorboard"
+
+
+@dataclass(frozen=True)
+class Reports:
+    """Who is told while a training goes on."""
+
+    status: Callable[[Status], None] = lambda status: None
+    """After every update."""
+    judged: Callable[[int, dict[str, Figure]], None] = lambda steps, figures: None
+    """After every look at held-out maps: decisions of vehicles so far, and figures."""
+
+
+def resumed_plan(out: Path) -> Plan:
+    """Return the plan of the unfinished training in a folder.
+
+    Raises:
+        CoopenvError: there is none, or its checkpoint is damaged.
+    """
+    if not (out / checkpoint.CHECKPOINT_FILE).is_file() and (out / EXPORTED[0]).is_file():
+        raise CoopenvError(f"nothing to resume: {out} holds a finished agent and no checkpoint")
+    return checkpoint.read(out / checkpoint.CHECKPOINT_FILE).plan
+
+
+def train(
+    plan: Plan,
+    out: Path,
+    *,
+    resume: bool = False,
+    threads: int | None = None,
+    onnx: bool = False,
+    logs: Path | None = None,
+    reports: Reports | None = None,
+) -> dict[str, Figure]:
+    """Train a policy and write it as an agent to a folder.
+
+    While it learns the folder holds `checkpoint.safetensors`, and `tensorboard/` unless `logs` says otherwise. When it
+    is finished the agent takes the checkpoint's place, at once and as a whole.
+
+    Args:
+        plan: what to train.
+        out: the agent's folder.
+        resume: go on from the folder's checkpoint, which is of the same plan.
+        threads: shares of the batch on the CPU; results do not depend on it.
+        onnx: also write an ONNX model.
+        logs: folder for TensorBoard.
+        reports: who is told.
+
+    Returns:
+        The results on held-out maps, as in `agent.toml`.
+
+    Raises:
+        CoopenvError: the plan does not describe a possible training, there is nothing to resume, or there is an
+            unfinished training that is not to be resumed.
+        OutputError: something cannot be written; the last checkpoint stays.
+    """
+    tell, path = reports or Reports(), out / checkpoint.CHECKPOINT_FILE
+    scenario = open_simulation(plan.environment, plan.all_overrides)
+    if not scenario.driven:
+        raise CoopenvError(f"{plan.environment}: all motion here is prescribed, there is nothing to learn")
+    kept = checkpoint.read(path) if resume else None
+    if kept is None and path.is_file():
+        raise CoopenvError(f"{out} holds an unfinished training: go on with --resume, or remove {path}")
+    out.mkdir(parents=True, exist_ok=True)
+    check_file(path)
+    trainer = Trainer(plan, scenario, threads, str(logs or out / LOGS))
+    curve = kept.curve if kept is not None else []
+    try:
+        if kept is not None:
+            checkpoint.restore(kept, trainer)
+        else:
+            trainer.begin()
+        _learn(trainer, path, curve, threads, tell)
+        results = _judge(trainer, plan.settings.evaluation.final_worlds, threads, tell)
+        with replacing_folder(out, NAMES) as folder:
+            export(folder, trainer, results, curve, onnx)
+    finally:
+        trainer.close()
+    return results
+
+
+def _learn(trainer: Trainer, path: Path, curve: list[dict[str, float]], threads: int | None, tell: Reports) -> None:
+    """Update until the budget is spent; judge and write a checkpoint every so often."""
+    evaluation = trainer.plan.settings.evaluation
+    if not path.is_file():
+        _save(trainer, path, curve)
+    while trainer.status.share < 1.0:
+        before = trainer.status.steps // evaluation.every
+        status = trainer.update()
+        tell.status(status)
+        if status.steps // evaluation.every > before and status.share < 1.0:
+            figures = _judge(trainer, evaluation.worlds, threads, tell)
+            means = {name: figure.mean for name, figure in figures.items()}
+            trainer.record(means)
+            curve.append({"steps": status.steps, "seconds": round(status.seconds, 1), **means})
+            _save(trainer, path, curve)
+
+
+def _save(trainer: Trainer, path: Path, curve: list[dict[str, float]]) -> None:
+    checkpoint.save(path, trainer, curve)
+    interrupts.note(f"kept: {path} after {trainer.status.steps} steps; go on with --resume")
+
+
+def _judge(trainer: Trainer, worlds: int, threads: int | None, tell: Reports) -> dict[str, Figure]:
+    def mean_action(observations: np.ndarray) -> np.ndarray:
+        return np.asarray(trainer.model.predict(trainer.env.normalise(observations), deterministic=True)[0])
+
+    figures = judge(mean_action, trainer.scenario, Path(trainer.plan.environment).stem, worlds, threads)
+    tell.judged(trainer.status.steps, figures)
+    return figures

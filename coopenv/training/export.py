@@ -1,0 +1,173 @@
+"""An agent's folder from a trained policy: `agent.toml`, weights, settings, curve, ONNX. Needs the extra `train`."""
+
+import csv
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict
+from hashlib import sha256
+from importlib import metadata
+from pathlib import Path
+from shlex import join
+from typing import Any
+
+import numpy as np
+import tomlkit
+from safetensors.numpy import save
+from torch import nn
+
+from coopenv.api.terms.layout import observation_layout
+from coopenv.errors import CoopenvError
+from coopenv.files import writing
+from coopenv.policies.loader import AGENT_FILE
+from coopenv.policies.network import ENTRY, NetworkCard, layout_hash, layout_tables
+from coopenv.shipped import version
+from coopenv.training.judging import Figure
+from coopenv.training.settings import SETTINGS_FILE, Plan
+from coopenv.training.trainer import Trainer
+
+WEIGHTS_FILE, CURVE_FILE, ONNX_FILE = "weights.safetensors", "curve.csv", "policy.onnx"
+EXPORTED = (AGENT_FILE, WEIGHTS_FILE, SETTINGS_FILE, CURVE_FILE, ONNX_FILE)
+OPSET = 17
+PACKAGES = ("numpy", "warp-lang", "torch", "stable-baselines3")
+
+
+def export(
+    folder: Path, trainer: Trainer, results: Mapping[str, Figure], curve: list[dict[str, float]], onnx: bool = False
+) -> None:
+    """Write everything that an agent's folder holds.
+
+    Args:
+        folder: to write to.
+        trainer: whose policy it is.
+        results: figures on held-out maps.
+        curve: rows of figures while it learnt.
+        onnx: also write the mean action as an ONNX model, from raw observations to actions.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    tensors = network_of(trainer)
+    weights = save(tensors)
+    with writing(folder):
+        (folder / WEIGHTS_FILE).write_bytes(weights)
+        (folder / SETTINGS_FILE).write_text(_settings(trainer.plan), encoding="utf-8")
+        (folder / AGENT_FILE).write_text(_card(trainer, results, sha256(weights).hexdigest()), encoding="utf-8")
+        if curve:
+            with (folder / CURVE_FILE).open("w", newline="", encoding="utf-8") as file:
+                writer = csv.DictWriter(file, curve[-1])
+                writer.writeheader()
+                writer.writerows(curve)
+        if onnx:
+            (folder / ONNX_FILE).write_bytes(onnx_model(tensors, trainer.plan.settings.ppo.observation_clip))
+
+
+def network_of(trainer: Trainer) -> dict[str, np.ndarray]:
+    """Return the tensors of the mean action, float32, by the names that `coopenv.policies.network` reads."""
+    policy = trainer.model.policy
+    layers = [layer for layer in policy.mlp_extractor.policy_net if isinstance(layer, nn.Linear)]
+    tensors = {"observation.mean": trainer.env.statistics.mean, "observation.std": trainer.env.std}
+    for i, layer in enumerate([*layers, policy.action_net]):
+        tensors[f"layers.{i}.weight"] = layer.weight.detach().numpy()
+        tensors[f"layers.{i}.bias"] = layer.bias.detach().numpy()
+    tensors["log_std"] = policy.log_std.detach().numpy()
+    return {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in tensors.items()}
+
+
+def command_of(plan: Plan) -> str:
+    """Return the command that trains the same once more, from the folder's own settings."""
+    environment = Path(plan.environment).stem
+    return join(["coopenv", "train", environment, "--settings", SETTINGS_FILE, "--seed", str(plan.seed)])
+
+
+def _settings(plan: Plan) -> str:
+    values = plan.settings.model_dump(mode="json", exclude_none=True)
+    return tomlkit.dumps({**values, "scenario": plan.all_overrides})
+
+
+def _card(trainer: Trainer, results: Mapping[str, Figure], digest: str) -> str:
+    plan, environment = trainer.plan, Path(trainer.plan.environment).stem
+    observation, action = layout_tables(observation_layout(trainer.scenario))
+    card = NetworkCard(
+        weights=WEIGHTS_FILE,
+        sha256=digest,
+        layout=layout_hash(observation, action),
+        clip=plan.settings.ppo.observation_clip,
+        observation=observation,
+        action=action,
+    )
+    arm = f", arm {plan.arm}" if plan.arm else ""
+    document = tomlkit.document()
+    document["title"] = f"Learned driver of {environment}"
+    document["description"] = f"PPO, one policy for all vehicles{arm}, seed {plan.seed}."
+    document["kind"] = "learned"
+    document["entry"] = ENTRY
+    document["environments"] = [environment]
+    document["network"] = _with_rows(card.model_dump(), "observation", "action")
+    document["training"] = {
+        "command": command_of(plan),
+        "environment": environment,
+        "seed": plan.seed,
+        **({"arm": plan.arm} if plan.arm else {}),
+        "steps": trainer.status.steps,
+        "minutes": round(trainer.status.seconds / 60.0, 2),
+        "versions": {"coopenv": version(), "python": platform.python_version(), **_versions()},
+    }
+    known = {name: asdict(figure) for name, figure in results.items() if np.isfinite(figure.mean)}
+    figures = {name: {key: round(value, 5) for key, value in figure.items()} for name, figure in known.items()}
+    worlds = plan.settings.evaluation.final_worlds
+    document["results"] = _with_rows({"worlds": worlds, "figures": figures}, "figures")
+    return tomlkit.dumps(document)
+
+
+def _with_rows(table: dict[str, Any], *names: str) -> dict[str, Any]:
+    """Return a table in which the entries of some tables stand on one line each."""
+    rows = dict(table)
+    for name in names:
+        rows[name] = tomlkit.table()
+        for key, values in table[name].items():
+            row = tomlkit.inline_table()
+            row.update(values)
+            rows[name][key] = row
+    return rows
+
+
+def _versions() -> dict[str, str]:
+    return {name: metadata.version(name) for name in PACKAGES}
+
+
+def onnx_model(tensors: Mapping[str, np.ndarray], clip: float) -> bytes:
+    """Return an ONNX model from raw observations, (rows, D), to actions, (rows, A) in [-1, 1].
+
+    Raises:
+        CoopenvError: the package onnx is not installed.
+    """
+    try:
+        from onnx import TensorProto, checker, helper, numpy_helper
+    except ImportError:
+        raise CoopenvError("--onnx needs the package onnx: pip install '.[onnx]'") from None
+    constants = {**tensors, "clip.low": np.float32(-clip), "clip.high": np.float32(clip)}
+    constants |= {"action.low": np.float32(-1.0), "action.high": np.float32(1.0)}
+    del constants["log_std"]
+    depth = sum(name.endswith(".weight") for name in tensors)
+    nodes = [
+        helper.make_node("Sub", ["observation", "observation.mean"], ["centred"]),
+        helper.make_node("Div", ["centred", "observation.std"], ["scaled"]),
+        helper.make_node("Clip", ["scaled", "clip.low", "clip.high"], ["hidden.0"]),
+    ]
+    for i in range(depth):
+        inputs = [f"hidden.{i}", f"layers.{i}.weight", f"layers.{i}.bias"]
+        nodes.append(helper.make_node("Gemm", inputs, [f"linear.{i}"], transB=1))
+        nodes.append(helper.make_node("Tanh", [f"linear.{i}"], [f"hidden.{i + 1}"]))
+    nodes[-1] = helper.make_node("Clip", [f"linear.{depth - 1}", "action.low", "action.high"], ["action"])
+    entries, outputs = tensors["observation.mean"].shape[0], tensors["log_std"].shape[0]
+    graph = helper.make_graph(
+        nodes,
+        "policy",
+        [helper.make_tensor_value_info("observation", TensorProto.FLOAT, ["rows", entries])],
+        [helper.make_tensor_value_info("action", TensorProto.FLOAT, ["rows", outputs])],
+        [numpy_helper.from_array(np.asarray(values), name) for name, values in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=8)
+    checker.check_model(model)
+    data: bytes = model.SerializeToString()
+    return data

@@ -1,0 +1,199 @@
+"""The settings of a training, read from a TOML file, and what exactly is to be trained."""
+
+import json
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, ValidationError
+
+from coopenv.errors import CoopenvError, suggest
+from coopenv.scenario.base import NonNegative, Part, Positive, Probability
+from coopenv.scenario.validation import one_line
+
+SETTINGS_FILE = "train.toml"
+Count = Annotated[int, Field(gt=0, le=2**31)]
+Share = Annotated[float, Field(gt=0.0, lt=1.0)]
+
+
+class Ppo(Part):
+    """Proximal policy optimisation (Schulman et al. 2017) with parameters shared over vehicles."""
+
+    worlds: Count = 64
+    """Worlds side by side."""
+    decisions: Count = 64
+    """Decision steps of a rollout, after each of which the policy is updated."""
+    minibatches: Count = 8
+    """Gradient steps per pass over a rollout."""
+    epochs: Count = 4
+    """Passes over each rollout."""
+    learning_rate: Positive = 1e-3
+    """Of Adam at the start; falls linearly to zero."""
+    gamma: Share = 0.99
+    """Discount per decision."""
+    gae_lambda: Probability = 0.95
+    """Of the generalised advantage estimate (Schulman et al. 2016)."""
+    clip: Positive = 0.2
+    """Of the probability ratio."""
+    entropy: NonNegative = 0.0
+    """Weight of the entropy bonus."""
+    value_weight: NonNegative = 0.5
+    """Weight of the value loss."""
+    max_gradient: Positive = 0.5
+    """Norm at which gradients are clipped."""
+    reward_scale: Positive = 0.1
+    """Rewards are multiplied by it, which makes values of order one."""
+    initial_std: Positive = 0.5
+    """Standard deviation of the exploration at the start; actions reach from -1 to 1."""
+    hidden: tuple[Count, ...] = Field(default=(64, 64), min_length=1)
+    """Widths of the hidden layers, tanh, of the policy and of the value."""
+    observation_clip: Positive = 6.0
+    """Observations are normalised by their running mean and standard deviation and clipped to this."""
+
+
+class Clone(Part):
+    """A start from the behaviour of another driver, whose actions and returns are learnt by regression first."""
+
+    agent: str
+    """By what `coopenv.policies.find_agent` takes."""
+    episodes: Count = 64
+    """Worlds, of one episode each, in which it is watched."""
+    epochs: Count = 20
+    """Passes over what was seen."""
+    learning_rate: Positive = 1e-3
+    noise: NonNegative = 0.1
+    """Standard deviation of what is added to its actions, so that it is also seen mending deviations."""
+
+
+class Evaluation(Part):
+    """Judging the mean action on held-out maps."""
+
+    every: Count = 250_000
+    """Decisions of vehicles between two of them; a checkpoint is written after each."""
+    worlds: Count = 32
+    """One episode each, while training."""
+    final_worlds: Count = 256
+    """One episode each, for the results in `agent.toml`."""
+
+
+class Settings(Part):
+    """Everything that decides how a training goes, but for environment and seed."""
+
+    steps: Count | None = None
+    """Decisions of vehicles to collect (none: 2 million), or ..."""
+    minutes: Positive | None = None
+    """... how long to train."""
+    scenario: dict[str, Any] = Field(default={})
+    """Overrides of the environment's scenario, as tables or dotted keys."""
+    ppo: Ppo = Ppo()
+    evaluation: Evaluation = Evaluation()
+    clone: Clone | None = None
+
+    @property
+    def budget(self) -> tuple[int | None, float | None]:
+        """Steps and seconds at which to end; one of them is None."""
+        if self.minutes is not None:
+            return None, 60.0 * self.minutes
+        return self.steps or 2_000_000, None
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be trained; two runs of one plan and one version on one machine give the same policy."""
+
+    environment: str
+    settings: Settings
+    seed: int
+    arm: str | None = None
+    overrides: Mapping[str, Any] | None = None
+    """Those of the command line, after those of the settings."""
+
+    @property
+    def all_overrides(self) -> dict[str, Any]:
+        """Every override of the scenario by its dotted key."""
+        return {**self.settings.scenario, **(self.overrides or {})}
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain data."""
+        return {
+            "environment": self.environment,
+            "arm": self.arm,
+            "seed": self.seed,
+            "overrides": dict(self.overrides or {}),
+            "settings": self.settings.model_dump(mode="json"),
+        }
+
+    @classmethod
+    def of_document(cls, document: Mapping[str, Any]) -> "Plan":
+        """Return the plan of what `document` returned.
+
+        Raises:
+            CoopenvError: it is none.
+        """
+        try:
+            settings = Settings.model_validate_json(json.dumps(document["settings"]), strict=True)
+            return cls(str(document["environment"]), settings, document["seed"], document["arm"], document["overrides"])
+        except (ValidationError, KeyError, TypeError) as error:
+            raise CoopenvError(f"not the plan of a training: {type(error).__name__}") from None
+
+
+def read_settings(path: Path | None, arm: str | None = None, **changes: Any) -> Settings:
+    """Read settings, None for all defaults.
+
+    Args:
+        path: a TOML file with the keys of `Settings`, and under `arms` tables of the same keys by name.
+        arm: the table under `arms` whose values go before the others.
+        **changes: values that go before those of the file, where they are not None.
+
+    Raises:
+        CoopenvError: no such file or arm, or it is not valid; one line that names file and field.
+    """
+    where, raw = (str(path), _read(path)) if path is not None else ("settings", {})
+    raw["scenario"] = _flat(raw.get("scenario", {}), where)
+    arms = raw.pop("arms", {})
+    if not isinstance(arms, dict) or not all(isinstance(table, dict) for table in arms.values()):
+        raise CoopenvError(f"{where}: arms: expected tables by name")
+    if arm is not None:
+        if arm not in arms:
+            known = f"{suggest(arm, arms)}; known: {', '.join(arms) or 'none'}"
+            raise CoopenvError(f"{where}: no arm '{arm}'{known}")
+        chosen = {**arms[arm], "scenario": _flat(arms[arm].get("scenario", {}), f"{where}: arms.{arm}")}
+        raw = _merged(raw, chosen)
+    raw.update({name: value for name, value in changes.items() if value is not None})
+    if "steps" in raw and "minutes" in raw:
+        raise CoopenvError(f"{where}: steps and minutes: give one of them")
+    try:
+        return Settings.model_validate_json(json.dumps(raw, default=str), strict=True)
+    except ValidationError as error:
+        raise CoopenvError(one_line(error, where, Settings)) from None
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CoopenvError(f"{path}: not valid TOML: {error}") from None
+    except OSError as error:
+        raise CoopenvError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def _flat(tables: Any, where: str) -> dict[str, Any]:
+    """Return tables within tables as one of dotted keys."""
+    if not isinstance(tables, dict):
+        raise CoopenvError(f"{where}: scenario: expected a table")
+    flat: dict[str, Any] = {}
+    for key, value in tables.items():
+        inner = _flat(value, where) if isinstance(value, dict) else None
+        flat.update({key: value} if inner is None else {f"{key}.{name}": each for name, each in inner.items()})
+    return flat
+
+
+def _merged(base: dict[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a table with the values of another before its own, tables within it alike."""
+    merged = dict(base)
+    for key, value in change.items():
+        inner = merged.get(key)
+        merged[key] = _merged(inner, value) if isinstance(inner, dict) and isinstance(value, dict) else value
+    return merged

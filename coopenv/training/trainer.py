@@ -1,0 +1,121 @@
+"""One training: the batch, Stable-Baselines3's PPO on it, and how far it is. Needs the extra `train`."""
+
+import math
+from time import monotonic
+from typing import Any
+
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.logger import configure
+
+from coopenv.api.trainers.sb3 import CooperativeSB3VecEnv
+from coopenv.api.trainers.sb3_buffer import ActingRowsBuffer
+from coopenv.api.vector_env import CooperativeVectorEnv
+from coopenv.scenario import Scenario
+from coopenv.training.cloning import clone
+from coopenv.training.normalised import NormalisedEnv
+from coopenv.training.settings import Plan
+from coopenv.training.watch import Status, Watch
+
+
+class Trainer:
+    """A policy that all vehicles share, and everything that its next update depends on."""
+
+    def __init__(self, plan: Plan, scenario: Scenario, threads: int | None = None, logs: str | None = None) -> None:
+        """Build worlds and networks.
+
+        Args:
+            plan: what to train.
+            scenario: of the environment, the plan's overrides applied.
+            threads: shares of the batch on the CPU.
+            logs: folder for TensorBoard; None: nothing is written.
+        """
+        torch.set_num_threads(1)  # small matrices: more threads mostly wait for one another and for the worlds'
+        self.plan, self.scenario = plan, scenario
+        ppo = plan.settings.ppo
+        rows = CooperativeVectorEnv(
+            scenario,
+            plan.environment,
+            num_worlds=ppo.worlds,
+            autoreset="same_step",
+            arrays="numpy",
+            threads=threads,
+        )
+        self.batch = CooperativeSB3VecEnv(rows)
+        self.env = NormalisedEnv(self.batch, ppo.observation_clip, ppo.reward_scale)
+        self._rollout = ppo.decisions * self.env.num_envs
+        self._share, self._seconds = 0.0, 0.0
+        widths = list(ppo.hidden)
+        self.model = PPO(
+            "MlpPolicy",
+            self.env,
+            learning_rate=lambda _: ppo.learning_rate * (1.0 - self._share),
+            n_steps=ppo.decisions,
+            batch_size=max(2, self._rollout // ppo.minibatches),
+            n_epochs=ppo.epochs,
+            gamma=ppo.gamma,
+            gae_lambda=ppo.gae_lambda,
+            clip_range=ppo.clip,
+            ent_coef=ppo.entropy,
+            vf_coef=ppo.value_weight,
+            max_grad_norm=ppo.max_gradient,
+            rollout_buffer_class=ActingRowsBuffer,
+            rollout_buffer_kwargs={"rows": self.batch},
+            policy_kwargs={
+                "net_arch": {"pi": widths, "vf": widths},
+                "log_std_init": math.log(ppo.initial_std),
+                "optimizer_kwargs": {"eps": 1e-5},
+            },
+            seed=plan.seed,
+            device="cpu",
+        )
+        self.model.set_logger(configure(logs, ["tensorboard"] if logs else []))
+        self._watch = Watch(self.batch)
+
+    def begin(self) -> None:
+        """Clone another driver, where the settings say so, and start the first episodes."""
+        settings = self.plan.settings
+        if settings.clone is not None:
+            clone(
+                *(self.model.policy, self.env, settings.clone),
+                gamma=settings.ppo.gamma,
+                reward_scale=settings.ppo.reward_scale,
+                seed=self.plan.seed,
+            )
+        self.env.start()
+
+    def update(self) -> Status:
+        """Collect one rollout and learn from it."""
+        begin = monotonic()
+        self._share = self._spent()
+        self.model.learn(self._rollout, callback=self._watch, reset_num_timesteps=False)
+        self._seconds += monotonic() - begin
+        return self.status
+
+    @property
+    def status(self) -> Status:
+        """How far the training is."""
+        return Status(self.model.num_timesteps, self._seconds, self._spent(), self._watch.figures())
+
+    def _spent(self) -> float:
+        steps, seconds = self.plan.settings.budget
+        return min(1.0, self.model.num_timesteps / steps if steps else self._seconds / (seconds or math.inf))
+
+    def progress(self) -> dict[str, Any]:
+        """Return how far it is as plain data, for `continue_at`."""
+        return {"steps": self.model.num_timesteps, "seconds": self._seconds}
+
+    def continue_at(self, steps: int, seconds: float) -> None:
+        """Count on from there."""
+        self.model.num_timesteps, self._seconds = steps, seconds
+
+    def record(self, figures: dict[str, float]) -> None:
+        """Write figures of the mean action on held-out maps for TensorBoard."""
+        for name, value in figures.items():
+            self.model.logger.record(f"held_out/{name}", value)
+        self.model.logger.dump(self.model.num_timesteps)
+
+    def close(self) -> None:
+        """End the threads and the log."""
+        self.model.logger.close()
+        self.env.close()

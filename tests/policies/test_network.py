@@ -1,0 +1,128 @@
+"""Learned policies without torch: what they compute, and what they refuse."""
+
+from __future__ import annotations
+
+from hashlib import sha256
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.numpy import save
+
+import coopenv
+from coopenv.api.terms.layout import observation_layout
+from coopenv.policies import load_agent
+from coopenv.policies.network import Network, NetworkCard, layout_hash, layout_tables
+
+ENV = "urban_crossing"
+Tensors = dict[str, np.ndarray]
+
+
+def tensors_for(inputs: int, outputs: int = 2) -> Tensors:
+    rng = np.random.default_rng(0)
+    sizes = [inputs, 8, 8, outputs]
+    tensors: Tensors = {"observation.mean": rng.normal(size=inputs), "observation.std": rng.uniform(0.1, 1.0, inputs)}
+    for i, (before, after) in enumerate(pairwise(sizes)):
+        tensors[f"layers.{i}.weight"] = rng.normal(size=(after, before)) / before**0.5
+        tensors[f"layers.{i}.bias"] = rng.normal(size=after)
+    tensors["log_std"] = np.zeros(outputs)
+    return {name: values.astype(np.float32) for name, values in tensors.items()}
+
+
+def write(folder: Path, tensors: Tensors, overrides: dict[str, Any] | None = None, **changes: Any) -> NetworkCard:
+    """Write weights and return a card for an environment's layout."""
+    observation, action = layout_tables(observation_layout(coopenv.load_scenario(ENV, overrides)))
+    data = save(tensors)
+    (folder / "weights.safetensors").write_bytes(data)
+    values = {"sha256": sha256(data).hexdigest(), "layout": layout_hash(observation, action), **changes}
+    fields: dict[str, Any] = {"observation": observation, "action": action}
+    return NetworkCard(weights="weights.safetensors", clip=5.0, **{**fields, **values})
+
+
+def test_is_a_multilayer_perceptron_of_normalised_observations(tmp_path: Path) -> None:
+    scenario, tensors = coopenv.load_scenario(ENV), tensors_for(132)
+    policy = Network(scenario, folder=tmp_path, network=write(tmp_path, tensors))
+    observations = np.random.default_rng(1).uniform(-1, 1, (7, 132)).astype(np.float32)
+    t = {name: values.astype(np.float64) for name, values in tensors.items()}
+    for observation, action in zip(observations, policy(observations), strict=True):
+        x = np.clip((observation - t["observation.mean"]) / t["observation.std"], -5.0, 5.0)
+        for i in range(2):
+            x = np.tanh(t[f"layers.{i}.weight"] @ x + t[f"layers.{i}.bias"])
+        x = np.clip(t["layers.2.weight"] @ x + t["layers.2.bias"], -1.0, 1.0)
+        assert action == pytest.approx(x, abs=1e-5)
+
+
+def test_drives_where_there_is_more_to_see(tmp_path: Path) -> None:
+    """Fields are found by name: one trained without bearings gives the same actions where bearings are shown."""
+    few = {"observation.include": ["goal", "odometry"]}
+    small, large = coopenv.load_scenario(ENV, few), coopenv.load_scenario(ENV)
+    card = write(tmp_path, tensors_for(observation_layout(small).size), few)
+    narrow, wide = (Network(scenario, folder=tmp_path, network=card) for scenario in (small, large))
+    shown = coopenv.parallel_env(ENV).reset(seed=0)[0]
+    hidden = coopenv.parallel_env(ENV, overrides=few).reset(seed=0)[0]
+    assert np.array_equal(wide(np.stack(list(shown.values()))), narrow(np.stack(list(hidden.values()))))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"observation.position_scale": 9.0}, r"another observation: 'estimate_position' had scale 8\.0 and has 9\.0"),
+        ({"observation.include": ["odometry", "goal"]}, r"'estimate_position' is not in this environment"),
+        ({"dynamics.max_speed": 1.5}, r"another action: 'speed' had high 1\.0 and has 1\.5 here"),
+        ({"action.longitudinal": "acceleration"}, r"another action: 'speed' is not in this environment"),
+    ],
+)
+def test_another_layout_is_refused_by_its_first_field(overrides: dict[str, Any], message: str, tmp_path: Path) -> None:
+    card = write(tmp_path, tensors_for(132))
+    with pytest.raises(coopenv.CoopenvError, match=message):
+        Network(coopenv.load_scenario(ENV, overrides), folder=tmp_path, network=card)
+
+
+def without(tensors: Tensors, name: str) -> Tensors:
+    return {key: values for key, values in tensors.items() if key != name}
+
+
+@pytest.mark.parametrize(
+    ("tensors", "message"),
+    [
+        (without(tensors_for(132), "layers.1.bias"), "not the weights of a policy"),
+        (tensors_for(131), "shapes do not fit 132 observations and 2 entries"),
+        (tensors_for(132, 3), "shapes do not fit 132 observations and 2 entries"),
+        ({**tensors_for(132), "layers.0.bias": np.full(8, np.nan, np.float32)}, "not finite numbers in float32"),
+        ({**tensors_for(132), "observation.std": np.zeros(132, np.float32)}, "shapes do not fit|std"),
+    ],
+)
+def test_bad_weights_are_refused(tensors: Tensors, message: str, tmp_path: Path) -> None:
+    card = write(tmp_path, tensors)
+    with pytest.raises(coopenv.CoopenvError, match=message):
+        Network(coopenv.load_scenario(ENV), folder=tmp_path, network=card)
+
+
+def test_damaged_foreign_and_missing_files(tmp_path: Path) -> None:
+    scenario, card = coopenv.load_scenario(ENV), write(tmp_path, tensors_for(132))
+    path = tmp_path / "weights.safetensors"
+    data = path.read_bytes()
+    for damaged in (data[:1000], b"", b"\x00" * 64, data[:-4]):
+        path.write_bytes(damaged)
+        with pytest.raises(coopenv.CoopenvError, match=r"weights\.safetensors: damaged, or no weights"):
+            Network(scenario, folder=tmp_path, network=card)
+    path.write_bytes(data[:-4] + b"\x00\x00\x00\x01")
+    with pytest.raises(coopenv.CoopenvError, match=r"not the weights that agent\.toml was written with"):
+        Network(scenario, folder=tmp_path, network=card)
+    path.unlink()
+    with pytest.raises(coopenv.CoopenvError, match=r"weights\.safetensors: cannot be read: No such file"):
+        Network(scenario, folder=tmp_path, network=card)
+    write(tmp_path, tensors_for(132))
+    with pytest.raises(coopenv.CoopenvError, match="layout is not the hash of its tables"):
+        Network(scenario, folder=tmp_path, network=card.model_copy(update={"layout": "0" * 16}))
+
+
+def test_an_incomplete_card_names_the_field(tmp_path: Path) -> None:
+    (tmp_path / "agent.toml").write_text(
+        'title = "x"\ndescription = "y"\nenvironments = []\nentry = "coopenv.policies.network:Network"\n'
+        '[network]\nweights = "w"\nsha256 = ""\nlayout = ""\nclip = "far"\nobservation = {}\naction = {}\n'
+    )
+    with pytest.raises(coopenv.CoopenvError, match=r"agent\.toml: network\.clip: Input should be a valid number"):
+        load_agent(tmp_path, coopenv.load_scenario(ENV))

@@ -1,0 +1,215 @@
+"""`coopenv train` in processes of their own: an agent at the end, and a clean resume after whatever comes between."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+pytest.importorskip("stable_baselines3", reason="needs the extra 'train'")
+pytest.importorskip("tensorboard", reason="needs the extra 'train'")
+
+import coopenv
+from coopenv.cli import main
+from coopenv.policies import find_agent, load_agent
+from coopenv.training.settings import read_settings
+from tests.helpers.processes import COOPENV, start, wait_until
+
+pytestmark = pytest.mark.train
+SETTINGS = """
+steps = 3000
+scenario.horizon = 6.0
+[ppo]
+worlds = 4
+decisions = 25
+minibatches = 2
+epochs = 2
+[evaluation]
+every = 800
+worlds = 2
+final_worlds = 4
+"""
+STEPS = [800, 1600, 2400]
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "train.toml").write_text(SETTINGS)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def command(*more: str) -> list[str]:
+    return ["train", "urban_crossing", "--out", "agent", "--threads", "1", *more]
+
+
+def fresh(*more: str) -> list[str]:
+    return command("--settings", "train.toml", "--seed", "5", *more)
+
+
+def finished(folder: Path) -> dict[str, np.ndarray]:
+    """Return the weights of a whole agent in a folder."""
+    names = {path.name for path in folder.iterdir()}
+    assert names >= {"agent.toml", "weights.safetensors", "train.toml", "curve.csv", "tensorboard"}
+    assert "checkpoint.safetensors" not in names
+    load_agent(folder, coopenv.load_scenario("urban_crossing"))
+    return load_file(folder / "weights.safetensors")
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the agent of a training that nothing interrupted."""
+    folder = tmp_path_factory.mktemp("reference")
+    (folder / "train.toml").write_text(SETTINGS)
+    process = start((*COOPENV, *fresh("--json")), folder)
+    printed, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert set(json.loads(printed)["results"]) >= {"return", "arrival_rate", "collision_rate", "e50_m", "e95_m"}
+    return folder / "agent"
+
+
+def test_leaves_an_agent(reference: Path) -> None:
+    finished(reference)
+    agent = find_agent(reference)
+    assert (agent.kind, agent.environments) == ("learned", ("urban_crossing",))
+    with (reference / "curve.csv").open(encoding="utf-8") as file:
+        assert [int(row["steps"]) for row in csv.DictReader(file)] == STEPS
+    assert list((reference / "tensorboard").glob("events.*"))
+    again = read_settings(reference / "train.toml")
+    assert (again.steps, again.ppo.worlds, again.scenario) == (3000, 4, {"horizon": 6.0})
+
+
+@pytest.mark.slow
+def test_the_command_in_agent_toml_trains_the_same_again(reference: Path) -> None:
+    options = ["--settings", "agent/train.toml", "--seed", "5", "--threads", "2", "--out", "again"]
+    process = start((*COOPENV, "train", "urban_crossing", *options), reference.parent)
+    assert process.wait(300) == 0
+    same(finished(reference.parent / "again"), finished(reference))
+
+
+def same(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> None:
+    assert set(first) == set(second)
+    for name, values in first.items():
+        assert values == pytest.approx(second[name], abs=1e-5), name
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_learns_the_same(here: Path, reference: Path) -> None:
+    """After kill -9 just behind a checkpoint, the rest of the training is what it would have been."""
+    process = start((*COOPENV, *fresh()), here)
+    log: list[str] = []
+    assert process.stderr is not None
+    for line in process.stderr:
+        log.append(line)
+        if "1,600 steps, held-out maps" in line:  # the checkpoint before, of 800 steps, is whole in any case
+            os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL, "".join(log)
+    assert (here / "agent" / "checkpoint.safetensors").is_file()
+    assert not (here / "agent" / "agent.toml").exists()
+    assert main(fresh()) == 2  # it does not begin anew by mistake
+    process = start((*COOPENV, *command("--resume")), here)
+    _, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    assert " 800 steps" not in errors  # at most what came after the last checkpoint was done twice
+    same(finished(here / "agent"), finished(reference))
+
+
+def test_interrupted_says_how_to_go_on(here: Path) -> None:
+    process = start((*COOPENV, *fresh()), here)
+    wait_until(lambda: (here / "agent" / "checkpoint.safetensors").is_file() or process.poll() is not None)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "checkpoint.safetensors" in errors.splitlines()[-1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("left", [0, 100, 20_000])
+def test_a_truncated_checkpoint_is_one_line(left: int, here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    killed_at_the_start(here)
+    path = here / "agent" / "checkpoint.safetensors"
+    path.write_bytes(path.read_bytes()[:left])
+    assert main(command("--resume")) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("error: agent/checkpoint.safetensors: damaged, or not a checkpoint")
+    assert told.count("\n") == 1
+
+
+def killed_at_the_start(here: Path) -> None:
+    process = start((*COOPENV, *fresh()), here)
+    wait_until(lambda: (here / "agent" / "checkpoint.safetensors").is_file() or process.poll() is not None)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+
+
+@pytest.mark.slow
+def test_nothing_to_resume_and_options_that_cannot_change(
+    here: Path, reference: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(command("--resume")) == 2
+    assert "error: nothing to resume: there is no agent/checkpoint.safetensors\n" in capsys.readouterr().err
+    assert main(command("--resume", "--seed", "1", "--steps", "5")) == 2
+    assert "leave out --seed, --steps" in capsys.readouterr().err
+    assert main(["train", "urban_crossing", "--out", str(reference), "--resume"]) == 2
+    assert "holds a finished agent and no checkpoint" in capsys.readouterr().err
+    killed_at_the_start(here)
+    assert main(["train", "overtaking", "--out", "agent", "--resume"]) == 2
+    assert "agent holds a training of urban_crossing, not of overtaking" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_full_disk_keeps_the_last_checkpoint(here: Path, reference: Path) -> None:
+    """Files larger than 64 kB cannot be written: the first checkpoint fails in one line, and nothing is left."""
+    limited = ["bash", "-c", 'ulimit -f 64; exec "$@"', "bash"]
+    process = start((*limited, *COOPENV, *fresh()), here)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert errors.splitlines()[-1].startswith("error: cannot write to agent/checkpoint.safetensors")
+    assert not (here / "agent" / "agent.toml").exists()
+    killed_at_the_start(here)
+    before = (here / "agent" / "checkpoint.safetensors").read_bytes()
+    process = start((*limited, *COOPENV, *command("--resume")), here)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 2 and "cannot write to agent/checkpoint.safetensors" in errors
+    assert (here / "agent" / "checkpoint.safetensors").read_bytes() == before
+    process = start((*COOPENV, *command("--resume")), here)
+    assert process.wait(300) == 0
+    same(finished(here / "agent"), finished(reference))
+
+
+@pytest.mark.slow
+def test_an_environment_that_changed_since(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = coopenv.shipped.data_directory("envs") / "urban_crossing.toml"
+    (here / "mine.toml").write_text(source.read_text())
+    first = start((*COOPENV, "train", "mine.toml", "--settings", "train.toml", "--out", "agent"), here)
+    wait_until(lambda: (here / "agent" / "checkpoint.safetensors").is_file() or first.poll() is not None)
+    os.killpg(first.pid, signal.SIGKILL)
+    first.communicate()
+    (here / "mine.toml").write_text(source.read_text().replace("range = 12.0", "range = 6.0"))
+    assert main(["train", "mine.toml", "--out", "agent", "--resume"]) == 2
+    assert "mine.toml has changed since; remove the file to start anew" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train", "overtaking"], "all motion here is prescribed, there is nothing to learn"),
+        (["train", "urban_crossing", "--steps", "5", "--minutes", "1"], "steps and minutes: give one of them"),
+        (["train", "urban_crossing", "--agent", "give_way"], "--agent give_way: there is no train.toml beside it"),
+        (["train", "urban_crossing", "--agent", "give_way", "--settings", "train.toml"], "give one of them"),
+        (["train", "urban_crossing", "--arm", "x"], "no arm 'x'; known: none"),
+    ],
+)
+def test_mistakes_are_one_line(
+    arguments: list[str], message: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments) == 2
+    told = capsys.readouterr().err
+    assert message in told and told.count("\n") == 1
