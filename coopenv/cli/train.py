@@ -73,14 +73,14 @@ def train(
     with options.warned():
         options.load(environment, plan.all_overrides)
 
-    def judged(at: int, figures: dict[str, Any]) -> None:
-        log.print(f"{at:>10,} steps, held-out maps: {_told(figures)}", soft_wrap=True)
+    def judged(at: int, results: list[Any]) -> None:
+        log.print(f"{at:>10,} steps, held-out maps: {_told(results)}", soft_wrap=True)
 
     with Progress(log, "starting", total=1.0) as progress:
         reports = Reports(lambda status: progress.update(status.share, status.line), judged)
         results = perform(plan, folder, resume=resume, threads=threads, onnx=onnx, logs=logs, reports=reports)
     if as_json:
-        options.print_json({"agent": str(folder), "results": {name: asdict(each) for name, each in results.items()}})
+        options.print_json({"agent": str(folder), "results": [asdict(result) for result in results]})
         return
     options.console().print(f"Agent in {folder}: coopenv run {environment} --policy {folder}", soft_wrap=True)
 
@@ -99,8 +99,9 @@ def _settings(agent: str | None, path: Path | None, arm: str | None, steps: int 
     return read_settings(path, arm, steps=steps, minutes=minutes)
 
 
-def _told(figures: dict[str, Any]) -> str:
-    """Return figures on one line, each with its interval."""
+def _told(results: list[Any]) -> str:
+    """Return the most telling figures on one line, each with its interval."""
+    figures = {result.metric: result for result in results}
     percent = {"arrival_rate": "arrived", "collision_rate": "hit"}
     parts = [f"{word} {_interval(figures[name], 100, 0)} %" for name, word in percent.items()]
     parts.append(f"e95 {_interval(figures['e95_m'], 100, 0)} cm")

@@ -7,18 +7,22 @@ from pathlib import Path
 import numpy as np
 
 from coopenv import interrupts
+from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
 from coopenv.errors import CoopenvError
+from coopenv.evaluation import Result, drive, held_out_seeds, score
 from coopenv.files import check_file, replacing_folder
+from coopenv.seeds import evaluation_seed
 from coopenv.training import checkpoint
 from coopenv.training.export import EXPORTED, export
-from coopenv.training.judging import Figure, judge
 from coopenv.training.settings import Plan
 from coopenv.training.trainer import Trainer
 from coopenv.training.watch import Status
 
 NAMES = (*EXPORTED, checkpoint.CHECKPOINT_FILE)
 LOGS = "tensorboard"
+WHILE_LEARNING = 2**30
+"""Number of the first seed for evaluation that is looked at while learning; `coopenv evaluate` begins with number 0."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +31,7 @@ class Reports:
 
     status: Callable[[Status], None] = lambda status: None
     """After every update."""
-    judged: Callable[[int, dict[str, Figure]], None] = lambda steps, figures: None
+    judged: Callable[[int, list[Result]], None] = lambda steps, results: None
     """After every look at held-out maps: decisions of vehicles so far, and figures."""
 
 
@@ -51,7 +55,7 @@ def train(
     onnx: bool = False,
     logs: Path | None = None,
     reports: Reports | None = None,
-) -> dict[str, Figure]:
+) -> list[Result]:
     """Train a policy and write it as an agent to a folder.
 
     While it learns the folder holds `checkpoint.safetensors`, and `tensorboard/` unless `logs` says otherwise. When it
@@ -91,7 +95,8 @@ def train(
         else:
             trainer.begin()
         _learn(trainer, path, curve, threads, tell)
-        results = _judge(trainer, plan.settings.evaluation.final_worlds, threads, tell)
+        worlds = plan.settings.evaluation.final_worlds
+        results = _judge(trainer, held_out_seeds(0, worlds), threads, tell)
         with replacing_folder(out, NAMES) as folder:
             export(folder, trainer, results, curve, onnx)
     finally:
@@ -109,8 +114,8 @@ def _learn(trainer: Trainer, path: Path, curve: list[dict[str, float]], threads:
         status = trainer.update()
         tell.status(status)
         if status.steps // evaluation.every > before and status.share < 1.0:
-            figures = _judge(trainer, evaluation.worlds, threads, tell)
-            means = {name: figure.mean for name, figure in figures.items()}
+            seeds = [evaluation_seed(WHILE_LEARNING + world) for world in range(evaluation.worlds)]
+            means = {result.metric: result.mean for result in _judge(trainer, seeds, threads, tell)}
             trainer.record(means)
             curve.append({"steps": status.steps, "seconds": round(status.seconds, 1), **means})
             _save(trainer, path, curve)
@@ -121,10 +126,16 @@ def _save(trainer: Trainer, path: Path, curve: list[dict[str, float]]) -> None:
     interrupts.note(f"kept: {path} after {trainer.status.steps} steps; go on with --resume")
 
 
-def _judge(trainer: Trainer, worlds: int, threads: int | None, tell: Reports) -> dict[str, Figure]:
+def _judge(trainer: Trainer, seeds: list[int], threads: int | None, tell: Reports) -> list[Result]:
+    """Return how the mean action drives in held-out worlds."""
+
     def mean_action(observations: np.ndarray) -> np.ndarray:
         return np.asarray(trainer.model.predict(trainer.env.normalise(observations), deterministic=True)[0])
 
-    figures = judge(mean_action, trainer.scenario, Path(trainer.plan.environment).stem, worlds, threads)
-    tell.judged(trainer.status.steps, figures)
-    return figures
+    engine = Engine(trainer.scenario, len(seeds), threads=threads)
+    try:
+        results = score(drive(engine, mean_action, seeds))
+    finally:
+        engine.close()
+    tell.judged(trainer.status.steps, results)
+    return results

@@ -2,8 +2,7 @@
 
 import csv
 import platform
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from importlib import metadata
 from pathlib import Path
@@ -17,11 +16,11 @@ from torch import nn
 
 from coopenv.api.terms.layout import observation_layout
 from coopenv.errors import CoopenvError
+from coopenv.evaluation import Result
 from coopenv.files import writing
 from coopenv.policies.loader import AGENT_FILE
 from coopenv.policies.network import ENTRY, NetworkCard, layout_hash, layout_tables
 from coopenv.shipped import version
-from coopenv.training.judging import Figure
 from coopenv.training.settings import SETTINGS_FILE, Plan
 from coopenv.training.trainer import Trainer
 
@@ -32,7 +31,7 @@ PACKAGES = ("numpy", "warp-lang", "torch", "stable-baselines3")
 
 
 def export(
-    folder: Path, trainer: Trainer, results: Mapping[str, Figure], curve: list[dict[str, float]], onnx: bool = False
+    folder: Path, trainer: Trainer, results: Sequence[Result], curve: list[dict[str, float]], onnx: bool = False
 ) -> None:
     """Write everything that an agent's folder holds.
 
@@ -84,7 +83,7 @@ def _settings(plan: Plan) -> str:
     return tomlkit.dumps({**values, "scenario": plan.all_overrides})
 
 
-def _card(trainer: Trainer, results: Mapping[str, Figure], digest: str) -> str:
+def _card(trainer: Trainer, results: Sequence[Result], digest: str) -> str:
     plan, environment = trainer.plan, Path(trainer.plan.environment).stem
     observation, action = layout_tables(observation_layout(trainer.scenario))
     card = NetworkCard(
@@ -112,11 +111,20 @@ def _card(trainer: Trainer, results: Mapping[str, Figure], digest: str) -> str:
         "minutes": round(trainer.status.seconds / 60.0, 2),
         "versions": {"coopenv": version(), "python": platform.python_version(), **_versions()},
     }
-    known = {name: asdict(figure) for name, figure in results.items() if np.isfinite(figure.mean)}
-    figures = {name: {key: round(value, 5) for key, value in figure.items()} for name, figure in known.items()}
-    worlds = plan.settings.evaluation.final_worlds
-    document["results"] = _with_rows({"worlds": worlds, "figures": figures}, "figures")
+    document["results"] = _with_rows({"figures": _figures(results)}, "figures")
     return tomlkit.dumps(document)
+
+
+def _figures(results: Sequence[Result]) -> dict[str, dict[str, float]]:
+    """Return what is known of figures on held-out maps, with their intervals, by name; `n` worlds each."""
+    return {
+        result.metric: {
+            **{key: round(getattr(result, key), 5) for key in ("mean", "ci_low", "ci_high")},
+            "n": result.n,
+        }
+        for result in results
+        if np.isfinite(result.mean)
+    }
 
 
 def _with_rows(table: dict[str, Any], *names: str) -> dict[str, Any]:

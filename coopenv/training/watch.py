@@ -8,7 +8,7 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 
 from coopenv.api.trainers.sb3 import CooperativeSB3VecEnv
-from coopenv.training.judging import SETTLED_AFTER
+from coopenv.evaluation.metrics import SETTLED_FROM
 
 EPISODES = 200
 """Last episodes of vehicles over which is averaged."""
@@ -49,7 +49,7 @@ class Watch(BaseCallback):
 
     def _on_step(self) -> bool:
         told = self._env.batch_infos
-        counts = self._env.acted & (told["time"] > SETTLED_AFTER)
+        counts = self._env.acted & (told["time"] > SETTLED_FROM)
         self._errors.append(told["position_error"][counts])
         self._ended.extend(self.locals["infos"][row] for row in np.flatnonzero(self.locals["dones"]))
         return True

@@ -12,13 +12,15 @@ pytest.importorskip("stable_baselines3", reason="needs the extra 'train'")
 import torch
 
 import coopenv
+from coopenv.api.engine import Engine
 from coopenv.api.trainers.sb3 import make_sb3_vec_env
-from coopenv.policies import load_agent
+from coopenv.evaluation import Result, drive, held_out_seeds, score
+from coopenv.policies import Policy, load_agent
 from coopenv.policies.network import Network
+from coopenv.scenario import Scenario
 from coopenv.scenario.terms import REWARD_TERMS
 from coopenv.training.command import train
 from coopenv.training.export import export, network_of, onnx_model
-from coopenv.training.judging import judge
 from coopenv.training.normalised import LEAST_VARIANCE, NormalisedEnv
 from coopenv.training.settings import Clone, Evaluation, Plan, Ppo, Settings
 from coopenv.training.trainer import Trainer
@@ -42,7 +44,7 @@ def trained() -> Trainer:
 
 
 def test_numpy_and_onnx_agree_with_torch(trained: Trainer, tmp_path: Path) -> None:
-    export(tmp_path, trained, {}, [])
+    export(tmp_path, trained, [], [])
     observations = np.random.default_rng(0).uniform(-1, 1, (100, 132)).astype(np.float32)
     expected = trained.model.predict(trained.env.normalise(observations), deterministic=True)[0]
     agent = load_agent(tmp_path, trained.scenario)
@@ -76,38 +78,29 @@ def test_statistics_are_those_of_vehicles_under_way() -> None:
     assert normalised == pytest.approx(expected, abs=1e-2)
 
 
+def figures_of(policy: Policy, scenario: Scenario) -> dict[str, Result]:
+    results = score(drive(Engine(scenario, 8), policy, held_out_seeds(0, 8)))
+    return {result.metric: result for result in results}
+
+
 @pytest.mark.slow
 def test_a_clone_drives_like_its_model() -> None:
-    trainer = trainer_of(steps=1024, clone=Clone(agent="give_way", episodes=16, epochs=40))
+    trainer = trainer_of(steps=1024, clone=Clone(agent="route_follower", episodes=16, epochs=40))
     scenario = trainer.scenario
-    before = judge(lambda o: trainer.model.predict(trainer.env.normalise(o), deterministic=True)[0], scenario, "x", 8)
+
+    def mean_action(observations: np.ndarray) -> np.ndarray:
+        return trainer.model.predict(trainer.env.normalise(observations), deterministic=True)[0]
+
+    before = figures_of(mean_action, scenario)
     trainer.begin()
-    after = judge(lambda o: trainer.model.predict(trainer.env.normalise(o), deterministic=True)[0], scenario, "x", 8)
-    model = judge(load_agent("give_way", scenario), scenario, "x", 8)
+    after = figures_of(mean_action, scenario)
+    model = figures_of(load_agent("route_follower", scenario), scenario)
     assert before["arrival_rate"].mean < 0.4 and model["arrival_rate"].mean == 1.0
     assert after["arrival_rate"].mean > 0.6
     observation, _ = trainer.batch.envs.reset(seed=0)
-    value = trainer.model.policy.predict_values(torch.from_numpy(trainer.env.normalise(observation)))
-    assert 0.0 < float(value.mean()) < 3.0  # a tenth of what give_way earns, discounted
-
-
-def test_judging_by_hand() -> None:
-    """A driver that stands still: nobody arrives or collides, and the error is that of the world stepped by hand."""
-    scenario = coopenv.load_scenario("urban_crossing", {"horizon": 5.0})
-    figures = judge(lambda o: np.tile([-1.0, 0.0], (len(o), 1)), scenario, "x", worlds=3)
-    env = coopenv.make_vec("urban_crossing", num_worlds=3, overrides={"horizon": 5.0}, autoreset="disabled")
-    env.reset(seed=2**31)
-    returned, errors = np.zeros(env.num_envs), []
-    for _ in range(50):
-        _, rewards, _, _, infos = env.step(np.tile(np.float32([-1.0, 0.0]), (env.num_envs, 1)))
-        returned += rewards
-        if infos["time"][0] > 3.0:
-            errors.append(infos["position_error"])
-    assert figures["arrival_rate"].mean == figures["collision_rate"].mean == 0.0
-    assert figures["return"].mean == pytest.approx(returned.mean(), abs=1e-4)
-    assert figures["e95_m"].mean == pytest.approx(np.percentile(errors, 95), rel=1e-5)
-    assert figures["e50_m"].ci_low <= figures["e50_m"].mean <= figures["e50_m"].ci_high
-    assert np.isnan(figures["travel_time_s"].mean)
+    with torch.no_grad():
+        value = trainer.model.policy.predict_values(torch.from_numpy(trainer.env.normalise(observation)))
+    assert 0.0 < float(value.mean()) < 3.0  # a tenth of what route_follower earns, discounted
 
 
 @pytest.mark.slow
@@ -120,14 +113,15 @@ def test_learns_to_drive_faster_where_nothing_else_counts(tmp_path: Path) -> Non
     }
     ppo = Ppo(worlds=16, decisions=16, gamma=0.9, learning_rate=3e-3)
     settings = Settings(steps=40_000, scenario=overrides, ppo=ppo, evaluation=Evaluation(final_worlds=8))
-    figures = train(Plan("urban_crossing", settings, seed=2), tmp_path / "agent", threads=1)
+    results = train(Plan("urban_crossing", settings, seed=2), tmp_path / "agent", threads=1)
+    figures = {result.metric: result for result in results}
     scenario = coopenv.load_scenario("urban_crossing", overrides)
-    half_speed = judge(lambda o: np.zeros((len(o), 2)), scenario, "x", 8)
+    half_speed = figures_of(lambda observations: np.zeros((len(observations), 2)), scenario)
     assert figures["return"].ci_low > half_speed["return"].ci_high
 
 
 def test_an_agent_of_a_longer_action_is_not_this_one(trained: Trainer, tmp_path: Path) -> None:
-    export(tmp_path, trained, {}, [])
+    export(tmp_path, trained, [], [])
     text = (
         (tmp_path / "agent.toml")
         .read_text()

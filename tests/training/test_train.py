@@ -18,6 +18,7 @@ pytest.importorskip("tensorboard", reason="needs the extra 'train'")
 import coopenv
 from coopenv.cli import main
 from coopenv.policies import find_agent, load_agent
+from coopenv.policies.loader import read_card
 from coopenv.training.settings import read_settings
 from tests.helpers.processes import COOPENV, start, wait_until
 
@@ -70,7 +71,8 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     process = start((*COOPENV, *fresh("--json")), folder)
     printed, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors
-    assert set(json.loads(printed)["results"]) >= {"return", "arrival_rate", "collision_rate", "e50_m", "e95_m"}
+    told = {row["metric"]: row for row in json.loads(printed)["results"]}
+    assert told["e95_m"]["ci_low"] <= told["e95_m"]["mean"] <= told["e95_m"]["ci_high"]
     return folder / "agent"
 
 
@@ -78,6 +80,9 @@ def test_leaves_an_agent(reference: Path) -> None:
     finished(reference)
     agent = find_agent(reference)
     assert (agent.kind, agent.environments) == ("learned", ("urban_crossing",))
+    card = read_card(reference)
+    assert card.training["command"] == "coopenv train urban_crossing --settings train.toml --seed 5"
+    assert {"return", "arrival_rate", "collision_rate", "e50_m", "e95_m"} <= set(card.results["figures"])
     with (reference / "curve.csv").open(encoding="utf-8") as file:
         assert [int(row["steps"]) for row in csv.DictReader(file)] == STEPS
     assert list((reference / "tensorboard").glob("events.*"))
@@ -202,8 +207,11 @@ def test_an_environment_that_changed_since(here: Path, capsys: pytest.CaptureFix
     [
         (["train", "overtaking"], "all motion here is prescribed, there is nothing to learn"),
         (["train", "urban_crossing", "--steps", "5", "--minutes", "1"], "steps and minutes: give one of them"),
-        (["train", "urban_crossing", "--agent", "give_way"], "--agent give_way: there is no train.toml beside it"),
-        (["train", "urban_crossing", "--agent", "give_way", "--settings", "train.toml"], "give one of them"),
+        (
+            ["train", "urban_crossing", "--agent", "route_follower"],
+            "--agent route_follower: there is no train.toml beside it",
+        ),
+        (["train", "urban_crossing", "--agent", "route_follower", "--settings", "train.toml"], "give one of them"),
         (["train", "urban_crossing", "--arm", "x"], "no arm 'x'; known: none"),
     ],
 )
