@@ -7,8 +7,11 @@ import numpy as np
 
 from coopenv.errors import CoopenvError, shown, suggest
 
+OF_TESTS = ("options",)
+"""What PettingZoo's own tests of conformance pass to every environment."""
 
-def checked_options(options: object, known: tuple[str, ...]) -> dict[str, Any]:
+
+def checked_options(options: object, known: tuple[str, ...], ignored: tuple[str, ...] = ()) -> dict[str, Any]:
     """Return options by name, without those that are None.
 
     Raises:
@@ -19,7 +22,7 @@ def checked_options(options: object, known: tuple[str, ...]) -> dict[str, Any]:
     if not isinstance(options, Mapping):
         raise CoopenvError(f"options must be a dict, got {type(options).__name__}")
     for key in options:
-        if key not in known:
+        if key not in known and key not in ignored:
             raise CoopenvError(f"unknown option {shown(key)}{suggest(str(key), known)}; known: {', '.join(known)}")
     return {key: value for key, value in options.items() if value is not None}
 

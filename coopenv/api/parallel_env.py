@@ -12,7 +12,7 @@ from pettingzoo import ParallelEnv
 from coopenv.api.actions import ActionReader
 from coopenv.api.engine import Engine
 from coopenv.api.infos import InfoWriter, state_space, state_vector
-from coopenv.api.options import checked_options, world_number
+from coopenv.api.options import OF_TESTS, checked_options, world_number
 from coopenv.api.pictures import Pictures
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
@@ -137,7 +137,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         """
         first, own = 0, options or {}
         if self.engine.backend.capabilities.batched:
-            first, own = world_number(checked_options(options, ("world",)).get("world", 0)), {}
+            first, own = world_number(checked_options(options, ("world",), OF_TESTS).get("world", 0)), {}
         keys = None if seed is None else world_keys(seed, 1, first)
         if keys is not None:
             self._np_random = seeding.np_random(keys[0])[0]
