@@ -16,7 +16,7 @@ UNIFORM_ROTATION = (math.pi**2 / 3.0 + 2.0) / 3.0  # rad^2 per axis, of a rotati
 
 def briefing_of(scenario: Scenario, model: Any) -> Briefing:
     """Return what the observers of a simulated world are told."""
-    s, L = scenario, len(scenario.landmarks)
+    s, L, places = scenario, len(scenario.landmarks), scenario.cameras
     cameras, noises = model.camera.numpy(), model.noise.numpy()
     targets, counts = model.targets.numpy(), model.target_count.numpy()
     k, q = model.observer.k.numpy(), model.observer.q.numpy().astype(float)
@@ -27,9 +27,9 @@ def briefing_of(scenario: Scenario, model: Any) -> Briefing:
             target_names=tuple(s.target_names),
             landmarks=L,
             targets=targets[i, : counts[i]].astype(np.int64),
-            lever_arm=np.array(s.camera.position, float),
+            lever_arm=np.array(places[i].position, float),
             marker=np.array(s.vehicles[i].marker, float),
-            noise=_noise_of(scenario, cameras[i], noises[i]),
+            noise=_noise_of(scenario, i, cameras[i], noises[i]),
             gains=Gains(float(k[i]), q, s.observer.V, s.observer.P0, s.observer.max_turn),
         )
         for i, name in enumerate(s.vehicle_names)
@@ -45,12 +45,12 @@ def briefing_of(scenario: Scenario, model: Any) -> Briefing:
     )
 
 
-def _noise_of(scenario: Scenario, camera: Any, noise: Any) -> SensorNoise:
+def _noise_of(scenario: Scenario, vehicle: int, camera: Any, noise: Any) -> SensorNoise:
     """Return the noise of one vehicle from its entries of the model."""
     bearing, axis = float(noise["bearing"]), None
     if noise["bearing_paper"]:
         bearing /= math.sqrt(3.0)
-        along = camera["rotation"].astype(float) @ np.array(scenario.noise.bearing.axis, float)
+        along = camera["rotation"].astype(float) @ np.array(scenario.noises[vehicle].bearing.axis, float)
         x, y, z = (along / np.linalg.norm(along)).tolist()
         axis = x, y, z
     rate, duration, size, angle = (float(noise[f"slip_{name}"]) for name in ("rate", "duration", "size", "angle"))

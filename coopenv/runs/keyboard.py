@@ -44,7 +44,7 @@ class Keyboard:
     def __init__(self, scenario: Scenario, vehicle: int, others: Policy, keys: Keys) -> None:
         """Choose who is driven by whom; `vehicle` is an index."""
         self.keys, self._vehicle, self._others = keys, vehicle, others
-        self._longitudinal = action_fields(scenario)[0]
+        self._longitudinal = action_fields(scenario, scenario.limits[vehicle])[0]
         self._period = 1.0 / scenario.rates.decision
         self.reset(np.ones(len(scenario.vehicles), dtype=bool))
 

@@ -1,7 +1,7 @@
 """The first screen of `coopenv describe`: what matters about a scenario, and the same as data."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from textwrap import shorten
 from typing import Any
 
@@ -12,6 +12,7 @@ from rich.text import Text
 
 from coopenv.api.registration import environment_id
 from coopenv.api.terms.layout import observation_layout
+from coopenv.errors import listed
 from coopenv.format import number
 from coopenv.scenario import Scenario
 from coopenv.scenario.sensing import Noise
@@ -44,12 +45,13 @@ def facts(scenario: Scenario) -> dict[str, str]:
         groups[field.group] += field.stop - field.start
     corrections = "" if rates.observer is None else f", observer {number(rates.observer)}"
     spread = f"noise {number(noise.velocity)} m/s and {number(noise.angular_velocity)} rad/s"
+    spread = spread if noise.enabled else "no noise"
     weights = [f"{number(weight)} {name}" for name, weight in scenario.reward.by_name.items() if weight]
     found = {
         "Vehicles": _vehicles(scenario),
         "Targets": _targets(scenario),
-        "Camera": _camera(scenario),
-        "Odometry": f"linear and angular velocity, {spread if noise.enabled else 'no noise'}{_lasting(noise)}",
+        "Camera": _camera(scenario) + _own(scenario, "camera"),
+        "Odometry": f"linear and angular velocity, {spread}{_lasting(noise)}{_own(scenario, 'noise')}",
         "V2X": _v2x(scenario),
         "Observer": f"{observer.name} (gains k = {_gain(observer.k)}, q = {_gain(observer.q)})",
         "Rates": f"camera {number(rates.camera)} Hz, odometry {number(rates.odometry)}{corrections}, "
@@ -59,7 +61,7 @@ def facts(scenario: Scenario) -> dict[str, str]:
     }
     if scenario.driven:
         spans = [f"{entry.name} {number(entry.low)} to {number(entry.high)} {entry.unit}" for entry in layout.action]
-        found["Action"] = f"{len(spans)} numbers in [-1, 1]: {', '.join(spans)}"
+        found["Action"] = f"{len(spans)} numbers in [-1, 1]: {', '.join(spans)}{_own(scenario, 'dynamics')}"
     found["Reward"] = " + ".join(weights).replace("+ -", "- ") or "none: every weight is 0"
     return found | {"Ends": _end(scenario)}
 
@@ -67,7 +69,10 @@ def facts(scenario: Scenario) -> dict[str, str]:
 def _vehicles(scenario: Scenario) -> str:
     driven = sum(vehicle.motion.kind == "driven" for vehicle in scenario.vehicles)
     goals = sum(vehicle.goal_radius > 0 for vehicle in scenario.vehicles)
-    parts = [f"{driven} driven by actions, up to {number(scenario.dynamics.max_speed)} m/s"] if driven else []
+    fastest = [
+        own.max_speed for own, v in zip(scenario.limits, scenario.vehicles, strict=True) if v.motion.kind == "driven"
+    ]
+    parts = [f"{driven} driven by actions, up to {_span(fastest)} m/s"] if driven else []
     others = f"{len(scenario.vehicles) - driven} " + ("in traffic" if scenario.highway else "with prescribed motion")
     parts += [others] if driven < len(scenario.vehicles) else []
     return "; ".join([*parts, *([f"{goals} with a goal"] if goals else [])])
@@ -80,6 +85,9 @@ def _targets(scenario: Scenario) -> str:
         "fixed": "fixed topology: every neighbour is measured in every frame",
         "sensed": "sensed topology: what is in the field of view and not hidden is measured",
     }[scenario.topology.mode]
+    if scenario.sensing != "sensed":
+        mode = {"ideal": "every neighbour is measured in every frame", "blind": "nothing is measured"}[scenario.sensing]
+        mode = f"{scenario.sensing} sensing: {mode}"
     also = f" ({moving} moving)" if moving else ""
     return f"{len(scenario.landmarks)} landmarks{also}, other vehicles{buildings}; {mode}"
 
@@ -120,8 +128,19 @@ def _v2x(scenario: Scenario) -> str:
 
 def _gain(value: float | tuple[float, ...] | dict[str, float]) -> str:
     several = value.values() if isinstance(value, dict) else value if isinstance(value, tuple) else (value,)
-    low, high = min(several), max(several)
+    return _span(several)
+
+
+def _span(values: Collection[float]) -> str:
+    """Return `0.5`, or `0.5 to 2` where values differ."""
+    low, high = min(values), max(values)
     return number(low) if low == high else f"{number(low)} to {number(high)}"
+
+
+def _own(scenario: Scenario, part: str) -> str:
+    """Return which vehicles have a camera, noise or limits of their own."""
+    names = [name for name, v in zip(scenario.vehicle_names, scenario.vehicles, strict=True) if getattr(v, part)]
+    return f"; {listed(names)} with entries of their own" if names else ""
 
 
 def _end(scenario: Scenario) -> str:

@@ -1,7 +1,7 @@
 """What every part of a scenario shares: frozen, typed, and strict about its keys."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
@@ -12,6 +12,20 @@ class Part(BaseModel):
     """A frozen section of a scenario file; unknown keys are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+P = TypeVar("P", bound=Part)
+
+
+def overlaid(base: P, part: P | None) -> P:
+    """Return a section with what another one gives in place of its own entries; tables within are overlaid likewise."""
+    if part is None:
+        return base
+    changes = {}
+    for name in part.model_fields_set:
+        own, given = getattr(base, name), getattr(part, name)
+        changes[name] = overlaid(own, given) if isinstance(own, Part) and isinstance(given, Part) else given
+    return base.model_copy(update=changes)
 
 
 def _unit_quaternion(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:

@@ -4,7 +4,7 @@ import math
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, field_serializer, field_validator, model_validator
 
 from coopenv.scenario.base import (
     NonNegative,
@@ -18,6 +18,8 @@ from coopenv.scenario.base import (
     Vector3,
     Word,
 )
+from coopenv.scenario.learning import Dynamics
+from coopenv.scenario.sensing import Camera, Noise
 
 
 class Body(Part):
@@ -233,11 +235,20 @@ class Vehicle(Part):
     goal: Goal | None = None
     routes: tuple[str, ...] = Field(default=(), max_length=1000)
     """Names of routes, one of which is drawn at each reset: the vehicle starts at its beginning and goes to its end."""
+    camera: Camera | None = None
+    """This vehicle's own; what it does not give is as in the scenario's [camera]. Likewise the next two."""
+    noise: Noise | None = None
+    dynamics: Dynamics | None = None
 
     @property
     def goal_radius(self) -> float:
         """How near to its goal the vehicle has arrived, m; 0 without a goal."""
         return (self.goal or Goal()).radius if self.goal or self.routes else 0.0
+
+    @field_serializer("camera", "noise", "dynamics")
+    def _given(self, part: Part | None) -> dict[str, Any] | None:
+        """Leave out what is the scenario's."""
+        return None if part is None else part.model_dump(exclude_unset=True)
 
     @model_validator(mode="after")
     def _has_one_start_and_goal(self) -> Self:

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from coopenv.scenario.base import Part, Positive, Text, Vector3
+from coopenv.scenario.base import Part, Positive, Text, Vector3, overlaid
 from coopenv.scenario.bodies import Landmark, Obstacle, Road, Vehicle
 from coopenv.scenario.highway import Highway
 from coopenv.scenario.learning import Action, Dynamics, Observation, Reward, Termination
@@ -41,6 +41,10 @@ class ScenarioFields(Part):
     rates: Rates = Rates()
     noise: Noise = Noise()
     topology: Topology = Topology()
+    sensing: Literal["sensed", "ideal", "blind"] = "sensed"
+    """One switch for studies of what looking is worth; all else stays equal, noise, radio and draws included.
+    `ideal`: every neighbour is measured in every frame, whatever the field of view, range, misses and what is in
+    between; `blind`: nothing is ever measured; `sensed`: as `topology.mode` says."""
     v2x: V2x = V2x()
     observer: Observer = Observer()
     dynamics: Dynamics = Dynamics()
@@ -67,7 +71,23 @@ class ScenarioFields(Part):
     @property
     def has_lasting_errors(self) -> bool:
         """Whether any vehicle's odometry or camera has errors that last, see `[noise]` and `[camera]`."""
-        return self.noise.enabled and (self.noise.lasts or self.camera.is_misplaced)
+        noises, cameras = self.noises, self.cameras
+        return any(n.enabled and (n.lasts or c.is_misplaced) for n, c in zip(noises, cameras, strict=True))
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The camera of every vehicle."""
+        return [overlaid(self.camera, vehicle.camera) for vehicle in self.vehicles]
+
+    @property
+    def noises(self) -> list[Noise]:
+        """The noise of every vehicle's sensors."""
+        return [overlaid(self.noise, vehicle.noise) for vehicle in self.vehicles]
+
+    @property
+    def limits(self) -> list[Dynamics]:
+        """The dynamics of every vehicle."""
+        return [overlaid(self.dynamics, vehicle.dynamics) for vehicle in self.vehicles]
 
     @property
     def ticks_per_decision(self) -> int:

@@ -91,15 +91,22 @@ def _problems(s: ScenarioFields) -> Iterator[str]:
     for name, rate in (("camera", s.rates.camera), ("odometry", s.rates.odometry)):
         if s.horizon * rate > MOST_TICKS:
             yield f"horizon: {s.horizon:g} s at rates.{name} = {rate:g} Hz are over {MOST_TICKS:.0e} samples"
-    top, steering, decision = s.dynamics.max_speed, s.action.steering, 1.0 / s.rates.decision
-    for i, vehicle in enumerate(s.vehicles):
+    yield from _beyond_limits(s)
+
+
+def _beyond_limits(s: ScenarioFields) -> Iterator[str]:
+    """Yield what of the vehicles' motion and action is beyond their own limits."""
+    steering, decision = s.action.steering, 1.0 / s.rates.decision
+    for i, (vehicle, limits) in enumerate(zip(s.vehicles, s.limits, strict=True)):
+        own = vehicle.dynamics is not None
+        where, top = f"vehicles.{i}.dynamics" if own else "dynamics", limits.max_speed
         speed = vehicle.motion.initial_speed if vehicle.motion.kind == "driven" else 0.0
-        if not (-top if s.dynamics.reverse else 0.0) <= speed <= top:
+        if not (-top if limits.reverse else 0.0) <= speed <= top:
             yield f"vehicles.{i}.motion.initial_speed: {speed:g} m/s is beyond what [dynamics] permits"
-    if s.dynamics.latency > decision:
-        yield f"dynamics.latency: {s.dynamics.latency:g} s is longer than one decision ({decision:g} s)"
-    if steering is not None and steering > s.dynamics.max_steering:
-        yield f"action.steering: {steering:g} rad is above dynamics.max_steering ({s.dynamics.max_steering:g} rad)"
+        if limits.latency > decision:
+            yield f"{where}.latency: {limits.latency:g} s is longer than one decision ({decision:g} s)"
+        if steering is not None and steering > limits.max_steering:
+            yield f"action.steering: {steering:g} rad is above {where}.max_steering ({limits.max_steering:g} rad)"
 
 
 def _problems_of_routes(s: ScenarioFields) -> Iterator[str]:

@@ -31,7 +31,7 @@ ROTATION_OF_CAMERA = {"forward": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0
 
 
 class Camera(Part):
-    """The camera that every vehicle carries; optical frame: x right, y down, z forward."""
+    """The camera that every vehicle carries, unless it has its own; optical frame: x right, y down, z forward."""
 
     model: Literal["pinhole", "omnidirectional"] = "omnidirectional"
     """`omnidirectional` sees in every direction; `pinhole` is bounded by its image. The model, range, distortion

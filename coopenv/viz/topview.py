@@ -92,10 +92,10 @@ class TopView:
         bodies = [m.body for m in s.landmarks if m.body]
         self._other_box = np.array([geometry.box_shape(b.size, b.center, shortest) for b in bodies]).reshape(-1, 4, 2)
         self._marker = np.array([agent.marker for agent in agents])
-        self._camera, self._origin = np.array(s.camera.position), np.array(s.map.origin)
-        limit = _REACH * self._side
-        self._reach = min(s.camera.range or limit, limit)
-        self._fan = geometry.camera_fan(s.camera) if ground.sees_a_part(s) else None
+        cameras, limit = s.cameras, _REACH * self._side
+        self._camera, self._origin = np.array([camera.position for camera in cameras]), np.array(s.map.origin)
+        self._reach = np.array([min(c.range or limit, limit) if c.model == "pinhole" else 0.0 for c in cameras])
+        self._fan = np.array([geometry.camera_fan(camera) for camera in cameras]) if ground.sees_a_part(s) else None
         aside = self._box[:, 2, 1] + _LABEL * self._pixel
         self._label = np.stack([self._box[:, :, 0].mean(axis=1), aside], axis=-1)
 
@@ -187,7 +187,7 @@ class TopView:
     def _place_sight(self, R: np.ndarray, position: np.ndarray, sight: np.ndarray) -> None:
         L = self._landmarks
         target = (position + (R @ self._marker[..., None])[..., 0])[:, :2]
-        camera = position[L:] + R[L:] @ self._camera
+        camera = position[L:] + (R[L:] @ self._camera[..., None])[..., 0]
         for kind, lines in self._sight.items():
             observer, seen = np.nonzero(sight == kind)
             lines.set_segments(list(np.stack([camera[observer, :2], target[seen]], axis=1)))

@@ -87,14 +87,14 @@ def camera_fan(camera: Camera) -> np.ndarray:
 
 
 def free_lengths(
-    origin: np.ndarray, rays: np.ndarray, reach: float, obstacles: Sequence[Obstacle], shift: np.ndarray
+    origin: np.ndarray, rays: np.ndarray, reach: np.ndarray | float, obstacles: Sequence[Obstacle], shift: np.ndarray
 ) -> np.ndarray:
     """Return how far rays (N, K, 3) from cameras (N, 3) get before a building stops them, (N, K) m, up to `reach`.
 
-    Rays are unit vectors; they and the cameras are in the map frame, whose origin is at `shift` in the coordinates of
-    the buildings, those of the scenario's file, m.
+    `reach` is one for all, or (N,) of each camera. Rays are unit vectors; they and the cameras are in the map frame,
+    whose origin is at `shift` in the coordinates of the buildings, those of the scenario's file, m.
     """
-    length = np.full(rays.shape[:2], reach)
+    length = np.repeat(np.broadcast_to(np.asarray(reach, float), len(rays))[:, None], rays.shape[1], axis=1)
     for obstacle in obstacles:
         Rt = Rotation.from_euler("z", -obstacle.yaw).as_matrix()
         start = (origin - (np.array(obstacle.center) - shift)) @ Rt.T

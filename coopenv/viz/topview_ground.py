@@ -114,7 +114,7 @@ def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
         (True, _sight(Sight.VISIBLE, "sees (its colour)")),
         (sensed and scenario.obstacles, _sight(Sight.OCCLUDED_BY_BUILDING, "hidden by a building")),
         (sensed, _sight(Sight.OCCLUDED_BY_BODY, "hidden by a body")),
-        (scenario.camera.miss_probability > 0, _sight(Sight.MISSED, "in view, but missed")),
+        (any(camera.miss_probability > 0 for camera in scenario.cameras), _sight(Sight.MISSED, "in view, but missed")),
         (True, _mark("o", DARK_BLUE, DARK_BLUE, 5, "landmark")),
         (moving, _mark("D", DARK_BLUE, DARK_BLUE, 4.5, "moving landmark")),
         (scenario.highway, Patch(facecolor=TRAFFIC, edgecolor="white", linewidth=0.8, label="other traffic")),
@@ -131,7 +131,9 @@ def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
 
 def sees_a_part(scenario: Scenario) -> bool:
     """Return whether cameras have a field of view that matters."""
-    return scenario.camera.model == "pinhole" and scenario.topology.mode == "sensed"
+    if scenario.topology.mode != "sensed" or scenario.sensing != "sensed":
+        return False
+    return any(camera.model == "pinhole" for camera in scenario.cameras)
 
 
 def _sight(sight: Sight, label: str) -> Line2D:

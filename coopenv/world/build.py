@@ -10,12 +10,13 @@ import warp as wp
 from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Vehicle
+from coopenv.scenario.learning import Dynamics
 from coopenv.scenario.motion import compile_motion
 from coopenv.scenario.routes import even_points, point_count
-from coopenv.scenario.sensing import ROTATION_OF_CAMERA, Noise
 from coopenv.scenario.starts import agent_starts, rotation_of
 from coopenv.scenario.topology import neighbour_sets, processing_order
-from coopenv.world.model import DRIVEN, PRESCRIBED, STATIC, entry_struct, model_struct
+from coopenv.world.build_sensors import camera_entries, noise_entries
+from coopenv.world.model import BLIND, DRIVEN, IDEAL, PRESCRIBED, SENSED, STATIC, entry_struct, model_struct
 from coopenv.world.precision import Precision
 
 GRAMIAN_RATE = 20.0
@@ -32,11 +33,12 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     _fill(model, _world(scenario), device)
     _fill(model.start, _start(scenario), device)
     _fill(model.motion, _motion(scenario), device)
-    _fill(model.dynamics, _dynamics(scenario), device)
+    model.dynamics = _structs(p, "dynamics", [_dynamics(d, scenario) for d in scenario.limits], device)
     _fill(model.scene, _scene(scenario), device)
     _fill(model.routes, _routes(scenario), device)
-    model.camera = _structs(p, "camera", [_camera(scenario)] * len(scenario.vehicles), device)
-    model.noise = _structs(p, "noise", [_noise(scenario)] * len(scenario.vehicles), device)
+    sensors = zip(scenario.cameras, scenario.noises, strict=True)
+    model.camera = _structs(p, "camera", [camera_entries(camera, noise) for camera, noise in sensors], device)
+    model.noise = _structs(p, "noise", [noise_entries(n, scenario.rates) for n in scenario.noises], device)
     _fill(model.radio, _radio(scenario), device)
     _fill(model.observer, _observer(scenario), device)
     _fill(model.judgement, _judgement(scenario), device)
@@ -78,6 +80,7 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "obstacles": len(scenario.obstacles),
         "traffic": scenario.highway.most_vehicles if scenario.highway else 0,
         "sensed": int(scenario.topology.mode == "sensed"),
+        "sensing": {"sensed": SENSED, "ideal": IDEAL, "blind": BLIND}[scenario.sensing],
         "camera_rate": rates.camera,
         "odometry_rate": rates.odometry,
         "camera_period": 1.0 / rates.camera,
@@ -136,8 +139,8 @@ def _motion(scenario: Scenario) -> dict[str, Any]:
     }
 
 
-def _dynamics(scenario: Scenario) -> dict[str, Any]:
-    d, accelerates = scenario.dynamics, scenario.action.longitudinal == "acceleration"
+def _dynamics(d: Dynamics, scenario: Scenario) -> dict[str, Any]:
+    accelerates = scenario.action.longitudinal == "acceleration"
     same = ("wheelbase", "max_speed", "max_acceleration", "max_steering", "max_steering_rate")
     return {
         **{name: getattr(d, name) for name in same},
@@ -186,72 +189,6 @@ def _routes(scenario: Scenario) -> dict[str, Any]:
         **{name: [getattr(route, name) for route in routes] for name in ("lateral_spread", "wander", "start_spread")},
         "height": -origin[2],
     }
-
-
-def _camera(scenario: Scenario) -> dict[str, Any]:
-    c, on = scenario.camera, float(scenario.noise.enabled)
-    named = ROTATION_OF_CAMERA.get(c.orientation) if isinstance(c.orientation, str) else None
-    same = ("position", "image_size", "focal_length", "principal_point")
-    return {
-        **{name: getattr(c, name) for name in same},
-        "rotation": rotation_of(None, c.orientation) if named is None else named,
-        "pinhole": int(c.model == "pinhole"),
-        **dict(zip(("k1", "k2", "p1", "p2", "k3"), c.distortion, strict=True)),
-        "max_radius": _monotone_radius(c.distortion),
-        "undistort": int(c.undistort),
-        "quantise": int(c.quantise),
-        "range": math.inf if c.range is None else c.range,
-        "miss": c.miss_probability,
-        "orientation_std": on * c.extrinsics_error,
-        "position_std": on * c.extrinsics_position_error,
-    }
-
-
-def _monotone_radius(k: tuple[float, ...]) -> float:
-    """Return the radius up to which r (1 + k1 r^2 + k2 r^4 + k3 r^6) grows: farther rays would fold back."""
-    k1, k2, _, _, k3 = k
-    roots = np.roots([7 * k3, 0, 5 * k2, 0, 3 * k1, 0, 1.0]) if any((k1, k2, k3)) else np.array([])
-    real = roots[np.abs(roots.imag) < 1e-9].real
-    return float(real[real > 0].min(initial=math.inf))
-
-
-def _noise(scenario: Scenario) -> dict[str, Any]:
-    n, rates = scenario.noise, scenario.rates
-    on = float(n.enabled)
-    axis = np.array(n.bearing.axis) / np.linalg.norm(n.bearing.axis)
-    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    if abs(axis[2]) > 1 - 1e-12:
-        first = np.array([1.0, 0.0, 0.0])
-    first = first / np.linalg.norm(first)
-    return {
-        "velocity": on * _at_rate(n.velocity, n.odometry_rate, rates.odometry),
-        "angular_velocity": on * _at_rate(n.angular_velocity, n.odometry_rate, rates.odometry),
-        "bearing_paper": int(n.bearing.model == "paper"),
-        "bearing": on * _at_rate(n.bearing.scale, n.bearing.rate, rates.camera),
-        "axis": np.column_stack([first, np.cross(axis, first), axis]),
-        **_lasting(n),
-    }
-
-
-def _lasting(n: Noise) -> dict[str, Any]:
-    """Return the errors of the odometry that last."""
-    on, slip = float(n.enabled), n.slip
-    return {
-        "lasting": int(n.enabled and n.lasts),
-        "odometry_scale": on * n.odometry_scale,
-        "odometry_scale_walk": on * n.odometry_scale_walk,
-        "gyro_bias": on * np.broadcast_to(n.gyro_bias, 3),
-        "gyro_bias_walk": on * np.broadcast_to(n.gyro_bias_walk, 3),
-        "slip_rate": on * slip.rate,
-        "slip_duration": slip.duration,
-        "slip_size": slip.size,
-        "slip_angle": slip.angle,
-    }
-
-
-def _at_rate(std: float, stated: float | str, actual: float) -> float:
-    """Return the standard deviation per sample that keeps the density std^2 / stated rate."""
-    return std if isinstance(stated, str) else std * float(np.sqrt(actual / stated))
 
 
 def _radio(scenario: Scenario) -> dict[str, Any]:

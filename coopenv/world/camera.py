@@ -9,6 +9,7 @@ import warp as wp
 
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.so3 import exp_so3
+from coopenv.world.model import BLIND, IDEAL
 from coopenv.world.random import BEARING, gaussian_pair, pair, random_words, signed_uniform, uniform
 
 NOT_A_NEIGHBOUR = wp.constant(wp.uint8(Sight.NOT_A_NEIGHBOUR))
@@ -167,6 +168,15 @@ def through_pixels(camera: Any, bearing: Any):
 
 
 @wp.func
+def has_pixel(model: Any, camera: Any, ray: Any) -> bool:
+    """Return whether what is measured along a ray falls on the image: ideal sensing measures beyond it too."""
+    if model.sensing != IDEAL:
+        return True
+    _, _, inside = project(camera, ray)
+    return inside == 1
+
+
+@wp.func
 def noisy_bearing(noise: Any, bearing: Any, words: Any):
     """Return a noisy unit bearing: the paper's image-plane formula about an axis, or isotropic in the tangent plane."""
     one = bearing.dtype(1.0)
@@ -190,7 +200,9 @@ def noisy_bearing(noise: Any, bearing: Any, words: Any):
 @wp.func
 def sight_of(model: Any, state: Any, world: int, vehicle: int, target: int, origin: Any, line: Any, ray: Any):
     """Return whether a neighbour is in view now, and if not, why; `ray` is `line` in the optical frame."""
-    if model.sensed == 1:
+    if model.sensing == BLIND:
+        return OUT_OF_VIEW
+    if model.sensed == 1 and model.sensing != IDEAL:
         camera = model.camera[vehicle]
         if wp.dot(line, line) > camera.range * camera.range:
             return OUT_OF_VIEW
@@ -230,12 +242,12 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
             b = wp.normalize(ray)
         if sight == VISIBLE and random:
             words = random_words(state.seed[world], state.episode[world], tick, pair(vehicle, target), BEARING)
-            if uniform(words[2], zero) < camera.miss:
+            if model.sensing != IDEAL and uniform(words[2], zero) < camera.miss:
                 sight = MISSED
             if noise.bearing > zero:
                 b = noisy_bearing(noise, b, words)
         if sight == VISIBLE:
-            if camera.pinhole == 1 and model.sensed == 1:
+            if camera.pinhole == 1 and model.sensed == 1 and has_pixel(model, camera, ray):
                 b = through_pixels(camera, b)
             state.bearing[world, vehicle, target] = b
             state.bearing_tick[world, vehicle, target] = tick

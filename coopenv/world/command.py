@@ -30,13 +30,12 @@ def sanitised(action: Any):
 
 
 @wp.func
-def command_of(model: Any, action: Any):
-    """Return what an action in [-1, 1]^2 asks of a vehicle.
+def command_of(d: Any, action: Any):
+    """Return what an action in [-1, 1]^2 asks of a vehicle with the dynamics `d`.
 
     Where the first entry means an acceleration, the speed to reach is a limit of the vehicle: the highest or, to
     brake, the lowest.
     """
-    d = model.dynamics
     one = action.dtype(1.0)
     acceleration = d.max_acceleration
     if d.acceleration_mode == 1:
@@ -53,10 +52,10 @@ def decide(model: Any, state: Any, actions: Any, world: int):
     """Turn the actions of a decision that begins into commands; who has ended is to stand."""
     for vehicle in range(model.vehicles):
         action = sanitised(actions[world, vehicle])
-        command = command_of(model, action)
+        command = command_of(model.dynamics[vehicle], action)
         if state.ended[world, vehicle] != UNDER_WAY:
             command[SPEED] = action.dtype(0.0)
-            command[ACCELERATION] = model.dynamics.max_acceleration
+            command[ACCELERATION] = model.dynamics[vehicle].max_acceleration
         state.action[world, vehicle] = action
         state.command[world, vehicle] = command
 
@@ -64,6 +63,6 @@ def decide(model: Any, state: Any, actions: Any, world: int):
 @wp.func
 def command_in_force(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Return what the actuators follow during a tick: after a decision, the last command for the dead time."""
-    if (tick - 1) % model.ticks_per_decision < model.dynamics.latency_ticks:
+    if (tick - 1) % model.ticks_per_decision < model.dynamics[vehicle].latency_ticks:
         return state.last_command[world, vehicle]
     return state.command[world, vehicle]

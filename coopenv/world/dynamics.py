@@ -57,9 +57,8 @@ def first_order_lag(value: Any, target: Any, dt: Any, lag: Any, rate: Any):
 
 
 @wp.func
-def actuate(model: Any, speed: Any, steering: Any, command: Any, dt: Any):
-    """Return (speed, steering) after dt under a command, see `coopenv.world.command`."""
-    d = model.dynamics
+def actuate(d: Any, speed: Any, steering: Any, command: Any, dt: Any):
+    """Return (speed, steering) after dt under a command and limits `d`, see `coopenv.world.command`."""
     new_speed = first_order_lag(speed, command[SPEED], dt, d.speed_lag, command[ACCELERATION])
     angle = wp.clamp(command[STEERING], -d.max_steering, d.max_steering)
     new_steering = first_order_lag(steering, angle, dt, d.steering_lag, d.max_steering_rate)
@@ -67,16 +66,16 @@ def actuate(model: Any, speed: Any, steering: Any, command: Any, dt: Any):
 
 
 @wp.func
-def bicycle_step(model: Any, R: Any, position: Any, speed: Any, steering: Any, command: Any, dt: Any, parked: int):
+def bicycle_step(d: Any, R: Any, position: Any, speed: Any, steering: Any, command: Any, dt: Any, parked: int):
     """Return (R, position, speed, steering) after dt: rear-axle bicycle, its twist held at the mid-point."""
-    new_speed, new_steering = actuate(model, speed, steering, command, dt)
+    new_speed, new_steering = actuate(d, speed, steering, command, dt)
     if parked != 0:
         new_speed = type(speed)(0.0)
     half = type(speed)(0.5)
     mid_speed = wp.where(parked != 0, new_speed, (speed + new_speed) * half)
     way = mid_speed * dt
     o = type(position)()
-    turn = type(position)(o[0], o[1], way * wp.tan((steering + new_steering) * half) / model.dynamics.wheelbase)
+    turn = type(position)(o[0], o[1], way * wp.tan((steering + new_steering) * half) / d.wheelbase)
     new_R, new_position = increment(R, position, type(position)(way, o[1], o[2]), turn, type(speed)(1.0))
     return new_R, new_position, new_speed, new_steering
 
@@ -85,6 +84,7 @@ def bicycle_step(model: Any, R: Any, position: Any, speed: Any, steering: Any, c
 def drive(model: Any, state: Any, world: int, vehicle: int, command: Any, duration: wp.float64):
     """Advance a driven vehicle in short steps; one that has ended stands still."""
     agent = model.landmarks + vehicle
+    limits = model.dynamics[vehicle]
     R = state.rotation[world, agent]
     position = state.position[world, agent]
     speed = state.speed[world, vehicle]
@@ -93,20 +93,20 @@ def drive(model: Any, state: Any, world: int, vehicle: int, command: Any, durati
     steps = int(wp.ceil(duration / LONGEST_SUBSTEP))
     dt = type(speed)(duration / wp.float64(wp.max(steps, 1)))
     for _ in range(steps):
-        R, position, speed, steering = bicycle_step(model, R, position, speed, steering, command, dt, parked)
+        R, position, speed, steering = bicycle_step(limits, R, position, speed, steering, command, dt, parked)
     o = type(position)()
     state.rotation[world, agent] = orthonormalise(R)
     state.position[world, agent] = position
     state.speed[world, vehicle] = speed
     state.steering[world, vehicle] = steering
     state.velocity[world, agent] = type(o)(speed, o[1], o[2])
-    state.angular_velocity[world, agent] = type(o)(o[0], o[1], yaw_rate(model, speed, steering))
+    state.angular_velocity[world, agent] = type(o)(o[0], o[1], yaw_rate(limits, speed, steering))
 
 
 @wp.func
-def yaw_rate(model: Any, speed: Any, steering: Any):
+def yaw_rate(d: Any, speed: Any, steering: Any):
     """Return the bicycle's yaw rate, rad/s."""
-    return speed * wp.tan(steering) / model.dynamics.wheelbase
+    return speed * wp.tan(steering) / d.wheelbase
 
 
 @wp.func

@@ -16,6 +16,12 @@ DRIVEN = wp.constant(2)
 """Values of `Model.motion.kind`."""
 
 
+SENSED = wp.constant(0)
+IDEAL = wp.constant(1)
+BLIND = wp.constant(2)
+"""Values of `Model.sensing`, see the scenario's key."""
+
+
 mat66d: Any = wp.types.matrix((6, 6), wp.float64)
 
 
@@ -55,7 +61,7 @@ def model_struct(p: Precision) -> Any:
 
     @wp.struct
     class Dynamics:
-        """Kinematic bicycle and actuators; m, s, rad."""
+        """Kinematic bicycle and actuators of one vehicle; m, s, rad."""
 
         wheelbase: scalar
         max_speed: scalar
@@ -186,7 +192,8 @@ def model_struct(p: Precision) -> Any:
         agents: wp.int32
         obstacles: wp.int32
         traffic: wp.int32  # bodies that move and are nobody's target, at most
-        sensed: wp.int32
+        sensed: wp.int32  # 1: `topology.mode` asks for what is in view, 0: for every neighbour
+        sensing: wp.int32  # SENSED, IDEAL or BLIND
         camera_rate: wp.float64  # Hz
         odometry_rate: wp.float64  # Hz
         camera_period: wp.float64  # s
@@ -203,7 +210,7 @@ def model_struct(p: Precision) -> Any:
         rank: wp.array(dtype=wp.int32)  # (N,) place in the order
         start: Start
         motion: Motion
-        dynamics: Dynamics
+        dynamics: wp.array(dtype=Dynamics)  # (N,)
         scene: Scene
         routes: Routes
         camera: wp.array(dtype=Camera)  # (N,)

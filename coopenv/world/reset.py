@@ -86,11 +86,12 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
     state.steering[world, vehicle] = o[0]
     # The action in force before the first decision keeps the start speed, or accelerates by nothing.
     level = o[0]
-    if model.dynamics.acceleration_mode == 0:
-        span = model.dynamics.max_speed - model.dynamics.min_speed
-        level = (speed - model.dynamics.min_speed) * o.dtype(2.0) / span - o.dtype(1.0)
+    limits = model.dynamics[vehicle]
+    if limits.acceleration_mode == 0:
+        span = limits.max_speed - limits.min_speed
+        level = (speed - limits.min_speed) * o.dtype(2.0) / span - o.dtype(1.0)
     action = wp.vector(level, o[0])
-    command = command_of(model, action)
+    command = command_of(limits, action)
     state.action[world, vehicle] = action
     state.command[world, vehicle] = command
     state.last_command[world, vehicle] = command

@@ -10,6 +10,7 @@ from gymnasium import spaces
 
 from coopenv.errors import CoopenvError
 from coopenv.scenario import Scenario
+from coopenv.scenario.learning import Dynamics
 from coopenv.scenario.terms import GROUPS, OBSERVATION_FIELDS, ObservationField
 from coopenv.world.command import STEERING
 
@@ -54,11 +55,17 @@ class ActionField:
 
 
 class Layout(dict[str, Field]):
-    """The fields of the flat observation by name, in their order, and those of the action in `action`."""
+    """The fields of the flat observation by name, in their order, and those of the actions."""
 
-    def __init__(self, fields: Mapping[str, Field], action: tuple[ActionField, ...]) -> None:
+    def __init__(self, fields: Mapping[str, Field], actions: tuple[tuple[ActionField, ...], ...]) -> None:
         super().__init__(fields)
-        self.action = action
+        self.actions = actions
+        """Per vehicle, whose limits they span; all have the same names and units."""
+
+    @property
+    def action(self) -> tuple[ActionField, ...]:
+        """The fields of the first vehicle's action, and of any other's that has the same limits."""
+        return self.actions[0]
 
     @property
     def size(self) -> int:
@@ -67,7 +74,7 @@ class Layout(dict[str, Field]):
 
     def copy(self) -> Layout:
         """Return another one that may be changed."""
-        return Layout(self, self.action)
+        return Layout(self, self.actions)
 
 
 def included_fields(scenario: Scenario) -> dict[str, ObservationField]:
@@ -121,26 +128,34 @@ def observation_layout(scenario: Scenario) -> Layout:
         group, low = row.group or name, float(row.low)
         layout[name] = Field(start, stop, shape, group, row.unit, scale, low, row.meaning, center)
         start = stop
-    return Layout(layout, action_fields(scenario))
+    return Layout(layout, tuple(action_fields(scenario, limits) for limits in scenario.limits))
 
 
 def _scale(row: ObservationField, scenario: Scenario) -> float:
     if row.scale == "targets":
         return float(len(scenario.target_names))
     if row.scale == "steering":
-        return float(action_fields(scenario)[STEERING].high)
+        return float(max(action_fields(scenario, limits)[STEERING].high for limits in scenario.limits))
     return float(getattr(scenario.observation, row.scale) if isinstance(row.scale, str) else row.scale)
 
 
-def action_fields(scenario: Scenario) -> tuple[ActionField, ...]:
-    """Return what the two entries of an action mean: speed or acceleration, and steering (positive turns left)."""
-    limits = scenario.dynamics
+def action_fields(scenario: Scenario, limits: Dynamics | None = None) -> tuple[ActionField, ...]:
+    """Return what the entries of an action mean: speed or acceleration, and steering (positive turns left).
+
+    `limits` are a vehicle's; None: the first one's.
+    """
+    limits = limits or scenario.limits[0]
     steering = scenario.action.steering or limits.max_steering
     if scenario.action.longitudinal == "acceleration":
         first = ActionField("acceleration", "m/s^2", -limits.max_acceleration, limits.max_acceleration)
     else:
         first = ActionField("speed", "m/s", -limits.max_speed if limits.reverse else 0.0, limits.max_speed)
     return first, ActionField("steering", "rad", -steering, steering)
+
+
+def action_size(scenario: Scenario) -> int:
+    """Return how many numbers an action has."""
+    return len(action_fields(scenario))
 
 
 def flat_space(layout: Mapping[str, Field]) -> spaces.Box:

@@ -60,7 +60,7 @@ def metres(model: Any, state: Any, results: Any, world: int, vehicle: int, elaps
     way, length = way_made(model, state, world, vehicle)
     zero = way - way
     last = results.furthest[world, vehicle]
-    most = model.dynamics.max_speed * type(way)(FASTEST * elapsed)
+    most = model.dynamics[vehicle].max_speed * type(way)(FASTEST * elapsed)
     gained = wp.clamp(way - last, zero, most)
     missed = zero
     ends = results.terminated[world, vehicle] or results.truncated[world, vehicle]

@@ -79,7 +79,12 @@ def _of_robots(recording: Recording, name: str) -> dict[str, Any]:
             }
             for setup, position in starts
         ],
-        "camera": {"position": first.lever_arm.tolist(), "orientation": "body"},
+        "camera": {
+            "position": first.lever_arm.tolist(),
+            "orientation": "body",
+            "extrinsics_error": noise.camera_orientation,
+            "extrinsics_position_error": noise.camera_position,
+        },
         "rates": {
             "camera": rate,
             "odometry": 1.0 / noise.odometry_period,
@@ -90,6 +95,11 @@ def _of_robots(recording: Recording, name: str) -> dict[str, Any]:
             "velocity": noise.velocity,
             "angular_velocity": noise.angular_velocity,
             "bearing": {"model": "isotropic", "scale": noise.bearing},
+            "odometry_scale": noise.odometry_scale,
+            "odometry_scale_walk": noise.odometry_scale_walk,
+            "gyro_bias": noise.gyro_bias,
+            "gyro_bias_walk": noise.gyro_bias_walk,
+            "slip": dict(zip(("rate", "duration", "size", "angle"), noise.slip, strict=True)),
         },
         "topology": {"mode": "sensed", "acyclic": False},
         "v2x": {"period": recording.period, "staleness": staleness},

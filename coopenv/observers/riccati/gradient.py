@@ -47,6 +47,7 @@ class DifferentiableWorld:
         check_differentiable(scenario)
         self.scenario = scenario
         self._world = World(scenario, worlds, "float64", device)
+        self._latency = round(scenario.limits[0].latency * scenario.rates.camera)  # ticks
         self._order = processing_order(scenario, neighbour_sets(scenario))
 
     def rollout(self, actions: np.ndarray, seed: int = 0) -> Rollout:
@@ -127,7 +128,7 @@ class DifferentiableWorld:
     def _command(self, commands: list[Any], tick: int) -> Any:
         """Return the command in force during a tick, see `coopenv.world.command.command_in_force`."""
         decision, elapsed = divmod(tick - 1, self.scenario.ticks_per_decision)
-        if elapsed >= self._world.model.dynamics.latency_ticks:
+        if elapsed >= self._latency:
             return commands[decision]
         return commands[decision - 1] if decision > 0 else self._world.state.last_command
 
@@ -188,15 +189,16 @@ def check_differentiable(scenario: Scenario) -> None:
     Raises:
         ScenarioError: the first such setting.
     """
-    v2x, camera, observer = scenario.v2x, scenario.camera, scenario.observer
+    v2x, cameras, observer = scenario.v2x, scenario.cameras, scenario.observer
     reasons = {
         "every vehicle must have the motion 'driven'": all(v.motion.kind == "driven" for v in scenario.vehicles),
-        "noise.enabled must be false": not scenario.noise.enabled,
+        "noise.enabled must be false": not any(noise.enabled for noise in scenario.noises),
         "v2x must have delay 0, period 1, no loss, range or staleness": (
             (v2x.delay, v2x.period, v2x.loss, v2x.range, v2x.staleness) == (0, 1, 0.0, None, None)
         ),
-        "camera.miss_probability must be 0": camera.miss_probability == 0.0,
-        "camera.quantise must be false and camera.undistort true": camera.undistort and not camera.quantise,
+        "camera.miss_probability must be 0": all(c.miss_probability == 0.0 for c in cameras),
+        "camera.quantise must be false and camera.undistort true": all(c.undistort and not c.quantise for c in cameras),
+        "dynamics.latency must be the same for every vehicle": len({limits.latency for limits in scenario.limits}) == 1,
         "observer.name must be 'riccati' with k = 1": observer.name == "riccati" and observer.k == 1.0,
         "rates.observer must not be below rates.camera": (scenario.rates.observer or math.inf) >= scenario.rates.camera,
     }

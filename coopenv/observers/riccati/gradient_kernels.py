@@ -65,7 +65,7 @@ class Information:
 def command_kernel(model: Any, action: wp.array2d(dtype=Any), command: wp.array2d(dtype=Any)):
     """Make every vehicle's command of its action."""
     world, vehicle = wp.tid()
-    command[world, vehicle] = command_of(model, action[world, vehicle])
+    command[world, vehicle] = command_of(model.dynamics[vehicle], action[world, vehicle])
 
 
 def drive_kernel(
@@ -85,8 +85,9 @@ def drive_kernel(
     """
     world, vehicle = wp.tid()
     now = truth[world, vehicle]
+    limits = model.dynamics[vehicle]
     R, position, speed, steering = bicycle_step(
-        model, now.rotation, now.position, now.speed, now.steering, command[world, vehicle], dt, 0
+        limits, now.rotation, now.position, now.speed, now.steering, command[world, vehicle], dt, 0
     )
     truth_after[world, vehicle] = Truth(R, position, speed, steering)
     odometry = held[world, vehicle]
@@ -98,7 +99,7 @@ def drive_kernel(
         rotation, translation = increment(odometry.rotation, odometry.translation, v, w, dt)
     if sample != 0:
         v = vec3(speed, scalar(0.0), scalar(0.0))
-        w = vec3(scalar(0.0), scalar(0.0), yaw_rate(model, speed, steering))
+        w = vec3(scalar(0.0), scalar(0.0), yaw_rate(limits, speed, steering))
     held_after[world, vehicle] = Held(v, w, rotation, translation)
 
 
