@@ -38,8 +38,7 @@ class Driver(ABC):
 
     def read(self, observations: np.ndarray, name: str) -> np.ndarray:
         """Return a field of the observations in its unit, (rows, *shape)."""
-        field = self.layout[name]
-        return np.asarray(observations[:, field.slice].reshape(-1, *field.shape) * field.scale)
+        return self.layout[name].values(observations)
 
     def pursue(self, point: np.ndarray) -> np.ndarray:
         """Return the steering angles, (rows,) in rad, of the circles through points (rows, 2) in the own frame, m.

@@ -132,6 +132,10 @@ class Reward(Part):
     """m; terms per metre count what is above it"""
     uncertainty_cap: Positive = 1.0
     """m; and at most this, which is also the price of a metre that is never driven"""
+    observability_floor: Positive = 1e-5
+    """Added to the smallest eigenvalue of the sliding Gramian before the logarithm: above what rounding makes of 0"""
+    observability_level: Number = -1.0
+    """log10 of what the smallest eigenvalue should be"""
     custom: dict[Annotated[str, AfterValidator(REWARD_TERMS.free)], Term] = Field(default={})
     """Terms of one's own by name: where their functions stand, see docs/terms.md."""
     privileged: bool = False

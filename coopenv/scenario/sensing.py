@@ -197,6 +197,8 @@ class Observer(Part):
     """The correction is re-linearised whenever the attitude has turned by this much within a tick, rad."""
     gramian_window: float = Field(default=1.0, gt=0.0, le=3600.0)
     """Length of the sliding window of the observability Gramian, s."""
+    gramian_distance: Positive | None = None
+    """Its length in m driven forwards by odometry, in place of a time (none)."""
 
     @model_validator(mode="after")
     def _gain_is_stable(self) -> Self:

@@ -49,6 +49,8 @@ FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
          "log10 of the position's standard deviation along the estimated body's axes", XY, -1.25),
         ("heading_std", "vehicle", 1, "log10 rad", 1.5, -1, "log10 of that of the turn about the body's z axis",
          None, -2.0),
+        ("soft_observability", "vehicle", 1, "log10", 2.5, -1,
+         "log10 of floor + smallest eigenvalue of the sliding Gramian", None, -2.5),
     ],
     "sightings": [
         ("sighting", "neighbour", 3, "1", 1, -1, "unit vector camera to neighbour, body frame; 0: never seen", XY),
@@ -91,6 +93,8 @@ REWARDS: list[tuple[str, str, bool, str]] = [  # name, unit, privileged, meaning
     ("information_gain", "1", False, "Decrease of log det P / 6: a difference of potentials"),
     ("uncertainty", "1", False, "-log det P / 6: minus the mean log variance"),
     ("observability", "1", False, "log10 of the smallest eigenvalue of the sliding Gramian (floor 1e-9)"),
+    ("observability_shortfall", "m", False,
+     "Per metre gained: minus what log10(floor + smallest eigenvalue of the sliding Gramian) lacks to the level"),
     ("visibility", "1", False, "Share of its possible targets that the vehicle has in view"),
 ]  # fmt: skip
 

@@ -213,9 +213,11 @@ def _observer(scenario: Scenario) -> dict[str, Any]:
         "rate": min(scenario.rates.observer or camera, camera),
         "gramian_stride": stride,
         "block_ticks": stride * max(1, block),
+        "block_way": (o.gramian_distance or 0.0) / GRAMIAN_BLOCKS,
         "blocks": GRAMIAN_BLOCKS,
     }
 
 
 def _judgement(scenario: Scenario) -> dict[str, Any]:
-    return {name: getattr(scenario.reward, name) for name in ("uncertainty_threshold", "uncertainty_cap")}
+    names = ("uncertainty_threshold", "uncertainty_cap", "observability_floor", "observability_level")
+    return {name: getattr(scenario.reward, name) for name in names}

@@ -174,6 +174,7 @@ def model_struct(p: Precision) -> Any:
         rate: wp.float64  # Hz
         gramian_stride: wp.int32  # ticks between the samples of the sliding Gramian
         block_ticks: wp.int32  # ticks per block of it, a multiple of the stride
+        block_way: scalar  # m per block of it; 0: blocks last so many ticks
         blocks: wp.int32
 
     @wp.struct
@@ -182,6 +183,8 @@ def model_struct(p: Precision) -> Any:
 
         uncertainty_threshold: scalar  # m
         uncertainty_cap: scalar  # m
+        observability_floor: scalar  # of the smallest eigenvalue of the sliding Gramian
+        observability_level: scalar  # log10 of that eigenvalue
 
     @wp.struct
     class Model:

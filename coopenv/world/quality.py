@@ -81,24 +81,17 @@ def known_position(model: Any, state: Any, world: int, vehicle: int, target: int
 
 
 @wp.func
-def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: int, dt: Any):
-    """Add C^T C dt, dt being the time since the last sample, to the current block of the sliding Gramian.
+def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: int, block: int, dt: Any):
+    """Add C^T C dt, dt being the time (or the way) since the last sample, to a block of the sliding Gramian.
 
     In map axes the transition matrix of A_i is the identity, so that blocks simply add up; the spectrum is the same
     as in the body frame of the window's start. C is taken at the estimate, as the observer itself knows it.
     """
-    block = (tick // model.observer.block_ticks) % model.observer.blocks
     R = state.estimate_rotation[world, vehicle]
     p = state.estimate_position[world, vehicle]
-    G11 = type(R)()
-    G12 = type(R)()
-    G22 = type(R)()
-    time = type(dt)(0.0)
-    if tick % model.observer.block_ticks != 0:
-        G11 = state.gramian_11[world, vehicle, block]
-        G12 = state.gramian_12[world, vehicle, block]
-        G22 = state.gramian_22[world, vehicle, block]
-        time = state.gramian_time[world, vehicle, block]
+    G11 = state.gramian_11[world, vehicle, block]
+    G12 = state.gramian_12[world, vehicle, block]
+    G22 = state.gramian_22[world, vehicle, block]
     i3 = identity3(p)
     for n in range(model.target_count[vehicle]):
         target = model.targets[vehicle, n]
@@ -112,20 +105,63 @@ def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: i
     state.gramian_11[world, vehicle, block] = G11
     state.gramian_12[world, vehicle, block] = G12
     state.gramian_22[world, vehicle, block] = G22
-    state.gramian_time[world, vehicle, block] = time + dt
+    state.gramian_time[world, vehicle, block] = state.gramian_time[world, vehicle, block] + dt
+
+
+@wp.func
+def empty_block(state: Any, world: int, vehicle: int, block: int):
+    """Begin a block of the sliding Gramian anew."""
+    zero = type(state.gramian_11[world, vehicle, block])()
+    state.gramian_11[world, vehicle, block] = zero
+    state.gramian_12[world, vehicle, block] = zero
+    state.gramian_22[world, vehicle, block] = zero
+    state.gramian_time[world, vehicle, block] = zero[0, 0]
+
+
+@wp.func
+def sample_by_time(model: Any, state: Any, world: int, vehicle: int, tick: int):
+    """Add this tick to the sliding Gramian over a time."""
+    block = (tick // model.observer.block_ticks) % model.observer.blocks
+    if tick % model.observer.block_ticks == 0:
+        empty_block(state, world, vehicle, block)
+    dt = type(model.observer.max_turn)(model.camera_period)
+    accumulate_gramian(model, state, world, vehicle, tick, block, dt * type(dt)(model.observer.gramian_stride))
+
+
+@wp.func
+def sample_by_way(model: Any, state: Any, world: int, vehicle: int, tick: int):
+    """Add the way since the last sample to the sliding Gramian over a way: nothing while the vehicle stands."""
+    since = state.gramian_way[world, vehicle]
+    way = state.way_driven[world, vehicle] - since
+    if way > type(way)(0.0):
+        first = int(since / model.observer.block_way)
+        last = int((since + way) / model.observer.block_way)
+        for k in range(wp.max(first, last - model.observer.blocks) + 1, last + 1):
+            empty_block(state, world, vehicle, k % model.observer.blocks)
+        accumulate_gramian(model, state, world, vehicle, tick, last % model.observer.blocks, way)
+        state.gramian_way[world, vehicle] = since + way
 
 
 @wp.func
 def sample_gramian(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Add this tick to the sliding Gramian when a sample is due."""
+    by_way = model.observer.block_way > type(model.observer.max_turn)(0.0)
+    if by_way:
+        forward = state.increment_translation[world, vehicle][0]
+        state.way_driven[world, vehicle] = state.way_driven[world, vehicle] + forward
     if tick % model.observer.gramian_stride == 0:
-        dt = type(model.observer.max_turn)(model.camera_period)
-        accumulate_gramian(model, state, world, vehicle, tick, dt * type(dt)(model.observer.gramian_stride))
+        if by_way:
+            sample_by_way(model, state, world, vehicle, tick)
+        else:
+            sample_by_time(model, state, world, vehicle, tick)
 
 
 @wp.func
 def gramian_smallest_eigenvalue(model: Any, state: Any, world: int, vehicle: int):
-    """Return the smallest eigenvalue of (1/T) int Phi^T C^T C Phi dt over the sliding window; 0 before any data."""
+    """Return the smallest eigenvalue of (1/T) int Phi^T C^T C Phi dt over the sliding window; 0 before any data.
+
+    Where the window is a way, it is the mean over that.
+    """
     G11 = state.gramian_11[world, vehicle, 0]
     G12 = state.gramian_12[world, vehicle, 0]
     G22 = state.gramian_22[world, vehicle, 0]

@@ -126,6 +126,8 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
         state.gramian_12[world, vehicle, block] = type(R)()
         state.gramian_22[world, vehicle, block] = type(R)()
         state.gramian_time[world, vehicle, block] = o[0]
+    state.gramian_way[world, vehicle] = o[0]
+    state.way_driven[world, vehicle] = o[0]
 
 
 @wp.func

@@ -105,7 +105,9 @@ def state_struct(p: Precision) -> Any:
         gramian_11: array("WNB", mat33)  # block sums of int C^T C dt, map axes
         gramian_12: array("WNB", mat33)
         gramian_22: array("WNB", mat33)
-        gramian_time: array("WNB", scalar)  # s
+        gramian_time: array("WNB", scalar)  # s, or m where the window is a way
+        gramian_way: array("WN", scalar)  # m, `way_driven` at its last sample: the most so far
+        way_driven: array("WN", scalar)  # m forwards since the reset, by odometry; where the window is a way
 
     return State
 

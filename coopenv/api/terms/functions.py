@@ -8,17 +8,10 @@ import warp as wp
 
 from coopenv.api.step_results import DEGREES
 from coopenv.api.terms.map_view import MapLandmark
-from coopenv.api.terms.records import Ego, Neighbour, Target, Truth
+from coopenv.api.terms.records import Ego, Neighbour, Target, Truth, log10
 from coopenv.world.collision import ARRIVED, COLLIDED
 
 EIGENVALUE_FLOOR = wp.constant(1.0e-9)
-LOG10_E = wp.constant(0.4342944819032518)
-
-
-@wp.func
-def log10(value: wp.float32) -> wp.float32:
-    """Return the decimal logarithm."""
-    return wp.log(value) * LOG10_E
 
 
 @wp.func
@@ -267,6 +260,17 @@ def position_uncertainty(ego: Ego):
 @wp.func
 def position_error_per_metre(ego: Ego, truth: Truth):
     return per_metre(ego, truth.position_error - ego.uncertainty_threshold, ego.uncertainty_cap)
+
+
+@wp.func
+def soft_observability(ego: Ego):
+    return ego.soft_observability
+
+
+@wp.func
+def observability_shortfall(ego: Ego):
+    most = wp.max(ego.observability_level - ego.observability_floor, 0.0)
+    return per_metre(ego, ego.observability_level - ego.soft_observability, most)
 
 
 @wp.func

@@ -20,6 +20,8 @@ from coopenv.world.v2x import fresh
 NEVER = wp.constant(wp.float64(1.0e9))
 """Age of what has never been measured or heard, s."""
 
+LOG10_E = wp.constant(0.4342944819032518)
+
 mat66 = wp.types.matrix((6, 6), wp.float32)
 
 
@@ -43,6 +45,9 @@ class Ego:
     metres_gained: wp.float32  # of its way in this decision, beyond the farthest point so far, by the estimate
     metres_missed: wp.float32  # of its way never driven, in the step that ends its episode without an arrival; else 0
     gramian_min_eigenvalue: wp.float32  # of the sliding observability Gramian
+    soft_observability: wp.float32  # log10 of the floor + that
+    observability_floor: wp.float32  # log10 of the floor, of [reward]
+    observability_level: wp.float32  # log10, of [reward]
     targets_in_view: wp.int32
     possible_targets: wp.int32  # targets that may be measured
     velocity: wp.vec3  # m/s, last odometry sample, body
@@ -102,6 +107,12 @@ class Neighbour:
 
 
 @wp.func
+def log10(value: wp.float32) -> wp.float32:
+    """Return the decimal logarithm."""
+    return wp.log(value) * LOG10_E
+
+
+@wp.func
 def known(value: Any) -> wp.float32:
     """Return a quantity of truth, 0 where a recording does not know it."""
     return wp.where(wp.isfinite(value), wp.float32(value), 0.0)
@@ -152,6 +163,10 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     ego.metres_gained = wp.float32(gained)
     ego.metres_missed = wp.float32(missed)
     ego.gramian_min_eigenvalue = wp.float32(results.gramian_min_eigenvalue[world, vehicle])
+    floor = wp.float32(model.judgement.observability_floor)
+    ego.soft_observability = log10(floor + wp.max(ego.gramian_min_eigenvalue, 0.0))
+    ego.observability_floor = log10(floor)
+    ego.observability_level = wp.float32(model.judgement.observability_level)
     ego.targets_in_view = results.targets_in_view[world, vehicle]
     ego.possible_targets = model.target_count[vehicle]
     ego.velocity = wp.vec3(state.odometry_velocity[world, vehicle])

@@ -7,13 +7,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from coopenv.policies.give_way import GiveWay
 
 import coopenv
+from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import Scenario, load_scenario
 
 QUALITY = ("position_uncertainty", "position_error_per_metre")
-PLACES = {"urban_crossing": {}, "urban_crossing, nobody sees far": {"camera.range": 3.0}}
+OVER_A_WAY = {"observer.gramian_distance": 8.0}
+PLACES = {"urban_crossing": OVER_A_WAY, "urban_crossing, nobody sees far": {"camera.range": 3.0, **OVER_A_WAY}}
 DRIVERS = ("stand still", "creep", "constant speed", "give way", "weave")
 
 
@@ -34,7 +35,7 @@ def driver(name: str, scenario: Scenario) -> Any:
     steady = {"stand still": [-1.0, 0.0], "creep": [-0.8, 0.0], "constant speed": [1.0, 0.0]}
     if name in steady:
         return lambda observations: np.tile(steady[name], (len(observations), 1))
-    drive = GiveWay(scenario, cruise=1.0)
+    drive = RouteFollower(scenario)
     if name == "give way":
         return drive
     phase, weave = iter(range(10**6)), np.array([0.0, 0.5])
@@ -122,6 +123,17 @@ def test_information_gain_is_what_the_end_has_more_than_the_start(name: str) -> 
     steps = run.counts.sum(axis=0)
     end = np.take_along_axis(potential, steps[None], axis=0)[0]
     np.testing.assert_allclose(run.total(run.terms["information_gain"]), end - potential[0], atol=1e-3)
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_the_shortfall_of_observability_is_bounded_and_worst_for_standing_still(place: str) -> None:
+    lengths_of, still = lengths(scenario_of(place)), drive(place, DRIVERS[0])
+    for name in DRIVERS[1:]:
+        run = drive(place, name)
+        values = run.terms["observability_shortfall"]
+        assert (values[run.counts] <= 0.0).all() and (run.total(values) >= -4.0 * lengths_of - 1e-3).all()
+        farther = run.furthest[-1] > still.furthest[-1] + 1.0
+        assert (run.total(values) > still.total(still.terms["observability_shortfall"]))[farther].all()
 
 
 def test_a_vehicle_without_a_goal_pays_nothing() -> None:
