@@ -11,7 +11,6 @@ from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.world.launch import PerWorld
 from coopenv.world.records import allocate, fields
-from coopenv.world.world import World
 
 
 @dataclass(frozen=True)
@@ -81,9 +80,12 @@ class MovedWorld(SimulatedWorld):
         """Take poses for the last ones, of a world that is about to be restored."""
         self._xy[world], self._heading[world] = poses.xy, poses.heading
 
-    def tick(self) -> None:
-        """Sense and estimate at the poses that `move` has put."""
-        World.advance(self, 1)
+    def advance(self, ticks: int) -> None:
+        """Run camera ticks, see `World.advance`; `fetch` moves the vehicles to each."""
+        self.decide()
+        for _ in range(ticks):
+            self.fetch()
+            super().advance(1)
 
 
 def _about_z(heading: Array) -> Array:

@@ -72,8 +72,10 @@ def _misplaced(s: ScenarioFields) -> Iterator[str]:
             yield f"vehicles.{i}.motion.kind: 'traffic' needs backend = \"highway\""
         if not elsewhere and kind != "waypoints" and vehicle.initial_pose is None and not vehicle.routes:
             yield f"vehicles.{i}.initial_pose: needed, with at least a position"
-    for name in sorted(s.dynamics.model_fields_set - LIMITS) if elsewhere else ():
-        yield f"dynamics.{name}: highway-env has its own; allowed: {', '.join(sorted(LIMITS))}"
+    given = {"dynamics": s.dynamics, **{f"vehicles.{i}.dynamics": v.dynamics for i, v in enumerate(s.vehicles)}}
+    for where, part in given.items() if elsewhere else ():
+        for name in sorted((part.model_fields_set if part else set()) - LIMITS):
+            yield f"{where}.{name}: highway-env has its own; allowed: {', '.join(sorted(LIMITS))}"
     if elsewhere and s.rates.camera % 1.0:
         yield f"rates.camera: highway-env steps a whole number of times a second, not {s.rates.camera:g}"
     if elsewhere and not s.driven:

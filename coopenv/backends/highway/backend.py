@@ -30,13 +30,6 @@ class HighwayWorld(MovedWorld):
             self.place(w, self._simulations[w].reset(int(np.random.SeedSequence(key).generate_state(1)[0])))
         super().restart()
 
-    def advance(self, ticks: int) -> None:
-        """Run camera ticks, see `World.advance`."""
-        self.decide()
-        for _ in range(ticks):
-            self.fetch()
-            self.tick()
-
     def fetch(self) -> bool:
         """Drive to the next tick in the worlds that are not over."""
         commands, k = self.view("command"), self.view("tick")

@@ -57,7 +57,7 @@ def _creator(name: str) -> Any:
 
 def _config(scenario: Scenario, section: Highway, defaults: Mapping[str, Any]) -> dict[str, Any]:
     """Return what highway-env is told: the section's own keys, checked, and what the rest of the scenario says."""
-    d, rate = scenario.dynamics, int(scenario.rates.camera)
+    rate = int(scenario.rates.camera)
     for key, value in section.config.items():
         if key in OWNED:
             raise ScenarioError(f"highway.config.{key}: follows from {OWNED[key]}; leave this out")
@@ -69,11 +69,13 @@ def _config(scenario: Scenario, section: Highway, defaults: Mapping[str, Any]) -
                 f"highway.config.{key}: expected a value like {shown(defaults[key])}, got {shown(value)}"
             )
     kind = "IntersectionTraffic" if section.id.startswith("intersection") else "Traffic"
+    acceleration, steering = most_of_actions(scenario)
+    speeds = [limits.max_speed for limits in scenario.limits]
     drive = {
         "type": "ContinuousAction",
-        "acceleration_range": [-d.max_acceleration, d.max_acceleration],
-        "steering_range": [-d.max_steering, d.max_steering],
-        "speed_range": [-d.max_speed if d.reverse else 0.0, d.max_speed],
+        "acceleration_range": [-acceleration, acceleration],
+        "steering_range": [-steering, steering],
+        "speed_range": [-max(speeds) if any(limits.reverse for limits in scenario.limits) else 0.0, max(speeds)],
         "dynamical": section.dynamical,
     }
     return {
@@ -86,6 +88,12 @@ def _config(scenario: Scenario, section: Highway, defaults: Mapping[str, Any]) -
         "controlled_vehicles": sum(vehicle.motion.kind == "driven" for vehicle in scenario.vehicles),
         "duration": scenario.horizon,
     }
+
+
+def most_of_actions(scenario: Scenario) -> tuple[float, float]:
+    """Return the acceleration (m/s^2) and the steering angle (rad) that an action of highway-env of 1 stands for."""
+    limits = scenario.limits
+    return max(of.max_acceleration for of in limits), max(of.max_steering for of in limits)
 
 
 def _like(value: Any, default: Any) -> bool:

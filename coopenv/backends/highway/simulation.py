@@ -4,11 +4,12 @@ highway-env's y axis points down on its screen, so that a map with y north has i
 Lengths are in m, angles in rad.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from coopenv.backends.highway.settings import make_environment
+from coopenv.backends.highway.settings import make_environment, most_of_actions
 from coopenv.backends.moved import Poses
 from coopenv.errors import CoopenvError, ScenarioError, told
 from coopenv.estimation.arrays import Array
@@ -60,46 +61,20 @@ class Simulation:
 
     def drive(self, commands: Array) -> Poses:
         """Drive for one camera tick under commands (N, 3), see `coopenv.world.command`; traffic drives itself."""
-        d, rate = self._scenario.dynamics, self._scenario.rates.camera
+        (acceleration, steering), rate = most_of_actions(self._scenario), self._scenario.rates.camera
         actions = []
         for car, command in zip(self._cars, commands, strict=True):
             wanted = (command[SPEED] - car.speed) * rate
             most = command[ACCELERATION]
-            gas = np.clip(wanted, -most, most) / d.max_acceleration
-            actions.append(np.array([gas, -command[STEERING] / d.max_steering]))
+            gas = np.clip(wanted, -most, most) / acceleration
+            actions.append(np.array([gas, -command[STEERING] / steering]))
         self._call("step", tuple(action for action, driven in zip(actions, self._driven, strict=True) if driven))
         return self.poses()
 
     def poses(self) -> Poses:
-        """Return where everybody is.
-
-        Raises:
-            CoopenvError: there is more traffic than `highway.most_vehicles`.
-        """
+        """Return where everybody is; errors as for `poses_of`."""
         assert self._scenario.highway is not None
-        road, cars = self.environment.road, self._cars
-        here, own = {id(car) for car in road.vehicles}, {id(car) for car in cars}
-        others = [car for car in road.vehicles if id(car) not in own]
-        others += [thing for thing in road.objects if thing.solid]
-        most = self._scenario.highway.most_vehicles
-        if len(others) > most:
-            raise CoopenvError(f"highway.most_vehicles: {most} are too few, there are {len(others)} on the road")
-        position, heading, half = np.zeros((most, 3)), np.zeros(most), np.zeros((most, 3))
-        for k, car in enumerate(others):
-            position[k] = (*_flipped(car.position), HEIGHT / 2)
-            heading[k], half[k] = -car.heading, (car.LENGTH / 2, car.WIDTH / 2, HEIGHT / 2)
-        moving = np.array([id(car) in here for car in cars])
-        return Poses(
-            xy=np.array([_flipped(car.position) for car in cars]) - self._origin[:2],
-            heading=np.array([-car.heading for car in cars]),
-            speed=np.array([car.speed for car in cars]) * moving,
-            steering=np.array([-car.action["steering"] for car in cars]),
-            crashed=np.array([car.crashed for car in cars]),
-            left=~moving,
-            traffic_position=position - self._origin,
-            traffic_heading=heading,
-            traffic_half=half,
-        )
+        return poses_of(self._cars, self.environment.road, self._origin, self._scenario.highway.most_vehicles)
 
     def _call(self, method: str, *arguments: Any, **options: Any) -> None:
         try:
@@ -108,6 +83,34 @@ class Simulation:
             raise CoopenvError(f"highway-env: {method}: {told(error)}") from error
 
 
-def _flipped(position: Array) -> tuple[float, float]:
-    """Return highway-env's (x, y) in a frame whose y axis points up."""
-    return float(position[0]), -float(position[1])
+def poses_of(cars: Sequence[Any], road: Any, origin: Array, most: int) -> Poses:
+    """Return where some cars of a road are, and everything else on it, in a map whose origin is at `origin` (3,).
+
+    Raises:
+        CoopenvError: there are more than `most` other things.
+    """
+    here, own = {id(car) for car in road.vehicles}, {id(car) for car in cars}
+    others = [car for car in road.vehicles if id(car) not in own] + [thing for thing in road.objects if thing.solid]
+    if len(others) > most:
+        raise CoopenvError(f"highway.most_vehicles: {most} are too few, there are {len(others)} on the road")
+    position, heading, half = np.zeros((most, 3)), np.zeros(most), np.zeros((most, 3))
+    for k, car in enumerate(others):
+        position[k] = (*flipped(car.position), HEIGHT / 2)
+        heading[k], half[k] = -car.heading, (car.LENGTH / 2, car.WIDTH / 2, HEIGHT / 2)
+    moving = np.array([id(car) in here for car in cars])
+    return Poses(
+        xy=np.array([flipped(car.position) for car in cars]) - origin[:2],
+        heading=np.array([-car.heading for car in cars]),
+        speed=np.array([car.speed for car in cars]) * moving,
+        steering=np.array([-car.action["steering"] for car in cars]),
+        crashed=np.array([car.crashed for car in cars]),
+        left=~moving,
+        traffic_position=position - origin,
+        traffic_heading=heading,
+        traffic_half=half,
+    )
+
+
+def flipped(xy: Array) -> Array:
+    """Return (x, y) of highway-env in a frame whose y axis points up, or the other way round."""
+    return np.array([xy[0], -xy[1]])

@@ -1,0 +1,235 @@
+"""Any policy of highway-env on estimated kinematics: what localisation error costs it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import gymnasium
+import numpy as np
+
+from coopenv.api.engine import Engine
+from coopenv.backends.highway.followed import Followed, FollowedWorld
+from coopenv.backends.highway.simulation import flipped, poses_of
+from coopenv.errors import CoopenvError, checked_seed
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.outcomes import Sight
+from coopenv.scenario import Scenario, load_scenario
+from coopenv.viz.topview_geometry import position_covariance
+
+LONGEST = 3600.0  # s, of an episode
+
+
+class Kinematics(NamedTuple):
+    """Where a car is believed to be, in highway-env's frame."""
+
+    xy: Array  # (2,) m
+    heading: float  # rad
+    speed: float  # m/s
+
+
+class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """An environment of highway-env whose observation is made from estimates instead of the truth.
+
+    The car of the agent and up to `connected` cars of the traffic carry the scenario's cameras, odometry, radio and
+    observers, at every step of highway-env's simulation. When the observation is made,
+
+    - the agent's car is where its observer believes it to be, with the speed of its odometry;
+    - connected cars are where the agent last heard that they believe themselves to be, while that is not stale;
+    - everybody else is as seen from the agent's car: exact relative to it, and off with it.
+
+    All kinds of observation of highway-env, and all of their settings, work as they are. Rewards and ends of episodes
+    stay those of the truth.
+
+    `info["localisation"]` says of the agent's car, and `info["connected"]` of the others (a tuple), `position` (2,) m
+    and `heading` rad as believed and `position_covariance` (2, 2) m^2, in highway-env's frame, `position_error` m,
+    `orientation_error` deg, and `visible` (names of targets).
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[Any, Any],
+        scenario: str | Path = "highway_intersection",
+        *,
+        sensing: Literal["ideal", "sensed", "blind"] | None = None,
+        connected: int = 2,
+        lane_keeping: bool = False,
+        overrides: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Wrap an environment with one agent.
+
+        Args:
+            env: of highway-env.
+            scenario: name or file with the sensors, the observer and the landmarks; its vehicles give way to the cars.
+            sensing: the scenario's key: "ideal" measures every target in every frame, "sensed" what is in view, "blind"
+                nothing; None: as the scenario says.
+            connected: how many cars of the traffic are connected at most: those that are nearest at the start.
+            lane_keeping: whether the car's own control, such as highway-env's lane keeping, acts on its estimate too.
+            overrides: dotted keys of the scenario.
+
+        Raises:
+            CoopenvError: it is not an environment of highway-env, or another argument is not valid.
+        """
+        super().__init__(env)
+        if not isinstance(connected, int) or connected < 0:
+            raise CoopenvError(f"connected must be a whole number and not negative, got {connected!r}")
+        self.highway: Any = env.unwrapped
+        if not hasattr(self.highway, "road") or not hasattr(self.highway, "observation_type"):
+            raise CoopenvError(
+                f"EstimatedKinematics wraps environments of highway-env, not {type(self.highway).__name__}"
+            )
+        self.connected, self.lane_keeping = connected, lane_keeping
+        self._load = partial(load_scenario, scenario)
+        self._overrides = {**(overrides or {}), **({} if sensing is None else {"sensing": sensing})}
+        if self._load(self._overrides).highway is None:
+            raise CoopenvError(f'EstimatedKinematics: {scenario} has not backend = "highway"')
+        self._engines: dict[int, Engine] = {}
+        self._rng = np.random.default_rng()
+        self._cars: list[Any] = []  # connected ones, then the agent's, which hears all of them
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode; initial estimates are drawn about the truth as the scenario says."""
+        _, info = self.env.reset(seed=seed, options=options)
+        if seed is not None:
+            self._rng = np.random.default_rng(checked_seed(seed))
+        self._board()
+        self._world.present = self._poses()
+        self._engine.reset([int(self._rng.integers(2**63))])
+        return self.highway.observation_type.observe(), self._told(info)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step the environment; sensors and observers run along with its simulation."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, reward, terminated, truncated, self._told(info)
+
+    def _board(self) -> None:
+        """Find the cars of this episode, and hook into what moves and observes them."""
+        road, agents = self.highway.road, self.highway.controlled_vehicles
+        if len(agents) != 1:
+            raise CoopenvError(f"EstimatedKinematics takes environments with one agent, this one has {len(agents)}")
+        agent = agents[0]
+        traffic = [car for car in road.vehicles if car is not agent]
+        traffic.sort(key=lambda car: float(np.linalg.norm(car.position - agent.position)))
+        self._cars = [*traffic[: self.connected], agent]
+        road.step = partial(self._step_road, road.step)
+        self.highway.observation_type.observe = partial(self._observe, self.highway.observation_type.observe)
+        if self.lane_keeping:
+            agent.act = partial(self._act, agent.act)
+
+    def _step_road(self, step: Any, dt: float) -> None:
+        step(dt)
+        self._world.present = self._poses()
+        self._engine.step(ticks=1)
+
+    def _act(self, act: Any, action: Any = None) -> None:
+        with believing({self._cars[-1]: self._believed(len(self._cars) - 1)}):
+            act(action)
+
+    @property
+    def _engine(self) -> Engine:
+        """Sensors and observers for as many cars as there are."""
+        count = len(self._cars)
+        if count not in self._engines:
+            frequency = float(self.highway.config["simulation_frequency"])
+            cars = [{"motion": {"kind": "traffic"}}] * (count - 1) + [{"motion": {"kind": "driven"}}]
+            rates = {"rates.camera": frequency, "rates.decision": frequency, "rates.odometry": 5.0 * frequency}
+            fixed = {"horizon": LONGEST, "vehicles": cars, "routes": [], **rates}
+            scenario: Scenario = self._load({**self._overrides, **fixed})
+            self._engines[count] = Engine(scenario, 1, backend=Followed(scenario))
+        return self._engines[count]
+
+    @property
+    def _world(self) -> FollowedWorld:
+        world = self._engine.world
+        assert isinstance(world, FollowedWorld)
+        return world
+
+    def _poses(self) -> Any:
+        scenario = self._world.scenario
+        assert scenario.highway is not None
+        return poses_of(self._cars, self.highway.road, np.array(scenario.map.origin), scenario.highway.most_vehicles)
+
+    def _observe(self, observe: Any) -> Any:
+        """Return the observation that highway-env makes when everybody is where the agent believes it to be."""
+        agent, last = self._cars[-1], len(self._cars) - 1
+        own = self._believed(last)
+        heard = {self._cars[i]: self._heard(i) for i in range(last) if self._is_fresh(i)}
+        c, s = np.cos(own.heading - agent.heading), np.sin(own.heading - agent.heading)
+        turn = np.array([[c, -s], [s, c]])
+        seen = {
+            thing: Kinematics(
+                own.xy + turn @ (thing.position - agent.position),
+                thing.heading + own.heading - agent.heading,
+                thing.speed,
+            )
+            for thing in (*self.highway.road.vehicles, *self.highway.road.objects)
+        }
+        with believing({**seen, **heard, agent: own}):
+            return observe()
+
+    def _believed(self, i: int) -> Kinematics:
+        """Return what a car believes of itself."""
+        view = self._engine.view
+        R = view("estimate_rotation")[0, i]
+        return self._kinematics(i, R, R @ view("estimate_position")[0, i])
+
+    def _heard(self, i: int) -> Kinematics:
+        """Return what a connected car has last told the agent's."""
+        view = self._engine.view
+        return self._kinematics(i, view("inbox_rotation")[0, -1, i], view("inbox_position")[0, -1, i])
+
+    def _is_fresh(self, i: int) -> bool:
+        """Return whether the agent's car has heard a connected one that is on the road, and not too long ago."""
+        sent, radio = int(self._engine.view("inbox_tick")[0, -1, i]), self._world.model.radio
+        age = (int(self._engine.view("tick")[0]) - sent) / self._world.scenario.rates.camera
+        return sent >= 0 and age <= radio.staleness and any(car is self._cars[i] for car in self.highway.road.vehicles)
+
+    def _kinematics(self, i: int, R: Array, position: Array) -> Kinematics:
+        view = self._engine.view
+        v = view("odometry_velocity")[0, i]
+        known = view("odometry_samples")[0, i] > 0  # otherwise nothing has moved yet
+        speed = float(np.copysign(np.hypot(v[0], v[1]), v[0]) if known else view("speed")[0, i])
+        xy = position[:2] + self._world.scenario.map.origin[:2]
+        return Kinematics(flipped(xy.astype(float)), -float(np.arctan2(R[1, 0], R[0, 0])), speed)
+
+    def _told(self, info: dict[str, Any]) -> dict[str, Any]:
+        """Return the info with what observers say of themselves, and how far off they are."""
+        told = [self._told_of(i) for i in range(len(self._cars))]
+        return {**info, "localisation": told[-1], "connected": tuple(told[:-1])}
+
+    def _told_of(self, i: int) -> dict[str, Any]:
+        view, believed = self._engine.view, self._believed(i)
+        state = (view(name)[0, i] for name in ("estimate_rotation", "estimate_position", "covariance"))
+        mirror = np.diag([1.0, -1.0])
+        return {
+            "position": believed.xy,
+            "heading": believed.heading,
+            "position_covariance": mirror @ position_covariance(*state)[:2, :2] @ mirror,
+            "position_error": float(view("position_error")[0, i]),
+            "orientation_error": float(view("orientation_error")[0, i]),
+            "visible": tuple(
+                name
+                for name, sight in zip(self._world.scenario.target_names, view("sight")[0, i], strict=True)
+                if sight == Sight.VISIBLE
+            ),
+        }
+
+
+@contextmanager
+def believing(beliefs: Mapping[Any, Kinematics]) -> Iterator[None]:
+    """Put things of highway-env where they are believed to be, and back."""
+    names = ("position", "heading", "speed", "lane_index", "lane")
+    truth = {thing: [getattr(thing, name) for name in names] for thing in beliefs}
+    try:
+        for thing, believed in beliefs.items():
+            thing.position, thing.heading, thing.speed = believed
+            thing.lane_index = thing.road.network.get_closest_lane_index(thing.position, thing.heading)
+            thing.lane = thing.road.network.get_lane(thing.lane_index)
+        yield
+    finally:
+        for thing, values in truth.items():
+            for name, value in zip(names, values, strict=True):
+                setattr(thing, name, value)
