@@ -35,8 +35,8 @@ class Episodes:
     """(K + 1, W, N, 2), true, m, map; row 0 is the start."""
     heading: np.ndarray
     """(K, W, N), true, rad from the map's x axis."""
-    goal: np.ndarray
-    """(W, N, 2), m, map; NaN for vehicles without a goal."""
+    route: np.ndarray
+    """(W, N, P, 2), m, map, at the start; its last point is repeated, NaN for vehicles without a goal."""
     outcome: np.ndarray
     """(W, N), an `Outcome`, or a condition of the scenario's own."""
 
@@ -57,9 +57,19 @@ class Episodes:
 
     @property
     def looking(self) -> np.ndarray:
-        """(K, W, N) rad in [-pi, pi): heading from the direction of the way, start to goal; NaN without a goal."""
-        way = self.goal - self.position[0]
-        return np.asarray((self.heading - np.arctan2(way[..., 1], way[..., 0]) + np.pi) % (2 * np.pi) - np.pi)
+        """(K, W, N) rad in [-pi, pi): heading from that of the nearest piece of the route; NaN without a goal."""
+        way = np.full(self.heading.shape, np.nan)
+        nearest = np.full(self.heading.shape, np.inf)
+        for begin, end in zip(np.moveaxis(self.route, 2, 0)[:-1], np.moveaxis(self.route, 2, 0)[1:], strict=True):
+            leg = end - begin
+            square = np.maximum((leg**2).sum(axis=-1), 1e-12)
+            offset = self.position[1:] - begin
+            share = np.clip((offset * leg).sum(axis=-1) / square, 0.0, 1.0)
+            distance = np.linalg.norm(offset - share[..., None] * leg, axis=-1)
+            nearer = (distance < nearest) & (square > 1e-9)
+            way = np.where(nearer, np.arctan2(leg[..., 1], leg[..., 0]), way)
+            nearest = np.where(nearer, distance, nearest)
+        return np.asarray((self.heading - way + np.pi) % (2 * np.pi) - np.pi)
 
     @property
     def distance(self) -> np.ndarray:
@@ -68,7 +78,7 @@ class Episodes:
 
 
 def held_out_seeds(block: int, worlds: int) -> list[int]:
-    """Return the seeds of so many worlds that no training has seen; blocks 0, 1, ... share none."""
+    """Return the seeds of so many worlds that no training has seen; blocks of one size share none."""
     return [evaluation_seed(block * worlds + world) for world in range(worlds)]
 
 
@@ -102,7 +112,7 @@ def drive(
     agents = [first + i for i in chosen]
     with engine.stopping():
         engine.reset([world_keys(seed)[0] for seed in seeds])
-        goal = np.where(view("route_count")[:, chosen, None] > 0, view("goal")[:, chosen, :2], np.nan)
+        route = _routes(view("route")[:, chosen, :, :2], view("route_count")[:, chosen])
         restart(policy, np.ones(rows, dtype=bool))
         place = [view("position")[:, agents, :2].astype(np.float32)]
         headings = []
@@ -127,10 +137,17 @@ def drive(
         **record,
         position=np.stack(place),
         heading=np.stack(headings),
-        goal=goal,
+        route=route,
         outcome=view("ended")[:, chosen].copy(),
     )
 
 
 ERRORS = ("position_error", "orientation_error")
 KEPT = ("alive", *ERRORS, "targets_in_view", "reward")
+
+
+def _routes(points: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Return routes (W, N, P, 2) with their last point, number `count` (W, N), repeated; NaN without any."""
+    place = np.minimum(np.arange(points.shape[2]), np.maximum(count - 1, 0)[..., None])
+    found = np.take_along_axis(points, place[..., None], axis=2)
+    return np.where(count[..., None, None] > 0, found, np.nan)

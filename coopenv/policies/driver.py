@@ -1,4 +1,4 @@
-"""What scripted drivers share: reading observations, pursuing a point, giving way. All rows are computed at once."""
+"""What scripted drivers share: reading observations, the way ahead, pursuing a point. All rows are computed at once."""
 
 from abc import ABC, abstractmethod
 
@@ -7,32 +7,46 @@ import numpy as np
 from coopenv.api.terms.layout import observation_layout
 from coopenv.scenario import Scenario
 
+MULTIPLES = np.array([1.0, 2.0, 4.0, 8.0])
+"""Of `observation.route_step`: how far ahead the entries of `route_ahead` are."""
+
 
 class Driver(ABC):
-    """A policy that chooses a speed and a heading for every row from its observation alone."""
+    """A policy that chooses speed and steering for every row from its observation alone."""
 
-    needs: tuple[str, ...] = ("goal",)
+    needs: tuple[str, ...] = ()
     """Fields of the observation without which it cannot drive."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        """Learn where everything stands in an observation; ValueError: something needed is missing."""
+    def __init__(self, scenario: Scenario, *, cruise: float | None = None, look_ahead: float = 1.0) -> None:
+        """Learn where everything stands in an observation.
+
+        Args:
+            scenario: of the environment.
+            cruise: speed when nothing is in the way, m/s (None: top speed).
+            look_ahead: distance of the point of the way that is pursued, m.
+
+        Raises:
+            ValueError: the observation lacks a field, or the environment does not take speeds.
+        """
         if scenario.action.longitudinal != "speed":
             raise ValueError("it chooses speeds, so it needs action.longitudinal = 'speed'")
         self.layout = observation_layout(scenario)
-        if missing := [name for name in self.needs if name not in self.layout]:
-            raise ValueError(f"the observation lacks {', '.join(missing)}")
-        self.top_speed = self.layout.action[0].high
-        self.wheelbase = scenario.dynamics.wheelbase
+        known = {*self.layout, "way" if {"route_ahead", "goal"} & {*self.layout} else ""}
+        if missing := [name for name in (*self.needs, "way") if name not in known]:
+            raise ValueError(f"the observation lacks {', '.join(missing)} (way: the group route or goal)")
+        self.cruise = self.layout.action[0].high if cruise is None else cruise
+        self.look_ahead, self.wheelbase = look_ahead, scenario.dynamics.wheelbase
+        self._distances = scenario.observation.route_step * MULTIPLES
 
     @abstractmethod
-    def drive(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return speeds in m/s and steering angles in rad (positive to the left), (rows,) each."""
+    def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return speed, m/s, steering angle, rad (positive to the left), and maybe the camera's pan, (rows,) each."""
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """Return the actions, (rows, A), for observations (rows, D)."""
-        wanted = self.drive(np.asarray(observations, dtype=np.float32))
         actions = np.zeros((len(observations), len(self.layout.action)), dtype=np.float32)
-        for k, (field, values) in enumerate(zip(self.layout.action[:2], wanted, strict=True)):
+        wanted = self.drive(np.asarray(observations, dtype=np.float32))
+        for k, (field, values) in enumerate(zip(self.layout.action, wanted, strict=False)):
             actions[:, k] = np.clip(2.0 * (values - field.low) / (field.high - field.low) - 1.0, -1.0, 1.0)
         return actions
 
@@ -40,19 +54,41 @@ class Driver(ABC):
         """Return a field of the observations in its unit, (rows, *shape)."""
         return self.layout[name].values(observations)
 
-    def pursue(self, point: np.ndarray) -> np.ndarray:
-        """Return the steering angles, (rows,) in rad, of the circles through points (rows, 2) in the own frame, m.
+    def way_ahead(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return points of the way ahead, (rows, P, 2), m, in the own frame, and how far along it they are, (P,), m.
 
-        Source: Coulter, Implementation of the Pure Pursuit Path Tracking Algorithm, 1992. Points behind count as
+        The first is the vehicle's own place. Without the group `route` the way leads straight to the goal.
+        """
+        distance = np.concatenate([[0.0], self._distances])
+        if "route_ahead" in self.layout:
+            angle = self.read(observations, "route_ahead")
+        else:
+            goal = self.read(observations, "goal")
+            angle = np.repeat(np.arctan2(goal[:, 1], goal[:, 0])[:, None], len(self._distances), axis=1)
+        points = self._distances[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        return np.concatenate([np.zeros((len(points), 1, 2)), points], axis=1), distance
+
+    def direction(self, observations: np.ndarray) -> np.ndarray:
+        """Return the direction, (rows,) in rad from straight ahead, of the point of the way that is pursued."""
+        points, distance = self.way_ahead(observations)
+        place = int(np.clip(np.searchsorted(distance, self.look_ahead), 1, len(distance) - 1))
+        share = np.clip((self.look_ahead - distance[place - 1]) / (distance[place] - distance[place - 1]), 0.0, 1.0)
+        point = points[:, place - 1] + share * (points[:, place] - points[:, place - 1])
+        return np.asarray(np.arctan2(point[:, 1], point[:, 0]))
+
+    def pursue(self, direction: np.ndarray) -> np.ndarray:
+        """Return the steering angles, (rows,), that lead along a circle to a point `look_ahead` away, all in rad.
+
+        Source: Coulter, Implementation of the Pure Pursuit Path Tracking Algorithm, 1992. What lies behind counts as
         beside.
         """
-        ahead = np.maximum(point[:, 0], 0.0)
-        squared = np.maximum(ahead**2 + point[:, 1] ** 2, 1e-6)
-        return np.asarray(np.arctan(2.0 * self.wheelbase * point[:, 1] / squared))
+        turn = np.clip((direction + np.pi) % (2.0 * np.pi) - np.pi, -np.pi / 2.0, np.pi / 2.0)
+        return np.asarray(np.arctan(2.0 * self.wheelbase * np.sin(turn) / self.look_ahead))
 
 
-def closest_approach(position: np.ndarray, velocity: np.ndarray, until: float) -> np.ndarray:
-    """Return how near to the origin points come that move on straight: (..., 2) in m and m/s, within `until` s."""
-    square = np.maximum((velocity**2).sum(axis=-1), 1e-9)
-    time = np.clip(-(position * velocity).sum(axis=-1) / square, 0.0, until)
-    return np.asarray(np.linalg.norm(position + time[..., None] * velocity, axis=-1))
+class ConstantSpeed(Driver):
+    """Straight on at full speed, whatever happens."""
+
+    def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
+        """See `Driver.drive`."""
+        return np.full(len(observations), self.cruise), np.zeros(len(observations))

@@ -2,10 +2,8 @@
 
 import numpy as np
 
-from coopenv.policies.driver import Driver, closest_approach
+from coopenv.policies.driver import Driver
 from coopenv.scenario import Scenario
-
-MESSAGES = ("message_position", "message_forward", "message_mask")
 
 
 class RouteFollower(Driver):
@@ -14,52 +12,75 @@ class RouteFollower(Driver):
     In the leader-follower order a vehicle hears its leaders only, so giving way to whomever one hears cannot deadlock.
     """
 
-    needs = ("goal", *MESSAGES)
-
     def __init__(
         self,
         scenario: Scenario,
         *,
         cruise: float | None = None,
+        look_ahead: float = 1.0,
         clearance: float = 0.9,
         foresight: float = 6.0,
-        look_ahead: float = 1.2,
     ) -> None:
         """Choose the manner of driving.
 
         Args:
             scenario: of the environment.
             cruise: speed when nothing is in the way, m/s; also what others are expected to drive (None: top speed).
+            look_ahead: distance of the point of the way that is pursued, m.
             clearance: distance to keep between reference points, m.
             foresight: how far ahead to look for others, s.
-            look_ahead: distance of the point that is pursued, m.
         """
-        super().__init__(scenario)
-        self.cruise = self.top_speed if cruise is None else cruise
-        self.clearance, self.foresight, self.look_ahead = clearance, foresight, look_ahead
+        super().__init__(scenario, cruise=cruise, look_ahead=look_ahead)
+        self.clearance, self.foresight = clearance, foresight
 
-    def drive(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
         """See `Driver.drive`."""
-        return self.speed(observations), self.pursue(self.point_ahead(observations))
+        return self.speed(observations), self.pursue(self.direction(observations))
 
-    def point_ahead(self, observations: np.ndarray) -> np.ndarray:
-        """Return the point that is pursued, (rows, 2), m, own frame: so far ahead in the goal's direction."""
-        goal = self.read(observations, "goal")[:, :2]
-        distance = np.maximum(np.linalg.norm(goal, axis=1, keepdims=True), 1e-6)
-        return np.asarray(goal * (self.look_ahead / distance))
+    def heard(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return which others are heard, (rows, M), and their places and directions, (rows, M, 2), in the own frame."""
+        mask = self.read(observations, "message_mask") > 0.5
+        place, forward = (self.read(observations, f"message_{name}")[..., :2] for name in ("position", "forward"))
+        return mask, place, forward
 
     def speed(self, observations: np.ndarray) -> np.ndarray:
-        """Return the speeds, (rows,) in m/s: nothing, where going on comes too close and waiting does not."""
-        heard = self.read(observations, "message_mask") > 0.5
-        position = self.read(observations, "message_position")[..., :2]
-        velocity = self.cruise * self.read(observations, "message_forward")[..., :2]
-        going, waiting = (
-            np.min(
-                closest_approach(position, velocity - np.array([speed, 0.0]), self.foresight),
-                axis=1,
-                where=heard,
-                initial=np.inf,
-            )
-            for speed in (self.cruise, 0.0)
-        )
+        """Return the speeds, (rows,) in m/s: nothing, where going on comes too close and waiting does not.
+
+        Others are expected to go straight on at the speed `cruise`.
+        """
+        if "message_mask" not in self.layout:
+            return np.full(len(observations), self.cruise)
+        mask, place, forward = self.heard(observations)
+        points, distance = self.way_ahead(observations)
+        going = nearest(points, distance / self.cruise, place, self.cruise * forward, mask, self.foresight)
+        stay = np.zeros((len(observations), 2, 2))
+        waiting = nearest(stay, np.array([0.0, 1.0]), place, self.cruise * forward, mask, self.foresight)
         return np.where((going >= self.clearance) | (going > waiting), self.cruise, 0.0)
+
+
+def nearest(
+    path: np.ndarray, times: np.ndarray, place: np.ndarray, velocity: np.ndarray, mask: np.ndarray, until: float
+) -> np.ndarray:
+    """Return how near others come, (rows,) in m; infinite where there is nobody.
+
+    Args:
+        path: (rows, P, 2), m, one's own places at these times, between which one drives straight, and on beyond.
+        times: (P,), s.
+        place: (rows, M, 2), m, of others now.
+        velocity: (rows, M, 2), m/s, of others.
+        mask: (rows, M) who counts.
+        until: s.
+    """
+    found = np.full(len(path), np.inf)
+    for k in range(len(times) - 1):
+        begin, end = times[k], times[k + 1] if k < len(times) - 2 else max(until, times[k + 1])
+        own = (path[:, k + 1] - path[:, k]) / (times[k + 1] - times[k])
+        apart = place + velocity * begin - path[:, k][:, None]
+        away = velocity - own[:, None]
+        square = np.maximum((away**2).sum(axis=-1), 1e-9)
+        time = np.clip(-(apart * away).sum(axis=-1) / square, 0.0, min(end, until) - begin)
+        distance = np.linalg.norm(apart + time[..., None] * away, axis=-1)
+        found = np.minimum(found, np.min(distance, axis=1, where=mask, initial=np.inf))
+        if end >= until:
+            break
+    return found

@@ -13,7 +13,7 @@ from coopenv.scenario import Scenario
 
 BASELINE, IDEAL = "route_follower", "ideal_sensing"
 """Others are compared with the first; the second is the first one where everybody sees everything."""
-IDEAL_SENSING: Mapping[str, Any] = {"topology.mode": "fixed"}
+IDEAL_SENSING: Mapping[str, Any] = {"sensing": "ideal"}
 
 
 @dataclass(frozen=True)

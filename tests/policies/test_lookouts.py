@@ -1,0 +1,181 @@
+"""Drivers that look around, where it pays; and the small parts that they are made of."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coopenv.api.engine import Engine
+from coopenv.evaluation import drive, held_out_seeds, score
+from coopenv.policies import load_agent, restart
+from coopenv.policies.belief import Belief
+from coopenv.policies.idm import IntelligentDriver
+from coopenv.policies.peek import Peek
+from coopenv.policies.route_follower import RouteFollower, nearest
+from coopenv.policies.stop_when_lost import StopWhenLost
+from coopenv.policies.view import FieldOfView
+from coopenv.shipped import list_agents
+from tests.helpers.square import GROUPS, square
+
+SCENARIO = square()
+SCRIPTED = ("constant_speed", "idm", "look_ahead", "peek", "route_follower", "stop_when_lost")
+WORLDS = 16
+
+
+@pytest.fixture(scope="module")
+def engine() -> Engine:
+    return Engine(SCENARIO, WORLDS)
+
+
+def figures(engine: Engine, name: str) -> dict[str, float]:
+    found = drive(engine, load_agent(name, SCENARIO), held_out_seeds(3, WORLDS))
+    return {result.metric: result.mean for result in score(found)}
+
+
+def test_lookouts_know_their_place_better_at_little_time(engine: Engine) -> None:
+    follower, peek, planner = (figures(engine, name) for name in ("route_follower", "peek", "look_ahead"))
+    assert peek["e95_m"] < 0.5 * follower["e95_m"] and peek["e50_m"] < 0.5 * follower["e50_m"]
+    assert planner["e95_m"] < 0.6 * follower["e95_m"] and planner["e50_m"] < 0.7 * follower["e50_m"]
+    for looking in (peek, planner):
+        assert looking["few_targets_share"] < follower["few_targets_share"]
+        assert looking["travel_time_s"] < 1.15 * follower["travel_time_s"]
+    assert peek["arrival_rate"] >= 0.95
+
+
+def test_the_route_follower_arrives_where_everybody_sees_everything() -> None:
+    scenario = square(sensing="ideal")
+    found = drive(Engine(scenario, 25), load_agent("route_follower", scenario), held_out_seeds(0, 25))
+    assert (found.outcome == 1).mean() >= 0.99
+
+
+@pytest.mark.parametrize("name", SCRIPTED)
+def test_a_batch_is_its_rows(name: str, engine: Engine) -> None:
+    """The same observations give the same actions, in a batch and row by row; all are within [-1, 1]."""
+    assert name in list_agents()
+    drivers = [load_agent(name, SCENARIO) for _ in range(3)]
+    rows = engine.view("alive").size
+    engine.reset(held_out_seeds(1, WORLDS))
+    for driver, count in zip(drivers, (rows, rows, 1), strict=True):
+        restart(driver, np.ones(count, dtype=bool))
+    for _ in range(25):
+        observations = engine.view("observation").reshape(rows, -1).copy()
+        shown = (observations, observations, observations[5:6])
+        actions, again, alone = (np.asarray(driver(o)) for driver, o in zip(drivers, shown, strict=True))
+        np.testing.assert_array_equal(actions, again)
+        np.testing.assert_allclose(alone[0], actions[5], atol=1e-5)
+        assert np.isfinite(actions).all() and np.abs(actions).max() <= 1.0
+        engine.step(actions.reshape(WORLDS, -1, 2))
+
+
+def observation(**fields: object) -> np.ndarray:
+    """Return one row that holds these values, in their units."""
+    layout = RouteFollower(SCENARIO).layout
+    row = np.zeros((1, layout.size), dtype=np.float32)
+    for name, value in fields.items():
+        field = layout[name]
+        values = np.broadcast_to(np.asarray(value, float), field.shape)
+        row[0, field.slice] = ((values - field.center) / field.scale).ravel()
+    return row
+
+
+def test_peek_turns_to_landmarks_and_back_into_its_lane() -> None:
+    peek = Peek(SCENARIO)
+    beside = [[2.5, 3.0, 0.0]] * 3 + [[50.0, 0.0, 0.0]] * 5
+    lost = {"position_std": 0.0, "map_position": beside, "map_mask": [1, 1, 1, 0, 0, 0, 0, 0]}
+    steering = peek.drive(observation(**lost))[1]
+    assert steering[0] > 0.1  # to the left
+    certain = peek.drive(observation(**{**lost, "position_std": -2.0}))[1]
+    assert certain[0] == pytest.approx(0.0, abs=1e-6)
+    assert peek.drive(observation(**{**lost, "route_offset": 0.9}))[1][0] <= 0.0  # no farther to the left
+
+
+def test_stopping_has_an_end() -> None:
+    driver = StopWhenLost(SCENARIO, threshold=0.1, patience=0.3)
+    lost, sure = observation(position_std=0.0), observation(position_std=-2.0)
+    speeds = [driver.drive(row)[0][0] for row in (lost, lost, lost, lost, lost, sure, lost)]
+    assert speeds == [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0]
+    driver.reset(np.array([True]))
+    assert driver.drive(lost)[0][0] == 0.0
+
+
+def other(x: float, y: float, angle: float) -> dict[str, object]:
+    """Return what is heard of one other vehicle, at a place (m) and heading (rad) in the own frame."""
+    place, forward = np.zeros((3, 3)), np.zeros((3, 3))
+    place[0], forward[0] = (x, y, 0.0), (np.cos(angle), np.sin(angle), 0.0)
+    return {"message_position": place, "message_forward": forward, "message_mask": [1, 0, 0]}
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "angle", "speed"),
+    [
+        (3.0, -3.0, np.pi / 2, 0.0),  # would meet
+        (3.0, -1.0, np.pi / 2, 1.0),  # will have passed
+        (3.0, 3.0, np.pi / 2, 1.0),  # drives away
+        (-2.0, 0.0, 0.0, 1.0),  # behind, as fast
+        (0.5, 0.0, np.pi, 0.0),  # head-on: waiting is no worse
+    ],
+)
+def test_giving_way(x: float, y: float, angle: float, speed: float) -> None:
+    assert RouteFollower(SCENARIO).speed(observation(**other(x, y, angle)))[0] == speed
+
+
+def test_the_nearest_approach_is_that_of_fine_steps() -> None:
+    rng = np.random.default_rng(2)
+    path = np.cumsum(np.concatenate([np.zeros((6, 1, 2)), rng.normal(size=(6, 3, 2))], axis=1), axis=1)
+    times, place, velocity = np.array([0.0, 0.5, 1.2, 2.0]), rng.normal(size=(6, 2, 2)), rng.normal(size=(6, 2, 2))
+    mask = np.array([[True, True], [True, False], [False, False], [True, True], [False, True], [True, True]])
+    t = np.linspace(0.0, 5.0, 20001)
+    for row in range(6):
+        last = (path[row, 3] - path[row, 2]) / 0.8
+        own = np.stack([np.interp(t, times, path[row, :, k]) for k in (0, 1)], axis=-1)
+        own += np.maximum(t - 2.0, 0.0)[:, None] * last
+        apart = np.linalg.norm(place[row][:, None] + velocity[row][:, None] * t[:, None] - own, axis=-1).min(axis=1)
+        expected = min(apart[mask[row]], default=np.inf)
+        found = nearest(path, times, place, velocity, mask, 5.0)[row]
+        assert found == pytest.approx(expected, abs=1e-3)
+
+
+def test_the_intelligent_driver_keeps_its_distance() -> None:
+    driver = IntelligentDriver(SCENARIO)
+    free, near = (driver.drive(observation(velocity=[0.5, 0, 0], **way))[0][0] for way in ({}, other(0.9, 0, 0)))
+    aside = driver.drive(observation(velocity=[0.5, 0, 0], **other(0.9, 1.0, 0)))[0][0]
+    assert near < 0.5 < free == aside
+    assert driver.drive(observation(velocity=[1.0, 0, 0]))[0][0] == pytest.approx(1.0)
+
+
+def test_beliefs_are_those_of_a_kalman_filter() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(3, 3))
+    P = root @ root.T
+    belief = Belief(*(np.array([P[i, j]]) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))))
+    dx, dy, landmarks = 0.4, -0.3, np.array([[[2.0, 1.0], [-1.0, 3.0], [4.0, 4.0]]])
+    F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
+    P = F @ P @ F.T + np.diag([0.01, 0.01, 0.002])
+    weight = np.array([[100.0, 50.0, 0.0]])
+    for offset, w in zip(landmarks[0], weight[0], strict=True):
+        if w:
+            square_ = offset @ offset
+            H = np.array([[offset[1] / square_, -offset[0] / square_, -1.0]])
+            K = P @ H.T / (H @ P @ H.T + 1.0 / w)
+            P = (np.eye(3) - K @ H) @ P
+    found = belief.driven(np.array([dx]), np.array([dy]), 0.01, 0.002).measured(landmarks, weight)
+    np.testing.assert_allclose(np.concatenate(found), P[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]], rtol=1e-9)
+    assert found.std == pytest.approx(np.sqrt(P[0, 0] + P[1, 1]))
+
+
+def test_a_field_of_view_is_that_of_the_camera() -> None:
+    view = FieldOfView(SCENARIO.camera)
+    offset = np.array([[3.0, 0.0], [-3.0, 0.0], [7.0, 0.0], [2.0, 1.1], [2.0, 1.6], [2.0, -1.6]])
+    assert view.sees(offset, np.zeros(6)).tolist() == [True, False, False, True, False, False]
+    assert view.sees(offset, np.full(6, np.pi / 4)).tolist() == [False, False, False, True, True, False]
+    around = FieldOfView(SCENARIO.camera.model_copy(update={"model": "omnidirectional", "range": None}))
+    assert around.sees(offset, np.zeros(6)).all()
+
+
+def test_what_is_needed_is_named() -> None:
+    few = square(observation={"include": [group for group in GROUPS if group != "map"]})
+    with pytest.raises(ValueError, match=r"agent 'peek' cannot be built: the observation lacks map_position, map_mask"):
+        load_agent("peek", few)
+    nowhere = square(observation={"include": ["odometry"]})
+    with pytest.raises(ValueError, match=r"the observation lacks way \(way: the group route or goal\)"):
+        load_agent("constant_speed", nowhere)
