@@ -1,10 +1,12 @@
 """Train one policy that all vehicles share with PPO: everything in this file, plain torch, CPU or GPU.
 
 Run: python examples/train_ppo.py --out out/ppo                (about two minutes on two cores)
+     python examples/train_ppo.py --out out/ppo --resume       (goes on from the last checkpoint)
      python examples/train_ppo.py --device cuda:0 --num-worlds 8192 --rollout 16 --minibatches 8 --total-steps 50000000
 
-Needs torch (the extra `train`). The batch has one row per (world, vehicle), and its arrays are torch tensors on the
-device of the worlds: in the rollout nothing waits for the host. Three things deserve care, and each is one line below:
+Needs torch, tyro and TensorBoard (the extra `train`). The batch has one row per (world, vehicle), and its arrays are
+torch tensors on the device of the worlds: in the rollout nothing waits for the host. Three things deserve care, each of
+them one line below:
 
 - a vehicle that has arrived or crashed stays in its world until the others are done: its rows are not `alive`;
 - the batch resets a world in the step after its last one (`next_step`): that step took no action and is left out;
@@ -13,62 +15,111 @@ device of the worlds: in the rollout nothing waits for the host. Three things de
 
 from __future__ import annotations
 
-import argparse
 import csv
+import os
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+import tyro
 from torch import Tensor, nn
+from torch.utils.tensorboard import SummaryWriter
 
 import coopenv
 
 
-def option(default: Any, text: str) -> Any:
-    """Return a field with its default and the text that --help shows."""
-    return field(default=default, metadata={"help": text})
-
-
 @dataclass
 class Arguments:
-    env: str = option("urban_crossing", "environment or TOML file")
-    device: str = option("cpu", "cpu or cuda:0")
-    seed: int = option(1, "of the worlds, the weights and the exploration")
-    num_worlds: int = option(256, "worlds side by side")
-    total_steps: int = option(4_000_000, "decisions of vehicles to collect, the dead ones included")
-    rollout: int = option(32, "decision steps between updates")
-    epochs: int = option(4, "passes over each rollout")
-    minibatches: int = option(8, "gradient steps per pass")
-    learning_rate: float = option(1e-3, "of Adam at the start; falls linearly to zero")
-    gamma: float = option(0.998, "discount per decision; a crossing takes about 110 of them")
-    gae_lambda: float = option(0.95, "of the generalised advantage estimate")
-    clip: float = option(0.2, "of the probability ratio")
-    entropy: float = option(0.0, "weight of the entropy bonus")
-    value_weight: float = option(0.5, "weight of the value loss")
-    max_gradient: float = option(0.5, "norm at which gradients are clipped")
-    reward_scale: float = option(0.1, "makes values of order one")
-    hidden: int = option(64, "width of the two hidden layers")
-    initial_std: float = option(0.5, "of the exploration; actions reach from -1 to 1")
-    log_every: int = option(15, "updates between lines")
-    evaluation_worlds: int = option(64, "worlds of which one episode each is judged before and after")
-    out: str = option("", "folder for weights and curve; none: nothing is written")
+    env: str = "urban_crossing"
+    """environment or TOML file"""
+    device: str = "cpu"
+    """cpu or cuda:0"""
+    seed: int = 1
+    """of the worlds, the weights and the exploration"""
+    num_worlds: int = 256
+    """worlds side by side"""
+    total_steps: int = 4_000_000
+    """decisions of vehicles to collect, the dead ones included"""
+    rollout: int = 32
+    """decision steps between updates"""
+    epochs: int = 4
+    """passes over each rollout"""
+    minibatches: int = 8
+    """gradient steps per pass"""
+    learning_rate: float = 1e-3
+    """of Adam at the start; falls linearly to zero"""
+    gamma: float = 0.99
+    """discount per decision"""
+    gae_lambda: float = 0.95
+    """of the generalised advantage estimate"""
+    clip: float = 0.2
+    """of the probability ratio"""
+    entropy: float = 0.0
+    """weight of the entropy bonus"""
+    value_weight: float = 0.5
+    """weight of the value loss"""
+    max_gradient: float = 0.5
+    """norm at which gradients are clipped"""
+    reward_scale: float = 0.1
+    """makes values of order one"""
+    hidden: int = 64
+    """width of the two hidden layers"""
+    initial_std: float = 0.5
+    """of the exploration; actions reach from -1 to 1"""
+    log_every: int = 15
+    """updates between lines, each with a checkpoint"""
+    evaluation_worlds: int = 64
+    """held-out worlds of which one episode each is judged before and after"""
+    out: str = ""
+    """folder for weights, checkpoint, curve and TensorBoard; none: nothing is written"""
+    resume: bool = False
+    """go on from the checkpoint in the folder; the other arguments have to be those it began with"""
+
+
+class Normaliser(nn.Module):
+    """Observations by the running mean and standard deviation of those of rows that acted."""
+
+    LEAST_VARIANCE, LIMIT = 1e-4, 6.0
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        for name, value in (("mean", torch.zeros(size)), ("variance", torch.ones(size)), ("count", torch.zeros(()))):
+            self.register_buffer(name, value)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        scaled = (observation - self.mean) / torch.sqrt(self.variance + self.LEAST_VARIANCE)
+        return scaled.clamp(-self.LIMIT, self.LIMIT)
+
+    def learn(self, observation: Tensor) -> None:
+        """Take in observations (rows, size); Chan et al. 1979."""
+        count, (variance, mean) = len(observation), torch.var_mean(observation, 0, correction=0)
+        total = self.count + count
+        change, share = mean - self.mean, count / total
+        self.variance += share * (variance - self.variance) + share * (1 - share) * change**2
+        self.mean += share * change
+        self.count.copy_(total)
 
 
 class Policy(nn.Module):
-    """Mean action, one standard deviation per entry of it, and the value."""
+    """Mean action, one standard deviation per entry of it, and the value; actor and critic see normalised rows."""
 
     def __init__(self, inputs: int, outputs: int, hidden: int, initial_std: float) -> None:
         super().__init__()
+        self.normaliser = Normaliser(inputs)
         self.actor = network(inputs, hidden, outputs, gain=0.01)
         self.critic = network(inputs, hidden, 1, gain=1.0)
         self.log_std = nn.Parameter(torch.full((outputs,), float(np.log(initial_std))))
 
     def value(self, observation: Tensor) -> Tensor:
         return self.critic(observation).squeeze(-1)
+
+    def drive(self, observation: Tensor) -> Tensor:
+        """Return the mean action for observations as the environment gives them."""
+        return self.actor(self.normaliser(observation))
 
     def log_probability(self, observation: Tensor, action: Tensor) -> Tensor:
         return gaussian(action, self.actor(observation), self.log_std)
@@ -99,46 +150,45 @@ def gaussian(action: Tensor, mean: Tensor, log_std: Tensor) -> Tensor:
 class Tally:
     """Sums over the episodes of vehicles that have ended, kept on the device until someone reads them."""
 
-    NAMES = ("episodes", "return", "arrived", "collided", "steps", "position_error", "rows")
+    NAMES = ("episodes", "return", "steps", "arrived", "collided", "position_error", "rows")
 
-    def __init__(self, rows: int, device: str) -> None:
-        self.sums = torch.zeros(len(self.NAMES), device=device)
-        self.running = torch.zeros(2, rows, device=device)
+    def __init__(self, rows: int, device: str, terms: tuple[str, ...]) -> None:
+        self.names = (*self.NAMES, *(f"term_{name}" for name in terms))
+        self.sums = torch.zeros(len(self.names), device=device)
+        self.running = torch.zeros(2 + len(terms), rows, device=device)
 
-    def add(self, reward: Tensor, valid: Tensor, terminated: Tensor, done: Tensor, position_error: Tensor) -> None:
-        self.running[0] += reward * valid
-        self.running[1] += valid
+    def add(self, reward: Tensor, valid: Tensor, done: Tensor, infos: dict[str, Any]) -> None:
+        self.running += torch.stack([reward, torch.ones_like(reward), *infos["reward_terms"].values()]) * valid
         ended = valid & done
-        # arriving pays and colliding costs: the sign of the last reward tells which it was
-        events = (ended, ended & terminated & (reward > 0), ended & terminated & (reward <= 0))
-        episodes, arrived, collided = (event.sum() for event in events)
-        returned, steps = (self.running * ended).sum(1)
-        error = (position_error * valid).sum()
-        self.sums += torch.stack([episodes, returned, arrived, collided, steps, error, valid.sum()])
+        arrived, collided = ((ended & (infos["ended"] == outcome)).sum() for outcome in (1, 2))
+        returned, steps, *terms = (self.running * ended).sum(1)
+        error = (infos["position_error"] * valid).sum()
+        self.sums += torch.stack([ended.sum(), returned, steps, arrived, collided, error, valid.sum(), *terms])
         self.running *= ~ended
 
     def read(self) -> dict[str, float]:
         """Return means per finished episode and forget them; waits for the device."""
-        total = dict(zip(self.NAMES, self.sums.tolist(), strict=True))
+        total = dict(zip(self.names, self.sums.tolist(), strict=True))
         self.sums.zero_()
-        episodes, rows = max(total["episodes"], 1.0), max(total["rows"], 1.0)
-        means = {name: total[name] / episodes for name in ("return", "arrived", "collided", "steps")}
-        return {"episodes": total["episodes"], **means, "position_error": total["position_error"] / rows}
+        episodes, rows = total.pop("episodes"), total.pop("rows")
+        error = total.pop("position_error") / max(rows, 1.0)
+        means = {name: value / max(episodes, 1.0) for name, value in total.items()}
+        return {"episodes": episodes, **means, "position_error": error}
 
 
 def evaluate(act: Callable[[Tensor], Tensor], args: Arguments) -> dict[str, float]:
-    """Return the means of one episode per vehicle of fresh worlds."""
+    """Return the means of one episode per vehicle of held-out worlds."""
     env = coopenv.make_vec(
         args.env, num_worlds=args.evaluation_worlds, device=args.device, autoreset="disabled", arrays="torch"
     )
-    observation, _ = env.reset(seed=coopenv.evaluation_seed(args.seed))
-    tally = Tally(env.num_envs, args.device)
+    observation, _ = env.reset(seed=coopenv.evaluation_seed(0))
+    tally = Tally(env.num_envs, args.device, env.engine.reward_terms)
     over = torch.zeros(env.num_envs, dtype=torch.bool, device=args.device)
     for _ in range(round(env.scenario.horizon * env.scenario.rates.decision)):
         with torch.no_grad():
             action = act(observation)
         observation, reward, terminated, truncated, infos = env.step(action)
-        tally.add(reward, infos["alive"] & ~over, terminated, terminated | truncated, infos["position_error"])
+        tally.add(reward, infos["alive"] & ~over, terminated | truncated, infos)
         over |= terminated | truncated
     return tally.read()
 
@@ -189,7 +239,8 @@ def collect(
     steps: list[dict[str, Tensor]] = []
     std = policy.log_std.exp()
     for _ in range(args.rollout):
-        observation = now["observation"].clone()  # the environment writes the next one into the same memory
+        raw = now["observation"].clone()  # the environment writes the next one into the same memory
+        observation = policy.normaliser(raw)
         mean = policy.actor(observation)
         action = mean + std * torch.randn_like(mean)
         now["observation"], reward, terminated, truncated, infos = env.step(action)  # clips the action
@@ -197,6 +248,7 @@ def collect(
         now["done"] = terminated | truncated
         steps.append(
             {
+                "raw": raw,
                 "observation": observation,
                 "action": action,
                 "log_probability": gaussian(action, mean, policy.log_std),
@@ -207,8 +259,9 @@ def collect(
                 "valid": valid,
             }
         )
-        tally.add(reward, valid, terminated, now["done"], infos["position_error"])
-    return {name: torch.stack([step[name] for step in steps]) for name in steps[0]}, policy.value(now["observation"])
+        tally.add(reward, valid, now["done"], infos)
+    last_value = policy.value(policy.normaliser(now["observation"]))
+    return {name: torch.stack([step[name] for step in steps]) for name in steps[0]}, last_value
 
 
 def line(name: str, row: dict[str, float]) -> str:
@@ -218,21 +271,46 @@ def line(name: str, row: dict[str, float]) -> str:
     )
 
 
-def save(policy: Policy, args: Arguments, curve: list[dict[str, float]]) -> None:
-    """Write the weights (no pickle), the arguments beside them, and the learning curve."""
-    folder = Path(args.out)
-    folder.mkdir(parents=True, exist_ok=True)
-    weights = {name: values.detach().cpu().contiguous() for name, values in policy.state_dict().items()}
-    try:
+class Store:
+    """The folder of a training: a checkpoint that is replaced as a whole, the curve, and TensorBoard's files."""
+
+    def __init__(self, args: Arguments) -> None:
+        self.folder = Path(args.out) if args.out else None
+        self.writer = None
+        if self.folder is not None:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self.writer = SummaryWriter(str(self.folder / "tensorboard"))
+
+    def save(self, done: int, policy: Policy, optimiser: torch.optim.Optimizer, curve: list[dict[str, float]]) -> None:
+        if self.folder is None or self.writer is None:
+            return
+        for name, value in curve[-1].items():
+            self.writer.add_scalar(name, value, int(curve[-1]["vehicle_steps"]))
+        parts = {"done": done, "policy": policy.state_dict(), "optimiser": optimiser.state_dict(), "curve": curve}
+        new = self.folder / "checkpoint.new"
+        torch.save({**parts, "random": torch.get_rng_state()}, new)
+        os.replace(new, self.folder / "checkpoint.pt")  # noqa: PTH105
+        with (self.folder / "curve.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, curve[0])
+            writer.writeheader()
+            writer.writerows(curve)
+
+    def load(self, device: str) -> dict[str, Any]:
+        """Return what `save` wrote; tensors and numbers alone are read, no code."""
+        path = self.folder / "checkpoint.pt" if self.folder is not None else None
+        if path is None or not path.is_file():
+            raise SystemExit(f"nothing to resume: there is no {path or 'folder, --out'}")
+        return torch.load(path, map_location=device, weights_only=True)
+
+    def finish(self, policy: Policy) -> None:
+        """Write the weights alone (no pickle), and close the log."""
+        if self.folder is None or self.writer is None:
+            return
         from safetensors.torch import save_file
-    except ImportError:
-        np.savez(folder / "weights.npz", **{name: values.numpy() for name, values in weights.items()})
-    else:
-        save_file(weights, folder / "weights.safetensors", metadata={k: str(v) for k, v in asdict(args).items()})
-    with (folder / "curve.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, curve[0])
-        writer.writeheader()
-        writer.writerows(curve)
+
+        weights = {name: values.detach().cpu().contiguous() for name, values in policy.state_dict().items()}
+        save_file(weights, self.folder / "weights.safetensors")
+        self.writer.close()
 
 
 def train(args: Arguments) -> list[dict[str, float]]:
@@ -244,42 +322,55 @@ def train(args: Arguments) -> list[dict[str, float]]:
     size, actions = env.single_observation_space.shape[0], env.single_action_space.shape[0]
     policy = Policy(size, actions, args.hidden, args.initial_std).to(args.device)
     optimiser = torch.optim.Adam(policy.parameters(), args.learning_rate, eps=1e-5)
-    print(line("random", evaluate(lambda o: 2 * torch.rand(len(o), actions, device=args.device) - 1, args)))
+    store, begun, curve = Store(args), 0, []
+    if args.resume:
+        saved = store.load(args.device)
+        policy.load_state_dict(saved["policy"])
+        optimiser.load_state_dict(saved["optimiser"])
+        torch.set_rng_state(saved["random"].cpu())
+        begun, curve = saved["done"], saved["curve"]
+    else:
+        print(line("random", evaluate(lambda o: 2 * torch.rand(len(o), actions, device=args.device) - 1, args)))
 
-    first, _ = env.reset(seed=args.seed)
+    first, _ = env.reset(seed=args.seed + begun)  # worlds are drawn anew after a checkpoint
     now = {"observation": first, "done": torch.zeros(env.num_envs, dtype=torch.bool, device=args.device)}
-    tally = Tally(env.num_envs, args.device)
+    tally = Tally(env.num_envs, args.device, env.engine.reward_terms)
     updates = max(1, args.total_steps // (args.rollout * env.num_envs))
-    curve: list[dict[str, float]] = []
-    start = time.perf_counter()
-    for done in range(1, updates + 1):
+    start = time.perf_counter() - (curve[-1]["seconds"] if curve else 0.0)
+    for done in range(begun + 1, updates + 1):
         optimiser.param_groups[0]["lr"] = args.learning_rate * (1 - (done - 1) / updates)
-        with torch.no_grad():
-            buffer, last_value = collect(args, env, policy, now, tally)
-            buffer["advantage"] = advantages(args, buffer, last_value)
-            buffer["return"] = buffer["advantage"] + buffer["value"]
-        valid = buffer["valid"].flatten().nonzero().squeeze(1)
-        names = ("observation", "action", "log_probability", "advantage", "return")
-        update(args, policy, optimiser, {name: buffer[name].flatten(0, 1)[valid] for name in names})
+        learn(args, env, policy, optimiser, now, tally)
         if done % args.log_every == 0 or done == updates:
             seconds = time.perf_counter() - start
             steps = done * args.rollout * env.num_envs
             curve.append({"vehicle_steps": steps, "seconds": round(seconds, 2), **tally.read()})
             print(line(f"{steps:,} steps", curve[-1]), f" {seconds:4.0f} s  {steps / seconds:,.0f} steps/s", flush=True)
+            store.save(done, policy, optimiser, curve)
 
-    print(line("mean action", evaluate(policy.actor, args)))
-    if args.out:
-        save(policy, args, curve)
+    print(line("mean action", evaluate(policy.drive, args)))
+    store.finish(policy)
     return curve
 
 
-def parse(words: list[str] | None = None) -> Arguments:
-    parser = argparse.ArgumentParser(description="PPO with one policy for all vehicles")
-    for f in fields(Arguments):
-        flag = "--" + f.name.replace("_", "-")
-        parser.add_argument(flag, type=type(f.default), default=f.default, help=f"{f.metadata['help']} (%(default)s)")
-    return Arguments(**vars(parser.parse_args(words)))
+def learn(
+    args: Arguments,
+    env: coopenv.CooperativeVectorEnv,
+    policy: Policy,
+    optimiser: torch.optim.Optimizer,
+    now: dict[str, Tensor],
+    tally: Tally,
+) -> None:
+    """Collect a rollout and learn from its rows that acted."""
+    with torch.no_grad():
+        buffer, last_value = collect(args, env, policy, now, tally)
+        buffer["advantage"] = advantages(args, buffer, last_value)
+        buffer["return"] = buffer["advantage"] + buffer["value"]
+    valid = buffer["valid"].flatten().nonzero().squeeze(1)
+    names = ("raw", "observation", "action", "log_probability", "advantage", "return")
+    batch = {name: buffer[name].flatten(0, 1)[valid] for name in names}
+    policy.normaliser.learn(batch.pop("raw"))
+    update(args, policy, optimiser, batch)
 
 
 if __name__ == "__main__":
-    train(parse())
+    train(tyro.cli(Arguments, description=__doc__))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import coopenv
 from coopenv.api.statistics import RecordVehicleEpisodes
+from coopenv.api.true_ends import TrueEnds
 
 DECISIONS = 60
 OPTIONS = {"num_worlds": 6, "overrides": {"horizon": DECISIONS / 10}}
@@ -54,6 +57,21 @@ def test_true_episodes_only(autoreset: str) -> None:
     assert np.array_equal(first_length, length)
     assert env.episode_count == len(env.return_queue) >= 2 * env.num_envs
     assert max(env.length_queue) == DECISIONS and min(env.length_queue) > 0
+
+
+@pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
+def test_statistics_of_gymnasium_are_true_over_true_ends(autoreset: str) -> None:
+    if autoreset == "same_step" and tuple(map(int, gymnasium.__version__.split(".")[:2])) < (1, 4):
+        pytest.skip("the wrapper of older Gymnasium loses the first reward after a reset in this mode")
+    own = RecordVehicleEpisodes(coopenv.make_vec("urban_crossing", autoreset=autoreset, **OPTIONS), buffer_length=1000)
+    env = RecordEpisodeStatistics(TrueEnds(own), buffer_length=1000, stats_key="gymnasium")
+    env.reset(seed=5)
+    for _ in range(2 * DECISIONS + 2):
+        _, _, terminated, truncated, infos = env.step(actions_of(env.unwrapped))
+        if "final_obs" in infos:
+            assert np.array_equal(infos["_final_obs"], terminated | truncated)
+    assert env.episode_count == own.episode_count >= 2 * env.num_envs
+    assert list(env.return_queue) == pytest.approx(list(own.return_queue), abs=1e-3)
 
 
 def test_a_reset_begins_anew() -> None:

@@ -7,13 +7,17 @@ import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip("torch", reason="needs the extra 'train'")
+pytest.importorskip("tyro", reason="needs the extra 'train'")
+pytest.importorskip("tensorboard", reason="needs the extra 'train'")
 
 import torch
+from safetensors.torch import load_file
 
 import coopenv
 
@@ -31,25 +35,88 @@ def ppo() -> ModuleType:
     return module
 
 
+FEW = ["--num-worlds", "4", "--rollout", "16", "--total-steps", "1024", "--minibatches", "2", "--epochs", "2"]
+
+
+def few(ppo: ModuleType, folder: Path, *more: str) -> Any:
+    words = [*FEW, "--log-every", "1", "--evaluation-worlds", "2", "--out", str(folder), *more]
+    return ppo.tyro.cli(ppo.Arguments, args=words)
+
+
 def test_trains_and_saves(ppo: ModuleType, tmp_path: Path) -> None:
-    few = ["--num-worlds", "4", "--rollout", "16", "--total-steps", "1024", "--minibatches", "2", "--epochs", "2"]
-    args = ppo.parse([*few, "--log-every", "1", "--evaluation-worlds", "2", "--out", str(tmp_path)])
+    args = few(ppo, tmp_path)
     curve = ppo.train(args)
     assert [row["vehicle_steps"] for row in curve] == [256, 512, 768, 1024]
     assert all(np.isfinite(value) for row in curve for value in row.values())
     with (tmp_path / "curve.csv").open(encoding="utf-8") as file:
         assert len(list(csv.DictReader(file))) == 4
-    (weights,) = tmp_path.glob("weights.*")
-    if weights.suffix == ".npz":
-        saved = {name: torch.from_numpy(values) for name, values in np.load(weights, allow_pickle=False).items()}
-    else:
-        from safetensors.torch import load_file
-
-        saved = load_file(weights)
+    assert list((tmp_path / "tensorboard").glob("events.*"))
+    saved = load_file(tmp_path / "weights.safetensors")
     policy = ppo.Policy(132, 2, args.hidden, args.initial_std)
     untrained = {name: values.clone() for name, values in policy.state_dict().items()}
     policy.load_state_dict(saved)
     assert not torch.equal(saved["log_std"], untrained["log_std"])
+    assert saved["normaliser.count"] > 0
+
+
+def test_resumes_from_its_checkpoint(ppo: ModuleType, tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match=r"nothing to resume: there is no .*checkpoint\.pt"):
+        ppo.train(few(ppo, tmp_path, "--resume"))
+    args = few(ppo, tmp_path)
+    with pytest.MonkeyPatch.context() as patched:  # ended by force after the second checkpoint
+        save = ppo.Store.save
+
+        def save_twice(store: Any, done: int, *rest: Any) -> None:
+            save(store, done, *rest)
+            if done == 2:
+                raise KeyboardInterrupt
+
+        patched.setattr(ppo.Store, "save", save_twice)
+        with pytest.raises(KeyboardInterrupt):
+            ppo.train(args)
+    before = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    assert before["done"] == 2
+    curve = ppo.train(few(ppo, tmp_path, "--resume"))
+    assert [row["vehicle_steps"] for row in curve] == [256, 512, 768, 1024]
+    assert curve[:2] == before["curve"]
+    after = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    assert after["policy"]["normaliser.count"] > before["policy"]["normaliser.count"]
+    assert after["optimiser"]["state"][0]["step"] == 2 * before["optimiser"]["state"][0]["step"]
+
+
+def test_statistics_are_those_of_all_rows_taken_in(ppo: ModuleType) -> None:
+    normaliser, generator = ppo.Normaliser(3), torch.Generator().manual_seed(0)
+    parts = [torch.randn(n, 3, generator=generator) * torch.tensor([0.1, 1.0, 5.0]) + 2.0 for n in (10, 1, 300)]
+    for part in parts:
+        normaliser.learn(part)
+    rows = torch.cat(parts)
+    assert torch.allclose(normaliser.mean, rows.mean(0), atol=1e-5)
+    assert torch.allclose(normaliser.variance, rows.var(0, correction=0), rtol=1e-4)
+
+
+@pytest.mark.parametrize("weights", [{}, {"reward.weights.arrival": -5.0, "reward.weights.collision": -5.0}])
+def test_outcomes_are_told_whatever_is_paid_for_them(ppo: ModuleType, weights: dict[str, float]) -> None:
+    """Arrivals and collisions are counted by what the world says, not by the sign of the reward."""
+    overrides = {"horizon": 20.0, **weights}
+    env = coopenv.make_vec("urban_crossing", num_worlds=4, overrides=overrides, autoreset="disabled", arrays="torch")
+    env.reset(seed=0)
+    tally = ppo.Tally(env.num_envs, "cpu", env.engine.reward_terms)
+    over = torch.zeros(env.num_envs, dtype=torch.bool)
+    actions = torch.stack([torch.linspace(-0.5, 1.0, env.num_envs), torch.zeros(env.num_envs)], dim=1)
+    total = torch.zeros(env.num_envs)
+    for _ in range(200):
+        _, reward, terminated, truncated, infos = env.step(actions)
+        valid = infos["alive"] & ~over
+        total += reward * valid
+        tally.add(reward, valid, terminated | truncated, infos)
+        over |= terminated | truncated
+    read, ended = tally.read(), infos["ended"]
+    assert read["arrived"] == pytest.approx((ended == 1).float().mean().item()) and 0 < read["arrived"] < 1
+    assert read["collided"] == pytest.approx((ended == 2).float().mean().item()) and 0 < read["collided"] < 1
+    assert read["return"] == pytest.approx(total.mean().item(), abs=1e-3)
+    by_name = env.scenario.reward.by_name
+    weighted = sum(by_name[name.removeprefix("term_")] * read[name] for name in read if name.startswith("term_"))
+    assert weighted == pytest.approx(read["return"], abs=1e-3)
 
 
 def test_is_reproducible(ppo: ModuleType) -> None:
@@ -69,7 +136,7 @@ def rollout(ppo: ModuleType, env: coopenv.CooperativeVectorEnv, steps: int, bias
         policy.actor[-1].weight.zero_()
         first, _ = env.reset(seed=0)
         now = {"observation": first, "done": torch.zeros(env.num_envs, dtype=torch.bool)}
-        buffer, _ = ppo.collect(args, env, policy, now, ppo.Tally(env.num_envs, "cpu"))
+        buffer, _ = ppo.collect(args, env, policy, now, ppo.Tally(env.num_envs, "cpu", env.engine.reward_terms))
     return buffer
 
 
