@@ -15,7 +15,10 @@ from coopenv.cli import complete
 
 HEAVY = {"warp", "scipy", "matplotlib", "PIL", "pandas", "mcap", "torch", "joblib", "jinja2"}
 LIGHT = {"errors", "shipped", "interrupts", "api", "api.registration", "seeds"}
-LIGHT |= {"cli", *(f"cli.{name}" for name in ("bench", "complete", "evaluate", "live", "options", "run", "show", "train"))}
+LIGHT |= {
+    "cli",
+    *(f"cli.{name}" for name in ("bench", "complete", "evaluate", "live", "options", "run", "show", "train")),
+}
 
 
 def modules_after(statement: str) -> set[str]:
