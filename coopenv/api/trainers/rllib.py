@@ -1,12 +1,16 @@
-"""RLlib, new API stack: one world as a `MultiAgentEnv`. Needs the extra `rllib`."""
+"""RLlib, new API stack: one world as a `MultiAgentEnv`, or a batch as rows for one policy. Needs the extra `rllib`."""
 
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector import VectorWrapper
 
 from coopenv.api.parallel_env import parallel_env
 from coopenv.api.trainers.numeric_infos import PlainInfos
+from coopenv.api.true_ends import TrueEnds
+from coopenv.api.vector_env import make_rows
+from coopenv.errors import CoopenvError
 
 try:
     from ray.rllib.env.multi_agent_env import MultiAgentEnv
@@ -56,3 +60,35 @@ class CooperativeMultiAgentEnv(MultiAgentEnv):
 
     def close(self) -> None:
         self.env.close()
+
+
+class CooperativeRows(VectorWrapper):
+    """A batch as a vector environment of RLlib: rows (world, vehicle) for one policy that all vehicles share.
+
+        PPOConfig()
+        .environment(CooperativeRows, env_config={"env": "urban_crossing"})
+        .env_runners(num_envs_per_env_runner=256, gym_env_vectorize_mode="vector_entry_point")
+
+    An episode is a vehicle's, see `TrueEnds`. There are no infos: RLlib would keep them of every step.
+    """
+
+    def __init__(self, config: dict[str, Any]) -> None:
+        """Build the batch.
+
+        Args:
+            config: `env`: name or TOML file; `num_envs`: rows, a multiple of the vehicles, given by RLlib; the other
+                entries are options of `coopenv.make_vec`.
+
+        Raises:
+            CoopenvError: RLlib was not asked for one vector environment.
+        """
+        options = dict(config)
+        if "num_envs" not in options:
+            raise CoopenvError("CooperativeRows needs env_runners(gym_env_vectorize_mode='vector_entry_point')")
+        super().__init__(TrueEnds(make_rows(options.pop("env", "urban_crossing"), **options)))
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        return self.env.reset(seed=seed, options=options)[0], {}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        return *self.env.step(actions)[:4], {}
