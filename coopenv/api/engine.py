@@ -94,10 +94,12 @@ class Engine:
         seeds: Keys = None,
         mask: np.ndarray | None = None,
         options: Mapping[str, Any] | None = None,
+        parameters: Mapping[str, np.ndarray] | None = None,
     ) -> Keys:
         """Start new episodes, see `World.reset`; the results of the other worlds stay.
 
-        The first reset is of all worlds, and draws a seed for training where none is given.
+        The first reset is of all worlds, and draws a seed for training where none is given. `parameters` are set
+        before, in the worlds that are reset, see `World.set_parameters`.
 
         Returns:
             The keys of the worlds, or None where they go on from their last ones.
@@ -108,8 +110,10 @@ class Engine:
             mask = None
             drawn = world_keys(training_seed(), self.world.worlds)
             seeds = drawn if seeds is None else [b if a is None else a for a, b in zip(seeds, drawn, strict=True)]
-        self.world.reset(seeds, mask, options)
         chosen = np.ones(self.world.worlds, dtype=bool) if mask is None else np.asarray(mask, dtype=bool)
+        if parameters:
+            self.world.set_parameters(parameters, chosen)
+        self.world.reset(seeds, mask, options)
         if self.plugins is not None:
             self.plugins.start(np.flatnonzero(chosen))
         self._fresh.assign(chosen.astype(np.int32))

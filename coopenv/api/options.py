@@ -6,13 +6,18 @@ from typing import Any
 import numpy as np
 
 from coopenv.errors import CoopenvError, shown, suggest
+from coopenv.scenario import Scenario
+from coopenv.scenario.randomness import LEVELS, PARAMETERS
+
+SETTINGS = ("parameters", "difficulty")
+"""Options that hold until they are given again."""
 
 OF_TESTS = ("options",)
 """What PettingZoo's own tests of conformance pass to every environment."""
 
 
 def checked_options(options: object, known: tuple[str, ...], ignored: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return options by name, without those that are None.
+    """Return options by name.
 
     Raises:
         CoopenvError: they are not a dict, or one of them is not known.
@@ -24,7 +29,7 @@ def checked_options(options: object, known: tuple[str, ...], ignored: tuple[str,
     for key in options:
         if key not in known and key not in ignored:
             raise CoopenvError(f"unknown option {shown(key)}{suggest(str(key), known)}; known: {', '.join(known)}")
-    return {key: value for key, value in options.items() if value is not None}
+    return dict(options)
 
 
 def world_number(value: object) -> int:
@@ -60,3 +65,50 @@ def world_mask(value: object, worlds: int, vehicles: int) -> np.ndarray:
         expected = f"({worlds * vehicles},) rows or ({worlds},) worlds"
         raise CoopenvError(f"reset_mask has shape {chosen.shape}, expected {expected}")
     return chosen
+
+
+def world_parameters(options: Mapping[str, Any], worlds: int, scenario: Scenario) -> dict[str, np.ndarray]:
+    """Return the options `parameters` and `difficulty`, as far as they are given, as (worlds,) by name.
+
+    Raises:
+        CoopenvError: one is not known, or not what it must be.
+    """
+    factors = options.get("parameters") if options.get("parameters") is not None else {}
+    if not isinstance(factors, Mapping):
+        raise CoopenvError(f"option 'parameters' must be a dict, got {type(factors).__name__}")
+    found = {}
+    for name, value in factors.items():
+        if name not in PARAMETERS:
+            near = suggest(str(name), PARAMETERS)
+            raise CoopenvError(f"unknown parameter {shown(name)}{near}; known: {', '.join(PARAMETERS)}")
+        _, low, high = PARAMETERS[name]
+        if name == "traffic_pace" and not scenario.paced:
+            high = 1.0  # motions are worked out for the horizon alone
+        found[name] = (
+            np.full(worlds, np.nan) if value is None else _numbers(f"parameter '{name}'", value, worlds, low, high)
+        )
+    if "difficulty" in options:
+        value = options["difficulty"]
+        level = scenario.difficulty.number if value is None else value
+        if isinstance(level, str):
+            if level not in LEVELS:
+                raise CoopenvError(
+                    f"unknown difficulty {shown(level)}{suggest(level, LEVELS)}; known: {', '.join(LEVELS)}"
+                )
+            level = LEVELS[level]
+        found["difficulty"] = _numbers("option 'difficulty'", level, worlds, 0.0, 1.0)
+    return found
+
+
+def _numbers(what: str, value: object, worlds: int, low: float, high: float) -> np.ndarray:
+    """Return a number, or one per world, as (worlds,)."""
+    try:
+        given = np.asarray(value)
+        numbers = given.astype(float) if given.dtype.kind in "fiu" else np.array(np.nan)
+    except (TypeError, ValueError, RuntimeError):
+        numbers = np.array(np.nan)
+    if numbers.shape not in ((), (worlds,)):
+        raise CoopenvError(f"{what} has shape {numbers.shape}, expected a number or one per world, ({worlds},)")
+    if not ((numbers >= low) & (numbers <= high)).all():
+        raise CoopenvError(f"{what} must be from {low:g} to {high:g}, got {shown(value)}")
+    return np.broadcast_to(numbers, (worlds,)).copy()

@@ -12,7 +12,7 @@ from pettingzoo import ParallelEnv
 from coopenv.api.actions import ActionReader
 from coopenv.api.engine import Engine
 from coopenv.api.infos import InfoWriter, state_space, state_vector
-from coopenv.api.options import OF_TESTS, checked_options, world_number
+from coopenv.api.options import OF_TESTS, SETTINGS, checked_options, world_number, world_parameters
 from coopenv.api.pictures import Pictures
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
@@ -23,6 +23,7 @@ from coopenv.observers.contract import Factory
 from coopenv.observers.registry import named
 from coopenv.scenario import Scenario
 from coopenv.seeds import world_keys
+from coopenv.world.presence import ABSENT
 
 Observations = dict[str, Any]
 Infos = dict[str, dict[str, Any]]
@@ -129,21 +130,25 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         Args:
             seed: fixes the episode; None goes on with a new episode of the last seed (at first one for training is
                 drawn). `coopenv.EVALUATION_SEEDS` are reserved for evaluation.
-            options: `{"world": w}`: with a seed, be world w of a batch with that seed. A backend that takes options of
-                its own is given all of them instead.
+            options: `{"world": w}`: with a seed, be world w of a batch with that seed; `{"parameters": {name: factor}}`
+                and `{"difficulty": d}` hold for all episodes from this one on, until they are given again (None: drawn
+                again, and the scenario's level), see docs/draws.md. A backend that takes options of its own is given
+                all of them instead.
 
         Raises:
             CoopenvError: the seed or an option is not what it must be.
         """
-        first, own = 0, options or {}
+        first, own, parameters = 0, options or {}, None
         if self.engine.backend.capabilities.batched:
-            first, own = world_number(checked_options(options, ("world",), OF_TESTS).get("world", 0)), {}
+            wanted, own = checked_options(options, ("world", *SETTINGS), OF_TESTS), {}
+            first, parameters = world_number(wanted.get("world", 0)), world_parameters(wanted, 1, self.scenario)
         keys = None if seed is None else world_keys(seed, 1, first)
         if keys is not None:
             self._np_random = seeding.np_random(keys[0])[0]
         with self.engine.stopping():
-            self.engine.reset(keys, options=own)
-        self._agents = list(self.possible_agents)
+            self.engine.reset(keys, options=own, parameters=parameters)
+        there = self.engine.view("ended")[0] != ABSENT
+        self._agents = [agent for agent, is_there in zip(self.possible_agents, there, strict=True) if is_there]
         if self.render_mode == "human":
             self.render()
         return self._observations(self._agents), self._infos(self._agents)

@@ -16,6 +16,9 @@ OtherPolicy = Callable[[str, Any], np.ndarray]
 """Maps another vehicle's name and observation to its action."""
 
 
+MOST_EPISODES = 1000
+
+
 def keep_going(agent: str, observation: Any) -> np.ndarray:
     """Return the neutral action: straight on, at half of the speed range (or without acceleration)."""
     return np.zeros(2, dtype=np.float32)
@@ -73,6 +76,12 @@ class SingleVehicleEnv(gymnasium.Env[Any, np.ndarray]):
         """Start an episode, see `CooperativeLocalisationEnv.reset`."""
         super().reset(seed=seed)
         self._observations, infos = self.world.reset(seed=seed, options=options)
+        for _ in range(MOST_EPISODES):
+            if self.vehicle in infos:
+                break
+            self._observations, infos = self.world.reset()  # an episode without it
+        else:
+            raise CoopenvError(f"{self.vehicle} was absent in {MOST_EPISODES} episodes running")
         return self._observations[self.vehicle], infos[self.vehicle]
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:

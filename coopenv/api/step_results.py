@@ -49,6 +49,7 @@ def results_struct(p: Precision) -> Any:
         last_way: array("WN", scalar)  # m left to the goal, at the last step
         last_ended: array("WN", wp.int32)  # at the last step
         last_tick: array("WN", wp.int32)  # of the last step
+        last_arrivals: array("WN", wp.int32)  # at the last step
         last_log_determinant: array("WN", scalar)  # at the last step
         furthest: array("WN", scalar)  # m, the farthest along its way that the vehicle has believed to be
 
@@ -57,7 +58,8 @@ def results_struct(p: Precision) -> Any:
 
 MEMORY = {
     "last_way": NUMBER._replace(of_truth=True),
-    "last_ended": whole(0, "last_outcome"),
+    "last_ended": whole(-1, "last_outcome"),
+    "last_arrivals": whole(0, 10**8),
     "last_tick": whole(0, "tick"),
     "last_log_determinant": NUMBER,
     "furthest": NUMBER,
@@ -67,12 +69,13 @@ MEMORY = {
 
 
 @wp.func
-def remember(results: Any, world: int, vehicle: int, way: Any, furthest: Any, ended: int, tick: int):
+def remember(state: Any, results: Any, world: int, vehicle: int, way: Any, furthest: Any, tick: int):
     """Keep what the next step compares with; `assess` comes before."""
+    results.last_arrivals[world, vehicle] = state.arrivals[world, vehicle]
     results.last_log_determinant[world, vehicle] = results.log_determinant[world, vehicle]
     results.furthest[world, vehicle] = furthest
     results.last_way[world, vehicle] = way
-    results.last_ended[world, vehicle] = ended
+    results.last_ended[world, vehicle] = state.ended[world, vehicle]
     results.last_tick[world, vehicle] = tick
 
 

@@ -14,7 +14,7 @@ from gymnasium.vector.utils import batch_space
 
 from coopenv.api.array_io import ArrayKind, Exchange
 from coopenv.api.engine import Engine
-from coopenv.api.options import checked_options, world_mask
+from coopenv.api.options import SETTINGS, checked_options, world_mask, world_parameters
 from coopenv.api.pictures import Pictures
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
@@ -125,15 +125,19 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
                 these seeds. None, for all or for one, goes on from the last (at first one for training is drawn).
                 `coopenv.EVALUATION_SEEDS` are reserved for evaluation.
             options: `{"reset_mask": bool array}` of one per row or per world restricts the reset to whole worlds (not
-                the first one).
+                the first one); `{"parameters": {name: factors}}` and `{"difficulty": d}`, numbers or arrays of one per
+                world, hold for all episodes of the worlds that are reset, automatic ones too, until they are given
+                again (None: drawn again, and the scenario's level), see docs/draws.md.
 
         Raises:
             CoopenvError: a mask that splits a world, or a sequence of the wrong length.
         """
-        wanted = checked_options(options, ("reset_mask",))
-        mask = world_mask(wanted["reset_mask"], self.num_worlds, self.vehicles) if "reset_mask" in wanted else None
+        wanted = checked_options(options, ("reset_mask", *SETTINGS))
+        parameters = world_parameters(wanted, self.num_worlds, self.scenario)
+        given = wanted.get("reset_mask")
+        mask = None if given is None else world_mask(given, self.num_worlds, self.vehicles)
         self._exchange.follow_torch()
-        seeds = self.engine.reset(self._world_seeds(seed), mask)
+        seeds = self.engine.reset(self._world_seeds(seed), mask, parameters=parameters)
         if seeds is not None and seeds[0] is not None:
             self._np_random, self._np_random_seed = seeding.np_random(int(seeds[0]))
         return self._observations(), self._infos()

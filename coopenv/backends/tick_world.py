@@ -17,6 +17,7 @@ from coopenv.observers.contract import Message
 from coopenv.observers.kernel_world import views_of
 from coopenv.observers.recording import Briefing, Sensed, Truth, is_due
 from coopenv.observers.registry import find_embedded
+from coopenv.scenario.randomness import PARAMETERS
 from coopenv.world.embedded import HOST
 from coopenv.world.records import allocate, fields
 from coopenv.world.state import state_fields
@@ -66,7 +67,7 @@ class TickWorld(SensingWorld):
 
     def _build_record(self) -> Any:
         struct, model = record_struct(self.precision), self.model
-        sizes = {"K": 1, "N": model.vehicles, "T": model.agents, "L": model.landmarks}
+        sizes = {"K": 1, "N": model.vehicles, "T": model.agents, "L": model.landmarks, "Q": len(PARAMETERS)}
         record = allocate(struct, sizes, self.device)
         for start in (record.start_rotation, record.start_position):
             start.fill_(np.nan)

@@ -100,6 +100,15 @@ def sealed(view: NDArray[Any]) -> NDArray[Any]:
     return view
 
 
+@dataclass(frozen=True)
+class Drawn:
+    """What the draws of a simulated episode follow from: who was there, routes and goals, and later routes."""
+
+    key: int  # of the world's random streams, see `coopenv.seeds`
+    episode: int
+    parameters: tuple[float, ...]  # factors, in the order of `coopenv.scenario.randomness.PARAMETERS`
+
+
 PER_TICK = ("rotation", "translation", "velocity", "angular_velocity", "bearings", "visible", "landmarks", "inbox_tick")
 """Arrays of a recording that have a row per tick."""
 
@@ -127,6 +136,7 @@ class Recording:
     start_covariance: Array  # (N, 6, 6) LEFT coordinates
     truth: Truth
     scenario: "Scenario | None" = None  # the world that was recorded; None for recorded robots
+    drawn: Drawn | None = None  # None: not simulated
 
     @property
     def ticks(self) -> int:

@@ -14,6 +14,7 @@ from coopenv.estimation.validity import are_covariances, are_numbers, are_rotati
 from coopenv.observers.contract import Setup
 from coopenv.observers.recording import Recording, is_due
 from coopenv.scenario.base import LARGEST
+from coopenv.scenario.randomness import MOST, PARAMETERS
 from coopenv.scenario.topology import neighbour_sets, processing_order
 
 SHAPES: dict[str, tuple[str | int, ...]] = {
@@ -52,6 +53,7 @@ def check_recording(recording: Recording, where: str) -> None:
         _check_start(recording)
         _check_ticks(recording)
         _check_scenario(recording)
+        _check_drawn(recording)
     except _RecordingError as error:
         raise DataError(f"{where}: {error}") from None
 
@@ -140,6 +142,15 @@ def _check_start(r: Recording) -> None:
         _require(are_numbers(r.start_position[i]).all(), f"start_position: of {setup.name} is not finite or too large")
         definite = are_covariances(r.start_covariance[i], LEAST_EIGENVALUE)
         _require(definite, f"start_covariance: of {setup.name} is not symmetric and positive definite")
+
+
+def _check_drawn(r: Recording) -> None:
+    if r.drawn is not None:
+        _between("drawn.key", r.drawn.key, 0, 2**64 - 1)
+        _between("drawn.episode", r.drawn.episode, 0, 2**32 - 1)
+        _require(len(r.drawn.parameters) == len(PARAMETERS), f"drawn.parameters: not {len(PARAMETERS)} numbers")
+        for factor in r.drawn.parameters:
+            _between("drawn.parameters", factor, 0.0, MOST**3)
 
 
 def _check_ticks(r: Recording) -> None:

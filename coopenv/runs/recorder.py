@@ -7,7 +7,7 @@ import numpy as np
 from coopenv.api.engine import Engine
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import simulation_of
-from coopenv.observers.recording import Recording, Truth, is_due
+from coopenv.observers.recording import Drawn, Recording, Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
 from coopenv.runs.episode import Views, play
 from coopenv.scenario import Scenario
@@ -37,9 +37,13 @@ def record(
     driver = load_policy(policy, scenario, seed) if isinstance(policy, str) else policy
     engine = Engine(scenario, 1, "float64", backend=backend)
     views = Views(engine, ("rotation", "position", "estimate_rotation", "estimate_position", "inbox_tick"))
-    ticks = []
+    ticks: list[Sensed] = []
+    drawn = None
     for k in play(engine, [seed], scenario.horizon_ticks, driver if scenario.driven else None):
         views.take()
+        if k == 0 and backend.capabilities.batched:
+            key, episode, parameters = (engine.view(name)[0].tolist() for name in ("seed", "episode", "parameter"))
+            drawn = Drawn(key, episode, tuple(parameters))
         ticks.append(engine.world.sensed(0, k))
         on_progress(k / scenario.horizon_ticks)
     L, briefing = len(scenario.landmarks), engine.world.briefing
@@ -60,5 +64,6 @@ def record(
         start_covariance=briefing.start_covariance,
         truth=Truth(views["rotation"][:, 0, L:], views["position"][:, 0, L:]),
         scenario=scenario,
+        drawn=drawn,
         **kept,
     )

@@ -13,6 +13,7 @@ from coopenv.scenario.base import (
     Part,
     Positive,
     PositiveVector3,
+    Probability,
     QuaternionWxyz,
     Vector2,
     Vector3,
@@ -127,6 +128,8 @@ class DrivenMotion(Part):
     kind: Literal["driven"] = "driven"
     initial_speed: Number = 0.0
     """m/s"""
+    initial_speed_spread: NonNegative = 0.0
+    """Half-width of a uniform deviation of it, m/s; what comes out is kept within what `[dynamics]` permits."""
 
 
 class TrafficMotion(Part):
@@ -210,6 +213,14 @@ class Landmark(Part):
     name: str = Field(min_length=1, max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")
     position: Vector3
     """Position (of its origin, at t = 0) in the coordinates of this file, m."""
+    position_spread: NonNegativeVector3 = (0.0, 0.0, 0.0)
+    """Half-widths of a uniform offset along its own x, y, z axes, drawn at every reset, m; vehicles know it."""
+    presence: Probability = 1.0
+    """Chance that it is there, drawn at every reset; vehicles know."""
+    pace_spread: Probability = 0.0
+    """Half-width of a uniform factor about 1 of the pace of its motion, drawn at every reset."""
+    group: str | None = None
+    """The group of `landmark_groups` that draws its position; written by the group."""
     yaw: Number = 0.0
     """Orientation of a moving landmark's body at t = 0, rad."""
     motion: LandmarkMotion = StaticMotion()
@@ -217,6 +228,11 @@ class Landmark(Part):
     """A landmark with a body occludes what is behind it."""
     marker: Vector3 = (0.0, 0.0, 0.0)
     """The point that cameras see, in the landmark's body frame, m."""
+
+    @property
+    def is_drawn(self) -> bool:
+        """Whether a reset draws where it is, or whether it is there."""
+        return self.group is not None or any(self.position_spread) or self.presence < 1.0
 
 
 class Vehicle(Part):
@@ -230,6 +246,12 @@ class Vehicle(Part):
     body: Body | None = None
     marker: Vector3 = (0.0, 0.0, 0.0)
     """The point of this vehicle that other cameras see, in its body frame, m."""
+    presence: Probability = 1.0
+    """Chance that it is there, drawn at every reset; one vehicle is always left, a driven one where there is any."""
+    pace_spread: Probability = 0.0
+    """Half-width of a uniform factor about 1 of the pace of a prescribed motion, drawn at every reset."""
+    next_routes: tuple[str, ...] = Field(default=(), max_length=1000)
+    """Routes that may follow its routes where `termination.after_arrival` is `continue` (default: all)."""
     neighbours: tuple[str, ...] | None = None
     """Targets it may measure: landmark names and vehicle names (default: every landmark and every leader)."""
     goal: Goal | None = None

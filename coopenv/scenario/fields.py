@@ -7,7 +7,9 @@ from pydantic import Field
 from coopenv.scenario.base import Part, Positive, Text, Vector3, overlaid
 from coopenv.scenario.bodies import Landmark, Obstacle, Road, Vehicle
 from coopenv.scenario.highway import Highway
+from coopenv.scenario.landmarks import LandmarkGroup
 from coopenv.scenario.learning import Action, Dynamics, Observation, Reward, Termination
+from coopenv.scenario.randomness import Difficulty, Randomisation
 from coopenv.scenario.routes import Route
 from coopenv.scenario.sensing import Camera, Noise, Observer, Rates, Topology, V2x
 
@@ -36,6 +38,7 @@ class ScenarioFields(Part):
     roads: tuple[Road, ...] = Field(default=(), max_length=10_000)
     obstacles: tuple[Obstacle, ...] = Field(default=(), max_length=10_000)
     landmarks: tuple[Landmark, ...] = Field(max_length=50_000)
+    landmark_groups: tuple[LandmarkGroup, ...] = Field(default=(), max_length=1_000)
     vehicles: tuple[Vehicle, ...] = Field(min_length=1, max_length=1_000)
     camera: Camera = Camera()
     rates: Rates = Rates()
@@ -48,10 +51,19 @@ class ScenarioFields(Part):
     v2x: V2x = V2x()
     observer: Observer = Observer()
     dynamics: Dynamics = Dynamics()
+    randomisation: Randomisation = Randomisation()
+    difficulty: Difficulty = Difficulty()
     observation: Observation = Observation()
     action: Action = Action()
     reward: Reward = Reward()
     termination: Termination = Termination()
+
+    @property
+    def paced(self) -> bool:
+        """Whether the pace of prescribed motions may differ from what they say."""
+        factors = (*self.randomisation.factors("traffic_pace"), *self.difficulty.factors("traffic_pace"))
+        spreads = (*(mark.pace_spread for mark in self.landmarks), *(vehicle.pace_spread for vehicle in self.vehicles))
+        return any(factor != 1.0 for factor in factors) or any(spreads)
 
     @property
     def vehicle_names(self) -> list[str]:

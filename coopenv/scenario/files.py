@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from coopenv.errors import ScenarioError, UnknownEnvironmentError, shortened, shown, suggest
+from coopenv.scenario.landmarks import with_groups
 from coopenv.scenario.own_terms import located
 from coopenv.scenario.schema import Scenario
 from coopenv.scenario.validation import TOO_DEEP, one_line
@@ -102,7 +103,7 @@ def parse_scenario(raw: Mapping[str, Any], where: str) -> Scenario:
     """
     try:
         # Through JSON, where the strict mode refuses "5" and true for a number but takes lists for tuples.
-        text = json.dumps(raw, default=_plain)
+        text = json.dumps(with_groups(raw), default=_plain)
     except (TypeError, ValueError) as error:  # keys that are no text, tables within themselves, thousands of digits
         raise ScenarioError(f"{where}: {error}") from None
     except RecursionError:

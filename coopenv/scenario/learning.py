@@ -167,6 +167,9 @@ class Termination(Part):
     """Touching a building or another body ends the vehicle's episode."""
     arrival: bool = True
     """Reaching its goal ends the vehicle's episode."""
+    after_arrival: Literal["park", "leave", "continue"] = "park"
+    """`park`: a vehicle that has arrived stands where it is; `leave`: it is gone from the next camera tick on;
+    `continue`: it draws a new route that starts where the old one ends, and its episode goes on to the horizon."""
     custom: dict[Annotated[str, AfterValidator(TERMINATION_CONDITIONS.free)], Term] = Field(default={})
     """Conditions of one's own by name: where their functions stand, see docs/terms.md."""
     privileged: bool = False

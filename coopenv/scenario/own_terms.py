@@ -159,7 +159,8 @@ def without_own_terms(raw: Mapping[str, Any]) -> dict[str, Any]:
             continue
         part = result[section] = {key: value for key, value in result[section].items() if key != "custom"}
         if section == "termination":
-            result[section] = {key: on for key, on in part.items() if key in TERMINATION_CONDITIONS.built_in}
+            known = (*TERMINATION_CONDITIONS.built_in, "after_arrival")
+            result[section] = {key: on for key, on in part.items() if key in known}
         elif isinstance(weights := part.get("weights"), dict):
             part["weights"] = {name: weight for name, weight in weights.items() if name in REWARD_TERMS.built_in}
         elif section == "observation":

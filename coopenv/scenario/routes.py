@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from coopenv.scenario.base import NonNegative, Part, Vector2
+from coopenv.scenario.bodies import Vehicle
 
 SPACING = 0.25  # m between the points of a route that is not straight ...
 MOST_POINTS = 64  # ... and how many there are at most
@@ -143,3 +144,11 @@ def _pieces(route: Route) -> Iterator[Piece]:
             begin = np.array(route.waypoints[i + 1]) - cuts[i + 1] * ahead
             arc = route.corner_radius * abs(turn)
             yield Piece(begin, float(heading), math.copysign(1.0 / route.corner_radius, turn), arc)
+
+
+def followers(vehicle: Vehicle, route: Route, routes: Sequence[Route]) -> list[int]:
+    """Return the numbers of the routes that may follow one: as designed they start within the radius of its end."""
+    end = np.array(route.waypoints[-1])
+    near = [np.linalg.norm(np.array(other.waypoints[0]) - end) <= vehicle.goal_radius for other in routes]
+    allowed = vehicle.next_routes or tuple(other.name for other in routes)
+    return [i for i, other in enumerate(routes) if near[i] and other.name in allowed]

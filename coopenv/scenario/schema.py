@@ -12,6 +12,7 @@ from pydantic import field_validator, model_validator
 from coopenv.errors import ScenarioWarning, listed, shown, suggest
 from coopenv.scenario.bodies import Landmark
 from coopenv.scenario.fields import ScenarioFields
+from coopenv.scenario.routes import followers
 from coopenv.scenario.starts import check_room
 from coopenv.scenario.topology import neighbour_sets, processing_order
 
@@ -90,6 +91,7 @@ def _problems(s: ScenarioFields) -> Iterator[str]:
     for name in [name for name in q if name not in targets] if isinstance(q, dict) else ():
         yield f"observer.q: unknown target {shown(name)}{suggest(name, targets)}"
     yield from _problems_of_routes(s)
+    yield from _problems_of_draws(s)
     for name, rate in (("camera", s.rates.camera), ("odometry", s.rates.odometry)):
         if s.horizon * rate > MOST_TICKS:
             yield f"horizon: {s.horizon:g} s at rates.{name} = {rate:g} Hz are over {MOST_TICKS:.0e} samples"
@@ -117,9 +119,44 @@ def _problems_of_routes(s: ScenarioFields) -> Iterator[str]:
         if times > 1:
             yield f"routes: the name '{name}' is used twice"
     for i, vehicle in enumerate(s.vehicles):
-        for name in vehicle.routes:
+        for key, name in [*(("routes", n) for n in vehicle.routes), *(("next_routes", n) for n in vehicle.next_routes)]:
             if name not in names:
-                yield f"vehicles.{i}.routes: unknown route {shown(name)}{suggest(name, names)}; known: {listed(names)}"
+                yield f"vehicles.{i}.{key}: unknown route {shown(name)}{suggest(name, names)}; known: {listed(names)}"
+
+
+def _problems_of_draws(s: ScenarioFields) -> Iterator[str]:
+    groups = [group.name for group in s.landmark_groups]
+    for name, times in Counter(groups).items():
+        if times > 1:
+            yield f"landmark_groups: the name '{name}' is used twice"
+    for i, mark in enumerate(s.landmarks):
+        if mark.group is not None and mark.group not in groups:
+            yield f"landmarks.{i}.group: unknown group {shown(mark.group)}; groups make their landmarks themselves"
+    if s.termination.after_arrival == "park":
+        return
+    if not s.termination.arrival:
+        yield f"termination.arrival: must be true where after_arrival is '{s.termination.after_arrival}'"
+    if s.termination.after_arrival == "continue":
+        yield from _problems_of_sequels(s)
+
+
+def _problems_of_sequels(s: ScenarioFields) -> Iterator[str]:
+    """Yield where a vehicle arrives and no route goes on."""
+    by_name = {route.name: route for route in s.routes}
+    for i, vehicle in enumerate(s.vehicles):
+        if vehicle.goal is not None and not vehicle.routes:
+            yield f"vehicles.{i}.routes: needed by a vehicle with a goal where termination.after_arrival is 'continue'"
+        reached, new = set(), {*vehicle.routes}
+        while new:
+            reached |= new
+            after = {name: followers(vehicle, by_name[name], s.routes) for name in new}
+            for name, sequels in after.items():
+                if not sequels:
+                    yield (
+                        f"vehicles.{i}: termination.after_arrival is 'continue', but no route that may follow starts "
+                        f"within {vehicle.goal_radius:g} m of the end of route '{name}'"
+                    )
+            new = {s.routes[k].name for sequels in after.values() for k in sequels} - reached
 
 
 def _doubts(s: ScenarioFields, neighbours: Sequence[Sequence[int]]) -> Iterator[str]:

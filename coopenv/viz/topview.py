@@ -30,7 +30,7 @@ _BOX = ("rotation", "position", "half")
 _POINT = Body(size=(2e-3, 1e-3, 1e-3))  # stands in for a vehicle without a body, drawn at the least size
 _FIELDS = (
     *("rotation", "position", "estimate_rotation", "estimate_position", "covariance"),
-    *("sight", "ended", "position_error", "orientation_error", *GOAL_FIELDS),
+    *("sight", "ended", "position_error", "orientation_error", "present", *GOAL_FIELDS),
     *("traffic_rotation", "traffic_position", "traffic_half"),
 )
 
@@ -63,6 +63,8 @@ class TopView:
         R, position = view["rotation"], view["position"]
         R_hat, p_hat = view["estimate_rotation"], view["estimate_position"]
         estimate = (R_hat @ p_hat[..., None])[..., 0]
+        absent = view["present"] == 0.0
+        position[absent] = estimate[absent[self._landmarks :]] = np.nan
         sigma = self._place_ellipses(estimate, geometry.position_covariance(R_hat, p_hat, view["covariance"]))
         self._goals.place(view)
         self._place_bodies(R, position, R_hat, estimate)
@@ -127,7 +129,7 @@ class TopView:
         self._moving_names = {
             i: layers.keep(ground.label_landmark(self._axes, m.name, np.zeros(2)))
             for i, m in enumerate(self.scenario.landmarks)
-            if m.motion.kind != "static"
+            if m.motion.kind != "static" or m.is_drawn
         }
 
     def _prepare_table(self) -> None:
@@ -198,10 +200,11 @@ class TopView:
             length = geometry.free_lengths(camera, rays, self._reach, self.scenario.obstacles, self._origin)
             rim = camera[:, None] + length[..., None] * rays
             self._wedges.set_verts(np.concatenate([camera[:, None], rim], axis=1)[..., :2])
-        moving = np.array(list(self._moving_names), dtype=int)
+        moving = np.array([i for i, m in enumerate(self.scenario.landmarks) if m.motion.kind != "static"], dtype=int)
         self._still.set_data(*np.delete(target[:L], moving, axis=0).T)
         self._moving.set_data(*target[moving].T)
         for i, name in self._moving_names.items():
+            name.set_visible(bool(np.isfinite(target[i]).all()))
             name.xy = (float(target[i, 0]), float(target[i, 1]))
 
     def _place_marks(self, R: np.ndarray, position: np.ndarray, ended: np.ndarray) -> None:

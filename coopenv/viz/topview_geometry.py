@@ -138,6 +138,10 @@ def _places(scenario: Scenario) -> list[np.ndarray]:
     for route in scenario.routes:
         margin = followed.get(route.name, 0.0) + route.breadth
         around += [point - origin + margin * corners for point in even_points(route)[:, :2]]
+    for group in scenario.landmark_groups:
+        for corner, first, second in group.parallelograms:
+            corner_of = np.array(corner) - origin
+            around.append(np.array([corner_of, corner_of + first, corner_of + second]))
     return [*around, *(road_corners(road.start, road.end, road.width) - origin for road in scenario.roads)]
 
 

@@ -85,10 +85,10 @@ def draw_site(ax: Axes, scenario: Scenario) -> None:
 
 
 def _name_landmarks(ax: Axes, scenario: Scenario) -> None:
-    """Write the names of static landmarks."""
+    """Write the names of landmarks that are always in the same place."""
     origin = np.array(scenario.map.origin)[:2]
     for landmark in scenario.landmarks:
-        if landmark.motion.kind == "static":
+        if landmark.motion.kind == "static" and not landmark.is_drawn:
             place = np.array(landmark.position)[:2] + np.array(landmark.marker)[:2] - origin
             label_landmark(ax, landmark.name, place)
 

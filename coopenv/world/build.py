@@ -12,9 +12,10 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.learning import Dynamics
 from coopenv.scenario.motion import compile_motion
-from coopenv.scenario.routes import even_points, point_count
+from coopenv.scenario.randomness import FASTEST_PACE
 from coopenv.scenario.starts import agent_starts, rotation_of
 from coopenv.scenario.topology import neighbour_sets, processing_order
+from coopenv.world.build_draws import drawn_of, routes_of
 from coopenv.world.build_sensors import camera_entries, noise_entries
 from coopenv.world.model import BLIND, DRIVEN, IDEAL, PRESCRIBED, SENSED, STATIC, entry_struct, model_struct
 from coopenv.world.precision import Precision
@@ -35,7 +36,8 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     _fill(model.motion, _motion(scenario), device)
     model.dynamics = _structs(p, "dynamics", [_dynamics(d, scenario) for d in scenario.limits], device)
     _fill(model.scene, _scene(scenario), device)
-    _fill(model.routes, _routes(scenario), device)
+    _fill(model.routes, routes_of(scenario), device)
+    _fill(model.drawn, drawn_of(scenario), device)
     sensors = zip(scenario.cameras, scenario.noises, strict=True)
     model.camera = _structs(p, "camera", [camera_entries(camera, noise) for camera, noise in sensors], device)
     model.noise = _structs(p, "noise", [noise_entries(n, scenario.rates) for n in scenario.noises], device)
@@ -112,7 +114,13 @@ def _start(scenario: Scenario) -> dict[str, Any]:
     return {
         "position": positions,
         "rotation": rotations,
-        "position_spread": [pose.position_spread if pose else NOWHERE for pose in poses],
+        "position_spread": [
+            *(mark.position_spread for mark in scenario.landmarks),
+            *(
+                vehicle.initial_pose.position_spread if vehicle.initial_pose else NOWHERE
+                for vehicle in scenario.vehicles
+            ),
+        ],
         "yaw_spread": [pose.yaw_spread if pose else 0.0 for pose in poses],
         "speed": [motion.initial_speed if motion.kind == "driven" else 0.0 for motion in motions],
         "estimate_fixed": [e.position is not None for e in estimates],
@@ -128,7 +136,7 @@ def _motion(scenario: Scenario) -> dict[str, Any]:
     _, rotations = agent_starts(scenario)
     everyone: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
     motions = [agent.motion for agent in everyone]
-    until = scenario.horizon + 1.0 / scenario.rates.camera
+    until = (scenario.horizon + 1.0 / scenario.rates.camera) * (2.0 * FASTEST_PACE if scenario.paced else 1.0)
     tables = [compile_motion(motion, R, until) for motion, R in zip(motions, rotations, strict=True)]
     kinds = {"static": STATIC, "driven": DRIVEN, "traffic": DRIVEN}
     columns = ("start", "linear", "angular", "rotation", "position")
@@ -167,27 +175,6 @@ def _scene(scenario: Scenario) -> dict[str, Any]:
         "goal_radius": [vehicle.goal_radius for vehicle in scenario.vehicles],
         "end_on_collision": int(scenario.termination.collision),
         "end_on_arrival": int(scenario.termination.arrival),
-    }
-
-
-def _routes(scenario: Scenario) -> dict[str, Any]:
-    origin, routes = np.array(scenario.map.origin), scenario.routes
-    number = {route.name: i for i, route in enumerate(routes)}
-    choices = [[number[name] for name in vehicle.routes] for vehicle in scenario.vehicles]
-    places = [vehicle.goal and vehicle.goal.position for vehicle in scenario.vehicles]
-    counts = [point_count(route) for route in routes]
-    points = np.zeros((len(routes), max(counts, default=0), 3))
-    for route, row in zip(routes, points, strict=True):
-        row[: point_count(route)] = even_points(route) - [*origin[:2], 0.0]
-    return {
-        "first": np.cumsum([0, *(len(own) for own in choices)]),
-        "choice": [i for own in choices for i in own],
-        "goal": [np.array(place) - origin if place else NOWHERE for place in places],
-        "points": max([*counts, 2]),
-        "count": counts,
-        "point": points,
-        **{name: [getattr(route, name) for route in routes] for name in ("lateral_spread", "wander", "start_spread")},
-        "height": -origin[2],
     }
 
 

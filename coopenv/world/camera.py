@@ -10,6 +10,7 @@ import warp as wp
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.so3 import exp_so3
 from coopenv.world.model import BLIND, IDEAL
+from coopenv.world.parameters import BEARING_NOISE, CAMERA_RANGE
 from coopenv.world.random import BEARING, gaussian_pair, pair, random_words, signed_uniform, uniform
 
 NOT_A_NEIGHBOUR = wp.constant(wp.uint8(Sight.NOT_A_NEIGHBOUR))
@@ -83,7 +84,7 @@ def occlusion(model: Any, state: Any, world: int, observer: int, target: int, or
             return OCCLUDED_BY_BUILDING
     for agent in range(model.agents):
         half = model.scene.body_half[agent]
-        if agent != observer and agent != target and half[0] > half.dtype(0.0):
+        if agent != observer and agent != target and half[0] > half.dtype(0.0) and state.present[world, agent] != 0:
             R = state.rotation[world, agent]
             center = state.position[world, agent] + R * model.scene.body_center[agent]
             if segment_hits_box(origin, direction, inverse_square, R, center, half):
@@ -177,8 +178,11 @@ def has_pixel(model: Any, camera: Any, ray: Any) -> bool:
 
 
 @wp.func
-def noisy_bearing(noise: Any, bearing: Any, words: Any):
-    """Return a noisy unit bearing: the paper's image-plane formula about an axis, or isotropic in the tangent plane."""
+def noisy_bearing(noise: Any, level: Any, bearing: Any, words: Any):
+    """Return a unit bearing with noise of a level.
+
+    It is that of the paper's image-plane formula about an axis, or isotropic in the tangent plane.
+    """
     one = bearing.dtype(1.0)
     if noise.bearing_paper == 1:
         g = wp.transpose(noise.axis) * bearing
@@ -186,25 +190,31 @@ def noisy_bearing(noise: Any, bearing: Any, words: Any):
         tiny = bearing.dtype(1.0e-6)
         if wp.abs(depth) < tiny:  # the formula divides by it: docs/method.md, Limits
             depth = wp.where(depth < bearing.dtype(0.0), -tiny, tiny)
-        x = g[0] / depth + noise.bearing * signed_uniform(words[0], one)
-        y = g[1] / depth + noise.bearing * signed_uniform(words[1], one)
+        x = g[0] / depth + level * signed_uniform(words[0], one)
+        y = g[1] / depth + level * signed_uniform(words[1], one)
         return wp.normalize(noise.axis * type(bearing)(x, y, one)) * wp.sign(depth)
     n1, n2 = gaussian_pair(words[0], words[1], one)
     helper = type(bearing)()
     helper[wp.where(wp.abs(bearing[0]) > bearing.dtype(0.7), 1, 0)] = one
     first = wp.normalize(wp.cross(bearing, helper))
     second = wp.cross(bearing, first)
-    return wp.normalize(bearing + noise.bearing * (n1 * first + n2 * second))
+    return wp.normalize(bearing + level * (n1 * first + n2 * second))
 
 
 @wp.func
 def sight_of(model: Any, state: Any, world: int, vehicle: int, target: int, origin: Any, line: Any, ray: Any):
-    """Return whether a neighbour is in view now, and if not, why; `ray` is `line` in the optical frame."""
+    """Return whether a neighbour is in view now, and if not, why; `ray` is `line` in the optical frame.
+
+    Nobody sees who is absent, and who is absent sees nobody.
+    """
+    if state.present[world, target] == 0 or state.present[world, model.landmarks + vehicle] == 0:
+        return OUT_OF_VIEW
     if model.sensing == BLIND:
         return OUT_OF_VIEW
     if model.sensed == 1 and model.sensing != IDEAL:
         camera = model.camera[vehicle]
-        if wp.dot(line, line) > camera.range * camera.range:
+        reach = camera.range * state.parameter[world, CAMERA_RANGE]
+        if wp.dot(line, line) > reach * reach:
             return OUT_OF_VIEW
         if camera.pinhole == 1:
             if ray[2] <= ray.dtype(0.0):
@@ -222,6 +232,7 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
     agent = model.landmarks + vehicle
     camera = model.camera[vehicle]
     noise = model.noise[vehicle]
+    level = noise.bearing * state.parameter[world, BEARING_NOISE]
     R = state.rotation[world, agent]
     place = camera.position
     turned = camera_to_body(model, state, world, vehicle)
@@ -231,7 +242,7 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
         turned = turned * exp_so3(state.camera_turn[world, vehicle])
     origin = state.position[world, agent] + R * place
     to_camera = wp.transpose(R * turned)
-    random = camera.miss > zero or noise.bearing > zero
+    random = camera.miss > zero or level > zero
     for n in range(model.target_count[vehicle]):
         target = model.targets[vehicle, n]
         line = marker_position(model, state, world, target) - origin
@@ -244,8 +255,8 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
             words = random_words(state.seed[world], state.episode[world], tick, pair(vehicle, target), BEARING)
             if model.sensing != IDEAL and uniform(words[2], zero) < camera.miss:
                 sight = MISSED
-            if noise.bearing > zero:
-                b = noisy_bearing(noise, b, words)
+            if level > zero:
+                b = noisy_bearing(noise, level, b, words)
         if sight == VISIBLE:
             if camera.pinhole == 1 and model.sensed == 1 and has_pixel(model, camera, ray):
                 b = through_pixels(camera, b)

@@ -5,6 +5,8 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.outcomes import Outcome
+from coopenv.world.draw_route import draw_next_route
+from coopenv.world.model import CONTINUE, LEAVE
 from coopenv.world.route import goal_distance, has_routes, is_past_end
 
 UNDER_WAY = wp.constant(int(Outcome.UNDER_WAY))
@@ -48,7 +50,7 @@ def touches_one_of(model: Any, state: Any, world: int, vehicle: int, count: int)
     """Return 1 when a vehicle's box overlaps a building or the body of another one of the first `count` agents."""
     agent = model.landmarks + vehicle
     half = model.scene.body_half[agent]
-    if half[0] <= half.dtype(0.0):
+    if half[0] <= half.dtype(0.0) or state.present[world, agent] == 0:
         return 0
     R = state.rotation[world, agent]
     center = state.position[world, agent] + R * model.scene.body_center[agent]
@@ -64,7 +66,7 @@ def touches_one_of(model: Any, state: Any, world: int, vehicle: int, count: int)
             return 1
     for other in range(count):
         other_half = model.scene.body_half[other]
-        if other != agent and other_half[0] > half.dtype(0.0):
+        if other != agent and other_half[0] > half.dtype(0.0) and state.present[world, other] != 0:
             other_R = state.rotation[world, other]
             other_center = state.position[world, other] + other_R * model.scene.body_center[other]
             if boxes_touch(center, R, half, other_center, other_R, other_half):
@@ -91,8 +93,17 @@ def reaches_goal(model: Any, state: Any, world: int, vehicle: int) -> bool:
 
 
 @wp.func
+def depart(model: Any, state: Any, world: int):
+    """Take the vehicles that have arrived off the scene, where they leave; called at the start of a tick."""
+    if model.drawn.after_arrival == LEAVE:
+        for vehicle in range(model.vehicles):
+            if state.ended[world, vehicle] == ARRIVED:
+                state.present[world, model.landmarks + vehicle] = 0
+
+
+@wp.func
 def referee(model: Any, state: Any, world: int, vehicle: int):
-    """Mark contact, and end the vehicle's episode on a collision or an arrival that counts."""
+    """Mark contact, and end the vehicle's episode on a collision or an arrival that counts; or give it a new route."""
     touching = touches_anything(model, state, world, vehicle)
     ended = state.ended[world, vehicle]
     if ended == UNDER_WAY:
@@ -100,6 +111,10 @@ def referee(model: Any, state: Any, world: int, vehicle: int):
             ended = COLLIDED
         elif model.scene.end_on_arrival == 1:
             if reaches_goal(model, state, world, vehicle):
-                ended = ARRIVED
+                state.arrivals[world, vehicle] += 1
+                if model.drawn.after_arrival == CONTINUE:
+                    draw_next_route(model, state, world, vehicle)
+                else:
+                    ended = ARRIVED
     state.collided[world, vehicle] = touching
     state.ended[world, vehicle] = ended

@@ -5,10 +5,14 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.so3 import exp_so3
-from coopenv.world.random import ROUTE, ROUTE_SHAPE, random_words, signed_uniform, uniform
+from coopenv.world.parameters import WANDER
+from coopenv.world.random import NEXT_ROUTE, ROUTE, ROUTE_SHAPE, on_cells, random_words, signed_uniform, uniform
 from coopenv.world.route import has_routes, point_on_route
 
 TURN = wp.constant(6.283185307179586)
+
+AFTER_STARTS = wp.constant(1000)
+"""Draws of the shapes of later routes are numbered from here on, those at a reset by its attempts."""
 
 
 @wp.func
@@ -33,28 +37,52 @@ def wave(share: Any, first: Any, second: Any):
 
 
 @wp.func
+def one_of(word: wp.uint32, first: int, count: int) -> int:
+    """Return one of the numbers first .. first + count - 1, by a random word."""
+    return first + wp.min(int(uniform(word, wp.float64(1.0)) * wp.float64(count)), count - 1)
+
+
+@wp.func
 def draw_route(model: Any, state: Any, world: int, vehicle: int, attempt: int):
     """Draw one of a vehicle's routes and its variant.
 
     Returns:
         Where along the route the vehicle starts, m.
     """
+    first = model.routes.first[vehicle]
+    words = random_words(state.seed[world], state.episode[world], attempt, vehicle, ROUTE)
+    choice = one_of(words[3], first, model.routes.first[vehicle + 1] - first)
+    return shape_route(model, state, world, vehicle, model.routes.choice[choice], attempt, words)
+
+
+@wp.func
+def draw_next_route(model: Any, state: Any, world: int, vehicle: int):
+    """Draw the route of a vehicle that has arrived, among those that start where its old one ends."""
+    old = state.route_drawn[world, vehicle]
+    arrival = state.arrivals[world, vehicle]
+    first = model.drawn.next_first[vehicle, old]
+    words = random_words(state.seed[world], state.episode[world], arrival, vehicle, NEXT_ROUTE)
+    choice = one_of(words[3], first, model.drawn.next_first[vehicle, old + 1] - first)
+    shape_route(model, state, world, vehicle, model.drawn.next_choice[choice], AFTER_STARTS + arrival, words)
+
+
+@wp.func
+def shape_route(model: Any, state: Any, world: int, vehicle: int, route: int, index: int, drawn: Any):
+    """Write a variant of a route of the scenario as the vehicle's, and return where it may start, m."""
     r = model.routes
     one = type(r.height)(1.0)
+    zero = one - one
     seed = state.seed[world]
-    episode = state.episode[world]
-    words = random_words(seed, episode, attempt, vehicle, ROUTE)
-    first = r.first[vehicle]
-    choices = r.first[vehicle + 1] - first
-    route = r.choice[first + wp.min(int(uniform(words[0], wp.float64(1.0)) * wp.float64(choices)), choices - 1)]
-    shift = r.lateral_spread[route] * signed_uniform(words[1], one)
-    start = r.start_spread[route] * uniform(words[2], one)
-    phases = random_words(seed, episode, attempt, vehicle, ROUTE_SHAPE)
+    words = on_cells(drawn, seed, r.lateral_spread[route] > zero, r.start_spread[route] > zero, False)
+    shift = r.lateral_spread[route] * signed_uniform(words[0], one)
+    start = r.start_spread[route] * uniform(words[1], one)
+    wander = r.wander[route] * state.parameter[world, WANDER]
+    phases = random_words(seed, state.episode[world], index, vehicle, ROUTE_SHAPE)
     count = r.count[route]
     for k in range(count):
         designed = r.point[route, k]
         share = type(one)(k) / type(one)(count - 1)
-        aside = shift + r.wander[route] * wave(share, uniform(phases[0], one), uniform(phases[1], one))
+        aside = shift + wander * wave(share, uniform(phases[0], one), uniform(phases[1], one))
         x = designed[0] - aside * wp.sin(designed[2])
         y = designed[1] + aside * wp.cos(designed[2])
         add_point(state, world, vehicle, k, x, y)

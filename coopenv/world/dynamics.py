@@ -27,11 +27,13 @@ def segment_at(model: Any, agent: int, t: wp.float64) -> int:
 
 @wp.func
 def prescribe(model: Any, state: Any, world: int, agent: int, t: wp.float64):
-    """Set an agent's pose and twist to its prescribed motion at time t."""
-    segment = segment_at(model, agent, t)
+    """Set an agent's pose and twist to its prescribed motion at time t, at the pace that has been drawn."""
+    pace = state.pace[world, agent]
+    at = t * wp.float64(pace)
+    segment = segment_at(model, agent, at)
     v = model.motion.linear[segment]
     w = model.motion.angular[segment]
-    h = v.dtype(t - model.motion.start[segment])
+    h = v.dtype(at - model.motion.start[segment])
     R0 = state.start_rotation[world, agent]
     R = R0 * model.motion.rotation[segment]
     travelled = v * h
@@ -43,8 +45,8 @@ def prescribe(model: Any, state: Any, world: int, agent: int, t: wp.float64):
     state.position[world, agent] = (
         state.start_position[world, agent] + R0 * model.motion.position[segment] + R * travelled
     )
-    state.velocity[world, agent] = v
-    state.angular_velocity[world, agent] = w
+    state.velocity[world, agent] = v * pace
+    state.angular_velocity[world, agent] = w * pace
 
 
 @wp.func

@@ -11,7 +11,7 @@ import warp as wp
 
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.world.camera import observe
-from coopenv.world.collision import referee
+from coopenv.world.collision import depart, referee
 from coopenv.world.dynamics import move
 from coopenv.world.odometry import measure_odometry
 from coopenv.world.reset import reset_world
@@ -142,6 +142,7 @@ def begin_simulation(model: Any, state: Any, record: Any, world: int):
 @wp.func
 def sense_simulation(model: Any, state: Any, record: Any, world: int, tick: int):
     """Move the truth of one world to a tick and measure it."""
+    depart(model, state, world)
     move(model, state, world, tick)
     for vehicle in range(model.vehicles):
         measure_odometry(model, state, world, vehicle, tick)

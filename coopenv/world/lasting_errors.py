@@ -9,6 +9,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.so3 import exp_so3
+from coopenv.world.parameters import EXTRINSICS, GYRO_BIAS, ODOMETRY_SCALE, SLIP_RATE
 from coopenv.world.random import (
     ODOMETRY_WALK,
     RESET_CAMERA,
@@ -37,11 +38,12 @@ def draw_errors(model: Any, state: Any, world: int, vehicle: int):
     shift = o
     if camera.orientation_std > o[0] or camera.position_std > o[0]:
         turn, shift = six_gaussians(seed, episode, 0, vehicle, RESET_CAMERA, o)
-    state.odometry_scale[world, vehicle] = noise.odometry_scale * scale[0]
-    state.gyro_bias[world, vehicle] = wp.cw_mul(noise.gyro_bias, bias)
+    factor = state.parameter[world, EXTRINSICS]
+    state.odometry_scale[world, vehicle] = noise.odometry_scale * state.parameter[world, ODOMETRY_SCALE] * scale[0]
+    state.gyro_bias[world, vehicle] = wp.cw_mul(noise.gyro_bias, bias) * state.parameter[world, GYRO_BIAS]
     state.slip[world, vehicle] = type(state.slip[world, vehicle])()
-    state.camera_turn[world, vehicle] = camera.orientation_std * turn
-    state.camera_shift[world, vehicle] = camera.position_std * shift
+    state.camera_turn[world, vehicle] = camera.orientation_std * factor * turn
+    state.camera_shift[world, vehicle] = camera.position_std * factor * shift
 
 
 @wp.func
@@ -54,6 +56,8 @@ def drift(model: Any, state: Any, world: int, vehicle: int, tick: int):
     one = o.dtype(1.0)
     dt = o.dtype(model.camera_period)
     scale, bias = six_gaussians(state.seed[world], state.episode[world], tick, vehicle, ODOMETRY_WALK, o)
+    scale = scale * state.parameter[world, ODOMETRY_SCALE]
+    bias = bias * state.parameter[world, GYRO_BIAS]
     step = wp.sqrt(dt)
     state.odometry_scale[world, vehicle] += noise.odometry_scale_walk * step * scale[0]
     state.gyro_bias[world, vehicle] += wp.cw_mul(noise.gyro_bias_walk, bias) * step
@@ -61,7 +65,7 @@ def drift(model: Any, state: Any, world: int, vehicle: int, tick: int):
         slip = state.slip[world, vehicle]
         words = random_words(state.seed[world], state.episode[world], tick, vehicle, SLIP)
         slips = slip[0] != o[0] or slip[1] != o[0]
-        rate = wp.where(slips, one / noise.slip_duration, noise.slip_rate)
+        rate = wp.where(slips, one / noise.slip_duration, noise.slip_rate * state.parameter[world, SLIP_RATE])
         if uniform(words[0], one) < one - wp.exp(-rate * dt):  # a Markov chain of two states
             slip = type(slip)()
             if not slips:

@@ -21,6 +21,11 @@ IDEAL = wp.constant(1)
 BLIND = wp.constant(2)
 """Values of `Model.sensing`, see the scenario's key."""
 
+PARK = wp.constant(0)
+LEAVE = wp.constant(1)
+CONTINUE = wp.constant(2)
+"""Values of `Model.drawn.after_arrival`."""
+
 
 mat66d: Any = wp.types.matrix((6, 6), wp.float64)
 
@@ -106,6 +111,30 @@ def model_struct(p: Precision) -> Any:
         wander: wp.array(dtype=scalar)  # (R,) m
         start_spread: wp.array(dtype=scalar)  # (R,) m
         height: scalar  # m, of the ground that routes lie on, map
+
+    @wp.struct
+    class Drawn:
+        """What else a world draws at a reset, G groups of landmarks with Y areas in all."""
+
+        presence: wp.array(dtype=scalar)  # (A,) chance to be there
+        any_driven: wp.int32
+        pace_spread: wp.array(dtype=scalar)  # (A,) of prescribed motions
+        speed_spread: wp.array(dtype=scalar)  # (N,) m/s, at the start
+        group: wp.array(dtype=wp.int32)  # (L,) of each landmark; -1: none
+        first_area: wp.array(dtype=wp.int32)  # (G + 1,)
+        area_share: wp.array(dtype=wp.float64)  # (Y,) of its group up to and with this one
+        area_corner: wp.array(dtype=vec3)  # (Y,) m, map, at the least height
+        area_first_edge: wp.array(dtype=vec3)  # (Y,) m
+        area_second_edge: wp.array(dtype=vec3)  # (Y,) m
+        height: wp.array(dtype=scalar)  # (G,) m, from the least to the greatest
+        low: wp.array(dtype=scalar)  # (Q,) least factor of each parameter
+        high: wp.array(dtype=scalar)  # (Q,)
+        easy: wp.array(dtype=scalar)  # (Q,) factor at difficulty 0
+        hard: wp.array(dtype=scalar)  # (Q,) and at 1
+        level: scalar  # difficulty, unless another one is set
+        after_arrival: wp.int32
+        next_first: wp.array2d(dtype=wp.int32)  # (N, R + 1) routes that may follow route r of vehicle i ...
+        next_choice: wp.array(dtype=wp.int32)  # ... are next_choice[next_first[i, r]] .. [next_first[i, r + 1] - 1]
 
     @wp.struct
     class Camera:
@@ -216,6 +245,7 @@ def model_struct(p: Precision) -> Any:
         dynamics: wp.array(dtype=Dynamics)  # (N,)
         scene: Scene
         routes: Routes
+        drawn: Drawn
         camera: wp.array(dtype=Camera)  # (N,)
         noise: wp.array(dtype=Noise)  # (N,)
         radio: Radio

@@ -12,6 +12,7 @@ from coopenv.estimation.so3 import identity3, increment
 from coopenv.world.dynamics import segment_at
 from coopenv.world.lasting_errors import drift, with_errors
 from coopenv.world.model import DRIVEN
+from coopenv.world.parameters import ODOMETRY_NOISE
 from coopenv.world.random import ODOMETRY, six_gaussians
 
 
@@ -21,8 +22,9 @@ def noisy_sample(model: Any, state: Any, world: int, vehicle: int, sample: int, 
     noise = model.noise[vehicle]
     if noise.velocity > v.dtype(0.0) or noise.angular_velocity > v.dtype(0.0):
         linear, angular = six_gaussians(state.seed[world], state.episode[world], sample, vehicle, ODOMETRY, v)
-        v = v + noise.velocity * linear
-        w = w + noise.angular_velocity * angular
+        factor = state.parameter[world, ODOMETRY_NOISE]
+        v = v + noise.velocity * factor * linear
+        w = w + noise.angular_velocity * factor * angular
     return v, w
 
 
@@ -36,9 +38,10 @@ def true_twist(model: Any, state: Any, world: int, vehicle: int, taken: int, t: 
         v = state.sampled_velocity[world, vehicle, taken]
         w = state.sampled_angular_velocity[world, vehicle, taken]
     else:
-        segment = segment_at(model, agent, t)
-        v = model.motion.linear[segment]
-        w = model.motion.angular[segment]
+        pace = state.pace[world, agent]
+        segment = segment_at(model, agent, t * wp.float64(pace))
+        v = model.motion.linear[segment] * pace
+        w = model.motion.angular[segment] * pace
     return v, w
 
 

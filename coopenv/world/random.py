@@ -25,6 +25,11 @@ BEARING = wp.constant(wp.uint32(6))
 RADIO = wp.constant(wp.uint32(7))
 ROUTE = wp.constant(wp.uint32(8))
 ROUTE_SHAPE = wp.constant(wp.uint32(9))
+NEXT_ROUTE = wp.constant(wp.uint32(10))
+LANDMARK = wp.constant(wp.uint32(11))
+PRESENCE = wp.constant(wp.uint32(12))
+PARAMETER = wp.constant(wp.uint32(13))
+INITIAL_SPEED = wp.constant(wp.uint32(14))
 RESET_ODOMETRY = wp.constant(wp.uint32(32))
 RESET_CAMERA = wp.constant(wp.uint32(34))
 ODOMETRY_WALK = wp.constant(wp.uint32(36))
@@ -60,6 +65,31 @@ def random_words(seed: wp.uint64, episode: wp.uint32, index: int, subject: int, 
 def pair(vehicle: int, other: int) -> int:
     """Return the subject of what concerns a vehicle and another agent."""
     return vehicle * 65536 + other
+
+
+CELL_SHIFT = wp.constant(wp.uint32(28))
+"""Sixteen cells per axis: the first four bits of a word number the cell that the number drawn from it falls into."""
+
+
+@wp.func
+def on_cells(words: vec4u, seed: wp.uint64, first: bool, second: bool, third: bool) -> vec4u:
+    """Return the words of a place such that the numbers of its cells along the axes that count have the right parity.
+
+    The sum is even in worlds for training and odd in those for evaluation (bit 31 of the key), so that none of the
+    latter's places is in a cell of the former's. Where several axes count, each coordinate by itself stays uniform: the
+    last one is moved to the cell beside, which is right for one half of what the others may be.
+    """
+    one = wp.uint32(1)
+    odd = wp.uint32(seed >> wp.uint64(31)) & one
+    result = words
+    last = int(-1)
+    for axis in range(3):
+        if (axis == 0 and first) or (axis == 1 and second) or (axis == 2 and third):
+            odd = odd ^ ((words[axis] >> CELL_SHIFT) & one)
+            last = axis
+    if last >= 0 and odd == one:
+        result[last] = words[last] ^ (one << CELL_SHIFT)
+    return result
 
 
 @wp.func

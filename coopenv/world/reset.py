@@ -13,10 +13,15 @@ from coopenv.world.draw_route import draw_route, go_straight, start_on_route
 from coopenv.world.dynamics import prescribe
 from coopenv.world.lasting_errors import draw_errors
 from coopenv.world.model import DRIVEN, PRESCRIBED
+from coopenv.world.parameters import INITIAL_ERROR, draw_parameters
+from coopenv.world.presence import draw_presence
 from coopenv.world.random import (
+    INITIAL_SPEED,
+    LANDMARK,
     RESET_ESTIMATE_ORIENTATION,
     RESET_ESTIMATE_POSITION,
     RESET_POSE,
+    on_cells,
     random_words,
     signed_uniform,
     uniform,
@@ -34,9 +39,12 @@ def place_agent(model: Any, state: Any, world: int, agent: int):
     """Draw the true start pose of one agent, and its route, and set its motion going; those before it are in place."""
     vehicle = agent - model.landmarks
     if vehicle < 0:
-        place_at(model, state, world, agent, model.start.position[agent], model.start.rotation[agent], 0)
+        position = model.start.position[agent]
+        if model.drawn.group[agent] >= 0:
+            position = draw_place(model, state, world, agent)
+        place_at(model, state, world, agent, position, model.start.rotation[agent], 0)
         return
-    state.ended[world, vehicle] = 0
+    state.arrivals[world, vehicle] = 0
     if not has_routes(model, vehicle):
         place_at(model, state, world, agent, model.start.position[agent], model.start.rotation[agent], 0)
         go_straight(model, state, world, vehicle)
@@ -50,12 +58,34 @@ def place_agent(model: Any, state: Any, world: int, agent: int):
 
 
 @wp.func
+def draw_place(model: Any, state: Any, world: int, landmark: int):
+    """Draw the position of a landmark of a group: uniform over the group's areas and heights."""
+    d = model.drawn
+    group = d.group[landmark]
+    seed = state.seed[world]
+    words = random_words(seed, state.episode[world], 0, landmark, LANDMARK)
+    area = d.first_area[group]
+    share = uniform(words[3], wp.float64(1.0))
+    while area < d.first_area[group + 1] - 1 and d.area_share[area] < share:
+        area += 1
+    second = d.area_second_edge[area]
+    height = d.height[group]
+    zero = height - height
+    one = zero + type(zero)(1.0)
+    words = on_cells(words, seed, True, wp.dot(second, second) > zero, height > zero)
+    along = d.area_first_edge[area] * uniform(words[0], one) + second * uniform(words[1], one)
+    return d.area_corner[area] + along + type(second)(zero, zero, height * uniform(words[2], one))
+
+
+@wp.func
 def place_at(model: Any, state: Any, world: int, agent: int, position: Any, R: Any, attempt: int):
     """Draw the true start pose of one agent about a given one and set its motion going."""
     spread = model.start.position_spread[agent]
     o = type(position)()
     one = o.dtype(1.0)
     words = random_words(state.seed[world], state.episode[world], attempt, agent, RESET_POSE)
+    if agent < model.landmarks:
+        words = on_cells(words, state.seed[world], spread[0] > o[0], spread[1] > o[0], spread[2] > o[0])
     offset = type(o)(
         spread[0] * signed_uniform(words[0], one),
         spread[1] * signed_uniform(words[1], one),
@@ -82,6 +112,10 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
     agent = model.landmarks + vehicle
     o = type(state.velocity[world, agent])()
     speed = model.start.speed[vehicle]
+    if model.drawn.speed_spread[vehicle] > o[0]:
+        words = random_words(state.seed[world], state.episode[world], 0, vehicle, INITIAL_SPEED)
+        speed = speed + model.drawn.speed_spread[vehicle] * signed_uniform(words[0], o.dtype(1.0))
+        speed = wp.clamp(speed, model.dynamics[vehicle].min_speed, model.dynamics[vehicle].max_speed)
     state.speed[world, vehicle] = speed
     state.steering[world, vehicle] = o[0]
     # The action in force before the first decision keeps the start speed, or accelerates by nothing.
@@ -164,13 +198,17 @@ def believe(model: Any, state: Any, world: int, vehicle: int):
         position = position + state.position[world, agent]
     words = random_words(seed, episode, 0, vehicle, RESET_ESTIMATE_POSITION)
     third = o.dtype(1.0) / o.dtype(3.0)
-    radius = model.start.estimate_radius[vehicle] * wp.pow(uniform(words[2], third), third)
+    factor = state.parameter[world, INITIAL_ERROR]
+    radius = model.start.estimate_radius[vehicle] * factor * wp.pow(uniform(words[2], third), third)
     position = position + unit_vector(words[0], words[1], o) * radius
     R = model.start.estimate_rotation[vehicle]
     if model.start.orientation_fixed[vehicle] == 0:
         R = state.rotation[world, agent] * R
     words = random_words(seed, episode, 0, vehicle, RESET_ESTIMATE_ORIENTATION)
-    turn = random_turn(model.start.orientation_angle[vehicle], words, o)
+    largest = model.start.orientation_angle[vehicle]
+    if largest > o[0]:
+        largest = wp.min(largest * factor, o.dtype(3.141592653589793))
+    turn = random_turn(largest, words, o)
     R = orthonormalise(R * exp_so3(turn))
     state.estimate_rotation[world, vehicle] = R
     state.estimate_position[world, vehicle] = wp.transpose(R) * position
@@ -193,6 +231,8 @@ def reset_world(model: Any, state: Any, world: int):
     """Start a new episode in one world; its seed and episode number are already set."""
     state.tick[world] = 0
     state.exhausted[world] = 0
+    draw_parameters(model, state, world)
+    draw_presence(model, state, world)
     for agent in range(model.agents):
         place_agent(model, state, world, agent)
     for vehicle in range(model.vehicles):

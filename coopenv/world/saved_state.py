@@ -69,6 +69,10 @@ ROUTE_COUNT = Rule(
     "0, or how many points a route may have",
     lambda values, fields, model: (values == 0) | ((values >= 2) & (values <= model.routes.points)),
 )
+ROUTE_DRAWN = Rule(
+    "a number of a route, or -1",
+    lambda values, fields, model: (values >= -1) & (values < max(model.routes.count.size, 1)),
+)
 DIRECTION = Rule(
     "a unit vector, or zero",
     lambda values, fields, model: are_unit_vectors(values, TOLERANCE[values.dtype]) | everywhere(values == 0.0, -1),

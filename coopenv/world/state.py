@@ -1,8 +1,7 @@
 """The changing side of a world: one record of arrays with leading axes (world, agent or vehicle).
 
 W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders), M odometry samples a tick, S slots of
-the radio's outbox, B blocks of the sliding Gramian, P points of a route, Z bodies of
-the traffic.
+the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q parameters, Z bodies of the traffic.
 """
 
 from collections.abc import Mapping
@@ -14,6 +13,7 @@ import warp as wp
 
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario.base import LARGEST
+from coopenv.scenario.randomness import MOST, PARAMETERS
 from coopenv.world.precision import Precision
 from coopenv.world.records import allocate, array, fields
 from coopenv.world.saved_state import (
@@ -25,6 +25,7 @@ from coopenv.world.saved_state import (
     ODOMETRY_SAMPLES,
     ROTATION,
     ROUTE_COUNT,
+    ROUTE_DRAWN,
     TICK,
     Rule,
     numbers,
@@ -46,10 +47,17 @@ def state_struct(p: Precision) -> Any:
         tick: array("W", wp.int32)  # camera ticks since the reset
         exhausted: array("W", wp.int32)  # 1: its source has no more ticks, the episode is over
 
+        parameter: array("WQ", scalar)  # factors, see `coopenv.world.parameters`
+        parameter_set: array("WQ", scalar)  # by whoever resets, for all episodes to come; negative: drawn
+        difficulty: array("W", scalar)  # in [0, 1], of the episodes to come
+        present: array("WA", wp.int32)  # 1: in the scene now; landmarks keep their place on the map
+        pace: array("WA", scalar)  # of prescribed motions
+
         route: array("WNP", vec3)  # x, y in m, map; arc length s from the first point, m
         route_count: array("WN", wp.int32)  # points of it; 0: no goal
         route_drawn: array("WN", wp.int32)  # number of the scenario's route that it is drawn from; -1: of none
         goal: array("WN", vec3)  # m, map
+        arrivals: array("WN", wp.int32)  # at goals, in this episode
 
         start_rotation: array("WA", mat33)
         start_position: array("WA", vec3)  # map
@@ -120,8 +128,14 @@ VALID: dict[str, Rule] = {
     "episode": ANYTHING,
     "tick": whole(0, "horizon_ticks"),
     "exhausted": FLAG,
+    "parameter": numbers(MOST**3),
+    "parameter_set": numbers(MOST),
+    "difficulty": numbers(1.0),
+    "present": FLAG,
+    "pace": numbers(2.0 * MOST**3),
     "route_count": ROUTE_COUNT,
-    "route_drawn": whole(-1, 10**6),
+    "route_drawn": ROUTE_DRAWN,
+    "arrivals": whole(0, 10**8),
     "start_rotation": ROTATION,
     "rotation": ROTATION._replace(of_truth=True),
     "position": NUMBER._replace(of_truth=True),
@@ -130,7 +144,7 @@ VALID: dict[str, Rule] = {
     **dict.fromkeys(LASTING_ERRORS, NUMBER._replace(of_truth=True)),
     "steering": numbers(1.6),
     "action": numbers(1.001),
-    "ended": whole(0, "last_outcome"),
+    "ended": whole(-1, "last_outcome"),
     "collided": FLAG,
     "traffic_rotation": ROTATION,
     "odometry_samples": ODOMETRY_SAMPLES,
@@ -156,7 +170,8 @@ VALID: dict[str, Rule] = {
 def state_sizes(model: Any, worlds: int) -> dict[str, int]:
     """Return the length of every axis of the state, and of an observer's memory, by its letter."""
     ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
-    return {"W": worlds, "A": model.agents, "N": model.vehicles, "P": model.routes.points, "Z": model.traffic, **ticks}
+    draws = {"P": model.routes.points, "Q": len(PARAMETERS), "Z": model.traffic}
+    return {"W": worlds, "A": model.agents, "N": model.vehicles, **draws, **ticks}
 
 
 def allocate_state(model: Any, worlds: int, p: Precision, device: str, shared: str = "") -> Any:

@@ -4,15 +4,16 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.world.parameters import V2X_LOSS
 from coopenv.world.random import RADIO, pair, random_words, uniform
 
 
 @wp.func
 def broadcast(model: Any, state: Any, world: int, vehicle: int, tick: int):
-    """Put this vehicle's estimate (Rhat, Rhat phat) on the air if a message is due."""
+    """Put this vehicle's estimate (Rhat, Rhat phat) on the air if a message is due and it is there."""
     slot = tick % model.radio.slots
     sent = int(-1)
-    if tick % model.radio.period == 0:
+    if tick % model.radio.period == 0 and state.present[world, model.landmarks + vehicle] != 0:
         sent = tick
         R = state.estimate_rotation[world, vehicle]
         state.outbox_rotation[world, vehicle, slot] = R
@@ -41,9 +42,10 @@ def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
                 there = state.position[world, model.landmarks + sender]
                 if wp.length(there - here) > model.radio.range:
                     heard = int(0)
-                if model.radio.loss > type(model.radio.loss)(0.0):
+                loss = model.radio.loss * state.parameter[world, V2X_LOSS]
+                if loss > type(loss)(0.0):
                     words = random_words(state.seed[world], state.episode[world], tick, pair(receiver, sender), RADIO)
-                    if uniform(words[0], model.radio.loss) < model.radio.loss:
+                    if uniform(words[0], loss) < loss:
                         heard = int(0)
                 if heard == 1:
                     state.inbox_rotation[world, receiver, sender] = state.outbox_rotation[world, sender, slot]

@@ -8,10 +8,12 @@ import warp as wp
 
 from coopenv.errors import CoopenvError, check_memory
 from coopenv.scenario import Scenario
+from coopenv.scenario.randomness import PARAMETERS
 from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
 from coopenv.world.launch import Launcher, PerWorld, default_threads
 from coopenv.world.model import mat66d
+from coopenv.world.parameters import NOT_SET
 from coopenv.world.precision import check_device, device_memory, precision
 from coopenv.world.records import allocate, parts, size_of
 from coopenv.world.saved_state import Rule, checked_state
@@ -83,6 +85,8 @@ class World:
         needed = size_of(state_struct(self.precision), sizes) + size_of(self.observer.memory, sizes)
         check_memory(needed, f"num_worlds: {worlds}", device_memory(self.device))
         self.state = allocate_state(self.model, worlds, self.precision, self.device)
+        self.state.parameter_set.fill_(NOT_SET)
+        self.state.difficulty.fill_(self.scenario.difficulty.number)
         N = self.model.vehicles
         covariance = np.zeros((N, 6, 6)) if start_covariance is None else np.ascontiguousarray(start_covariance)
         self.model.start.covariance = wp.array(covariance, dtype=mat66d, device=self.device)
@@ -101,6 +105,22 @@ class World:
     def _build_record(self) -> Any:
         """Return what the source of ticks reads."""
         return Nothing()
+
+    def set_parameters(self, values: Mapping[str, np.ndarray], worlds: np.ndarray) -> None:
+        """Set what the next resets of the worlds of a mask (W,) make of parameters, until it is set again.
+
+        Args:
+            values: (W,) by name: factors of the scenario's parameters (NaN: drawn again), and `difficulty`.
+            worlds: (W,) bool.
+        """
+        factors = self.state.parameter_set.numpy().copy()
+        for name, given in values.items():
+            if name == "difficulty":
+                self.state.difficulty.assign(np.where(worlds, given, self.state.difficulty.numpy()))
+            else:
+                column = factors[:, list(PARAMETERS).index(name)]
+                column[worlds] = np.where(np.isnan(given), NOT_SET, given)[worlds]
+        self.state.parameter_set.assign(factors)
 
     def reset(self, keys: Keys = None, mask: np.ndarray | None = None, options: Options = None) -> None:
         """Start a new episode in the worlds of `mask` (all by default).

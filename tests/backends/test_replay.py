@@ -22,11 +22,14 @@ from coopenv import CoopenvError
 from coopenv.api.engine import Engine
 from coopenv.api.parallel_env import CooperativeLocalisationEnv as Env
 from coopenv.backends.mcap import write_recording
+from coopenv.backends.mcap.reader import read_recording
 from coopenv.backends.mrclam import load_dataset
 from coopenv.backends.mrclam.recording import recording_of
 from coopenv.backends.replay import Replay
 from coopenv.observers import Recording, run
-from tests.helpers import mrclam_files
+from coopenv.runs import record
+from coopenv.scenario import Scenario
+from tests.helpers import builders, mrclam_files
 from tests.helpers.recordings import simulated
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
@@ -239,3 +242,69 @@ def test_recordings_that_no_scenario_can_say(data: Path) -> None:
     ):
         with pytest.raises(CoopenvError, match=f"drive: .*{why}"):
             replayed(recording)
+
+
+def everything_drawn() -> Scenario:
+    """Routes that go on, landmarks and vehicles that may be absent, and parameters."""
+    routes = [{"name": f"r{k}", "waypoints": [[2.0 * k, 0], [2.0 * k + 2.0, 0]], "wander": 0.1} for k in range(9)]
+    routes.append({"name": "on", "waypoints": [[18, 0], [50, 0], [50, 40], [18, 40], [18, 0.1]], "corner_radius": 5.0})
+    car = {"motion": {"kind": "driven", "initial_speed": 0.5}, "body": {"size": [0.5, 0.2, 0.2]}}
+    group = {
+        "name": "g",
+        "count": 6,
+        "boxes": [{"center": [4, 4], "half": [4, 1]}],
+        "height": [0.5, 1.0],
+        "presence": 0.7,
+    }
+    return builders.scenario(
+        [
+            {"routes": ["r0"], **car},
+            {"routes": ["r2"], "presence": 0.5, **car},
+            {"routes": ["r4"], "presence": 0.5, **car},
+        ],
+        routes=routes,
+        landmark_groups=[{**group, "presence": 0.7}],
+        termination={"after_arrival": "continue", "collision": False},
+        randomisation={"camera_range": [0.3, 1.0], "landmark_presence": [0.5, 1.0]},
+        camera={"orientation": "body", "range": 8.0},
+        topology={"mode": "sensed"},
+        observation={"include": ["estimate", "goal", "bearings", "map", "route"]},
+        horizon=5.0,
+    )
+
+
+def test_what_was_drawn_is_drawn_again_and_goes_through_a_file(tmp_path: Path) -> None:
+    made = everything_drawn()
+    recording = record(made, seed=2**31 + 3)
+    write_recording(recording, tmp_path / "drive.mcap")
+    stored = read_recording(tmp_path / "drive.mcap")
+    assert stored.drawn == recording.drawn
+    env, again = Env(made, "drive", dtype="float64"), replayed(stored)
+    env.reset(seed=2**31 + 3)
+    again.reset(seed=5)
+    names = ("goal", "route", "route_count", "route_drawn", "present", "arrivals", "parameter", "observation")
+    decisions = 0
+    while env.agents:
+        for name in names:
+            assert_allclose(env.engine.view(name), again.engine.view(name), atol=1e-9, err_msg=name)
+        for drive in (env, again):
+            drive.step({agent: np.zeros(2, np.float32) for agent in drive.agents})
+        decisions += 1
+    assert decisions == 50
+    assert env.engine.view("arrivals").max() >= 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"key": -1}, "drawn.key: -1 is not in 0"),
+        ({"episode": 2**32}, "drawn.episode"),
+        ({"parameters": (1.0,)}, "drawn.parameters: not 12 numbers"),
+        ({"parameters": (-1.0,) * 12}, "drawn.parameters: -1.0 is not in 0"),
+    ],
+)
+def test_draws_of_a_recording_are_checked(change: dict[str, Any], message: str) -> None:
+    recording = simulated()
+    assert recording.drawn is not None
+    with pytest.raises(CoopenvError, match=message):
+        Replay(replace(recording, drawn=replace(recording.drawn, **change)), "drive")

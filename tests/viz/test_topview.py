@@ -334,3 +334,24 @@ def test_drawn_routes_and_goals_are_where_the_state_says() -> None:
         assert at(picture, view, goal_x + 0.35, goal_y).min() > 245
         seen.append(picture)
     assert (seen[0] != seen[1]).any()
+
+
+def test_who_is_absent_is_not_drawn() -> None:
+    """Nor is its name; the picture of a world without absent agents has them."""
+    group = {"name": "g", "count": 2, "boxes": [{"center": [0, 5], "half": [3, 1]}], "height": [0.5, 1.0]}
+    cars = [{"initial_pose": {"position": [x, -3.0, 0.0]}, "presence": 0.5} for x in (-3.0, 3.0)]
+    made = scenario(cars, landmarks=[], landmark_groups=[{**group, "presence": 0.5}])
+    engine, view = Engine(made), TopView(made)
+    seen = set()
+    for seed in range(12):
+        engine.reset([seed])
+        picture = view.draw(engine)
+        present = engine.view("present")[0] == 1
+        for i in (2, 3):
+            x, y, _ = engine.view("start_position")[0, i]
+            assert (at(picture, view, x + 0.05, y).min() < 200) == present[i]
+        for i in (0, 1):
+            x, y, _ = engine.view("position")[0, i]
+            assert (at(picture, view, x, y)[2] < 150) == present[i]
+        seen |= {*zip(range(4), present.tolist(), strict=True)}
+    assert len(seen) == 8

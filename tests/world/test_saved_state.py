@@ -47,7 +47,7 @@ def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
         ("odometry_samples", (0, 2), -(2**31), "'odometry_samples' at .* is not as many as at this tick"),
         ("odometry_samples", (0, 2), 2**31 - 1, "'odometry_samples'"),
         ("odometry_samples", (0, 2), 0, "'odometry_samples'"),
-        ("ended", (0, 0), 2**31 - 1, "'ended' at .*: 2147483647 is not in 0 .. last_outcome"),
+        ("ended", (0, 0), 2**31 - 1, "'ended' at .*: 2147483647 is not in -1 .. last_outcome"),
         ("tick", (0,), -1, "'tick' at .* is not in 0 .. horizon_ticks"),
         ("tick", (0,), 2**31 - 1, "'tick'"),
         ("bearing_tick", (0, 0, 0), 19, "'bearing_tick' at .*: 19 is not in -1 .. tick"),

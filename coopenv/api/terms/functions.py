@@ -9,7 +9,7 @@ import warp as wp
 from coopenv.api.step_results import DEGREES
 from coopenv.api.terms.map_view import MapLandmark
 from coopenv.api.terms.records import Ego, Neighbour, Target, Truth, log10
-from coopenv.world.collision import ARRIVED, COLLIDED
+from coopenv.world.collision import COLLIDED
 
 EIGENVALUE_FLOOR = wp.constant(1.0e-9)
 
@@ -209,7 +209,7 @@ def progress(ego: Ego, truth: Truth):
 
 @wp.func
 def arrival(ego: Ego):
-    return wp.where(ego.outcome == ARRIVED, 1.0, 0.0)
+    return wp.float32(ego.arrived)
 
 
 @wp.func

@@ -17,7 +17,7 @@ from coopenv.api.step_results import assess, is_over, remember, set_flags
 from coopenv.api.terms.binding import Bound, Terms
 from coopenv.api.terms.map_view import MapLandmark, Nearest, map_record, next_nearest
 from coopenv.api.terms.records import Ego, Neighbour, Target, Truth, neighbour_record, own_records, target_record
-from coopenv.api.terms.way import way_made
+from coopenv.api.terms.way import furthest_so_far, way_made
 from coopenv.errors import CoopenvError
 from coopenv.world import kernel_cache
 from coopenv.world.collision import UNDER_WAY
@@ -96,12 +96,12 @@ def results_kernel(terms: Terms, p: Precision) -> wp.Kernel:
         assess(model, state, results, world, vehicle)
         if fresh[world] != 0:
             made, _ = way_made(model, state, world, vehicle)
-            remember(results, world, vehicle, way, made, UNDER_WAY, 0)
+            remember(state, results, world, vehicle, way, made, 0)
         ended = state.ended[world, vehicle]
         set_flags(results, world, vehicle, ended, is_over(model, state, world), model.horizon_ticks)
         ego, truth = own_records(model, state, results, world, vehicle, way)
-        furthest = results.furthest[world, vehicle] + type(way)(ego.metres_gained)
-        remember(results, world, vehicle, way, furthest, ended, state.tick[world])
+        furthest = furthest_so_far(state, results, world, vehicle) + type(way)(ego.metres_gained)
+        remember(state, results, world, vehicle, way, furthest, state.tick[world])
         total = float(0.0)
         for k in range(wp.static(len(rewards))):
             value = wp.static(rewards[k])(ego, truth)

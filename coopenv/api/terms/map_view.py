@@ -45,7 +45,8 @@ def next_nearest(model: Any, state: Any, world: int, vehicle: int, last: Nearest
         offset = marker_position(model, state, world, n) - p
         distance = wp.float32(wp.sqrt(offset[0] * offset[0] + offset[1] * offset[1]))
         behind = distance > last.distance or (distance == last.distance and n > last.index)
-        if behind and (found.index < 0 or distance < found.distance):
+        nearer = found.index < 0 or distance < found.distance
+        if state.present[world, n] != 0 and behind and nearer:  # an absent one is on no map
             found.index = n
             found.distance = distance
     return found

@@ -14,7 +14,7 @@ from coopenv.api.terms.way import metres, seen_from_estimate
 from coopenv.world.camera import VISIBLE, body_bearing
 from coopenv.world.collision import UNDER_WAY
 from coopenv.world.quality import position_covariance
-from coopenv.world.route import goal_distance
+from coopenv.world.route import goal_distance, route_length
 from coopenv.world.v2x import fresh
 
 NEVER = wp.constant(wp.float64(1.0e9))
@@ -63,6 +63,7 @@ class Ego:
     route_left: wp.float32  # m of its way to the goal
     route_ahead: wp.vec4  # rad to the left, where its way is 1, 2, 4 and 8 steps ahead
     goal: wp.vec3  # m, seen from the estimate, body; 0 without a goal
+    arrived: wp.int32  # arrivals at a goal in this step
     outcome: wp.int32  # `Outcome` in the step of arrival or collision, else UNDER_WAY
 
 
@@ -185,6 +186,8 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     ego.route_ahead = ahead
     if model.scene.goal_radius[vehicle] > p.dtype(0.0):
         ego.goal = wp.vec3(wp.transpose(R) * state.goal[world, vehicle] - p)
+    if results.alive[world, vehicle]:
+        ego.arrived = state.arrivals[world, vehicle] - results.last_arrivals[world, vehicle]
     ego.outcome = wp.where(results.alive[world, vehicle], state.ended[world, vehicle], UNDER_WAY)
 
     truth = Truth()
@@ -198,7 +201,10 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     truth.nees = known(results.nees[world, vehicle])
     truth.goal_distance = known(goal_distance(model, state, world, vehicle))
     if model.scene.goal_radius[vehicle] > p.dtype(0.0):
-        truth.progress = known(results.last_way[world, vehicle] - way)
+        progress = results.last_way[world, vehicle] - way
+        if ego.arrived > 0 and ego.outcome == UNDER_WAY:  # on a new route now, the old one is done
+            progress += route_length(state, world, vehicle)
+        truth.progress = known(progress)
     truth.contact = state.collided[world, vehicle] != 0
     return ego, truth
 

@@ -52,6 +52,18 @@ def seen_from_estimate(model: Any, state: Any, world: int, vehicle: int):
 
 
 @wp.func
+def furthest_so_far(state: Any, results: Any, world: int, vehicle: int):
+    """Return the farthest along its present way that a vehicle had believed to be, m: 0 on a route that is new."""
+    last = results.furthest[world, vehicle]
+    if (
+        state.arrivals[world, vehicle] != results.last_arrivals[world, vehicle]
+        and state.ended[world, vehicle] != ARRIVED
+    ):
+        last = last - last
+    return last
+
+
+@wp.func
 def metres(model: Any, state: Any, results: Any, world: int, vehicle: int, elapsed: wp.float64):
     """Return the metres of its way that a vehicle gains in this decision, and those that it will never drive.
 
@@ -59,7 +71,7 @@ def metres(model: Any, state: Any, results: Any, world: int, vehicle: int, elaps
     """
     way, length = way_made(model, state, world, vehicle)
     zero = way - way
-    last = results.furthest[world, vehicle]
+    last = furthest_so_far(state, results, world, vehicle)
     most = model.dynamics[vehicle].max_speed * type(way)(FASTEST * elapsed)
     gained = wp.clamp(way - last, zero, most)
     missed = zero

@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError
 from coopenv.errors import DataError
 from coopenv.jsonable import jsonable
 from coopenv.observers.contract import Gains, SensorNoise, Setup
-from coopenv.observers.recording import Recording
+from coopenv.observers.recording import Drawn, Recording
 from coopenv.scenario.base import Number, Part, Vector3
 from coopenv.scenario.files import parse_scenario
 from coopenv.scenario.own_terms import without_own_terms
@@ -65,6 +65,14 @@ class SetupHeader(Part):
     gains: GainsHeader
 
 
+class DrawnHeader(Part):
+    """A `Drawn`."""
+
+    key: int
+    episode: int
+    parameters: tuple[Number, ...]
+
+
 class Header(Part):
     """Everything of a `Recording` that does not change from tick to tick; `check_recording` knows what makes sense."""
 
@@ -79,6 +87,7 @@ class Header(Part):
     start_position: tuple[Vector3, ...]
     start_covariance: tuple[Matrix6, ...]
     scenario: dict[str, Any] | None
+    drawn: DrawnHeader | None = None
 
     @classmethod
     def read(cls, text: bytes, where: str) -> Self:
@@ -99,6 +108,7 @@ class Header(Part):
             "start_rotation": np.array(self.start_rotation),
             "start_position": np.array(self.start_position),
             "start_covariance": np.array(self.start_covariance),
+            "drawn": None if self.drawn is None else Drawn(**dict(self.drawn)),
             "scenario": None if self.scenario is None else parse_scenario(without_own_terms(self.scenario), where),
         }
 

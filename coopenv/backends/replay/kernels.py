@@ -8,10 +8,14 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers.recording import Recording, Truth
+from coopenv.scenario.randomness import PARAMETERS
 from coopenv.world.camera import NOT_A_NEIGHBOUR, OUT_OF_VIEW, VISIBLE, camera_to_body
-from coopenv.world.collision import referee, touches_anything
+from coopenv.world.collision import depart, referee, touches_anything
 from coopenv.world.embedded import Source
+from coopenv.world.parameters import COUNT as PARAMETER_COUNT
+from coopenv.world.parameters import draw_parameters
 from coopenv.world.precision import Precision
+from coopenv.world.presence import draw_presence
 from coopenv.world.records import array, fields
 from coopenv.world.reset import believe, place_agent, place_vehicle
 from coopenv.world.v2x import broadcast, deliver
@@ -94,6 +98,7 @@ def redeliver(model: Any, state: Any, record: Any, world: int, receiver: int, ti
 @wp.func
 def resense(model: Any, state: Any, record: Any, world: int, tick: int):
     """Recall a tick and judge contacts and arrivals by its truth, where that is known."""
+    depart(model, state, world)
     recall(model, state, record, world, tick)
     for vehicle in range(model.vehicles):
         referee(model, state, world, vehicle)
@@ -104,6 +109,13 @@ def rewind(model: Any, state: Any, record: Any, world: int):
     """Go to the start in one world: initial estimates are those of the record, or drawn as the scenario says."""
     state.tick[world] = 0
     state.exhausted[world] = 0
+    if record.drawn != 0:
+        state.seed[world] = record.key
+        state.episode[world] = record.episode
+        for k in range(PARAMETER_COUNT):
+            state.parameter_set[world, k] = record.parameter[k]
+    draw_parameters(model, state, world)
+    draw_presence(model, state, world)
     for agent in range(model.agents):
         place_agent(model, state, world, agent)
     for vehicle in range(model.vehicles):
@@ -133,9 +145,13 @@ def record_struct(p: Precision) -> Any:
 
     @wp.struct
     class Record:
-        """K ticks, N vehicles, T targets, L landmarks; lengths in m."""
+        """K ticks, N vehicles, T targets, L landmarks, Q parameters; lengths in m."""
 
         last: wp.int32  # K - 1
+        drawn: wp.int32  # 1: what follows says what was drawn
+        key: wp.uint64
+        episode: wp.uint32
+        parameter: array("Q", p.scalar)
         rotation: array("KN", mat33)  # odometry increments
         translation: array("KN", vec3)
         velocity: array("KN", vec3)  # m/s, last odometry sample
@@ -170,6 +186,10 @@ def upload(recording: Recording, odometry_rate: float, p: Precision, device: str
     }
     record = record_struct(p)()
     record.last = recording.ticks - 1
+    values["parameter"] = np.ones(len(PARAMETERS))
+    if recording.drawn is not None:
+        record.drawn, record.key, record.episode = 1, recording.drawn.key, recording.drawn.episode
+        values["parameter"] = np.array(recording.drawn.parameters)
     for name, field in fields(record_struct(p)).items():
         data = values[name] if name in values else getattr(recording, name)
         kind = {wp.int32: np.int32, wp.uint8: np.uint8}.get(field.dtype, p.numpy)
