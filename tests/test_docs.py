@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 from coopenv.api.reward import FIELDS, OTHERS
+from coopenv.api.terms.layout import observation_layout
 from coopenv.observers import registry, run
 from coopenv.observers.registry import find
+from coopenv.policies import load_agent
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
@@ -77,3 +79,14 @@ def test_the_programs_on_terms_run(tmp_path: Path, capsys: pytest.CaptureFixture
     assert float(capsys.readouterr().out) < 0.0
     program["envs"].reset(seed=0)
     assert np.isfinite(program["envs"].step(np.zeros(program["envs"].action_space.shape))[1]).all()
+
+
+def test_the_programs_on_agents_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, own = python_blocks(DOCS / "agents.md")
+    exec(compile(first, "agents.md", "exec"), {})
+    assert "arrival_rate: 1 [" in capsys.readouterr().out
+    (tmp_path / "mine.py").write_text(own, encoding="utf-8")
+    scenario = load_scenario("urban_crossing")
+    policy = load_agent(f"{tmp_path / 'mine.py'}:Mine", scenario)
+    rows = np.zeros((3, observation_layout(scenario).size), dtype=np.float32)
+    np.testing.assert_array_equal(policy(rows), [[0.0, 0.0]] * 3)

@@ -11,7 +11,9 @@ from coopenv.scenario import Scenario
 
 OFFSETS = (0.0, 0.4, -0.4, 0.8, -0.8)  # rad, of the heading from that of the way
 STEP, FIRST, STEPS = 0.4, 2, 7  # s; steps with the first of two offsets; steps in all
-HOLD = 3  # decisions that a plan is kept
+HOLD = 2  # decisions that a plan is kept
+ENOUGH = 3  # targets in view; fewer bearings do not determine a pose
+OUTSIDE, BACK = 5.0, 1.0  # s/s for each metre too far out; s for each metre from the way at the end of a plan
 FAR = 3.0  # m, how much farther one would drive blind after a plan
 
 
@@ -30,11 +32,9 @@ class LookAhead(RouteFollower):
         *,
         price: float = 4.0,
         tolerated: float = 0.03,
-        bearing_std: float = 0.02,
+        bearing_std: float = 0.01,
         drift: float = 0.05,
-        farthest: float = 0.3,
-        outside: float = 5.0,
-        back: float = 1.0,
+        farthest: float = 0.5,
     ) -> None:
         """Choose what matters.
 
@@ -45,12 +45,9 @@ class LookAhead(RouteFollower):
             bearing_std: of what one step tells of a landmark in view, rad.
             drift: growth of the standard deviation by odometry, m per root metre.
             farthest: offset from the way that costs nothing, m.
-            outside: seconds that a second a metre farther out costs.
-            back: seconds that an offset of a metre at the end of a plan costs.
         """
         super().__init__(scenario)
         self.view = FieldOfView(scenario.camera)
-        self.outside, self.back = outside, back
         self.price, self.tolerated, self.farthest = price, tolerated, farthest
         self.information, self.drift = bearing_std**-2, drift**2
         plans = product(OFFSETS, repeat=2)
@@ -102,13 +99,14 @@ class LookAhead(RouteFollower):
             along = along + stride * np.cos(heading - bend)
             aside = aside + stride * np.sin(heading - bend)
             line = landmarks - np.stack([x, y], axis=-1)[:, :, None]
-            seen = self.view.sees(line, heading[..., None])
+            seen = self.view.sees(line, heading[..., None]) & (known > 0.0)
+            seen &= seen.sum(axis=-1, keepdims=True) >= ENOUGH
             belief = belief.driven(dx, dy, self.drift * stride, 1e-5).measured(line, known * seen)
             cost += STEP * self.price * np.maximum(belief.std - self.tolerated, 0.0)
-            cost += STEP * self.outside * np.maximum(np.abs(aside) - self.farthest, 0.0)
+            cost += STEP * OUTSIDE * np.maximum(np.abs(aside) - self.farthest, 0.0)
         later = belief.driven(FAR * np.cos(heading), FAR * np.sin(heading), 0.0, 0.0)
         cost += self.price * FAR / self.cruise * np.maximum(later.std - self.tolerated, 0.0)
-        return np.asarray(cost - along / self.cruise + self.back * np.abs(aside))
+        return np.asarray(cost - along / self.cruise + BACK * np.abs(aside))
 
     def _way(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the directions of the pieces of the way, (rows, P), rad, own frame, and where they begin, (P,), m."""

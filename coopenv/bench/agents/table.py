@@ -56,13 +56,13 @@ def shown(mean: float, low: float, high: float) -> tuple[str, str, str]:
 
 def _cell(result: Result, factor: float) -> str:
     mean, low, high = shown(factor * result.mean, factor * result.ci_low, factor * result.ci_high)
-    return f"{mean}\n{low}..{high}"
+    return mean if low == NONE else f"{mean}\n{low}..{high}"
 
 
 def _change(difference: Difference) -> str:
     percent = [100 * v for v in (difference.relative, difference.relative_ci_low, difference.relative_ci_high)]
-    mean, low, high = ("+" + text if text[0] not in "-" else text for text in shown(*percent))
-    return f"{mean}\n{low}..{high}"
+    mean, low, high = (text if text.startswith("-") else f"+{text}" for text in shown(*percent))
+    return f"{mean}\n{low}..{high}" if np.isfinite(percent[1]) else mean
 
 
 def explanations(evaluation: Evaluation) -> Mapping[str, str]:
