@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.estimation.outcomes import Outcome
 from coopenv.policies import Policy, decide, restart
 from coopenv.scenario import Scenario
 from coopenv.seeds import evaluation_seed, world_keys
@@ -37,8 +36,10 @@ class Episodes:
     """(K, W, N), true, rad from the map's x axis."""
     route: np.ndarray
     """(W, N, P, 2), m, map, at the start; its last point is repeated, NaN for vehicles without a goal."""
+    arrivals: np.ndarray
+    """(K, W, N), how often the vehicle had arrived by the end of the decision."""
     outcome: np.ndarray
-    """(W, N), an `Outcome`, or a condition of the scenario's own."""
+    """(W, N), an `Outcome`, or a condition of the scenario's own; negative: the vehicle was not there."""
 
     @property
     def worlds(self) -> int:
@@ -52,8 +53,14 @@ class Episodes:
 
     @property
     def travel_time(self) -> np.ndarray:
-        """(W, N) s from the start to the end of the decision in which a vehicle arrived; NaN for those that did not."""
-        return np.where(self.outcome == Outcome.ARRIVED, self.under_way.sum(axis=0) * self.period, np.nan)
+        """(W, N) s from the start to the end of the decision in which a vehicle first arrived; NaN: never."""
+        first = np.argmax(self.arrivals > 0, axis=0) + 1
+        return np.where(self.arrivals[-1] > 0, first * self.period, np.nan)
+
+    @property
+    def present(self) -> np.ndarray:
+        """(W, N) bool: the vehicle was there."""
+        return np.asarray(self.outcome >= 0)
 
     @property
     def looking(self) -> np.ndarray:
@@ -143,7 +150,7 @@ def drive(
 
 
 ERRORS = ("position_error", "orientation_error")
-KEPT = ("alive", *ERRORS, "targets_in_view", "reward")
+KEPT = ("alive", *ERRORS, "targets_in_view", "reward", "arrivals")
 
 
 def _routes(points: np.ndarray, count: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from coopenv.estimation.outcomes import Outcome
 from coopenv.evaluation.bootstrap import Quantile, Ratio, Statistic, interval, resamples
 from coopenv.evaluation.episodes import Episodes
 
+COLLIDED = Outcome.COLLIDED
 SETTLED_FROM = 3.0
 """s from which on errors count: before it they are those of the initial estimate."""
 FEW_TARGETS = 3
@@ -32,8 +33,9 @@ def _per_vehicle(values: np.ndarray) -> Ratio:
     return Ratio(np.where(known, values, 0.0).sum(axis=1), known.sum(axis=1))
 
 
-def _ended(episodes: Episodes, outcome: Outcome) -> Ratio:
-    return _per_vehicle((episodes.outcome == outcome).astype(float))
+def _share(episodes: Episodes, holds: np.ndarray) -> Ratio:
+    """Return the mean of something (W, N) over the vehicles that are there."""
+    return _per_vehicle(np.where(episodes.present, holds, np.nan))
 
 
 def _counted(episodes: Episodes, start: float) -> np.ndarray:
@@ -78,15 +80,15 @@ def _errors(quantity: str, unit: str, name: str, prefix: str = "") -> dict[str, 
 
 
 METRICS: dict[str, Metric] = {
-    "arrival_rate": Metric("Share of vehicles that arrive", "1", lambda e: _ended(e, Outcome.ARRIVED), True),
-    "collision_rate": Metric("Share of vehicles that collide", "1", lambda e: _ended(e, Outcome.COLLIDED), True),
-    "travel_time_s": Metric("Time from start to arrival, over arrivals", "s", lambda e: _per_vehicle(e.travel_time)),
+    "arrival_rate": Metric("Share of vehicles that arrive", "1", lambda e: _share(e, e.arrivals[-1] > 0), True),
+    "collision_rate": Metric("Share of vehicles that collide", "1", lambda e: _share(e, e.outcome == COLLIDED), True),
+    "travel_time_s": Metric("Time to the first arrival, over arrivals", "s", lambda e: _per_vehicle(e.travel_time)),
     **_errors("position", "m", "position_error"),
     **_errors("orientation", "deg", "orientation_error", "orientation_"),
     "few_targets_share": Metric(
         f"Share of time from {SETTLED_FROM:g} s on with fewer than {FEW_TARGETS} targets in view", "1", _few_targets
     ),
-    "return": Metric("Sum of the rewards of a vehicle", "1", lambda e: _per_vehicle(e.reward.sum(axis=0, dtype=float))),
+    "return": Metric("Sum of the rewards of a vehicle", "1", lambda e: _share(e, e.reward.sum(axis=0, dtype=float))),
 }
 """Over vehicle-steps of vehicles under way, or over vehicles; all vehicles of all worlds together."""
 

@@ -56,7 +56,7 @@ def test_figures_by_hand(episodes: Episodes) -> None:
 
 
 def test_a_share_that_is_the_same_everywhere_has_an_interval_all_the_same(episodes: Episodes) -> None:
-    never = replace(episodes, outcome=np.zeros_like(episodes.outcome))
+    never = replace(episodes, arrivals=np.zeros_like(episodes.arrivals))
     arrived = next(result for result in score(never) if result.metric == "arrival_rate")
     assert (arrived.mean, arrived.ci_low) == (0.0, 0.0) and 0.2 < arrived.ci_high < 0.5  # Wilson, 0 of 6
     time = next(result for result in score(never) if result.metric == "travel_time_s")
@@ -74,10 +74,10 @@ def test_paired_differences(episodes: Episodes) -> None:
 
 
 def test_travel_times_are_compared_over_those_who_arrive_with_both(episodes: Episodes) -> None:
-    lost = episodes.outcome.copy()
-    slowest = np.unravel_index(np.nanargmax(episodes.travel_time), lost.shape)
-    lost[slowest] = Outcome.COLLIDED
-    fewer = replace(episodes, outcome=lost)
+    lost = episodes.arrivals.copy()
+    slowest = np.unravel_index(np.nanargmax(episodes.travel_time), lost[0].shape)
+    lost[:, *slowest] = 0
+    fewer = replace(episodes, arrivals=lost)
     difference = next(d for d in compare_paired(fewer, episodes) if d.metric == "travel_time_s")
     assert difference.difference == 0.0
     assert np.nanmean(fewer.travel_time) < np.nanmean(episodes.travel_time)
@@ -98,3 +98,31 @@ def _still(observations: np.ndarray) -> np.ndarray:
 def test_held_out_seeds_are_shared_by_no_two_blocks() -> None:
     seeds = [seed for block in range(3) for seed in held_out_seeds(block, 5)]
     assert len(set(seeds)) == 15 and min(seeds) >= 2**31
+
+
+def test_vehicles_that_are_not_there_do_not_count(episodes: Episodes) -> None:
+    outcome, reward = episodes.outcome.copy(), episodes.reward.copy()
+    outcome[0, :2], reward[:, 0, :2] = -1, 1e6
+    found = {result.metric: result.mean for result in score(replace(episodes, outcome=outcome, reward=reward))}
+    there = np.ones((6, 4), dtype=bool)
+    there[0, :2] = False
+    assert found["return"] == pytest.approx(episodes.reward.sum(axis=0)[there].mean(), rel=1e-4)
+    assert found["collision_rate"] == 0.0
+
+
+def test_vehicles_that_go_on_have_arrived_once_they_have() -> None:
+    scenario = coopenv.load_scenario("urban_crossing", {"horizon": 16.0})
+    again = replace(drive(Engine(scenario, 2), load_agent("route_follower", scenario), held_out_seeds(0, 2)))
+    time = again.travel_time.copy()
+    on = again.arrivals.copy()
+    on[-1] += 1  # a second arrival does not change when the first was
+    np.testing.assert_array_equal(replace(again, arrivals=on).travel_time[on[-2] > 0], time[on[-2] > 0])
+
+
+def test_looking_is_told_from_the_nearest_piece_of_the_route() -> None:
+    route = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [4.0, 4.0]])[None, None]
+    position = np.array([[0.0, 0.0], [1.0, 0.3], [4.2, 2.0], [3.9, 6.0]])[:, None, None]
+    heading = np.array([0.3, np.pi / 2 - 0.4, -np.pi])[:, None, None]
+    none = np.zeros((3, 1, 1))
+    found = Episodes(("a",), 0.1, *(none,) * 5, position, heading, route, none, none[0])
+    np.testing.assert_allclose(found.looking[:, 0, 0], [0.3, -0.4, np.pi / 2], atol=1e-12)
