@@ -12,8 +12,8 @@ from coopenv.world.state import LASTING_ERRORS
 
 
 def outcome_words(scenario: Scenario) -> tuple[str, ...]:
-    """Return the words of `info["outcome"]` by the values of the field `ended`."""
-    return (*(outcome.words for outcome in Outcome), *scenario.termination.own)
+    """Return the words of `info["outcome"]` by the values of the field `ended`; that of -1 stands last."""
+    return (*(outcome.words for outcome in Outcome), *scenario.termination.own, "absent")
 
 
 class InfoWriter:

@@ -12,6 +12,8 @@ import coopenv.api.single_vehicle
 from coopenv import CoopenvError
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.vector_env import CooperativeVectorEnv
+from coopenv.runs import Rollout
+from coopenv.runs.metrics import outcome_line
 from coopenv.scenario import Scenario
 from coopenv.scenario.randomness import PARAMETERS
 from tests.helpers.builders import landmark, scenario, vehicle
@@ -176,3 +178,11 @@ def test_drawn_landmarks_stand_in_the_truth_of_the_state() -> None:
     second = env.engine.view("position")[0, :4]
     np.testing.assert_array_equal(first[0], second[0])
     assert (np.abs(first[1:] - second[1:]).max(axis=1) > 1e-3).all()
+
+
+def test_a_run_says_who_was_absent() -> None:
+    run = Rollout(sometimes(), seed=1)
+    assert len(list(run.play())) == 61
+    words = [ending.outcome for ending in run.endings()]
+    assert words.count("absent") == 2
+    assert "2 absent" in outcome_line(run)

@@ -66,8 +66,11 @@ class CooperativeSB3VecEnv(VecEnv):
         return self.envs.observation_layout
 
     def reset(self) -> Any:
-        """Start a new episode in every world; seeds given by `seed()` count once."""
-        observation, self.batch_infos = self.envs.reset(seed=self._seeds[0])
+        """Start a new episode in every world; what `seed()` and `set_options()` have given counts once.
+
+        Options are those of `CooperativeVectorEnv.reset`; its settings hold until they are given again.
+        """
+        observation, self.batch_infos = self.envs.reset(seed=self._seeds[0], options=self._options[0] or None)
         self._sums.forget(np.ones(self.num_envs, dtype=bool))
         self._reset_seeds()
         self._reset_options()

@@ -13,6 +13,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import coopenv
+from coopenv import CoopenvError
 from coopenv.api.trainers.sb3 import make_sb3_vec_env
 from coopenv.scenario.terms import REWARD_TERMS
 
@@ -78,6 +79,18 @@ def test_seeding() -> None:
     assert not np.array_equal(first, second)
     single, _ = coopenv.parallel_env("urban_crossing").reset(seed=7, options={"world": 1})
     assert np.array_equal(first[4:8], np.stack(list(single.values())))  # world 1 of the batch
+
+
+def test_options_of_a_reset_count_once_and_its_settings_hold() -> None:
+    env = make_sb3_vec_env("urban_crossing", num_worlds=2)
+    env.set_options({"difficulty": "hard", "parameters": {"camera_range": np.array([0.5, 0.75])}})
+    for _ in range(2):
+        env.reset()
+        np.testing.assert_allclose(env.envs.engine.view("parameter")[:, 0], [0.5, 0.75])
+        np.testing.assert_allclose(env.envs.engine.view("difficulty"), 1.0)
+    env.set_options({"dificulty": 1})
+    with pytest.raises(CoopenvError, match=r"unknown option 'dificulty' \(did you mean 'difficulty'"):
+        env.reset()
 
 
 def test_methods_reach_the_batch() -> None:
