@@ -6,13 +6,15 @@ from typing import Any
 import warp as wp
 
 from coopenv.world.camera import observe
-from coopenv.world.collision import ARRIVED, COLLIDED, UNDER_WAY, referee, touches_anything
+from coopenv.world.collision import ARRIVED, COLLIDED, UNDER_WAY, depart, referee, touches_anything
 from coopenv.world.dynamics import prescribe
 from coopenv.world.embedded import Source, deliver_simulation
 from coopenv.world.lasting_errors import draw_errors
 from coopenv.world.model import PRESCRIBED
 from coopenv.world.odometry import measure_odometry
+from coopenv.world.parameters import draw_parameters
 from coopenv.world.precision import Precision
+from coopenv.world.presence import draw_presence
 from coopenv.world.records import array
 from coopenv.world.reset import believe, place_agent, place_vehicle, sense_first
 
@@ -52,6 +54,8 @@ def take_poses(model: Any, state: Any, moved: Any, world: int):
         state.angular_velocity[world, agent] = moved.angular_velocity[world, vehicle]
         state.speed[world, vehicle] = moved.speed[world, vehicle]
         state.steering[world, vehicle] = moved.steering[world, vehicle]
+        if moved.left[world, vehicle] != 0:
+            state.present[world, agent] = 0
         for sample in range(model.samples_per_tick):
             state.sampled_velocity[world, vehicle, sample] = moved.velocity[world, vehicle]
             state.sampled_angular_velocity[world, vehicle, sample] = moved.angular_velocity[world, vehicle]
@@ -94,6 +98,8 @@ def begin_moved(model: Any, state: Any, moved: Any, world: int):
     """Begin an episode where the vehicles stand; initial estimates are drawn as in the simulation."""
     state.tick[world] = 0
     state.exhausted[world] = 0
+    draw_parameters(model, state, world)
+    draw_presence(model, state, world)
     for agent in range(model.agents):
         place_agent(model, state, world, agent)
     for vehicle in range(model.vehicles):
@@ -112,6 +118,7 @@ def begin_moved(model: Any, state: Any, moved: Any, world: int):
 @wp.func
 def sense_moved(model: Any, state: Any, moved: Any, world: int, tick: int):
     """Take the poses of a tick and measure there."""
+    depart(model, state, world)
     for landmark in range(model.landmarks):
         if model.motion.kind[landmark] == PRESCRIBED:
             prescribe(model, state, world, landmark, wp.float64(tick) * model.camera_period)

@@ -79,7 +79,7 @@ def test_commands_are_speeds_and_steering_to_the_left() -> None:
     assert infos["vehicle_1"]["truth"]["position"][1] < -40.0
     for _ in range(12):
         env.step({agent: np.array([-0.5, 0.0]) for agent in env.agents})
-    assert env.engine.view("speed")[0, 0] == pytest.approx(4.0, abs=1e-6)
+    assert env.engine.view("speed")[0, 0] == pytest.approx(3.0, abs=1e-6)
     *_, infos = env.step({agent: np.array([-0.5, 1.0]) for agent in env.agents})
     assert infos["vehicle_1"]["truth"]["angular_velocity"][2] > 0.2
     assert env.engine.view("steering")[0, 0] == pytest.approx(0.5)
@@ -302,3 +302,27 @@ def test_its_roads_are_drawn() -> None:
     assert picture is not None
     asphalt = (picture == np.array([0xE2, 0xE2, 0xE2])).all(axis=-1)
     assert asphalt.mean() > 0.01
+
+
+@pytest.mark.parametrize(("name", "speed", "seed"), [(CROSSING, 10.0, 4), (ROUNDABOUT, 6.0, 1)])
+def test_its_way_can_be_driven_by_what_is_observed(name: str, speed: float, seed: int) -> None:
+    env = coopenv.parallel_env(name, observation="dict", overrides={"horizon": 20.0, "termination.collision": False})
+    ahead = 2.0 * env.scenario.observation.route_step
+    top, widest = env.scenario.dynamics.max_speed, env.scenario.action.steering
+    assert widest is not None
+    observations, infos = env.reset(seed=seed)
+    offset = []
+    while "vehicle_1" in env.agents:
+        seen = observations["vehicle_1"]
+        beta = np.arcsin(np.clip(2.5 * 2.0 * np.sin(seen["route_ahead"][..., 1].item()) / ahead, -0.9, 0.9))
+        actions = {agent: np.array([-1.0, 0.0]) for agent in env.agents}
+        actions["vehicle_1"] = np.array([2.0 * speed / top - 1.0, np.arctan(2.0 * np.tan(beta)) / widest])
+        observations, *_, infos = env.step(actions)
+        offset.append(abs(float(observations["vehicle_1"]["route_offset"].item())))
+    assert infos["vehicle_1"]["outcome"] == "arrived"
+    assert max(offset[5:]) < 1.0
+    engine, agent = env.engine, env.engine.world.model.landmarks
+    driven = engine.world._simulations[0].environment.vehicle
+    engine.step(ticks=2)
+    assert engine.view("present")[0, agent] == 0  # who has arrived leaves
+    assert not any(car is driven for car in road_of(engine).vehicles)

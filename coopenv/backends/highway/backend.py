@@ -33,8 +33,9 @@ class HighwayWorld(MovedWorld):
     def fetch(self) -> bool:
         """Drive to the next tick in the worlds that are not over."""
         commands, k = self.view("command"), self.view("tick")
+        present = self.view("present")[:, self.model.landmarks :]
         for w in np.flatnonzero((self.mask.numpy() == 0) & (k < self.model.horizon_ticks)).tolist():
-            self.move(w, self._simulations[w].drive(np.array(commands[w], dtype=float)))
+            self.move(w, self._simulations[w].drive(np.array(commands[w], dtype=float), present[w]))
         return True
 
     def source_state(self) -> dict[str, Any]:

@@ -59,8 +59,14 @@ class Simulation:
         self._cars = [next(own if is_driven else others) for is_driven in self._driven]
         return self.poses()
 
-    def drive(self, commands: Array) -> Poses:
-        """Drive for one camera tick under commands (N, 3), see `coopenv.world.command`; traffic drives itself."""
+    def drive(self, commands: Array, present: Array) -> Poses:
+        """Drive for one camera tick under commands (N, 3), see `coopenv.world.command`; traffic drives itself.
+
+        Those that are not present (N,) are taken off the road.
+        """
+        gone = {id(car) for car, there in zip(self._cars, present, strict=True) if not there}
+        road = self.environment.road
+        road.vehicles = [car for car in road.vehicles if id(car) not in gone]
         (acceleration, steering), rate = most_of_actions(self._scenario), self._scenario.rates.camera
         actions = []
         for car, command in zip(self._cars, commands, strict=True):
