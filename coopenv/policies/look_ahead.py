@@ -9,8 +9,8 @@ from coopenv.policies.route_follower import RouteFollower
 from coopenv.policies.view import FieldOfView
 from coopenv.scenario import Scenario
 
-OFFSETS = (0.0, 0.4, -0.4, 0.8, -0.8)  # rad, of the heading from that of the way
-STEP, FIRST, STEPS = 0.4, 2, 7  # s; steps with the first of two offsets; steps in all
+OFFSETS = (0.0, 0.2, -0.2, 0.4, -0.4, 0.6, -0.6, 0.8, -0.8)  # rad, of the heading from that of the way
+STEP, FIRST, STEPS = 0.4, 3, 7  # s; steps with the first of two offsets; steps in all
 HOLD = 2  # decisions that a plan is kept
 ENOUGH = 3  # targets in view; fewer bearings do not determine a pose
 OUTSIDE, BACK = 5.0, 1.0  # s/s for each metre too far out; s for each metre from the way at the end of a plan
@@ -34,7 +34,7 @@ class LookAhead(RouteFollower):
         tolerated: float = 0.03,
         bearing_std: float = 0.01,
         drift: float = 0.05,
-        farthest: float = 0.5,
+        farthest: float = 0.6,
     ) -> None:
         """Choose what matters.
 
