@@ -19,6 +19,9 @@ SECTIONS = ("camera", "rates", "noise", "topology", "v2x", "observer", "observat
 DRIVEN_SECTIONS = ("dynamics", "action")
 """Sections that matter only where actions drive a vehicle."""
 
+DRAWN_SECTIONS = ("randomisation", "difficulty")
+"""Sections that are shown only where they say something."""
+
 VALUE_WIDTH = 17
 
 IMAGE_FIELDS = ("image_size", "focal_length", "principal_point", "distortion", "undistort", "quantise")
@@ -33,12 +36,13 @@ def describe_scenario(scenario: Scenario) -> Iterator[RenderableType]:
             yield f"{' '.join(text.split())}\n"
     steps = round(scenario.horizon * scenario.rates.decision)
     yield f"Horizon: {scenario.horizon:g} s, {steps} decisions of {scenario.ticks_per_decision} camera ticks each.\n"
-    for table in (vehicle_table, landmark_table, motion_table, obstacle_table):
+    for table in (vehicle_table, route_table, landmark_table, group_table, motion_table, obstacle_table):
         if (shown := table(scenario)).row_count:
             yield shown
             yield ""
     yield Text("Settings (* differs from the default)\n", "bold")
     names = [*SECTIONS, *(DRIVEN_SECTIONS if scenario.driven else ())]
+    names += [name for name in DRAWN_SECTIONS if getattr(scenario, name) != type(getattr(scenario, name))()]
     width = max(len(key) for name in names for key, *_ in settings(getattr(scenario, name))) + 2
     for name in names:
         yield section_table(name, getattr(scenario, name), width)
@@ -57,12 +61,30 @@ def vehicle_table(scenario: Scenario) -> Table:
     return table
 
 
+def route_table(scenario: Scenario) -> Table:
+    """Return one row per route."""
+    table = _table("route", "waypoints", "corners", "drawn", title="Routes (m)")
+    for route in scenario.routes:
+        points = ", ".join(words.vector(point) for point in route.waypoints)
+        table.add_row(route.name, points, f"radius {number(route.corner_radius)}", words.drawn_route(route))
+    return table
+
+
+def group_table(scenario: Scenario) -> Table:
+    """Return one row per group of landmarks."""
+    table = _table("group", "landmarks", "drawn in", "height", title="Groups of landmarks (m)")
+    for group in scenario.landmark_groups:
+        height = " to ".join(number(z) for z in group.height)
+        table.add_row(group.name, str(group.count), words.areas(group), height)
+    return table
+
+
 def landmark_table(scenario: Scenario) -> Table:
     """Return one row per landmark."""
     table = _table("landmark", "position", "motion", "body", title="Landmarks (m)")
     for mark in scenario.landmarks:
         motion, body = words.motion(mark.motion), words.body(mark.body) or "none"
-        table.add_row(mark.name, words.vector(mark.position), motion, body)
+        table.add_row(mark.name, words.place(mark), motion, body)
     return table
 
 

@@ -14,11 +14,14 @@ from coopenv.scenario.bodies import (
     DrivenMotion,
     InitialEstimate,
     InitialPose,
+    Landmark,
     SegmentMotion,
     TrafficMotion,
     Vehicle,
     WaypointMotion,
 )
+from coopenv.scenario.landmarks import LandmarkGroup
+from coopenv.scenario.routes import Route
 from coopenv.scenario.schema import Scenario
 from coopenv.scenario.topology import neighbour_sets
 
@@ -81,6 +84,30 @@ def start(vehicle: Vehicle) -> str:
     if pose.yaw_spread:
         lines.append(f"+- {number(math.degrees(pose.yaw_spread))} deg")
     return "\n".join(lines)
+
+
+def place(landmark: Landmark) -> str:
+    """Return where a landmark stands, one line per fact."""
+    lines = [f"drawn by group {landmark.group}" if landmark.group else vector(landmark.position)]
+    if any(landmark.position_spread):
+        lines.append(f"+- {vector(landmark.position_spread)}")
+    if landmark.presence < 1.0:
+        lines.append(f"there with {number(100.0 * landmark.presence)} %")
+    return "\n".join(lines)
+
+
+def drawn_route(route: Route) -> str:
+    """Return how a route is drawn, one line per fact; empty where it is always the same."""
+    lines = [f"shifted by +- {number(route.lateral_spread)}"] if route.lateral_spread else []
+    lines += [f"wanders by {number(route.wander)}"] if route.wander else []
+    lines += [f"begun along the first {number(route.start_spread)}"] if route.start_spread else []
+    return "\n".join(lines)
+
+
+def areas(group: LandmarkGroup) -> str:
+    """Return where a group draws its landmarks, one line per area."""
+    boxes = [f"{vector(box.center)} +- {vector(box.half)}" for box in group.boxes]
+    return "\n".join([*boxes, *(f"{vector(line.start)} to {vector(line.end)}" for line in group.lines)])
 
 
 def estimate(belief: InitialEstimate) -> str:

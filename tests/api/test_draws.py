@@ -16,7 +16,7 @@ from coopenv.runs import Rollout
 from coopenv.runs.metrics import outcome_line
 from coopenv.scenario import Scenario
 from coopenv.scenario.randomness import PARAMETERS
-from tests.helpers.builders import landmark, scenario, vehicle
+from tests.helpers.builders import constant, landmark, scenario, vehicle
 
 HALF = {"vehicles.*.presence": 0.5}
 DRIVEN = {"kind": "driven", "initial_speed": 0.5}
@@ -186,3 +186,19 @@ def test_a_run_says_who_was_absent() -> None:
     words = [ending.outcome for ending in run.endings()]
     assert words.count("absent") == 2
     assert "2 absent" in outcome_line(run)
+
+
+@pytest.mark.parametrize("observer", ["riccati", "robust", "mekf"])
+def test_observers_know_where_landmarks_have_been_drawn(observer: str) -> None:
+    """Embedded and on the host: without noise the estimate goes to the truth, whatever the map."""
+    group = {"name": "g", "count": 6, "boxes": [{"center": [0, 0], "half": [6, 6]}], "height": [0.5, 3.0]}
+    belief = {"position_radius": 0.5, "orientation_angle": 0.2}
+    car = {**vehicle((0, 0, 0.5), motion=constant([1.0, 0, 0], [0, 0, 0.3])), "initial_estimate": belief}
+    made = scenario([car], landmarks=[], landmark_groups=[group], observer={"name": observer}, horizon=6.0)
+    env = CooperativeLocalisationEnv(made, "test", dtype="float64")
+    for seed in (0, 1):
+        _, infos = env.reset(seed=seed)
+        assert infos["vehicle_1"]["position_error"] > 0.1
+        while env.agents:
+            *_, infos = env.step({"vehicle_1": np.zeros(2, np.float32)})
+        assert infos["vehicle_1"]["position_error"] < 0.02

@@ -212,3 +212,33 @@ def test_vehicles_may_leave_out_what_the_defaults_say(validator: Any) -> None:
     assert validator.is_valid(document)
     del document["horizon"]
     assert not validator.is_valid(document)
+
+
+def test_what_is_drawn_is_described() -> None:
+    raw = {
+        "title": "Drawn",
+        "horizon": 5.0,
+        "landmarks": [{"name": "sign", "position": [1, 2, 3], "position_spread": [0.5, 0.5, 0], "presence": 0.8}],
+        "landmark_groups": [
+            {"name": "posts", "count": 3, "boxes": [{"center": [5, 5], "half": [2, 1]}], "height": [0.4, 1.2]},
+            {"name": "kerb", "count": 1, "lines": [{"start": [0, 3], "end": [9, 3]}], "height": [1, 1]},
+        ],
+        "routes": [
+            {"name": "left", "waypoints": [[-8, 0], [0, 0], [0, 8]], "corner_radius": 1.5, "lateral_spread": 0.1},
+            {"name": "ahead", "waypoints": [[-8, 0], [8, 0]], "wander": 0.2, "start_spread": 1.0},
+        ],
+        "vehicles": [{"routes": ["left", "ahead"], "motion": {"kind": "driven"}}],
+        "randomisation": {"camera_range": [0.8, 1.2]},
+    }
+    stream = io.StringIO()
+    console = Console(file=stream, width=160, markup=False, highlight=False, emoji=False)
+    for part in describe_scenario(parse_scenario(raw, "test")):
+        console.print(part)
+    text = stream.getvalue()
+    for said in (
+        *("end of its route: left or ahead", "(-8, 0), (0, 0), (0, 8)", "radius 1.5", "shifted by +- 0.1"),
+        *("wanders by 0.2", "begun along the first 1", "there with 80 %", "+- (0.5, 0.5, 0)", "drawn by group posts"),
+        *("(5, 5) +- (2, 1)", "(0, 3) to (9, 3)", "0.4 to 1.2", "camera_range *"),
+    ):
+        assert said in text, said
+    assert "[difficulty]" not in text
