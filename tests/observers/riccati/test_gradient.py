@@ -10,6 +10,7 @@ import pytest
 import coopenv
 from coopenv.observers.riccati.gradient import DifferentiableWorld, check_differentiable, tick_intervals
 from coopenv.scenario import Scenario
+from coopenv.seeds import world_keys
 from tests.helpers.builders import simulate
 
 SMOOTH: dict[str, Any] = {
@@ -38,7 +39,7 @@ def commands(seed: int = 0) -> np.ndarray:
 def test_forward_equals_the_world(made: Scenario) -> None:
     rollout = DifferentiableWorld(made, WORLDS).rollout(commands(), SEED)
     world = simulate(made, WORLDS)
-    world.reset([SEED, SEED + 1])
+    world.reset(world_keys(SEED, WORLDS))
     for command in commands():
         world.actions.assign(command)
         world.advance(made.ticks_per_decision)
