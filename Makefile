@@ -33,7 +33,7 @@ test: lint ## lint, type check and all tests but the slow ones
 
 $(VENV)/.train: $(VENV)/.dev
 	@echo "Installing torch and Stable-Baselines3 into $(VENV) (once) ..."
-	@$(PIP) --editable '.[train]'
+	@$(PIP) --editable '.[train,onnx]'
 	@touch $@
 
 test-train: $(VENV)/.train ## the tests that train policies (installs torch)

@@ -78,6 +78,14 @@ def test_statistics_are_those_of_vehicles_under_way() -> None:
     assert normalised == pytest.approx(expected, abs=1e-2)
 
 
+def test_a_budget_in_minutes_is_spent_by_the_clock() -> None:
+    trainer = trainer_of(minutes=1e-6)
+    assert trainer.status.share == 0.0
+    assert trainer.update().share == 1.0
+    trainer.continue_at(steps=128, seconds=3e-5)
+    assert (trainer.status.steps, trainer.status.share) == (128, pytest.approx(0.5))
+
+
 def figures_of(policy: Policy, scenario: Scenario) -> dict[str, Result]:
     results = score(drive(Engine(scenario, 8), policy, held_out_seeds(0, 8)))
     return {result.metric: result for result in results}
