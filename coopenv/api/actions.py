@@ -9,11 +9,12 @@ from coopenv.errors import ActionError, suggest
 
 
 class ActionReader:
-    """Turns {agent: (2,)} into (1, N, 2), clipped to [-1, 1]."""
+    """Turns {agent: (A,)} into (1, N, A), clipped to [-1, 1]."""
 
     def __init__(self, possible_agents: Sequence[str], engine: Engine) -> None:
         self._index = {agent: i for i, agent in enumerate(possible_agents)}
         self._engine = engine
+        self._size = engine.view("actions").shape[-1]
 
     def __call__(self, actions: Mapping[str, np.ndarray], alive: Sequence[str]) -> np.ndarray:
         """Return the actions of the living agents; those that have ended keep their last one, whatever is given.
@@ -27,7 +28,7 @@ class ActionReader:
             values = np.array([actions[agent] for agent in alive])
         except (IndexError, KeyError, TypeError, ValueError, RuntimeError):
             values = np.empty(0)
-        numeric = values.dtype.kind in "fiu" and values.shape == (len(alive), 2)
+        numeric = values.dtype.kind in "fiu" and values.shape == (len(alive), self._size)
         unknown = len(actions) != len(alive) and not set(actions) <= set(self._index)
         if not numeric or unknown or not np.isfinite(values).all():
             self._complain(actions, alive)
@@ -44,10 +45,10 @@ class ActionReader:
         for agent in alive:
             if agent not in actions:
                 raise ActionError(f"no action for '{agent}'; agents: {', '.join(alive)}")
-            check_action(actions[agent], agent)
+            check_action(actions[agent], agent, self._size)
 
 
-def check_action(action: object, agent: str) -> np.ndarray:
+def check_action(action: object, agent: str, size: int) -> np.ndarray:
     """Return one action as a float array.
 
     Raises:
@@ -59,8 +60,8 @@ def check_action(action: object, agent: str) -> np.ndarray:
         value = np.array("?")
     if value.dtype.kind not in "fiu":
         raise ActionError(f"action of '{agent}' is not numeric: {action!r}")
-    if value.shape != (2,):
-        raise ActionError(f"action of '{agent}' has shape {value.shape}, expected (2,)")
+    if value.shape != (size,):
+        raise ActionError(f"action of '{agent}' has shape {value.shape}, expected ({size},)")
     if not np.isfinite(value).all():
         raise ActionError(f"action of '{agent}' is not finite: {value.tolist()}")
     return value

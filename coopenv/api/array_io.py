@@ -33,9 +33,8 @@ class Exchange:
             raise CoopenvError(f"unknown arrays '{kind}'; known: numpy, torch")
         if self.kind == "torch" and find_spec("torch") is None:
             raise CoopenvError("arrays='torch' needs torch: pip install '.[train]'")
-        worlds, vehicles = engine.world.worlds, engine.world.model.vehicles
-        self._rows = worlds * vehicles
-        self._shape = (worlds, vehicles, 2)
+        self._shape: tuple[int, ...] = tuple(engine.array("actions").shape)
+        self._rows = self._shape[0] * self._shape[1]
         self._tensors: dict[str, Any] = {}
         self._stream: Any = None
 
@@ -81,7 +80,7 @@ class Exchange:
         return rows if self.kind == "numpy" else rows.clone()
 
     def set_actions(self, actions: Any) -> None:
-        """Take actions (W N, 2), or (W, N, 2), clipped to [-1, 1] by the actuators.
+        """Take actions (W N, A), or (W, N, A), clipped to [-1, 1] by the actuators.
 
         A tensor that is on the device already is copied there; whether it is finite is not checked, as that would
         wait for the device: an action that is not finite counts as zero.
@@ -97,8 +96,8 @@ class Exchange:
     def _set_tensor(self, actions: Any) -> None:
         import torch
 
-        if tuple(actions.shape) not in ((self._rows, 2), self._shape):
-            raise ActionError(f"actions have shape {tuple(actions.shape)}, expected ({self._rows}, 2)")
+        if tuple(actions.shape) not in ((self._rows, self._shape[-1]), self._shape):
+            raise ActionError(f"actions have shape {tuple(actions.shape)}, expected ({self._rows}, {self._shape[-1]})")
         if not torch.is_floating_point(actions) or actions.device.type == "meta":
             raise ActionError(f"actions have dtype {actions.dtype} on {actions.device}, expected a float with data")
         if actions.device.type == "cpu" and not torch.isfinite(actions).all():
@@ -108,25 +107,25 @@ class Exchange:
 
 
 def host_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return host actions as an array (W, N, 2).
+    """Return host actions as an array (W, N, A).
 
     Args:
-        actions: (W N, 2) or (W, N, 2).
-        shape: (W, N, 2).
+        actions: (W N, A) or (W, N, A).
+        shape: (W, N, A).
 
     Raises:
         ActionError: wrong shape or dtype, or not finite.
     """
-    rows = shape[0] * shape[1]
+    rows, size = shape[0] * shape[1], shape[2]
     try:
         values = np.asarray(actions)
     except (TypeError, ValueError, RuntimeError) as error:
-        raise ActionError(f"actions cannot be read as an array of shape ({rows}, 2): {error}") from None
-    if values.shape not in ((rows, 2), shape):
-        raise ActionError(f"actions have shape {values.shape}, expected ({rows}, 2)")
+        raise ActionError(f"actions cannot be read as an array of shape ({rows}, {size}): {error}") from None
+    if values.shape not in ((rows, size), shape):
+        raise ActionError(f"actions have shape {values.shape}, expected ({rows}, {size})")
     if values.dtype.kind not in "fiu":
         raise ActionError(f"actions have dtype {values.dtype}, expected a float")
     if not np.isfinite(values).all():
-        row = int(np.flatnonzero(~np.isfinite(values.reshape(rows, 2)).all(axis=1))[0])
-        raise ActionError(f"action of row {row} is not finite: {values.reshape(rows, 2)[row].tolist()}")
+        row = int(np.flatnonzero(~np.isfinite(values.reshape(rows, size)).all(axis=1))[0])
+        raise ActionError(f"action of row {row} is not finite: {values.reshape(rows, size)[row].tolist()}")
     return values.reshape(shape)

@@ -137,7 +137,7 @@ class Engine:
         self._fill_results("load", self._nowhere, self._nowhere)
 
     def step(self, actions: np.ndarray | None = None, ticks: int | None = None) -> None:
-        """Advance by one decision (or `ticks` camera ticks) under actions (W, N, 2) in [-1, 1]."""
+        """Advance by one decision (or `ticks` camera ticks) under actions (W, N, A) in [-1, 1]."""
         if actions is not None:
             self.set_actions(actions)
         (self.plugins or self.world).advance(self.world.model.ticks_per_decision if ticks is None else ticks)
@@ -172,7 +172,7 @@ class Engine:
             self.plugins.start(np.flatnonzero(self.world.mask.numpy()))
 
     def set_actions(self, actions: np.ndarray) -> None:
-        """Copy host actions, (W, N, 2), to the device."""
+        """Copy host actions, (W, N, A), to the device."""
         if self.world.device == "cpu":
             self.view("actions")[...] = actions
         else:

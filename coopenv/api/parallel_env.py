@@ -37,7 +37,8 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
     Observation (per agent): a flat float32 Box whose entries `observation_layout` names, or a one-level Dict of the
     same fields. It holds only what the vehicle itself measures, hears and estimates.
 
-    Action (per agent): Box(-1, 1, (2,), float32): speed or acceleration, and steering (positive: left). Values beyond
+    Action (per agent): Box(-1, 1, (2,), float32): speed or acceleration, and steering (positive: left); with
+    `[action.pan]` a third entry, the angle of the camera. Values beyond
     are clipped. Vehicles with prescribed motion ignore it.
 
     Reward: the weighted sum of the named terms in `info["reward_terms"]`, or what a function in Python returns.
@@ -86,7 +87,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         layout = self.engine.layout
         space: spaces.Space[Any] = flat_space(layout) if self._flat else dict_space(layout)
         self.observation_spaces = {agent: space for agent in self.possible_agents}
-        self.action_spaces = {agent: action_space() for agent in self.possible_agents}
+        self.action_spaces = {agent: action_space(scenario) for agent in self.possible_agents}
         self.state_space = state_space(scenario)
         self._read_actions = ActionReader(self.possible_agents, self.engine)
         self._infos = InfoWriter(self.engine, scenario)

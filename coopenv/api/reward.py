@@ -37,7 +37,7 @@ class Step:
     - `truth`: position (m, map frame), velocity and angular_velocity (m/s, rad/s, body frame), each (W, N, 3), and
       rotation (W, N, 3, 3), body to map; `estimate`: position, rotation, and covariance (W, N, 6, 6);
     - `visible`: (W, N, T), the targets measured in this frame; `time`: (W, 1), s since the reset;
-    - `observation`: (W, N, D), scaled and clipped; `action`: (W, N, 2) in [-1, 1];
+    - `observation`: (W, N, D), scaled and clipped; `action`: (W, N, A) in [-1, 1];
     - `reward_terms`: (W, N) by name, and `reward`, what the scenario's weights make of them;
     - `alive`, `terminated`, `truncated`: (W, N) bool; `ended`: (W, N), 0 under way, 1 arrived, 2 collided, from 3 on
       the scenario's own conditions.

@@ -87,7 +87,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         }
         self._flat, layout = observation == "flat", self.engine.layout
         self.single_observation_space = flat_space(layout) if self._flat else dict_space(layout)
-        self.single_action_space = action_space()
+        self.single_action_space = action_space(self.scenario)
         self._exchange = Exchange(self.engine, arrays)
 
     @cached_property
@@ -146,7 +146,7 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         """Drive all worlds for one decision period.
 
         Args:
-            actions: (num_envs, 2) in [-1, 1]; values beyond are clipped.
+            actions: (num_envs, A) in [-1, 1], A as in the action space; values beyond are clipped.
 
         Raises:
             ActionError: wrong shape or dtype, or (host arrays) not finite.

@@ -19,7 +19,7 @@ from coopenv.estimation.arrays import Array
 from coopenv.observers.briefing import briefing_of
 from coopenv.observers.recording import Briefing, Sensed
 from coopenv.scenario import Scenario
-from coopenv.world.command import ACCELERATION, SPEED, STEERING
+from coopenv.world.command import ACCELERATION, PAN, SPEED, STEERING
 from coopenv.world.world import World
 
 
@@ -33,17 +33,20 @@ class Command:
     speed: Array  # (N,) m/s, to reach
     steering: Array  # (N,) rad, positive to the left
     acceleration: Array  # (N,) m/s^2, at most, on the way to the speed
+    pan: Array | None = None  # (N,) rad, of cameras that turn, positive to the left; None: 0
 
     @classmethod
     def of(cls, rows: Array) -> Self:
-        """Return the command whose entries stand in the columns of (N, 3), as in the state of a world."""
+        """Return the command whose entries stand in the columns of (N, 4), as in a world's state; or (N, 3), no pan."""
         values = np.array(rows, dtype=np.float64)
-        return cls(values[:, int(SPEED)], values[:, int(STEERING)], values[:, int(ACCELERATION)])
+        entries = (SPEED, STEERING, ACCELERATION, PAN)[: values.shape[1]]
+        return cls(*(values[:, int(entry)] for entry in entries))
 
     @property
     def rows(self) -> Array:
-        """(N, 3) as in the state of a world."""
-        return np.stack([self.speed, self.steering, self.acceleration], axis=-1)
+        """(N, 4) as in the state of a world."""
+        pan = np.zeros_like(self.speed) if self.pan is None else self.pan
+        return np.stack([self.speed, self.steering, self.acceleration, pan], axis=-1)
 
 
 @dataclass(frozen=True)

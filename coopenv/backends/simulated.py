@@ -11,7 +11,7 @@ import warp as wp
 from coopenv.backends.base import Capabilities, Episode, SensingWorld, TickGenerator
 from coopenv.estimation.outcomes import Sight
 from coopenv.observers.briefing import start_covariances
-from coopenv.observers.recording import Sensed, Truth, is_due
+from coopenv.observers.recording import Sensed, Truth, is_due, sealed
 from coopenv.observers.registry import find_embedded
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST
@@ -48,8 +48,9 @@ class SimulatedWorld(SensingWorld):
         }
         for values in arrays.values():
             values.setflags(write=False)
+        pan = None if self.scenario.action.pan is None else sealed(self._copy("pan", world))
         due = bool(is_due(k, self.model.observer.rate / rates.camera))
-        return Sensed(index=k, dt=1.0 / rates.camera, due=due, **arrays)
+        return Sensed(index=k, dt=1.0 / rates.camera, due=due, pan=pan, **arrays)
 
     def told(self, k: int) -> Sensed:
         """Return all that a source of ticks tells of the first world, truth and messages included."""

@@ -10,11 +10,11 @@ from coopenv.estimation.validity import are_numbers, are_rotations, are_unit_vec
 from coopenv.observers.checks import check_message
 from coopenv.observers.contract import Message
 from coopenv.observers.recording import Briefing, Sensed
-from coopenv.observers.recording_checks import SHAPES
+from coopenv.observers.recording_checks import LARGEST_PAN, SHAPES
 
 MEASURED = ("rotation", "translation", "velocity", "angular_velocity", "bearings", "visible", "landmarks")
 TICK_SHAPES = {name: shape[1:] for name, shape in SHAPES.items() if shape[0] == "K" and name != "due"}
-TICK_SHAPES |= dict.fromkeys(("odometry_age", "bearing_age", "missing", "late"), ("N",))
+TICK_SHAPES |= dict.fromkeys(("pan", "odometry_age", "bearing_age", "missing", "late"), ("N",))
 KINDS = {"visible": "b", "missing": "b", "late": "b", "inbox_tick": "iu"}
 """NumPy's kinds of the arrays that do not hold numbers of any kind."""
 
@@ -58,6 +58,8 @@ def _judged(tick: Sensed) -> Iterator[tuple[str, Any, str]]:
         yield name, everywhere(are_numbers(getattr(tick, name)), -1) | absent, "not finite or too large"
     seen = tick.visible & ~absent[:, None]
     yield "bearings", everywhere(are_unit_vectors(tick.bearings) | ~seen, -1), "not unit vectors"
+    if tick.pan is not None:
+        yield "pan", (np.abs(tick.pan) <= LARGEST_PAN) | absent, f"not within {LARGEST_PAN} rad"
     for name in ("odometry_age", "bearing_age"):
         if (age := getattr(tick, name)) is not None:
             yield name, (age >= 0.0) | absent, "negative or not a number"

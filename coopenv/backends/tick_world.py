@@ -140,6 +140,8 @@ class TickWorld(SensingWorld):
         sampled = (now.index * now.dt - np.asarray(now.odometry_age) + 1e-9) * rate
         self._row["samples"][...] = np.where(sampled >= 0.0, np.floor(np.maximum(sampled, 0.0)) + 1, 0)
         self._row["bearing_lag"][...] = np.round(np.minimum(np.asarray(now.bearing_age) / now.dt, now.index))
+        if now.pan is not None:  # of who is missing it stays
+            self._row["pan"][...] = np.where(np.asarray(now.missing), self._row["pan"], now.pan)
         self._row["inbox_tick"][...] = BY_RADIO if now.inbox_tick is None else now.inbox_tick
         self.late += now.late
         self.missing += now.missing

@@ -27,6 +27,7 @@ def model_of(setup: Setup, p: Precision) -> Any:
     N, model = T - L, model_struct(p)()
     model.landmarks, model.vehicles, model.agents = L, N, T
     model.samples_per_tick = model.observer.blocks = model.ticks_per_decision = 1
+    model.action_size = 2
     model.horizon_ticks = 2**31 - 1
     model.odometry_period, model.odometry_rate = setup.noise.odometry_period, 1.0 / setup.noise.odometry_period
     targets = np.full((1, T), -1, dtype=np.int32)

@@ -59,6 +59,7 @@ class Sensed:
     visible: NDArray[np.bool_]  # (N, T)
     landmarks: Array  # (L, 3) map, m
     due: bool = True  # whether the scenario's observer rate asks for a correction
+    pan: Array | None = None  # (N,) rad, by which cameras are turned to the left; None: 0
     time: float | None = None  # s since the reset on the source's clock; None: index * dt
     odometry_age: Array | None = None  # (N,) s since the last odometry sample; None: 0
     bearing_age: Array | None = None  # (N,) s since the frame was exposed; None: 0
@@ -135,6 +136,7 @@ class Recording:
     start_position: Array  # (N, 3) map, m
     start_covariance: Array  # (N, 6, 6) LEFT coordinates
     truth: Truth
+    pan: Array | None = None  # (K, N) rad, by which cameras were turned to the left; None: never
     scenario: "Scenario | None" = None  # the world that was recorded; None for recorded robots
     drawn: Drawn | None = None  # None: not simulated
 
@@ -166,6 +168,8 @@ class Recording:
         """Return what all vehicles sense at tick k."""
         sensed: dict[str, Any] = {name: sealed(getattr(self, name)[k]) for name in PER_TICK}
         truth = Truth(self.truth.rotation[k], self.truth.position[k])
+        if self.pan is not None:
+            sensed["pan"] = sealed(self.pan[k])
         return Sensed(index=k, dt=self.dt, due=bool(self.due[k]), truth=truth, **sensed)
 
     def tick(self, k: int, vehicle: int, messages: Mapping[int, Received]) -> Tick:

@@ -37,6 +37,7 @@ KINDS = {"visible": "b", "due": "b", "inbox_tick": "i"}  # NumPy's kind of the a
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}")
 TICK_LENGTHS_S = (1e-5, 1e3)
+LARGEST_PAN = 3.15  # rad, after rounding
 MAX_PERIOD_TICKS = 100_000
 LEAST_EIGENVALUE = 1e-12  # least eigenvalue of the correlations of an initial estimate
 
@@ -159,6 +160,10 @@ def _check_ticks(r: Recording) -> None:
         _require_all(r, everywhere(are_numbers(getattr(r, name)), -1), name, "not finite or too large")
     unseen = everywhere(np.isnan(r.bearings), -1) & ~r.visible
     _require_all(r, everywhere(are_unit_vectors(r.bearings) | unseen, -1), "bearings", "not unit vectors")
+    if r.pan is not None:
+        fits = r.pan.shape == r.visible.shape[:2] and r.pan.dtype.kind == "f"
+        _require(fits, f"pan: shape {r.pan.shape} of {r.pan.dtype}, expected {r.visible.shape[:2]} of f")
+        _require_all(r, np.abs(r.pan) <= LARGEST_PAN, "pan", f"not within {LARGEST_PAN} rad")
     _require_all(r, everywhere(are_numbers(r.landmarks), 1, 2), "landmarks", "not finite or too large")
     R, p = r.truth.rotation, r.truth.position
     unknown_R, unknown_p = everywhere(np.isnan(R), -1, -2), everywhere(np.isnan(p), -1)
@@ -184,6 +189,7 @@ def _check_scenario(r: Recording) -> None:
     neighbours = neighbour_sets(s)
     for setup, targets in zip(r.setups, neighbours, strict=True):
         _require(setup.targets.tolist() == targets, f"scenario: {setup.name} has other neighbours than in its setup")
+    _require((s.action.pan is None) == (r.pan is None), "pan: as in the scenario, cameras turn or they do not")
     rates, staleness = s.rates, np.inf if s.v2x.staleness is None else s.v2x.staleness
     _require(list(r.order) == processing_order(s, neighbours), "scenario: vehicles in another order than recorded")
     _require(r.dt == 1.0 / rates.camera, f"scenario: ticks of {1.0 / rates.camera:g} s, recorded {r.dt:g} s")

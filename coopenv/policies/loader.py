@@ -9,7 +9,6 @@ from typing import Any, Literal, cast
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from coopenv import user_code
-from coopenv.api.terms.layout import action_size
 from coopenv.errors import CoopenvError, suggest, told
 from coopenv.policies.base import PLAIN, Policy
 from coopenv.policies.network import NetworkCard
@@ -142,7 +141,7 @@ def load_policy(name: str, scenario: Scenario, seed: int) -> Policy:
         CoopenvError: there is no such policy, or the agent cannot drive in this scenario.
     """
     if name in PLAIN:
-        return PLAIN[name](seed, action_size(scenario))
+        return PLAIN[name](seed, scenario.action.size)
     if name not in list_agents() and not user_code.is_reference(name) and not (Path(name) / AGENT_FILE).is_file():
         known = [*PLAIN, *list_agents()]
         raise CoopenvError(f"unknown policy '{name}'{suggest(name, known)}; known: {', '.join(known)}")

@@ -47,7 +47,8 @@ def record(
         ticks.append(engine.world.sensed(0, k))
         on_progress(k / scenario.horizon_ticks)
     L, briefing = len(scenario.landmarks), engine.world.briefing
-    kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in SENSED}
+    names = SENSED if scenario.action.pan is None else (*SENSED, "pan")
+    kept = {name: np.stack([getattr(tick, name) for tick in ticks]) for name in names}
     start_rotation = views["estimate_rotation"][0, 0]
     for values in (*kept.values(), start_rotation):
         values.setflags(write=False)  # observers get views

@@ -129,7 +129,7 @@ def rollout(
         dtype: "float32" or "float64".
         device: "cpu" or a CUDA device.
         policy: "zero", "random", an agent's name, or a function of the observations (N, D) that returns actions
-            (N, 2); vehicles with prescribed motion ignore their actions.
+            (N, A); vehicles with prescribed motion ignore their actions.
         on_tick: called with the engine and the tick's number after every tick, 0 included.
 
     Raises:

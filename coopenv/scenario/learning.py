@@ -1,5 +1,6 @@
 """What a policy sees, does and is rewarded for."""
 
+import math
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal, Self
 
@@ -92,13 +93,29 @@ class Dynamics(Part):
     """Dead time between a decision and its effect, s; at most one decision period."""
 
 
+class Pan(Part):
+    """A camera that turns about its own centre and the body's z axis; the vehicle knows the angle."""
+
+    limit: float = Field(gt=0.0, le=math.pi)
+    """Largest angle to either side, rad; an entry of 1 asks for it (positive turns left)."""
+    rate: Positive
+    """Largest angular rate, rad/s."""
+
+
 class Action(Part):
-    """Meaning of the two entries of an action in [-1, 1]."""
+    """Meaning of the entries of an action in [-1, 1]; with `[action.pan]` there is a third one, the camera's angle."""
 
     longitudinal: Literal["speed", "acceleration"] = "speed"
     """`speed`: -1..1 spans the permitted speeds (0 or -max .. max); `acceleration`: times max_acceleration."""
     steering: Positive | None = None
     """Steering angle at action 1, rad (none: max_steering)."""
+    pan: Pan | None = None
+    """None: cameras do not turn, and an action has two entries."""
+
+    @property
+    def size(self) -> int:
+        """How many entries an action has."""
+        return 2 if self.pan is None else 3
 
 
 _built_in: dict[str, Any] = {

@@ -95,6 +95,8 @@ def _problems(s: ScenarioFields) -> Iterator[str]:
     for name, rate in (("camera", s.rates.camera), ("odometry", s.rates.odometry)):
         if s.horizon * rate > MOST_TICKS:
             yield f"horizon: {s.horizon:g} s at rates.{name} = {rate:g} Hz are over {MOST_TICKS:.0e} samples"
+    if s.action.pan is not None and s.highway is not None:
+        yield "action.pan: cameras of vehicles of highway-env do not turn"
     yield from _beyond_limits(s)
 
 

@@ -77,6 +77,9 @@ FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
         ("last_action", "vehicle", 2, "1", 1, -1, "action of the last decision"),
         ("time_left", "vehicle", 1, "horizon", 0.5, -1, "share of the horizon that is left", None, 0.5),
     ],
+    "pan": [
+        ("camera_pan", "vehicle", 1, "rad", "pan", -1, "angle by which the camera is turned, positive to the left"),
+    ],
 }  # fmt: skip
 
 REWARDS: list[tuple[str, str, bool, str]] = [  # name, unit, privileged, meaning

@@ -16,9 +16,9 @@ from coopenv.scenario.base import Number, Part, Positive, Text
 from coopenv.scenario.term_rows import COLUMNS, CONDITIONS, FIELDS, REWARDS
 
 Scale = Literal[
-    "position_scale", "velocity_scale", "angular_velocity_scale", "age_scale", "map_scale", "steering", "targets"
+    "position_scale", "velocity_scale", "angular_velocity_scale", "age_scale", "map_scale", "steering", "pan", "targets"
 ]
-"""A setting of `[observation]`, the steering angle at action 1, or the number of targets."""
+"""A setting of `[observation]`, the steering or the pan angle at action 1, or the number of targets."""
 Per = Literal["vehicle", "target", "neighbour", "landmark"]
 """One value of the vehicle itself, one of every target (landmarks, then vehicles), one of every other vehicle, or one
 of each of the landmarks that are nearest by the vehicle's own estimate."""

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import to_rgba_array
 from matplotlib.patheffects import withStroke
+from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.format import fixed
@@ -31,7 +32,7 @@ _POINT = Body(size=(2e-3, 1e-3, 1e-3))  # stands in for a vehicle without a body
 _FIELDS = (
     *("rotation", "position", "estimate_rotation", "estimate_position", "covariance"),
     *("sight", "ended", "position_error", "orientation_error", "present", *GOAL_FIELDS),
-    *("traffic_rotation", "traffic_position", "traffic_half"),
+    *("traffic_rotation", "traffic_position", "traffic_half", "pan"),
 )
 
 
@@ -70,7 +71,7 @@ class TopView:
         self._place_bodies(R, position, R_hat, estimate)
         there = view["traffic_half"][:, 0] > 0.0
         self._traffic.set_verts(geometry.box_outlines(*(view[f"traffic_{part}"][there] for part in _BOX)))
-        self._place_sight(R, position, view["sight"])
+        self._place_sight(R, position, view["sight"], view["pan"])
         self._place_marks(R, position, view["ended"])
         self._write(view, sigma, float(engine.view("tick")[0]) / self.scenario.rates.camera)
         return self._layers.paint()
@@ -186,7 +187,7 @@ class TopView:
         if pointing is self._strays:
             pointing.set_facecolor(self._rgba[which])
 
-    def _place_sight(self, R: np.ndarray, position: np.ndarray, sight: np.ndarray) -> None:
+    def _place_sight(self, R: np.ndarray, position: np.ndarray, sight: np.ndarray, pan: np.ndarray) -> None:
         L = self._landmarks
         target = (position + (R @ self._marker[..., None])[..., 0])[:, :2]
         camera = position[L:] + (R[L:] @ self._camera[..., None])[..., 0]
@@ -196,7 +197,8 @@ class TopView:
             if "color" not in ground.SIGHT_LOOKS[kind]:
                 lines.set_color(to_rgba_array(self._rgba[observer], 0.9))
         if self._fan is not None:
-            rays = self._fan @ np.swapaxes(R[L:], 1, 2)
+            turned = Rotation.from_euler("z", pan[:, None]).as_matrix()
+            rays = self._fan @ np.swapaxes(R[L:] @ turned, 1, 2)
             length = geometry.free_lengths(camera, rays, self._reach, self.scenario.obstacles, self._origin)
             rim = camera[:, None] + length[..., None] * rays
             self._wedges.set_verts(np.concatenate([camera[:, None], rim], axis=1)[..., :2])

@@ -89,6 +89,7 @@ def _world(scenario: Scenario) -> dict[str, Any]:
         "odometry_period": 1.0 / rates.odometry,
         "samples_per_tick": math.ceil(rates.odometry / rates.camera - 1e-9) + 1,
         "ticks_per_decision": scenario.ticks_per_decision,
+        "action_size": scenario.action.size,
         "horizon_ticks": scenario.horizon_ticks,
         "last_outcome": max(Outcome) + len(scenario.termination.own),
         "map_size": scenario.observation.map_size,
@@ -148,7 +149,7 @@ def _motion(scenario: Scenario) -> dict[str, Any]:
 
 
 def _dynamics(d: Dynamics, scenario: Scenario) -> dict[str, Any]:
-    accelerates = scenario.action.longitudinal == "acceleration"
+    accelerates, pan = scenario.action.longitudinal == "acceleration", scenario.action.pan
     same = ("wheelbase", "max_speed", "max_acceleration", "max_steering", "max_steering_rate")
     return {
         **{name: getattr(d, name) for name in same},
@@ -158,6 +159,8 @@ def _dynamics(d: Dynamics, scenario: Scenario) -> dict[str, Any]:
         "latency_ticks": round(d.latency * scenario.rates.camera),
         "acceleration_mode": int(accelerates),
         "action_steering": scenario.action.steering or d.max_steering,
+        "pan_limit": pan.limit if pan else 0.0,
+        "pan_rate": pan.rate if pan else 0.0,
     }
 
 

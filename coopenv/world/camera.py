@@ -1,6 +1,7 @@
 """Camera: which targets are in view and not occluded, and their noisy unit bearings.
 
-A bearing is stored as the unit vector from the observing camera to the target, in the camera's optical frame.
+A bearing is stored as the unit vector from the observing camera to the target, in the camera's optical frame; of a
+camera that pans in that frame without pan, as the vehicle knows the angle, so that all who read it need not.
 """
 
 from typing import Any
@@ -30,13 +31,18 @@ def marker_position(model: Any, state: Any, world: int, agent: int):
 @wp.func
 def camera_to_body(model: Any, state: Any, world: int, vehicle: int):
     """Return the rotation of a vehicle's camera in its body, as the vehicle knows it."""
-    return model.camera[vehicle].rotation
+    R = model.camera[vehicle].rotation
+    pan = state.pan[world, vehicle]
+    zero = type(pan)(0.0)
+    if pan != zero:
+        R = exp_so3(type(model.camera[vehicle].position)(zero, zero, pan)) * R
+    return R
 
 
 @wp.func
 def body_bearing(model: Any, state: Any, world: int, vehicle: int, target: int):
     """Return the last measured unit bearing of a target in the body frame."""
-    return camera_to_body(model, state, world, vehicle) * state.bearing[world, vehicle, target]
+    return model.camera[vehicle].rotation * state.bearing[world, vehicle, target]
 
 
 @wp.func
@@ -235,8 +241,9 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
     level = noise.bearing * state.parameter[world, BEARING_NOISE]
     R = state.rotation[world, agent]
     place = camera.position
-    turned = camera_to_body(model, state, world, vehicle)
     zero = place.dtype(0.0)
+    turned = camera_to_body(model, state, world, vehicle)
+    to_rest = wp.transpose(camera.rotation) * turned
     if camera.orientation_std > zero or camera.position_std > zero:
         place = place + state.camera_shift[world, vehicle]
         turned = turned * exp_so3(state.camera_turn[world, vehicle])
@@ -260,6 +267,8 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
         if sight == VISIBLE:
             if camera.pinhole == 1 and model.sensed == 1 and has_pixel(model, camera, ray):
                 b = through_pixels(camera, b)
+            if state.pan[world, vehicle] != zero:
+                b = to_rest * b
             state.bearing[world, vehicle, target] = b
             state.bearing_tick[world, vehicle, target] = tick
         state.sight[world, vehicle, target] = sight

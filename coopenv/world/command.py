@@ -1,7 +1,8 @@
 """Commands in SI units, made once per decision from an action in [-1, 1] and the vehicle's limits.
 
 A command says what ROS' AckermannDrive says: the speed to reach (m/s), the steering angle (rad, positive to the left),
-and the acceleration (m/s^2) that the speed changes with at most. It is a vector with these three entries.
+and the acceleration (m/s^2) that the speed changes with at most; and the camera's pan angle (rad, positive to the
+left). It is a vector with these four entries.
 """
 
 from typing import Any
@@ -13,50 +14,51 @@ from coopenv.world.collision import UNDER_WAY
 SPEED = wp.constant(0)
 STEERING = wp.constant(1)
 ACCELERATION = wp.constant(2)
+PAN = wp.constant(3)
 """Entries of a command."""
 
 
 @wp.func
-def sanitised(action: Any):
-    """Return an action clipped to [-1, 1], zero where it is not finite."""
-    one = action.dtype(1.0)
-    result = type(action)()
-    for axis in range(2):
-        if wp.isfinite(action[axis]):
-            result[axis] = wp.clamp(action[axis], -one, one)
-        else:
-            result[axis] = action.dtype(0.0)
-    return result
+def sanitised(level: Any):
+    """Return an entry of an action clipped to [-1, 1], zero where it is not finite."""
+    one = type(level)(1.0)
+    if wp.isfinite(level):
+        return wp.clamp(level, -one, one)
+    return type(level)(0.0)
 
 
 @wp.func
-def command_of(d: Any, action: Any):
-    """Return what an action in [-1, 1]^2 asks of a vehicle with the dynamics `d`.
+def command_of(d: Any, first: Any, steering: Any, pan: Any):
+    """Return what the entries of an action in [-1, 1] ask of a vehicle with the dynamics `d`.
 
     Where the first entry means an acceleration, the speed to reach is a limit of the vehicle: the highest or, to
     brake, the lowest.
     """
-    one = action.dtype(1.0)
+    one = type(first)(1.0)
     acceleration = d.max_acceleration
     if d.acceleration_mode == 1:
-        acceleration = wp.abs(action[0] * d.max_acceleration)
-        speed = wp.where(action[0] < action.dtype(0.0), d.min_speed, d.max_speed)
+        acceleration = wp.abs(first * d.max_acceleration)
+        speed = wp.where(first < type(first)(0.0), d.min_speed, d.max_speed)
     else:
-        span = (d.max_speed - d.min_speed) * action.dtype(0.5)
-        speed = d.min_speed + (action[0] + one) * span
-    return wp.vector(speed, action[1] * d.action_steering, acceleration)
+        span = (d.max_speed - d.min_speed) * type(first)(0.5)
+        speed = d.min_speed + (first + one) * span
+    return wp.vector(speed, steering * d.action_steering, acceleration, pan * d.pan_limit)
 
 
 @wp.func
 def decide(model: Any, state: Any, actions: Any, world: int):
     """Turn the actions of a decision that begins into commands; who has ended is to stand."""
     for vehicle in range(model.vehicles):
-        action = sanitised(actions[world, vehicle])
-        command = command_of(model.dynamics[vehicle], action)
+        for k in range(model.action_size):
+            state.action[world, vehicle, k] = sanitised(actions[world, vehicle, k])
+        first = state.action[world, vehicle, 0]
+        pan = type(first)(0.0)
+        if model.action_size > 2:
+            pan = state.action[world, vehicle, 2]
+        command = command_of(model.dynamics[vehicle], first, state.action[world, vehicle, 1], pan)
         if state.ended[world, vehicle] != UNDER_WAY:
-            command[SPEED] = action.dtype(0.0)
+            command[SPEED] = type(first)(0.0)
             command[ACCELERATION] = model.dynamics[vehicle].max_acceleration
-        state.action[world, vehicle] = action
         state.command[world, vehicle] = command
 
 

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.so3 import increment, orthonormalise, rigid_motion
-from coopenv.world.command import ACCELERATION, SPEED, STEERING, command_in_force
+from coopenv.world.command import ACCELERATION, PAN, SPEED, STEERING, command_in_force
 from coopenv.world.model import DRIVEN, PRESCRIBED
 
 LONGEST_SUBSTEP = wp.constant(wp.float64(0.0100001))  # s; the bicycle's twist is held over no longer than this
@@ -134,6 +134,17 @@ def drive_through(model: Any, state: Any, world: int, vehicle: int, command: Any
 
 
 @wp.func
+def turn_camera(model: Any, state: Any, world: int, vehicle: int, command: Any):
+    """Turn a vehicle's camera through one camera tick towards the angle that is asked for."""
+    limits = model.dynamics[vehicle]
+    if limits.pan_limit > type(limits.pan_limit)(0.0):
+        pan = state.pan[world, vehicle]
+        step = limits.pan_rate * type(pan)(model.camera_period)
+        wanted = wp.clamp(command[PAN], -limits.pan_limit, limits.pan_limit)
+        state.pan[world, vehicle] = pan + wp.clamp(wanted - pan, -step, step)
+
+
+@wp.func
 def move(model: Any, state: Any, world: int, tick: int):
     """Carry all truth of one world to the tick's end."""
     t = wp.float64(tick) * model.camera_period
@@ -144,3 +155,4 @@ def move(model: Any, state: Any, world: int, tick: int):
         if model.motion.kind[model.landmarks + vehicle] == DRIVEN:
             command = command_in_force(model, state, world, vehicle, tick)
             drive_through(model, state, world, vehicle, command, tick)
+            turn_camera(model, state, world, vehicle, command)

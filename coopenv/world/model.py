@@ -79,6 +79,8 @@ def model_struct(p: Precision) -> Any:
         latency_ticks: wp.int32
         acceleration_mode: wp.int32  # 1: the first entry of an action is an acceleration
         action_steering: scalar  # of an action of 1
+        pan_limit: scalar  # of the camera; 0: it does not turn
+        pan_rate: scalar
 
     @wp.struct
     class Scene:
@@ -232,6 +234,7 @@ def model_struct(p: Precision) -> Any:
         odometry_period: wp.float64  # s
         samples_per_tick: wp.int32  # odometry samples that may fall into one camera tick
         ticks_per_decision: wp.int32
+        action_size: wp.int32  # numbers of an action
         horizon_ticks: wp.int32
         last_outcome: wp.int32  # largest value of `ended`
         map_size: wp.int32  # landmarks of the map that an observation tells of

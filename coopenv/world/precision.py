@@ -18,13 +18,14 @@ class Precision:
     numpy: Any
     vec2: Any
     vec3: Any
+    vec4: Any
     mat33: Any
     mat66: Any
 
 
 def _precision(scalar: Any) -> Precision:
     vector, matrix, number = wp.types.vector, wp.types.matrix, wp.dtype_to_numpy(scalar)
-    small = vector(2, scalar), vector(3, scalar), matrix((3, 3), scalar)
+    small = vector(2, scalar), vector(3, scalar), vector(4, scalar), matrix((3, 3), scalar)
     return Precision(scalar.__name__, scalar, number, *small, matrix((6, 6), scalar))
 
 

@@ -124,9 +124,11 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
     if limits.acceleration_mode == 0:
         span = limits.max_speed - limits.min_speed
         level = (speed - limits.min_speed) * o.dtype(2.0) / span - o.dtype(1.0)
-    action = wp.vector(level, o[0])
-    command = command_of(limits, action)
-    state.action[world, vehicle] = action
+    command = command_of(limits, level, o[0], o[0])
+    state.action[world, vehicle, 0] = level
+    for k in range(1, model.action_size):
+        state.action[world, vehicle, k] = o[0]
+    state.pan[world, vehicle] = o[0]
     state.command[world, vehicle] = command
     state.last_command[world, vehicle] = command
     if model.motion.kind[agent] == DRIVEN:

@@ -1,7 +1,8 @@
 """The changing side of a world: one record of arrays with leading axes (world, agent or vehicle).
 
 W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders), M odometry samples a tick, S slots of
-the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q parameters, Z bodies of the traffic.
+the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q parameters, U numbers of an action, Z bodies
+of the traffic.
 """
 
 from collections.abc import Mapping
@@ -36,7 +37,7 @@ from coopenv.world.saved_state import (
 @cache
 def state_struct(p: Precision) -> Any:
     """Return the Warp struct of the state in one precision."""
-    scalar, vec2, vec3, mat33, mat66 = p.scalar, p.vec2, p.vec3, p.mat33, p.mat66
+    scalar, vec2, vec3, vec4, mat33, mat66 = p.scalar, p.vec2, p.vec3, p.vec4, p.mat33, p.mat66
 
     @wp.struct
     class State:
@@ -67,9 +68,10 @@ def state_struct(p: Precision) -> Any:
         angular_velocity: array("WA", vec3)  # truth, body, rad/s
         speed: array("WN", scalar)  # of the bicycle, m/s
         steering: array("WN", scalar)  # rad
-        action: array("WN", vec2)  # of the decision under way, in [-1, 1]
-        command: array("WN", vec3)  # what it asks for: speed m/s, steering rad, acceleration m/s^2
-        last_command: array("WN", vec3)  # of the decision before, in force during the dead time
+        pan: array("WN", scalar)  # angle by which the camera is turned to the left, rad
+        action: array("WNU", scalar)  # of the decision under way, in [-1, 1]
+        command: array("WN", vec4)  # what it asks for: speed m/s, steering rad, acceleration m/s^2, pan rad
+        last_command: array("WN", vec4)  # of the decision before, in force during the dead time
         ended: array("WN", wp.int32)  # values of `Outcome`, then one per condition of the scenario's own
         collided: array("WN", wp.int32)  # touching something now
 
@@ -92,7 +94,7 @@ def state_struct(p: Precision) -> Any:
         increment_rotation: array("WN", mat33)  # odometry over the last tick
         increment_translation: array("WN", vec3)  # m, in the body frame at the tick's start
 
-        bearing: array("WNA", vec3)  # camera to target, camera frame, last measured
+        bearing: array("WNA", vec3)  # camera to target, camera frame without pan, last measured
         bearing_tick: array("WNA", wp.int32)  # tick of that bearing; -1: never
         sight: array("WNA", wp.uint8)  # values of `Sight`
 
@@ -144,6 +146,7 @@ VALID: dict[str, Rule] = {
     **dict.fromkeys(LASTING_ERRORS, NUMBER._replace(of_truth=True)),
     "steering": numbers(1.6),
     "action": numbers(1.001),
+    "pan": numbers(3.15),
     "ended": whole(-1, "last_outcome"),
     "collided": FLAG,
     "traffic_rotation": ROTATION,
@@ -170,7 +173,7 @@ VALID: dict[str, Rule] = {
 def state_sizes(model: Any, worlds: int) -> dict[str, int]:
     """Return the length of every axis of the state, and of an observer's memory, by its letter."""
     ticks = {"M": model.samples_per_tick, "S": model.radio.slots, "B": model.observer.blocks}
-    draws = {"P": model.routes.points, "Q": len(PARAMETERS), "Z": model.traffic}
+    draws = {"P": model.routes.points, "Q": len(PARAMETERS), "Z": model.traffic, "U": model.action_size}
     return {"W": worlds, "A": model.agents, "N": model.vehicles, **draws, **ticks}
 
 

@@ -44,7 +44,7 @@ def advance_kernel(source: Source, observer: Embedded) -> Kernel:
         state: Any,
         memory: Any,
         record: Any,
-        actions: wp.array2d(dtype=Any),
+        actions: wp.array3d(dtype=Any),
         hold: wp.array(dtype=wp.int32),
         ticks: int,
     ):
@@ -88,7 +88,7 @@ def restart_kernel(source: Source, observer: Embedded) -> Kernel:
     return _named(restart, source.name, observer.name, **observer.options)
 
 
-def decide_kernel(model: Any, state: Any, actions: wp.array2d(dtype=Any), hold: wp.array(dtype=wp.int32)):
+def decide_kernel(model: Any, state: Any, actions: wp.array3d(dtype=Any), hold: wp.array(dtype=wp.int32)):
     """Make commands of actions, where `advance` would. One thread per world."""
     world = wp.tid()
     if hold[world] == 0 and state.tick[world] < model.horizon_ticks:

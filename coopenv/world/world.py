@@ -93,7 +93,7 @@ class World:
         self.memory = allocate(self.observer.memory, sizes, self.device)
         """What the embedded observer remembers besides the state."""
         self._record = self._build_record()
-        self.actions = wp.zeros((worlds, N), dtype=self.precision.vec2, device=self.device)
+        self.actions = wp.zeros((worlds, N, self.model.action_size), dtype=self.precision.scalar, device=self.device)
         self.mask = wp.zeros(worlds, dtype=wp.int32, device=self.device)
         """(W,) worlds that `restart` resets and that `advance` leaves alone; zero between calls."""
         self.launch = Launcher(worlds, self.device, dtype, self.threads)

@@ -91,7 +91,7 @@ def test_commands_and_their_rows() -> None:
     rows = np.arange(6.0).reshape(2, 3)
     command = Command.of(rows)
     assert command.speed.tolist() == [0, 3] and command.steering.tolist() == [1, 4]
-    assert command.acceleration.tolist() == [2, 5] and np.array_equal(command.rows, rows)
+    assert command.acceleration.tolist() == [2, 5] and np.array_equal(command.rows, np.insert(rows, 3, 0.0, axis=1))
 
 
 def test_it_is_one_world_on_the_cpu() -> None:

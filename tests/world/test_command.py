@@ -55,4 +55,4 @@ def test_who_has_arrived_is_to_stand() -> None:
     run(world, 60)
     assert world.view("ended")[0, 0] == 1
     world.decide()
-    assert_allclose(world.view("command")[0, 0], [0.0, 0.0, 2.0])
+    assert_allclose(world.view("command")[0, 0], [0.0, 0.0, 2.0, 0.0])

@@ -193,6 +193,11 @@ def steering(ego: Ego):
 
 
 @wp.func
+def camera_pan(ego: Ego):
+    return ego.pan
+
+
+@wp.func
 def last_action(ego: Ego):
     return ego.action
 

@@ -136,11 +136,13 @@ def _scale(row: ObservationField, scenario: Scenario) -> float:
         return float(len(scenario.target_names))
     if row.scale == "steering":
         return float(max(action_fields(scenario, limits)[STEERING].high for limits in scenario.limits))
+    if row.scale == "pan":
+        return 1.0 if scenario.action.pan is None else scenario.action.pan.limit
     return float(getattr(scenario.observation, row.scale) if isinstance(row.scale, str) else row.scale)
 
 
 def action_fields(scenario: Scenario, limits: Dynamics | None = None) -> tuple[ActionField, ...]:
-    """Return what the entries of an action mean: speed or acceleration, and steering (positive turns left).
+    """Return what the entries of an action mean: speed or acceleration, steering (positive turns left), and pan.
 
     `limits` are a vehicle's; None: the first one's.
     """
@@ -150,12 +152,9 @@ def action_fields(scenario: Scenario, limits: Dynamics | None = None) -> tuple[A
         first = ActionField("acceleration", "m/s^2", -limits.max_acceleration, limits.max_acceleration)
     else:
         first = ActionField("speed", "m/s", -limits.max_speed if limits.reverse else 0.0, limits.max_speed)
-    return first, ActionField("steering", "rad", -steering, steering)
-
-
-def action_size(scenario: Scenario) -> int:
-    """Return how many numbers an action has."""
-    return len(action_fields(scenario))
+    entries = first, ActionField("steering", "rad", -steering, steering)
+    pan = scenario.action.pan
+    return entries if pan is None else (*entries, ActionField("pan", "rad", -pan.limit, pan.limit))
 
 
 def flat_space(layout: Mapping[str, Field]) -> spaces.Box:
@@ -171,6 +170,6 @@ def dict_space(layout: Mapping[str, Field]) -> spaces.Dict:
     )
 
 
-def action_space() -> spaces.Box:
-    """Return the action: (speed or acceleration, steering; positive turns left), each in [-1, 1]."""
-    return spaces.Box(-1.0, 1.0, shape=(2,), dtype=np.float32)
+def action_space(scenario: Scenario) -> spaces.Box:
+    """Return the action: (speed or acceleration, steering; positive turns left), and pan if any, each in [-1, 1]."""
+    return spaces.Box(-1.0, 1.0, shape=(scenario.action.size,), dtype=np.float32)

@@ -13,6 +13,7 @@ import warp as wp
 from coopenv.api.terms.way import metres, seen_from_estimate
 from coopenv.world.camera import VISIBLE, body_bearing
 from coopenv.world.collision import UNDER_WAY
+from coopenv.world.command import ACCELERATION, SPEED, STEERING
 from coopenv.world.quality import position_covariance
 from coopenv.world.route import goal_distance, route_length
 from coopenv.world.v2x import fresh
@@ -57,6 +58,7 @@ class Ego:
     effort: wp.float32  # |action|^2
     command: wp.vec3  # what it asked for: speed m/s, steering rad, acceleration m/s^2
     steering: wp.float32  # rad, positive to the left
+    pan: wp.float32  # of the camera, rad, positive to the left
     time_left: wp.float32  # share of the horizon
     route_offset: wp.float32  # m to the left of its way, by the estimate
     route_heading: wp.float32  # rad, estimated heading less that of its way
@@ -173,10 +175,13 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     ego.velocity = wp.vec3(state.odometry_velocity[world, vehicle])
     ego.angular_velocity = wp.vec3(state.odometry_angular_velocity[world, vehicle])
     ego.odometry_age = odometry_age(state.odometry_samples[world, vehicle], time, model.odometry_rate)
-    action = state.action[world, vehicle]
-    ego.action = wp.vec2(action)
-    ego.effort = wp.float32(wp.dot(action, action))
-    ego.command = wp.vec3(state.command[world, vehicle])
+    first = state.action[world, vehicle, 0]
+    second = state.action[world, vehicle, 1]
+    ego.action = wp.vec2(wp.float32(first), wp.float32(second))
+    ego.effort = wp.float32(first * first + second * second)
+    command = state.command[world, vehicle]
+    ego.command = wp.vec3(wp.float32(command[SPEED]), wp.float32(command[STEERING]), wp.float32(command[ACCELERATION]))
+    ego.pan = wp.float32(state.pan[world, vehicle])
     ego.steering = wp.float32(state.steering[world, vehicle])
     ego.time_left = 1.0 - wp.float32(tick) / wp.float32(model.horizon_ticks)
     offset, turn, left, ahead = seen_from_estimate(model, state, world, vehicle)

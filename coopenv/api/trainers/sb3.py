@@ -92,7 +92,7 @@ class CooperativeSB3VecEnv(VecEnv):
         return self.engine.view("observation").reshape(self.num_envs, -1).copy()
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions, (num_envs, 2)."""
+        """Take the actions, (num_envs, A)."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, np.ndarray, np.ndarray, list[dict[str, Any]]]:

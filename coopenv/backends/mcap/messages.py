@@ -31,12 +31,19 @@ float64[] vectors  # x, y, z per target: unit vector camera -> target, body fram
 std_msgs/Header header
 int64[] tick_sent  # per sender: when the last message heard was sent; -1: none
 """,
+    "coopenv_msgs/msg/Pan": """
+std_msgs/Header header
+float64[1] angle  # rad, by which the camera is turned to the left
+""",
     "coopenv_msgs/msg/Truth": """
 std_msgs/Header header
 float64[9] rotation  # body to map, row by row; NaN: not known
 float64[3] position  # m, map
 """,
 }
+
+PAN = {"pan": "coopenv_msgs/msg/Pan"}
+"""A further topic of a vehicle, where cameras pan."""
 
 EXACT = {
     "increment": "coopenv_msgs/msg/Odometry",
@@ -49,6 +56,7 @@ EXACT = {
 CONTENTS = {
     "increment": {name: name for name in ("rotation", "translation", "velocity", "angular_velocity")},
     "bearings": {},
+    "pan": {"angle": "pan"},
     "v2x": {"tick_sent": "inbox_tick"},
     "truth_exact": {"rotation": "truth.rotation", "position": "truth.position"},
 }

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from coopenv.backends.mcap.header import Header
-from coopenv.backends.mcap.messages import ATTACHMENT, EXACT, FORMAT, LANDMARKS, LANDMARKS_TYPE, codec, topic
+from coopenv.backends.mcap.messages import ATTACHMENT, EXACT, FORMAT, LANDMARKS, LANDMARKS_TYPE, PAN, codec, topic
 from coopenv.backends.mcap.ticks import TickArrays
 from coopenv.errors import CoopenvError, DataError
 from coopenv.observers.recording import Recording
@@ -47,8 +47,11 @@ def _read(container: Container, where: str) -> Recording:
     header = _header(container, where)
     constants = header.constants(f"{where}: {ATTACHMENT}")
     names = [setup.name for setup in header.setups]
-    ticks = TickArrays(header.ticks, names, len(header.setups[0].target_names), header.setups[0].landmarks)
-    kinds = {LANDMARKS: LANDMARKS_TYPE} | {topic(name, field): EXACT[field] for name in names for field in EXACT}
+    scenario, first = constants["scenario"], header.setups[0]
+    pan = scenario is not None and scenario.action.pan is not None
+    exact = EXACT | PAN if pan else EXACT
+    ticks = TickArrays(header.ticks, names, len(first.target_names), first.landmarks, pan)
+    kinds = {LANDMARKS: LANDMARKS_TYPE} | {topic(name, field): exact[field] for name in names for field in exact}
     for channel, schema, message in container.messages():
         kind = kinds.get(channel.topic)
         if kind is None:

@@ -6,19 +6,21 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.mcap.messages import CONTENTS, EXACT, LANDMARKS, topic
+from coopenv.backends.mcap.messages import CONTENTS, EXACT, LANDMARKS, PAN, topic
 from coopenv.errors import check_memory
 from coopenv.observers.recording import Truth
 from coopenv.observers.recording_checks import KINDS, SHAPES
 
 
 class TickArrays:
-    """K ticks of N vehicles and T targets, of which the first L are landmarks."""
+    """K ticks of N vehicles and T targets, of which the first L are landmarks; `pan` says whether cameras turn."""
 
-    def __init__(self, ticks: int, vehicles: Sequence[str], targets: int, landmarks: int) -> None:
+    def __init__(self, ticks: int, vehicles: Sequence[str], targets: int, landmarks: int, pan: bool) -> None:
         """Allocate the arrays. Raises CoopenvError: they would not fit into memory."""
         sizes = {"K": ticks, "N": len(vehicles), "T": targets, "L": landmarks}
         shapes = {name: [int(sizes.get(str(n), n)) for n in shape] for name, shape in SHAPES.items() if shape[0] == "K"}
+        shapes |= {"pan": [ticks, len(vehicles)]} if pan else {}
+        exact = EXACT | PAN if pan else EXACT
         needed = 8 * sum(math.prod(shape) for shape in shapes.values())
         check_memory(needed, f"a recording of {ticks} ticks, {len(vehicles)} vehicles and {targets} targets")
         self._shape_of_landmarks = shapes.pop("landmarks")[1:]
@@ -28,7 +30,7 @@ class TickArrays:
         self._arrays = {name: np.zeros(n, dtypes.get(KINDS.get(name, ""), np.float64)) for name, n in shapes.items()}
         self._ticks, self._targets = ticks, targets
         self._landmarks: dict[int, np.ndarray] = {}
-        self._places = {topic(name, field): (field, i) for i, name in enumerate(vehicles) for field in EXACT}
+        self._places = {topic(name, field): (field, i) for i, name in enumerate(vehicles) for field in exact}
         self._columns = {
             name: [(part, self._arrays[array][:, i]) for part, array in CONTENTS[field].items()]
             for name, (field, i) in self._places.items()

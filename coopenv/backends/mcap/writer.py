@@ -17,6 +17,7 @@ from coopenv.backends.mcap.messages import (
     FORMAT,
     LANDMARKS,
     LANDMARKS_TYPE,
+    PAN,
     SHOWN,
     codec,
     topic,
@@ -57,6 +58,7 @@ class _Log:
         from mcap.writer import Writer
 
         self.recording, self.codec = recording, codec()
+        self.exact = EXACT if recording.pan is None else EXACT | PAN
         self.types = {name.removeprefix("geometry_msgs/msg/"): kind for name, kind in self.codec.types.items()}
         self.writer = Writer(stream)
         self.writer.start(profile="ros2", library=f"coopenv {version()}")
@@ -71,7 +73,7 @@ class _Log:
         self.writer.add_metadata("coopenv", about)
         self.writer.add_attachment(0, 0, ATTACHMENT, "application/json", header)
         for i, setup in enumerate(r.setups):  # so that topics are there even if nothing is ever known
-            for name, kind in {**EXACT, **SHOWN}.items():
+            for name, kind in {**self.exact, **SHOWN}.items():
                 self._channel(topic(setup.name, name), kind)
             self._write_vehicle(i, setup.name)
         changed = (r.landmarks[1:] != r.landmarks[:-1]).any(axis=(1, 2))
@@ -84,12 +86,12 @@ class _Log:
         r, known = self.recording, np.flatnonzero(self.recording.truth.known[:, i])
         columns = {
             field: {part: attrgetter(array)(r)[:, i].reshape(r.ticks, -1) for part, array in CONTENTS[field].items()}
-            for field in EXACT
+            for field in self.exact
         }
         for k, shown in enumerate(self._poses(*_dead_reckoned(r, i))):
             for field, parts in columns.items():
                 row = {part: column[k] for part, column in parts.items()} or self._bearings(k, i)
-                self._send(topic(name, field), EXACT[field], k, "map" if field == "truth_exact" else name, **row)
+                self._send(topic(name, field), self.exact[field], k, "map" if field == "truth_exact" else name, **row)
             self._show_odometry(k, i, name, shown)
         truth = self._poses(r.truth.position[known, i], r.truth.rotation[known, i])
         for k, pose in zip(known.tolist(), truth, strict=True):

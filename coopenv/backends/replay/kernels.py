@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.observers.recording import Recording, Truth
 from coopenv.scenario.randomness import PARAMETERS
-from coopenv.world.camera import NOT_A_NEIGHBOUR, OUT_OF_VIEW, VISIBLE, camera_to_body
+from coopenv.world.camera import NOT_A_NEIGHBOUR, OUT_OF_VIEW, VISIBLE
 from coopenv.world.collision import depart, referee, touches_anything
 from coopenv.world.embedded import Source
 from coopenv.world.parameters import COUNT as PARAMETER_COUNT
@@ -66,7 +66,8 @@ def recall(model: Any, state: Any, record: Any, world: int, tick: int):
         state.odometry_velocity[world, vehicle] = record.velocity[row, vehicle]
         state.odometry_angular_velocity[world, vehicle] = record.angular_velocity[row, vehicle]
         state.odometry_samples[world, vehicle] = record.samples[row, vehicle]
-        to_camera = wp.transpose(camera_to_body(model, state, world, vehicle))
+        state.pan[world, vehicle] = record.pan[row, vehicle]
+        to_camera = wp.transpose(model.camera[vehicle].rotation)
         for target in range(model.agents):
             state.sight[world, vehicle, target] = NOT_A_NEIGHBOUR
         for n in range(model.target_count[vehicle]):
@@ -160,6 +161,7 @@ def record_struct(p: Precision) -> Any:
         bearings: array("KNT", vec3)  # body frame
         bearing_lag: array("KN", wp.int32)  # ticks since the frame was exposed
         visible: array("KNT", wp.uint8)
+        pan: array("KN", p.scalar)  # rad
         landmarks: array("KL", vec3)  # map
         inbox_tick: array("KNN", wp.int32)  # of sending, per receiver and sender; BY_RADIO: not known
         true_rotation: array("KN", mat33)  # NaN: not known
@@ -179,6 +181,7 @@ def upload(recording: Recording, odometry_rate: float, p: Precision, device: str
     values: dict[str, np.ndarray] = {
         "samples": np.broadcast_to(samples_taken(recording.t, odometry_rate)[:, None], shape),
         "bearing_lag": np.zeros(shape),
+        "pan": np.zeros(shape) if recording.pan is None else recording.pan,
         "true_rotation": recording.truth.rotation,
         "true_position": recording.truth.position,
         "true_velocity": linear,

@@ -72,7 +72,7 @@ class DifferentiableWorld:
         truth, held, belief = self._start()
         tape = wp.Tape()
         with tape:
-            commands = [self._array(np.zeros((*action.shape, 3)), kernels.vec3) for action in decisions]
+            commands = [self._array(np.zeros((*action.shape, 4)), kernels.vec4) for action in decisions]
             for action, command in zip(decisions, commands, strict=True):
                 self._launch(kernels.command_kernel, [world.model, action, command])
             for tick in range(1, len(actions) * self.scenario.ticks_per_decision + 1):
@@ -200,6 +200,7 @@ def check_differentiable(scenario: Scenario) -> None:
         "camera.quantise must be false and camera.undistort true": all(c.undistort and not c.quantise for c in cameras),
         "dynamics.latency must be the same for every vehicle": len({limits.latency for limits in scenario.limits}) == 1,
         "observer.name must be 'riccati' with k = 1": observer.name == "riccati" and observer.k == 1.0,
+        "action.pan must not be there": scenario.action.pan is None,
         "rates.observer must not be below rates.camera": (scenario.rates.observer or math.inf) >= scenario.rates.camera,
     }
     for reason, holds in reasons.items():

@@ -17,8 +17,8 @@ from coopenv.world.dynamics import bicycle_step, prescribe, yaw_rate
 from coopenv.world.model import PRESCRIBED
 from coopenv.world.precision import precision
 
-scalar, vec2, vec3, mat33, mat66 = (
-    getattr(precision("float64"), name) for name in ("scalar", "vec2", "vec3", "mat33", "mat66")
+scalar, vec2, vec3, vec4, mat33, mat66 = (
+    getattr(precision("float64"), name) for name in ("scalar", "vec2", "vec3", "vec4", "mat33", "mat66")
 )
 
 
@@ -65,7 +65,8 @@ class Information:
 def command_kernel(model: Any, action: wp.array2d(dtype=Any), command: wp.array2d(dtype=Any)):
     """Make every vehicle's command of its action."""
     world, vehicle = wp.tid()
-    command[world, vehicle] = command_of(model.dynamics[vehicle], action[world, vehicle])
+    levels = action[world, vehicle]
+    command[world, vehicle] = command_of(model.dynamics[vehicle], levels[0], levels[1], scalar(0.0))
 
 
 def drive_kernel(
