@@ -39,8 +39,8 @@ class Step:
     - `visible`: (W, N, T), the targets measured in this frame; `time`: (W, 1), s since the reset;
     - `observation`: (W, N, D), scaled and clipped; `action`: (W, N, A) in [-1, 1];
     - `reward_terms`: (W, N) by name, and `reward`, what the scenario's weights make of them;
-    - `alive`, `terminated`, `truncated`: (W, N) bool; `ended`: (W, N), 0 under way, 1 arrived, 2 collided, from 3 on
-      the scenario's own conditions.
+    - `alive`, `terminated`, `truncated`: (W, N) bool; `ended`: (W, N), 0 under way, 1 arrived, 2 collided, 3 off
+      route, from 4 on the scenario's own conditions.
     """
 
     def __init__(self, view: Callable[[str], np.ndarray], scenario: Scenario) -> None:

@@ -20,8 +20,9 @@ class Outcome(IntEnum):
     UNDER_WAY = 0
     ARRIVED = 1
     COLLIDED = 2
+    OFF_ROUTE = 3
 
     @property
     def words(self) -> str:
-        """The name in small letters: "under way", "arrived", "collided"."""
+        """The name in small letters: "under way", "arrived", "collided", "off route"."""
         return self.name.lower().replace("_", " ")

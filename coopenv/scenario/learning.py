@@ -184,6 +184,8 @@ class Termination(Part):
     """Touching a building or another body ends the vehicle's episode."""
     arrival: bool = True
     """Reaching its goal ends the vehicle's episode."""
+    off_route: Positive | None = None
+    """A vehicle that is so far beside its route, or beyond an end of it, has left the road, and its episode ends, m."""
     after_arrival: Literal["park", "leave", "continue"] = "park"
     """`park`: a vehicle that has arrived stands where it is; `leave`: it is gone from the next camera tick on;
     `continue`: it draws a new route that starts where the old one ends, and its episode goes on to the horizon."""

@@ -86,6 +86,7 @@ REWARDS: list[tuple[str, str, bool, str]] = [  # name, unit, privileged, meaning
     ("progress", "m", True, "Decrease of the true way to the goal: along the drawn route, else as the crow flies"),
     ("arrival", "1", False, "1 in the step of arrival"),
     ("collision", "1", False, "-1 in the step of a collision"),
+    ("off_route", "1", False, "-1 in the step in which the vehicle has left its route"),
     ("control", "1", False, "-|action|^2"),
     ("time", "s", False, "Minus the time that has passed"),
     ("position_error", "m", True, "-|position error|"),
@@ -103,5 +104,6 @@ REWARDS: list[tuple[str, str, bool, str]] = [  # name, unit, privileged, meaning
 
 CONDITIONS = [  # name, function, meaning
     ("collision", "touches_anything", "Touching a building or another body, at any camera tick"),
+    ("off_route", "has_left_route", "Being farther from its route than the given distance, after a decision"),
     ("arrival", "reaches_goal", "Reaching the goal, or passing the end of a drawn route, at any camera tick"),
 ]

@@ -178,6 +178,7 @@ def _scene(scenario: Scenario) -> dict[str, Any]:
         "goal_radius": [vehicle.goal_radius for vehicle in scenario.vehicles],
         "end_on_collision": int(scenario.termination.collision),
         "end_on_arrival": int(scenario.termination.arrival),
+        "off_route": scenario.termination.off_route or 0.0,
     }
 
 

@@ -7,11 +7,12 @@ import warp as wp
 from coopenv.estimation.outcomes import Outcome
 from coopenv.world.draw_route import draw_next_route
 from coopenv.world.model import CONTINUE, LEAVE
-from coopenv.world.route import goal_distance, has_routes, is_past_end
+from coopenv.world.route import goal_distance, has_routes, is_past_end, place_on_route, route_length
 
 UNDER_WAY = wp.constant(int(Outcome.UNDER_WAY))
 ARRIVED = wp.constant(int(Outcome.ARRIVED))
 COLLIDED = wp.constant(int(Outcome.COLLIDED))
+OFF_ROUTE = wp.constant(int(Outcome.OFF_ROUTE))
 
 
 @wp.func
@@ -93,6 +94,21 @@ def reaches_goal(model: Any, state: Any, world: int, vehicle: int) -> bool:
 
 
 @wp.func
+def has_left_route(model: Any, state: Any, world: int, vehicle: int) -> bool:
+    """Return whether a vehicle is farther beside its route, or beyond an end of it, than is allowed.
+
+    It is looked at where a decision ends.
+    """
+    allowed = model.scene.off_route
+    if allowed <= allowed.dtype(0.0) or (state.tick[world] + 1) % model.ticks_per_decision != 0:
+        return False
+    p = state.position[world, model.landmarks + vehicle]
+    s, offset, _ = place_on_route(state, world, vehicle, p[0], p[1])
+    beyond = wp.max(s - route_length(state, world, vehicle), -s)
+    return wp.max(wp.abs(offset), beyond) > allowed
+
+
+@wp.func
 def depart(model: Any, state: Any, world: int):
     """Take the vehicles that have arrived off the scene, where they leave; called at the start of a tick."""
     if model.drawn.after_arrival == LEAVE:
@@ -116,5 +132,7 @@ def referee(model: Any, state: Any, world: int, vehicle: int):
                     draw_next_route(model, state, world, vehicle)
                 else:
                     ended = ARRIVED
+        if ended == UNDER_WAY and has_left_route(model, state, world, vehicle):
+            ended = OFF_ROUTE
     state.collided[world, vehicle] = touching
     state.ended[world, vehicle] = ended

@@ -95,6 +95,7 @@ def model_struct(p: Precision) -> Any:
         goal_radius: wp.array(dtype=scalar)  # (N,) m; 0: no goal
         end_on_collision: wp.int32
         end_on_arrival: wp.int32
+        off_route: scalar  # m from the route that end an episode; 0: none do
 
     @wp.struct
     class Routes:

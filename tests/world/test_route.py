@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+import coopenv
 from tests.helpers.route_calls import places, points
 from tests.helpers.warp_calls import DTYPES, EPSILON
 
@@ -79,3 +80,19 @@ def test_no_route(dtype: str) -> None:
     nothing = np.zeros((0, 2))
     assert_allclose(places(dtype, nothing, np.array([[3.0, 4.0]])), 0.0)
     assert_allclose(points(dtype, nothing, np.array([3.0])), 0.0)
+
+
+def test_a_vehicle_that_leaves_its_route_ends_there() -> None:
+    overrides = {"termination.off_route": 1.5, "obstacles": []}
+    env = coopenv.parallel_env("urban_crossing", overrides=overrides)
+    _, infos = env.reset(seed=0)
+    goal, left = np.array(env.scenario.vehicles[0].goal.position[:2]), 0
+    begin = infos["vehicle_1"]["truth"]["position"][:2]
+    along = (goal - begin) / np.linalg.norm(goal - begin)
+    while "vehicle_1" in env.agents:  # a circle to the left
+        _, _, terminated, _, infos = env.step({agent: np.array([1.0, 0.5]) for agent in env.agents})
+        x, y = infos["vehicle_1"]["truth"]["position"][:2] - begin
+        left = max(abs(along[0] * y - along[1] * x), -(along[0] * x + along[1] * y))
+        assert terminated["vehicle_1"] == (left > 1.5)
+    assert infos["vehicle_1"]["outcome"] == "off route"
+    assert infos["vehicle_1"]["reward_terms"]["collision"] == 0.0

@@ -9,7 +9,7 @@ import warp as wp
 from coopenv.api.step_results import DEGREES
 from coopenv.api.terms.map_view import MapLandmark
 from coopenv.api.terms.records import Ego, Neighbour, Target, Truth, log10
-from coopenv.world.collision import COLLIDED
+from coopenv.world.collision import COLLIDED, OFF_ROUTE
 
 EIGENVALUE_FLOOR = wp.constant(1.0e-9)
 
@@ -220,6 +220,11 @@ def arrival(ego: Ego):
 @wp.func
 def collision(ego: Ego):
     return wp.where(ego.outcome == COLLIDED, -1.0, 0.0)
+
+
+@wp.func
+def off_route(ego: Ego):
+    return wp.where(ego.outcome == OFF_ROUTE, -1.0, 0.0)
 
 
 @wp.func
