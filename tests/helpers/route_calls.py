@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import string
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ def points_kernel(state: Any, query: wp.array(dtype=Any), found: wp.array(dtype=
 
 def _found(function: Any, dtype: str, line: np.ndarray, query: np.ndarray) -> np.ndarray:
     p = precision(dtype)
-    sizes = {"W": 1, "N": 1, "A": 1, "P": max(len(line), 1), "M": 1, "S": 1, "B": 1}
+    sizes = {**dict.fromkeys(string.ascii_uppercase, 1), "P": max(len(line), 1)}
     state = allocate(state_struct(p), sizes, "cpu")
     steps = np.linalg.norm(np.diff(line, axis=0), axis=1)
     if len(line):
