@@ -5,12 +5,28 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import eigen_symmetric6, symmetric_part
-from coopenv.estimation.so3 import exp_so3, orthonormalise, quaternion_vector, rotation_vector_sine, skew
-from coopenv.observers.robust.constants import KNOWN_ANGLE, KNOWN_POSITION, MIN_ANGULAR_VELOCITY_STD, MIN_VELOCITY_STD
+from coopenv.estimation.so3 import (
+    exp_so3,
+    orthonormalise,
+    quaternion_vector,
+    rodrigues,
+    rotation_vector_sine,
+    skew,
+    turn_by,
+)
+from coopenv.observers.robust.constants import (
+    KNOWN_ANGLE,
+    KNOWN_POSITION,
+    MAX_ACCELERATION,
+    MIN_ANGULAR_VELOCITY_STD,
+    MIN_VELOCITY_STD,
+)
 from coopenv.observers.robust.memory import Estimate, Pose, mat66d, vec2d, vec6d
 
 KNOWN_ANGLE_VARIANCE = KNOWN_ANGLE**2
 KNOWN_POSITION_VARIANCE = KNOWN_POSITION**2
+QUARTER = 0.25 / MAX_ACCELERATION**2
+THIRD = 1.0 / 3.0
 BEYOND = -0.9  # cosine of an angle from which on the skew part of a rotation says little of its axis
 
 
@@ -43,6 +59,22 @@ def left_error(pose: Pose, other: Pose):
 def displaced(pose: Pose, error: Any):
     """Return the pose that has a left error against one."""
     return Pose(pose.R * exp_so3(error[:3]), pose.p + pose.R * error[3:])
+
+
+@wp.func
+def recentring(error: Any):
+    """Return the derivative, 6x6, of errors about a pose that has been moved by an error by those about it before.
+
+    Exp(theta') = Exp(-dtheta) Exp(theta) and rho' = Exp(-dtheta) (rho - drho): diag(J_r(dtheta), Exp(-dtheta)).
+    Source: Sola, Deray and Atchuthan, A micro Lie theory for state estimation in robotics, arXiv:1812.01537, (143).
+    """
+    w = error[:3]
+    square = wp.dot(w, w)
+    a, b, c = rodrigues(square)
+    S = skew(w)
+    zero = wp.matrix(dtype=wp.float64, shape=(3, 3))
+    right = wp.identity(3, wp.float64) - b * S + c * (S * S)
+    return lower_blocks(right, zero, wp.transpose(turn_by(w, square, a, b)))
 
 
 @wp.func
@@ -82,6 +114,15 @@ def odometry_noise(model: Any, i: int, dt: Any):
     angular = wp.max(wp.float64(model.noise[i].angular_velocity), wp.float64(MIN_ANGULAR_VELOCITY_STD))
     linear = wp.max(wp.float64(model.noise[i].velocity), wp.float64(MIN_VELOCITY_STD))
     return vec2d(angular * angular * scale, linear * linear * scale)
+
+
+@wp.func
+def averaging_time(model: Any, i: int):
+    """Return over which time vehicle i averages a velocity by odometry that changes by `MAX_ACCELERATION` at most, s.
+
+    Over a time t noise of density q has the variance q / (2 t), and the lag is a t: their sum is least at this one.
+    """
+    return wp.pow(odometry_noise(model, i, wp.float64(1.0))[1] * wp.float64(QUARTER), wp.float64(THIRD))
 
 
 @wp.func

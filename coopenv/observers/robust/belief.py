@@ -9,9 +9,9 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import symmetric_part
-from coopenv.observers.robust.algebra import displaced, inverse6, moved, transition, with_noise
-from coopenv.observers.robust.constants import FORGET_TIME, SAME_TIME
+from coopenv.estimation.linalg import block3, cholesky6, symmetric_part
+from coopenv.observers.robust.algebra import displaced, lower_blocks, moved, recentring, transition, with_noise
+from coopenv.observers.robust.constants import FORGET_TIME, MAX_GROWTH, SAME_TIME
 from coopenv.observers.robust.memory import Estimate, Member, Pose, mat66d
 from coopenv.world.camera import VISIBLE
 
@@ -62,6 +62,20 @@ def apply_error(memory: Any, world: int, i: int, n: int, error: Any):
 
 
 @wp.func
+def apply_corrections(memory: Any, world: int, i: int):
+    """Move all members by their corrections, and let the covariance be about where they are then."""
+    for k in range(memory.belief[world, i].members):
+        correction = memory.scratch[world, k].correction
+        apply_error(memory, world, i, k, correction)
+        G = recentring(correction)
+        memory.scratch[world, k].recentring = G
+        for j in range(k + 1):
+            block = G * memory.P[world, i, k, j] * wp.transpose(memory.scratch[world, j].recentring)
+            memory.P[world, i, k, j] = block
+            memory.P[world, i, j, k] = wp.transpose(block)
+
+
+@wp.func
 def subtract_block(memory: Any, world: int, i: int, k: int, j: int, block: Any):
     """Subtract a block from the covariance at (k, j), and its transpose at (j, k)."""
     left = memory.P[world, i, k, j] - block
@@ -72,22 +86,39 @@ def subtract_block(memory: Any, world: int, i: int, k: int, j: int, block: Any):
 
 
 @wp.func
+def cholesky_of(P: Any):
+    """Return the Cholesky factor of a 6x6 matrix in blocks, and the inverses of those on its diagonal."""
+    return cholesky6(block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3))
+
+
+@wp.func
 def fuse_information(memory: Any, world: int, i: int, n: int, information: Any, vector: Any):
     """Fuse information about a member's error x, whose likelihood has the exponent vector^T x - x^T information x / 2.
 
-    P' = P - P_n M P_n^T with M = information (I + P_nn information)^-1, P_n being the member's columns.
+    P' = P - P_n M P_n^T with M = information (I + P_nn information)^-1, P_n being the member's columns. With
+    P_nn = L L^T that is information - Y^T Y, Y = C^-1 L^T information, C C^T = I + L^T information L. Information is a
+    difference and may be negative by rounding; where it would make a variance `MAX_GROWTH` times as large it is none.
     """
     members = memory.belief[world, i].members
-    W = inverse6(memory.P[world, i, n, n] * information + wp.identity(6, wp.float64))
-    M = symmetric_part(information * W)
-    along = wp.transpose(W) * vector
+    L11, L21, L22, _, _ = cholesky_of(memory.P[world, i, n, n])
+    L = lower_blocks(L11, L21, L22)
+    V = wp.transpose(L) * information
+    _, C21, _, I11, I22 = cholesky_of(V * L + wp.identity(6, wp.float64))
+    grown = wp.max(wp.max(wp.get_diag(I11)), wp.max(wp.get_diag(I22)))
+    if not grown * grown < wp.float64(MAX_GROWTH):
+        return
+    inverse = lower_blocks(I11, -(I22 * C21 * I11), I22)
+    Y = inverse * V
+    M = information - wp.transpose(Y) * Y
+    along = vector - wp.transpose(Y) * (inverse * (wp.transpose(L) * vector))
     for k in range(members):
         memory.scratch[world, k].column = memory.P[world, i, k, n]
     for k in range(members):
         gain = memory.scratch[world, k].column * M
         for j in range(k + 1):
             subtract_block(memory, world, i, k, j, gain * wp.transpose(memory.scratch[world, j].column))
-        apply_error(memory, world, i, k, memory.scratch[world, k].column * along)
+        memory.scratch[world, k].correction = memory.scratch[world, k].column * along
+    apply_corrections(memory, world, i)
 
 
 @wp.func

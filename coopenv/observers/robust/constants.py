@@ -4,15 +4,19 @@
 
 MAX_MEMBERS, MAX_MEMBERS_JOINT = 5, 8
 """Vehicles in a belief, the vehicle itself included: of `robust` and of `robust_joint`."""
-MAX_LINEARISATIONS, RELINEARISATION_ANGLE = 8, 0.01
-"""Linearisations of one correction; how far it may turn a line of sight without another one, rad: what is neglected
-then, 0.01^2 / 2, is below `MIN_BEARING_STD`."""
+MAX_LINEARISATIONS, RELINEARISATION_ANGLE = 8, 0.05
+"""Linearisations of one correction; how far it may turn a line of sight to be near, rad. Tuned."""
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
 FORGET_TIME = 1.0  # s out of view after which a member may be evicted. Chosen
 MAX_ACCELERATION = 1.0  # m/s^2 by which a member may leave its last known twist. Chosen: an ordinary start or stop
-TWIST_AVERAGING_TIME = 0.3  # s, over which a neighbour's twist is averaged. Chosen
 MIN_VELOCITY_STD, MIN_ANGULAR_VELOCITY_STD = 2e-3, 2e-4
 """m/s and rad/s, of an odometry sample: the increments of a moving vehicle are never exact."""
+
+JUMP_GATE = 32.5
+"""Change of the odometry's twist from sample to sample, squared, in variances of a sample, that is no noise: twice the
+0.999 quantile of a chi-square of 3."""
+MAX_SMOOTH_ACCELERATION, MAX_SMOOTH_ANGULAR_ACCELERATION = 10.0, 30.0
+"""m/s^2 and rad/s^2 beyond which a change is one that no brakes and no steering make. Chosen."""
 
 # Tests
 
@@ -35,6 +39,7 @@ DEPENDENT_SHARE = 0.7
 """Share that counts of the information of a sender that depends on others: some may have arrived already. Tuned."""
 MAX_VARIANCE_GROWTH = 1.01
 """Ratio of a variance to the predicted one; beyond it the sender has lost information, and its message has no news."""
+MAX_GROWTH = 2.0  # of a variance by information that is negative by rounding; it is below 1.1 as a rule
 MASK_BITS = 64  # vehicles in a mask; numbers from 64 on share bits with lower ones
 MAX_TOLD = 4  # vehicles in a message of `robust_joint`, the sender included: 1.7 kB
 SUPERSEDING_TIME = 1.0  # s, for which a joint message stands for the messages of the vehicles that it holds. Chosen

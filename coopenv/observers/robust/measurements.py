@@ -83,6 +83,7 @@ def set_line_to_member(model: Any, memory: Any, world: int, i: int, n: int, memb
         if memory.member[world, i, member].has_twist == 1:
             half_turn = memory.member[world, i, member].w * (wp.float64(0.5) * age)
             gone = exp_so3(half_turn) * memory.member[world, i, member].v * age
+            variance += memory.member[world, i, member].velocity_variance * age * age
     set_line(memory, world, n, member, b, gone, variance)
 
 

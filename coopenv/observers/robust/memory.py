@@ -62,6 +62,7 @@ class Member:
     has_twist: wp.int32
     v: vec3d  # m/s, body
     w: vec3d  # rad/s, body
+    velocity_variance: wp.float64  # (m/s)^2 per axis, of v
     seen_tick: wp.int32  # when it was last in view
     report: Report  # its last one, at which it stands
     distrusted: wp.int32
@@ -73,6 +74,9 @@ class Belief:
     """What a vehicle believes, but for the members' poses and covariance."""
 
     odometry: Pose  # by dead reckoning, in a frame of its own
+    has_sample: wp.int32  # whether there has been a tick
+    sample_v: vec3d  # m/s, body: the odometry sample held at the last tick's end
+    sample_w: vec3d  # rad/s, body
     members: wp.int32  # how many
     depends_on: wp.uint64  # bits of vehicles
     missed_share: wp.float64  # mean share of bearings that do not fit
@@ -135,6 +139,7 @@ class Scratch:
     PHt: mat62d
     correction: vec6d
     last_correction: vec6d  # where the lines were linearised
+    recentring: mat66d  # of errors about where they were linearised, then about where the member is put
     pose: Pose  # before the correction
 
 
@@ -200,7 +205,10 @@ def _others(rule: Rule) -> Rule:
 
 def rules_for(members: int) -> dict[str, Rule]:
     """Return what a saved memory with so many members may hold, by field, see `coopenv.world.saved_state`."""
-    flags = "search.active outbox.valid inbox.valid member.has_twist member.distrusted member.report.valid line.fits"
+    flags = (
+        "search.active outbox.valid inbox.valid belief.has_sample member.has_twist member.distrusted "
+        "member.report.valid line.fits"
+    )
     ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick"
     large = (
         "hypothesis.cost hypothesis.prior_distance line.variance line.noise scratch.column scratch.PHt scratch_blocks"

@@ -102,13 +102,17 @@ def add_member(model: Any, memory: Any, world: int, i: int, sender: int, tick: i
 
 
 @wp.func
-def propagate_member(memory: Any, world: int, i: int, n: int, step: Pose, dt: Any, noise: Any):
+def propagate_member(model: Any, memory: Any, world: int, i: int, n: int, step: Pose, dt: Any, noise: Any):
     """Carry a member on to its new message by its odometry over dt, and average its twist."""
+    averaged = wp.max(algebra.averaging_time(model, i), wp.float64(0.5) * dt)
+    lag = wp.float64(constants.MAX_ACCELERATION) * averaged
+    q = algebra.odometry_noise(model, i, wp.float64(1.0))[1]
+    memory.member[world, i, n].velocity_variance = lag * lag + wp.float64(0.5) * q / averaged
     propagate(memory, world, i, n, step, noise)
     v = step.p / dt
     w = algebra.log_so3(step.R) / dt
     if memory.member[world, i, n].has_twist == 1:
-        share = wp.min(wp.float64(1.0), dt / wp.float64(constants.TWIST_AVERAGING_TIME))
+        share = wp.min(wp.float64(1.0), dt / averaged)
         v = memory.member[world, i, n].v + share * (v - memory.member[world, i, n].v)
         w = memory.member[world, i, n].w + share * (w - memory.member[world, i, n].w)
     memory.member[world, i, n].v = v
@@ -158,10 +162,15 @@ def fuse_tracklet(memory: Any, world: int, i: int, n: int, report: Report, befor
     for k in range(6):
         if after[k, k] > wp.float64(constants.MAX_VARIANCE_GROWTH) * before.P[k, k]:
             return
-    precision = algebra.inverse6(after)
+    news = algebra.left_error(before.pose, report.pose)
+    G = algebra.recentring(news)
+    precision = wp.transpose(G) * algebra.inverse6(after) * G  # of the error about `before`, as the rest
     information = symmetric_part(precision - algebra.inverse6(before.P))
     offset = algebra.left_error(before.pose, memory.member[world, i, n].pose)
-    vector = precision * algebra.left_error(before.pose, report.pose) - information * offset
+    vector = precision * news - information * offset
+    A = algebra.recentring(-offset)  # backwards, to second order: of the error about the member
+    information = symmetric_part(wp.transpose(A) * information * A)
+    vector = wp.transpose(A) * vector
     share = information_share(memory, world, i, report.depends_on)
     fuse_information(memory, world, i, n, share * information, share * vector)
     memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | report.depends_on
@@ -176,7 +185,7 @@ def fuse_message(model: Any, memory: Any, world: int, i: int, n: int, sender: in
         dt = wp.float64(report.tick - last.tick) * model.camera_period
         step = algebra.between(last.odometry, report.odometry)
         noise = algebra.odometry_noise(model, i, dt)
-        propagate_member(memory, world, i, n, step, dt, noise)
+        propagate_member(model, memory, world, i, n, step, dt, noise)
         before = algebra.carried(Estimate(last.pose, mat66d(last.P)), step, noise)
         was_distrusted = memory.member[world, i, n].distrusted
         memory.member[world, i, n].report = report

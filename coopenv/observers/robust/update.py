@@ -34,7 +34,7 @@ def gate(model: Any, memory: Any, world: int, i: int):
         member = memory.line[world, n].member
         if member != NOTHING:
             nis = innovation_squared(model, memory, world, i, n)
-            if nis < wp.float64(constants.BEARING_GATE):
+            if nis >= wp.float64(0.0) and nis < wp.float64(constants.BEARING_GATE):
                 memory.line[world, n].fits = 1
                 fitting += 1
                 total += nis

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.rotations import exp_so3
 from coopenv.observers.contract import SensorNoise
-from tests.oracles.robust.belief import Belief, Member
+from tests.oracles.robust.belief import Belief, Member, recentring
+from tests.oracles.robust.tracklets import left_error
 
 LEVER_ARM = np.array([0.3, 0.1, 0.5])
 NOISE = SensorNoise(velocity=0.1, angular_velocity=0.01, odometry_period=1 / 60, bearing=0.003)
@@ -63,10 +64,29 @@ def test_correction_adds_information():
     expected = np.linalg.inv(np.linalg.inv(b.P) + H.T @ np.diag(1 / noise) @ H)
     dx, before = expected @ H.T @ (residual / noise), copy.deepcopy(b.members)
     b.correct(H, noise, residual)
-    assert_allclose(b.P, expected, rtol=1e-8, atol=1e-12)
+    G = recentring(dx)
+    assert_allclose(b.P, G @ expected @ G.T, rtol=1e-8, atol=1e-12)
     for n, (old, new) in enumerate(zip(before, b.members, strict=True)):
         assert_allclose(new.R, old.R @ exp_so3(dx[6 * n : 6 * n + 3]), atol=1e-10)
         assert_allclose(new.p, old.p + old.R @ dx[6 * n + 3 : 6 * n + 6], atol=1e-10)
+
+
+def test_recentring_is_the_derivative_of_errors_about_a_moved_pose():
+    b, moved = belief(), belief()
+    dx = 0.3 * np.random.default_rng(3).normal(size=18)
+    moved.shift(dx)
+    there = [left_error(m.R, m.p, *pose_of(b, n, dx)) for n, m in enumerate(moved.members)]
+    assert_allclose(there, 0.0, atol=1e-9)
+    for e in np.eye(18):
+        poses = [pose_of(b, n, dx + 1e-6 * e) for n in range(3)]
+        change = [left_error(m.R, m.p, *pose) for m, pose in zip(moved.members, poses, strict=True)]
+        assert_allclose(recentring(dx) @ e, np.concatenate(change) / 1e-6, atol=1e-5)
+
+
+def pose_of(b: Belief, n: int, dx: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The pose of a member with errors dx."""
+    m = b.members[n]
+    return m.R @ exp_so3(dx[6 * n : 6 * n + 3]), m.p + m.R @ dx[6 * n + 3 : 6 * n + 6]
 
 
 def test_informing_is_correcting_by_an_equivalent_measurement():

@@ -58,7 +58,7 @@ def test_a_receiver_without_news_of_its_own_ends_where_the_sender_is(gap):
         new = sender.report()
         receiver.follow(1, new.odometry_turn[0], new.odometry_position[0], new.time[0], NOISE)
         learnt = tracklet(last, new, NOISE)
-        receiver.inform(np.arange(6, 12), learnt.information, learnt.about([receiver.members[1]]))
+        receiver.inform(np.arange(6, 12), *learnt.about([receiver.members[1]]))
         last = new
     assert_allclose(receiver.members[1].R, sender.belief.own.R, atol=1e-8)
     assert_allclose(receiver.members[1].p, sender.belief.own.p, atol=1e-8)

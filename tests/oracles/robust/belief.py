@@ -13,15 +13,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.estimation.arrays import Array, solve
+from coopenv.estimation.arrays import Array, cholesky, solve
 from coopenv.estimation.rotations import exp_so3, lengths, log_so3, orthonormalise, skew, tangent_basis
 from coopenv.observers.contract import SensorNoise
 from coopenv.observers.mekf import LeftError
 from coopenv.observers.robust.constants import (
+    MAX_ACCELERATION,
+    MAX_GROWTH,
     MAX_LINEARISATIONS,
     RELINEARISATION_ANGLE,
     SAME_TIME,
-    TWIST_AVERAGING_TIME,
 )
 from tests.oracles.robust.matrices import solve_positive
 
@@ -41,6 +42,8 @@ class Member:
     """(3,) last known velocity in its body, m/s; None before a second message."""
     w: Array | None = None
     """(3,) last known angular velocity in its body, rad/s."""
+    velocity_variance: float = 0.0
+    """(m/s)^2 per axis."""
     seen: float = 0.0
     """s, when it was last in view, or was told of along with one in view."""
 
@@ -132,11 +135,14 @@ class Belief:
         R, p = member.odometry
         dR, dp = R.T.dot(odometry_turn), R.T.dot(odometry_position - p)
         self.move(n, dR, dp, noise.odometry(dt))
+        q = float(noise.odometry(1.0)[3])
+        averaged = max((q / (4.0 * MAX_ACCELERATION**2)) ** (1.0 / 3.0), dt / 2.0)
+        member.velocity_variance = (MAX_ACCELERATION * averaged) ** 2 + q / (2.0 * averaged)
         v, w = dp / dt, log_so3(dR) / dt
         if member.v is None or member.w is None:
             member.v, member.w = v, w
         else:
-            share = min(1.0, dt / TWIST_AVERAGING_TIME)
+            share = min(1.0, dt / averaged)
             member.v, member.w = member.v + share * (v - member.v), member.w + share * (w - member.w)
         member.time, member.odometry = time, (odometry_turn, odometry_position)
 
@@ -172,12 +178,12 @@ class Belief:
         """Take independent measurements residual = H x + noise of variances (m,), in Joseph's form."""
         K = self.gain(H, noise)
         self.condense(K, H, noise)
-        self.shift(K.dot(residual))
+        self.shift_about(K.dot(residual))
 
     def settle(
         self, sight: Sight, noise: Array, fits: NDArray[np.bool_], look: Callable[[], tuple[Sight, Array]]
     ) -> None:
-        """Correct by bearings, linearised anew at where they put the poses while that is far from where they were.
+        """Correct by bearings, linearised anew half way, or at where they put the poses if that is far.
 
         Source: the iterated extended Kalman filter as Gauss-Newton steps, Bell and Cathey, The iterated Kalman filter
         update as a Gauss-Newton method, IEEE Transactions on Automatic Control 38(2), 1993.
@@ -189,19 +195,28 @@ class Belief:
             look: returns sight and noise again, at the poses believed by then.
         """
         before = [(member.R, member.p) for member in self.members]
-        dx = np.zeros(len(self.P))
+        x0 = np.zeros(len(self.P))  # where the lines are linearised
         for step in range(MAX_LINEARISATIONS):
             if step > 0:
+                self._put(before, x0)
                 sight, noise = look()
-            H, variances = sight.H[fits].reshape(-1, len(dx)), np.repeat(noise[fits], 2)
+            H = sight.H[fits].reshape(-1, len(x0)).dot(recentring(x0))
+            variances = np.repeat(noise[fits], 2)
             K = self.gain(H, variances)
-            last, dx = dx, K.dot(sight.residual[fits].ravel() + H.dot(dx))
-            for member, (R, p) in zip(self.members, before, strict=True):
-                member.R, member.p = R, p
-            self.shift(dx)
-            if _bend(dx - last, float(sight.distance[fits].min())) < RELINEARISATION_ANGLE:
+            dx = K.dot(sight.residual[fits].ravel() + H.dot(x0))
+            distance = float(sight.distance[fits].min())
+            last, x0 = x0, dx if _bend(dx, distance) >= RELINEARISATION_ANGLE else dx / 2
+            if step > 0 and _bend(x0 - last, distance) < RELINEARISATION_ANGLE:
                 break
+        self._put(before, np.zeros(len(x0)))
         self.condense(K, H, variances)
+        self.shift_about(dx)
+
+    def _put(self, poses: list[tuple[Array, Array]], error: Array) -> None:
+        """Put the members at poses moved by errors."""
+        for member, (R, p) in zip(self.members, poses, strict=True):
+            member.R, member.p = R, p
+        self.shift(error)
 
     def gain(self, H: Array, noise: Array) -> Array:
         """Return the Kalman gain K (6n, m) of measurements H x + noise of variances (m,)."""
@@ -226,13 +241,23 @@ class Belief:
             vector: (m,).
         """
         columns = self.P.take(index, axis=1)
+        L = cholesky(columns.take(index, axis=0))
+        least = np.linalg.eigvalsh(L.T.dot(information).dot(L))[0] if len(index) == 6 else 0.0
+        if not 1.0 + least > 1.0 / MAX_GROWTH:
+            return
         A = columns.take(index, axis=0).dot(information)
         A.flat[:: len(A) + 1] += 1.0
         W = solve(A, np.eye(len(A)))
         M = information.dot(W)
         P = self.P - columns.dot((M + M.T) / 2).dot(columns.T)
         self.P = (P + P.T) / 2
-        self.shift(columns.dot(vector.dot(W)))
+        self.shift_about(columns.dot(vector.dot(W)))
+
+    def shift_about(self, dx: Array) -> None:
+        """Move the poses by the error dx, and let the covariance be about where they are then."""
+        G = recentring(dx)
+        self.P = G.dot(self.P).dot(G.T)
+        self.shift(dx)
 
     def shift(self, dx: Array) -> None:
         """Move the poses of the first members by their part of the error dx (6m,)."""
@@ -240,6 +265,17 @@ class Belief:
             member = self.members[n]
             member.p = member.p + member.R.dot(dx[6 * n + 3 : 6 * n + 6])
             member.R = member.R.dot(exp_so3(dx[6 * n : 6 * n + 3]))
+
+
+def recentring(dx: Array) -> Array:
+    """Return (6n, 6n) the derivative of errors about poses moved by errors dx (6n,) by those about them before."""
+    G = np.zeros((len(dx), len(dx)))
+    for n in range(0, len(dx), 6):
+        w = dx[n : n + 3]
+        x, S = max(float(np.linalg.norm(w)), 1e-6), skew(w)
+        G[n : n + 3, n : n + 3] = np.eye(3) - (1 - np.cos(x)) / x**2 * S + (x - np.sin(x)) / x**3 * S @ S
+        G[n + 3 : n + 6, n + 3 : n + 6] = exp_so3(-w)
+    return G
 
 
 def errors_of(members: Sequence[int]) -> NDArray[np.int64]:

@@ -16,13 +16,13 @@ more. So nothing that was heard before counts twice, and the neighbour's slowly 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
-from coopenv.estimation.rotations import orthonormalise
+from coopenv.estimation.rotations import exp_so3, orthonormalise
 from coopenv.observers.contract import Estimate, Message, SensorNoise, Setup, Tick
 from coopenv.observers.robust.constants import (
     AGREEMENT_DISTANCE,
@@ -33,10 +33,13 @@ from coopenv.observers.robust.constants import (
     DEPENDENT_SHARE,
     HEALTHY_SHARE,
     HEALTHY_TIME,
+    JUMP_GATE,
     LOST_SHARE,
     LOST_TIME,
     MAX_ACCELERATION,
     MAX_MEMBERS,
+    MAX_SMOOTH_ACCELERATION,
+    MAX_SMOOTH_ANGULAR_ACCELERATION,
     MAX_SPEED,
     MESSAGE_GATE,
     MIN_ANGULAR_VELOCITY_STD,
@@ -49,6 +52,8 @@ from tests.oracles.robust.matrices import solve_positive
 from tests.oracles.robust.resection import resect
 from tests.oracles.robust.search import Search, Sighting, is_known
 from tests.oracles.robust.tracklets import Report, from_message, left_error, mask_of, to_message, tracklet
+
+SMOOTH = MAX_SMOOTH_ANGULAR_ACCELERATION, MAX_SMOOTH_ACCELERATION
 
 
 @dataclass
@@ -88,6 +93,7 @@ class Robust:
             setup.noise.odometry_period,
             setup.noise.bearing,
         )
+        self.sample_noise = setup.noise.angular_velocity, setup.noise.velocity
         self.variance = self.noise.bearing_std**2
         self.possible_dependencies = int(
             mask_of({int(t) - self.landmarks for t in setup.targets if t >= self.landmarks})
@@ -98,6 +104,7 @@ class Robust:
         R, p = (np.array(x, float) for x in initial_pose)
         P = np.array(initial_covariance, float)
         self.odometry = np.eye(3), np.zeros(3)
+        self.sample: tuple[Array, Array] | None = None  # held at the last tick's end
         self.contacts: dict[int, Contact] = {}
         self.depends_on = self.possible_dependencies
         self.missed = 0.0
@@ -107,9 +114,10 @@ class Robust:
 
     def update(self, tick: Tick) -> Estimate:
         """Take one camera tick."""
+        tick, jumps = self._trapezoidal(tick)
         R, p = self.odometry
         self.odometry = orthonormalise(R.dot(tick.rotation)), p + R.dot(tick.translation)
-        noise = self.noise.odometry(tick.dt)
+        noise = self.noise.odometry(tick.dt) + jumps
         self.nis, self.nis_dof = 0.0, 0
         if self.search is not None:
             self.search.move(tick, noise)
@@ -124,6 +132,26 @@ class Robust:
         belief = self.belief if self.search is None else self.search.best
         P, coordinates = belief.P[:6, :6].copy(), Coordinates.LEFT
         return Estimate(belief.own.R, belief.own.p, P, coordinates, self.nis if self.nis_dof else None, self.nis_dof)
+
+    def _trapezoidal(self, tick: Tick) -> tuple[Tick, Array]:
+        """Return a tick whose increment has the half change of the held sample that holding it has left out.
+
+        Also the variances (6,) of what has changed at once, at an unknown time between two samples.
+        """
+        before, self.sample = self.sample, (tick.angular_velocity, tick.velocity)
+        if before is None:
+            return tick, np.zeros(6)
+        T = self.noise.odometry_period
+        changes = [b - a for a, b in zip(before, self.sample, strict=True)]
+        turn, step = (0.5 * T * change for change in changes)
+        translation = tick.translation + tick.rotation.dot(step)
+        jumps = [
+            change.dot(change) * T * T / 12.0
+            if change.dot(change) > max(JUMP_GATE * std**2, (smooth * T) ** 2)
+            else 0.0
+            for change, std, smooth in zip(changes, self.sample_noise, SMOOTH, strict=True)
+        ]
+        return replace(tick, rotation=tick.rotation.dot(exp_so3(turn)), translation=translation), np.repeat(jumps, 3)
 
     def message(self) -> Message:
         """Return pose, covariance and odometry, or nothing while the pose is not known."""
@@ -263,8 +291,8 @@ class Robust:
         if learnt is None:
             return
         share = self._share(report)
-        vector = learnt.about([self.belief.members[n] for n in places])
-        self.belief.inform(errors_of(places), share * learnt.information, share * vector)
+        information, vector = learnt.about([self.belief.members[n] for n in places])
+        self.belief.inform(errors_of(places), share * information, share * vector)
         self.depends_on |= report.depends_on
 
     def _share(self, report: Report) -> float:
@@ -335,7 +363,7 @@ class Robust:
                 z.append(member.p + member.R.dot(point))
                 places.append(place)
                 points.append(point)
-                drift.append(self._drift(age))
+                drift.append(self._drift(age) + member.velocity_variance * max(age, 0.0) ** 2)
                 counts.append(contact is None or contact.trusted)
             else:
                 continue

@@ -19,7 +19,7 @@ from coopenv.estimation.rotations import exp_so3, log_so3, orthonormalise, skew
 from coopenv.observers.contract import Message, SensorNoise
 from coopenv.observers.mekf import LeftError
 from coopenv.observers.robust.constants import MASK_BITS
-from tests.oracles.robust.belief import Belief, Member
+from tests.oracles.robust.belief import Belief, Member, recentring
 from tests.oracles.robust.matrices import invert_positive
 
 
@@ -60,11 +60,11 @@ class Tracklet:
     information: Array  # (6m, 6m)
     vector: Array  # (6m,)
 
-    def about(self, members: list[Member]) -> Array:
-        """Return the vector (6m,) for errors about other poses."""
+    def about(self, members: list[Member]) -> tuple[Array, Array]:
+        """Return information (6m, 6m) and vector (6m,) for errors about other poses."""
         offset = np.concatenate([left_error(R, p, m.R, m.p) for R, p, m in zip(self.R, self.p, members, strict=True)])
-        result: Array = self.vector - self.information.dot(offset)
-        return result
+        A = recentring(-offset)  # backwards, to second order
+        return A.T.dot(self.information).dot(A), A.T.dot(self.vector - self.information.dot(offset))
 
 
 def tracklet(last: Report, new: Report, noise: SensorNoise) -> Tracklet | None:
@@ -83,7 +83,8 @@ def tracklet(last: Report, new: Report, noise: SensorNoise) -> Tracklet | None:
     before.flat[:: 6 * m + 1] += Q
     if (new.P.diagonal() > 1.01 * before.diagonal()).any():
         return None
-    after = invert_positive(new.P)
+    G = recentring(c)
+    after = G.T.dot(invert_positive(new.P)).dot(G)
     return Tracklet(R, p, after - invert_positive(before), after.dot(c))
 
 

@@ -4,10 +4,19 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.observers.robust.algebra import between, left_error, moved, odometry_noise, transition
-from coopenv.observers.robust.belief import apply_error, index_of, subtract_block
+from coopenv.observers.robust.algebra import between, left_error, moved, odometry_noise, recentring, transition
+from coopenv.observers.robust.belief import apply_corrections, index_of, subtract_block
 from coopenv.observers.robust.constants import MAX_TOLD, MAX_VARIANCE_GROWTH
-from coopenv.observers.robust.joint.matrices import AFTER, BEFORE, INVERSE, entry, invert, multiply, symmetrise
+from coopenv.observers.robust.joint.matrices import (
+    AFTER,
+    BEFORE,
+    INVERSE,
+    entry,
+    invert,
+    multiply,
+    recentre,
+    symmetrise,
+)
 from coopenv.observers.robust.memory import mat66d, vec6d
 from coopenv.observers.robust.tracklets import propagate_member
 
@@ -46,7 +55,7 @@ def propagate_told(model: Any, memory: Any, world: int, i: int, count: int):
             if told.tick > last.tick:
                 dt = wp.float64(told.tick - last.tick) * model.camera_period
                 step = between(last.odometry, told.odometry)
-                propagate_member(memory, world, i, n, step, dt, odometry_noise(model, i, dt))
+                propagate_member(model, memory, world, i, n, step, dt, odometry_noise(model, i, dt))
                 memory.member[world, i, n].report.tick = told.tick
                 memory.member[world, i, n].report.odometry = told.odometry
 
@@ -61,6 +70,9 @@ def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
         if entry(memory, world, AFTER, k, k) > wp.float64(MAX_VARIANCE_GROWTH) * entry(memory, world, BEFORE, k, k):
             return False
     invert(memory, world, AFTER, INVERSE, count)
+    for a in range(count):  # of the errors about `step`, as the rest
+        memory.scratch[world, a].recentring = recentring(left_error(memory.step[world, a], memory.told[world, a].pose))
+    recentre(memory, world, INVERSE, count)
     for a in range(count):
         vector = vec6d()
         for b in range(count):
@@ -82,6 +94,12 @@ def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
             vector = vector - memory.matrix[world, BEFORE, a, b] * offset
         memory.scratch[world, a].correction = vector
         size += wp.dot(vector, vector)
+    for a in range(count):  # of the errors about the members, backwards, to second order
+        n = index_of(memory, world, i, memory.told[world, a].vehicle)
+        G = recentring(-left_error(memory.step[world, a], memory.member[world, i, n].pose))
+        memory.scratch[world, a].recentring = G
+        memory.scratch[world, a].correction = wp.transpose(G) * memory.scratch[world, a].correction
+    recentre(memory, world, BEFORE, count)
     return wp.isfinite(size)
 
 
@@ -122,4 +140,5 @@ def fuse_joint_information(memory: Any, world: int, i: int, count: int):
                 gain += memory.blocks[world, k, a] * memory.matrix[world, AFTER, a, b]
             for j in range(k + 1):
                 subtract_block(memory, world, i, k, j, gain * wp.transpose(memory.blocks[world, j, b]))
-        apply_error(memory, world, i, k, error)
+        memory.scratch[world, k].correction = error
+    apply_corrections(memory, world, i)

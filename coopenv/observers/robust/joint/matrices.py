@@ -21,6 +21,16 @@ def multiply(memory: Any, world: int, x: int, y: int, z: int, count: int):
 
 
 @wp.func
+def recentre(memory: Any, world: int, x: int, count: int):
+    """Turn the information x about some errors into that about others, of which `scratch` holds the derivatives."""
+    for a in range(count):
+        Gt = wp.transpose(memory.scratch[world, a].recentring)
+        for b in range(count):
+            block = Gt * memory.matrix[world, x, a, b] * memory.scratch[world, b].recentring
+            memory.matrix[world, x, a, b] = block
+
+
+@wp.func
 def symmetrise(memory: Any, world: int, x: int, count: int):
     """Replace the matrix x, of so many blocks, by its symmetric part."""
     for a in range(count):

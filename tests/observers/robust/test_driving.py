@@ -1,0 +1,89 @@
+"""`robust` in scenes in which cars are driven: it knows how wrong it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from coopenv.scenario import Scenario
+from coopenv.scenario.files import load_scenario
+from coopenv.world.world import World
+from tests.helpers.builders import reset, simulate
+from tests.helpers.warp_calls import DTYPES
+
+CORNERS = [(x, y) for x in (-3.8, 3.8) for y in (-3.8, 3.8)]
+SIDES = [
+    (sx * a, sy * b) for sx in (-1, 1) for sy in (-1, 1) for a, b in ((5.5, 3.9), (3.9, 5.5), (7.5, 4.0), (4.0, 7.5))
+]
+HEIGHTS = (0.3, 0.6, 0.9, 0.5, 0.7)
+
+
+def square(**overrides: object) -> Scenario:
+    """Return four cars on an open square whose landmarks are seen by those only that look aside."""
+    landmarks = [{"name": f"L{n}", "position": [x, y, HEIGHTS[n % 5]]} for n, (x, y) in enumerate(CORNERS + SIDES)]
+    start = {"vehicle_defaults.initial_estimate": {"position_radius": 0.3, "orientation_angle": 0.15}}
+    open_space = {"obstacles": [], "landmarks": landmarks, "camera.range": 6.0, "horizon": 20.0}
+    return load_scenario("urban_crossing", {**open_space, **start, "observer.name": "robust", **overrides})
+
+
+def estimates(world: World) -> tuple[np.ndarray, np.ndarray]:
+    """Return R (W, N, 3, 3) and p (W, N, 3) as estimated."""
+    R = world.view("estimate_rotation").astype(float)
+    return R, np.einsum("wnij,wnj->wni", R, world.view("estimate_position").astype(float))
+
+
+def weaving(world: World, k: int, phase: np.ndarray) -> np.ndarray:
+    """Return actions (W, N, 2) of drivers that weave along their lanes."""
+    R, p = estimates(world)
+    goal = world.view("goal").astype(float)
+    start = world.view("start_position")[:, world.model.landmarks :].astype(float)
+    along = (goal - start) / np.linalg.norm(goal - start, axis=-1, keepdims=True)
+    ahead = start + along * (np.einsum("wni,wni->wn", p - start, along) + 1.5)[..., None] - p
+    heading = np.arctan2(ahead[..., 1], ahead[..., 0]) + 0.6 * np.sin(0.16 * k + phase)
+    turn = heading - np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    return np.stack([np.ones_like(turn), 3.0 * np.arctan2(np.sin(turn), np.cos(turn))], -1)
+
+
+def turning_hard(world: World, k: int, phase: np.ndarray) -> np.ndarray:
+    """Return actions (W, N, 2) of drivers that steer as far as they can, to either side in turn."""
+    return np.stack([np.full(phase.shape, 0.5), np.sign(np.sin(0.09 * k + phase))], -1)
+
+
+def driven(scenario: Scenario, driver: object, worlds: int, dtype: str, seconds: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return NEES / 6 (K, W, N) and position errors in m of vehicles under way; NaN of others and in a search."""
+    world = simulate(scenario, worlds, dtype)
+    reset(world, range(1000, 1000 + worlds))
+    phase = np.random.default_rng(0).uniform(0, 2 * np.pi, (worlds, world.model.vehicles))
+    nees, errors = [], []
+    for k in range(10 * seconds):
+        world.actions.numpy()[...] = np.clip(driver(world, k, phase), -1, 1)
+        world.advance(6)
+        (R, p), L = estimates(world), world.model.landmarks
+        assert np.isfinite(p).all()
+        away = world.view("position")[:, L:].astype(float) - p
+        turned = Rotation.from_matrix((np.swapaxes(R, -1, -2) @ world.view("rotation")[:, L:]).reshape(-1, 3, 3))
+        e = np.concatenate([turned.as_rotvec().reshape(p.shape), np.einsum("wnji,wnj->wni", R, away)], -1)
+        searching = world.memory.search.numpy()["active"] == 1
+        P = np.where(searching[..., None, None], np.eye(6), world.memory.P.numpy()[:, :, 0, 0])
+        assert (np.linalg.eigvalsh(P)[..., 0] > 0.0).all()
+        under_way = (world.view("ended") == 0) & ~searching
+        found = np.einsum("wni,wni->wn", e, np.linalg.solve(P, e[..., None])[..., 0]) / 6.0
+        nees.append(np.where(under_way, found, np.nan))
+        errors.append(np.where(under_way, np.linalg.norm(away, axis=-1), np.nan))
+    return np.array(nees), np.array(errors)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_hard_turns_are_in_the_covariance(dtype: str) -> None:
+    """Samples of odometry that are held lag behind: with a lag of half a period ANEES/6 would be 1.86."""
+    nees, errors = driven(square(), turning_hard, 48, dtype, 14)
+    assert 0.8 < np.nanmean(nees[30:]) < 1.2
+    assert np.nanpercentile(errors[80:], 95) < 0.03
+
+
+def test_cars_that_see_little_but_each_other_are_consistent() -> None:
+    """With covariances left about poses before their correction ANEES/6 would be 1.6, at worst 80."""
+    nees, _ = driven(square(), weaving, 96, "float32", 12)
+    assert 0.8 < np.nanmean(nees[30:]) < 1.35
+    assert np.nanmean(nees[30:] > 5.0) < 3e-3
