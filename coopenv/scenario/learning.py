@@ -176,7 +176,8 @@ class Termination(Part):
     """What ends an agent's episode before the horizon: a switch for every condition, its own and those of coopenv."""
 
     model_config = ConfigDict(
-        extra="allow", json_schema_extra=_only_those_of_coopenv([*TERMINATION_CONDITIONS.built_in, "privileged"])
+        extra="allow",
+        json_schema_extra=_only_those_of_coopenv([*TERMINATION_CONDITIONS.built_in, "after_arrival", "privileged"]),
     )
     __pydantic_extra__: dict[str, bool] = Field(init=False)
 

@@ -12,6 +12,8 @@ from coopenv.backends.moved import MovedWorld
 from coopenv.backends.simulated import Simulated
 from coopenv.errors import CoopenvError
 from coopenv.scenario import Scenario
+from coopenv.world.collision import UNDER_WAY
+from coopenv.world.command import SPEED, STEERING
 
 
 class HighwayWorld(MovedWorld):
@@ -31,11 +33,16 @@ class HighwayWorld(MovedWorld):
         super().restart()
 
     def fetch(self) -> bool:
-        """Drive to the next tick in the worlds that are not over."""
-        commands, k = self.view("command"), self.view("tick")
+        """Drive to the next tick in the worlds that are not over.
+
+        Who has ended brakes with its wheels straight: here it still rolls, and its action must not steer it.
+        """
+        commands, k = np.array(self.view("command"), dtype=float), self.view("tick")
+        ended = self.view("ended") != UNDER_WAY
+        commands[ended, SPEED] = commands[ended, STEERING] = 0.0
         present = self.view("present")[:, self.model.landmarks :]
         for w in np.flatnonzero((self.mask.numpy() == 0) & (k < self.model.horizon_ticks)).tolist():
-            self.move(w, self._simulations[w].drive(np.array(commands[w], dtype=float), present[w]))
+            self.move(w, self._simulations[w].drive(commands[w], present[w]))
         return True
 
     def source_state(self) -> dict[str, Any]:
