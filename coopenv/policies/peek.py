@@ -20,7 +20,7 @@ class Peek(RouteFollower):
     needs = ("position_std", "map_position", "map_mask", "route_heading", "route_offset")
 
     def __init__(
-        self, scenario: Scenario, *, threshold: float = 0.05, ahead: float = 0.4, farthest: float = 0.6
+        self, scenario: Scenario, *, threshold: float = 0.1, ahead: float = 0.4, farthest: float = 0.6
     ) -> None:
         """Choose when to peek.
 
