@@ -287,7 +287,7 @@ def test_many_chunks_that_unpack_to_much(written: Path, tmp_path: Path) -> None:
     path, more = tmp_path / "hostile.mcap", tmp_path / "more.mcap"
     bomb(written, path, 9 * 2**20)  # a million records of 9 bytes
     bomb(path, more, 9 * 2**20)
-    refused(more, "would unpack to 9437184, more than 8")
+    refused(more, r"would unpack to 9437184, more than [89]\d{6}\b")  # the limit is for both
 
 
 def test_a_chunk_that_is_not_what_it_says(written: Path, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import coopenv
+from coopenv.estimation.outcomes import Outcome
 
 EXAMPLES = Path(__file__).parents[3] / "examples"
 
@@ -39,4 +40,4 @@ def test_leaving_the_road_ends_an_episode() -> None:
     envs = coopenv.make_vec(path, num_worlds=2, overrides=overrides, autoreset="disabled")
     envs.reset(seed=0)
     ended = np.array([envs.step(np.tile([1.0, 0.0], (2, 1)))[4]["ended"] for _ in range(25)])  # 2 m at 1.5 m/s
-    assert set(ended[:10].ravel()) == {0} and set(ended[-1]) == {3}
+    assert set(ended[:10].ravel()) == {0} and set(ended[-1]) == {len(Outcome)}

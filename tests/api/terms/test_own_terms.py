@@ -16,6 +16,7 @@ import coopenv
 from coopenv.api.terms.records import Ego, Target, Truth
 from coopenv.cli import main
 from coopenv.errors import CoopenvError, ScenarioError
+from coopenv.estimation.outcomes import Outcome
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.scenario.files import scenario_path
 from coopenv.scenario.terms import REWARD_TERMS
@@ -138,7 +139,11 @@ def test_conditions_of_ones_own_end_episodes(face: str) -> None:
     env = coopenv.make_vec("urban_crossing", num_worlds=2, overrides=overrides)
     env.reset(seed=0)
     ended = [env.step(np.zeros(env.action_space.shape, np.float32))[4]["ended"].tolist() for _ in range(3)]
-    assert ended == [[0] * 8, [3] * 8, [0] * 8]  # not of coopenv's outcomes: the first own one; then all over again
+    assert ended == [
+        [0] * 8,
+        [len(Outcome)] * 8,
+        [0] * 8,
+    ]  # the first own outcome; then all over again
 
 
 def test_conditions_that_are_off_and_terms_without_weight_cost_nothing() -> None:
