@@ -54,6 +54,12 @@ class Driver(ABC):
         """Return a field of the observations in its unit, (rows, *shape)."""
         return self.layout[name].values(observations)
 
+    def known(self, observations: np.ndarray) -> np.ndarray:
+        """Return which landmarks of the map there are, (rows, K): all, where the observation has no `map_mask`."""
+        if "map_mask" in self.layout:
+            return self.read(observations, "map_mask") > 0.5
+        return np.ones((len(observations), self.layout["map_position"].shape[0]), dtype=bool)
+
     def way_ahead(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return points of the way ahead, (rows, P, 2), m, in the own frame, and how far along it they are, (P,), m.
 

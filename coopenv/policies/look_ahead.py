@@ -24,7 +24,7 @@ class LookAhead(RouteFollower):
     uncertainty costs: the standard deviation of the position, over the plan and a few metres beyond.
     """
 
-    needs = ("axis_std", "heading_std", "map_position", "map_mask", "route_heading", "route_offset", "route_ahead")
+    needs = ("axis_std", "heading_std", "map_position", "route_heading", "route_offset", "route_ahead")
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class LookAhead(RouteFollower):
         """Return the costs, (rows, plans) in s."""
         way, bends = self._way(observations)
         landmarks = self.read(observations, "map_position")[:, None, :, :2]
-        known = self.information * (self.read(observations, "map_mask") > 0.5)[:, None]
+        known = self.information * self.known(observations)[:, None]
         belief = self._belief(observations)
         shape = len(observations), len(self._first)
         x, y, heading, along = (np.zeros(shape, dtype=np.float32) for _ in range(4))

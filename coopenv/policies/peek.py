@@ -17,7 +17,7 @@ class Peek(RouteFollower):
     none that leads farther from the way once it is too far from it. With a camera that pans it turns that instead.
     """
 
-    needs = ("position_std", "map_position", "map_mask", "route_heading", "route_offset")
+    needs = ("position_std", "map_position", "route_heading", "route_offset")
 
     def __init__(
         self, scenario: Scenario, *, threshold: float = 0.1, ahead: float = 0.4, farthest: float = 0.6
@@ -48,7 +48,7 @@ class Peek(RouteFollower):
     def offset(self, observations: np.ndarray, heading: np.ndarray) -> np.ndarray:
         """Return the heading, (rows,) in rad from the way's, from which most landmarks would be in view."""
         landmarks = self.read(observations, "map_position")[..., :2]
-        known = self.read(observations, "map_mask") > 0.5
+        known = self.known(observations)
         aside = self.read(observations, "route_offset")[:, 0]
         best, most = np.zeros(len(heading)), np.full(len(heading), -1)
         for offset in OFFSETS:

@@ -15,7 +15,7 @@ from coopenv.shipped import list_agents
 COLUMNS = {
     "envs": ("name", "vehicles", "landmarks", "motion", "horizon_s"),
     "observers": ("name", "about"),
-    "agents": ("name", "kind", "environments", "about"),
+    "agents": ("name", "kind", "about"),
     "variants": ("name", "of", "about"),
 }
 """What the tables show of the rows."""

@@ -147,6 +147,7 @@ def _end(scenario: Scenario) -> str:
     steps = round(scenario.horizon * scenario.rates.decision)
     ends = scenario.termination
     causes = [word for word in ("collision", "arrival") if scenario.driven and getattr(ends, word)] + [*ends.own]
+    causes += [f"{number(ends.off_route)} m off its route"] if ends.off_route else []
     early = f"; for a vehicle at {' or '.join(causes)}" if causes else ""
     return f"after {number(scenario.horizon)} s, {steps} decisions{early}"
 
