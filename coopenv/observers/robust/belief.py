@@ -71,6 +71,8 @@ def apply_corrections(memory: Any, world: int, i: int):
         memory.scratch[world, k].recentring = G
         for j in range(k + 1):
             block = G * memory.P[world, i, k, j] * wp.transpose(memory.scratch[world, j].recentring)
+            if k == j:
+                block = symmetric_part(block)
             memory.P[world, i, k, j] = block
             memory.P[world, i, j, k] = wp.transpose(block)
 
