@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-train test-all test-matrix lint format bench stages schema clean
+.PHONY: help demo test test-train test-all test-matrix lint format bench stages schema pages clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -66,6 +66,9 @@ stages: $(VENV)/.base ## measure what a vehicle tick costs, stage by stage
 
 schema: $(VENV)/.base ## write the JSON schema of scenario files, which editors complete from
 	@$(BIN)/coopenv schema --out docs/scenario.schema.json
+
+pages: $(VENV)/.base ## write the pages of the environments; MEASURE=--measure for their figures, too
+	@$(BIN)/coopenv page --all $(MEASURE) --out docs/environments
 
 clean: ## remove the virtual environment and all results
 	@rm -rf $(VENV) out build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -1,4 +1,4 @@
-"""The command line: `coopenv list | describe | schema | run | record | train | evaluate | watch | play | bench`.
+"""The command line: `coopenv list | describe | schema | run | record | train | evaluate | watch | play | page | bench`.
 
 Commands import what they need when they run, so that `--help` and completion are quick.
 """
@@ -16,6 +16,7 @@ from coopenv.cli import show
 from coopenv.cli.bench import bench
 from coopenv.cli.evaluate import evaluate
 from coopenv.cli.live import play, watch
+from coopenv.cli.page import page
 from coopenv.cli.run import record_command, run
 from coopenv.cli.train import train
 from coopenv.errors import CoopenvError
@@ -40,6 +41,7 @@ app.command()(train)
 app.command()(evaluate)
 app.command()(watch)
 app.command()(play)
+app.command()(page)
 app.add_typer(bench, name="bench")
 
 

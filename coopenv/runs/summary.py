@@ -80,7 +80,7 @@ def _vehicles(scenario: Scenario) -> str:
 
 def _targets(scenario: Scenario) -> str:
     moving = sum(landmark.motion.kind != "static" for landmark in scenario.landmarks)
-    buildings = f", {len(scenario.obstacles)} buildings" if scenario.obstacles else ""
+    buildings = f", {_several(len(scenario.obstacles), 'building')}" if scenario.obstacles else ""
     mode = {
         "fixed": "fixed topology: every neighbour is measured in every frame",
         "sensed": "sensed topology: what is in the field of view and not hidden is measured",
@@ -89,7 +89,12 @@ def _targets(scenario: Scenario) -> str:
         mode = {"ideal": "every neighbour is measured in every frame", "blind": "nothing is measured"}[scenario.sensing]
         mode = f"{scenario.sensing} sensing: {mode}"
     also = f" ({moving} moving)" if moving else ""
-    return f"{len(scenario.landmarks)} landmarks{also}, other vehicles{buildings}; {mode}"
+    others = ", other vehicles" if len(scenario.vehicles) > 1 else ""
+    return f"{_several(len(scenario.landmarks), 'landmark')}{also}{others}{buildings}; {mode}"
+
+
+def _several(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def _camera(scenario: Scenario) -> str:

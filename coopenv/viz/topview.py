@@ -130,7 +130,7 @@ class TopView:
         self._moving_names = {
             i: layers.keep(ground.label_landmark(self._axes, m.name, np.zeros(2)))
             for i, m in enumerate(self.scenario.landmarks)
-            if m.motion.kind != "static" or m.is_drawn
+            if (m.motion.kind != "static" or m.is_drawn) and m.group is None  # names of a group say little, and overlap
         }
 
     def _prepare_table(self) -> None:

@@ -18,6 +18,7 @@ from coopenv.viz.topview_geometry import limits, road_corners
 
 WIDTH, HEIGHT = 896, 672  # px; multiples of 16, as video codecs like them
 _LEFT, _BOTTOM, _SIDE = 54, 46, 592  # px, of the square axes
+_WORDS = 36  # px, from the axes to what is written beside them, whatever numbers stand between
 PANEL = _LEFT + _SIDE + 12  # px, left edge of the panel
 SMALLER = 6.5  # pt
 ROW = 16  # px
@@ -55,7 +56,8 @@ def new_ground(scenario: Scenario) -> tuple[Figure, Axes]:
     ax.grid(True, color="white", linewidth=0.8)
     ax.tick_params(labelsize=SMALL, length=2.5, width=0.6, colors=INK)
     ax.set_xlabel("x [m]", fontsize=NORMAL, color=INK, labelpad=1)
-    ax.set_ylabel("y [m]", fontsize=NORMAL, color=INK, labelpad=-2)
+    ax.set_ylabel("y [m]", fontsize=NORMAL, color=INK)
+    ax.yaxis.set_label_coords(-_WORDS / _SIDE, 0.5)
     for spine in ax.spines.values():
         spine.set(linewidth=0.6, color=GREY)
     low, high = limits(scenario)

@@ -17,7 +17,8 @@ import coopenv
 from coopenv.api.terms.layout import observation_layout
 from coopenv.cli import main
 from coopenv.runs import scenario_text as words
-from coopenv.runs.describe import describe_scenario, settings
+from coopenv.runs.describe import describe_scenario
+from coopenv.runs.scenario_rows import settings
 from coopenv.scenario.bodies import ConstantMotion, InitialEstimate, SegmentMotion, TwistSegment, WaypointMotion
 from coopenv.scenario.files import apply_vehicle_defaults, parse_scenario
 from coopenv.scenario.json_schema import schema_text

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from coopenv.bench.agents.contest import IDEAL, Entrant, Evaluation
-from coopenv.bench.agents.table import COLUMNS, shown
+from coopenv.bench.agents.table import COLUMNS, cell
 from coopenv.errors import CoopenvError
 from coopenv.files import check_file, replace_text
 from coopenv.jsonable import json_text
@@ -75,15 +75,9 @@ def text(entrant: Entrant, card: dict[str, Any]) -> str:
     lines = [f"# {entrant.name}", "", " ".join(entrant.agent.description.split()), ""]
     lines += [f"| environment | worlds | {' | '.join(headings)} |", "|---" * (len(headings) + 2) + "|"]
     for name, entry in card["environments"].items():
-        cells = [_cell(entry["results"][metric], factor) for metric, (_, factor) in COLUMNS.items()]
+        cells = [cell(entry["results"][metric], factor) for metric, (_, factor) in COLUMNS.items()]
         lines.append(f"| {name} | {entry['worlds']} | {' | '.join(cells)} |")
     lines += ["", "With 95 % intervals over worlds; errors from 3 s on, of vehicles under way. Measured with", ""]
     commands = dict.fromkeys((entry["command"], entry["coopenv"]) for entry in card["environments"].values())
     lines += [f"    {command} --write-card  # coopenv {number}" for command, number in commands]
     return "\n".join(lines) + "\n"
-
-
-def _cell(result: dict[str, Any], factor: float) -> str:
-    values = [float("nan") if result[key] is None else factor * result[key] for key in ("mean", "ci_low", "ci_high")]
-    mean, low, high = shown(*values)
-    return f"{mean} [{low}, {high}]"

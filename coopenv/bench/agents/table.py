@@ -1,6 +1,7 @@
 """The tables that `coopenv evaluate` prints."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from rich.table import Table
@@ -52,6 +53,13 @@ def shown(mean: float, low: float, high: float) -> tuple[str, str, str]:
         decimals = int(np.clip(-np.floor(np.log10(width)), 0, 2))
     first, second, third = (f"{v + 0.0:.{decimals}f}" if np.isfinite(v) else NONE for v in (mean, low, high))
     return first, second, third
+
+
+def cell(result: Mapping[str, Any], factor: float) -> str:
+    """Return a figure of a file, `mean` with `ci_low` and `ci_high`, with its interval in brackets."""
+    values = [float("nan") if result[key] is None else factor * result[key] for key in ("mean", "ci_low", "ci_high")]
+    mean, low, high = shown(*values)
+    return f"{mean} [{low}, {high}]"
 
 
 def _cell(result: Result, factor: float) -> str:

@@ -1,0 +1,75 @@
+"""Pages of environments as files: text, picture and measured figures of each, and an index."""
+
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from coopenv.api.engine import Engine
+from coopenv.bench.agents.dial import dial_text, measure_dial, read_dial
+from coopenv.files import check_file, replace_text, replacing_file, writing
+from coopenv.jsonable import json_text
+from coopenv.runs.page import index_text, page_text
+from coopenv.scenario import Scenario
+from coopenv.seeds import world_keys
+from coopenv.viz.topview import TopView
+
+INDEX = "README.md"
+COLOURS, REFINED = 256, 2
+"""Of a picture, which is a drawing: so it takes a third of the bytes; rounds in which they are improved."""
+
+
+def prepare(folder: Path, names: list[str]) -> None:
+    """Make the folder of pages and find out before any work whether they can be written there.
+
+    Raises:
+        OutputError: they cannot.
+    """
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        for suffix in ("md", "png", "json"):
+            check_file(folder / f"{name}.{suffix}")
+
+
+def environment_page(name: str, scenario: Scenario, folder: Path) -> str:
+    """Return the page of an environment, with the figures that stand in the folder, if any do."""
+    dial = read_dial(folder / f"{name}.json")
+    return page_text(name, scenario, "" if dial is None else dial_text(name, scenario, dial))
+
+
+def write_page(name: str, scenario: Scenario, folder: Path) -> None:
+    """Write text and picture of an environment's page to a folder."""
+    text = environment_page(name, scenario, folder)
+    picture = Image.fromarray(first_picture(scenario)).quantize(COLOURS, kmeans=REFINED, dither=Image.Dither.NONE)
+    with replacing_file(folder / f"{name}.png") as path:
+        picture.save(path, optimize=True)
+    replace_text(folder / f"{name}.md", text)
+
+
+def write_figures(
+    environment: str,
+    name: str,
+    scenario: Scenario,
+    folder: Path,
+    worlds: int,
+    on_progress: Callable[[float, str], None],
+) -> dict[str, Any]:
+    """Measure what sensing is worth in an environment, and write it for the page."""
+    dial = measure_dial(environment, scenario, worlds, on_progress)
+    replace_text(folder / f"{name}.json", json_text(dial))
+    return dial
+
+
+def write_index(scenarios: dict[str, Scenario], folder: Path) -> None:
+    """Write the list of those environments whose pages are in the folder."""
+    replace_text(folder / INDEX, index_text({k: s for k, s in scenarios.items() if (folder / f"{k}.md").is_file()}))
+
+
+def first_picture(scenario: Scenario) -> Any:
+    """Return the top view, (H, W, 3) uint8, of the start of the episode of seed 0."""
+    with closing(Engine(scenario)) as engine, closing(TopView(scenario)) as view:
+        engine.reset([world_keys(0)[0]])
+        return view.draw(engine)

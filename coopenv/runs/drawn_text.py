@@ -1,0 +1,96 @@
+"""What a scenario draws anew at every reset, in words."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from coopenv.errors import listed
+from coopenv.format import number
+from coopenv.scenario.randomness import PARAMETERS
+from coopenv.scenario.schema import Scenario
+
+
+def drawn(scenario: Scenario) -> Iterator[str]:
+    """Yield one line per thing that every world draws for itself at every reset."""
+    yield from _of_vehicles(scenario)
+    yield from _of_landmarks(scenario)
+    yield from _of_errors(scenario)
+    for name, (what, _, _) in PARAMETERS.items():
+        low, high = scenario.randomisation.factors(name)
+        if (low, high) != (1.0, 1.0):
+            yield f"a factor of {what}: {number(low)} to {number(high)}"
+
+
+def graded(scenario: Scenario) -> Iterator[str]:
+    """Yield one line per thing that grows with the difficulty."""
+    for name, (what, _, _) in PARAMETERS.items():
+        low, high = scenario.difficulty.factors(name)
+        if (low, high) != (1.0, 1.0):
+            yield f"a factor of {what}: {number(low)} at difficulty 0, {number(high)} at 1"
+
+
+def _of_vehicles(s: Scenario) -> Iterator[str]:
+    if s.highway is not None:
+        yield f"roads and traffic, by highway-env's `{s.highway.id}`"
+    several = [name for name, v in zip(s.vehicle_names, s.vehicles, strict=True) if len(v.routes) > 1]
+    if several:
+        yield f"one of its routes, for {listed(several)}"
+    yield from _spans("shift of a route to either side", s.routes, lambda r: r.lateral_spread, "m")
+    yield from _spans("further deviation of a route", s.routes, lambda r: r.wander, "m")
+    yield from _spans("start along a route", s.routes, lambda r: r.start_spread, "m")
+    poses = [vehicle.initial_pose for vehicle in s.vehicles if vehicle.initial_pose is not None]
+    yield from _spans("a vehicle's start along its own axis", poses, lambda p: p.position_spread[0], "m", "+- ")
+    yield from _spans("a vehicle's start to either side", poses, lambda p: p.position_spread[1], "m", "+- ")
+    yield from _spans("a vehicle's start in height", poses, lambda p: p.position_spread[2], "m", "+- ")
+    yield from _spans("a vehicle's heading", poses, lambda p: math.degrees(p.yaw_spread), "deg", "+- ")
+    motions = [vehicle.motion for vehicle in s.vehicles]
+    yield from _spans(
+        "a vehicle's first speed", motions, lambda m: getattr(m, "initial_speed_spread", 0.0), "m/s", "+- "
+    )
+    moving = [*s.vehicles, *s.landmarks]
+    yield from _spans("pace of a prescribed motion", moving, lambda m: 100.0 * m.pace_spread, "%", "+- ")
+    yield from _absent("a vehicle", s.vehicles)
+
+
+def _of_landmarks(s: Scenario) -> Iterator[str]:
+    for group in s.landmark_groups:
+        sort, count = ("areas", len(group.boxes)) if group.boxes else ("lines", len(group.lines))
+        where = f"{count} {sort}" if count > 1 else f"one {sort.removesuffix('s')}"
+        yield f"the places of {group.count} landmarks `{group.name}`, over {where}"
+    spread = [mark for mark in s.landmarks if any(mark.position_spread)]
+    yield from _spans("place of a landmark along an axis", spread, lambda m: max(m.position_spread), "m", "+- ")
+    yield from _absent("a landmark", s.landmarks)
+
+
+def _of_errors(s: Scenario) -> Iterator[str]:
+    beliefs = [vehicle.initial_estimate for vehicle in s.vehicles]
+    yield from _spans("offset of an initial estimate", beliefs, lambda b: b.position_radius, "m")
+    if any(belief.orientation_angle == "uniform" for belief in beliefs):
+        yield "turn of an initial estimate: over SO(3)"
+    turned = [belief for belief in beliefs if belief.orientation_angle != "uniform"]
+    yield from _spans("turn of an initial estimate", turned, lambda b: math.degrees(b.orientation_angle), "deg")
+    noises = [noise for noise in s.noises if noise.enabled]
+    cameras = [camera for camera, noise in zip(s.cameras, s.noises, strict=True) if noise.enabled]
+    deviation = "standard deviation "
+    yield from _spans("scale error of the odometry", noises, lambda n: 100.0 * n.odometry_scale, "%", deviation)
+    yield from _spans("bias of the gyro", noises, lambda n: math.degrees(np.max(n.gyro_bias)), "deg/s", deviation)
+    yield from _spans("turn of a camera", cameras, lambda c: math.degrees(c.extrinsics_error), "deg", deviation)
+    yield from _spans("offset of a camera", cameras, lambda c: c.extrinsics_position_error, "m", deviation)
+
+
+def _spans(what: str, parts: Sequence[Any], of: Callable[[Any], float], unit: str, kind: str = "") -> Iterator[str]:
+    """Yield one line that says how large a spread is, from the least to the largest of those that are not 0."""
+    values = sorted({float(of(part)) for part in parts} - {0.0})
+    if values:
+        low, high = number(values[0]), number(values[-1])
+        kind = kind or "up to "
+        yield f"{what}: {kind}{high if low == high else f'{low} .. {high}'} {unit}"
+
+
+def _absent(what: str, parts: Sequence[Any]) -> Iterator[str]:
+    chances = sorted({part.presence for part in parts} - {1.0})
+    if chances:
+        low, high = (number(100.0 * chance) for chance in (chances[0], chances[-1]))
+        yield f"whether {what} is there: with {low if low == high else f'{low} .. {high}'} %"

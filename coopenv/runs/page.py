@@ -1,0 +1,138 @@
+"""The page of an environment, in Markdown, from its scenario."""
+
+from collections.abc import Iterator
+
+from coopenv.api.registration import environment_id
+from coopenv.api.terms.layout import observation_layout
+from coopenv.format import number
+from coopenv.runs import scenario_rows
+from coopenv.runs.describe import shown_sections
+from coopenv.runs.drawn_text import drawn, graded
+from coopenv.runs.markdown import bullets, plain, table
+from coopenv.runs.summary import facts
+from coopenv.scenario import Scenario
+from coopenv.scenario.terms import REWARD_TERMS, TERMINATION_CONDITIONS, Term
+from coopenv.shipped import list_envs
+
+GLANCE = ("Vehicles", "Targets", "Camera", "Odometry", "V2X", "Observer", "Rates")
+"""Facts that no table below repeats."""
+TOLD = {"observation.include", "observation.scales", "observation.centers", "reward.privileged"}
+"""Settings that other tables tell, as they tell the weights."""
+
+
+def page_text(name: str, scenario: Scenario, measured: str = "") -> str:
+    """Return the page of an environment.
+
+    Args:
+        name: of the environment; the picture beside the page is called so, too.
+        scenario: what the page is about.
+        measured: a part with figures that were measured, if there are any.
+    """
+    return "\n\n".join([*_head(name, scenario), *_scene(scenario), *_learning(scenario), *_end(name, measured)]) + "\n"
+
+
+def _head(name: str, scenario: Scenario) -> Iterator[str]:
+    shipped = name in list_envs()
+    yield f"# {plain(scenario.title)}"
+    file = f"[`envs/{name}.toml`](../../envs/{name}.toml), " if shipped else ""
+    known = f"`{environment_id(name)}`, " if shipped else ""
+    yield f"`{name}`: {file}{known}this page by `coopenv page {name}`."
+    for text in (scenario.description, scenario.source and f"Source: {scenario.source}"):
+        if text:
+            yield plain(text)
+    yield f"![Top view of {name}]({name}.png)"
+    yield "At the start of the episode of seed 0: true vehicles filled, estimates in outline."
+    known_facts = facts(scenario)
+    yield table(("", ""), [(subject, known_facts[subject]) for subject in GLANCE])
+
+
+def _scene(scenario: Scenario) -> Iterator[str]:
+    yield "## Drawn at every reset"
+    yield bullets(drawn(scenario)) or "Nothing: every episode begins alike, only noise differs."
+    if lines := list(graded(scenario)):
+        yield f"With the difficulty (here {number(scenario.difficulty.number)}; [draws](../draws.md)):"
+        yield bullets(lines)
+    for listing in scenario_rows.scene(scenario, grouped=False):
+        yield f"## {listing.title}"
+        yield table(listing.columns, listing.rows)
+    yield "## Settings"
+    yield "Those that differ from the default."
+    rows = [
+        (f"`{section}.{key}`", value, meaning)
+        for section in shown_sections(scenario)
+        for key, value, meaning, differs in scenario_rows.settings(getattr(scenario, section))
+        if differs and f"{section}.{key}" not in TOLD and not key.startswith("weights.")
+    ]
+    yield table(("key", "value", "meaning"), rows)
+
+
+def _learning(scenario: Scenario) -> Iterator[str]:
+    layout = observation_layout(scenario)
+    yield "## Observation"
+    yield f"{layout.size} entries per vehicle; each is (value - center) / scale, clipped to [low, 1]."
+    rows = [
+        (f.group, f"`{name}`", "x".join(map(str, f.shape)), f.unit, *map(number, (f.center, f.scale, f.low)), f.meaning)
+        for name, f in layout.items()
+    ]
+    yield table(("group", "field", "size", "unit", "center", "scale", "low", "meaning"), rows)
+    if scenario.driven:
+        yield "## Action"
+        yield "Entries in [-1, 1] span what follows, here of the first vehicle."
+        yield table(
+            ("entry", "at -1", "at 1", "unit"),
+            [(entry.name, number(entry.low), number(entry.high), entry.unit) for entry in layout.action],
+        )
+    yield "## Reward"
+    terms = REWARD_TERMS.known(scenario.reward.custom)
+    weights = {name: weight for name, weight in scenario.reward.by_name.items() if weight}
+    rows = [(f"`{name}`", number(weight), terms[name].unit, _meaning(terms[name])) for name, weight in weights.items()]
+    yield table(("term", "weight", "unit", "meaning"), rows) if rows else "None: every weight is 0."
+    yield "## Termination"
+    yield bullets(_endings(scenario))
+
+
+def _meaning(term: Term) -> str:
+    return f"{term.meaning} (privileged)" if term.privileged else term.meaning
+
+
+def _endings(scenario: Scenario) -> Iterator[str]:
+    steps, end = round(scenario.horizon * scenario.rates.decision), scenario.termination
+    yield f"for all after {number(scenario.horizon)} s, {steps} decisions"
+    known = TERMINATION_CONDITIONS.known(end.custom)
+    causes = [name for name in ("collision", "arrival") if scenario.driven and getattr(end, name)]
+    for name in (*causes, *end.own):
+        yield f"`{name}`: {known[name].meaning}"
+    if end.off_route:
+        yield f"`off_route`: being farther than {number(end.off_route)} m from its route, or beyond an end of it"
+    if scenario.driven and end.arrival:
+        after = {"park": "stands where it is", "leave": "is gone from the next camera tick on"}
+        yield f"who has arrived {after.get(end.after_arrival, 'draws a new route and goes on')}"
+
+
+def _end(name: str, measured: str) -> Iterator[str]:
+    if measured:
+        yield "## What sensing is worth"
+        yield measured
+    yield "## To try it"
+    yield f"```\ncoopenv describe {name} --all\ncoopenv run {name} --seed 0\n```"
+
+
+def index_text(scenarios: dict[str, Scenario]) -> str:
+    """Return the page that lists environments, each with a page beside it."""
+    rows = [
+        (
+            f"[`{name}`]({name}.md)",
+            scenario.title,
+            f"{len(scenario.vehicles)}",
+            f"{len(scenario.landmarks)}",
+            "driven" if scenario.driven else "prescribed",
+            number(scenario.horizon),
+        )
+        for name, scenario in scenarios.items()
+    ]
+    lines = [
+        "# Environments",
+        "One page per file of `envs/`, written by `coopenv page --all --out docs/environments` (`make pages`).",
+        table(("environment", "title", "vehicles", "landmarks", "motion", "horizon [s]"), rows),
+    ]
+    return "\n\n".join(lines) + "\n"

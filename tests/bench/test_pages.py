@@ -1,0 +1,134 @@
+"""The pages of environments say what the files say, and those of the project are up to date."""
+
+from __future__ import annotations
+
+import json
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from coopenv.bench.agents.dial import DRIVERS, METRICS, SETTINGS, dial_text, fingerprint, has_dial
+from coopenv.bench.pages import environment_page
+from coopenv.cli import main
+from coopenv.runs.page import index_text
+from coopenv.scenario import Scenario, load_scenario
+from coopenv.shipped import list_envs
+from coopenv.viz.topview_ground import HEIGHT, WIDTH
+
+PAGES = Path(__file__).parents[2] / "docs" / "environments"
+SMALL = """
+title = "A | b"
+description = "One <car>."
+horizon = 5.0
+landmarks = [{ name = "sign", position = [1, 2, 3], presence = 0.75 }]
+landmark_groups = [{ name = "posts", count = 3, boxes = [{ center = [5, 5], half = [2, 1] }], height = [0.4, 1.2] }]
+vehicles = [{ initial_pose = { position = [0, 0, 0], yaw_spread = 0.1 }, motion = { kind = "driven" } }]
+randomisation = { camera_range = [0.75, 1.25] }
+difficulty = { v2x_loss = [0.0, 2.0] }
+reward.weights = { time = 0.375 }
+camera.range = 7.25
+"""
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Path:
+    path = tmp_path / "small.toml"
+    path.write_text(SMALL)
+    return path
+
+
+@pytest.mark.parametrize("name", list_envs())
+def test_the_page_of_every_environment_is_up_to_date(name: str) -> None:
+    page, measure = PAGES / f"{name}.md", " --measure" if has_dial(name) else ""
+    again = f"run: coopenv page {name} --out docs/environments"
+    assert page.is_file(), again + measure
+    assert page.read_text(encoding="utf-8") == environment_page(name, load_scenario(name), PAGES), again
+    assert not measure or (PAGES / f"{name}.json").is_file(), again + measure
+    with Image.open(PAGES / f"{name}.png") as picture:
+        assert picture.size == (WIDTH, HEIGHT), again
+
+
+def test_the_index_lists_every_environment() -> None:
+    index = (PAGES / "README.md").read_text(encoding="utf-8")
+    assert index == index_text({name: load_scenario(name) for name in list_envs()}), "run: make pages"
+    assert index.count("](") == len(list_envs())
+
+
+def test_a_page_says_what_the_file_says(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["page", str(small), "--out", str(tmp_path / "pages")]) == 0
+    assert "small.md" in capsys.readouterr().out
+    assert sorted(path.name for path in (tmp_path / "pages").iterdir()) == ["small.md", "small.png"]
+    text = (tmp_path / "pages" / "small.md").read_text(encoding="utf-8")
+    for line in (
+        *("# A | b", "One &lt;car>.", "- whether a landmark is there: with 75 %", "| `time` | 0.375 | s |"),
+        *("- the places of 3 landmarks `posts`, over one area", "- a factor of the cameras' range: 0.75 to 1.25"),
+        *("0 at difficulty 0, 2 at 1", "| posts | 3 | (5, 5) +- (2, 1) | 0.4 to 1.2 |", "| `camera.range` | 7.25 |"),
+        *("- a vehicle's heading: +- 5.73 deg", "| steering | -0.6981 | 0.6981 | rad |", "after 5 s, 50 decisions"),
+    ):
+        assert line in text, line
+    assert "| posts_1 |" not in text
+    assert "What sensing is worth" not in text
+    for line in text.splitlines():
+        if line.startswith("|"):
+            assert line.endswith("|")
+    with Image.open(tmp_path / "pages" / "small.png") as picture:
+        assert np.ptp(np.asarray(picture.convert("L"))) > 100
+
+
+def test_the_dial_is_measured_and_shown(tmp_path: Path) -> None:
+    assert main(["page", "facade", "--measure", "--worlds", "2", "--out", str(tmp_path)]) == 0
+    dial = json.loads((tmp_path / "facade.json").read_text())
+    assert {(row["sensing"], row["agent"]) for row in dial["rows"]} == {
+        (how, who) for how in SETTINGS for who in DRIVERS
+    }
+    e95 = {(row["sensing"], row["agent"]): row["mean"] for row in dial["rows"] if row["metric"] == "e95_m"}
+    assert e95["ideal", "route_follower"] < e95["blind", "route_follower"]
+    text = (tmp_path / "facade.md").read_text()
+    assert f"{100 * e95['blind', 'peek']:.0f} [" in text.split("| blind | peek |")[1]
+    assert (tmp_path / "README.md").read_text().count("](") == 1
+
+
+def made_up_dial(scenario: Scenario) -> dict[str, object]:
+    rows = [
+        {"sensing": how, "agent": who, "metric": metric, "mean": 0.5, "ci_low": 0.25, "ci_high": 0.75, "n": 2}
+        for how, who, metric in product(SETTINGS, DRIVERS, METRICS)
+    ]
+    return {"coopenv": "1.2.3", "worlds": 2, "scenario": fingerprint(scenario), "rows": rows}
+
+
+def test_figures_that_are_older_than_the_environment_are_marked() -> None:
+    scenario = load_scenario("facade")
+    dial = made_up_dial(scenario)
+    assert "has changed since" not in dial_text("facade", scenario, dial)
+    assert "| sensed | peek | 50 [25, 75] |" in dial_text("facade", scenario, dial)
+    assert "has changed since" not in dial_text("facade", load_scenario("facade", {"title": "Another"}), dial)
+    assert "has changed since" in dial_text("facade", load_scenario("facade", {"camera.range": 5.0}), dial)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["page"], "name environments, or give --all"),
+        (["page", "facade", "--all"], "name environments, or give --all"),
+        (["page", "facad"], "did you mean 'facade'"),
+        (["page", "facade", "elsewhere/facade.toml"], "two environments have the same name"),
+        (["page", "busy_intersection", "--measure"], "all motion here is prescribed"),
+    ],
+)
+def test_mistakes_are_one_line(
+    arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*arguments, "--out", str(tmp_path / "pages")]) == 2
+    error = capsys.readouterr().err
+    assert words in error and len(error.strip().splitlines()) == 1
+    assert not list(tmp_path.rglob("*.*"))
+
+
+def test_figures_that_cannot_be_read_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "facade.json").write_text('{"rows": []}')
+    assert main(["page", "facade", "--out", str(tmp_path)]) == 2
+    assert "facade.json: no figures of a page" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["facade.json"]
