@@ -1,10 +1,12 @@
 """Planning what to look at: the belief rolled forward over sampled plans. A yardstick of what is possible."""
 
+from functools import partial
 from itertools import product
 
 import numpy as np
 
 from coopenv.policies.belief import Belief
+from coopenv.policies.occluders import Occluders, hidden
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.policies.view import FieldOfView
 from coopenv.scenario import Scenario
@@ -47,7 +49,7 @@ class LookAhead(RouteFollower):
             farthest: offset from the way that costs nothing, m.
         """
         super().__init__(scenario)
-        self.view = FieldOfView(scenario.camera)
+        self.view, self.occluders = FieldOfView(scenario.camera), Occluders(scenario, self.layout)
         self.price, self.tolerated, self.farthest = price, tolerated, farthest
         self.information, self.drift = bearing_std**-2, drift**2
         plans = product(OFFSETS, repeat=2)
@@ -80,7 +82,8 @@ class LookAhead(RouteFollower):
     def costs(self, observations: np.ndarray) -> np.ndarray:
         """Return the costs, (rows, plans) in s."""
         way, bends = self._way(observations)
-        landmarks = self.read(observations, "map_position")[:, None, :, :2]
+        landmarks = self.read(observations, "map_position")[..., :2]
+        boxes = self.occluders.boxes(partial(self.read, observations))
         known = self.information * self.known(observations)[:, None]
         belief = self._belief(observations)
         shape = len(observations), len(self._first)
@@ -98,8 +101,10 @@ class LookAhead(RouteFollower):
             x, y = x + dx, y + dy
             along = along + stride * np.cos(heading - bend)
             aside = aside + stride * np.sin(heading - bend)
-            line = landmarks - np.stack([x, y], axis=-1)[:, :, None]
+            place, forward = np.stack([x, y], axis=-1), np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+            line = landmarks[:, None] - place[:, :, None]
             seen = self.view.sees(line, heading[..., None]) & (known > 0.0)
+            seen &= ~hidden(boxes, place + self.view.ahead * forward, landmarks, stride * (step + 1))
             seen &= seen.sum(axis=-1, keepdims=True) >= ENOUGH
             belief = belief.driven(dx, dy, self.drift * stride, 1e-5).measured(line, known * seen)
             cost += STEP * self.price * np.maximum(belief.std - self.tolerated, 0.0)

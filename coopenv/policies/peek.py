@@ -1,7 +1,10 @@
 """Looking where landmarks are, one step ahead."""
 
+from functools import partial
+
 import numpy as np
 
+from coopenv.policies.occluders import Occluders, hidden
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.policies.view import FieldOfView
 from coopenv.scenario import Scenario
@@ -13,8 +16,9 @@ OFFSETS = (0.0, 0.2, -0.2, 0.4, -0.4, 0.6, -0.6, 0.8, -0.8)
 class Peek(RouteFollower):
     """The route follower, but where its position is uncertain it turns off its way to see more landmarks of the map.
 
-    It takes the smallest of a few headings from which most of the known landmarks would be in view a moment later, and
-    none that leads farther from the way once it is too far from it. With a camera that pans it turns that instead.
+    It takes the smallest of a few headings from which most of the known landmarks would be in view a moment later, past
+    buildings and the vehicles that it hears, and none that leads farther from the way once it is too far from it. With
+    a camera that pans it turns that instead.
     """
 
     needs = ("position_std", "map_position", "route_heading", "route_offset")
@@ -31,7 +35,7 @@ class Peek(RouteFollower):
             farthest: offset from the way from which on it does not lead farther away, m.
         """
         super().__init__(scenario)
-        self.view = FieldOfView(scenario.camera)
+        self.view, self.occluders = FieldOfView(scenario.camera), Occluders(scenario, self.layout)
         self.threshold, self.ahead, self.farthest = np.log10(threshold), ahead, farthest
         self.pans = next((field.high for field in self.layout.action if field.name == "pan"), 0.0)
 
@@ -48,15 +52,14 @@ class Peek(RouteFollower):
     def offset(self, observations: np.ndarray, heading: np.ndarray) -> np.ndarray:
         """Return the heading, (rows,) in rad from the way's, from which most landmarks would be in view."""
         landmarks = self.read(observations, "map_position")[..., :2]
-        known = self.known(observations)
-        aside = self.read(observations, "route_offset")[:, 0]
-        best, most = np.zeros(len(heading)), np.full(len(heading), -1)
-        for offset in OFFSETS:
-            if self.pans and abs(offset) > self.pans:
-                continue
-            turned = offset - heading  # in the own frame
-            place = self.ahead * np.stack([np.cos(turned), np.sin(turned)], axis=-1)
-            seen = self.view.sees(landmarks - place[:, None], turned[:, None]) & known
-            count = np.where((np.abs(aside) > self.farthest) & (offset * aside > 0.0), -1, seen.sum(axis=1))
-            best, most = np.where(count > most, offset, best), np.maximum(count, most)
-        return best
+        aside = self.read(observations, "route_offset")
+        offsets = np.array([offset for offset in OFFSETS if not self.pans or abs(offset) <= self.pans])
+        turned = offsets - heading[:, None]  # in the own frame
+        forward = np.stack([np.cos(turned), np.sin(turned)], axis=-1)
+        place = self.ahead * forward
+        seen = self.view.sees(landmarks[:, None] - place[:, :, None], turned[..., None])
+        seen &= self.known(observations)[:, None]
+        boxes = self.occluders.boxes(partial(self.read, observations))
+        seen &= ~hidden(boxes, place + self.view.ahead * forward, landmarks, self.ahead)
+        too_far = (np.abs(aside) > self.farthest) & (offsets * aside > 0.0)
+        return np.asarray(offsets[np.argmax(np.where(too_far, -1, seen.sum(axis=-1)), axis=1)])

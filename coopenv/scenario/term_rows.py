@@ -62,7 +62,7 @@ FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
          "landmark of the map seen from one's own estimate, body frame", XY),
         ("map_mask", "landmark", 1, "bool", 1, 0, "1: there is such a landmark"),
         ("map_in_view", "landmark", 1, "bool", 1, 0,
-         "1: to be seen from one's own estimate: in range, in the image, behind no building"),
+         "1: to be seen from one's own estimate: in range, in the image, behind nothing known"),
         ("map_age", "landmark", 1, "s", "age_scale", 0, "time since its bearing was measured"),
     ],
     "route": [

@@ -75,9 +75,8 @@ def segment_hits_box(origin: Any, direction: Any, inverse_square: Any, R: Any, c
 
 
 @wp.func
-def occlusion(model: Any, state: Any, world: int, observer: int, target: int, origin: Any, direction: Any):
-    """Return VISIBLE, or what blocks the line of sight; neither end's own body does."""
-    inverse_square = direction.dtype(1.0) / wp.max(wp.dot(direction, direction), direction.dtype(1.0e-12))
+def behind_building(model: Any, origin: Any, direction: Any, inverse_square: Any) -> bool:
+    """Return whether a building is in the way of a line of sight; `inverse_square` is 1 / |direction|^2."""
     for k in range(model.obstacles):
         if segment_hits_box(
             origin,
@@ -87,7 +86,22 @@ def occlusion(model: Any, state: Any, world: int, observer: int, target: int, or
             model.scene.obstacle_center[k],
             model.scene.obstacle_half[k],
         ):
-            return OCCLUDED_BY_BUILDING
+            return True
+    return False
+
+
+@wp.func
+def inverse_square_of(direction: Any):
+    """Return 1 / |direction|^2; of a direction without length something large."""
+    return direction.dtype(1.0) / wp.max(wp.dot(direction, direction), direction.dtype(1.0e-12))
+
+
+@wp.func
+def occlusion(model: Any, state: Any, world: int, observer: int, target: int, origin: Any, direction: Any):
+    """Return VISIBLE, or what blocks the line of sight; neither end's own body does."""
+    inverse_square = inverse_square_of(direction)
+    if behind_building(model, origin, direction, inverse_square):
+        return OCCLUDED_BY_BUILDING
     for agent in range(model.agents):
         half = model.scene.body_half[agent]
         if agent != observer and agent != target and half[0] > half.dtype(0.0) and state.present[world, agent] != 0:

@@ -56,6 +56,10 @@ def places() -> dict[str, dict[str, Any]]:
 
 PLACES = places()
 EXCEPTIONS = {
+    "behind_truck": {
+        "message_position": "the truck, which alone is heard, is always straight ahead",
+        "message_forward": "and goes the same way as the car",
+    },
     "facade": {"map_in_view": "the nearest landmark stands beside the car, out of its camera's view"},
     "urban_crossing, seen from near": {
         "message_forward": "in the leader-follower order a second slot is heard by those that come from ahead alone",

@@ -1,7 +1,7 @@
 """Landmarks of the map as a vehicle knows them: where its own estimate puts them, nearest first, and what it measured.
 
-Everybody knows the map, and buildings stand in it. Nothing here depends on where the vehicle truly is but through its
-estimate and its measurements.
+Everybody knows the map, and buildings stand in it; other vehicles are where their messages say. Nothing here depends on
+where the vehicles truly are but through estimates and measurements.
 """
 
 from typing import Any
@@ -9,7 +9,17 @@ from typing import Any
 import warp as wp
 
 from coopenv.api.terms.records import NEVER, seconds_since
-from coopenv.world.camera import VISIBLE, body_bearing, camera_to_body, marker_position, project, segment_hits_box
+from coopenv.world.camera import (
+    VISIBLE,
+    behind_building,
+    body_bearing,
+    camera_to_body,
+    inverse_square_of,
+    marker_position,
+    project,
+    segment_hits_box,
+)
+from coopenv.world.v2x import fresh
 
 
 @wp.struct
@@ -20,7 +30,7 @@ class MapLandmark:
     exists: wp.bool
     position: wp.vec3  # m, seen from the estimate, body
     distance: wp.float32  # m, horizontal, from the estimate
-    expected: wp.bool  # to be seen from the estimate: in range, in the image, behind no building
+    expected: wp.bool  # to be seen from the estimate: in range, in the image, behind nothing that it knows of
     in_view: wp.bool  # measured in this frame
     bearing: wp.vec3  # unit vector camera to landmark, body, last measured; 0: never
     age: wp.float32  # s since measured
@@ -53,10 +63,25 @@ def next_nearest(model: Any, state: Any, world: int, vehicle: int, last: Nearest
 
 
 @wp.func
-def to_be_seen(model: Any, state: Any, world: int, vehicle: int, point: Any) -> bool:
-    """Return whether a point of the map, m, is in view from a vehicle's estimate: range, image and buildings.
+def behind_vehicle(model: Any, state: Any, world: int, vehicle: int, origin: Any, line: Any, inverse_square: Any):
+    """Return whether another vehicle is in the way of a line of sight where its last message puts it."""
+    now = state.tick[world]
+    for sender in range(model.vehicles):
+        agent = model.landmarks + sender
+        half = model.scene.body_half[agent]
+        if sender != vehicle and half[0] > half.dtype(0.0) and fresh(model, state, world, vehicle, sender, now):
+            R = state.inbox_rotation[world, vehicle, sender]
+            center = state.inbox_position[world, vehicle, sender] + R * model.scene.body_center[agent]
+            if segment_hits_box(origin, line, inverse_square, R, center, half):
+                return True
+    return False
 
-    Bodies of other vehicles hide nothing here, as where they are is known worse.
+
+@wp.func
+def to_be_seen(model: Any, state: Any, world: int, vehicle: int, point: Any) -> bool:
+    """Return whether a point of the map, m, is in view from a vehicle's estimate.
+
+    It is in range, in the image, and behind no building, nor another vehicle as that one believes to stand.
     """
     if model.sensed == 0:
         return True
@@ -64,25 +89,16 @@ def to_be_seen(model: Any, state: Any, world: int, vehicle: int, point: Any) -> 
     camera = model.camera[vehicle]
     origin = R * (state.estimate_position[world, vehicle] + camera.position)
     line = point - origin
-    square = wp.dot(line, line)
-    if square > camera.range * camera.range:
+    if wp.dot(line, line) > camera.range * camera.range:
         return False
     if camera.pinhole == 1:
         _, _, inside = project(camera, wp.transpose(R * camera_to_body(model, state, world, vehicle)) * line)
         if inside == 0:
             return False
-    inverse_square = line.dtype(1.0) / wp.max(square, line.dtype(1.0e-12))
-    for k in range(model.obstacles):
-        if segment_hits_box(
-            origin,
-            line,
-            inverse_square,
-            model.scene.obstacle_rotation[k],
-            model.scene.obstacle_center[k],
-            model.scene.obstacle_half[k],
-        ):
-            return False
-    return True
+    inverse_square = inverse_square_of(line)
+    if behind_building(model, origin, line, inverse_square):
+        return False
+    return not behind_vehicle(model, state, world, vehicle, origin, line, inverse_square)
 
 
 @wp.func

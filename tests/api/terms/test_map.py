@@ -42,8 +42,23 @@ def estimates(engine: Engine) -> tuple[np.ndarray, np.ndarray]:
     return R, np.einsum("wnij,wnj->wni", R, engine.view("estimate_position"))
 
 
-def predicted(scenario: Scenario, point: np.ndarray, R: np.ndarray, p: np.ndarray) -> bool:
-    """Tell by the oracle whether a point is to be seen from a pose."""
+Box = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Center, rotation and half sizes."""
+
+
+def heard(engine: Engine, scenario: Scenario, w: int, i: int) -> list[Box]:
+    """Return the boxes of the vehicles from whom vehicle i has a fresh message, where the messages put them."""
+    sent, now = engine.view("inbox_tick")[w, i], engine.view("tick")[w]
+    boxes = []
+    for sender, vehicle in enumerate(scenario.vehicles):
+        if sender != i and sent[sender] >= 0 and now - sent[sender] <= scenario.v2x.staleness * scenario.rates.camera:
+            R, p = (engine.view(f"inbox_{name}")[w, i, sender] for name in ("rotation", "position"))
+            boxes.append((p + R @ np.array(vehicle.body.center), R, np.array(vehicle.body.size) / 2))
+    return boxes
+
+
+def predicted(scenario: Scenario, point: np.ndarray, R: np.ndarray, p: np.ndarray, vehicles: list[Box]) -> bool:
+    """Tell by the oracle whether a point is to be seen from a pose, past buildings and vehicles."""
     camera = scenario.camera
     ray = point_in_camera(point, R, p, camera.position)
     intrinsics = (*camera.focal_length, *camera.principal_point, *camera.image_size)
@@ -52,7 +67,7 @@ def predicted(scenario: Scenario, point: np.ndarray, R: np.ndarray, p: np.ndarra
     if not in_field_of_view(ray, *intrinsics):
         return False
     origin = p + R @ np.array(camera.position)
-    boxes = [(np.array(o.center), np.eye(3), np.array(o.size) / 2) for o in scenario.obstacles]
+    boxes = [(np.array(o.center), np.eye(3), np.array(o.size) / 2) for o in scenario.obstacles] + vehicles
     return not any(is_occluded(origin, point, center, turn, half) for center, turn, half in boxes)
 
 
@@ -70,7 +85,8 @@ def test_the_map_is_that_of_the_nearest_landmarks_by_ones_own_estimate() -> None
         np.testing.assert_allclose(position[w, i, :12], (places[order] - p[w, i]) @ R[w, i], atol=1e-4)
         assert mask[w, i].tolist() == [1] * 12 + [0] * 2
         assert not position[w, i, 12:].any() and not in_view[w, i, 12:].any() and (age[w, i, 12:] == 1000.0).all()
-        expected = [predicted(scenario, places[n], R[w, i], p[w, i]) for n in order]
+        boxes = heard(engine, scenario, w, i)
+        expected = [predicted(scenario, places[n], R[w, i], p[w, i], boxes) for n in order]
         assert in_view[w, i, :12].tolist() == expected
         found += expected
         then = engine.view("bearing_tick")[w, i, order]
@@ -86,6 +102,25 @@ def test_what_is_expected_in_view_mostly_is() -> None:
     order = np.argsort(np.linalg.norm((places - p[..., None, :])[..., :2], axis=-1), axis=-1)
     visible = np.take_along_axis(engine.view("sight")[..., :12] == Sight.VISIBLE, order, axis=-1)
     assert (visible == (seen(engine, scenario, "map_in_view") == 1.0)).mean() > 0.9  # the others: cars, misses, errors
+
+
+def test_a_vehicle_that_is_heard_hides_what_is_behind_it() -> None:
+    """By the oracle, and often: the truck."""
+    more = {"include": ["map"], "map_size": 14, "map_scale": 50.0}
+    scenario = load_scenario("behind_truck", {f"observation.{key}": value for key, value in more.items()})
+    engine = driven(scenario, steps=0)
+    for _ in range(90):
+        engine.step(np.tile([1.0, 0.0], (4, 2, 1)))
+    R, p = estimates(engine)
+    marks = np.array([engine.view("position")[:, k] for k in range(14)]).swapaxes(0, 1)
+    found = []
+    for w, place in enumerate(marks):
+        order = np.argsort(np.linalg.norm((place - p[w, 1])[:, :2], axis=1))
+        boxes = heard(engine, scenario, w, 1)
+        past, through = ([predicted(scenario, place[n], R[w, 1], p[w, 1], b) for n in order] for b in (boxes, []))
+        assert seen(engine, scenario, "map_in_view")[w, 1].tolist() == past
+        found.append(sum(through) - sum(past))
+    assert sum(found) >= 4
 
 
 def test_every_landmark_is_expected_where_the_topology_is_fixed() -> None:
