@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-train test-all test-matrix lint format bench stages schema pages clean
+.PHONY: help demo test test-train test-all test-matrix lint format bench stages gpu schema pages clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -64,6 +64,10 @@ bench: $(VENV)/.base ## measure steps per second
 stages: $(VENV)/.base ## measure what a vehicle tick costs, stage by stage
 	@$(BIN)/python -m benchmarks.stages
 
+gpu: ## on a machine with a GPU: CUDA tests, CPU against CUDA, throughput, a training; DEVICE=cuda:1, WHEELS=DIR
+	@$(PYTHON) -m benchmarks.gpu.prepare .venv-gpu $(if $(WHEELS),--wheels $(WHEELS))
+	@.venv-gpu/bin/python -m benchmarks.gpu --device $(or $(DEVICE),cuda:0) $(GPU_OPTIONS)
+
 schema: $(VENV)/.base ## write the JSON schema of scenario files, which editors complete from
 	@$(BIN)/coopenv schema --out docs/scenario.schema.json
 
@@ -71,4 +75,4 @@ pages: $(VENV)/.base ## write the pages of the environments; MEASURE=--measure f
 	@$(BIN)/coopenv page --all $(MEASURE) --out docs/environments
 
 clean: ## remove the virtual environment and all results
-	@rm -rf $(VENV) out build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	@rm -rf $(VENV) .venv-gpu out build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -1,0 +1,99 @@
+"""The section of docs/benchmarks.md that a run on a GPU fills, from its JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from coopenv.errors import CoopenvError
+from coopenv.files import replace_text
+from coopenv.format import number
+from coopenv.runs.markdown import table
+
+BEGIN, END = "<!-- make gpu: begin -->", "<!-- make gpu: end -->"
+
+
+def section(document: dict[str, Any]) -> str:
+    """Return what stands between the marks: machine, throughput, agreement, training, tests, and what was left out."""
+    rows = document["stages"]
+    results = {row["name"]: row["result"] for row in rows if "result" in row}
+    parts = [_machine(document, results.get("machine")), _throughput(results)]
+    parts += [_agreement(name, result) for name, result in results.items() if name.startswith("agreement")]
+    if "training" in results:
+        parts.append(_training(results["training"]))
+    if "tests" in results:
+        tests = results["tests"]
+        parts.append(f"CUDA tests: {tests['passed']} passed, {tests['failed']} failed.")
+    left = [f"{row['name']} ({row.get('problem') or row['skipped']})" for row in rows if "result" not in row]
+    parts += [f"Left out: {'; '.join(left)}."] if left else []
+    return "\n\n".join(part for part in parts if part)
+
+
+def _machine(document: dict[str, Any], found: dict[str, Any] | None) -> str:
+    if found is None:
+        return f"`{document['command']}`, coopenv {document['coopenv']}."
+    device, place = found["device"], found["host"]
+    versions = ", ".join(f"{name} {version}" for name, version in found["versions"].items())
+    return (
+        f"`{document['command']}` on one {device['name']} ({device['memory_bytes'] / 2**30:.0f} GiB), "
+        f"{place['cores_available']} cores of {place['processor']}; coopenv {document['coopenv']}, {versions}. Rates "
+        "are medians over rounds of a second; in brackets the slowest and the fastest round."
+    )
+
+
+def _throughput(results: dict[str, dict[str, Any]]) -> str:
+    rows = []
+    for name, found in results.items():
+        if not name.startswith("throughput"):
+            continue
+        low, high = (found["env_steps_per_s"] * found[key] for key in ("slowest_round", "fastest_round"))
+        rates = (_rate(found["env_steps_per_s"]), f"[{_rate(low)}, {_rate(high)}]")
+        ticks = _rate(found["vehicle_ticks_per_s"])
+        memory = f"{found['bytes_per_world'] / 1024:.1f}"
+        observer = name.split(", ")[1]
+        rows.append(
+            (observer, f"{found['worlds']:,}", " ".join(rates), _rate(found["agent_steps_per_s"]), ticks, memory)
+        )
+    columns = ("observer", "worlds", "env steps/s", "agent steps/s", "vehicle ticks/s", "arrays, KiB/world")
+    return table(columns, rows) if rows else ""
+
+
+def _rate(value: float) -> str:
+    for unit, size in (("M", 1e6), ("k", 1e3)):
+        if value >= size:
+            return f"{number(value / size, 3)} {unit}"
+    return number(value, 3)
+
+
+def _agreement(name: str, found: dict[str, Any]) -> str:
+    observer, largest = name.split(", ")[1], found["largest_difference"]
+    difference = "none that is finite" if largest is None else f"{largest:.1e}"  # JSON has no infinity
+    return (
+        f"CPU and device, float64, `{observer}`: {found['worlds_alike']} of {found['worlds']} worlds alike; largest "
+        f"difference {difference} ({found['in'] or 'nowhere'})."
+    )
+
+
+def _training(found: dict[str, Any]) -> str:
+    first, last = found["first"], found["last"]
+    return (
+        f"Training (`examples/train_ppo.py`, {found['env']}, {found['num_worlds']:,} worlds, one seed): "
+        f"{found['vehicle_steps'] / 1e6:.1f} M vehicle steps at {_rate(found['steps_per_s'])} a second; return "
+        f"{first['return']:.1f} at the first report, {last['return']:.1f} at the last, where "
+        f"{100 * last['arrived']:.0f} % arrive."
+    )
+
+
+def put(document: dict[str, Any], page: Path) -> None:
+    """Put the section of a run into a page.
+
+    Raises:
+        CoopenvError: the page has no place for it, or the run was on a CPU.
+    """
+    if document["device"] == "cpu":
+        raise CoopenvError("these figures are of a CPU; the page has room for those of a GPU")
+    text = page.read_text(encoding="utf-8")
+    if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
+        raise CoopenvError(f"{page}: needs one line '{BEGIN}' and after it one '{END}'")
+    before, after = text.partition(BEGIN)[0], text.partition(END)[2]
+    replace_text(page, f"{before}{BEGIN}\n\n{section(document)}\n\n{END}{after}")

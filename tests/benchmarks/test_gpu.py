@@ -1,0 +1,148 @@
+"""`make gpu` keeps what it has, leaves out what does not fit, and runs whole on a CPU."""
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.gpu import work
+from benchmarks.gpu.__main__ import PAGE, main
+from benchmarks.gpu.plan import OBSERVERS, SIZES, Stage, plan
+from benchmarks.gpu.prepare import requirements
+from benchmarks.gpu.runner import failures, run
+from benchmarks.gpu.table import BEGIN, END, put, section
+from coopenv.errors import CoopenvError
+
+HEAD = {"command": "python -m benchmarks.gpu", "coopenv": "1.2.3", "device": "cuda:0"}
+
+
+def test_every_stage_has_work_and_a_limit() -> None:
+    stages = plan("cuda:0")
+    assert all(stage.work in work.WORK and 0.0 < stage.limit <= 150.0 for stage in stages)
+    assert len({stage.name for stage in stages}) == len(stages)
+    batches = [stage.arguments for stage in stages if stage.work == "throughput"]
+    measured = {(batch["overrides"]["observer.name"], batch["worlds"]) for batch in batches}
+    assert measured == {(observer, size) for observer in OBSERVERS for size in SIZES}
+    assert max(SIZES) == 262_144 and min(SIZES) == 4_096
+
+
+def test_what_is_there_is_kept_when_a_stage_fails_or_takes_too_long(tmp_path: Path) -> None:
+    """The document is on the disk after every stage; a mistake and a limit are lines in it, not the end of the run."""
+    seen: list[int] = []
+
+    def tell(line: str) -> None:
+        seen.append(len(json.loads((tmp_path / "gpu.json").read_text())["stages"]))
+
+    stages = [Stage("slow", "machine", 0.05, {"device": "cpu"}), Stage("wrong", "machine", 60.0, {"device": "tpu"})]
+    document = run(stages, HEAD, tmp_path / "gpu.json", 600.0, tell)
+    assert seen == [1, 2]
+    assert json.loads((tmp_path / "gpu.json").read_text()) == document
+    slow, wrong = document["stages"]
+    assert slow["problem"] == "ended after its limit of 0 s"
+    assert "unknown device 'tpu'" in wrong["problem"]
+    assert failures(document) == ["slow", "wrong"]
+    late = run(stages, HEAD, tmp_path / "gpu.json", 0.0)
+    assert [row["skipped"] for row in late["stages"]] == ["no time was left"] * 2 and not failures(late)
+
+
+def test_worlds_that_do_not_fit_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """1,000 worlds of over 10 KiB each are more than 80 % of 10 MiB."""
+    monkeypatch.setattr(work, "free_memory", lambda device: 10 * 2**20)
+    (stage,) = (s for s in plan("cpu", (1000,)) if s.name == "throughput, riccati, 1000")
+    assert work.throughput(**stage.arguments)["skipped"].startswith("1000 worlds take 0.0 GiB")
+
+
+def test_worlds_are_compared_one_by_one() -> None:
+    here = {"a": np.array([[1.0, np.nan], [2.0, np.inf], [3.0, 0.0]]), "n": np.array([1, 2, 3]), "tick": 4}
+    there = copy.deepcopy(here)
+    assert work.compared(here, there, 3) == {"worlds": 3, "worlds_alike": 3, "largest_difference": 0.0, "in": ""}
+    there["a"][2, 0] += 4e-3
+    found = work.compared(here, there, 3)
+    assert found["worlds_alike"] == 2 and found["in"] == "a"
+    assert found["largest_difference"] == pytest.approx(1e-3)
+    there["n"][0] = 7
+    assert work.compared(here, there, 3)["largest_difference"] == np.inf
+    there["a"][1, 1] = np.nan
+    assert work.compared(here, there, 3)["worlds_alike"] == 0
+
+
+def document_of_a_gpu() -> dict[str, Any]:
+    rate = {"env_steps_per_s": 2e6, "agent_steps_per_s": 1e7, "vehicle_ticks_per_s": 6e7, "bytes_per_world": 2048.0}
+    spread = {"slowest_round": 0.5, "fastest_round": 1.5}
+    alike = {"worlds": 64, "worlds_alike": 64, "largest_difference": 2e-9, "in": "position"}
+    stages = [
+        {"name": "throughput, riccati, 4096", "result": {"worlds": 4096, **rate, **spread}},
+        {"name": "throughput, robust, 262144", "skipped": "262144 worlds take 99.0 GiB, 80.0 GiB are free"},
+        {"name": "agreement, riccati", "result": alike},
+        {"name": "tests", "result": {"status": 0, "passed": 4, "failed": 0, "left_out": 0}},
+    ]
+    return {**HEAD, "stages": stages}
+
+
+def test_the_table_stands_between_the_marks(tmp_path: Path) -> None:
+    page, document = tmp_path / "page.md", document_of_a_gpu()
+    page.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    put(document, page)
+    text = page.read_text()
+    assert text.startswith(f"before\n{BEGIN}\n") and text.endswith(f"{END}\nafter\n") and "old" not in text
+    assert "| riccati | 4,096 | 2 M [1 M, 3 M] | 10 M | 60 M | 2.0 |" in text
+    assert "64 of 64 worlds alike" in text and "4 passed, 0 failed" in text and "99.0 GiB" in text
+    put(document, page)
+    assert page.read_text() == text
+    with pytest.raises(CoopenvError, match="of a CPU"):
+        put({**document, "device": "cpu"}, page)
+    page.write_text("no marks")
+    with pytest.raises(CoopenvError, match="needs one line"):
+        put(document, page)
+
+
+def test_the_page_has_a_place_for_the_table(tmp_path: Path) -> None:
+    page = tmp_path / "benchmarks.md"
+    page.write_text(PAGE.read_text(encoding="utf-8"))
+    put(document_of_a_gpu(), page)
+    assert section(document_of_a_gpu()) in page.read_text()
+
+
+def test_bad_worlds_and_failed_tests_are_failures() -> None:
+    document = document_of_a_gpu()
+    assert not failures(document)
+    document["stages"][2]["result"] |= {"worlds_alike": 63, "largest_difference": None}
+    assert "63 of 64 worlds alike; largest difference none that is finite" in section(document)
+    document["stages"][3]["result"]["passed"] = 0
+    assert failures(document) == ["agreement, riccati", "tests"]
+
+
+def test_a_torch_that_is_there_is_not_installed_again() -> None:
+    with_it, without = requirements(has_torch=True), requirements(has_torch=False)
+    assert {*without} - {*with_it} == {"torch"}
+    assert {line.partition(">")[0] for line in with_it} >= {"warp-lang", "numpy", "tyro", "tensorboard", "pytest"}
+
+
+def test_mistakes_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    for arguments, words in (
+        (["--device", "tpu"], "unknown device 'tpu'"),
+        (["--device", "cpu", "--out", str(tmp_path / "file" / "gpu.json")], "cannot write to"),
+        (["--table", str(tmp_path / "none.json")], "none.json"),
+    ):
+        assert main(arguments) == 2
+        error = capsys.readouterr().err
+        assert words in error and len(error.splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_the_whole_run_on_a_cpu(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "gpu.json"
+    assert main(["--device", "cpu", "--quick", "--worlds", "64", "--out", str(out)]) == 0
+    document = json.loads(out.read_text())
+    assert [row["name"] for row in document["stages"]] == [stage.name for stage in plan("cpu", (64,), True)]
+    results = {row["name"]: row["result"] for row in document["stages"] if "result" in row}
+    assert results["agreement, robust"]["worlds_alike"] == results["agreement, robust"]["worlds"]
+    assert results["throughput, riccati, 64"]["env_steps_per_s"] > 0.0
+    assert results["tests"]["failed"] == 0 < results["tests"]["passed"]
+    assert "| riccati | 64 |" in capsys.readouterr().out
