@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-train test-all test-matrix lint format bench stages gpu schema pages clean
+.PHONY: help demo test test-train agents test-all test-matrix lint format bench stages gpu schema pages clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -38,6 +38,9 @@ $(VENV)/.train: $(VENV)/.dev
 
 test-train: $(VENV)/.train ## the tests that train policies (installs torch)
 	@$(BIN)/python -m pytest -m train
+
+agents: $(VENV)/.train ## train the agents of agents/ that learn, about two hours; goes on where it was interrupted
+	@$(BIN)/coopenv bench learning agents/study.toml
 
 test-all: lint ## every test whose tools are installed
 	@$(BIN)/python -m pytest -n 2 --dist loadfile

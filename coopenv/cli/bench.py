@@ -72,8 +72,8 @@ def bench_observers(
     as_json: options.AsJson = False,
 ) -> None:
     """Compare observers on the same data and with their bound."""
+    from coopenv.bench.executors import find_executor
     from coopenv.bench.observers.command import REPORT_FILE, perform, request_of
-    from coopenv.bench.observers.executors import find_executor
 
     if open_report and out is None:
         raise CoopenvError("--open: the report needs a folder, --out DIR")
@@ -85,3 +85,37 @@ def bench_observers(
     perform(request, find_executor(engine, jobs, address), out, figures, printed, log, as_json)
     if open_report and out is not None:
         options.show(out / REPORT_FILE)
+
+
+@bench.command("learning")
+def bench_learning(
+    study: Annotated[Path, typer.Argument(help="TOML file of the study, such as agents/study.toml.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for the agents (default: beside the study).")] = None,
+    only: Annotated[
+        str | None,
+        typer.Option(help="Part of it: environments, arms and seeds with commas between, such as facade,quality,1."),
+    ] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Trainings side by side (default: one per core).")] = None,
+    worlds: Annotated[int, typer.Option(min=2, help="Number of held-out worlds for the cards.")] = 256,
+    logs: Annotated[Path, typer.Option(help="Folder for TensorBoard's files.")] = Path("out", "tensorboard"),
+) -> None:
+    """Train agents by environment, arm and seed, and write their cards; goes on where it was interrupted."""
+    try:
+        from coopenv.bench.learning import command
+    except ImportError as error:
+        raise CoopenvError(f"coopenv bench learning needs the extra train: pip install '.[train]' ({error})") from None
+    from coopenv.bench.learning.study import read_study
+    from coopenv.machine import available_cores
+
+    words = [word.strip() for word in only.split(",") if word.strip()] if only else []
+    whole, log = read_study(study), options.console(stderr=True)
+    chosen, folder = whole.only(words), out or study.parent
+    with options.warned():
+        for group in chosen.groups:
+            options.load(group.environment, chosen.settings[group.arm].scenario)
+    command.run(whole, chosen, folder, logs, jobs or available_cores(), worlds, log)
+    printed = options.console()
+    if not printed.is_terminal:
+        printed.width = max(printed.width, command.WIDTH)
+    printed.print(command.results_table(chosen, folder))
+    printed.print("Figures of the best seed, with 95 % intervals over worlds. More in every agent's card.md.")

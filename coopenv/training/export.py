@@ -20,6 +20,7 @@ from coopenv.evaluation import Result
 from coopenv.files import writing
 from coopenv.policies.loader import AGENT_FILE
 from coopenv.policies.network import ENTRY, NetworkCard, layout_hash, layout_tables
+from coopenv.scenario import Scenario
 from coopenv.shipped import version
 from coopenv.training.settings import SETTINGS_FILE, Plan
 from coopenv.training.trainer import Trainer
@@ -78,6 +79,12 @@ def command_of(plan: Plan) -> str:
     return join(["coopenv", "train", environment, "--settings", SETTINGS_FILE, "--seed", str(plan.seed)])
 
 
+def scenario_digest(scenario: Scenario) -> str:
+    """Return the first 16 hexadecimal digits of SHA-256 over what a scenario sets, whatever it is called."""
+    told = scenario.model_dump_json(exclude={"title", "description", "source"}, exclude_defaults=True)
+    return sha256(told.encode()).hexdigest()[:16]
+
+
 def _settings(plan: Plan) -> str:
     values = plan.settings.model_dump(mode="json", exclude_none=True)
     return tomlkit.dumps({**values, "scenario": plan.all_overrides})
@@ -106,6 +113,7 @@ def _card(trainer: Trainer, results: Sequence[Result], digest: str) -> str:
         "command": command_of(plan),
         "environment": environment,
         "seed": plan.seed,
+        "scenario": scenario_digest(trainer.scenario),
         **({"arm": plan.arm} if plan.arm else {}),
         "steps": trainer.status.steps,
         "minutes": round(trainer.status.seconds / 60.0, 2),

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from coopenv.bench.agents.contest import IDEAL, Entrant, Evaluation
+from coopenv.bench.agents.seeds_section import seeds_section
 from coopenv.bench.agents.table import COLUMNS, cell
 from coopenv.errors import CoopenvError
 from coopenv.files import check_file, replace_text
@@ -32,16 +33,17 @@ def check(entrants: Sequence[Entrant]) -> None:
 
 
 def read(folder: Path) -> dict[str, Any]:
-    """Return what a card says by environment; empty without one.
+    """Return what `card.json` holds, results by environment under `environments`; nothing of them without a card.
 
     Raises:
         CoopenvError: `card.json` is not one.
     """
     path = folder / JSON_FILE
     if not path.exists():
-        return {}
+        return {"environments": {}}
     try:
-        return dict(json.loads(path.read_text(encoding="utf-8"))["environments"])
+        document = json.loads(path.read_text(encoding="utf-8"))
+        return {**document, "environments": dict(document["environments"])}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CoopenvError(f"{path}: not a card: {error}") from None
 
@@ -53,8 +55,9 @@ def write(evaluation: Evaluation, command: str) -> list[Path]:
         folder = entrant.agent.folder
         if folder is None or entrant.name == IDEAL:
             continue
-        known = read(folder)
+        card = read(folder)
         rows = [row for row in evaluation.rows() if row["agent"] == entrant.name]
+        known = card["environments"]
         known[evaluation.environment] = {
             "command": command,
             "coopenv": version(),
@@ -62,17 +65,17 @@ def write(evaluation: Evaluation, command: str) -> list[Path]:
             "seed_block": evaluation.block,
             "results": {row["metric"]: {key: row[key] for key in ("mean", "ci_low", "ci_high", "n")} for row in rows},
         }
-        card = {"agent": entrant.name, "kind": entrant.kind, "environments": dict(sorted(known.items()))}
+        card |= {"agent": entrant.name, "kind": entrant.kind, "environments": dict(sorted(known.items()))}
         replace_text(folder / JSON_FILE, json_text(card))
-        replace_text(folder / TEXT_FILE, text(entrant, card))
+        replace_text(folder / TEXT_FILE, text(entrant.agent.description, card))
         written.append(folder / TEXT_FILE)
     return written
 
 
-def text(entrant: Entrant, card: dict[str, Any]) -> str:
+def text(description: str, card: dict[str, Any]) -> str:
     """Return a card for people, in Markdown."""
     headings = [heading.strip().replace("\n", " ") for heading, _ in COLUMNS.values()]
-    lines = [f"# {entrant.name}", "", " ".join(entrant.agent.description.split()), ""]
+    lines = [f"# {card['agent']}", "", " ".join(description.split()), ""]
     lines += [f"| environment | worlds | {' | '.join(headings)} |", "|---" * (len(headings) + 2) + "|"]
     for name, entry in card["environments"].items():
         cells = [cell(entry["results"][metric], factor) for metric, (_, factor) in COLUMNS.items()]
@@ -80,4 +83,6 @@ def text(entrant: Entrant, card: dict[str, Any]) -> str:
     lines += ["", "With 95 % intervals over worlds; errors from 3 s on, of vehicles under way. Measured with", ""]
     commands = dict.fromkeys((entry["command"], entry["coopenv"]) for entry in card["environments"].values())
     lines += [f"    {command} --write-card  # coopenv {number}" for command, number in commands]
+    if "study" in card:
+        lines += ["", *seeds_section(card["study"])]
     return "\n".join(lines) + "\n"

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from coopenv.bench.observers.executors import Executor
+from coopenv.bench.executors import Executor
 from coopenv.bench.observers.faults import changed
 from coopenv.bench.observers.sources import Source
 from coopenv.errors import CoopenvError

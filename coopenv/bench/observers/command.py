@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
+from coopenv.bench.executors import Executor
 from coopenv.bench.observers.basin import Basin, Draw, basin_failures, basin_table, basins_of, check_source, study_basin
 from coopenv.bench.observers.comparison import Comparison, Plan
-from coopenv.bench.observers.executors import Executor
 from coopenv.bench.observers.sources import ALL, find_source
 from coopenv.bench.observers.tables import csv_text
 from coopenv.errors import CoopenvError

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
+from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables
-from coopenv.bench.observers.executors import Executor, Local
 from coopenv.bench.observers.judge import Task, judge
 from coopenv.bench.observers.leaderboard import Leaderboard
 from coopenv.bench.observers.rows import Row

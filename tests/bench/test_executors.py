@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from coopenv.bench.observers.executors import Local, find_executor, reach
+from coopenv.bench.executors import Local, find_executor, reach
 from coopenv.errors import CoopenvError
 from coopenv.machine import ONE_THREAD
 

@@ -1,0 +1,117 @@
+"""The agent of a group of runs: its best seed, and the card that tells of all of them."""
+
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+
+from coopenv.bench.agents import cards
+from coopenv.bench.learning.judge import REPORTED, Judge
+from coopenv.bench.learning.study import Group, Run, Study
+from coopenv.bench.learning.work import is_finished
+from coopenv.evaluation import Difference, Result
+from coopenv.files import replace_text
+from coopenv.jsonable import json_text
+from coopenv.policies.loader import AGENT_FILE
+from coopenv.shipped import version
+
+BASELINES = ("route_follower", "peek")
+COMPARED = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m")
+
+
+def stale_groups(study: Study, folder: Path) -> list[Group]:
+    """Return the groups whose card does not tell of all runs that are finished."""
+    return [group for group in study.groups if _finished(study, group, folder) != _told(folder / group.name)]
+
+
+def write(study: Study, group: Group, folder: Path, judge: Judge) -> None:
+    """Write the agent and the card of a group of which some runs are finished.
+
+    Which seed is the best is decided by the return that it learnt from, in held-out worlds of their own.
+    """
+    runs = {seed: Run(group, seed) for seed in _finished(study, group, folder)}
+    overrides, place = study.settings[group.arm].scenario, folder / group.name
+    merits = {seed: judge.merit(group.environment, folder / run.folder, overrides) for seed, run in runs.items()}
+    best = max(merits, key=lambda seed: merits[seed])
+    results = {seed: judge.results(group.environment, folder / run.folder) for seed, run in runs.items()}
+    description = _write_agent(place, runs[best].folder.name, group, sorted(runs))
+    chosen = folder / runs[best].folder
+    against = {name: judge.against(group.environment, chosen, name) for name in BASELINES}
+    baselines = {name: judge.results(group.environment, name) for name in BASELINES}
+    baselines["ideal_sensing"] = judge.ideal(group.environment, BASELINES[0])
+    agents = ",".join(str(folder / run.folder) for run in runs.values())
+    command = f"coopenv evaluate {group.environment} --agents {agents},{','.join(BASELINES)} --worlds {judge.worlds}"
+    card = {
+        "agent": group.name,
+        "kind": "learned",
+        "environments": {
+            group.environment: {
+                "command": f"{command} --seed-block {REPORTED} --ideal",
+                "coopenv": version(),
+                "worlds": judge.worlds,
+                "seed_block": REPORTED,
+                "results": _figures(results[best]),
+            }
+        },
+        "study": {
+            "arm": group.arm,
+            "best": best,
+            "seeds": {
+                str(seed): {
+                    "runs": _trained(folder / run.folder),
+                    "merit": merits[seed],
+                    "results": _figures(results[seed]),
+                }
+                for seed, run in runs.items()
+            },
+            "beside": {name: _figures(found) for name, found in baselines.items()},
+            "against": {name: _changes(found) for name, found in against.items()},
+        },
+    }
+    replace_text(place / cards.JSON_FILE, json_text(card))
+    replace_text(place / cards.TEXT_FILE, cards.text(description, card))
+
+
+def _finished(study: Study, group: Group, folder: Path) -> dict[int, str]:
+    """Return the digest of the weights of every seed that is finished."""
+    runs = {seed: Run(group, seed) for seed in study.seeds}
+    done = {seed: folder / run.folder for seed, run in runs.items() if is_finished(study, run, folder)}
+    return {seed: _trained(place)["sha256"] for seed, place in done.items()}
+
+
+def _told(place: Path) -> dict[int, str]:
+    """Return the digests of which a card tells."""
+    seeds = cards.read(place).get("study", {}).get("seeds", {})
+    return {int(seed): entry["runs"]["sha256"] for seed, entry in seeds.items()}
+
+
+def _trained(place: Path) -> dict[str, Any]:
+    """Return what an agent's folder says of its training."""
+    document = tomllib.loads((place / AGENT_FILE).read_text(encoding="utf-8"))
+    training = document["training"]
+    return {"sha256": document["network"]["sha256"], **{key: training[key] for key in ("steps", "minutes", "command")}}
+
+
+def _write_agent(place: Path, best: str, group: Group, seeds: Sequence[int]) -> str:
+    """Write the agent that drives as one seed of it does, and return its description."""
+    document = tomlkit.parse((place / best / AGENT_FILE).read_text(encoding="utf-8"))
+    names = ", ".join(map(str, seeds))
+    description = f"PPO in {group.environment}, arm {group.arm}: {best.replace('_', ' ')}, the best of {names}."
+    document["title"], document["description"] = f"{group.environment}, {group.arm}", description
+    document["network"]["weights"] = f"{best}/{document['network']['weights']}"
+    replace_text(place / AGENT_FILE, tomlkit.dumps(document))
+    return description
+
+
+def _figures(results: Sequence[Result]) -> dict[str, dict[str, float]]:
+    return {r.metric: {"mean": r.mean, "ci_low": r.ci_low, "ci_high": r.ci_high, "n": r.n} for r in results}
+
+
+def _changes(differences: Sequence[Difference]) -> dict[str, dict[str, float]]:
+    return {
+        d.metric: {"relative": d.relative, "ci_low": d.relative_ci_low, "ci_high": d.relative_ci_high}
+        for d in differences
+        if d.metric in COMPARED
+    }

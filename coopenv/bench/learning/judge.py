@@ -1,0 +1,56 @@
+"""How the agents of a study and the drivers beside them do on held-out worlds; everybody drives once."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from coopenv.api.engine import Engine
+from coopenv.backends.sources import open_simulation
+from coopenv.bench.agents.contest import IDEAL_SENSING
+from coopenv.evaluation import Difference, Episodes, Result, compare_paired, drive, held_out_seeds, score
+from coopenv.policies import load_agent
+
+REPORTED, CHOSEN = 0, 1
+"""Blocks of held-out seeds: figures on cards are of the first; which seed is the best is decided in the second."""
+
+
+class Judge:
+    """Drives agents in the same worlds, and remembers what came of it."""
+
+    def __init__(self, worlds: int) -> None:
+        """Take so many worlds of either block."""
+        self.worlds = worlds
+        self._known: dict[tuple[str, ...], Episodes] = {}
+
+    def results(self, environment: str, agent: str | Path, overrides: Mapping[str, Any] | None = None) -> list[Result]:
+        """Return the figures of an agent in the reported worlds, under overrides of the environment."""
+        return score(self._episodes(environment, agent, overrides or {}, REPORTED))
+
+    def ideal(self, environment: str, agent: str) -> list[Result]:
+        """Return those of an agent that sees everything."""
+        return self.results(environment, agent, IDEAL_SENSING)
+
+    def against(self, environment: str, agent: str | Path, other: str | Path) -> list[Difference]:
+        """Return how much an agent's figures differ from another's in the same worlds."""
+        own, others = (self._episodes(environment, each, {}, REPORTED) for each in (agent, other))
+        return compare_paired(own, others)
+
+    def merit(self, environment: str, agent: Path, overrides: Mapping[str, Any]) -> float:
+        """Return the mean return of an agent by the reward that it learnt from, in worlds of the other block."""
+        figures = {
+            result.metric: result.mean for result in score(self._episodes(environment, agent, overrides, CHOSEN))
+        }
+        return figures["return"]
+
+    def _episodes(self, environment: str, agent: str | Path, overrides: Mapping[str, Any], block: int) -> Episodes:
+        weights = sorted(str(path.stat().st_mtime_ns) for path in Path(agent).glob("*.safetensors"))
+        key = (environment, str(agent), repr(sorted(overrides.items())), str(block), *weights)
+        if key not in self._known:
+            scenario = open_simulation(environment, overrides)
+            engine = Engine(scenario, self.worlds)
+            try:
+                seeds = held_out_seeds(block, self.worlds)
+                self._known[key] = drive(engine, load_agent(agent, scenario), seeds)
+            finally:
+                engine.close()
+        return self._known[key]

@@ -1,0 +1,112 @@
+"""Which agents a study trains: environments, arms of the settings, and seeds."""
+
+import tomllib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+from pydantic import Field, ValidationError
+
+from coopenv.errors import CoopenvError, suggest
+from coopenv.scenario.base import Part
+from coopenv.scenario.validation import one_line
+from coopenv.training.settings import Plan, Settings, read_settings
+
+Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]
+Name = Annotated[str, Field(pattern=r"^[a-z0-9_]+$")]
+
+
+class StudyFile(Part):
+    """The contents of a study's TOML file."""
+
+    settings: str
+    """TOML file of `coopenv train`, beside this one, with a table under `arms` for each arm."""
+    environments: tuple[Name, ...] = Field(min_length=1)
+    arms: tuple[Name, ...] = Field(min_length=1)
+    seeds: tuple[Seed, ...] = Field(min_length=1)
+
+
+class Group(NamedTuple):
+    """The runs that differ in nothing but their seed; one agent comes of them."""
+
+    environment: str
+    arm: str
+
+    @property
+    def name(self) -> str:
+        """Of the agent and its folder."""
+        return f"{self.environment}_{self.arm}"
+
+
+class Run(NamedTuple):
+    """One training."""
+
+    group: Group
+    seed: int
+
+    @property
+    def folder(self) -> Path:
+        """Where its agent goes, in the study's folder."""
+        return Path(self.group.name, f"seed_{self.seed}")
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is to be trained."""
+
+    environments: tuple[str, ...]
+    seeds: tuple[int, ...]
+    settings: dict[str, Settings]
+    """By arm."""
+
+    @property
+    def groups(self) -> list[Group]:
+        """All agents, by environment."""
+        return [Group(environment, arm) for environment in self.environments for arm in self.settings]
+
+    @property
+    def runs(self) -> Iterator[Run]:
+        """All trainings; every agent's first one before any agent's second."""
+        return (Run(group, seed) for seed in self.seeds for group in self.groups)
+
+    def plan(self, run: Run) -> Plan:
+        """Return what exactly a run trains."""
+        return Plan(run.group.environment, self.settings[run.group.arm], run.seed, run.group.arm)
+
+    def only(self, words: Sequence[str]) -> "Study":
+        """Return the part of the study that names of environments and arms and numbers of seeds choose.
+
+        Raises:
+            CoopenvError: it has nothing of such a name.
+        """
+        seeds = {str(seed): seed for seed in self.seeds}
+        known = (*self.environments, *self.settings, *seeds)
+        for word in words:
+            if word not in known:
+                raise CoopenvError(
+                    f"--only: the study has no '{word}'{suggest(word, known)}; known: {', '.join(known)}"
+                )
+        environments = tuple(name for name in self.environments if name in words) or self.environments
+        arms = [arm for arm in self.settings if arm in words] or list(self.settings)
+        chosen = tuple(seed for text, seed in seeds.items() if text in words) or self.seeds
+        return Study(environments, chosen, {arm: self.settings[arm] for arm in arms})
+
+
+def read_study(path: Path) -> Study:
+    """Read a study and the settings that it names.
+
+    Raises:
+        CoopenvError: one of the files is not valid; one line that names file and field.
+    """
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+        file = StudyFile.model_validate(raw)
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CoopenvError(f"{path}: not valid TOML: {error}") from None
+    except OSError as error:
+        raise CoopenvError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except ValidationError as error:
+        raise CoopenvError(one_line(error, str(path), StudyFile)) from None
+    settings = {arm: read_settings(path.parent / file.settings, arm) for arm in file.arms}
+    return Study(file.environments, file.seeds, settings)

@@ -1,0 +1,60 @@
+"""The trainings of a study: which are done, and doing one, in a process of its own. Needs the extra `train`."""
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+
+from coopenv.backends.sources import open_simulation
+from coopenv.bench.learning.study import Run, Study
+from coopenv.errors import CoopenvError
+from coopenv.policies.loader import AGENT_FILE, read_card
+from coopenv.training.checkpoint import CHECKPOINT_FILE, read
+from coopenv.training.command import train
+from coopenv.training.export import scenario_digest
+from coopenv.training.settings import SETTINGS_FILE, Plan, read_settings
+
+
+@dataclass(frozen=True)
+class Task:
+    """One training as it is sent to another process."""
+
+    plan: Plan
+    out: Path
+    logs: Path
+
+
+def tasks(study: Study, folder: Path, logs: Path) -> list[Task]:
+    """Return the trainings of a study that are not finished."""
+    return [
+        Task(study.plan(run), folder / run.folder, logs / run.folder)
+        for run in study.runs
+        if not is_finished(study, run, folder)
+    ]
+
+
+def is_finished(study: Study, run: Run, folder: Path) -> bool:
+    """Return whether a run's agent is there, trained as the study and its environment's file say now."""
+    place, plan = folder / run.folder, study.plan(run)
+    if not (place / AGENT_FILE).is_file() or not (place / SETTINGS_FILE).is_file():
+        return False
+    try:
+        card, settings = read_card(place), read_settings(place / SETTINGS_FILE)
+    except (CoopenvError, tomllib.TOMLDecodeError):
+        return False
+    known = [card.training.get(key) for key in ("environment", "seed", "arm", "scenario")]
+    scenario = scenario_digest(open_simulation(plan.environment, plan.all_overrides))
+    return known == [plan.environment, plan.seed, plan.arm, scenario] and settings == plan.settings
+
+
+def perform(task: Task) -> None:
+    """Train on one core, going on from a checkpoint where there is one.
+
+    Raises:
+        CoopenvError: there is the checkpoint of another training, or what `train` raises.
+    """
+    path = task.out / CHECKPOINT_FILE
+    resume = path.is_file()
+    if resume and read(path).plan != task.plan:
+        raise CoopenvError(f"{path}: of a training with other settings; remove it to start anew")
+    task.logs.mkdir(parents=True, exist_ok=True)
+    train(task.plan, task.out, resume=resume, threads=1, logs=task.logs)

@@ -1,0 +1,79 @@
+"""`coopenv bench learning` in processes of its own: agents with cards, and going on after kill -9."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("stable_baselines3", reason="needs the extra 'train'")
+pytest.importorskip("tensorboard", reason="needs the extra 'train'")
+
+import coopenv
+from coopenv.policies import find_agent, load_agent
+from tests.helpers.processes import COOPENV, start, wait_until
+
+pytestmark = [pytest.mark.train, pytest.mark.slow]
+STUDY = 'settings = "train.toml"\nenvironments = ["open_square"]\narms = ["quality", "plain"]\nseeds = [1, 2]\n'
+SETTINGS = """
+steps = 2000
+scenario.horizon = 6.0
+[ppo]
+worlds = 4
+decisions = 25
+minibatches = 2
+[evaluation]
+every = 800
+worlds = 2
+final_worlds = 4
+[arms.quality]
+[arms.plain]
+scenario.reward.weights.position_uncertainty = 0.0
+"""
+COMMAND = (*COOPENV, "bench", "learning", "study.toml", "--worlds", "4", "--jobs", "2", "--logs", "logs")
+
+
+def test_interrupted_goes_on_and_leaves_every_agent_with_its_card(tmp_path: Path) -> None:
+    (tmp_path / "train.toml").write_text(SETTINGS)
+    (tmp_path / "study.toml").write_text(STUDY)
+    first = start(COMMAND, tmp_path)
+    wait_until(lambda: (tmp_path / "open_square_quality" / "card.md").is_file() or first.poll() is not None)
+    os.killpg(first.pid, signal.SIGKILL)
+    first.communicate()
+    early = (tmp_path / "open_square_quality" / "seed_1" / "weights.safetensors").stat().st_mtime_ns
+    second = start(COMMAND, tmp_path)
+    printed, errors = second.communicate(timeout=300)
+    assert second.returncode == 0, errors
+    assert "open_square_plain" in printed
+    assert (tmp_path / "open_square_quality" / "seed_1" / "weights.safetensors").stat().st_mtime_ns == early
+    for arm in ("quality", "plain"):
+        folder = tmp_path / f"open_square_{arm}"
+        assert not list(folder.rglob("checkpoint*"))
+        card = json.loads((folder / "card.json").read_text())
+        study = card["study"]
+        merits = {seed: entry["merit"] for seed, entry in study["seeds"].items()}
+        assert sorted(merits) == ["1", "2"]
+        assert str(study["best"]) == max(merits, key=lambda seed: merits[seed])
+        assert card["environments"]["open_square"]["results"] == study["seeds"][str(study["best"])]["results"]
+        assert "(best)" in (folder / "card.md").read_text()
+        agent = find_agent(folder)
+        assert (agent.name, agent.kind, agent.environments) == (folder.name, "learned", ("open_square",))
+        load_agent(folder, coopenv.load_scenario("open_square"))
+
+
+def test_settings_of_another_training_are_not_gone_on_with(tmp_path: Path) -> None:
+    (tmp_path / "train.toml").write_text(SETTINGS)
+    (tmp_path / "study.toml").write_text(STUDY)
+    first = start((*COMMAND, "--only", "plain,1"), tmp_path)
+    kept = tmp_path / "open_square_plain" / "seed_1" / "checkpoint.safetensors"
+    wait_until(lambda: kept.is_file() or first.poll() is not None)
+    os.killpg(first.pid, signal.SIGKILL)
+    first.communicate()
+    (tmp_path / "train.toml").write_text(SETTINGS.replace("2000", "3000"))
+    second = start((*COMMAND, "--only", "plain,1"), tmp_path)
+    _, errors = second.communicate(timeout=120)
+    assert second.returncode == 2
+    assert "of a training with other settings; remove it to start anew" in errors.splitlines()[-1]
