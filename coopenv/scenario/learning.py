@@ -31,6 +31,8 @@ class Observation(Part):
 
     include: tuple[str, ...] = Field(default=USUAL_GROUPS, min_length=1, json_schema_extra=_list_groups)
     """Groups of coopenv's fields, and names of single fields: coopenv's, registered and custom ones."""
+    exclude: tuple[str, ...] = Field(default=(), json_schema_extra=_list_groups)
+    """Groups and fields that are left out of those again, for what an ablation does without."""
     planar: bool = False
     """Whether to leave out what a vehicle on a plane cannot change: heights, roll and pitch."""
     position_scale: Positive = 50.0
@@ -60,6 +62,7 @@ class Observation(Part):
         groups = {*fields, *(row.group for row in fields.values() if row.group)}
         for key, names, allowed in (
             ("include: unknown group or field", self.include, groups),
+            ("exclude: unknown group or field", self.exclude, groups),
             ("scales: unknown field", self.scales, {*fields}),
             ("centers: unknown field", self.centers, {*fields}),
         ):

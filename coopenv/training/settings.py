@@ -21,8 +21,8 @@ Share = Annotated[float, Field(gt=0.0, lt=1.0)]
 class Ppo(Part):
     """Proximal policy optimisation (Schulman et al. 2017) with parameters shared over vehicles."""
 
-    worlds: Count = 64
-    """Worlds side by side."""
+    vehicles: Count = 512
+    """Driven vehicles side by side: as many worlds as hold so many, so that every environment's batch is alike."""
     decisions: Count = 64
     """Decision steps of a rollout, after each of which the policy is updated."""
     minibatches: Count = 8

@@ -11,6 +11,7 @@ from stable_baselines3.common.logger import configure
 from coopenv.api.trainers.sb3 import CooperativeSB3VecEnv
 from coopenv.api.trainers.sb3_buffer import ActingRowsBuffer
 from coopenv.api.vector_env import CooperativeVectorEnv
+from coopenv.evaluation.episodes import driven_vehicles
 from coopenv.scenario import Scenario
 from coopenv.training.cloning import clone
 from coopenv.training.normalised import NormalisedEnv
@@ -36,7 +37,7 @@ class Trainer:
         rows = CooperativeVectorEnv(
             scenario,
             plan.environment,
-            num_worlds=ppo.worlds,
+            num_worlds=max(1, ppo.vehicles // len(driven_vehicles(scenario))),
             autoreset="same_step",
             arrays="numpy",
             threads=threads,

@@ -27,7 +27,7 @@ from coopenv.training.trainer import Trainer
 
 pytestmark = pytest.mark.train
 torch.set_num_threads(1)
-SMALL = Ppo(worlds=4, decisions=32, epochs=1)
+SMALL = Ppo(vehicles=16, decisions=32, epochs=1)
 
 
 def trainer_of(**settings: object) -> Trainer:
@@ -119,7 +119,7 @@ def test_learns_to_drive_faster_where_nothing_else_counts(tmp_path: Path) -> Non
         "reward.weights": {**dict.fromkeys(REWARD_TERMS.built_in, 0.0), "progress": 1.0},
         "termination": {"collision": False, "arrival": False},
     }
-    ppo = Ppo(worlds=16, decisions=16, gamma=0.9, learning_rate=3e-3)
+    ppo = Ppo(vehicles=64, decisions=16, gamma=0.9, learning_rate=3e-3)
     settings = Settings(steps=40_000, scenario=overrides, ppo=ppo, evaluation=Evaluation(final_worlds=8))
     results = train(Plan("urban_crossing", settings, seed=2), tmp_path / "agent", threads=1)
     figures = {result.metric: result for result in results}

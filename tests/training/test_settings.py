@@ -15,7 +15,7 @@ steps = 1000
 reward.weights.position_error = 0.1
 "rates.decision" = 5.0
 [ppo]
-worlds = 8
+vehicles = 8
 [arms.blind]
 steps = 2000
 scenario = { camera.range = 0.5, "reward.weights.position_error" = 0.0 }
@@ -33,14 +33,14 @@ def path(tmp_path: Path) -> Path:
 def test_defaults() -> None:
     settings = read_settings(None)
     assert settings.budget == (2_000_000, None)
-    assert (settings.ppo.worlds, settings.ppo.decisions, settings.ppo.hidden) == (64, 64, (64, 64))
+    assert (settings.ppo.vehicles, settings.ppo.decisions, settings.ppo.hidden) == (512, 64, (64, 64))
     assert settings.clone is None
 
 
 def test_tables_and_dotted_keys_are_the_same(path: Path) -> None:
     settings = read_settings(path)
     assert settings.scenario == {"reward.weights.position_error": 0.1, "rates.decision": 5.0}
-    assert (settings.ppo.worlds, settings.ppo.gamma) == (8, 0.99)
+    assert (settings.ppo.vehicles, settings.ppo.gamma) == (8, 0.99)
 
 
 def test_an_arm_changes_what_it_names(path: Path) -> None:
@@ -50,7 +50,7 @@ def test_an_arm_changes_what_it_names(path: Path) -> None:
         "rates.decision": 5.0,
         "camera.range": 0.5,
     }
-    assert (settings.steps, settings.ppo.worlds, settings.ppo.gamma) == (2000, 8, 0.9)
+    assert (settings.steps, settings.ppo.vehicles, settings.ppo.gamma) == (2000, 8, 0.9)
 
 
 def test_the_command_line_goes_before_the_file(path: Path) -> None:
@@ -69,7 +69,7 @@ def test_a_plan_survives_as_plain_data(path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[ppo]\nwolds = 3", r"train\.toml: ppo\.wolds: unknown key \(did you mean 'worlds'\?\)"),
+        ("[ppo]\nvehicls = 3", r"train\.toml: ppo\.vehicls: unknown key \(did you mean 'vehicles'\?\)"),
         ("[ppo]\ngamma = 1.5", r"train\.toml: ppo\.gamma: Input should be less than 1, got 1\.5"),
         ("[ppo]\nhidden = []", r"train\.toml: ppo\.hidden: .*at least 1"),
         ("[clone]\nepisodes = 3", r"train\.toml: clone\.agent: Field required"),

@@ -27,7 +27,7 @@ SETTINGS = """
 steps = 3000
 scenario.horizon = 6.0
 [ppo]
-worlds = 4
+vehicles = 16
 decisions = 25
 minibatches = 2
 epochs = 2
@@ -87,7 +87,7 @@ def test_leaves_an_agent(reference: Path) -> None:
         assert [int(row["steps"]) for row in csv.DictReader(file)] == STEPS
     assert list((reference / "tensorboard").glob("events.*"))
     again = read_settings(reference / "train.toml")
-    assert (again.steps, again.ppo.worlds, again.scenario) == (3000, 4, {"horizon": 6.0})
+    assert (again.steps, again.ppo.vehicles, again.scenario) == (3000, 16, {"horizon": 6.0})
 
 
 @pytest.mark.slow

@@ -81,21 +81,25 @@ def included_fields(scenario: Scenario) -> dict[str, ObservationField]:
     """Return the rows of the fields that a scenario's observation holds: coopenv's, then others as they are listed.
 
     Raises:
-        CoopenvError: one is not known in this process.
+        CoopenvError: one is not known in this process, or none is left.
     """
-    wanted = scenario.observation.include
+    wanted, unwanted = scenario.observation.include, scenario.observation.exclude
     known = OBSERVATION_FIELDS.known(scenario.observation.custom)
     by_group: dict[str, dict[str, ObservationField]] = {}
     for name, row in known.items():
         by_group.setdefault(row.group or name, {})[name] = row
     for name, row in known.items():
         by_group.setdefault(name, {name: row})  # a group of one, unless a group has its name
-    for group in wanted:
+    for group in (*wanted, *unwanted):
         if group not in by_group:
             raise CoopenvError(f"observation field '{group}' is not registered in this process; see docs/terms.md")
     first = [group for group in GROUPS if group in wanted]
     fields = {name: row for group in (*first, *wanted) for name, row in by_group[group].items()}
-    return {name: row for name, row in fields.items() if entries_of(row, scenario)}
+    left_out = {name for group in unwanted for name in by_group[group]}
+    kept = {name: row for name, row in fields.items() if name not in left_out and entries_of(row, scenario)}
+    if not kept:
+        raise CoopenvError("observation.exclude: nothing is left of the observation")
+    return kept
 
 
 def entries_of(row: ObservationField, scenario: Scenario) -> tuple[int, ...]:

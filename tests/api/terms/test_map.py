@@ -253,3 +253,24 @@ def test_scales_and_centers_of_single_fields() -> None:
 def test_errors_are_one_line(key: str, value: Any, message: str) -> None:
     with pytest.raises(coopenv.ScenarioError, match=message):
         load_scenario("urban_crossing", {f"observation.{key}": value})
+
+
+def test_what_is_excluded_is_left_out_and_nothing_else() -> None:
+    layout = observation_layout(load_scenario("open_square"))
+    changes = {"observation.exclude": ["map", "goal"]}
+    left = observation_layout(load_scenario("open_square", changes))
+    assert list(left) == [name for name, field in layout.items() if field.group not in ("map", "goal")]
+    assert layout.size - left.size == sum(f.stop - f.start for f in layout.values() if f.group in ("map", "goal"))
+    observation, _ = coopenv.parallel_env("open_square", overrides=changes).reset(seed=1)
+    whole, _ = coopenv.parallel_env("open_square").reset(seed=1)
+    for name, field in left.items():
+        np.testing.assert_array_equal(field.values(observation["vehicle_2"]), layout[name].values(whole["vehicle_2"]))
+
+
+def test_an_observation_of_nothing_is_refused() -> None:
+    with pytest.raises(coopenv.CoopenvError, match=r"exclude: unknown group or field 'maap' \(did you mean 'map'\?\)"):
+        load_scenario("open_square", {"observation.exclude": ["maap"]})
+    with pytest.raises(coopenv.CoopenvError, match=r"observation\.exclude: nothing is left"):
+        observation_layout(
+            load_scenario("open_square", {"observation.include": ["map"], "observation.exclude": ["map"]})
+        )

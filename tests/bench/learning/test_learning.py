@@ -22,7 +22,7 @@ SETTINGS = """
 steps = 2000
 scenario.horizon = 6.0
 [ppo]
-worlds = 4
+vehicles = 16
 decisions = 25
 minibatches = 2
 [evaluation]
