@@ -31,7 +31,7 @@ class Ppo(Part):
     """Passes over each rollout."""
     learning_rate: Positive = 1e-3
     """Of Adam at the start; falls linearly to zero."""
-    gamma: Share = 0.99
+    gamma: Share = 0.995
     """Discount per decision."""
     gae_lambda: Probability = 0.95
     """Of the generalised advantage estimate (Schulman et al. 2016)."""
@@ -47,7 +47,7 @@ class Ppo(Part):
     """Rewards are multiplied by it, which makes values of order one."""
     initial_std: Positive = 0.5
     """Standard deviation of the exploration at the start; actions reach from -1 to 1."""
-    hidden: tuple[Count, ...] = Field(default=(64, 64), min_length=1)
+    hidden: tuple[Count, ...] = Field(default=(128, 128), min_length=1)
     """Widths of the hidden layers, tanh, of the policy and of the value."""
     observation_clip: Positive = 6.0
     """Observations are normalised by their running mean and standard deviation and clipped to this."""

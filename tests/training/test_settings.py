@@ -33,14 +33,14 @@ def path(tmp_path: Path) -> Path:
 def test_defaults() -> None:
     settings = read_settings(None)
     assert settings.budget == (2_000_000, None)
-    assert (settings.ppo.vehicles, settings.ppo.decisions, settings.ppo.hidden) == (512, 64, (64, 64))
+    assert (settings.ppo.vehicles, settings.ppo.decisions, settings.ppo.hidden) == (512, 64, (128, 128))
     assert settings.clone is None
 
 
 def test_tables_and_dotted_keys_are_the_same(path: Path) -> None:
     settings = read_settings(path)
     assert settings.scenario == {"reward.weights.position_error": 0.1, "rates.decision": 5.0}
-    assert (settings.ppo.vehicles, settings.ppo.gamma) == (8, 0.99)
+    assert (settings.ppo.vehicles, settings.ppo.gamma) == (8, 0.995)
 
 
 def test_an_arm_changes_what_it_names(path: Path) -> None:
