@@ -17,7 +17,10 @@ HEAVY = {"warp", "scipy", "matplotlib", "PIL", "pandas", "mcap", "torch", "jobli
 LIGHT = {"errors", "shipped", "interrupts", "api", "api.registration", "seeds"}
 LIGHT |= {
     "cli",
-    *(f"cli.{name}" for name in ("bench", "complete", "evaluate", "live", "options", "page", "run", "show", "train")),
+    *(
+        f"cli.{name}"
+        for name in ("bench", "complete", "dataset", "evaluate", "live", "options", "page", "run", "show", "train")
+    ),
 }
 
 

@@ -1,4 +1,4 @@
-"""The command line: `coopenv list | describe | schema | run | record | train | evaluate | watch | play | page | bench`.
+"""The command line, `coopenv COMMAND`; `coopenv --help` lists the commands.
 
 Commands import what they need when they run, so that `--help` and completion are quick.
 """
@@ -14,6 +14,7 @@ import typer
 from coopenv import interrupts
 from coopenv.cli import show
 from coopenv.cli.bench import bench
+from coopenv.cli.dataset import dataset
 from coopenv.cli.evaluate import evaluate
 from coopenv.cli.live import play, watch
 from coopenv.cli.page import page
@@ -37,6 +38,7 @@ app.command()(show.describe)
 app.command()(show.schema)
 app.command()(run)
 app.command("record")(record_command)
+app.command()(dataset)
 app.command()(train)
 app.command()(evaluate)
 app.command()(watch)

@@ -1,0 +1,75 @@
+"""`coopenv dataset`: what Minari reads back is what was driven."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import coopenv
+from coopenv.cli import main
+from coopenv.policies import load_agent
+from coopenv.runs.driven import drive_vehicles
+
+IDENTITY = "coopenv/facade/route_follower-v0"
+
+
+def test_without_minari_one_line_says_what_to_install(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "minari", None)
+    assert main(["dataset", "facade", "--out", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert "pip install '.[minari]'" in error and len(error.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    pytest.importorskip("minari", reason="needs the extra minari")
+    pytest.importorskip("h5py", reason="needs the extra minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    return tmp_path
+
+
+def test_a_dataset_holds_the_episodes(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import minari
+
+    assert main(["dataset", "facade", "--worlds", "3", "--seed", "7"]) == 0
+    assert "3 episodes" in capsys.readouterr().out
+    dataset = minari.load_dataset(IDENTITY)
+    scenario = coopenv.load_scenario("facade")
+    driven = drive_vehicles(scenario, load_agent("route_follower", scenario), 7, 3)
+    assert dataset.total_episodes == 3 and dataset.total_steps == sum(len(e.rewards) for e in driven)
+    for number, (read, own) in enumerate(zip(dataset.iterate_episodes(), driven, strict=True)):
+        for name in ("observations", "actions", "rewards", "terminations", "truncations"):
+            assert np.array_equal(getattr(read, name), getattr(own, name)), name
+        assert np.array_equal(read.infos["position_error"], own.position_error)
+        (facts,) = dataset.storage.get_episode_metadata([number])
+        assert facts["options"] == {"world": number, "vehicle": 1}
+    env = dataset.recover_environment()
+    assert env.observation_space == dataset.spec.observation_space and env.action_space == dataset.spec.action_space
+    assert list(minari.list_local_datasets()) == [IDENTITY]
+    assert sorted(path.name for path in root.rglob("*") if path.is_file()) == ["main_data.hdf5", "metadata.json"]
+
+
+def test_a_dataset_that_is_there_is_kept_unless_forced(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import minari
+
+    arguments = ["dataset", "facade", "--set", "horizon=2.0", "--id", "own/short-v3", "--worlds"]
+    assert main([*arguments, "2"]) == 0
+    assert main([*arguments, "4"]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert minari.load_dataset("own/short-v3").total_episodes == 2
+    assert main([*arguments, "4", "--force"]) == 0
+    assert minari.load_dataset("own/short-v3").total_episodes == 4
+    assert minari.load_dataset("own/short-v3").spec.env_spec is None  # of an environment that nobody registered
+
+
+@pytest.mark.parametrize("identity", ["no_version", "../out-v0", "a b-v0", "-v0"])
+def test_identities_that_are_none_are_refused(identity: str, root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["dataset", "facade", f"--id={identity}"]) == 2
+    assert "expected NAMESPACE/NAME-v0" in capsys.readouterr().err
+    assert not list(root.iterdir())
