@@ -12,7 +12,7 @@ import warp as wp
 from coopenv.estimation.linalg import block3, cholesky6, symmetric_part
 from coopenv.observers.robust.algebra import displaced, lower_blocks, moved, recentring, transition, with_noise
 from coopenv.observers.robust.constants import FORGET_TIME, MAX_GROWTH, SAME_TIME
-from coopenv.observers.robust.memory import Estimate, Member, Pose, mat66d
+from coopenv.observers.robust.memory import ERRORS, Estimate, Member, Pose, mat66d
 from coopenv.world.camera import VISIBLE
 
 MAX_UNSEEN_TIME = FORGET_TIME + SAME_TIME
@@ -21,7 +21,7 @@ MAX_UNSEEN_TIME = FORGET_TIME + SAME_TIME
 @wp.func
 def index_of(memory: Any, world: int, i: int, vehicle: int) -> int:
     """Return the index of a vehicle among the members of i's belief, 0 if it is not one of the others."""
-    for n in range(1, memory.belief[world, i].members):
+    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
         if memory.member[world, i, n].vehicle == vehicle:
             return n
     return 0
@@ -29,8 +29,12 @@ def index_of(memory: Any, world: int, i: int, vehicle: int) -> int:
 
 @wp.func
 def begin_belief(memory: Any, world: int, i: int, estimate: Estimate):
-    """Believe in the vehicle itself alone."""
-    memory.belief[world, i].members = 1
+    """Believe in the vehicle itself alone, and of its odometry's errors what was believed before."""
+    others = memory.belief[world, i].others
+    memory.belief[world, i].members = others
+    if others > ERRORS:
+        memory.P[world, i, 0, ERRORS] = mat66d()
+        memory.P[world, i, ERRORS, 0] = mat66d()
     memory.member[world, i, 0].vehicle = i
     memory.member[world, i, 0].pose = estimate.pose
     memory.P[world, i, 0, 0] = estimate.P
@@ -66,8 +70,13 @@ def apply_corrections(memory: Any, world: int, i: int):
     """Move all members by their corrections, and let the covariance be about where they are then."""
     for k in range(memory.belief[world, i].members):
         correction = memory.scratch[world, k].correction
-        apply_error(memory, world, i, k, correction)
-        G = recentring(correction)
+        G = wp.identity(6, wp.float64)
+        if k < ERRORS or k >= memory.belief[world, i].others:
+            apply_error(memory, world, i, k, correction)
+            G = recentring(correction)
+        else:
+            memory.member[world, i, k].w = memory.member[world, i, k].w + correction[:3]
+            memory.member[world, i, k].v = memory.member[world, i, k].v + correction[3:]
         memory.scratch[world, k].recentring = G
         for j in range(k + 1):
             block = G * memory.P[world, i, k, j] * wp.transpose(memory.scratch[world, j].recentring)
@@ -173,7 +182,7 @@ def is_unseen(model: Any, memory: Any, world: int, i: int, n: int, tick: int):
 def longest_unseen(model: Any, memory: Any, world: int, i: int, tick: int) -> int:
     """Return the member that has been out of view for longest, 0 if all have been in view lately."""
     found = int(0)
-    for n in range(1, memory.belief[world, i].members):
+    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
         if is_unseen(model, memory, world, i, n, tick):
             if found == 0 or memory.member[world, i, n].seen_tick < memory.member[world, i, found].seen_tick:
                 found = n
@@ -181,9 +190,15 @@ def longest_unseen(model: Any, memory: Any, world: int, i: int, tick: int) -> in
 
 
 @wp.func
+def most_others(memory: Any) -> int:
+    """Return how many other vehicles there is room for in a belief."""
+    return memory.member.shape[2] - 1 - ERRORS
+
+
+@wp.func
 def make_room(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
     """Return whether there is room for one more, after an eviction if there has to be one and may be one."""
-    if memory.belief[world, i].members < memory.member.shape[2]:
+    if memory.belief[world, i].members - memory.belief[world, i].others < most_others(memory):
         return True
     n = longest_unseen(model, memory, world, i, tick)
     if n > 0:

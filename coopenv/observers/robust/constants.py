@@ -3,9 +3,12 @@
 # Belief
 
 MAX_MEMBERS, MAX_MEMBERS_JOINT = 5, 8
-"""Vehicles in a belief, the vehicle itself included: of `robust` and of `robust_joint`."""
+"""Vehicles in a belief, the vehicle itself included, what stands for its odometry's errors not: of `robust` and of
+`robust_joint`."""
 MAX_LINEARISATIONS, RELINEARISATION_ANGLE = 8, 0.05
 """Linearisations of one correction; how far it may turn a line of sight to be near, rad. Tuned."""
+BEND_FACTOR = 4.0
+"""Factor of the variance of what a bearing's linearisation leaves out: it does not average out as noise does. Tuned."""
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
 FORGET_TIME = 1.0  # s out of view after which a member may be evicted. Chosen
 MAX_ACCELERATION = 1.0  # m/s^2 by which a member may leave its last known twist. Chosen: an ordinary start or stop
@@ -17,6 +20,10 @@ JUMP_GATE = 32.5
 0.999 quantile of a chi-square of 3."""
 MAX_SMOOTH_ACCELERATION, MAX_SMOOTH_ANGULAR_ACCELERATION = 10.0, 30.0
 """m/s^2 and rad/s^2 beyond which a change is one that no brakes and no steering make. Chosen."""
+
+ERRORS_TIME = 1.0
+"""s for which an error of a vehicle's odometry that lasts counts as the same where it is taken as noise. Chosen."""
+MIN_ERROR_STD = 1e-6  # rad/s and a share: of an error that is not declared beside one that is
 
 # Tests
 

@@ -7,11 +7,12 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.estimation.linalg import block3
 from coopenv.estimation.so3 import exp_so3, skew
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust.algebra import odometry_noise
 from coopenv.observers.robust.belief import index_of
-from coopenv.observers.robust.constants import CORRELATION_FACTOR, MAX_ACCELERATION, MAX_SPEED
+from coopenv.observers.robust.constants import BEND_FACTOR, CORRELATION_FACTOR, MAX_ACCELERATION, MAX_SPEED
 from coopenv.observers.robust.memory import mat26d, vec3d
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.v2x import fresh
@@ -117,6 +118,24 @@ def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
 
 
 @wp.func
+def bend_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: Any, distance: Any):
+    """Return the variance of what a bearing's linearisation leaves out, rad^2.
+
+    With relative position uncertain by s along the line of sight u and by t across, its direction is t / (d + s), and
+    t s / d^2 of that no linear function of them. That error is the same for many ticks, so that it counts more than
+    noise of that size. `turn` is from the member's body to the vehicle's.
+    """
+    V = block3(memory.P[world, i, 0, 0], 3, 3)
+    if member > 0:
+        C = block3(memory.P[world, i, 0, member], 3, 3) * wp.transpose(turn)
+        V = V + turn * block3(memory.P[world, i, member, member], 3, 3) * wp.transpose(turn) - C - wp.transpose(C)
+    along = wp.max(wp.dot(u, V * u), wp.float64(0.0))
+    across = wp.max(wp.trace(V) - along, wp.float64(0.0))
+    square = distance * distance
+    return wp.float64(BEND_FACTOR) * along * across / (square * square)
+
+
+@wp.func
 def linearise(model: Any, memory: Any, world: int, i: int, n: int):
     """Linearise the n-th bearing, residual = H x + noise; return whether its target is ahead of the camera."""
     line = memory.line[world, n]
@@ -135,14 +154,17 @@ def linearise(model: Any, memory: Any, world: int, i: int, n: int):
     H[:, :3] = B * skew(a)
     H[:, 3:] = -B
     memory.line[world, n].jacobian = H
+    turn = wp.identity(3, wp.float64)
     if line.member > 0:
-        G = B * (wp.transpose(own.R) * memory.member[world, i, line.member].pose.R)
+        turn = wp.transpose(own.R) * memory.member[world, i, line.member].pose.R
+        G = B * turn
         H[:, :3] = -(G * skew(line.point))
         H[:, 3:] = G
         memory.line[world, n].member_jacobian = H
     memory.line[world, n].residual = T * line.bearing
     memory.line[world, n].distance = distance
-    memory.line[world, n].noise = bearing_variance(model, i) + line.variance / (distance * distance)
+    bend = bend_variance(memory, world, i, line.member, turn, u, distance)
+    memory.line[world, n].noise = bearing_variance(model, i) + line.variance / (distance * distance) + bend
     return wp.dot(u, line.bearing) > wp.float64(0.0)
 
 

@@ -60,8 +60,8 @@ class Member:
     vehicle: wp.int32
     pose: Pose
     has_twist: wp.int32
-    v: vec3d  # m/s, body
-    w: vec3d  # rad/s, body
+    v: vec3d  # m/s, body; of the odometry's errors: (scale, 0, 0)
+    w: vec3d  # rad/s, body; of the odometry's errors: the gyro's bias
     velocity_variance: wp.float64  # (m/s)^2 per axis, of v
     seen_tick: wp.int32  # when it was last in view
     report: Report  # its last one, at which it stands
@@ -78,6 +78,7 @@ class Belief:
     sample_v: vec3d  # m/s, body: the odometry sample held at the last tick's end
     sample_w: vec3d  # rad/s, body
     members: wp.int32  # how many
+    others: wp.int32  # the first of them that is another vehicle; before it, where it is 2, the odometry's errors
     depends_on: wp.uint64  # bits of vehicles
     missed_share: wp.float64  # mean share of bearings that do not fit
     healthy_time: wp.float64  # s for which it has been low
@@ -160,7 +161,8 @@ class RobustMemory:
     scratch_blocks: array("WKK", mat66d)  # before the correction
 
 
-SIZES = {"K": MAX_MEMBERS, "H": MAX_HYPOTHESES + 1}  # besides the hypotheses of one frame there is the prior
+ERRORS = 1  # the member that stands for the odometry's errors, where there is one, see odometry.py
+SIZES = {"K": MAX_MEMBERS + ERRORS, "H": MAX_HYPOTHESES + 1}  # besides the hypotheses of one frame there is the prior
 
 
 @wp.func
@@ -220,6 +222,7 @@ def rules_for(members: int) -> dict[str, Rule]:
         **dict.fromkeys(("belief.odometry.R", "anchor.estimate.pose.R", "anchor.odometry.R"), ROTATION),
         **dict.fromkeys(("search.attempts", "hypothesis.bearings"), whole(0, 10**9)),
         "belief.members": whole(1, members),
+        "belief.others": whole(1, ERRORS + 1),
         "P": Rule("a covariance", lambda P, fields, model: are_joint(P, fields["observer_belief.members"]), axes=4),
         "anchor.estimate.P": COVARIANCE,
         "search.hypotheses": whole(0, MAX_HYPOTHESES),

@@ -11,21 +11,15 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import symmetric_part
-from coopenv.estimation.so3 import exp_so3, orthonormalise, skew
-from coopenv.observers.robust.algebra import distance_squared, is_known, lower_blocks, moved, odometry_noise
-from coopenv.observers.robust.belief import begin_belief, own_estimate, propagate
-from coopenv.observers.robust.constants import (
-    JUMP_GATE,
-    MAX_SMOOTH_ACCELERATION,
-    MAX_SMOOTH_ANGULAR_ACCELERATION,
-    SAME_PRIOR,
-)
-from coopenv.observers.robust.memory import Estimate, Pose, clear, mat33d, vec2d, vec3d
+from coopenv.estimation.so3 import orthonormalise, skew
+from coopenv.observers.robust.algebra import distance_squared, is_known, lower_blocks, odometry_noise
+from coopenv.observers.robust.belief import begin_belief, own_estimate
+from coopenv.observers.robust.constants import SAME_PRIOR
+from coopenv.observers.robust.memory import Estimate, Pose, clear, mat33d, vec3d
+from coopenv.observers.robust.odometry import begin_errors, increment_noise, propagate_own, take_odometry, walk_errors
 from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
 from coopenv.observers.robust.tracklets import bit_of
 from coopenv.observers.robust.update import resect, set_anchor, update
-
-TWELFTH = 1.0 / 12.0
 
 
 @wp.func
@@ -38,49 +32,6 @@ def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: Estima
         if model.targets[i, n] >= model.landmarks:
             bits = bits | bit_of(model.targets[i, n] - model.landmarks)
     memory.belief[world, i].depends_on = bits
-
-
-@wp.func
-def jump_variance(change: Any, std: Any, period: Any, smooth: Any):
-    """Return the variance, per axis, of a sum of samples between two of which the twist has changed by so much.
-
-    What is more than the samples' noise and a `smooth` acceleration has come at once, in a collision for example, and
-    at any time of the period.
-    """
-    square = wp.dot(change, change)
-    gate = wp.max(wp.float64(JUMP_GATE) * std * std, smooth * smooth * period * period)
-    return wp.where(square > gate, square * period * period * wp.float64(TWELFTH), wp.float64(0.0))
-
-
-@wp.func
-def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int):
-    """Return the increment of a tick and variances to add to its noise; carry the dead reckoning through it.
-
-    Samples are held until the next one, so that the sum lags by half a period. Half of what the held sample has changed
-    by makes it the trapezoidal rule: (v0 + v1) T / 2 = v0 T + (v1 - v0) T / 2. The noise that comes in goes out again
-    with the next sample.
-    """
-    v = vec3d(state.odometry_velocity[world, i])
-    w = vec3d(state.odometry_angular_velocity[world, i])
-    R = orthonormalise(mat33d(state.increment_rotation[world, i]))
-    p = vec3d(state.increment_translation[world, i])
-    noise = vec2d()
-    if memory.belief[world, i].has_sample == 1:
-        change_v = v - memory.belief[world, i].sample_v
-        change_w = w - memory.belief[world, i].sample_w
-        half = wp.float64(0.5) * model.odometry_period
-        p = p + R * (half * change_v)
-        R = R * exp_so3(half * change_w)
-        period = model.odometry_period
-        linear, angular = wp.float64(MAX_SMOOTH_ACCELERATION), wp.float64(MAX_SMOOTH_ANGULAR_ACCELERATION)
-        noise[0] = jump_variance(change_w, wp.float64(model.noise[i].angular_velocity), period, angular)
-        noise[1] = jump_variance(change_v, wp.float64(model.noise[i].velocity), period, linear)
-    memory.belief[world, i].has_sample = 1
-    memory.belief[world, i].sample_v = v
-    memory.belief[world, i].sample_w = w
-    step = Pose(R, p)
-    memory.belief[world, i].odometry = moved(memory.belief[world, i].odometry, step)
-    return step, noise
 
 
 @wp.func
@@ -114,6 +65,8 @@ def make_start(clear_messages: Any, receive: Any) -> Any:
         """
         clear(model, memory, world, i)
         clear_messages(model, memory, world, i)
+        memory.belief[world, i].others = 1
+        begin_errors(model, memory, world, i)
         R = orthonormalise(mat33d(state.estimate_rotation[world, i]))
         initial = Estimate(Pose(R, R * vec3d(state.estimate_position[world, i])), model.start.covariance[i])
         restart_belief(model, memory, world, i, initial)
@@ -153,14 +106,16 @@ def make_estimate(receive: Any, fuse_messages: Any) -> Any:
         state.nis[world, i] = wp.float64(0.0)
         state.nis_dof[world, i] = 0
         receive(model, state, memory, world, i)
-        step, jump = take_odometry(model, state, memory, world, i)
-        noise = odometry_noise(model, i, now.period) + jump
+        step, jump = take_odometry(model, state, memory, world, i, now.period)
+        walk_errors(model, memory, world, i, now.period)
         if memory.search[world, i].active == 1:
+            noise = increment_noise(model, memory, world, i, step, now.period) + jump
             propagate_search(memory, world, i, step, noise)
             if now.due:
                 search(model, state, memory, world, i, now)
         else:
-            propagate(memory, world, i, 0, step, noise)
+            noise = odometry_noise(model, i, now.period) + jump
+            propagate_own(memory, world, i, step, noise, now.period)
             fuse_messages(model, state, memory, world, i, now.tick)
             if now.due:
                 update(model, state, memory, world, i, now)

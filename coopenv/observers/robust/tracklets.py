@@ -17,6 +17,7 @@ from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import append_member, fuse_information, index_of, make_room, mark_seen, propagate
 from coopenv.observers.robust.measurements import is_heard
 from coopenv.observers.robust.memory import Estimate, Pose, Report, mat66d, mat66f, vec3d
+from coopenv.observers.robust.odometry import increment_noise
 from coopenv.world.camera import VISIBLE
 
 
@@ -149,7 +150,7 @@ def information_share(memory: Any, world: int, i: int, depends_on: wp.uint64):
     if (depends_on & own) == wp.uint64(0):
         return wp.float64(constants.DEPENDENT_SHARE)
     count = int(1)
-    for n in range(1, memory.belief[world, i].members):
+    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
         if (memory.member[world, i, n].report.depends_on & own) != wp.uint64(0):
             count += 1
     return wp.float64(1.0) / wp.float64(count)
@@ -184,7 +185,7 @@ def fuse_message(model: Any, memory: Any, world: int, i: int, n: int, sender: in
     if report.tick > last.tick:
         dt = wp.float64(report.tick - last.tick) * model.camera_period
         step = algebra.between(last.odometry, report.odometry)
-        noise = algebra.odometry_noise(model, i, dt)
+        noise = increment_noise(model, memory, world, i, step, dt)
         propagate_member(model, memory, world, i, n, step, dt, noise)
         before = algebra.carried(Estimate(last.pose, mat66d(last.P)), step, noise)
         was_distrusted = memory.member[world, i, n].distrusted

@@ -16,6 +16,7 @@ from coopenv.observers.robust.belief import apply_error
 from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.measurements import NOTHING, innovation_squared, set_lines
 from coopenv.observers.robust.memory import Anchor, Estimate, mat66d, vec2d, vec6d
+from coopenv.observers.robust.odometry import begin_errors, lasting_noise
 from coopenv.observers.robust.search import begin_search
 
 
@@ -76,7 +77,9 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
         anchor = memory.anchor[world, i]  # where most bearings fitted, carried on by odometry since
         elapsed = wp.float64(now.tick - anchor.tick) * model.camera_period
         step = between(anchor.odometry, memory.belief[world, i].odometry)
-        begin_search(memory, world, i, carried(anchor.estimate, step, odometry_noise(model, i, elapsed)))
+        begin_errors(model, memory, world, i)  # what was believed of them may be as wrong
+        noise = odometry_noise(model, i, elapsed) + lasting_noise(memory, world, i, step, elapsed, elapsed)
+        begin_search(memory, world, i, carried(anchor.estimate, step, noise))
     elif healthy > wp.float64(constants.HEALTHY_TIME):
         noise = vec2d(wp.float64(constants.ANCHOR_ANGLE_VARIANCE), wp.float64(constants.ANCHOR_POSITION_VARIANCE))
         set_anchor(memory, world, i, with_noise(wp.float64(4.0) * memory.P[world, i, 0, 0], noise), now.tick)

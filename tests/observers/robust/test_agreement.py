@@ -29,6 +29,8 @@ from tests.oracles.robust.observer import Robust
 ISOTROPIC = {"noise.bearing.model": "isotropic", "noise.bearing.scale": 0.0029}
 LOSSY = {"v2x.delay": 6, "v2x.loss": 0.3}
 LOST = {"position_radius": 4.0, "orientation_angle": "uniform"}
+LASTING = {"noise.odometry_scale": 0.03, "noise.gyro_bias": (0.0, 0.0, 0.0087)}
+WALKING = {"noise.odometry_scale_walk": 0.003, "noise.gyro_bias_walk": 0.001}
 STALE = {"v2x.delay": 3, "v2x.loss": 0.4, "v2x.period": 2, "v2x.staleness": 0.2}
 
 
@@ -68,6 +70,9 @@ CASES: dict[str, Callable[[float], Recording]] = {
     "cyclic": lambda horizon: near(recorded(horizon=horizon, topology__acyclic=False)),
     "sensed": lambda horizon: recorded("urban_crossing", horizon=horizon),
     "three landmarks": lambda horizon: recorded("crossing_path", horizon=horizon),
+    "errors that last": lambda horizon: near(recorded(horizon=horizon, **dotted(LASTING))),
+    "errors that last, any start": lambda horizon: random_start(recorded(horizon=horizon, **dotted(LASTING)), 2),
+    "errors that walk": lambda horizon: recorded("busy_intersection_tracking", horizon=horizon, **dotted(WALKING)),
     "mirror": lambda horizon: recorded("busy_intersection_mirror", horizon=horizon),
 }
 
@@ -110,6 +115,7 @@ JOINT_CASES = {
     "late radio": CASES["late radio"],
     "eviction": lambda: crowd(6.0, 9, 7),
     "eviction of those told of": lambda: crowd(6.0, 9, 7, True),
+    "errors that last": lambda: recorded("busy_intersection_tracking", horizon=3.0, **dotted(LASTING)),
     "a liar": lambda: FAULTS["lying_neighbour"].applied(small_errors(4.0), 0),
 }
 

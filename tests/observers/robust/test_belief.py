@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.rotations import exp_so3
 from coopenv.observers.contract import SensorNoise
+from coopenv.observers.robust.constants import BEND_FACTOR
 from tests.oracles.robust.belief import Belief, Member, recentring
 from tests.oracles.robust.tracklets import left_error
 
@@ -48,6 +49,23 @@ def test_jacobian_is_the_derivative_of_the_residual():
         moved.shift(1e-6 * e)
         change = b.sight(lines(moved, points), LEVER_ARM, z, [1, 2], points).residual / 1e-6
         assert_allclose(sight.H @ e, change, atol=1e-6)
+
+
+def test_what_is_not_linear_has_the_variance_that_is_added() -> None:
+    """Drawn errors of position turn lines of sight by more than their linearisation says."""
+    rng, b = np.random.default_rng(0), belief()
+    b.P = block_diag(1e-12 * np.eye(3), 0.2 * np.eye(3), 1e-12 * np.eye(3), positive(rng, 3, 0.03), np.eye(6))
+    points = [np.zeros(3)] * 2
+    z = np.array([[4.0, -3.0, 2.0], *(m.p for m in b.members[1:])])
+    sight = b.sight(lines(b, points), LEVER_ARM, z, [1, 2], points)
+    left = []
+    for x in rng.multivariate_normal(np.zeros(18), b.P, 4000):
+        moved = copy.deepcopy(b)
+        moved.shift(x)
+        seen = b.sight(lines(moved, points)[:2], LEVER_ARM, z[:2], [1], points[:1])
+        left.append(seen.residual - sight.H[:2] @ x)
+    variance = np.square(left).sum(axis=-1).mean(axis=0)
+    assert_allclose(sight.bend[:2] / BEND_FACTOR, variance, rtol=0.5)
 
 
 def test_targets_behind_are_not_ahead():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -11,6 +13,8 @@ from coopenv.scenario.files import load_scenario
 from coopenv.world.world import World
 from tests.helpers.builders import reset, simulate
 from tests.helpers.warp_calls import DTYPES
+
+Driver = Callable[[World, int, np.ndarray], np.ndarray | float]
 
 CORNERS = [(x, y) for x in (-3.8, 3.8) for y in (-3.8, 3.8)]
 SIDES = [
@@ -50,40 +54,47 @@ def turning_hard(world: World, k: int, phase: np.ndarray) -> np.ndarray:
     return np.stack([np.full(phase.shape, 0.5), np.sign(np.sin(0.09 * k + phase))], -1)
 
 
-def driven(scenario: Scenario, driver: object, worlds: int, dtype: str, seconds: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return NEES / 6 (K, W, N) and position errors in m of vehicles under way; NaN of others and in a search."""
+def nees_of(world: World) -> tuple[np.ndarray, np.ndarray]:
+    """Return NEES / 6 (W, N) and position errors in m of vehicles under way; NaN of others and in a search."""
+    (R, p), L, memory = estimates(world), world.model.landmarks, world.memory
+    assert np.isfinite(p).all()
+    away = world.view("position")[:, L:].astype(float) - p
+    turned = Rotation.from_matrix((np.swapaxes(R, -1, -2) @ world.view("rotation")[:, L:]).reshape(-1, 3, 3))
+    e = np.concatenate([turned.as_rotvec().reshape(p.shape), np.einsum("wnji,wnj->wni", R, away)], -1)
+    searching = memory.search.numpy()["active"] == 1
+    P = np.where(searching[..., None, None], np.eye(6), memory.P.numpy()[:, :, 0, 0])
+    assert (np.linalg.eigvalsh(P)[..., 0] > 0.0).all()
+    under_way = (world.view("ended") == 0) & ~searching
+    found = np.einsum("wni,wni->wn", e, np.linalg.solve(P, e[..., None])[..., 0]) / 6.0
+    return np.where(under_way, found, np.nan), np.where(under_way, np.linalg.norm(away, axis=-1), np.nan)
+
+
+def driven(
+    scenario: Scenario, driver: Driver, worlds: int, dtype: str, seconds: int
+) -> tuple[np.ndarray, np.ndarray, World]:
+    """Return NEES / 6 (K, W, N) and position errors in m of vehicles under way, and the world in the end."""
     world = simulate(scenario, worlds, dtype)
     reset(world, range(1000, 1000 + worlds))
     phase = np.random.default_rng(0).uniform(0, 2 * np.pi, (worlds, world.model.vehicles))
-    nees, errors = [], []
+    found = []
     for k in range(10 * seconds):
         world.actions.numpy()[...] = np.clip(driver(world, k, phase), -1, 1)
         world.advance(6)
-        (R, p), L = estimates(world), world.model.landmarks
-        assert np.isfinite(p).all()
-        away = world.view("position")[:, L:].astype(float) - p
-        turned = Rotation.from_matrix((np.swapaxes(R, -1, -2) @ world.view("rotation")[:, L:]).reshape(-1, 3, 3))
-        e = np.concatenate([turned.as_rotvec().reshape(p.shape), np.einsum("wnji,wnj->wni", R, away)], -1)
-        searching = world.memory.search.numpy()["active"] == 1
-        P = np.where(searching[..., None, None], np.eye(6), world.memory.P.numpy()[:, :, 0, 0])
-        assert (np.linalg.eigvalsh(P)[..., 0] > 0.0).all()
-        under_way = (world.view("ended") == 0) & ~searching
-        found = np.einsum("wni,wni->wn", e, np.linalg.solve(P, e[..., None])[..., 0]) / 6.0
-        nees.append(np.where(under_way, found, np.nan))
-        errors.append(np.where(under_way, np.linalg.norm(away, axis=-1), np.nan))
-    return np.array(nees), np.array(errors)
+        found.append(nees_of(world))
+    nees, errors = zip(*found, strict=True)
+    return np.array(nees), np.array(errors), world
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_hard_turns_are_in_the_covariance(dtype: str) -> None:
     """Samples of odometry that are held lag behind: with a lag of half a period ANEES/6 would be 1.86."""
-    nees, errors = driven(square(), turning_hard, 48, dtype, 14)
+    nees, errors, _ = driven(square(), turning_hard, 48, dtype, 14)
     assert 0.8 < np.nanmean(nees[30:]) < 1.2
     assert np.nanpercentile(errors[80:], 95) < 0.03
 
 
 def test_cars_that_see_little_but_each_other_are_consistent() -> None:
     """With covariances left about poses before their correction ANEES/6 would be 1.6, at worst 80."""
-    nees, _ = driven(square(), weaving, 96, "float32", 12)
+    nees, _, _ = driven(square(), weaving, 96, "float32", 12)
     assert 0.8 < np.nanmean(nees[30:]) < 1.35
     assert np.nanmean(nees[30:] > 5.0) < 3e-3

@@ -76,11 +76,14 @@ def test_messages_are_as_small_as_promised(name, most):
 @pytest.mark.parametrize("fault", ["v2x_loss", "v2x_delay", "wrong_association", "lying_neighbour", "landmarks_lost"])
 @BOTH
 def test_faults_do_not_mislead(name, fault):
-    record, lie = FAULTS[fault].applied(small_errors(12.0), 0)
-    result = run(name, record, lie)
-    assert not result.failure
-    assert (result.position_error[-1] < 0.9).all()  # the last vehicle's bound is 0.3 m by then
-    assert (result.anees(8.0) < 6.0).all()
+    misled = []
+    for seed in range(5):
+        record, lie = FAULTS[fault].applied(small_errors(12.0, seed), seed)
+        result = run(name, record, lie)
+        assert not result.failure
+        far = result.position_error[-1] > np.array([0.2, 0.2, 0.3, 0.6, 1.2])  # 95 % of the last one's are below 1.1 m
+        misled.append(far.any() or (result.anees(8.0) > 6.0).any())
+    assert sum(misled) <= 1  # a wrong association may pass while a follower is uncertain by metres
 
 
 def test_a_joint_liar_is_as_sure_in_every_entry():

@@ -18,9 +18,12 @@ from coopenv.estimation.rotations import exp_so3, lengths, log_so3, orthonormali
 from coopenv.observers.contract import SensorNoise
 from coopenv.observers.mekf import LeftError
 from coopenv.observers.robust.constants import (
+    BEND_FACTOR,
+    ERRORS_TIME,
     MAX_ACCELERATION,
     MAX_GROWTH,
     MAX_LINEARISATIONS,
+    MIN_ERROR_STD,
     RELINEARISATION_ANGLE,
     SAME_TIME,
 )
@@ -55,6 +58,45 @@ class Member:
         return result
 
 
+ERRORS = -1
+"""In place of a vehicle's number: the errors of one's own odometry, (bias (3,), scale, 0, 0), `w` and `v` of the
+member."""
+
+
+@dataclass(frozen=True)
+class Lasting:
+    """Variances of errors of odometry that last, as declared."""
+
+    bias: Array  # (3,) (rad/s)^2
+    scale: float
+    bias_walk: Array  # (3,) per second
+    scale_walk: float
+
+    @classmethod
+    def of(cls, noise: SensorNoise) -> Lasting:
+        """Return what a vehicle is told."""
+        bias, walk = np.square(noise.gyro_bias), np.square(noise.gyro_bias_walk)
+        return cls(bias, noise.odometry_scale**2, walk, noise.odometry_scale_walk**2)
+
+    @property
+    def any(self) -> bool:
+        """Whether there are any."""
+        return bool(self.bias.any() or self.bias_walk.any() or self.scale or self.scale_walk)
+
+    @property
+    def start(self) -> Array:
+        """(6, 6) covariance before anything is known."""
+        return np.diag([*np.maximum([*self.bias, self.scale], MIN_ERROR_STD**2), 1.0, 1.0])
+
+
+def as_noise(P: Array | None, dp: Array, dt: float, correlated: float) -> Array:
+    """Return the variances (6,) of an increment by errors that last, of covariance P, if they were noise."""
+    if P is None:
+        return np.zeros(6)
+    time = max(correlated, dt)
+    return np.repeat([P.diagonal()[:3].max() * dt * time, P[3, 3] * dp.dot(dp) * time / max(dt, SAME_TIME)], 3)
+
+
 class Sight(NamedTuple):
     """Bearings as measurements, residual = H x + noise, at the poses believed."""
 
@@ -62,6 +104,7 @@ class Sight(NamedTuple):
     residual: Array  # (m, 2) rad
     ahead: NDArray[np.bool_]  # (m,) whether the target is in front of the bearing at all
     distance: Array  # (m,) m
+    bend: Array  # (m,) rad^2, the variance of what is not linear in x
 
     def normalised(self, P: Array, noise: Array) -> Array:
         """Return (m,) the normalised innovations squared under P and noise variances (m,)."""
@@ -91,6 +134,41 @@ class Belief:
         """Start with the vehicle itself."""
         self.members = [Member(vehicle, R, p, time)]
         self.P = P
+
+    def begin_errors(self, P: Array, like: Belief | None = None) -> None:
+        """Let member 1 stand for the odometry's errors, of covariance P (6, 6), as another belief has them."""
+        member = Member(ERRORS, np.eye(3), np.zeros(3), v=np.zeros(3), w=np.zeros(3))
+        if like is not None and like.errors is not None:
+            member.v, member.w = like.errors.v, like.errors.w
+        self.add([member], P)
+
+    @property
+    def errors(self) -> Member | None:
+        """The member that stands for the odometry's errors, if there is one."""
+        return self.members[1] if len(self.members) > 1 and self.members[1].vehicle == ERRORS else None
+
+    @property
+    def errors_covariance(self) -> Array | None:
+        """(6, 6) of the odometry's errors, if there are any."""
+        return None if self.errors is None else self.P[6:12, 6:12]
+
+    def corrected(self, dR: Array, dp: Array, dt: float) -> tuple[Array, Array]:
+        """Return an odometry increment over dt without the errors that are believed."""
+        if self.errors is None or self.errors.v is None or self.errors.w is None:
+            return dR, dp
+        turn = self.errors.w * dt
+        return dR.dot(exp_so3(-turn)), (dp - np.cross(turn, dp) / 2) / (1.0 + self.errors.v[0])
+
+    def drift(self, dR: Array, dp: Array, dt: float) -> None:
+        """Let the odometry's errors be in the vehicle's own after a corrected increment."""
+        if self.errors is None or self.errors.v is None:
+            return
+        A = np.eye(len(self.P))
+        A[:3, 6:9] = -dt * np.eye(3)
+        A[3:6, 6:9] = dR.T.dot(skew(dp)) * dt / 2
+        A[3:6, 9] = -dR.T.dot(dp) / (1.0 + self.errors.v[0])
+        P = A.dot(self.P).dot(A.T)
+        self.P = (P + P.T) / 2
 
     @property
     def own(self) -> Member:
@@ -126,15 +204,26 @@ class Belief:
         self.P[:, block] = self.P[:, block].dot(F.T)
         self.P.flat[6 * n * (len(self.P) + 1) : (6 * n + 6) * len(self.P) : len(self.P) + 1] += noise
 
-    def follow(self, n: int, odometry_turn: Array, odometry_position: Array, time: float, noise: SensorNoise) -> None:
-        """Carry a member on to where its own odometry says that it was at a time."""
+    def follow(
+        self,
+        n: int,
+        odometry_turn: Array,
+        odometry_position: Array,
+        time: float,
+        noise: SensorNoise,
+        memory: float = 0.0,
+    ) -> None:
+        """Carry a member on to where its own odometry says that it was at a time.
+
+        Its errors that last are taken as noise of as large errors as one's own, the same for a `memory`, s.
+        """
         member = self.members[n]
         dt = time - member.time
         if dt < SAME_TIME or member.odometry is None:
             return
         R, p = member.odometry
         dR, dp = R.T.dot(odometry_turn), R.T.dot(odometry_position - p)
-        self.move(n, dR, dp, noise.odometry(dt))
+        self.move(n, dR, dp, noise.odometry(dt) + as_noise(self.errors_covariance, dp, dt, ERRORS_TIME))
         q = float(noise.odometry(1.0)[3])
         averaged = max((q / (4.0 * MAX_ACCELERATION**2)) ** (1.0 / 3.0), dt / 2.0)
         member.velocity_variance = (MAX_ACCELERATION * averaged) ** 2 + q / (2.0 * averaged)
@@ -172,7 +261,25 @@ class Belief:
             H[k, :, 6 * n + 3 : 6 * n + 6] = G
             if point.any():
                 H[k, :, 6 * n : 6 * n + 3] = G.dot(skew(-point))
-        return Sight(H, (T @ bearings[..., None])[..., 0], (u * bearings).sum(axis=1) > 0.0, distance)
+        bend = self._bends(d.dot(own.R.T), dict(zip(range(m - len(places), m), places, strict=True)))
+        return Sight(H, (T @ bearings[..., None])[..., 0], (u * bearings).sum(axis=1) > 0.0, distance, bend)
+
+    def _bends(self, lines: Array, places: dict[int, int]) -> Array:
+        """Return (m,) the variance of the part t s / d^2 of lines d (m, 3), map frame, that is not linear in errors.
+
+        An error s along a line and t across it. The last lines are to members, by line.
+        """
+        result = np.zeros(len(lines))
+        for k, d in enumerate(lines):
+            D = np.zeros((3, len(self.P)))
+            D[:, 3:6] = -self.own.R
+            if k in places:
+                n = places[k]
+                D[:, 6 * n + 3 : 6 * n + 6] = self.members[n].R
+            V, square = D.dot(self.P).dot(D.T), float(d.dot(d))
+            along = float(d.dot(V).dot(d)) / square
+            result[k] = BEND_FACTOR * max(along, 0.0) * max(float(np.trace(V)) - along, 0.0) / square**2
+        return result
 
     def correct(self, H: Array, noise: Array, residual: Array) -> None:
         """Take independent measurements residual = H x + noise of variances (m,), in Joseph's form."""
@@ -256,6 +363,10 @@ class Belief:
     def shift_about(self, dx: Array) -> None:
         """Move the poses by the error dx, and let the covariance be about where they are then."""
         G = recentring(dx)
+        if self.errors is not None:
+            G[6:12] = 0.0
+            G[6:12, 6:12] = np.eye(6)
+            self.errors.w, self.errors.v = self.errors.w + dx[6:9], self.errors.v + dx[9:12]
         self.P = G.dot(self.P).dot(G.T)
         self.shift(dx)
 
@@ -263,8 +374,9 @@ class Belief:
         """Move the poses of the first members by their part of the error dx (6m,)."""
         for n in range(len(dx) // 6):
             member = self.members[n]
-            member.p = member.p + member.R.dot(dx[6 * n + 3 : 6 * n + 6])
-            member.R = member.R.dot(exp_so3(dx[6 * n : 6 * n + 3]))
+            if member.vehicle != ERRORS:
+                member.p = member.p + member.R.dot(dx[6 * n + 3 : 6 * n + 6])
+                member.R = member.R.dot(exp_so3(dx[6 * n : 6 * n + 3]))
 
 
 def recentring(dx: Array) -> Array:

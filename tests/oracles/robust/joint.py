@@ -17,7 +17,7 @@ from coopenv.estimation.arrays import Array, cholesky
 from coopenv.estimation.rotations import exp_so3, log_so3
 from coopenv.observers.contract import Message
 from coopenv.observers.robust.constants import MAX_MEMBERS_JOINT, MAX_TOLD, SAME_TIME, SUPERSEDING_TIME
-from tests.oracles.robust.belief import Member
+from tests.oracles.robust.belief import ERRORS, Member, errors_of
 from tests.oracles.robust.observer import Robust
 from tests.oracles.robust.tracklets import Report, from_message, marker_jacobian, mask_of
 
@@ -32,15 +32,16 @@ class RobustJoint(Robust):
         message = super().message()
         if message.position is None:
             return message
-        told = self.belief.members[:MAX_TOLD]
-        P = self.belief.P[: 6 * len(told), : 6 * len(told)]
+        places = [n for n, member in enumerate(self.belief.members) if member.vehicle != ERRORS]
+        told, index = [self.belief.members[n] for n in places[:MAX_TOLD]], errors_of(places[:MAX_TOLD])
+        P = self.belief.P[np.ix_(index, index)]
         if self.marker.any():
             J = np.eye(len(P))
             J[:6, :6] = marker_jacobian(self.marker)
             P = J.dot(P).dot(J.T)
         return replace(
             message,
-            extra={**message.extra, **_told(told, P, len(told) == len(self.belief.members), self.belief.own.time)},
+            extra={**message.extra, **_told(told, P, len(told) == len(places), self.belief.own.time)},
         )
 
     @staticmethod

@@ -31,6 +31,7 @@ from coopenv.observers.robust.constants import (
     ANCHOR_POSITION_VARIANCE,
     BEARING_GATE,
     DEPENDENT_SHARE,
+    ERRORS_TIME,
     HEALTHY_SHARE,
     HEALTHY_TIME,
     JUMP_GATE,
@@ -46,7 +47,7 @@ from coopenv.observers.robust.constants import (
     MIN_VELOCITY_STD,
     SAME_TIME,
 )
-from tests.oracles.robust.belief import Belief, Member, View, errors_of
+from tests.oracles.robust.belief import Belief, Lasting, Member, View, as_noise, errors_of
 from tests.oracles.robust.eviction import room_for
 from tests.oracles.robust.matrices import solve_positive
 from tests.oracles.robust.resection import resect
@@ -94,6 +95,7 @@ class Robust:
             setup.noise.bearing,
         )
         self.sample_noise = setup.noise.angular_velocity, setup.noise.velocity
+        self.lasting = Lasting.of(setup.noise)
         self.variance = self.noise.bearing_std**2
         self.possible_dependencies = int(
             mask_of({int(t) - self.landmarks for t in setup.targets if t >= self.landmarks})
@@ -108,23 +110,27 @@ class Robust:
         self.contacts: dict[int, Contact] = {}
         self.depends_on = self.possible_dependencies
         self.missed = 0.0
-        self.belief = Belief(self.vehicle, R, p, P.copy())
+        self.belief = self._alone(R, p, P.copy())
         self.search = None if is_known(P) else Search(self.vehicle, R, p, P.copy())
         self.anchor, self.healthy = Anchor(R, p, P, self.odometry, 0.0), 0.0
 
     def update(self, tick: Tick) -> Estimate:
         """Take one camera tick."""
         tick, jumps = self._trapezoidal(tick)
+        dR, dp = self.belief.corrected(tick.rotation, tick.translation, tick.dt)
+        tick = replace(tick, rotation=dR, translation=dp)
+        self._walk(tick.dt)
         R, p = self.odometry
         self.odometry = orthonormalise(R.dot(tick.rotation)), p + R.dot(tick.translation)
         noise = self.noise.odometry(tick.dt) + jumps
         self.nis, self.nis_dof = 0.0, 0
         if self.search is not None:
-            self.search.move(tick, noise)
+            self.search.move(tick, noise + as_noise(self.belief.errors_covariance, dp, tick.dt, ERRORS_TIME))
             if tick.due:
                 self._search(tick)
         else:
             self.belief.move(0, tick.rotation, tick.translation, noise)
+            self.belief.drift(tick.rotation, tick.translation, tick.dt)
             self.belief.own.time = tick.time
             self._listen(tick)
             if tick.due:
@@ -132,6 +138,19 @@ class Robust:
         belief = self.belief if self.search is None else self.search.best
         P, coordinates = belief.P[:6, :6].copy(), Coordinates.LEFT
         return Estimate(belief.own.R, belief.own.p, P, coordinates, self.nis if self.nis_dof else None, self.nis_dof)
+
+    def _alone(self, R: Array, p: Array, P: Array) -> Belief:
+        """Return a belief in the vehicle alone, that knows of its odometry's errors what is declared."""
+        belief = Belief(self.vehicle, R, p, P)
+        if self.lasting.any:
+            belief.begin_errors(self.lasting.start)
+        return belief
+
+    def _walk(self, dt: float) -> None:
+        """Let the odometry's errors have walked."""
+        if self.belief.errors is not None:
+            walk = np.append(self.lasting.bias_walk, self.lasting.scale_walk) * dt
+            self.belief.P[6:10, 6:10] += np.diag(walk)
 
     def _trapezoidal(self, tick: Tick) -> tuple[Tick, Array]:
         """Return a tick whose increment has the half change of the held sample that holding it has left out.
@@ -177,7 +196,9 @@ class Robust:
     def _begin(self, pose: Belief, tick: Tick) -> None:
         """Believe in a pose and in those that are in view."""
         own = pose.own
-        self.belief = Belief(self.vehicle, own.R, own.p, pose.P.copy(), tick.time)
+        before, self.belief = self.belief, Belief(self.vehicle, own.R, own.p, pose.P.copy(), tick.time)
+        if before.errors_covariance is not None:
+            self.belief.begin_errors(before.errors_covariance, before)
         self.contacts, self.depends_on, self.missed = {}, self.possible_dependencies, 0.0
         self._listen(tick)
 
@@ -200,7 +221,10 @@ class Robust:
         anchor, (R, p) = self.anchor, self.odometry
         prior = Belief(self.vehicle, anchor.R, anchor.p, anchor.P.copy())
         since = anchor.odometry[0].T
-        prior.move(0, since.dot(R), since.dot(p - anchor.odometry[1]), self.noise.odometry(time - anchor.time))
+        dt, dp = time - anchor.time, since.dot(p - anchor.odometry[1])
+        self.belief = self._alone(self.belief.own.R, self.belief.own.p, self.belief.P[:6, :6])
+        noise = self.noise.odometry(dt) + as_noise(self.belief.errors_covariance, dp, dt, dt)
+        prior.move(0, since.dot(R), dp, noise)
         self.search = Search(self.vehicle, prior.own.R, prior.own.p, prior.P)
 
     def _report(self, message: Message, sender: int, time: float) -> Report | None:
@@ -287,7 +311,11 @@ class Robust:
                 self.belief.follow(n, R, p, time, self.noise)
         was_trusted = contact.trusted
         self._judge(contact, report, dt)
-        learnt = tracklet(last, report, self.noise) if was_trusted and contact.trusted else None
+        learnt = (
+            tracklet(last, report, self.noise, self.belief.errors_covariance)
+            if was_trusted and contact.trusted
+            else None
+        )
         if learnt is None:
             return
         share = self._share(report)
@@ -369,7 +397,7 @@ class Robust:
                 continue
             known.append(n)
         sight = belief.sight(tick.bearings[known], tick.lever_arm, np.array(z).reshape(-1, 3), places, points)
-        noise = self.variance + np.array(drift) / sight.distance**2
+        noise = self.variance + np.array(drift) / sight.distance**2 + sight.bend
         nis = sight.normalised(belief.P, noise)
         fits = sight.ahead & (nis < BEARING_GATE)
         judged = [fit for fit, judges in zip(fits.tolist(), counts, strict=True) if judges]

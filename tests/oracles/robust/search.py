@@ -216,16 +216,12 @@ def _perspectives(three: list[Sighting], variance: float) -> Iterator[tuple[Arra
     yield from zip(R[mask], camera[mask], strict=True)
 
 
-def _noise(distance: Array, sightings: list[Sighting], variance: float) -> Array:
-    """Return the variances (m,) of bearings, their targets' uncertainty included."""
-    return variance + CORRELATION_FACTOR * np.array([s.variance for s in sightings]) / distance**2
-
-
 def _seen(belief: Belief, tick: Tick, sightings: list[Sighting], variance: float) -> tuple[Sight, Array]:
     """Return sightings as measurements at a pose, and their variances (m,)."""
     b, z = np.array([s.bearing for s in sightings]), np.array([s.z for s in sightings])
     sight = belief.sight(b, tick.lever_arm, z)
-    return sight, _noise(sight.distance, sightings, variance)
+    places = CORRELATION_FACTOR * np.array([s.variance for s in sightings]) / sight.distance**2
+    return sight, variance + places + sight.bend
 
 
 def _covariance(belief: Belief, tick: Tick, sightings: list[Sighting], variance: float) -> Array | None:

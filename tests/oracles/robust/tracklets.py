@@ -18,8 +18,8 @@ from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import exp_so3, log_so3, orthonormalise, skew
 from coopenv.observers.contract import Message, SensorNoise
 from coopenv.observers.mekf import LeftError
-from coopenv.observers.robust.constants import MASK_BITS
-from tests.oracles.robust.belief import Belief, Member, recentring
+from coopenv.observers.robust.constants import ERRORS_TIME, MASK_BITS
+from tests.oracles.robust.belief import Belief, Member, as_noise, recentring
 from tests.oracles.robust.matrices import invert_positive
 
 
@@ -67,8 +67,11 @@ class Tracklet:
         return A.T.dot(self.information).dot(A), A.T.dot(self.vector - self.information.dot(offset))
 
 
-def tracklet(last: Report, new: Report, noise: SensorNoise) -> Tracklet | None:
-    """Return what was learnt between two reports of the same vehicles; None if the later one knows less."""
+def tracklet(last: Report, new: Report, noise: SensorNoise, errors: Array | None = None) -> Tracklet | None:
+    """Return what was learnt between two reports of the same vehicles; None if the later one knows less.
+
+    Errors of the odometry that last are taken to have the covariance (6, 6) of one's own.
+    """
     m = len(new.vehicles)
     F, Q = np.zeros_like(new.P), np.empty(6 * m)
     R, p, c = np.empty_like(new.R), np.empty_like(new.p), np.empty(6 * m)
@@ -76,7 +79,8 @@ def tracklet(last: Report, new: Report, noise: SensorNoise) -> Tracklet | None:
         block = slice(6 * n, 6 * n + 6)
         dR, dp = new.motion_since(last, n)
         F[block, block] = LeftError.transition(dR, dp)
-        Q[block] = noise.odometry(max(new.time[n] - last.time[n], 0.0))
+        dt = max(new.time[n] - last.time[n], 0.0)
+        Q[block] = noise.odometry(dt) + as_noise(errors, dp, dt, ERRORS_TIME)
         R[n], p[n] = orthonormalise(last.R[n].dot(dR)), last.p[n] + last.R[n].dot(dp)
         c[block] = left_error(R[n], p[n], new.R[n], new.p[n])
     before = F.dot(last.P).dot(F.T)

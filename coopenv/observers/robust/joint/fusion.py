@@ -4,7 +4,15 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.observers.robust.belief import append_member, index_of, is_unseen, longest_unseen, mark_seen, remove_member
+from coopenv.observers.robust.belief import (
+    append_member,
+    index_of,
+    is_unseen,
+    longest_unseen,
+    mark_seen,
+    most_others,
+    remove_member,
+)
 from coopenv.observers.robust.constants import MAX_TOLD
 from coopenv.observers.robust.joint import radio
 from coopenv.observers.robust.joint.information import fuse_joint_information, news_of, predict_told, propagate_told
@@ -34,12 +42,12 @@ def make_joint_room(model: Any, memory: Any, world: int, i: int, tick: int, coun
     own = wp.where(is_told(memory, world, count, i), 1, 0)
     staying = int(0)
     unseen = int(0)
-    for n in range(1, memory.belief[world, i].members):
+    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
         if not is_told(memory, world, count, memory.member[world, i, n].vehicle):
             staying += 1
             if is_unseen(model, memory, world, i, n, tick):
                 unseen += 1
-    excess = wp.max(0, 1 + staying + count - own - memory.member.shape[2])
+    excess = wp.max(0, staying + count - own - most_others(memory))
     if excess > unseen:
         return False
     for a in range(count):

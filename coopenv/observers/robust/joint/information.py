@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.observers.robust.algebra import between, left_error, moved, odometry_noise, recentring, transition
+from coopenv.observers.robust.algebra import between, left_error, moved, recentring, transition
 from coopenv.observers.robust.belief import apply_corrections, index_of, subtract_block
 from coopenv.observers.robust.constants import MAX_TOLD, MAX_VARIANCE_GROWTH
 from coopenv.observers.robust.joint.matrices import (
@@ -18,6 +18,7 @@ from coopenv.observers.robust.joint.matrices import (
     symmetrise,
 )
 from coopenv.observers.robust.memory import mat66d, vec6d
+from coopenv.observers.robust.odometry import increment_noise
 from coopenv.observers.robust.tracklets import propagate_member
 
 
@@ -37,7 +38,9 @@ def predict_told(model: Any, memory: Any, world: int, i: int, c: int, count: int
             Ft = wp.transpose(memory.scratch[world, b].column)
             memory.matrix[world, BEFORE, a, b] = memory.matrix[world, BEFORE, a, b] * Ft
         ticks = wp.max(memory.told[world, a].tick - memory.contact_told[world, i, c, a].tick, 0)
-        noise = odometry_noise(model, i, wp.float64(ticks) * model.camera_period)
+        dt = wp.float64(ticks) * model.camera_period
+        step = between(memory.contact_told[world, i, c, a].odometry, memory.told[world, a].odometry)
+        noise = increment_noise(model, memory, world, i, step, dt)
         block = memory.matrix[world, BEFORE, a, a]
         for k in range(6):
             block[k, k] += noise[k // 3]
@@ -55,7 +58,8 @@ def propagate_told(model: Any, memory: Any, world: int, i: int, count: int):
             if told.tick > last.tick:
                 dt = wp.float64(told.tick - last.tick) * model.camera_period
                 step = between(last.odometry, told.odometry)
-                propagate_member(model, memory, world, i, n, step, dt, odometry_noise(model, i, dt))
+                noise = increment_noise(model, memory, world, i, step, dt)
+                propagate_member(model, memory, world, i, n, step, dt, noise)
                 memory.member[world, i, n].report.tick = told.tick
                 memory.member[world, i, n].report.odometry = told.odometry
 

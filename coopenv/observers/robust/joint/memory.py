@@ -5,7 +5,17 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust.constants import MAX_MEMBERS_JOINT, MAX_TOLD
-from coopenv.observers.robust.memory import LARGE, SIZES, Pose, RobustMemory, are_joint, mat66d, rules_for, where
+from coopenv.observers.robust.memory import (
+    ERRORS,
+    LARGE,
+    SIZES,
+    Pose,
+    RobustMemory,
+    are_joint,
+    mat66d,
+    rules_for,
+    where,
+)
 from coopenv.world.records import array, extended
 from coopenv.world.saved_state import FLAG, ROTATION, TICK, Rule, whole
 
@@ -66,7 +76,7 @@ JointMemory = extended(
 DIMENSION = 6 * MAX_TOLD
 JOINT_SIZES = {
     **SIZES,
-    "K": MAX_MEMBERS_JOINT,
+    "K": MAX_MEMBERS_JOINT + ERRORS,
     "T": MAX_TOLD,
     "B": MAX_TOLD - 1,
     "E": MAX_TOLD**2,
@@ -87,7 +97,7 @@ SENDER = Rule("a vehicle or -1", lambda values, fields, model: (values >= -1) & 
 def joint_rules() -> dict[str, Rule]:
     """Return what a saved memory may hold, see `rules_for`."""
     rules = {
-        **rules_for(MAX_MEMBERS_JOINT),
+        **rules_for(JOINT_SIZES["K"]),
         "contact.sender": SENDER,
         "contact.count": whole(0, MAX_TOLD),
         "contact_P": Rule("a covariance", _are_told, axes=3),

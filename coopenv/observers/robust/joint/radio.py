@@ -57,7 +57,8 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
     slot = tick % model.radio.slots
     report = own_report(model, memory, world, i, tick)
     joint = Joint()
-    members = memory.belief[world, i].members
+    others = memory.belief[world, i].others
+    members = memory.belief[world, i].members - others + 1  # without the odometry's errors
     count = wp.min(members, MAX_TOLD)
     if report.valid == 1:
         joint.others = count - 1
@@ -65,7 +66,7 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
         J = marker_jacobian(vec3d(model.scene.marker[model.landmarks + i]))
         for a in range(count):
             for b in range(count):
-                block = memory.P[world, i, a, b]
+                block = memory.P[world, i, wp.where(a > 0, others - 1 + a, 0), wp.where(b > 0, others - 1 + b, 0)]
                 if a == 0:
                     block = J * block
                 if b == 0:
@@ -75,7 +76,7 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
             report.valid = 0
             joint = Joint()
     for n in range(joint.others):
-        other = memory.member[world, i, n + 1]
+        other = memory.member[world, i, others + n]
         told = Told(other.vehicle, other.report.tick, other.pose, other.report.odometry)
         memory.outbox_told[world, i, slot, n] = told
     if report.valid == 1:
@@ -209,7 +210,7 @@ def forget_contacts(memory: Any, world: int, i: int):
 @wp.func
 def note_contacts(memory: Any, world: int, i: int):
     """Let the members show what their contacts say: whether they are trusted, and on whom they depend."""
-    for n in range(1, memory.belief[world, i].members):
+    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
         c = contact_of(memory, world, i, memory.member[world, i, n].vehicle)
         memory.member[world, i, n].distrusted = 0
         memory.member[world, i, n].report.depends_on = wp.uint64(0)

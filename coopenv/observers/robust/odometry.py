@@ -1,0 +1,188 @@
+"""A vehicle's own odometry: increments by the trapezoidal rule, and errors of scale and gyro that last.
+
+Where a scenario declares such errors, member 1 of the belief stands for them: its error is (bias (3,), scale, 0, 0),
+rad/s and a share, added to what is believed. Odometry couples it to the vehicle's own pose; bearings and messages
+correct it through that. Who hears the vehicle cannot know how well it knows them, and takes them as noise.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.estimation.linalg import symmetric_part
+from coopenv.estimation.so3 import exp_so3, orthonormalise, skew
+from coopenv.observers.robust.algebra import moved, odometry_noise
+from coopenv.observers.robust.belief import propagate
+from coopenv.observers.robust.constants import (
+    ERRORS_TIME,
+    JUMP_GATE,
+    MAX_SMOOTH_ACCELERATION,
+    MAX_SMOOTH_ANGULAR_ACCELERATION,
+    MIN_ERROR_STD,
+    SAME_TIME,
+)
+from coopenv.observers.robust.memory import ERRORS, Member, Pose, mat33d, mat66d, vec2d, vec3d
+
+TWELFTH = 1.0 / 12.0
+
+
+@wp.func
+def lasting_variances(model: Any, i: int):
+    """Return the variances, as declared, of the gyro's bias per axis and of the odometry's scale."""
+    noise = model.noise[i]
+    bias = vec3d(noise.gyro_bias)
+    return wp.cw_mul(bias, bias), wp.float64(noise.odometry_scale) * wp.float64(noise.odometry_scale)
+
+
+@wp.func
+def walk_variances(model: Any, i: int):
+    """Return by how much these variances grow, per second."""
+    noise = model.noise[i]
+    bias = vec3d(noise.gyro_bias_walk)
+    scale = wp.float64(noise.odometry_scale_walk)
+    return wp.cw_mul(bias, bias), scale * scale
+
+
+@wp.func
+def has_lasting_errors(model: Any, i: int) -> bool:
+    """Return whether a scale error or a bias of the gyro is declared."""
+    bias, scale = lasting_variances(model, i)
+    bias_walk, scale_walk = walk_variances(model, i)
+    return wp.max(bias + bias_walk) + scale + scale_walk > wp.float64(0.0)
+
+
+@wp.func
+def begin_errors(model: Any, memory: Any, world: int, i: int):
+    """Let member 1 stand for the odometry's errors, where there are any, and believe of them what is declared."""
+    if has_lasting_errors(model, i):
+        memory.belief[world, i].others = ERRORS + 1
+        errors = Member()
+        errors.vehicle = i
+        errors.pose.R = wp.identity(3, wp.float64)
+        memory.member[world, i, ERRORS] = errors
+        bias, scale = lasting_variances(model, i)
+        least = wp.float64(MIN_ERROR_STD) * wp.float64(MIN_ERROR_STD)
+        P = wp.identity(6, wp.float64)  # of what does not exist, any
+        for k in range(3):
+            P[k, k] = wp.max(bias[k], least)
+        P[3, 3] = wp.max(scale, least)
+        memory.P[world, i, ERRORS, ERRORS] = P
+
+
+@wp.func
+def walk_errors(model: Any, memory: Any, world: int, i: int, dt: Any):
+    """Let the odometry's errors have walked for a time."""
+    if memory.belief[world, i].others > ERRORS:
+        bias, scale = walk_variances(model, i)
+        for k in range(3):
+            memory.P[world, i, ERRORS, ERRORS][k, k] += bias[k] * dt
+        memory.P[world, i, ERRORS, ERRORS][3, 3] += scale * dt
+
+
+@wp.func
+def corrected(memory: Any, world: int, i: int, step: Pose, dt: Any):
+    """Return an increment over dt without the errors that are believed, to first order in the bias."""
+    if memory.belief[world, i].others <= ERRORS:
+        return step
+    bias = memory.member[world, i, ERRORS].w
+    scale = wp.float64(1.0) + memory.member[world, i, ERRORS].v[0]
+    turn = bias * dt
+    return Pose(step.R * exp_so3(-turn), (step.p - wp.float64(0.5) * wp.cross(turn, step.p)) / scale)
+
+
+@wp.func
+def errors_transition(memory: Any, world: int, i: int, step: Pose, dt: Any):
+    """Return the derivative, 6x6, of the left error after a corrected increment by the odometry's errors."""
+    scale = wp.float64(1.0) + memory.member[world, i, ERRORS].v[0]
+    Rt = wp.transpose(step.R)
+    G = mat66d()
+    for k in range(3):
+        G[k, k] = -dt
+    G[3:, :3] = Rt * skew((wp.float64(0.5) * dt) * step.p)
+    along = -(Rt * step.p) / scale
+    for k in range(3):
+        G[k + 3, 3] = along[k]
+    return G
+
+
+@wp.func
+def propagate_own(memory: Any, world: int, i: int, step: Pose, noise: Any, dt: Any):
+    """Carry the vehicle itself through a corrected increment over dt, with noise and the errors that are left."""
+    propagate(memory, world, i, 0, step, noise)
+    if memory.belief[world, i].others > ERRORS:
+        G = errors_transition(memory, world, i, step, dt)
+        for k in range(memory.belief[world, i].members):
+            coupled = G * memory.P[world, i, ERRORS, k]
+            if k > 0:
+                block = memory.P[world, i, 0, k] + coupled
+                memory.P[world, i, 0, k] = block
+                memory.P[world, i, k, 0] = wp.transpose(block)
+            else:
+                both = coupled + wp.transpose(coupled) + G * memory.P[world, i, ERRORS, ERRORS] * wp.transpose(G)
+                memory.P[world, i, 0, 0] = symmetric_part(memory.P[world, i, 0, 0] + both)
+
+
+@wp.func
+def lasting_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, correlated: Any):
+    """Return the variances (rotation, translation) of an increment over dt by errors of odometry, taken as noise.
+
+    They are as large as the vehicle's own may be, as far as it knows them. An error that lasts adds up as noise does
+    that is the same for as long as it is `correlated`, s.
+    """
+    noise = vec2d()
+    if memory.belief[world, i].others > ERRORS:
+        P = memory.P[world, i, ERRORS, ERRORS]
+        time = wp.max(correlated, dt)
+        noise[0] = wp.max(wp.max(P[0, 0], P[1, 1]), P[2, 2]) * dt * time
+        noise[1] = P[3, 3] * wp.length_sq(step.p) * time / wp.max(dt, wp.float64(SAME_TIME))
+    return noise
+
+
+@wp.func
+def increment_noise(model: Any, memory: Any, world: int, i: int, step: Pose, dt: Any):
+    """Return the variances (rotation, translation) of an increment over dt, errors that last among them."""
+    noise = odometry_noise(model, i, dt)
+    return noise + lasting_noise(memory, world, i, step, dt, wp.float64(ERRORS_TIME))
+
+
+@wp.func
+def jump_variance(change: Any, std: Any, period: Any, smooth: Any):
+    """Return the variance, per axis, of a sum of samples between two of which the twist has changed by so much.
+
+    What is more than the samples' noise and a `smooth` acceleration has come at once, in a collision for example, and
+    at any time of the period.
+    """
+    square = wp.dot(change, change)
+    gate = wp.max(wp.float64(JUMP_GATE) * std * std, smooth * smooth * period * period)
+    return wp.where(square > gate, square * period * period * wp.float64(TWELFTH), wp.float64(0.0))
+
+
+@wp.func
+def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: Any):
+    """Return the increment over a tick of dt and variances to add to its noise; carry the dead reckoning through it.
+
+    Samples are held until the next one, so that the sum lags by half a period. Half of what the held sample has changed
+    by makes it the trapezoidal rule: (v0 + v1) T / 2 = v0 T + (v1 - v0) T / 2. The noise that comes in goes out again
+    with the next sample.
+    """
+    v = vec3d(state.odometry_velocity[world, i])
+    w = vec3d(state.odometry_angular_velocity[world, i])
+    R = orthonormalise(mat33d(state.increment_rotation[world, i]))
+    p = vec3d(state.increment_translation[world, i])
+    noise = vec2d()
+    if memory.belief[world, i].has_sample == 1:
+        change_v = v - memory.belief[world, i].sample_v
+        change_w = w - memory.belief[world, i].sample_w
+        half = wp.float64(0.5) * model.odometry_period
+        p = p + R * (half * change_v)
+        R = R * exp_so3(half * change_w)
+        period = model.odometry_period
+        linear, angular = wp.float64(MAX_SMOOTH_ACCELERATION), wp.float64(MAX_SMOOTH_ANGULAR_ACCELERATION)
+        noise[0] = jump_variance(change_w, wp.float64(model.noise[i].angular_velocity), period, angular)
+        noise[1] = jump_variance(change_v, wp.float64(model.noise[i].velocity), period, linear)
+    memory.belief[world, i].has_sample = 1
+    memory.belief[world, i].sample_v = v
+    memory.belief[world, i].sample_w = w
+    step = corrected(memory, world, i, Pose(R, p), dt)
+    memory.belief[world, i].odometry = moved(memory.belief[world, i].odometry, step)
+    return step, noise

@@ -1,0 +1,131 @@
+"""`robust` learns the scale error of its odometry and its gyro's bias, and knows how well."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from coopenv.api.engine import Engine
+from coopenv.policies import find_agent
+from coopenv.scenario.files import load_scenario
+from coopenv.world.world import World
+from tests.helpers.builders import reset, simulate
+from tests.observers.robust.test_driving import driven, nees_of, square, weaving
+from tests.oracles.robust.belief import Belief
+from tests.oracles.robust.tracklets import left_error
+
+LASTING = {"noise.odometry_scale": 0.03, "noise.gyro_bias": 0.0087}
+YAW_ONLY = LASTING | {"noise.gyro_bias": [0.0, 0.0, 0.0087]}
+ROBUST = {"observer.name": "robust"}
+
+
+def still(world: World, k: int, phase: np.ndarray) -> float:
+    """Return the action of who follows a prescribed motion."""
+    return 0.0
+
+
+def tell(name: str, lasting: dict[str, Any], nees: np.ndarray, errors: np.ndarray) -> None:
+    """Print ANEES / 6 with its standard error over worlds and the 95th percentile of position errors (`pytest -s`)."""
+    worlds, e95 = np.nanmean(nees, axis=(0, 2)), 100.0 * np.nanpercentile(errors, 95)
+    std = np.nanstd(worlds) / np.sqrt(len(worlds))
+    print(f"\n{name}, {lasting or 'none'}: ANEES/6 {worlds.mean():.2f} +- {std:.2f}, e95 {e95:.0f} cm")
+
+
+def normalised_errors(world: World) -> np.ndarray:
+    """Return (W, N, 4) errors of the estimated biases and scale in standard deviations."""
+    memory: Any = world.memory
+    believed, P = memory.member.numpy()[:, :, 1], memory.P.numpy()[:, :, 1, 1]
+    scale = believed["v"][..., 0] - world.view("odometry_scale")
+    errors = np.concatenate([believed["w"] - world.view("gyro_bias"), scale[..., None]], -1)
+    return errors / np.sqrt(np.einsum("wnii->wni", P)[..., :4])
+
+
+def test_the_errors_drive_the_pose_as_finite_differences_say() -> None:
+    rng = np.random.default_rng(0)
+    R, p = Rotation.random(None, rng).as_matrix(), rng.normal(size=3)
+    dt, v, w, bias, scale = 0.02, rng.normal(size=3), rng.normal(size=3), 0.01 * rng.normal(size=3), 0.03
+
+    def carried(v: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the increment over dt, by many small steps."""
+        pose, place, h = np.eye(3), np.zeros(3), dt / 200
+        half = Rotation.from_rotvec(w * h / 2).as_matrix()
+        for _ in range(200):
+            place = place + pose @ half @ v * h
+            pose = pose @ half @ half
+        return pose, place
+
+    def after(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pose where bias and scale differ by an error from what is believed."""
+        turn, step = carried(v / (1 + scale + error[3]), w - bias - error[:3])
+        return R @ turn, p + R @ step
+
+    belief = Belief(0, R, p, np.zeros((6, 6)))
+    belief.begin_errors(np.eye(6))
+    errors = belief.errors
+    assert errors is not None
+    errors.w, errors.v = bias, np.array([scale, 0.0, 0.0])
+    dR, dp = belief.corrected(*carried(v, w), dt)
+    expected = after(np.zeros(4))
+    belief.move(0, dR, dp, np.zeros(6))
+    assert_allclose(belief.own.p, expected[1], atol=5e-4 * dt)
+    assert_allclose(belief.own.R, expected[0], atol=5e-4 * dt)
+    belief.drift(dR, dp, dt)
+    for k in range(4):
+        change = left_error(*expected, *after(1e-4 * np.eye(4)[k])) / 1e-4
+        assert_allclose(belief.P[:6, 6 + k], change, atol=3e-2 * dt)
+
+
+def test_nothing_is_carried_where_nothing_is_declared() -> None:
+    world = simulate(load_scenario("busy_intersection_tracking", ROBUST), 1)
+    reset(world)
+    world.advance(6)
+    memory: Any = world.memory
+    assert (memory.belief.numpy()["others"] == 1).all()
+
+
+@pytest.mark.parametrize("lasting", [LASTING, YAW_ONLY])
+def test_vehicles_on_prescribed_paths_know_their_errors(lasting: dict[str, Any]) -> None:
+    scenario = load_scenario("busy_intersection_tracking", ROBUST | lasting)
+    nees, _, world = driven(scenario, still, 16, "float64", 8)
+    assert 0.5 < np.nanmean(nees[20:]) < 1.5
+    squared = normalised_errors(world)[:, :3] ** 2  # of those that see landmarks early
+    assert (squared.mean(axis=(0, 1)) < 2.0).all()
+    assert np.sqrt(world.memory.P.numpy()[:, :3, 1, 1, 3, 3]).max() < 0.02  # it was declared to be 0.03
+
+
+def test_driven_cars_know_their_errors() -> None:
+    nees, _, world = driven(square(**LASTING), weaving, 48, "float32", 10)
+    assert 0.5 < np.nanmean(nees[20:]) < 1.5
+    assert (normalised_errors(world) ** 2).mean() < 2.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lasting", [LASTING, YAW_ONLY, {}])
+def test_a_whole_episode_on_prescribed_paths(lasting: dict[str, Any]) -> None:
+    scenario = load_scenario("busy_intersection_tracking", ROBUST | lasting)
+    nees, errors, _ = driven(scenario, still, 32, "float64", 40)
+    tell("tracking from 2 s on", lasting, nees[20:], errors[20:])
+    for part in (nees[20:150], nees[150:]):
+        assert 0.5 < np.nanmean(part) < 1.5
+    assert 0.8 < np.nanmean(nees[350:]) < 1.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("agent", ["route_follower", "peek"])
+@pytest.mark.parametrize("lasting", [LASTING, YAW_ONLY, {}])
+def test_drivers_of_the_open_square(lasting: dict[str, Any], agent: str) -> None:
+    scenario = load_scenario("open_square", ROBUST | lasting)
+    engine, policy = Engine(scenario, 96), find_agent(agent).policy(scenario)
+    engine.reset(range(1000, 1096))
+    actions, observed, found = engine.world.actions.numpy(), engine.view("observation"), []
+    for _ in range(200):
+        actions[...] = policy(observed.reshape(-1, observed.shape[-1])).reshape(actions.shape)
+        engine.step()
+        found.append(nees_of(engine.world))
+    nees, errors = (np.array(part)[20:] for part in zip(*found, strict=True))
+    tell(agent, lasting, nees, errors)
+    assert (0.5 if lasting else 0.8) < np.nanmean(nees) < (1.5 if lasting else 1.3)
