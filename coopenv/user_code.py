@@ -8,6 +8,7 @@ from hashlib import sha256
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from traceback import extract_tb
 from types import ModuleType
 from typing import Any
 
@@ -52,6 +53,23 @@ def load(reference: str) -> Any:
         known = [known for known in vars(module) if not known.startswith("_")]
         raise CoopenvError(f"'{reference}': no '{name}' in {place}{suggest(name, known)}")
     return getattr(module, name)
+
+
+@contextmanager
+def blamed(who: str) -> Iterator[None]:
+    """Turn what anybody's code raises meanwhile into a `CoopenvError` that says who, what and in which line.
+
+    Raises:
+        CoopenvError: it raises something; its own errors of this kind stay as they are.
+    """
+    try:
+        yield
+    except CoopenvError:
+        raise
+    except (Exception, SystemExit) as error:
+        last = extract_tb(error.__traceback__)[-1]
+        where = f"{Path(last.filename).name}:{last.lineno}"
+        raise CoopenvError(f"{who} failed at {where}: {told(error)}") from error
 
 
 def _file(place: str, folder: Path | None = None) -> Path:

@@ -18,7 +18,9 @@ def dataset(
             autocompletion=complete.policies,
         ),
     ] = "route_follower",
-    worlds: Annotated[int, typer.Option(min=1, help="Worlds; an episode of each of their vehicles is kept.")] = 64,
+    worlds: Annotated[
+        int, typer.Option(min=1, max=options.MOST_WORLDS, help="Worlds; an episode of each of their vehicles is kept.")
+    ] = 64,
     seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of the worlds.")] = 0,
     overrides: options.Overrides = None,
     identity: Annotated[

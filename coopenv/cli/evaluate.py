@@ -20,7 +20,9 @@ def evaluate(
             autocompletion=complete.agent_lists,
         ),
     ] = None,
-    worlds: Annotated[int, typer.Option(min=2, help="Number of held-out worlds, the same for every agent.")] = 256,
+    worlds: Annotated[
+        int, typer.Option(min=2, max=options.MOST_WORLDS, help="Number of held-out worlds, the same for every agent.")
+    ] = 256,
     seed_block: Annotated[int, typer.Option(min=0, help="Number of the block of held-out seeds.")] = 0,
     overrides: options.Overrides = None,
     ideal: Annotated[
@@ -44,6 +46,8 @@ def evaluate(
     if film and out is None:
         raise CoopenvError("--film: the film needs a folder, --out DIR")
     names = [word.strip() for word in agents.split(",") if word.strip()] if agents else []
+    if agents is not None and not names:
+        raise CoopenvError(f"--agents {agents}: names none; leave it out for all that were made for {environment}")
     changes, log = options.parse_overrides(overrides), options.console(stderr=True)
     request = command.Request(environment, names, worlds, seed_block, tuple(overrides or ()), changes, ideal)
     with options.warned():

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
     from coopenv.backends.base import Backend
 
+MOST_WORLDS = 1_000_000
+"""Of a command that drives them all at once."""
+
 _source = partial(typer.Argument, autocompletion=complete.environments)
 Environment = Annotated[
     str, _source(metavar="ENV", help="Name of an environment (see `coopenv list`) or path of a TOML file.")

@@ -25,11 +25,11 @@ def page(
         bool,
         typer.Option("--measure", help="Measure what sensing is worth, for ENV.json; else what is there is shown."),
     ] = False,
-    worlds: Annotated[int, typer.Option(min=2, help="Held-out worlds to measure in.")] = 256,
+    worlds: Annotated[int, typer.Option(min=2, max=options.MOST_WORLDS, help="Held-out worlds to measure in.")] = 256,
 ) -> None:
     """Write the pages of environments: what they are, a picture, what sensing is worth."""
     from coopenv.bench import pages
-    from coopenv.bench.agents.dial import has_dial
+    from coopenv.bench.agents.dial import entrants, has_dial
     from coopenv.runs.console import Progress
     from coopenv.shipped import list_envs
 
@@ -40,12 +40,15 @@ def page(
     if len(stems) < len(names):
         raise CoopenvError("two environments have the same name")
     scenarios = {name: options.load(text, {}) for name, text in stems.items()}
+    measured = [name for name in stems if measure and (has_dial(name) or not everything)]
+    for name in measured:
+        entrants(stems[name])
     pages.prepare(out, list(stems))
     log = options.console(stderr=True)
     with Progress(log, "pages", total=len(stems)) as progress:
         for number, (name, scenario) in enumerate(scenarios.items()):
             progress.update(number, name)
-            if measure and (has_dial(name) or not everything):
+            if name in measured:
 
                 def told(done: float, who: str, number: int = number, name: str = name) -> None:
                     progress.update(number + done, f"{name}, {who}")

@@ -5,7 +5,8 @@ from typing import Protocol
 
 import numpy as np
 
-from coopenv.errors import CoopenvError
+from coopenv import user_code
+from coopenv.errors import CoopenvError, shown
 
 
 class Policy(Protocol):
@@ -23,16 +24,22 @@ def restart(policy: Policy, mask: np.ndarray) -> None:
     """Tell a policy that remembers something in which rows, mask (rows,) of bool, a new episode begins."""
     reset = getattr(policy, "reset", None)
     if callable(reset):
-        reset(mask)
+        with user_code.blamed("the policy's reset"):
+            reset(mask)
 
 
 def decide(policy: Policy, observations: np.ndarray, width: int = 2) -> np.ndarray:
     """Return the actions that a policy chooses, (rows, width) in float64, clipped to [-1, 1].
 
     Raises:
-        CoopenvError: the policy returned something of another shape, or not finite.
+        CoopenvError: the policy raised something, or returned no numbers, another shape or what is not finite.
     """
-    actions = np.asarray(policy(observations), dtype=np.float64)
+    with user_code.blamed("the policy"):
+        returned = policy(observations)
+    try:
+        actions = np.asarray(returned, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise CoopenvError(f"the policy returned no array of numbers, but {shown(returned)}") from None
     if actions.shape != (len(observations), width):
         raise CoopenvError(
             f"the policy returned actions of shape {actions.shape}, expected {(len(observations), width)}"

@@ -70,7 +70,7 @@ class Agent:
         made: Any = factory
         try:
             policy: Policy = made(scenario, **self.options)
-        except Exception as error:  # anybody's code
+        except (Exception, SystemExit) as error:  # anybody's code
             plain = isinstance(error, ValueError | TypeError | KeyError)
             raise CoopenvError(f"agent '{self.name}' cannot be built: {error if plain else told(error)}") from error
         if not callable(policy):

@@ -21,6 +21,8 @@ from coopenv.shipped import version
 
 FILES = ("main_data.hdf5", "metadata.json")
 """Of a dataset, in its folder `data`."""
+PER_EPISODE = 1 << 16
+"""Bytes that an episode takes at most besides its arrays."""
 
 
 def dataset_place(identity: str, root: Path | None, force: bool) -> Path:
@@ -68,6 +70,7 @@ def write_dataset(
         OutputError: it cannot be written.
     """
     with writing(place):
+        _check_room(place, episodes)
         place.parent.mkdir(parents=True, exist_ok=True)
     with replacing_folder(place, FILES) as new, _datasets_in(new), writing(place):
         import minari
@@ -86,6 +89,20 @@ def write_dataset(
         for file in FILES:
             (new / identity / "data" / file).rename(new / file)
         shutil.rmtree(new / identity.split("/")[0])
+
+
+def _check_room(place: Path, episodes: Sequence[DrivenEpisode]) -> None:
+    """Make sure that the disk has room: HDF5 ends the process where it has none (seen with h5py 3.16).
+
+    Raises:
+        OutputError: it has not.
+    """
+    arrays = sum(value.nbytes for episode in episodes for value in vars(episode).values() if hasattr(value, "nbytes"))
+    needed = 2 * arrays + PER_EPISODE * len(episodes)
+    free = shutil.disk_usage(next(folder for folder in place.absolute().parents if folder.is_dir())).free
+    if free < needed:
+        told = f"{needed / 2**20:.1f} MiB, {free / 2**20:.1f} MiB are free"
+        raise OutputError(f"cannot write to {place.parent}: the dataset may need {told}")
 
 
 def _buffers(episodes: Sequence[DrivenEpisode]) -> Iterator[Any]:

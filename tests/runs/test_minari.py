@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -66,6 +68,17 @@ def test_a_dataset_that_is_there_is_kept_unless_forced(root: Path, capsys: pytes
     assert main([*arguments, "4", "--force"]) == 0
     assert minari.load_dataset("own/short-v3").total_episodes == 4
     assert minari.load_dataset("own/short-v3").spec.env_spec is None  # of an environment that nobody registered
+
+
+def test_a_full_disk_is_found_before_anything_is_written(
+    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """HDF5 itself would end the process."""
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=100_000))
+    assert main(["dataset", "facade", "--worlds", "2"]) == 2
+    error = capsys.readouterr().err
+    assert "the dataset may need" in error and "0.1 MiB are free" in error
+    assert not list(root.iterdir())
 
 
 @pytest.mark.parametrize("identity", ["no_version", "../out-v0", "a b-v0", "-v0"])

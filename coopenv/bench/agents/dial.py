@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from coopenv.bench.agents.contest import contest, enter
+from coopenv.bench.agents.contest import Entrant, contest, enter
 from coopenv.bench.agents.table import COLUMNS, cell
 from coopenv.errors import CoopenvError
 from coopenv.policies import agents_for
@@ -25,6 +25,15 @@ KEYS = ("sensing", "agent", "metric", "mean", "ci_low", "ci_high", "n")
 def has_dial(name: str) -> bool:
     """Return whether an environment is there to learn to look: both drivers were made for it."""
     return {*DRIVERS} <= {*agents_for(name)}
+
+
+def entrants(environment: str, sensing: str = "sensed") -> list[Entrant]:
+    """Return the drivers at a position of the dial, built.
+
+    Raises:
+        CoopenvError: one cannot drive here, or nothing is driven.
+    """
+    return enter(environment, Path(environment).stem, {"sensing": sensing}, DRIVERS, ideal=False)
 
 
 def measure_dial(
@@ -47,8 +56,7 @@ def measure_dial(
         def told(done: float, name: str, place: int = place, how: str = how) -> None:
             on_progress((place + done / len(DRIVERS)) / len(SETTINGS), f"{how}: {name}")
 
-        entrants = enter(environment, Path(environment).stem, {"sensing": how}, DRIVERS, ideal=False)
-        found = contest(Path(environment).stem, entrants, worlds, 0, told).rows()
+        found = contest(Path(environment).stem, entrants(environment, how), worlds, 0, told).rows()
         rows += [{key: {"sensing": how, **row}[key] for key in KEYS} for row in found if row["metric"] in METRICS]
     return {"coopenv": version(), "worlds": worlds, "scenario": fingerprint(scenario), "rows": rows}
 

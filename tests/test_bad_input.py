@@ -1,0 +1,88 @@
+"""Agents that misbehave, places that cannot be written, numbers that are none: one line, and nothing is left behind."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from coopenv.cli import main
+
+AGENTS = """
+import numpy as np
+
+def shape(observations): return np.zeros((len(observations), 5))
+def nan(observations): return np.full((len(observations), 2), np.nan)
+def text(observations): return "left"
+def none(observations): return None
+def boom(observations): raise KeyError("inside")
+
+class Init:
+    def __init__(self, scenario): raise ZeroDivisionError("no")
+
+class Leaves:
+    def __init__(self, scenario): raise SystemExit(3)
+
+class Reset:
+    def __init__(self, scenario): pass
+    def reset(self, mask): raise ValueError("bad reset")
+    def __call__(self, observations): return np.zeros((len(observations), 2))
+"""
+SHORT = ["--set", "horizon=0.5"]
+EVALUATE = ["evaluate", "facade", *SHORT, "--worlds", "2", "--out", "out", "--agents"]
+WATCH = ["watch", "--env", "facade", *SHORT, "--out", "film"]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "acts.py").write_text(AGENTS)
+    (tmp_path / "raises.py").write_text("raise RuntimeError('at import')")
+    (tmp_path / "exits.py").write_text("raise SystemExit(3)")
+    (tmp_path / "file").touch()
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([*EVALUATE, "acts.py:shape"], "the policy returned actions of shape (2, 5), expected (2, 2)"),
+        ([*EVALUATE, "acts.py:nan"], "not finite for row 0"),
+        ([*EVALUATE, "acts.py:text"], "the policy returned no array of numbers, but 'left'"),
+        ([*EVALUATE, "acts.py:none"], "the policy returned actions of shape (), expected (2, 2)"),
+        ([*EVALUATE, "acts.py:boom"], "the policy failed at acts.py:8: KeyError: 'inside'"),
+        ([*EVALUATE, "acts.py:Reset"], "the policy's reset failed at acts.py:18: ValueError: bad reset"),
+        ([*EVALUATE, "acts.py:Init"], "agent 'Init' cannot be built: ZeroDivisionError: no"),
+        ([*EVALUATE, "acts.py:Leaves"], "agent 'Leaves' cannot be built: SystemExit: 3"),
+        ([*EVALUATE, "raises.py:Mine"], "cannot be loaded: RuntimeError: at import"),
+        ([*EVALUATE, "exits.py:Mine"], "cannot be loaded: SystemExit: 3"),
+        ([*EVALUATE, ","], "--agents ,: names none"),
+        ([*EVALUATE, "peek", "--set", "camera.range=nan"], "camera.range: Input should be a finite number, got nan"),
+        ([*EVALUATE, "peek", "--out", "file"], "cannot write to file: it is not a folder"),
+        ([*EVALUATE, "peek", "--worlds", "99999999999"], "Invalid value for '--worlds'"),
+        ([*WATCH, "acts.py:shape"], "the policy returned actions of shape (1, 5)"),
+        ([*WATCH, "acts.py:boom"], "the policy failed at acts.py:8"),
+        ([*WATCH, "route_follower", "--out", "file"], "cannot write to file: it is not a folder"),
+        (["watch", "route_follower", "--speed", "nan"], "Invalid value for '--speed'"),
+        (["play", "facade", "--others", "nobody"], "unknown policy 'nobody'"),
+        (["page", "facade", "--out", "file"], "cannot write to file"),
+        (["page", "facade", "busy_intersection", "--measure"], "there is nothing to drive"),
+        (["page", "raises.py"], "unknown environment 'raises.py'"),
+    ],
+)
+def test_one_line_and_nothing_is_left(
+    arguments: list[str], words: str, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there = sorted(folder.rglob("*"))
+    assert main(arguments) == 2
+    errors = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 1 and words in errors[0], errors
+    assert [path for path in sorted(folder.rglob("*")) if "__pycache__" not in path.parts] == there
+
+
+@pytest.mark.skipif(not os.path.ismount("/proc"), reason="needs a folder that nobody can write to")
+@pytest.mark.parametrize("arguments", [[*EVALUATE, "peek"], [*WATCH, "peek"], ["page", "facade"]])
+def test_a_folder_that_cannot_be_made(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*arguments, "--out", "/proc/nobody"]) == 2
+    assert "error: cannot write to /proc/nobody" in capsys.readouterr().err
