@@ -12,10 +12,9 @@ from coopenv.policies.view import FieldOfView
 from coopenv.scenario import Scenario
 
 OFFSETS = (0.0, 0.2, -0.2, 0.4, -0.4, 0.6, -0.6, 0.8, -0.8)  # rad, of the heading from that of the way
-STEP, FIRST, STEPS = 0.4, 3, 7  # s; steps with the first of two offsets; steps in all
+STEP, FIRST, STEPS = 0.4, 4, 10  # s; steps with the first of two offsets; steps in all
 HOLD = 2  # decisions that a plan is kept
-ENOUGH = 3  # targets in view; fewer bearings do not determine a pose
-OUTSIDE, BACK = 5.0, 1.0  # s/s for each metre too far out; s for each metre from the way at the end of a plan
+OUTSIDE, BACK = 5.0, 0.5  # s/s for each metre too far out; s for each metre from the way at the end of a plan
 FAR = 3.0  # m, how much farther one would drive blind after a plan
 
 
@@ -32,11 +31,11 @@ class LookAhead(RouteFollower):
         self,
         scenario: Scenario,
         *,
-        price: float = 4.0,
-        tolerated: float = 0.03,
+        price: float = 6.0,
+        tolerated: float = 0.02,
         bearing_std: float = 0.01,
         drift: float = 0.05,
-        farthest: float = 0.6,
+        farthest: float = 0.8,
     ) -> None:
         """Choose what matters.
 
@@ -105,7 +104,6 @@ class LookAhead(RouteFollower):
             line = landmarks[:, None] - place[:, :, None]
             seen = self.view.sees(line, heading[..., None]) & (known > 0.0)
             seen &= ~hidden(boxes, place + self.view.ahead * forward, landmarks, stride * (step + 1))
-            seen &= seen.sum(axis=-1, keepdims=True) >= ENOUGH
             belief = belief.driven(dx, dy, self.drift * stride, 1e-5).measured(line, known * seen)
             cost += STEP * self.price * np.maximum(belief.std - self.tolerated, 0.0)
             cost += STEP * OUTSIDE * np.maximum(np.abs(aside) - self.farthest, 0.0)

@@ -25,7 +25,7 @@ class Ppo(Part):
     """Driven vehicles side by side: as many worlds as hold so many, so that every environment's batch is alike."""
     decisions: Count = 64
     """Decision steps of a rollout, after each of which the policy is updated."""
-    minibatches: Count = 8
+    minibatches: Count = 16
     """Gradient steps per pass over a rollout."""
     epochs: Count = 4
     """Passes over each rollout."""
