@@ -6,17 +6,14 @@ from typing import Any
 import warp as wp
 
 from coopenv.world.camera import observe
-from coopenv.world.collision import ARRIVED, COLLIDED, UNDER_WAY, depart, referee, touches_anything
+from coopenv.world.collision import ARRIVED, COLLIDED, UNDER_WAY, depart, referee
 from coopenv.world.dynamics import prescribe
 from coopenv.world.embedded import Source, deliver_simulation
-from coopenv.world.lasting_errors import draw_errors
 from coopenv.world.model import PRESCRIBED
 from coopenv.world.odometry import measure_odometry
-from coopenv.world.parameters import draw_parameters
 from coopenv.world.precision import Precision
-from coopenv.world.presence import draw_presence
 from coopenv.world.records import array
-from coopenv.world.reset import believe, place_agent, place_vehicle, sense_first
+from coopenv.world.reset import begin_sensing, place_everybody
 
 
 @cache
@@ -96,23 +93,13 @@ def judge(model: Any, state: Any, moved: Any, world: int, vehicle: int):
 @wp.func
 def begin_moved(model: Any, state: Any, moved: Any, world: int):
     """Begin an episode where the vehicles stand; initial estimates are drawn as in the simulation."""
-    state.tick[world] = 0
-    state.exhausted[world] = 0
-    draw_parameters(model, state, world)
-    draw_presence(model, state, world)
-    for agent in range(model.agents):
-        place_agent(model, state, world, agent)
-    for vehicle in range(model.vehicles):
-        place_vehicle(model, state, world, vehicle)
+    place_everybody(model, state, world)
     take_poses(model, state, moved, world)
     for vehicle in range(model.vehicles):
         agent = model.landmarks + vehicle
         state.start_rotation[world, agent] = state.rotation[world, agent]
         state.start_position[world, agent] = state.position[world, agent]
-        believe(model, state, world, vehicle)
-        draw_errors(model, state, world, vehicle)
-        state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
-    sense_first(model, state, world)
+    begin_sensing(model, state, world)
 
 
 @wp.func

@@ -34,6 +34,8 @@ class Episodes:
     """(K + 1, W, N, 2), true, m, map; row 0 is the start."""
     heading: np.ndarray
     """(K, W, N), true, rad from the map's x axis."""
+    pan: np.ndarray
+    """(K, W, N), angle by which the camera is turned to the left, rad."""
     route: np.ndarray
     """(W, N, P, 2), m, map, at the start; its last point is repeated, NaN for vehicles without a goal."""
     arrivals: np.ndarray
@@ -64,7 +66,7 @@ class Episodes:
 
     @property
     def looking(self) -> np.ndarray:
-        """(K, W, N) rad in [-pi, pi): heading from that of the nearest piece of the route; NaN without a goal."""
+        """(K, W, N) rad in [-pi, pi): where the camera looks, from the nearest piece of the route; NaN without one."""
         way = np.full(self.heading.shape, np.nan)
         nearest = np.full(self.heading.shape, np.inf)
         for begin, end in zip(np.moveaxis(self.route, 2, 0)[:-1], np.moveaxis(self.route, 2, 0)[1:], strict=True):
@@ -76,7 +78,7 @@ class Episodes:
             nearer = (distance < nearest) & (square > 1e-9)
             way = np.where(nearer, np.arctan2(leg[..., 1], leg[..., 0]), way)
             nearest = np.where(nearer, distance, nearest)
-        return np.asarray((self.heading - way + np.pi) % (2 * np.pi) - np.pi)
+        return np.asarray((self.heading + self.pan - way + np.pi) % (2 * np.pi) - np.pi)
 
     @property
     def distance(self) -> np.ndarray:
@@ -150,7 +152,7 @@ def drive(
 
 
 ERRORS = ("position_error", "orientation_error")
-KEPT = ("alive", *ERRORS, "targets_in_view", "reward", "arrivals")
+KEPT = ("alive", *ERRORS, "targets_in_view", "reward", "arrivals", "pan")
 
 
 def _routes(points: np.ndarray, count: np.ndarray) -> np.ndarray:

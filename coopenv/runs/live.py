@@ -38,16 +38,6 @@ class Clock:
         time.sleep(max(0.0, self._begin + moment / self._speed - time.monotonic()))
 
 
-def need_display(window: Window, instead: str = "") -> None:
-    """Refuse to go on without a window; `instead` says what can be done.
-
-    Raises:
-        CoopenvError: there is none.
-    """
-    if not window.is_open:
-        raise CoopenvError(f"there is no display to open a window on{instead}")
-
-
 class Stage:
     """One world, drawn as it runs."""
 
@@ -85,6 +75,21 @@ class Stage:
         ]
 
 
+def opened(
+    scenario: Scenario, seed: int, log: Console, window: Window | None, instead: str = ""
+) -> tuple[Stage, Window]:
+    """Return a world and the window that shows its start; `instead` says what can be done where there is none.
+
+    Raises:
+        CoopenvError: there is no display.
+    """
+    stage, window = Stage(scenario, log), window or Window(scenario.title)
+    window.show(stage.first(seed))
+    if not window.is_open:
+        raise CoopenvError(f"there is no display to open a window on{instead}")
+    return stage, window
+
+
 def watch(
     scenario: Scenario,
     policy: Policy,
@@ -98,9 +103,7 @@ def watch(
     Raises:
         CoopenvError: there is no display.
     """
-    stage, window = Stage(scenario, log), window or Window(scenario.title)
-    window.show(stage.first(seed))
-    need_display(window, "; --out DIR writes a film instead")
+    stage, window = opened(scenario, seed, log, window, "; --out DIR writes a film instead")
     stage.run(policy, seed, window.show, clock or Clock(), lambda: window.is_open)
     return stage
 
@@ -130,9 +133,7 @@ def drive_by_hand(
     Raises:
         CoopenvError: there is no display.
     """
-    stage, window = Stage(scenario, log), window or Window(scenario.title)
-    window.show(stage.first(seed))
-    need_display(window)
+    stage, window = opened(scenario, seed, log, window)
     keys = Keys(window.canvas)
     policy = Keyboard(scenario, vehicle, others, keys)
 

@@ -74,7 +74,7 @@ FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
     ],
     "self": [
         ("steering", "vehicle", 1, "rad", "steering", -1, "steering angle, positive to the left"),
-        ("last_action", "vehicle", 2, "1", 1, -1, "action of the last decision"),
+        ("last_action", "vehicle", 3, "1", 1, -1, "action of the last decision; a third entry with `action.pan`"),
         ("time_left", "vehicle", 1, "horizon", 0.5, -1, "share of the horizon that is left", None, 0.5),
     ],
     "pan": [

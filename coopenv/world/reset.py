@@ -219,8 +219,25 @@ def believe(model: Any, state: Any, world: int, vehicle: int):
 
 
 @wp.func
-def sense_first(model: Any, state: Any, world: int):
-    """Take the first frame and send the first messages; everybody is in place."""
+def place_everybody(model: Any, state: Any, world: int):
+    """Begin at tick 0, draw what the world draws, and put everybody in place."""
+    state.tick[world] = 0
+    state.exhausted[world] = 0
+    draw_parameters(model, state, world)
+    draw_presence(model, state, world)
+    for agent in range(model.agents):
+        place_agent(model, state, world, agent)
+    for vehicle in range(model.vehicles):
+        place_vehicle(model, state, world, vehicle)
+
+
+@wp.func
+def begin_sensing(model: Any, state: Any, world: int):
+    """Draw initial estimates and lasting errors, look for contact, take the first frame, send the first messages."""
+    for vehicle in range(model.vehicles):
+        believe(model, state, world, vehicle)
+        draw_errors(model, state, world, vehicle)
+        state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
     for place in range(model.vehicles):
         vehicle = model.order[place]
         observe(model, state, world, vehicle, 0)
@@ -231,16 +248,5 @@ def sense_first(model: Any, state: Any, world: int):
 @wp.func
 def reset_world(model: Any, state: Any, world: int):
     """Start a new episode in one world; its seed and episode number are already set."""
-    state.tick[world] = 0
-    state.exhausted[world] = 0
-    draw_parameters(model, state, world)
-    draw_presence(model, state, world)
-    for agent in range(model.agents):
-        place_agent(model, state, world, agent)
-    for vehicle in range(model.vehicles):
-        place_vehicle(model, state, world, vehicle)
-        believe(model, state, world, vehicle)
-        draw_errors(model, state, world, vehicle)
-    for vehicle in range(model.vehicles):
-        state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
-    sense_first(model, state, world)
+    place_everybody(model, state, world)
+    begin_sensing(model, state, world)

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import coopenv
+from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.base import Command
 from coopenv.backends.mcap.reader import read_recording
@@ -49,6 +50,20 @@ def test_it_turns_at_its_rate_up_to_its_limit(dtype: str) -> None:
     time = np.arange(121) / 60
     assert_allclose(angles[:, 0], np.minimum(0.9 * time, 0.6), atol=1e-5)
     assert_allclose(angles[:, 1], -np.minimum(0.9 * time, 1.2), atol=1e-5)
+
+
+def test_the_last_action_and_its_price_hold_the_angle_that_was_asked_for() -> None:
+    """Two entries without a pan, three with one; `control` is minus the square of them all."""
+    actions = np.array([[0.3, -0.4, 0.5]] * 4)
+    for given, size in (({}, 2), ({"action.pan": PAN}, 3)):
+        made = load_scenario("urban_crossing", {**given, "observation.include": ["self"]})
+        engine = Engine(made, 1)
+        engine.reset([0])
+        engine.step(actions[None, :, :size])
+        observed = engine.layout["last_action"].values(engine.view("observation")[0])
+        assert_allclose(observed, actions[:, :size], atol=1e-6)
+        control = engine.view("terms")[0][:, engine.reward_terms.index("control")]
+        assert_allclose(control, -np.sum(actions[:, :size] ** 2, axis=1), rtol=1e-5)
 
 
 def test_dead_time_holds_for_it_too() -> None:

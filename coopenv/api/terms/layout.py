@@ -104,6 +104,8 @@ def included_fields(scenario: Scenario) -> dict[str, ObservationField]:
 
 def entries_of(row: ObservationField, scenario: Scenario) -> tuple[int, ...]:
     """Return which entries of a field's value a scenario's observation holds."""
+    if row is OBSERVATION_FIELDS.built_in["last_action"]:
+        return tuple(range(scenario.action.size))
     if scenario.observation.planar and row.planar is not None:
         return row.planar
     return tuple(range(row.size))

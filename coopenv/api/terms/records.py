@@ -54,7 +54,7 @@ class Ego:
     velocity: wp.vec3  # m/s, last odometry sample, body
     angular_velocity: wp.vec3  # rad/s, last odometry sample, body
     odometry_age: wp.float32  # s
-    action: wp.vec2  # of this decision, [-1, 1]
+    action: wp.vec3  # of this decision, [-1, 1]; the third entry is 0 where cameras do not pan
     effort: wp.float32  # |action|^2
     command: wp.vec3  # what it asked for: speed m/s, steering rad, acceleration m/s^2
     steering: wp.float32  # rad, positive to the left
@@ -175,10 +175,13 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     ego.velocity = wp.vec3(state.odometry_velocity[world, vehicle])
     ego.angular_velocity = wp.vec3(state.odometry_angular_velocity[world, vehicle])
     ego.odometry_age = odometry_age(state.odometry_samples[world, vehicle], time, model.odometry_rate)
-    first = state.action[world, vehicle, 0]
-    second = state.action[world, vehicle, 1]
-    ego.action = wp.vec2(wp.float32(first), wp.float32(second))
-    ego.effort = wp.float32(first * first + second * second)
+    first = wp.float32(state.action[world, vehicle, 0])
+    second = wp.float32(state.action[world, vehicle, 1])
+    third = float(0.0)
+    if model.action_size > 2:
+        third = wp.float32(state.action[world, vehicle, 2])
+    ego.action = wp.vec3(first, second, third)
+    ego.effort = wp.length_sq(ego.action)
     command = state.command[world, vehicle]
     ego.command = wp.vec3(wp.float32(command[SPEED]), wp.float32(command[STEERING]), wp.float32(command[ACCELERATION]))
     ego.pan = wp.float32(state.pan[world, vehicle])

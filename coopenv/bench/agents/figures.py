@@ -18,6 +18,8 @@ BINS = 24
 _RESAMPLES, _FINE = 300, 300
 _PANEL = 2.0  # inches
 _MARKS = "osD^vPX*"
+_RAREST = 1e-3
+"""Share of time that is at the centre of the directions looked in."""
 
 
 def save_figures(evaluation: Evaluation, folder: Path, file_format: str) -> list[Path]:
@@ -81,23 +83,31 @@ def pareto_figure(evaluation: Evaluation, width: float | None = None) -> Figure:
 
 
 def looking_figure(evaluation: Evaluation, width: float | None = None) -> Figure:
-    """Draw how often each driver looked in which direction, 0 being straight ahead along its way."""
+    """Draw how often each driver's camera looked in which direction, 0 being straight ahead along its way.
+
+    Radii are logarithms of the shares: most of the time everybody looks ahead, which would hide the rest.
+    """
     columns = min(4, len(evaluation.episodes))
     rows = -(-len(evaluation.episodes) // columns)
-    note = _note(evaluation, "share of time; 0: along the way, positive: to the left")
+    note = _note(evaluation, f"share of time from {100 * _RAREST:g} %, logarithmic; 0: along the way, positive: left")
     figure, _ = style.canvas(width, 0.5 + _PANEL * rows, note)
     edges = np.radians(np.arange(-93, 94, 6))
-    shares = [_shares(episodes, edges) for episodes in evaluation.episodes.values()]
-    most = max(0.05, *(float(share.max()) for share in shares))
-    for number, (look, share) in enumerate(zip(_looks(evaluation), shares, strict=True)):
+    rings = _RAREST * 10.0 ** np.arange(1, 4)
+    for number, (look, episodes) in enumerate(zip(_looks(evaluation), evaluation.episodes.values(), strict=True)):
         ax: Any = figure.add_subplot(rows, columns, number + 1, projection="polar")
         ax.set_theta_zero_location("N")
-        ax.set(thetamin=-93, thetamax=93, rlim=(0, most))
+        ax.set(thetamin=-93, thetamax=93, rlim=(0, _radius(rings[-1])))
         ax.tick_params(labelsize=SMALL, pad=1)
-        ax.set_rticks([most / 2, most], [f"{50 * most:.0f} %", f"{100 * most:.0f} %"], fontsize=SMALL - 1)
-        ax.bar(edges[:-1], share, width=np.diff(edges), align="edge", color=look["color"], alpha=0.75, linewidth=0)
+        ax.set_rticks(_radius(rings), [f"{100 * ring:g} %" for ring in rings], fontsize=SMALL - 1)
+        bars = {"width": np.diff(edges), "align": "edge", "color": look["color"], "alpha": 0.75, "linewidth": 0}
+        ax.bar(edges[:-1], _radius(_shares(episodes, edges)), **bars)
         ax.set_title(look["label"], fontsize=NORMAL, color=INK, pad=6)
     return figure
+
+
+def _radius(share: np.ndarray) -> np.ndarray:
+    """Return decades above the rarest share that is drawn; 0 below it."""
+    return np.asarray(np.log10(np.maximum(share, _RAREST) / _RAREST))
 
 
 def _shares(episodes: Episodes, edges: np.ndarray) -> np.ndarray:
