@@ -26,8 +26,9 @@ from coopenv.seeds import EVALUATION_SEEDS, evaluation_seed
 from coopenv.shipped import list_envs
 
 if TYPE_CHECKING:
-    from coopenv.api.parallel_env import CooperativeLocalisationEnv, parallel_env
-    from coopenv.api.vector_env import CooperativeVectorEnv, make_vec
+    from coopenv.api.make import make_vec, parallel_env
+    from coopenv.api.parallel_env import CooperativeLocalisationEnv
+    from coopenv.api.vector_env import CooperativeVectorEnv
     from coopenv.bench.observers.comparison import Comparison, compare
     from coopenv.scenario import Scenario, load_scenario
     from coopenv.scenario.own_terms import register_observation, register_reward, register_termination
@@ -41,8 +42,8 @@ else:
         "Scenario": "coopenv.scenario",
         "compare": "coopenv.bench.observers.comparison",
         "load_scenario": "coopenv.scenario",
-        "make_vec": "coopenv.api.vector_env",
-        "parallel_env": "coopenv.api.parallel_env",
+        "make_vec": "coopenv.api.make",
+        "parallel_env": "coopenv.api.make",
         "register_observation": "coopenv.scenario.own_terms",
         "register_reward": "coopenv.scenario.own_terms",
         "register_termination": "coopenv.scenario.own_terms",

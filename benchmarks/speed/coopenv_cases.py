@@ -12,8 +12,8 @@ import warp as wp
 from benchmarks.speed.cases import COOPENV, Built, Case, parallel_step
 from benchmarks.speed.growth import growth_scenario
 from coopenv.api.engine import Engine
-from coopenv.api.parallel_env import parallel_env
-from coopenv.api.vector_env import CooperativeVectorEnv, make_vec
+from coopenv.api.make import make_vec, parallel_env
+from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.scenario import Scenario
 from coopenv.world.launch import default_threads
 

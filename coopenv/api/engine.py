@@ -1,6 +1,6 @@
 """The batched core under every interface: worlds plus step results, with constant Python work per step."""
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -8,21 +8,17 @@ import numpy as np
 import warp as wp
 
 from coopenv.api.plugins import PlugIns
-from coopenv.api.reward import RewardFunction, Step, check_finite, check_function, reward_of
-from coopenv.api.step_results import MEMORY, results_struct
-from coopenv.api.terms.binding import bound_terms, own_places
-from coopenv.api.terms.kernels import check_own_terms, endings_kernel, results_kernel
+from coopenv.api.report import Report
+from coopenv.api.reward import RewardFunction
+from coopenv.api.step_results import MEMORY
 from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import simulation_of
 from coopenv.backends.tick_world import open_world
-from coopenv.errors import CoopenvError, check_memory, told
+from coopenv.errors import CoopenvError, told
 from coopenv.scenario import Scenario
 from coopenv.seeds import training_seed, world_keys
 from coopenv.world.embedded import HOST
-from coopenv.world.launch import PerWorld
-from coopenv.world.precision import device_memory
-from coopenv.world.records import allocate, size_of
 from coopenv.world.saved_state import has_begun
 from coopenv.world.state import overwrite, state_fields
 from coopenv.world.world import Keys
@@ -62,30 +58,15 @@ class Engine:
         self.plugins = PlugIns(scenario.observer.name, self.world) if on_host else None
         """The observers that run on the host; None where the embedded one estimates."""
         self.layout = observation_layout(scenario)
-        worlds, device = self.world.worlds, self.world.device
-        weights = scenario.reward.by_name
-        self.reward_terms = tuple(weights)
+        self.reward_terms = tuple(scenario.reward.by_name)
         """Names of the reward terms, in the order of the field `terms`."""
-        p = self.world.precision
-        sizes = {"W": worlds, "N": self.world.model.vehicles, "D": self.layout.size, "K": len(weights)}
-        check_memory(size_of(results_struct(p), sizes), f"results of {worlds} worlds", device_memory(device))
-        self.results = allocate(results_struct(p), sizes, device)
-        terms = bound_terms(scenario)
-        check_own_terms(terms, device)
-        self._own_terms = own_places(terms, self.layout)
-        check_function(reward, device)
-        self._reward, self._step = reward, Step(self.view, scenario)
-        self._fill = results_kernel(terms, p)
-        self._end = endings_kernel(terms.conditions, p) if terms.conditions else None
-        fields = self.layout.values()
-        self._start = _vector(wp.int32, [field.start for field in fields])
-        self._center = _vector(wp.float32, [field.center for field in fields])
-        self._factor = _vector(wp.float32, [1.0 / field.scale for field in fields])
-        self._weight = _vector(wp.float32, weights.values())
+        self._views: dict[str, np.ndarray] = {}
+        self._state_fields = set(state_fields(self.world.precision))
+        self._report = Report(scenario, self.world, self.layout, reward, self.view)
+        self.results = self._report.results
+        worlds, device = self.world.worlds, self.world.device
         flags: list[Any] = [wp.full(worlds, value, dtype=wp.int32, device=device) for value in (1, 0, 0)]
         self._everywhere, self._nowhere, self._fresh = flags
-        self._state_fields = set(state_fields(self.world.precision))
-        self._views: dict[str, np.ndarray] = {}
         self.begun = False
         """Whether every world has been reset, or restored from one that had."""
 
@@ -117,7 +98,7 @@ class Engine:
         if self.plugins is not None:
             self.plugins.start(np.flatnonzero(chosen))
         self._fresh.assign(chosen.astype(np.int32))
-        self._fill_results("results fresh", self._fresh, self._fresh)
+        self._report.fill("results fresh", self._fresh, self._fresh)
         self.begun = True
         return seeds
 
@@ -133,17 +114,17 @@ class Engine:
     def load(self) -> None:
         """Load all kernels, compiling those that this machine has not compiled yet; nothing moves."""
         (self.plugins or self.world).load()
-        self._end_episodes()
-        self._fill_results("load", self._nowhere, self._nowhere)
+        self._report.end_episodes()
+        self._report.fill("load", self._nowhere, self._nowhere)
 
     def step(self, actions: np.ndarray | None = None, ticks: int | None = None) -> None:
         """Advance by one decision (or `ticks` camera ticks) under actions (W, N, A) in [-1, 1]."""
         if actions is not None:
             self.set_actions(actions)
         (self.plugins or self.world).advance(self.world.model.ticks_per_decision if ticks is None else ticks)
-        self._end_episodes()
+        self._report.end_episodes()
         self.refresh()
-        self._reward_anew(self._nowhere)
+        self._report.reward_anew(self._nowhere)
 
     def step_or_restart(self) -> None:
         """Restart the worlds that are over, advance the others by one decision; nothing leaves the device."""
@@ -153,9 +134,9 @@ class Engine:
         wp.copy(self.world.mask, self.results.over)
         (self.plugins or self.world).advance(self.world.model.ticks_per_decision)
         self._restart()
-        self._end_episodes()
-        self._fill_results("results some fresh", self.world.mask, self._everywhere)
-        self._reward_anew(self.world.mask)
+        self._report.end_episodes()
+        self._report.fill("results some fresh", self.world.mask, self._everywhere)
+        self._report.reward_anew(self.world.mask)
         self.world.mask.zero_()
 
     def restart_finished(self) -> None:
@@ -164,7 +145,7 @@ class Engine:
         wp.copy(self._fresh, self.results.over)
         self._restart()
         self.world.mask.zero_()
-        self._fill_results("results fresh", self._fresh, self._fresh)
+        self._report.fill("results fresh", self._fresh, self._fresh)
 
     def _restart(self) -> None:
         self.world.restart()
@@ -180,28 +161,7 @@ class Engine:
 
     def refresh(self) -> None:
         """Recompute the step results of every world from the present state."""
-        self._fill_results("results", self._nowhere, self._everywhere)
-
-    def _end_episodes(self) -> None:
-        """End the episodes of vehicles that fulfil a condition of the scenario's own."""
-        if self._end is not None:
-            arguments = [self.world.model, PerWorld(self.world.state), PerWorld(self.results)]
-            self.world.launch("end", self._end, arguments, inner=(self.world.model.vehicles,))
-
-    def _fill_results(self, key: str, fresh: Any, chosen: Any) -> None:
-        vectors = [self._start, self._center, self._factor, self._weight]
-        fixed = [self.world.model, PerWorld(self.world.state), *vectors]
-        changing = [PerWorld(part) for part in (self.results, fresh, chosen)]
-        self.world.launch(key, self._fill, fixed + changing, inner=(self.world.model.vehicles,))
-        if self.world.device == "cpu":  # to look at a GPU would mean to wait for it
-            for title, name, place in self._own_terms:
-                check_finite(title, self.view(name)[..., place])
-
-    def _reward_anew(self, fresh: Any) -> None:
-        """Replace the reward of the worlds that have not just been reset by that of a function in Python."""
-        if self._reward is not None:
-            earning = self.view("alive") & (fresh.numpy()[:, None] == 0)
-            self.view("reward")[...] = reward_of(self._reward, self._step, earning)
+        self._report.fill("results", self._nowhere, self._everywhere)
 
     def view(self, name: str) -> np.ndarray:
         """Return a field of the results, the state or the actions on the host."""
@@ -257,8 +217,3 @@ class Engine:
         self.refresh()
         overwrite(memory, checked)
         self.begun = bool(has_begun(self.view("start_rotation")).all())
-
-
-def _vector(dtype: Any, values: Collection[float]) -> Any:
-    """Return a Warp vector, which a kernel takes by value."""
-    return wp.types.vector(length=len(values), dtype=dtype)(*values)

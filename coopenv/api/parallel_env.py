@@ -1,7 +1,6 @@
 """The PettingZoo environment: one world, dictionaries keyed by agent."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -10,6 +9,7 @@ from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 
 from coopenv.api.actions import ActionReader
+from coopenv.api.choices import check_choice
 from coopenv.api.engine import Engine
 from coopenv.api.infos import InfoWriter, state_space, state_vector
 from coopenv.api.options import OF_TESTS, SETTINGS, checked_options, world_number, world_parameters
@@ -17,10 +17,8 @@ from coopenv.api.pictures import Pictures
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
 from coopenv.backends.base import Backend, Health
-from coopenv.backends.sources import open_backend, simulation_of
-from coopenv.errors import CoopenvError, ScenarioError, shown, suggest
-from coopenv.observers.contract import Factory
-from coopenv.observers.registry import named
+from coopenv.backends.sources import simulation_of
+from coopenv.errors import CoopenvError, shown, suggest
 from coopenv.scenario import Scenario
 from coopenv.seeds import world_keys
 from coopenv.world.presence import ABSENT
@@ -67,8 +65,8 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
     ) -> None:
         """Build the world; use `coopenv.parallel_env` to build one by name."""
         self._arguments = {key: value for key, value in locals().items() if key != "self"}
-        _one_of("render_mode", render_mode, (None, *RENDER_MODES))
-        _one_of("observation", observation, ("flat", "dict"))
+        check_choice("render_mode", render_mode, (None, *RENDER_MODES))
+        check_choice("observation", observation, ("flat", "dict"))
         backend = simulation_of(source) if isinstance(source, Scenario) else source
         self.scenario = scenario = backend.scenario
         self.render_mode = render_mode
@@ -245,65 +243,3 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
     def __setstate__(self, saved: dict[str, Any]) -> None:
         self.__init__(**saved["arguments"])  # type: ignore[misc]
         self.set_state(saved["state"])
-
-
-def _one_of(what: str, value: Any, allowed: tuple[Any, ...]) -> None:
-    if value not in allowed:
-        names = [str(a) for a in allowed]
-        raise CoopenvError(f"unknown {what} '{value}'{suggest(str(value), names)}; known: {', '.join(names)}")
-
-
-def parallel_env(
-    name_or_path: str | Path,
-    *,
-    render_mode: str | None = None,
-    observer: str | Factory | None = None,
-    backend: str | Backend | None = None,
-    observation: Literal["flat", "dict"] = "flat",
-    device: str = "cpu",
-    dtype: str = "float32",
-    overrides: Mapping[str, Any] | None = None,
-    data: str | Path | None = None,
-    variant: str | None = None,
-    reward: RewardFunction | None = None,
-) -> CooperativeLocalisationEnv:
-    """Return an environment by name (`coopenv.list_envs()`), from a TOML file, or from a recording.
-
-    A recording goes by as it was, whatever the actions; see docs/replay.md.
-
-    Args:
-        name_or_path: for example "busy_intersection"; "mrclam_6" or "drive.mcap" replay what was recorded. Where
-            `backend` is an object, any name for the environment.
-        render_mode: None, "rgb_array" or "human".
-        observer: estimator that every vehicle runs, embedded or a plug-in: a name, a class, or where one stands
-            (`mine.py:Mine`, `package.module:Mine`); None: as the scenario says.
-        backend: where measurements come from, "simulated", "highway" or "replay", or a `coopenv.backends.base.Backend`,
-            which has its own scenario; None: as the name says.
-        observation: "flat" Box or one-level "dict".
-        device: "cpu" or a CUDA device.
-        dtype: "float32" or "float64" (of the world; observations are float32).
-        overrides: dotted scenario keys, for example {"noise.enabled": False}.
-        data: folder of recorded data sets; None: what COOPENV_DATA says.
-        variant: of a recorded data set: "landmarks", "landmarks+robots" (the default) or "blind".
-        reward: a function of a `coopenv.api.reward.Step` that returns the rewards (1, vehicles); None: the weighted
-            sum of the scenario's terms.
-
-    Raises:
-        UnknownEnvironmentError: no such environment.
-        ScenarioError: the file or an override is not valid.
-        CoopenvError: another argument is not valid.
-    """
-    if overrides is not None and not isinstance(overrides, Mapping):
-        raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
-    merged = dict(overrides or {})
-    if observer is not None:
-        merged["observer.name"] = named(observer)
-    return CooperativeLocalisationEnv(
-        open_backend(name_or_path, backend, merged, data, variant),
-        Path(str(name_or_path)).stem,
-        render_mode=render_mode,
-        observation=observation,
-        device=device,
-        dtype=dtype,
-        reward=reward,
-    )

@@ -32,7 +32,7 @@ def make_parallel(name: str, max_cycles: int | None = None, **options: Any) -> C
         max_cycles: decision steps per episode instead of the scenario's horizon.
         options: those of `coopenv.parallel_env`.
     """
-    from coopenv.api.parallel_env import parallel_env
+    from coopenv.api.make import parallel_env
     from coopenv.scenario import load_scenario
 
     if max_cycles is not None:
@@ -56,7 +56,7 @@ def register_all() -> None:
             gymnasium.register(
                 identity,
                 entry_point="coopenv.api.single_vehicle:SingleVehicleEnv",
-                vector_entry_point="coopenv.api.vector_env:make_rows",
+                vector_entry_point="coopenv.api.make:make_rows",
                 kwargs={"name_or_path": name},
             )
         for kind, registry in (("parallel", parallel_registry), ("aec", aec_registry)):

@@ -9,7 +9,8 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from coopenv.api.parallel_env import RENDER_MODES, CooperativeLocalisationEnv, parallel_env
+from coopenv.api.make import parallel_env
+from coopenv.api.parallel_env import RENDER_MODES, CooperativeLocalisationEnv
 from coopenv.errors import CoopenvError, suggest
 
 OtherPolicy = Callable[[str, Any], np.ndarray]

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Literal
 
 import gymnasium
@@ -13,15 +12,13 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from coopenv.api.array_io import ArrayKind, Exchange
+from coopenv.api.choices import check_choice, checked_autoreset
 from coopenv.api.engine import Engine
 from coopenv.api.options import SETTINGS, checked_options, world_mask, world_parameters
 from coopenv.api.pictures import Pictures
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
-from coopenv.backends.sources import open_simulation
-from coopenv.errors import CoopenvError, ScenarioError, suggest
-from coopenv.observers.contract import Factory
-from coopenv.observers.registry import named
+from coopenv.errors import CoopenvError
 from coopenv.scenario import Scenario
 from coopenv.seeds import world_keys
 
@@ -68,10 +65,8 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
     ) -> None:
         """Build the worlds; use `coopenv.make_vec` to build them by name."""
         self._arguments = {key: value for key, value in locals().items() if key != "self"}
-        if render_mode not in (None, "rgb_array"):
-            raise CoopenvError(f"unknown render_mode '{render_mode}'; known: None, rgb_array")
-        if observation not in ("flat", "dict"):
-            raise CoopenvError(f"unknown observation '{observation}'; known: flat, dict")
+        check_choice("render_mode", render_mode, (None, "rgb_array"))
+        check_choice("observation", observation, ("flat", "dict"))
         self.engine = Engine(scenario, num_worlds, dtype, device, threads, reward=reward)
         self.scenario = scenario = self.engine.backend.scenario
         self.pictures = Pictures(self.engine, scenario)
@@ -247,92 +242,3 @@ class CooperativeVectorEnv(gymnasium.vector.VectorEnv[Any, Any, Any]):
         if hasattr(self, "engine"):
             self.engine.close()
             self.pictures.close()
-
-
-def checked_autoreset(mode: AutoresetMode | str) -> AutoresetMode:
-    """Return a member of Gymnasium's enumeration for it, its name or its value.
-
-    Raises:
-        CoopenvError: no such mode.
-    """
-    known = {word.lower(): m for m in AutoresetMode for word in (m.name, m.value)}
-    word = str(getattr(mode, "name", mode)).lower().replace("-", "_")
-    if word not in known:
-        names = [m.name.lower() for m in AutoresetMode]
-        raise CoopenvError(f"unknown autoreset '{mode}'{suggest(word, names)}; known: {', '.join(names)}")
-    return known[word]
-
-
-def make_vec(
-    name_or_path: str | Path,
-    *,
-    num_worlds: int,
-    device: str = "cpu",
-    dtype: str = "float32",
-    autoreset: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-    overrides: Mapping[str, Any] | None = None,
-    arrays: ArrayKind | None = None,
-    threads: int | None = None,
-    render_mode: str | None = None,
-    reward: RewardFunction | None = None,
-    observer: str | Factory | None = None,
-    observation: Literal["flat", "dict"] = "flat",
-) -> CooperativeVectorEnv:
-    """Return a batch of worlds as a Gymnasium `VectorEnv` with num_worlds x vehicles rows.
-
-    Args:
-        name_or_path: environment or TOML file.
-        num_worlds: how many worlds.
-        device: "cpu" or a CUDA device.
-        dtype: precision of the worlds; observations and rewards are float32.
-        autoreset: "next_step", "same_step" or "disabled".
-        overrides: dotted scenario keys.
-        arrays: "numpy" (default on the CPU) or "torch" (default on CUDA).
-        threads: shares of the batch on the CPU; None: by size and cores.
-        render_mode: None or "rgb_array".
-        reward: a function of a `coopenv.api.reward.Step` that returns the rewards (num_worlds, vehicles), on the CPU
-            only; None: the weighted sum of the scenario's terms.
-        observer: estimator that every vehicle runs, as for `coopenv.parallel_env`; None: as the scenario says.
-        observation: "flat" rows, or a "dict" of arrays (num_envs, size) by field.
-
-    Raises:
-        CoopenvError: any argument is not valid.
-    """
-    if overrides is not None and not isinstance(overrides, Mapping):
-        raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
-    merged = {**(overrides or {}), **({} if observer is None else {"observer.name": named(observer)})}
-    return CooperativeVectorEnv(
-        open_simulation(name_or_path, merged),
-        Path(str(name_or_path)).stem,
-        num_worlds=num_worlds,
-        device=device,
-        dtype=dtype,
-        autoreset=autoreset,
-        arrays=arrays,
-        threads=threads,
-        render_mode=render_mode,
-        reward=reward,
-        observation=observation,
-    )
-
-
-def make_rows(
-    name_or_path: str,
-    num_envs: int = 1,
-    vectorization_mode: Literal["vector_entry_point"] | None = None,
-    **options: Any,
-) -> CooperativeVectorEnv:
-    """Entry point of `gymnasium.make_vec("coopenv/...", num_envs=rows)`.
-
-    Raises:
-        CoopenvError: `num_envs` is not a multiple of the vehicles.
-    """
-    if "num_worlds" in options:
-        raise CoopenvError("give num_envs, which counts rows (world, vehicle), instead of num_worlds")
-    vehicles = len(open_simulation(name_or_path, options.get("overrides")).vehicles)
-    if not isinstance(num_envs, int | np.integer) or num_envs < 1 or num_envs % vehicles:
-        raise CoopenvError(
-            f"num_envs counts rows (world, vehicle): {num_envs} is not a positive multiple of the {vehicles} vehicles "
-            f"of {name_or_path}"
-        )
-    return make_vec(name_or_path, num_worlds=int(num_envs) // vehicles, **options)

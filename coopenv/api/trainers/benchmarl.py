@@ -5,7 +5,7 @@ from itertools import count, repeat
 from pathlib import Path
 from typing import Any
 
-from coopenv.api.parallel_env import parallel_env
+from coopenv.api.make import parallel_env
 from coopenv.api.trainers.numeric_infos import NUMBERS, PlainInfos
 
 try:

@@ -6,10 +6,9 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorWrapper
 
-from coopenv.api.parallel_env import parallel_env
+from coopenv.api.make import make_rows, parallel_env
 from coopenv.api.trainers.numeric_infos import PlainInfos
 from coopenv.api.true_ends import TrueEnds
-from coopenv.api.vector_env import make_rows
 from coopenv.errors import CoopenvError
 
 try:

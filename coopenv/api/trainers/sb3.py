@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from coopenv.api.infos import outcome_words
+from coopenv.api.make import make_vec
 from coopenv.api.statistics import EpisodeSums
 from coopenv.api.terms.layout import Layout
-from coopenv.api.vector_env import CooperativeVectorEnv, make_vec
+from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.errors import CoopenvError, checked_seed
 from coopenv.estimation.outcomes import Outcome
 

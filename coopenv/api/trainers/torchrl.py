@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorWrapper
 
+from coopenv.api.make import make_vec
 from coopenv.api.true_ends import TrueEnds
-from coopenv.api.vector_env import CooperativeVectorEnv, make_vec
+from coopenv.api.vector_env import CooperativeVectorEnv
 
 try:
     from torchrl.envs import GymWrapper

@@ -1,0 +1,152 @@
+"""Environments by name: `coopenv.parallel_env` and `coopenv.make_vec`, and the entry point of Gymnasium's registry."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from coopenv.api.array_io import ArrayKind
+from coopenv.api.parallel_env import CooperativeLocalisationEnv
+from coopenv.api.reward import RewardFunction
+from coopenv.api.vector_env import CooperativeVectorEnv
+from coopenv.backends.base import Backend
+from coopenv.backends.sources import open_backend, open_simulation
+from coopenv.errors import CoopenvError, ScenarioError
+from coopenv.observers.contract import Factory
+from coopenv.observers.registry import named
+
+
+def parallel_env(
+    name_or_path: str | Path,
+    *,
+    render_mode: str | None = None,
+    observer: str | Factory | None = None,
+    backend: str | Backend | None = None,
+    observation: Literal["flat", "dict"] = "flat",
+    device: str = "cpu",
+    dtype: str = "float32",
+    overrides: Mapping[str, Any] | None = None,
+    data: str | Path | None = None,
+    variant: str | None = None,
+    reward: RewardFunction | None = None,
+) -> CooperativeLocalisationEnv:
+    """Return an environment by name (`coopenv.list_envs()`), from a TOML file, or from a recording.
+
+    A recording goes by as it was, whatever the actions; see docs/replay.md.
+
+    Args:
+        name_or_path: for example "busy_intersection"; "mrclam_6" or "drive.mcap" replay what was recorded. Where
+            `backend` is an object, any name for the environment.
+        render_mode: None, "rgb_array" or "human".
+        observer: estimator that every vehicle runs, embedded or a plug-in: a name, a class, or where one stands
+            (`mine.py:Mine`, `package.module:Mine`); None: as the scenario says.
+        backend: where measurements come from, "simulated", "highway" or "replay", or a `coopenv.backends.base.Backend`,
+            which has its own scenario; None: as the name says.
+        observation: "flat" Box or one-level "dict".
+        device: "cpu" or a CUDA device.
+        dtype: "float32" or "float64" (of the world; observations are float32).
+        overrides: dotted scenario keys, for example {"noise.enabled": False}.
+        data: folder of recorded data sets; None: what COOPENV_DATA says.
+        variant: of a recorded data set: "landmarks", "landmarks+robots" (the default) or "blind".
+        reward: a function of a `coopenv.api.reward.Step` that returns the rewards (1, vehicles); None: the weighted
+            sum of the scenario's terms.
+
+    Raises:
+        UnknownEnvironmentError: no such environment.
+        ScenarioError: the file or an override is not valid.
+        CoopenvError: another argument is not valid.
+    """
+    return CooperativeLocalisationEnv(
+        open_backend(name_or_path, backend, _with_observer(overrides, observer), data, variant),
+        Path(str(name_or_path)).stem,
+        render_mode=render_mode,
+        observation=observation,
+        device=device,
+        dtype=dtype,
+        reward=reward,
+    )
+
+
+def make_vec(
+    name_or_path: str | Path,
+    *,
+    num_worlds: int,
+    device: str = "cpu",
+    dtype: str = "float32",
+    autoreset: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    overrides: Mapping[str, Any] | None = None,
+    arrays: ArrayKind | None = None,
+    threads: int | None = None,
+    render_mode: str | None = None,
+    reward: RewardFunction | None = None,
+    observer: str | Factory | None = None,
+    observation: Literal["flat", "dict"] = "flat",
+) -> CooperativeVectorEnv:
+    """Return a batch of worlds as a Gymnasium `VectorEnv` with num_worlds x vehicles rows.
+
+    Args:
+        name_or_path: environment or TOML file.
+        num_worlds: how many worlds.
+        device: "cpu" or a CUDA device.
+        dtype: precision of the worlds; observations and rewards are float32.
+        autoreset: "next_step", "same_step" or "disabled".
+        overrides: dotted scenario keys.
+        arrays: "numpy" (default on the CPU) or "torch" (default on CUDA).
+        threads: shares of the batch on the CPU; None: by size and cores.
+        render_mode: None or "rgb_array".
+        reward: a function of a `coopenv.api.reward.Step` that returns the rewards (num_worlds, vehicles), on the CPU
+            only; None: the weighted sum of the scenario's terms.
+        observer: estimator that every vehicle runs, as for `coopenv.parallel_env`; None: as the scenario says.
+        observation: "flat" rows, or a "dict" of arrays (num_envs, size) by field.
+
+    Raises:
+        CoopenvError: any argument is not valid.
+    """
+    return CooperativeVectorEnv(
+        open_simulation(name_or_path, _with_observer(overrides, observer)),
+        Path(str(name_or_path)).stem,
+        num_worlds=num_worlds,
+        device=device,
+        dtype=dtype,
+        autoreset=autoreset,
+        arrays=arrays,
+        threads=threads,
+        render_mode=render_mode,
+        reward=reward,
+        observation=observation,
+    )
+
+
+def make_rows(
+    name_or_path: str,
+    num_envs: int = 1,
+    vectorization_mode: Literal["vector_entry_point"] | None = None,
+    **options: Any,
+) -> CooperativeVectorEnv:
+    """Entry point of `gymnasium.make_vec("coopenv/...", num_envs=rows)`.
+
+    Raises:
+        CoopenvError: `num_envs` is not a multiple of the vehicles.
+    """
+    if "num_worlds" in options:
+        raise CoopenvError("give num_envs, which counts rows (world, vehicle), instead of num_worlds")
+    vehicles = len(open_simulation(name_or_path, options.get("overrides")).vehicles)
+    if not isinstance(num_envs, int | np.integer) or num_envs < 1 or num_envs % vehicles:
+        raise CoopenvError(
+            f"num_envs counts rows (world, vehicle): {num_envs} is not a positive multiple of the {vehicles} vehicles "
+            f"of {name_or_path}"
+        )
+    return make_vec(name_or_path, num_worlds=int(num_envs) // vehicles, **options)
+
+
+def _with_observer(overrides: Mapping[str, Any] | None, observer: str | Factory | None) -> dict[str, Any]:
+    """Return dotted keys and the observer's among them.
+
+    Raises:
+        ScenarioError: the overrides are no mapping.
+    """
+    if overrides is not None and not isinstance(overrides, Mapping):
+        raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
+    return {**(overrides or {}), **({} if observer is None else {"observer.name": named(observer)})}
