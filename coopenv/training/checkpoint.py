@@ -21,7 +21,7 @@ from coopenv.training.settings import Plan
 from coopenv.training.trainer import Trainer
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
-FORMAT = 1
+FORMAT = 2
 HEADER = "coopenv_checkpoint"
 Arrays = dict[str, np.ndarray]
 
@@ -74,7 +74,8 @@ def read(path: Path) -> Checkpoint:
         if header["format"] != FORMAT:
             raise CoopenvError(f"{path}: a checkpoint of format {header['format']}, expected {FORMAT}")
         plan = Plan.of_document(header["plan"])
-        progress = {"steps": int(header["progress"]["steps"]), "seconds": float(header["progress"]["seconds"])}
+        told = header["progress"]
+        progress = {"steps": int(told["steps"]), **{name: float(told[name]) for name in ("seconds", "cpu_seconds")}}
         return Checkpoint(path, plan, header["scenario"], progress, header["curve"], arrays)
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, CoopenvError):

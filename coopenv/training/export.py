@@ -117,6 +117,7 @@ def _card(trainer: Trainer, results: Sequence[Result], digest: str) -> str:
         **({"arm": plan.arm} if plan.arm else {}),
         "steps": trainer.status.steps,
         "minutes": round(trainer.status.seconds / 60.0, 2),
+        "cpu_minutes": round(trainer.cpu_seconds / 60.0, 2),
         "versions": {"coopenv": version(), "python": platform.python_version(), **_versions()},
     }
     document["results"] = _with_rows({"figures": _figures(results)}, "figures")

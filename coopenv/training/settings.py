@@ -31,7 +31,7 @@ class Ppo(Part):
     """Passes over each rollout."""
     learning_rate: Positive = 1e-3
     """Of Adam at the start; falls linearly to zero."""
-    gamma: Share = 0.995
+    gamma: Share = 0.99
     """Discount per decision."""
     gae_lambda: Probability = 0.95
     """Of the generalised advantage estimate (Schulman et al. 2016)."""

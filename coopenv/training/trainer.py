@@ -1,7 +1,7 @@
 """One training: the batch, Stable-Baselines3's PPO on it, and how far it is. Needs the extra `train`."""
 
 import math
-from time import monotonic
+from time import monotonic, process_time
 from typing import Any
 
 import torch
@@ -45,7 +45,7 @@ class Trainer:
         self.batch = CooperativeSB3VecEnv(rows)
         self.env = NormalisedEnv(self.batch, ppo.observation_clip, ppo.reward_scale)
         self._rollout = ppo.decisions * self.env.num_envs
-        self._share, self._seconds = 0.0, 0.0
+        self._share, self._seconds, self.cpu_seconds = 0.0, 0.0, 0.0
         widths = list(ppo.hidden)
         self.model = PPO(
             "MlpPolicy",
@@ -87,10 +87,11 @@ class Trainer:
 
     def update(self) -> Status:
         """Collect one rollout and learn from it."""
-        begin = monotonic()
+        begin, cpu_begin = monotonic(), process_time()
         self._share = self._spent()
         self.model.learn(self._rollout, callback=self._watch, reset_num_timesteps=False)
         self._seconds += monotonic() - begin
+        self.cpu_seconds += process_time() - cpu_begin
         return self.status
 
     @property
@@ -104,11 +105,11 @@ class Trainer:
 
     def progress(self) -> dict[str, Any]:
         """Return how far it is as plain data, for `continue_at`."""
-        return {"steps": self.model.num_timesteps, "seconds": self._seconds}
+        return {"steps": self.model.num_timesteps, "seconds": self._seconds, "cpu_seconds": self.cpu_seconds}
 
-    def continue_at(self, steps: int, seconds: float) -> None:
+    def continue_at(self, steps: int, seconds: float, cpu_seconds: float) -> None:
         """Count on from there."""
-        self.model.num_timesteps, self._seconds = steps, seconds
+        self.model.num_timesteps, self._seconds, self.cpu_seconds = steps, seconds, cpu_seconds
 
     def record(self, figures: dict[str, float]) -> None:
         """Write figures of the mean action on held-out maps for TensorBoard."""

@@ -40,7 +40,7 @@ def test_defaults() -> None:
 def test_tables_and_dotted_keys_are_the_same(path: Path) -> None:
     settings = read_settings(path)
     assert settings.scenario == {"reward.weights.position_error": 0.1, "rates.decision": 5.0}
-    assert (settings.ppo.vehicles, settings.ppo.gamma) == (8, 0.995)
+    assert (settings.ppo.vehicles, settings.ppo.gamma) == (8, 0.99)
 
 
 def test_an_arm_changes_what_it_names(path: Path) -> None:

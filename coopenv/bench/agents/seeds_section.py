@@ -14,10 +14,14 @@ def seeds_section(study: dict[str, Any]) -> list[str]:
     lines = [f"| on the same worlds | {' | '.join(headings)} | trained |", "|---" * (len(headings) + 2) + "|"]
     for seed, entry in study["seeds"].items():
         best = " (best)" if int(seed) == study["best"] else ""
-        minutes = f"{entry['runs']['steps'] / 1e6:.1f} M steps, {entry['runs']['minutes']:.1f} min"
+        minutes = f"{entry['runs']['steps'] / 1e6:.1f} M steps, {entry['runs']['cpu_minutes']:.1f} min"
         lines.append(_row(f"seed {seed}{best}", entry["results"], minutes))
     lines += [_row(name, figures, "") for name, figures in study["beside"].items()]
-    lines += ["", "The best is the one with the highest return by its own reward, in worlds that are not these.", ""]
+    lines += [
+        "",
+        "Minutes are of one core. The best has the highest return by its own reward, in worlds that are not these.",
+        "",
+    ]
     for name, changes in study["against"].items():
         told = ", ".join(f"{word} {_change(changes[metric])}" for metric, word in CHANGES.items())
         lines.append(f"- Best against `{name}`: {told}.")

@@ -91,7 +91,8 @@ def _trained(place: Path) -> dict[str, Any]:
     """Return what an agent's folder says of its training."""
     document = tomllib.loads((place / AGENT_FILE).read_text(encoding="utf-8"))
     training = document["training"]
-    return {"sha256": document["network"]["sha256"], **{key: training[key] for key in ("steps", "minutes", "command")}}
+    told = {key: training[key] for key in ("steps", "cpu_minutes", "command")}
+    return {"sha256": document["network"]["sha256"], **told}
 
 
 def _write_agent(place: Path, best: str, group: Group, seeds: Sequence[int]) -> str:

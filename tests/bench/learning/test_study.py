@@ -45,7 +45,7 @@ def test_arms_differ_in_what_they_say(study: Study) -> None:
     assert (plain.environment, plain.arm, plain.seed) == ("facade", "plain", 7)
     assert plain.all_overrides == {"reward.weights.position_uncertainty": 0.0}
     quality = study.plan(Run(Group("facade", "quality"), 7))
-    assert (plain.settings.ppo.gamma, quality.settings.ppo.gamma) == (0.9, 0.995)
+    assert (plain.settings.ppo.gamma, quality.settings.ppo.gamma) == (0.9, 0.99)
     assert quality.settings.steps == plain.settings.steps == 1000
 
 
