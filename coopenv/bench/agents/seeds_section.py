@@ -23,7 +23,7 @@ def seeds_section(study: dict[str, Any]) -> list[str]:
         "",
     ]
     for name, changes in study["against"].items():
-        told = ", ".join(f"{word} {_change(changes[metric])}" for metric, word in CHANGES.items())
+        told = ", ".join(f"{word} {percent(changes[metric])}" for metric, word in CHANGES.items())
         lines.append(f"- Best against `{name}`: {told}.")
     lines.append(f"- {_spread(study)}")
     return lines
@@ -37,7 +37,8 @@ def _row(name: str, figures: dict[str, Any], trained: str) -> str:
     return f"| {name} | {' | '.join(cells)} | {trained} |"
 
 
-def _change(change: dict[str, float]) -> str:
+def percent(change: dict[str, float]) -> str:
+    """Return a relative difference and its interval, in percent."""
     mean, low, high = shown(*(100.0 * change[key] for key in ("relative", "ci_low", "ci_high")))
     return f"{mean if mean.startswith('-') else '+' + mean} [{low}, {high}] %"
 

@@ -17,7 +17,7 @@ from coopenv.jsonable import json_text
 from coopenv.policies.loader import AGENT_FILE
 from coopenv.shipped import version
 
-BASELINES = ("route_follower", "peek")
+BASELINES = ("route_follower", "peek", "look_ahead")
 COMPARED = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m")
 
 
@@ -111,8 +111,10 @@ def _figures(results: Sequence[Result]) -> dict[str, dict[str, float]]:
 
 
 def _changes(differences: Sequence[Difference]) -> dict[str, dict[str, float]]:
-    return {
-        d.metric: {"relative": d.relative, "ci_low": d.relative_ci_low, "ci_high": d.relative_ci_high}
-        for d in differences
-        if d.metric in COMPARED
-    }
+    return {d.metric: relative(d) for d in differences if d.metric in COMPARED}
+
+
+def relative(difference: Difference) -> dict[str, float]:
+    """Return a difference as a share of the other one's figure."""
+    ends = {"ci_low": difference.relative_ci_low, "ci_high": difference.relative_ci_high}
+    return {"relative": difference.relative, **ends}

@@ -9,7 +9,7 @@ from rich.table import Table
 from coopenv.bench.agents import cards as agents_cards
 from coopenv.bench.agents.table import cell
 from coopenv.bench.executors import Local
-from coopenv.bench.learning import cards
+from coopenv.bench.learning import cards, overview
 from coopenv.bench.learning.judge import Judge
 from coopenv.bench.learning.study import Study
 from coopenv.bench.learning.work import perform, tasks
@@ -50,8 +50,11 @@ def run(study: Study, part: Study, folder: Path, logs: Path, jobs: int, worlds: 
     folder.mkdir(parents=True, exist_ok=True)
 
     def judge_finished() -> None:
-        for group in cards.stale_groups(study, folder):
+        stale = cards.stale_groups(study, folder)
+        for group in stale:
             cards.write(study, group, folder, judge)
+        if stale or not (folder / overview.PAGE_FILE).exists():
+            overview.write(study, folder, judge)
 
     with Progress(
         log, f"{total - len(missing)} of {total} trainings were done", total=len(missing) or None

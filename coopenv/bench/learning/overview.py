@@ -1,0 +1,80 @@
+"""The page that lays the agents of a study side by side: `README.md` in their folder."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from coopenv.bench.agents import cards
+from coopenv.bench.agents.seeds_section import percent
+from coopenv.bench.agents.table import cell
+from coopenv.bench.learning.cards import relative
+from coopenv.bench.learning.judge import Judge
+from coopenv.bench.learning.study import Group, Study
+from coopenv.evaluation import Difference
+from coopenv.files import replace_text
+
+PAGE_FILE = "README.md"
+BASE_ARM = "plain"
+"""The arm that others are compared with."""
+COLUMNS = {
+    "arrival_rate": ("arrived [%]", 100.0),
+    "collision_rate": ("collided [%]", 100.0),
+    "travel_time_s": ("travel [s]", 1.0),
+    "e50_m": ("e50 [cm]", 100.0),
+    "e95_m": ("e95 [cm]", 100.0),
+}
+INTRODUCTION = """# Agents
+
+One folder per driver, each with a card; [docs/agents.md](../docs/agents.md) tells of the scripted ones.
+The learned ones are those of `study.toml`, their settings and arms those of `train.toml`. `make agents` trains
+them and writes this page. Of each agent the best of its seeds, by the reward that it learnt from, in worlds that
+are not these.
+"""
+LEGEND = """With 95 % intervals over {worlds} held-out worlds, the same for all; e50 and e95 of the position error of
+vehicles under way, from 3 s on; e95 of seeds in their order."""
+
+
+def write(study: Study, folder: Path, judge: Judge) -> None:
+    """Write the page of all agents that have a card."""
+    parts = [INTRODUCTION]
+    for environment in study.environments:
+        groups = [group for group in study.groups if group.environment == environment]
+        found = {group: card for group in groups if "study" in (card := cards.read(folder / group.name))}
+        if found:
+            parts.append(_section(environment, found, folder, judge))
+    replace_text(folder / PAGE_FILE, "\n".join(parts))
+
+
+def _section(environment: str, found: dict[Group, dict[str, Any]], folder: Path, judge: Judge) -> str:
+    headings = " | ".join(heading for heading, _ in COLUMNS.values())
+    lines = [f"## {environment}", "", f"| agent | {headings} | e95 of seeds [cm] |", "|---" * (len(COLUMNS) + 2) + "|"]
+    newest = list(found.values())[-1]
+    for name, figures in newest["study"]["beside"].items():
+        lines.append(_row(name, figures, ""))
+    for group, card in found.items():
+        seeds = card["study"]["seeds"].values()
+        errors = ", ".join(f"{100 * entry['results']['e95_m']['mean']:.1f}" for entry in seeds)
+        results = card["environments"][environment]["results"]
+        lines.append(_row(f"[`{group.name}`]({group.name}/card.md)", results, errors))
+    lines += ["", LEGEND.format(worlds=newest["environments"][environment]["worlds"]), ""]
+    for group, card in found.items():
+        told = [f"{name} {percent(changes['e95_m'])}" for name, changes in card["study"]["against"].items()]
+        lines.append(f"- `{group.name}`: e95 against {', '.join(told)}.")
+    base = next((group for group in found if group.arm == BASE_ARM), None)
+    for group in found:
+        if base is not None and group != base:
+            best, bases = (folder / g.name / f"seed_{found[g]['study']['best']}" for g in (group, base))
+            differences = judge.against(environment, best, bases)
+            lines.append(f"- `{group.name}` against `{base.name}`: {_told(differences)}.")
+    return "\n".join([*lines, ""])
+
+
+def _row(name: str, figures: dict[str, Any], errors: str) -> str:
+    cells = [cell(figures[metric], factor) for metric, (_, factor) in COLUMNS.items()]
+    return f"| {name} | {' | '.join(cells)} | {errors} |"
+
+
+def _told(differences: Sequence[Difference]) -> str:
+    words = {"e50_m": "e50", "e95_m": "e95", "travel_time_s": "travel time"}
+    found = {d.metric: d for d in differences}
+    return ", ".join(f"{word} {percent(relative(found[metric]))}" for metric, word in words.items())
