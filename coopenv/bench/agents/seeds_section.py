@@ -25,7 +25,8 @@ def seeds_section(study: dict[str, Any]) -> list[str]:
     for name, changes in study["against"].items():
         told = ", ".join(f"{word} {percent(changes[metric])}" for metric, word in CHANGES.items())
         lines.append(f"- Best against `{name}`: {told}.")
-    lines.append(f"- {_spread(study)}")
+    command = study["seeds"][str(study["best"])]["runs"]["command"]
+    lines += [f"- {_spread(study)}", "", "Trained with, in this folder,", "", f"    {command}"]
     return lines
 
 

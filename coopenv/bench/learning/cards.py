@@ -16,6 +16,7 @@ from coopenv.files import replace_text
 from coopenv.jsonable import json_text
 from coopenv.policies.loader import AGENT_FILE
 from coopenv.shipped import version
+from coopenv.training.settings import SETTINGS_FILE
 
 BASELINES = ("route_follower", "peek", "look_ahead")
 COMPARED = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m")
@@ -96,13 +97,14 @@ def _trained(place: Path) -> dict[str, Any]:
 
 
 def _write_agent(place: Path, best: str, group: Group, seeds: Sequence[int]) -> str:
-    """Write the agent that drives as one seed of it does, and return its description."""
+    """Write the agent that drives as one seed of it does, with its settings, and return its description."""
     document = tomlkit.parse((place / best / AGENT_FILE).read_text(encoding="utf-8"))
     names = ", ".join(map(str, seeds))
     description = f"PPO in {group.environment}, arm {group.arm}: {best.replace('_', ' ')}, the best of {names}."
     document["title"], document["description"] = f"{group.environment}, {group.arm}", description
     document["network"]["weights"] = f"{best}/{document['network']['weights']}"
     replace_text(place / AGENT_FILE, tomlkit.dumps(document))
+    replace_text(place / SETTINGS_FILE, (place / best / SETTINGS_FILE).read_text(encoding="utf-8"))
     return description
 
 

@@ -14,6 +14,7 @@ pytest.importorskip("tensorboard", reason="needs the extra 'train'")
 
 import coopenv
 from coopenv.policies import find_agent, load_agent
+from coopenv.training.settings import read_settings
 from tests.helpers.processes import COOPENV, start, wait_until
 
 pytestmark = [pytest.mark.train, pytest.mark.slow]
@@ -30,6 +31,7 @@ every = 800
 worlds = 2
 final_worlds = 4
 [arms.quality]
+scenario.reward.weights.position_uncertainty = 2.0
 [arms.plain]
 scenario.reward.weights.position_uncertainty = 0.0
 """
@@ -62,6 +64,11 @@ def test_interrupted_goes_on_and_leaves_every_agent_with_its_card(tmp_path: Path
         agent = find_agent(folder)
         assert (agent.name, agent.kind, agent.environments) == (folder.name, "learned", ("open_square",))
         load_agent(folder, coopenv.load_scenario("open_square"))
+        again = read_settings(folder / "train.toml")
+        assert again.scenario["reward.weights.position_uncertainty"] == (0.0 if arm == "plain" else 2.0)
+        assert f"--seed {study['best']}" in (folder / "card.md").read_text()
+    page = (tmp_path / "README.md").read_text()
+    assert page.count("## open_square") == 1 and "`open_square_quality` against `open_square_plain`: e50" in page
 
 
 def test_settings_of_another_training_are_not_gone_on_with(tmp_path: Path) -> None:
