@@ -18,13 +18,6 @@ from coopenv.runs.table import number_table
 
 WIDTH = 100
 """Characters that the table is wide where no terminal says otherwise."""
-SHOWN = {
-    "arrival_rate": ("arrived\n[%]", 100.0),
-    "collision_rate": ("collided\n[%]", 100.0),
-    "travel_time_s": ("travel\n[s]", 1.0),
-    "e50_m": ("e50\n[cm]", 100.0),
-    "e95_m": ("e95\n[cm]", 100.0),
-}
 
 
 def run(study: Study, part: Study, folder: Path, logs: Path, jobs: int, worlds: int, log: Console) -> None:
@@ -75,7 +68,9 @@ def _reporter(judge_finished: Callable[[], None], progress: Progress, before: in
 
 def results_table(study: Study, folder: Path) -> Table:
     """Return one row per agent: the figures of its best seed, and how its seeds differ."""
-    table = number_table(("agent", "seeds"), [*(heading for heading, _ in SHOWN.values()), "e95 of\nseeds [cm]"], gap=0)
+    table = number_table(
+        ("agent", "seeds"), [*(heading for heading, _ in overview.COLUMNS.values()), "e95 of\nseeds [cm]"], gap=0
+    )
     for group in study.groups:
         card = agents_cards.read(folder / group.name)
         if "study" not in card:
@@ -83,6 +78,8 @@ def results_table(study: Study, folder: Path) -> Table:
         seeds = card["study"]["seeds"]
         results = card["environments"][group.environment]["results"]
         errors = " ".join(f"{100 * entry['results']['e95_m']['mean']:.0f}" for entry in seeds.values())
-        figures = [cell(results[metric], factor).replace(" ", "\n", 1) for metric, (_, factor) in SHOWN.items()]
+        figures = [
+            cell(results[metric], factor).replace(" ", "\n", 1) for metric, (_, factor) in overview.COLUMNS.items()
+        ]
         table.add_row(group.name, str(len(seeds)), *figures, errors)
     return table

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from coopenv.bench.agents import cards
+from coopenv.bench.agents import cards, table
 from coopenv.bench.agents.seeds_section import percent
 from coopenv.bench.agents.table import cell
 from coopenv.bench.learning.cards import relative
@@ -16,13 +16,9 @@ from coopenv.files import replace_text
 PAGE_FILE = "README.md"
 BASE_ARM = "plain"
 """The arm that others are compared with."""
-COLUMNS = {
-    "arrival_rate": ("arrived [%]", 100.0),
-    "collision_rate": ("collided [%]", 100.0),
-    "travel_time_s": ("travel [s]", 1.0),
-    "e50_m": ("e50 [cm]", 100.0),
-    "e95_m": ("e95 [cm]", 100.0),
-}
+FIGURES = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m")
+COLUMNS = {metric: table.COLUMNS[metric] for metric in FIGURES}
+"""Metric, its heading, and the factor to the heading's unit."""
 INTRODUCTION = """# Agents
 
 One folder per driver, each with a card; [docs/agents.md](../docs/agents.md) tells of the scripted ones.
@@ -46,7 +42,7 @@ def write(study: Study, folder: Path, judge: Judge) -> None:
 
 
 def _section(environment: str, found: dict[Group, dict[str, Any]], folder: Path, judge: Judge) -> str:
-    headings = " | ".join(heading for heading, _ in COLUMNS.values())
+    headings = " | ".join(heading.replace("\n", " ") for heading, _ in COLUMNS.values())
     lines = [f"## {environment}", "", f"| agent | {headings} | e95 of seeds [cm] |", "|---" * (len(COLUMNS) + 2) + "|"]
     newest = list(found.values())[-1]
     for name, figures in newest["study"]["beside"].items():
