@@ -112,7 +112,7 @@ def bench_learning(
     chosen, folder = whole.only(words), out or study.parent
     with options.warned():
         for group in chosen.groups:
-            options.load(group.environment, chosen.settings[group.arm].scenario)
+            options.load(group.environment, chosen.settings[group].scenario)
     command.run(whole, chosen, folder, logs, jobs or available_cores(), worlds, log)
     printed = options.console()
     if not printed.is_terminal:

@@ -67,7 +67,7 @@ def train(
         if plan.environment != environment:
             raise CoopenvError(f"{folder} holds a training of {plan.environment}, not of {environment}")
     else:
-        chosen = _settings(agent, settings, arm, steps, minutes)
+        chosen = _settings(environment, agent, settings, arm, steps, minutes)
         plan = Plan(environment, chosen, seed or 0, arm, options.parse_overrides(overrides))
     log = options.console(stderr=True)
     with options.warned():
@@ -85,7 +85,14 @@ def train(
     options.console().print(f"Agent in {folder}: coopenv run {environment} --policy {folder}", soft_wrap=True)
 
 
-def _settings(agent: str | None, path: Path | None, arm: str | None, steps: int | None, minutes: float | None) -> Any:
+def _settings(
+    environment: str,
+    agent: str | None,
+    path: Path | None,
+    arm: str | None,
+    steps: int | None,
+    minutes: float | None,
+) -> Any:
     from coopenv.policies import find_agent
     from coopenv.training.settings import SETTINGS_FILE, read_settings
 
@@ -96,7 +103,7 @@ def _settings(agent: str | None, path: Path | None, arm: str | None, steps: int 
         if folder is None or not (folder / SETTINGS_FILE).is_file():
             raise CoopenvError(f"--agent {agent}: there is no {SETTINGS_FILE} beside it, so it was not learnt")
         path = folder / SETTINGS_FILE
-    return read_settings(path, arm, steps=steps, minutes=minutes)
+    return read_settings(path, arm, Path(environment).stem, steps=steps, minutes=minutes)
 
 
 def _told(results: list[Any]) -> str:

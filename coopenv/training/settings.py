@@ -139,12 +139,16 @@ class Plan:
             raise CoopenvError(f"not the plan of a training: {type(error).__name__}") from None
 
 
-def read_settings(path: Path | None, arm: str | None = None, **changes: Any) -> Settings:
+def read_settings(
+    path: Path | None, arm: str | None = None, environment: str | None = None, **changes: Any
+) -> Settings:
     """Read settings, None for all defaults.
 
     Args:
-        path: a TOML file with the keys of `Settings`, and under `arms` tables of the same keys by name.
+        path: a TOML file with the keys of `Settings`; under `environments` and `arms` tables of the same keys by name.
         arm: the table under `arms` whose values go before the others.
+        environment: name of the one that is trained in; the table under `environments`, if there is one, goes before
+            what is for all.
         **changes: values that go before those of the file, where they are not None.
 
     Raises:
@@ -152,15 +156,15 @@ def read_settings(path: Path | None, arm: str | None = None, **changes: Any) -> 
     """
     where, raw = (str(path), _read(path)) if path is not None else ("settings", {})
     raw["scenario"] = _flat(raw.get("scenario", {}), where)
-    arms = raw.pop("arms", {})
-    if not isinstance(arms, dict) or not all(isinstance(table, dict) for table in arms.values()):
-        raise CoopenvError(f"{where}: arms: expected tables by name")
-    if arm is not None:
-        if arm not in arms:
-            known = f"{suggest(arm, arms)}; known: {', '.join(arms) or 'none'}"
-            raise CoopenvError(f"{where}: no arm '{arm}'{known}")
-        chosen = {**arms[arm], "scenario": _flat(arms[arm].get("scenario", {}), f"{where}: arms.{arm}")}
-        raw = _merged(raw, chosen)
+    tables = {kind: _tables(raw.pop(kind, {}), f"{where}: {kind}") for kind in ("environments", "arms")}
+    if arm is not None and arm not in tables["arms"]:
+        known = f"{suggest(arm, tables['arms'])}; known: {', '.join(tables['arms']) or 'none'}"
+        raise CoopenvError(f"{where}: no arm '{arm}'{known}")
+    for kind, name in (("environments", environment), ("arms", arm)):
+        if name in tables[kind]:
+            chosen = tables[kind][name]
+            flat = _flat(chosen.get("scenario", {}), f"{where}: {kind}.{name}")
+            raw = _merged(raw, {**chosen, "scenario": flat})
     raw.update({name: value for name, value in changes.items() if value is not None})
     if "steps" in raw and "minutes" in raw:
         raise CoopenvError(f"{where}: steps and minutes: give one of them")
@@ -177,6 +181,12 @@ def _read(path: Path) -> dict[str, Any]:
         raise CoopenvError(f"{path}: not valid TOML: {error}") from None
     except OSError as error:
         raise CoopenvError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def _tables(tables: Any, where: str) -> dict[str, dict[str, Any]]:
+    if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
+        raise CoopenvError(f"{where}: expected tables by name")
+    return tables
 
 
 def _flat(tables: Any, where: str) -> dict[str, Any]:

@@ -16,6 +16,9 @@ reward.weights.position_error = 0.1
 "rates.decision" = 5.0
 [ppo]
 vehicles = 8
+[environments.open_square]
+scenario.reward.weights.position_error = 0.2
+ppo = { gamma = 0.8 }
 [arms.blind]
 steps = 2000
 scenario = { camera.range = 0.5, "reward.weights.position_error" = 0.0 }
@@ -51,6 +54,13 @@ def test_an_arm_changes_what_it_names(path: Path) -> None:
         "camera.range": 0.5,
     }
     assert (settings.steps, settings.ppo.vehicles, settings.ppo.gamma) == (2000, 8, 0.9)
+
+
+def test_an_environment_goes_before_all_and_an_arm_before_it(path: Path) -> None:
+    here, blind = (read_settings(path, arm, "open_square") for arm in (None, "blind"))
+    assert (here.scenario["reward.weights.position_error"], here.ppo.gamma, here.steps) == (0.2, 0.8, 1000)
+    assert (blind.scenario["reward.weights.position_error"], blind.ppo.gamma, blind.steps) == (0.0, 0.9, 2000)
+    assert read_settings(path, None, "facade") == read_settings(path)
 
 
 def test_the_command_line_goes_before_the_file(path: Path) -> None:

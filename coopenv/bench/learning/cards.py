@@ -33,7 +33,7 @@ def write(study: Study, group: Group, folder: Path, judge: Judge) -> None:
     Which seed is the best is decided by the return that it learnt from, in held-out worlds of their own.
     """
     runs = {seed: Run(group, seed) for seed in _finished(study, group, folder)}
-    overrides, place = study.settings[group.arm].scenario, folder / group.name
+    overrides, place = study.settings[group].scenario, folder / group.name
     merits = {seed: judge.merit(group.environment, folder / run.folder, overrides) for seed, run in runs.items()}
     best = max(merits, key=lambda seed: merits[seed])
     results = {seed: judge.results(group.environment, folder / run.folder) for seed, run in runs.items()}

@@ -55,15 +55,19 @@ class Run(NamedTuple):
 class Study:
     """What is to be trained."""
 
-    environments: tuple[str, ...]
+    settings: dict[Group, Settings]
+    """Of every agent, by environment and then by arm."""
     seeds: tuple[int, ...]
-    settings: dict[str, Settings]
-    """By arm."""
 
     @property
     def groups(self) -> list[Group]:
         """All agents, by environment."""
-        return [Group(environment, arm) for environment in self.environments for arm in self.settings]
+        return list(self.settings)
+
+    @property
+    def environments(self) -> list[str]:
+        """In their order."""
+        return list(dict.fromkeys(group.environment for group in self.settings))
 
     @property
     def runs(self) -> Iterator[Run]:
@@ -72,7 +76,7 @@ class Study:
 
     def plan(self, run: Run) -> Plan:
         """Return what exactly a run trains."""
-        return Plan(run.group.environment, self.settings[run.group.arm], run.seed, run.group.arm)
+        return Plan(run.group.environment, self.settings[run.group], run.seed, run.group.arm)
 
     def only(self, words: Sequence[str]) -> "Study":
         """Return the part of the study that names of environments and arms and numbers of seeds choose.
@@ -80,17 +84,16 @@ class Study:
         Raises:
             CoopenvError: it has nothing of such a name.
         """
+        environments, arms = ({*names} for names in zip(*self.settings, strict=True))
         seeds = {str(seed): seed for seed in self.seeds}
-        known = (*self.environments, *self.settings, *seeds)
+        known = (*environments, *arms, *seeds)
         for word in words:
             if word not in known:
-                raise CoopenvError(
-                    f"--only: the study has no '{word}'{suggest(word, known)}; known: {', '.join(known)}"
-                )
-        environments = tuple(name for name in self.environments if name in words) or self.environments
-        arms = [arm for arm in self.settings if arm in words] or list(self.settings)
-        chosen = tuple(seed for text, seed in seeds.items() if text in words) or self.seeds
-        return Study(environments, chosen, {arm: self.settings[arm] for arm in arms})
+                told = f"{suggest(word, known)}; known: {', '.join(sorted(known))}"
+                raise CoopenvError(f"--only: the study has no '{word}'{told}")
+        chosen = [{*words} & {*names} or {*names} for names in (environments, arms, seeds)]
+        kept = {g: s for g, s in self.settings.items() if g.environment in chosen[0] and g.arm in chosen[1]}
+        return Study(kept, tuple(seed for text, seed in seeds.items() if text in chosen[2]))
 
 
 def read_study(path: Path) -> Study:
@@ -108,5 +111,6 @@ def read_study(path: Path) -> Study:
         raise CoopenvError(f"{path}: cannot be read: {error.strerror or error}") from None
     except ValidationError as error:
         raise CoopenvError(one_line(error, str(path), StudyFile)) from None
-    settings = {arm: read_settings(path.parent / file.settings, arm) for arm in file.arms}
-    return Study(file.environments, file.seeds, settings)
+    groups = [Group(environment, arm) for environment in file.environments for arm in file.arms]
+    settings = {group: read_settings(path.parent / file.settings, group.arm, group.environment) for group in groups}
+    return Study(settings, file.seeds)
