@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import eigen_symmetric6, symmetric_part
+from coopenv.estimation.linalg import block3, cholesky6, eigen_symmetric6, join6, symmetric_part
 from coopenv.estimation.so3 import (
     exp_so3,
     orthonormalise,
@@ -78,6 +78,21 @@ def recentring(error: Any):
 
 
 @wp.func
+def recentred(left: Any, P: Any, right: Any):
+    """Return left P right^T for two matrices that are zero but for their blocks of 3x3 on the diagonal."""
+    A = block3(left, 0, 0)
+    D = block3(left, 3, 3)
+    At = wp.transpose(block3(right, 0, 0))
+    Dt = wp.transpose(block3(right, 3, 3))
+    result = mat66d()
+    result[:3, :3] = A * block3(P, 0, 0) * At
+    result[:3, 3:] = A * block3(P, 0, 3) * Dt
+    result[3:, :3] = D * block3(P, 3, 0) * At
+    result[3:, 3:] = D * block3(P, 3, 3) * Dt
+    return result
+
+
+@wp.func
 def moved(pose: Pose, step: Pose):
     """Return a pose after an increment of odometry."""
     return Pose(orthonormalise(pose.R * step.R), pose.p + pose.R * step.p)
@@ -105,6 +120,25 @@ def transition(step: Pose):
     """Return F of the left error over an increment of odometry."""
     E = wp.transpose(step.R)
     return lower_blocks(E, -E * skew(step.p), E)
+
+
+@wp.func
+def sheared(P: Any, S: Any):
+    """Return T P T^T for a symmetric 6x6 matrix P and T = [[I, 0], [S, I]]."""
+    SA = S * block3(P, 0, 0)
+    SB = S * block3(P, 0, 3)
+    B = block3(P, 0, 3) + wp.transpose(SA)
+    D = block3(P, 3, 3) + SB + wp.transpose(SB) + SA * wp.transpose(S)
+    return join6(block3(P, 0, 0), B, wp.transpose(B), D)
+
+
+@wp.func
+def propagated(P: Any, step: Pose):
+    """Return F P F^T for a symmetric 6x6 matrix P, see `transition`."""
+    M = sheared(P, -skew(step.p))
+    E = wp.transpose(step.R)
+    B = E * block3(M, 0, 3) * step.R
+    return join6(E * block3(M, 0, 0) * step.R, B, wp.transpose(B), E * block3(M, 3, 3) * step.R)
 
 
 @wp.func
@@ -138,8 +172,7 @@ def with_noise(P: Any, noise: Any):
 @wp.func
 def carried(estimate: Estimate, step: Pose, noise: Any):
     """Return an estimate after an increment of odometry with noise."""
-    F = transition(step)
-    return Estimate(moved(estimate.pose, step), with_noise(F * estimate.P * wp.transpose(F), noise))
+    return Estimate(moved(estimate.pose, step), with_noise(propagated(estimate.P, step), noise))
 
 
 @wp.func
@@ -160,35 +193,21 @@ def is_regular(M: Any, least: Any):
 
 
 @wp.func
+def inverse_factor(A: Any):
+    """Return the inverse of the Cholesky factor of a positive definite 6x6 matrix; not numbers where it is not one."""
+    _, L21, _, I11, I22 = cholesky6(block3(A, 0, 0), block3(A, 0, 3), block3(A, 3, 3))
+    return lower_blocks(I11, -(I22 * L21 * I11), I22)
+
+
+@wp.func
 def inverse6(A: Any):
-    """Return the inverse of a 6x6 matrix, by Gauss-Jordan elimination with partial pivoting."""
-    M = A
-    X = wp.identity(6, wp.float64)
-    for k in range(6):
-        best = int(k)
-        for i in range(k + 1, 6):
-            if wp.abs(M[i, k]) > wp.abs(M[best, k]):
-                best = i
-        if best != k:
-            row = M[k]
-            M[k] = M[best]
-            M[best] = row
-            row = X[k]
-            X[k] = X[best]
-            X[best] = row
-        scale = wp.float64(1.0) / M[k, k]
-        M[k] = M[k] * scale
-        X[k] = X[k] * scale
-        for i in range(6):
-            if i != k:
-                factor = M[i, k]
-                M[i] = M[i] - factor * M[k]
-                X[i] = X[i] - factor * X[k]
-    return X
+    """Return the inverse of a positive definite 6x6 matrix; not numbers where it is not one."""
+    X = inverse_factor(A)
+    return wp.transpose(X) * X
 
 
 @wp.func
 def distance_squared(a: Estimate, b: Estimate):
     """Return the squared distance of two independent estimates, in standard deviations."""
     e = left_error(a.pose, b.pose)
-    return wp.dot(e, inverse6(a.P + b.P) * e)
+    return wp.length_sq(inverse_factor(a.P + b.P) * e)

@@ -10,7 +10,16 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.linalg import block3, cholesky6, symmetric_part
-from coopenv.observers.robust.algebra import displaced, lower_blocks, moved, recentring, transition, with_noise
+from coopenv.observers.robust.algebra import (
+    displaced,
+    lower_blocks,
+    moved,
+    propagated,
+    recentred,
+    recentring,
+    transition,
+    with_noise,
+)
 from coopenv.observers.robust.constants import FORGET_TIME, MAX_GROWTH, SAME_TIME
 from coopenv.observers.robust.memory import ERRORS, Estimate, Member, Pose, mat66d
 from coopenv.world.camera import VISIBLE
@@ -56,7 +65,7 @@ def propagate(memory: Any, world: int, i: int, n: int, step: Pose, noise: Any):
             block = F * memory.P[world, i, n, k]
             memory.P[world, i, n, k] = block
             memory.P[world, i, k, n] = wp.transpose(block)
-    memory.P[world, i, n, n] = with_noise(F * memory.P[world, i, n, n] * wp.transpose(F), noise)
+    memory.P[world, i, n, n] = with_noise(propagated(memory.P[world, i, n, n], step), noise)
 
 
 @wp.func
@@ -79,7 +88,7 @@ def apply_corrections(memory: Any, world: int, i: int):
             memory.member[world, i, k].v = memory.member[world, i, k].v + correction[3:]
         memory.scratch[world, k].recentring = G
         for j in range(k + 1):
-            block = G * memory.P[world, i, k, j] * wp.transpose(memory.scratch[world, j].recentring)
+            block = recentred(G, memory.P[world, i, k, j], memory.scratch[world, j].recentring)
             if k == j:
                 block = symmetric_part(block)
             memory.P[world, i, k, j] = block

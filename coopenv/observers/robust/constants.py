@@ -42,6 +42,8 @@ ANCHOR_ANGLE_VARIANCE, ANCHOR_POSITION_VARIANCE = 0.05**2, 0.5**2
 
 # Messages
 
+NEWS_TIME = 0.2
+"""s between messages of a sender of which the news are fused; of those in between its odometry counts. Chosen."""
 DEPENDENT_SHARE = 0.7
 """Share that counts of the information of a sender that depends on others: some may have arrived already. Tuned."""
 MAX_VARIANCE_GROWTH = 1.01

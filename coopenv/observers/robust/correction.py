@@ -8,27 +8,15 @@ from coopenv.observers.robust.algebra import displaced, recentring
 from coopenv.observers.robust.belief import apply_corrections, subtract_block
 from coopenv.observers.robust.constants import MAX_LINEARISATIONS, RELINEARISATION_ANGLE
 from coopenv.observers.robust.measurements import linearise
-from coopenv.observers.robust.memory import vec6d
+from coopenv.observers.robust.memory import mat66d, vec6d
 
 
 @wp.func
-def store_belief(memory: Any, world: int, i: int):
-    """Store poses and covariance as they are before a correction."""
+def store_poses(memory: Any, world: int, i: int):
+    """Store poses as they are before a correction."""
     for k in range(memory.belief[world, i].members):
         memory.scratch[world, k].last_correction = vec6d()
         memory.scratch[world, k].pose = memory.member[world, i, k].pose
-        for j in range(k + 1):
-            memory.scratch_blocks[world, k, j] = memory.P[world, i, k, j]
-
-
-@wp.func
-def restore_covariance(memory: Any, world: int, i: int):
-    """Restore the covariance before a correction."""
-    for k in range(memory.belief[world, i].members):
-        for j in range(k + 1):
-            P = memory.scratch_blocks[world, k, j]
-            memory.P[world, i, k, j] = P
-            memory.P[world, i, j, k] = wp.transpose(P)
 
 
 @wp.func
@@ -50,41 +38,75 @@ def linearise_again(model: Any, memory: Any, world: int, i: int, share: Any):
 
 
 @wp.func
-def update_by_line(memory: Any, world: int, i: int, n: int):
-    """Update the covariance by a line, and the correction by what the line says beyond those before."""
-    members = memory.belief[world, i].members
-    line = memory.line[world, n]
-    for k in range(members):
-        C = memory.P[world, i, k, 0] * wp.transpose(line.jacobian)
-        if line.member > 0:
-            C = C + memory.P[world, i, k, line.member] * wp.transpose(line.member_jacobian)
-        memory.scratch[world, k].PHt = C
-    S = line.noise * wp.identity(2, wp.float64) + line.jacobian * memory.scratch[world, 0].PHt
-    own = memory.scratch[world, 0]  # where the lines were linearised, less the correction so far
-    residual = line.residual + line.jacobian * (own.last_correction - own.correction)
-    if line.member > 0:
-        theirs = memory.scratch[world, line.member]
-        S = S + line.member_jacobian * theirs.PHt
-        residual = residual + line.member_jacobian * (theirs.last_correction - theirs.correction)
-    weight = wp.inverse(S)
-    for k in range(members):
-        K = memory.scratch[world, k].PHt * weight
-        memory.scratch[world, k].correction += K * residual
-        for j in range(k + 1):
-            subtract_block(memory, world, i, k, j, K * wp.transpose(memory.scratch[world, j].PHt))
+def across_line(memory: Any, world: int, n: int, m: int):
+    """Return the covariance, 2x2, of what the n-th line measures with what is left of the m-th one's innovation."""
+    S = memory.line[world, n].jacobian * memory.gain[world, m, 0]
+    member = memory.line[world, n].member
+    if member > 0:
+        S = S + memory.line[world, n].member_jacobian * memory.gain[world, m, member]
+    return S
 
 
 @wp.func
-def update_by_lines(memory: Any, world: int, i: int, lines: int):
-    """Update the covariance by all lines that fit, and find the correction of the poses before.
+def set_gain(memory: Any, world: int, i: int, n: int):
+    """Set a line's `gain`, P H^T with the covariance that the lines before leave, and its `weight` S^-1."""
+    members = memory.belief[world, i].members
+    member = memory.line[world, n].member
+    Ht = wp.transpose(memory.line[world, n].jacobian)
+    for k in range(members):
+        memory.gain[world, n, k] = memory.P[world, i, k, 0] * Ht
+    if member > 0:
+        Ht = wp.transpose(memory.line[world, n].member_jacobian)
+        for k in range(members):
+            memory.gain[world, n, k] = memory.gain[world, n, k] + memory.P[world, i, k, member] * Ht
+    for m in range(n):
+        if memory.line[world, m].fits == 1:
+            share = memory.line[world, m].weight * wp.transpose(across_line(memory, world, n, m))
+            for k in range(members):
+                memory.gain[world, n, k] = memory.gain[world, n, k] - memory.gain[world, m, k] * share
+    S = memory.line[world, n].noise * wp.identity(2, wp.float64) + across_line(memory, world, n, n)
+    memory.line[world, n].weight = wp.inverse(S)
+
+
+@wp.func
+def error_left(memory: Any, world: int, k: int):
+    """Return where the lines were linearised, less the correction so far."""
+    return memory.scratch[world, k].last_correction - memory.scratch[world, k].correction
+
+
+@wp.func
+def correct_by_lines(memory: Any, world: int, i: int, lines: int):
+    """Find the correction of the poses before by all lines that fit; the covariance stays as it is.
 
     One line after the other, with the residual that those before have left, is the batch update.
     """
-    for k in range(memory.belief[world, i].members):
+    members = memory.belief[world, i].members
+    for k in range(members):
         memory.scratch[world, k].correction = vec6d()
     for n in range(lines):
         if memory.line[world, n].fits == 1:
-            update_by_line(memory, world, i, n)
+            set_gain(memory, world, i, n)
+            member = memory.line[world, n].member
+            residual = memory.line[world, n].residual + memory.line[world, n].jacobian * error_left(memory, world, 0)
+            if member > 0:
+                residual = residual + memory.line[world, n].member_jacobian * error_left(memory, world, member)
+            weighted = memory.line[world, n].weight * residual
+            for k in range(members):
+                correction = memory.scratch[world, k].correction + memory.gain[world, n, k] * weighted
+                memory.scratch[world, k].correction = correction
+
+
+@wp.func
+def condense(memory: Any, world: int, i: int, lines: int):
+    """Let the covariance be that after the lines that fit."""
+    for k in range(memory.belief[world, i].members):
+        for j in range(k + 1):
+            block = mat66d()
+            for n in range(lines):
+                if memory.line[world, n].fits == 1:
+                    K = memory.gain[world, n, k] * memory.line[world, n].weight
+                    block = block + K * wp.transpose(memory.gain[world, n, j])
+            subtract_block(memory, world, i, k, j, block)
 
 
 @wp.func
@@ -137,16 +159,16 @@ def iterated_update(model: Any, memory: Any, world: int, i: int):
     Control 38(2), 1993.
     """
     lines = model.target_count[i]
-    store_belief(memory, world, i)
-    update_by_lines(memory, world, i, lines)
+    store_poses(memory, world, i)
+    correct_by_lines(memory, world, i, lines)
     share = next_share(memory, world, i, lines, True)
     step = int(1)
     while share > wp.float64(0.0) and step < MAX_LINEARISATIONS:
-        restore_covariance(memory, world, i)
         linearise_again(model, memory, world, i, share)
-        update_by_lines(memory, world, i, lines)
+        correct_by_lines(memory, world, i, lines)
         share = next_share(memory, world, i, lines, False)
         step += 1
     for k in range(memory.belief[world, i].members):
         memory.member[world, i, k].pose = memory.scratch[world, k].pose
+    condense(memory, world, i, lines)
     apply_corrections(memory, world, i)

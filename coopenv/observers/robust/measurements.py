@@ -10,10 +10,11 @@ import warp as wp
 from coopenv.estimation.linalg import block3
 from coopenv.estimation.so3 import exp_so3, skew
 from coopenv.observers.contract import MIN_BEARING_STD
-from coopenv.observers.robust.algebra import odometry_noise
+from coopenv.observers.robust.algebra import between, odometry_noise
 from coopenv.observers.robust.belief import index_of
 from coopenv.observers.robust.constants import BEND_FACTOR, CORRELATION_FACTOR, MAX_ACCELERATION, MAX_SPEED
 from coopenv.observers.robust.memory import mat26d, vec3d
+from coopenv.observers.robust.odometry import increment_noise
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.v2x import fresh
 
@@ -73,17 +74,32 @@ def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, 
 
 
 @wp.func
-def set_line_to_member(model: Any, memory: Any, world: int, i: int, n: int, member: int, tick: int, b: Any):
-    """Let a bearing be to a member, which is carried on by its last twist since its last message."""
-    age = wp.float64(tick - memory.member[world, i, member].report.tick) * model.camera_period
+def set_line_to_member(
+    model: Any, memory: Any, world: int, i: int, n: int, member: int, heard: bool, tick: int, b: Any
+):
+    """Let a bearing be to a member, which has moved on since its last message that was fused.
+
+    By its odometry as far as messages tell it, and from there by its last twist.
+    """
+    stands = memory.member[world, i, member].report.tick
+    sender = memory.member[world, i, member].vehicle
     gone = vec3d()
+    turned = wp.identity(3, wp.float64)
     variance = wp.float64(0.0)
+    if heard and memory.inbox[world, i, sender].tick > stands:
+        step = between(memory.member[world, i, member].report.odometry, memory.inbox[world, i, sender].odometry)
+        gone = step.p
+        turned = step.R
+        passed = wp.float64(memory.inbox[world, i, sender].tick - stands) * model.camera_period
+        variance = increment_noise(model, memory, world, i, step, passed)[1]
+        stands = memory.inbox[world, i, sender].tick
+    age = wp.float64(tick - stands) * model.camera_period
     if age > wp.float64(0.0):
         away = wp.float64(HALF_ACCELERATION) * age * age
-        variance = odometry_noise(model, i, age)[1] + away * away
+        variance += odometry_noise(model, i, age)[1] + away * away
         if memory.member[world, i, member].has_twist == 1:
             half_turn = memory.member[world, i, member].w * (wp.float64(0.5) * age)
-            gone = exp_so3(half_turn) * memory.member[world, i, member].v * age
+            gone = gone + turned * (exp_so3(half_turn) * memory.member[world, i, member].v * age)
             variance += memory.member[world, i, member].velocity_variance * age * age
     set_line(memory, world, n, member, b, gone, variance)
 
@@ -111,7 +127,8 @@ def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
             else:
                 member = index_of(memory, world, i, sender)
                 if member > 0:
-                    set_line_to_member(model, memory, world, i, n, member, tick, b)
+                    heard = is_heard(model, state, memory, world, i, sender, tick)
+                    set_line_to_member(model, memory, world, i, n, member, heard, tick, b)
             if memory.line[world, n].member != NOTHING:
                 seen += 1
     return seen
@@ -138,12 +155,14 @@ def bend_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: An
 @wp.func
 def linearise(model: Any, memory: Any, world: int, i: int, n: int):
     """Linearise the n-th bearing, residual = H x + noise; return whether its target is ahead of the camera."""
-    line = memory.line[world, n]
+    member = memory.line[world, n].member
+    point = memory.line[world, n].point
+    bearing = memory.line[world, n].bearing
     own = memory.member[world, i, 0].pose
-    z = line.point
-    if line.member > 0:
-        theirs = memory.member[world, i, line.member].pose
-        z = theirs.p + theirs.R * line.point
+    z = point
+    if member > 0:
+        theirs = memory.member[world, i, member].pose
+        z = theirs.p + theirs.R * point
     a = wp.transpose(own.R) * (z - own.p)
     d = a - vec3d(model.camera[i].position)
     distance = wp.max(wp.length(d), wp.float64(1.0e-9))
@@ -155,17 +174,18 @@ def linearise(model: Any, memory: Any, world: int, i: int, n: int):
     H[:, 3:] = -B
     memory.line[world, n].jacobian = H
     turn = wp.identity(3, wp.float64)
-    if line.member > 0:
-        turn = wp.transpose(own.R) * memory.member[world, i, line.member].pose.R
+    if member > 0:
+        turn = wp.transpose(own.R) * memory.member[world, i, member].pose.R
         G = B * turn
-        H[:, :3] = -(G * skew(line.point))
+        H[:, :3] = -(G * skew(point))
         H[:, 3:] = G
         memory.line[world, n].member_jacobian = H
-    memory.line[world, n].residual = T * line.bearing
+    memory.line[world, n].residual = T * bearing
     memory.line[world, n].distance = distance
-    bend = bend_variance(memory, world, i, line.member, turn, u, distance)
-    memory.line[world, n].noise = bearing_variance(model, i) + line.variance / (distance * distance) + bend
-    return wp.dot(u, line.bearing) > wp.float64(0.0)
+    bend = bend_variance(memory, world, i, member, turn, u, distance)
+    place = memory.line[world, n].variance / (distance * distance)
+    memory.line[world, n].noise = bearing_variance(model, i) + place + bend
+    return wp.dot(u, bearing) > wp.float64(0.0)
 
 
 @wp.func
@@ -173,11 +193,12 @@ def innovation_squared(model: Any, memory: Any, world: int, i: int, n: int):
     """Linearise a line and return its normalised innovation squared, infinite where the target is not ahead."""
     if not linearise(model, memory, world, i, n):
         return wp.float64(wp.inf)
-    line = memory.line[world, n]
-    H = line.jacobian
-    S = line.noise * wp.identity(2, wp.float64) + H * (memory.P[world, i, 0, 0] * wp.transpose(H))
-    if line.member > 0:
-        G = line.member_jacobian
-        cross = H * (memory.P[world, i, 0, line.member] * wp.transpose(G))
-        S = S + cross + wp.transpose(cross) + G * (memory.P[world, i, line.member, line.member] * wp.transpose(G))
-    return wp.dot(line.residual, wp.inverse(S) * line.residual)
+    member = memory.line[world, n].member
+    residual = memory.line[world, n].residual
+    H = memory.line[world, n].jacobian
+    S = memory.line[world, n].noise * wp.identity(2, wp.float64) + H * (memory.P[world, i, 0, 0] * wp.transpose(H))
+    if member > 0:
+        G = memory.line[world, n].member_jacobian
+        cross = H * (memory.P[world, i, 0, member] * wp.transpose(G))
+        S = S + cross + wp.transpose(cross) + G * (memory.P[world, i, member, member] * wp.transpose(G))
+    return wp.dot(residual, wp.inverse(S) * residual)

@@ -17,6 +17,7 @@ from coopenv.world.saved_state import COVARIANCE, FLAG, LEAST_EIGENVALUE, ROTATI
 
 vec2d: Any = wp.vec2d
 vec3d: Any = wp.vec3d
+mat22d: Any = wp.mat22d
 mat33d: Any = wp.mat33d
 vec6d: Any = wp.types.vector(6, wp.float64)
 mat26d: Any = wp.types.matrix((2, 6), wp.float64)
@@ -130,6 +131,7 @@ class Line:
     noise: wp.float64  # rad^2 per axis
     distance: wp.float64  # m
     residual: vec2d  # rad
+    weight: mat22d  # 1/rad^2, inverse of the innovation's covariance
 
 
 @wp.struct
@@ -137,7 +139,6 @@ class Scratch:
     """What a correction needs of a member."""
 
     column: mat66d  # a block of the covariance
-    PHt: mat62d
     correction: vec6d
     last_correction: vec6d  # where the lines were linearised
     recentring: mat66d  # of errors about where they were linearised, then about where the member is put
@@ -158,7 +159,7 @@ class RobustMemory:
     inbox: array("WNN", Report)  # per receiver and sender
     line: array("WA", Line)
     scratch: array("WK", Scratch)
-    scratch_blocks: array("WKK", mat66d)  # before the correction
+    gain: array("WAK", mat62d)  # scratch: of a line in a member, not yet weighted, see correction.py
 
 
 ERRORS = 1  # the member that stands for the odometry's errors, where there is one, see odometry.py
@@ -176,11 +177,12 @@ def clear(model: Any, memory: Any, world: int, i: int):
         memory.scratch[world, n] = Scratch()
         for k in range(members):
             memory.P[world, i, n, k] = mat66d()
-            memory.scratch_blocks[world, n, k] = mat66d()
     for h in range(memory.hypothesis.shape[2]):
         memory.hypothesis[world, i, h] = Hypothesis()
     for n in range(model.agents):
         memory.line[world, n] = Line()
+        for k in range(members):
+            memory.gain[world, n, k] = mat62d()
 
 
 LARGE = numbers(LARGEST**3)
@@ -212,9 +214,7 @@ def rules_for(members: int) -> dict[str, Rule]:
         "member.report.valid line.fits"
     )
     ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick"
-    large = (
-        "hypothesis.cost hypothesis.prior_distance line.variance line.noise scratch.column scratch.PHt scratch_blocks"
-    )
+    large = "hypothesis.cost hypothesis.prior_distance line.variance line.noise line.weight scratch.column gain"
     rules = {
         **dict.fromkeys(flags.split(), FLAG),
         **dict.fromkeys(ticks.split(), TICK),

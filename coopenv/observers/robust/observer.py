@@ -12,7 +12,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import symmetric_part
 from coopenv.estimation.so3 import orthonormalise, skew
-from coopenv.observers.robust.algebra import distance_squared, is_known, lower_blocks, odometry_noise
+from coopenv.observers.robust.algebra import distance_squared, is_known, odometry_noise, sheared
 from coopenv.observers.robust.belief import begin_belief, own_estimate
 from coopenv.observers.robust.constants import SAME_PRIOR
 from coopenv.observers.robust.memory import Estimate, Pose, clear, mat33d, vec3d
@@ -46,9 +46,7 @@ def write(state: Any, memory: Any, world: int, i: int):
         if memory.search[world, i].hypotheses > 0:
             estimate = memory.hypothesis[world, i, 0].estimate
     position = wp.transpose(estimate.pose.R) * estimate.pose.p
-    one = wp.identity(3, wp.float64)
-    J = lower_blocks(one, skew(position), one)
-    P = symmetric_part(J * estimate.P * wp.transpose(J))
+    P = symmetric_part(sheared(estimate.P, skew(position)))
     state.estimate_rotation[world, i] = type(state.estimate_rotation[world, i])(estimate.pose.R)
     state.estimate_position[world, i] = type(state.estimate_position[world, i])(position)
     state.covariance[world, i] = type(state.covariance[world, i])(P)

@@ -20,6 +20,8 @@ from coopenv.observers.robust.memory import Estimate, Pose, Report, mat66d, mat6
 from coopenv.observers.robust.odometry import increment_noise
 from coopenv.world.camera import VISIBLE
 
+LEAST_TIME = constants.NEWS_TIME - constants.SAME_TIME
+
 
 @wp.func
 def bit_of(vehicle: int) -> wp.uint64:
@@ -42,12 +44,13 @@ def own_report(model: Any, memory: Any, world: int, i: int, tick: int):
     P = memory.P[world, i, 0, 0]
     if memory.search[world, i].active == 0 and algebra.is_known(P):
         marker = vec3d(model.scene.marker[model.landmarks + i])
-        J = marker_jacobian(marker)
+        if wp.length_sq(marker) > wp.float64(0.0):
+            P = algebra.sheared(P, -skew(marker))
         pose = memory.member[world, i, 0].pose
         odometry = memory.belief[world, i].odometry
         report.valid = 1
         report.pose = Pose(pose.R, pose.p + pose.R * marker)
-        report.P = mat66f(J * P * wp.transpose(J))
+        report.P = mat66f(P)
         report.odometry = Pose(odometry.R, odometry.p + odometry.R * marker)
         report.depends_on = memory.belief[world, i].depends_on
     return report
@@ -178,21 +181,29 @@ def fuse_tracklet(memory: Any, world: int, i: int, n: int, report: Report, befor
 
 
 @wp.func
+def is_due(model: Any, before: int, sent: int) -> bool:
+    """Return whether a message comes long enough after the last one of the sender that was fused to be so, too."""
+    return wp.float64(sent - before) * model.camera_period > wp.float64(LEAST_TIME)
+
+
+@wp.func
 def fuse_message(model: Any, memory: Any, world: int, i: int, n: int, sender: int):
-    """Carry a member to its new report, and fuse what it has learnt since the last one."""
-    last = memory.member[world, i, n].report
-    report = memory.inbox[world, i, sender]
-    if report.tick > last.tick:
-        dt = wp.float64(report.tick - last.tick) * model.camera_period
+    """Carry a member to its new report, and fuse what it has learnt since the last one, if that is long ago."""
+    sent = memory.inbox[world, i, sender].tick
+    before = memory.member[world, i, n].report.tick
+    if is_due(model, before, sent):
+        last = memory.member[world, i, n].report
+        report = memory.inbox[world, i, sender]
+        dt = wp.float64(sent - before) * model.camera_period
         step = algebra.between(last.odometry, report.odometry)
         noise = increment_noise(model, memory, world, i, step, dt)
         propagate_member(model, memory, world, i, n, step, dt, noise)
-        before = algebra.carried(Estimate(last.pose, mat66d(last.P)), step, noise)
+        carried = algebra.carried(Estimate(last.pose, mat66d(last.P)), step, noise)
         was_distrusted = memory.member[world, i, n].distrusted
         memory.member[world, i, n].report = report
         test_sender(memory, world, i, n, Estimate(report.pose, mat66d(report.P)), dt)
         if was_distrusted == 0 and memory.member[world, i, n].distrusted == 0:
-            fuse_tracklet(memory, world, i, n, report, before)
+            fuse_tracklet(memory, world, i, n, report, carried)
 
 
 @wp.func

@@ -45,6 +45,7 @@ from coopenv.observers.robust.constants import (
     MESSAGE_GATE,
     MIN_ANGULAR_VELOCITY_STD,
     MIN_VELOCITY_STD,
+    NEWS_TIME,
     SAME_TIME,
 )
 from tests.oracles.robust.belief import Belief, Lasting, Member, View, as_noise, errors_of
@@ -299,7 +300,7 @@ class Robust:
         """Carry a sender to its new message, and take in what it has learnt since the last one."""
         last = contact.last
         dt = float(report.time[0] - last.time[0])
-        if dt < SAME_TIME:  # the same message again
+        if dt <= NEWS_TIME - SAME_TIME:  # of the same message again, or of one soon after, the odometry counts at most
             return
         contact.last = report
         members = [member.vehicle for member in self.belief.members]
@@ -376,6 +377,7 @@ class Robust:
     def _view(self, tick: Tick) -> View:
         """Return the frame's bearings to landmarks and to members of the belief, as measurements."""
         belief = self.belief
+        heard = {report.vehicles[0]: report for report in self._reports(tick)}
         known, z, drift, counts, places, points = [], [], [], [], [], []
         targets = tick.targets.tolist()
         for n in tick.valid.nonzero()[0].tolist():  # landmarks come first
@@ -386,12 +388,13 @@ class Robust:
                 counts.append(True)
             elif (place := belief.place(vehicle)) is not None:
                 member, contact = belief.members[place], self.contacts.get(vehicle)
-                age = tick.time - member.time
-                point = member.carried(age)
+                turned, gone, stands, variance = self._gone(member, heard.get(vehicle))
+                age = tick.time - stands
+                point = gone + turned.dot(member.carried(age))
                 z.append(member.p + member.R.dot(point))
                 places.append(place)
                 points.append(point)
-                drift.append(self._drift(age) + member.velocity_variance * max(age, 0.0) ** 2)
+                drift.append(variance + self._drift(age) + member.velocity_variance * max(age, 0.0) ** 2)
                 counts.append(contact is None or contact.trusted)
             else:
                 continue
@@ -402,6 +405,16 @@ class Robust:
         fits = sight.ahead & (nis < BEARING_GATE)
         judged = [fit for fit, judges in zip(fits.tolist(), counts, strict=True) if judges]
         return View(sight, noise, nis, fits, judged.count(False) / len(judged) if judged else None)
+
+    def _gone(self, member: Member, report: Report | None) -> tuple[Array, Array, float, float]:
+        """Return the increment (dR, dp) since a member's last news by its odometry, until when, and its variance."""
+        if report is None or member.odometry is None or report.time[0] - member.time < SAME_TIME:
+            return np.eye(3), np.zeros(3), member.time, 0.0
+        R, p = member.odometry
+        dR, dp = R.T.dot(report.odometry_turn[0]), R.T.dot(report.odometry_position[0] - p)
+        dt = float(report.time[0]) - member.time
+        noise = self.noise.odometry(dt) + as_noise(self.belief.errors_covariance, dp, dt, ERRORS_TIME)
+        return dR, dp, float(report.time[0]), float(noise[3])
 
     def _drift(self, age: float) -> float:
         """Return the variance per axis, m^2, of where a sender is a time after its last message."""

@@ -20,7 +20,7 @@ from coopenv.observers.robust.joint.matrices import AFTER
 from coopenv.observers.robust.joint.memory import Contact
 from coopenv.observers.robust.measurements import is_heard
 from coopenv.observers.robust.memory import Estimate
-from coopenv.observers.robust.tracklets import bit_of, information_share, test_sender
+from coopenv.observers.robust.tracklets import bit_of, information_share, is_due, test_sender
 from coopenv.world.camera import VISIBLE
 
 
@@ -93,7 +93,7 @@ def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, 
 def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, sender: int, count: int):
     """Carry all that a message tells of to it, and fuse what has been learnt since the contact's last message."""
     ticks = memory.told[world, 0].tick - memory.contact_told[world, i, c, 0].tick
-    if ticks <= 0:
+    if not is_due(model, memory.contact_told[world, i, c, 0].tick, memory.told[world, 0].tick):
         return
     predict_told(model, memory, world, i, c, count)
     radio.store_contact(memory, world, i, c, sender, count)
