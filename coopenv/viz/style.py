@@ -173,10 +173,17 @@ def fitting(width: float, each: float, most: int) -> int:
 
 def legend_above(figure: Figure, handles: Sequence[Artist]) -> None:
     """Put a legend above the panels."""
-    length = sum(_LEGEND_MARK + _LEGEND_LETTER * len(str(handle.get_label())) for handle in handles)
-    columns = fitting(float(figure.get_figwidth()), length / len(handles), len(handles))
+    lengths = [_LEGEND_MARK + _LEGEND_LETTER * len(str(handle.get_label())) for handle in handles]
+    width = float(figure.get_figwidth())
+    columns = next(n for n in range(len(handles), 0, -1) if n == 1 or _columns_width(lengths, n) <= width)
     spacing: dict[str, Any] = {"handlelength": 2.2, "columnspacing": 1.6}
     legend(figure, handles, "outside upper center", ncols=columns, fontsize=SMALL + 0.5, **spacing)
+
+
+def _columns_width(lengths: Sequence[float], columns: int) -> float:
+    """Return how wide columns are in which entries stand below one another; the first ones may hold one more."""
+    rows = np.array_split(np.array(lengths), columns)
+    return float(sum(column.max(initial=0.0) for column in rows))
 
 
 def show_decades(ax: Axes) -> None:

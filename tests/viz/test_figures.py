@@ -466,3 +466,15 @@ def test_thinning_keeps_both_ends_and_short_records_whole() -> None:
     assert style.thinned(10).tolist() == list(range(10))
     long = style.thinned(100_000)
     assert len(long) <= style.MAX_POINTS and long[0] == 0 and long[-1] == 99_999
+
+
+@pytest.mark.parametrize(
+    "names", [["short"], ["a_rather_long_name"] * 10, ["a", "much_longer_than_the_others", "b", "c"]]
+)
+def test_a_legend_stays_within_its_figure(names: list[str]) -> None:
+    figure, width = style.canvas(5.2, 3.9, "")
+    figure.subplots()
+    style.legend_above(figure, [Line2D([], [], marker="o", label=name) for name in names])
+    figure.draw_without_rendering()
+    box = figure.legends[0].get_window_extent()
+    assert 0.0 <= box.x0 < box.x1 <= width * figure.dpi

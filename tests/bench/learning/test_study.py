@@ -53,7 +53,9 @@ def test_parts(study: Study) -> None:
     assert [run.folder for run in study.only(["facade", "7", "plain"]).runs] == [Path("facade_plain/seed_7")]
     assert len(list(study.only(["quality"]).runs)) == 4
     assert list(study.only([]).runs) == list(study.runs)
-    with pytest.raises(CoopenvError, match=r"the study has no 'facde' \(did you mean 'facade'\?\); known: 1, 7, facade"):
+    with pytest.raises(
+        CoopenvError, match=r"the study has no 'facde' \(did you mean 'facade'\?\); known: 1, 7, facade"
+    ):
         study.only(["facde"])
 
 
