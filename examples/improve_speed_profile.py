@@ -4,6 +4,8 @@ The distance that each vehicle is told to drive stays the same: only when it dri
 Run: python examples/improve_speed_profile.py (about two minutes)
 """
 
+from pathlib import Path
+
 import numpy as np
 
 import coopenv
@@ -16,7 +18,7 @@ overrides = {
     "vehicles.*.initial_estimate.position_radius": 0.01,
     "vehicles.*.initial_estimate.orientation_angle": 0.005,
 }
-world = DifferentiableWorld(coopenv.load_scenario("urban_crossing", overrides))
+world = DifferentiableWorld(coopenv.load_scenario(Path(__file__).with_name("four_way.toml"), overrides))
 commands = np.zeros((20, 1, 4, 2))  # two seconds straight on at half of the top speed
 best = world.rollout(commands)
 start, step = best.uncertainty, 0.3

@@ -3,6 +3,7 @@
 Needs the extra `train`. Run: python examples/profile_sb3.py
 """
 
+from pathlib import Path
 from time import perf_counter
 
 import torch
@@ -27,7 +28,7 @@ class TimedEnv(CooperativeSB3VecEnv):
         return result
 
 
-env = TimedEnv(coopenv.make_vec("urban_crossing", num_worlds=64, autoreset="same_step"))
+env = TimedEnv(coopenv.make_vec(Path(__file__).with_name("four_way.toml"), num_worlds=64, autoreset="same_step"))
 model = PPO("MlpPolicy", env, n_steps=64, seed=0, device="cpu")
 model.learn(2 * 64 * env.num_envs)  # compile and warm up
 env.seconds, start = 0.0, perf_counter()

@@ -56,7 +56,7 @@ def test_list_names_every_environment_on_one_line(capsys: pytest.CaptureFixture[
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines[2:]] == coopenv.list_envs()
     assert max(map(len, lines)) <= 80
-    assert lines[2].split() == ["busy_intersection", "5", "3", "prescribed", "50"]
+    assert ["busy_intersection", "5", "3", "prescribed", "50"] in [line.split() for line in lines]
 
 
 def test_list_of_observers_and_agents(capsys: pytest.CaptureFixture[str]) -> None:

@@ -84,7 +84,7 @@ def test_the_programs_on_terms_run(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_the_programs_on_agents_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first, own = python_blocks(DOCS / "agents.md")
     exec(compile(first, "agents.md", "exec"), {})
-    assert "arrival_rate: 1 [" in capsys.readouterr().out
+    assert "arrival_rate: 0.9" in capsys.readouterr().out
     (tmp_path / "mine.py").write_text(own, encoding="utf-8")
     scenario = load_scenario("urban_crossing")
     policy = load_agent(f"{tmp_path / 'mine.py'}:Mine", scenario)

@@ -12,7 +12,7 @@ from coopenv.evaluation import Episodes, compare_paired, drive, held_out_seeds, 
 from coopenv.policies import load_agent
 from coopenv.scenario import load_scenario
 
-ENVIRONMENTS = ("open_square", "facade", "behind_truck")
+ENVIRONMENTS = ("open_square", "facade", "behind_truck", "urban_crossing")
 WORLDS = 48
 
 

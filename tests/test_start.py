@@ -12,6 +12,7 @@ import pytest
 
 import coopenv
 from coopenv.cli import complete
+from tests.helpers.four_way import FOUR_WAY
 
 HEAVY = {"warp", "scipy", "matplotlib", "PIL", "pandas", "mcap", "torch", "joblib", "jinja2"}
 LIGHT = {"errors", "shipped", "interrupts", "api", "api.registration", "seeds"}
@@ -101,7 +102,7 @@ def test_every_completed_key_is_one_that_the_loader_knows() -> None:
     assert len(keys) > 50
     for key in keys:
         try:
-            coopenv.load_scenario("urban_crossing", {key: {"no": "such value"}})
+            coopenv.load_scenario(FOUR_WAY, {key: {"no": "such value"}})
         except coopenv.ScenarioError as error:
             assert "unknown" not in str(error), key
 

@@ -25,10 +25,10 @@ from coopenv.runs.console import Progress
 from coopenv.runs.table import number_table
 
 SENSED = {"topology.mode": "sensed"}
-ROBUST = {"observer.name": "robust"}
+RICCATI, ROBUST = {"observer.name": "riccati"}, {"observer.name": "robust"}
 TOTALS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("busy_intersection", SENSED),
-    ("urban_crossing", {}),
+    ("urban_crossing", RICCATI),
     ("busy_intersection", SENSED | ROBUST),
     ("urban_crossing", ROBUST),
 )

@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 
 from coopenv.policies.belief import Belief
-from coopenv.policies.occluders import Occluders, hidden
+from coopenv.policies.occluders import Occluders, unhidden
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.policies.view import FieldOfView
 from coopenv.scenario import Scenario
@@ -103,7 +103,7 @@ class LookAhead(RouteFollower):
             place, forward = np.stack([x, y], axis=-1), np.stack([np.cos(heading), np.sin(heading)], axis=-1)
             line = landmarks[:, None] - place[:, :, None]
             seen = self.view.sees(line, heading[..., None]) & (known > 0.0)
-            seen &= ~hidden(boxes, place + self.view.ahead * forward, landmarks, stride * (step + 1))
+            seen = unhidden(boxes, seen, place + self.view.ahead * forward, landmarks, stride * (step + 1))
             belief = belief.driven(dx, dy, self.drift * stride, 1e-5).measured(line, known * seen)
             cost += STEP * self.price * np.maximum(belief.std - self.tolerated, 0.0)
             cost += STEP * OUTSIDE * np.maximum(np.abs(aside) - self.farthest, 0.0)

@@ -86,28 +86,33 @@ def _footprint(body: Body | None) -> float:
     return body.size[0] * body.size[1] if body else 0.0
 
 
-def hidden(boxes: list[Box], camera: np.ndarray, points: np.ndarray, way: float = 0.0) -> np.ndarray:
-    """Return which points a box hides, (rows, P, K) bool.
+def unhidden(boxes: list[Box], seen: np.ndarray, camera: np.ndarray, points: np.ndarray, way: float) -> np.ndarray:
+    """Return which points in view no box hides, (rows, P, K) bool.
 
     Args:
         boxes: of `Occluders.boxes`.
+        seen: (rows, P, K), which points are in view without the boxes.
         camera: (rows, P, 2), m, where the camera is.
         points: (rows, K, 2), m.
         way: m that boxes which move have gone on.
     """
-    line = points[:, None] - camera[:, :, None]
-    found = np.zeros(line.shape[:-1], dtype=bool)
+    place = np.nonzero(seen)  # few
+    row, plan, point = place
+    start = camera[row, plan]
+    line = points[row, point] - start
+    blocked = np.zeros(len(row), dtype=bool)
     for box in boxes:
-        center = box.center + way * box.forward if box.moves else box.center
-        offset = center[:, None] - camera
-        enter, leave = np.zeros(1), np.full(1, box.below)
-        left = np.stack([-box.forward[:, 1], box.forward[:, 0]], axis=-1)
-        for axis, half in zip((box.forward, left), box.half, strict=True):
-            middle = np.einsum("rpi,ri->rp", offset, axis)[..., None]
-            along = np.einsum("rpki,ri->rpk", line, axis)
+        offset = (box.center + way * box.forward if box.moves else box.center)[row] - start
+        forward = box.forward[row]
+        enter, leave = np.zeros(len(row)), np.full(len(row), box.below)
+        left = np.stack([-forward[:, 1], forward[:, 0]], axis=-1)
+        for axis, half in zip((forward, left), box.half, strict=True):
+            middle, along = (offset * axis).sum(axis=-1), (line * axis).sum(axis=-1)
             along = np.where(np.abs(along) < 1e-9, 1e-9, along)
             first, last = (middle - half) / along, (middle + half) / along
             enter = np.maximum(enter, np.minimum(first, last))
             leave = np.minimum(leave, np.maximum(first, last))
-        found |= (enter < leave) & box.there[:, None, None]
-    return found
+        blocked |= (enter < leave) & box.there[row]
+    left_over = seen.copy()
+    left_over[place] = ~blocked
+    return left_over

@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 
-from coopenv.policies.occluders import Occluders, hidden
+from coopenv.policies.occluders import Occluders, unhidden
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.policies.view import FieldOfView
 from coopenv.scenario import Scenario
@@ -60,6 +60,6 @@ class Peek(RouteFollower):
         seen = self.view.sees(landmarks[:, None] - place[:, :, None], turned[..., None])
         seen &= self.known(observations)[:, None]
         boxes = self.occluders.boxes(partial(self.read, observations))
-        seen &= ~hidden(boxes, place + self.view.ahead * forward, landmarks, self.ahead)
+        seen = unhidden(boxes, seen, place + self.view.ahead * forward, landmarks, self.ahead)
         too_far = (np.abs(aside) > self.farthest) & (offsets * aside > 0.0)
         return np.asarray(offsets[np.argmax(np.where(too_far, -1, seen.sum(axis=-1)), axis=1)])

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 import coopenv
+from tests.helpers.four_way import FOUR_WAY
 
 
 @pytest.fixture(scope="module")
 def env() -> coopenv.CooperativeLocalisationEnv:
-    env = coopenv.parallel_env("urban_crossing")
+    env = coopenv.parallel_env(FOUR_WAY)
     env.reset(seed=0)
     return env
 
@@ -55,11 +56,11 @@ def test_all_at_once_is_not_a_dict(env: coopenv.CooperativeLocalisationEnv) -> N
 
 def test_step_before_reset() -> None:
     with pytest.raises(coopenv.CoopenvError, match="before reset"):
-        coopenv.parallel_env("urban_crossing").step(good())
+        coopenv.parallel_env(FOUR_WAY).step(good())
 
 
 def test_out_of_range_is_clipped() -> None:
-    a, b = coopenv.parallel_env("urban_crossing"), coopenv.parallel_env("urban_crossing")
+    a, b = coopenv.parallel_env(FOUR_WAY), coopenv.parallel_env(FOUR_WAY)
     a.reset(seed=1)
     b.reset(seed=1)
     far = a.step({agent: np.array([7.0, -9.0]) for agent in a.agents})

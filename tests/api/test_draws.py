@@ -17,6 +17,7 @@ from coopenv.runs.metrics import outcome_line
 from coopenv.scenario import Scenario
 from coopenv.scenario.randomness import PARAMETERS
 from tests.helpers.builders import constant, landmark, scenario, vehicle
+from tests.helpers.four_way import FOUR_WAY
 
 HALF = {"vehicles.*.presence": 0.5}
 DRIVEN = {"kind": "driven", "initial_speed": 0.5}
@@ -50,7 +51,7 @@ def test_absent_vehicles_are_no_agents() -> None:
 
 
 def test_the_vehicle_of_a_single_environment_is_there() -> None:
-    env = coopenv.api.single_vehicle.SingleVehicleEnv("urban_crossing", vehicle="vehicle_3", overrides=HALF)
+    env = coopenv.api.single_vehicle.SingleVehicleEnv(FOUR_WAY, vehicle="vehicle_3", overrides=HALF)
     for seed in range(12):
         _, info = env.reset(seed=seed)
         assert info["outcome"] == "under way"

@@ -19,6 +19,7 @@ from coopenv.api.engine import Engine
 from coopenv.observers import Coordinates, Estimate, Setup, Tick, register, run
 from coopenv.observers.dead_reckoning import DeadReckoning
 from coopenv.runs.recorder import record
+from tests.helpers.four_way import FOUR_WAY
 from tests.oracles.riccati import Riccati
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
@@ -29,7 +30,7 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     ),
     "slow corrections": ("busy_intersection", {"horizon": 2.0, "observer.k": 2.0, "rates.observer": 25.0}),
     "cyclic": ("busy_intersection", {"horizon": 1.0, "topology.acyclic": False}),
-    "driven": ("urban_crossing", {"horizon": 3.0}),
+    "driven": (FOUR_WAY, {"horizon": 3.0}),
 }
 SAME = (
     "estimate_rotation",

@@ -9,6 +9,7 @@ import coopenv
 from coopenv.api.engine import Engine
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.terms import GROUPS
+from tests.helpers.four_way import FOUR_WAY
 
 OBSERVERS = ("riccati", "robust")
 MOVABLE = [name for name in coopenv.list_envs() if load_scenario(name).backend == "simulated"]
@@ -73,7 +74,7 @@ def explained(inputs: np.ndarray, outputs: np.ndarray, fit: int) -> np.ndarray:
 def test_the_blind_cannot_tell_their_own_error_beyond_what_their_estimate_tells() -> None:
     """Of a start box all know that estimates outside it are wrong; nothing else in an observation tells an error."""
     blind = {"camera.range": 1e-6, "observer.name": "robust", "observation.planar": True}
-    envs = coopenv.make_vec("urban_crossing", num_worlds=1500, overrides={**EVERYTHING, **blind})
+    envs = coopenv.make_vec(FOUR_WAY, num_worlds=1500, overrides={**EVERYTHING, **blind})
     own = slice(0, None, len(envs.scenario.vehicles))  # one vehicle of every world
     observations, _ = envs.reset(seed=0)
     for steps in (0, 20):
@@ -124,7 +125,7 @@ def rms_distance(a: np.ndarray, b: np.ndarray) -> float:
 
 def test_observing_draws_nothing() -> None:
     """render, state and refresh leave the world as it is."""
-    env = coopenv.parallel_env("urban_crossing", render_mode="rgb_array")
+    env = coopenv.parallel_env(FOUR_WAY, render_mode="rgb_array")
     env.reset(seed=0)
     before = env.get_state()
     env.state()

@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose
 import coopenv
 from coopenv.api.reward import FIELDS, OTHERS, Step, check_function
 from coopenv.errors import CoopenvError
+from tests.helpers.four_way import FOUR_WAY
 
 SHORT = {"horizon": 0.5, "observation.include": ["estimate", "quality"]}
 
@@ -22,8 +23,8 @@ def minus_error(step: Step) -> Any:
 
 
 def test_it_replaces_the_reward_of_one_world_and_only_that() -> None:
-    plain = coopenv.parallel_env("urban_crossing", overrides=SHORT)
-    own = pickle.loads(pickle.dumps(coopenv.parallel_env("urban_crossing", overrides=SHORT, reward=minus_error)))
+    plain = coopenv.parallel_env(FOUR_WAY, overrides=SHORT)
+    own = pickle.loads(pickle.dumps(coopenv.parallel_env(FOUR_WAY, overrides=SHORT, reward=minus_error)))
     starts = [env.reset(seed=2) for env in (plain, own)]
     assert_allclose(starts[0][0]["vehicle_1"], starts[1][0]["vehicle_1"])
     while plain.agents:
@@ -45,9 +46,7 @@ def test_a_batch_earns_what_the_function_says_where_it_is_alive(autoreset: str, 
         assert step["truth"]["position"].dtype == dtype
         return 1.0 + step["time"] + 0.0 * step["position_error"]
 
-    envs = coopenv.make_vec(
-        "urban_crossing", num_worlds=2, dtype=dtype, autoreset=autoreset, overrides=SHORT, reward=reward
-    )
+    envs = coopenv.make_vec(FOUR_WAY, num_worlds=2, dtype=dtype, autoreset=autoreset, overrides=SHORT, reward=reward)
     envs.reset(seed=0)
     earned = []
     for _ in range(7 if autoreset != "disabled" else 5):
@@ -63,7 +62,7 @@ def test_a_batch_earns_what_the_function_says_where_it_is_alive(autoreset: str, 
 def test_vehicles_that_have_ended_earn_nothing() -> None:
     """All but the first touch their goals at once."""
     goals = {f"vehicles.{i}.goal.radius": 1000.0 for i in (1, 2, 3)}
-    envs = coopenv.make_vec("urban_crossing", num_worlds=1, overrides=goals, reward=lambda step: 3.0 + step["ended"])
+    envs = coopenv.make_vec(FOUR_WAY, num_worlds=1, overrides=goals, reward=lambda step: 3.0 + step["ended"])
     envs.reset(seed=0)
     earned = [envs.step(np.zeros(envs.action_space.shape, np.float32))[1].tolist() for _ in range(2)]
     assert earned == [[3.0, 4.0, 4.0, 4.0], [3.0, 0.0, 0.0, 0.0]]
@@ -89,7 +88,7 @@ def test_a_step_is_the_infos_of_everybody() -> None:
         assert set(step) == {*FIELDS, *OTHERS} and "time" in step and "tmie" not in step
         return np.zeros(step["alive"].shape)
 
-    env = coopenv.parallel_env("urban_crossing", dtype="float64", reward=keep)
+    env = coopenv.parallel_env(FOUR_WAY, dtype="float64", reward=keep)
     env.reset(seed=0)
     actions = {agent: np.array([0.25, -2.0]) for agent in env.agents}
     observations, _, _, _, infos = env.step(actions)
@@ -140,7 +139,7 @@ def test_nobody_writes_into_the_world() -> None:
 )
 @pytest.mark.filterwarnings("ignore:divide by zero")
 def test_mistakes_are_one_line(reward: Any, message: str) -> None:
-    envs = coopenv.make_vec("urban_crossing", num_worlds=2, reward=reward)
+    envs = coopenv.make_vec(FOUR_WAY, num_worlds=2, reward=reward)
     envs.reset(seed=0)
     with pytest.raises(CoopenvError, match=f"reward function <lambda>: .*{message}") as caught:
         envs.step(np.zeros(envs.action_space.shape, np.float32))

@@ -17,13 +17,14 @@ import coopenv.observers.registry as registry
 from coopenv.api.engine import Engine
 from coopenv.observers import register
 from tests.helpers import mrclam_files
+from tests.helpers.four_way import FOUR_WAY
 from tests.oracles.robust.observer import Robust
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "the paper's start": ("busy_intersection", {"horizon": 3.0}),
     "radio": ("busy_intersection", {"horizon": 3.0, "v2x.delay": 3, "v2x.loss": 0.4, "v2x.period": 2}),
     "slow corrections": ("busy_intersection", {"horizon": 2.0, "rates.observer": 25.0}),
-    "driven": ("urban_crossing", {"horizon": 3.0}),
+    "driven": (FOUR_WAY, {"horizon": 3.0}),
 }
 SAME = ("estimate_rotation", "estimate_position", "inbox_rotation", "inbox_position", "position_error")
 
@@ -58,7 +59,7 @@ def test_embedded_and_plugged_in_are_the_same(case: str) -> None:
 
 
 def test_official_test() -> None:
-    parallel_api_test(coopenv.parallel_env("urban_crossing", observer="robust"), num_cycles=60)
+    parallel_api_test(coopenv.parallel_env(FOUR_WAY, observer="robust"), num_cycles=60)
 
 
 def test_a_saved_environment_goes_on() -> None:

@@ -10,6 +10,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 import coopenv
 from coopenv.api.statistics import RecordVehicleEpisodes
 from coopenv.api.true_ends import TrueEnds
+from tests.helpers.four_way import FOUR_WAY
 
 DECISIONS = 60
 OPTIONS = {"num_worlds": 6, "overrides": {"horizon": DECISIONS / 10}}
@@ -22,7 +23,7 @@ def actions_of(env: coopenv.CooperativeVectorEnv) -> np.ndarray:
 
 def by_hand() -> tuple[np.ndarray, np.ndarray]:
     """Return (return, decisions) of every vehicle's first episode."""
-    env = coopenv.make_vec("urban_crossing", autoreset="disabled", **OPTIONS)
+    env = coopenv.make_vec(FOUR_WAY, autoreset="disabled", **OPTIONS)
     env.reset(seed=5)
     returned, length, under_way = np.zeros(env.num_envs), np.zeros(env.num_envs), np.ones(env.num_envs, bool)
     for _ in range(DECISIONS):
@@ -37,7 +38,7 @@ def by_hand() -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step", "disabled"])
 def test_true_episodes_only(autoreset: str) -> None:
     returned, length = by_hand()
-    env = RecordVehicleEpisodes(coopenv.make_vec("urban_crossing", autoreset=autoreset, **OPTIONS), buffer_length=1000)
+    env = RecordVehicleEpisodes(coopenv.make_vec(FOUR_WAY, autoreset=autoreset, **OPTIONS), buffer_length=1000)
     env.reset(seed=5)
     weights = env.unwrapped.scenario.reward.by_name
     first_return, first_length = np.full(env.num_envs, np.nan), np.zeros(env.num_envs)
@@ -63,7 +64,7 @@ def test_true_episodes_only(autoreset: str) -> None:
 def test_statistics_of_gymnasium_are_true_over_true_ends(autoreset: str) -> None:
     if autoreset == "same_step" and tuple(map(int, gymnasium.__version__.split(".")[:2])) < (1, 4):
         pytest.skip("the wrapper of older Gymnasium loses the first reward after a reset in this mode")
-    own = RecordVehicleEpisodes(coopenv.make_vec("urban_crossing", autoreset=autoreset, **OPTIONS), buffer_length=1000)
+    own = RecordVehicleEpisodes(coopenv.make_vec(FOUR_WAY, autoreset=autoreset, **OPTIONS), buffer_length=1000)
     env = RecordEpisodeStatistics(TrueEnds(own), buffer_length=1000, stats_key="gymnasium")
     env.reset(seed=5)
     for _ in range(2 * DECISIONS + 2):
@@ -75,7 +76,7 @@ def test_statistics_of_gymnasium_are_true_over_true_ends(autoreset: str) -> None
 
 
 def test_a_reset_begins_anew() -> None:
-    env = RecordVehicleEpisodes(coopenv.make_vec("urban_crossing", **OPTIONS))
+    env = RecordVehicleEpisodes(coopenv.make_vec(FOUR_WAY, **OPTIONS))
     env.reset(seed=5)
     for _ in range(7):
         env.step(np.zeros((env.num_envs, 2), np.float32))
@@ -88,4 +89,4 @@ def test_a_reset_begins_anew() -> None:
 def test_tensors_are_refused() -> None:
     pytest.importorskip("torch", reason="needs torch")
     with pytest.raises(coopenv.CoopenvError, match=r"needs NumPy arrays: make_vec\(arrays='numpy'\)"):
-        RecordVehicleEpisodes(coopenv.make_vec("urban_crossing", arrays="torch", **OPTIONS))
+        RecordVehicleEpisodes(coopenv.make_vec(FOUR_WAY, arrays="torch", **OPTIONS))

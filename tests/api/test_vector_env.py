@@ -15,9 +15,10 @@ import pytest
 from gymnasium.vector import AutoresetMode
 
 import coopenv
+from tests.helpers.four_way import FOUR_WAY
 
 ENVS = coopenv.list_envs()
-CRASH = {"urban_crossing": np.array([1.0, 1.0])}
+CRASH = {FOUR_WAY: np.array([1.0, 1.0])}
 """Actions under which vehicles soon end: full speed, full lock."""
 
 
@@ -55,9 +56,7 @@ def test_single_world_is_world_0_bit_for_bit(name: str, dtype: str) -> None:
 def test_threads_do_not_matter(autoreset: str) -> None:
     runs = []
     for threads in (1, 2, 5):
-        env = coopenv.make_vec(
-            "urban_crossing", num_worlds=7, threads=threads, autoreset=autoreset, overrides={"horizon": 2.0}
-        )
+        env = coopenv.make_vec(FOUR_WAY, num_worlds=7, threads=threads, autoreset=autoreset, overrides={"horizon": 2.0})
         assert env.engine.world.threads == threads
         rng = np.random.default_rng(1)
         record = [env.reset(seed=3)[0]]
@@ -136,7 +135,7 @@ def test_over_worlds_wait_in_disabled_mode() -> None:
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
 def test_dead_rows(autoreset: str) -> None:
     """A vehicle terminates once, earns nothing afterwards, and its row is truncated when the world is over."""
-    env = coopenv.make_vec("urban_crossing", num_worlds=16, autoreset=autoreset)
+    env = coopenv.make_vec(FOUR_WAY, num_worlds=16, autoreset=autoreset)
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     dead = np.zeros(env.num_envs, dtype=bool)
@@ -157,7 +156,7 @@ def test_dead_rows(autoreset: str) -> None:
 
 
 def test_every_reset_draws_anew() -> None:
-    env = coopenv.make_vec("urban_crossing", num_worlds=4, overrides={"horizon": 0.1}, autoreset="same_step")
+    env = coopenv.make_vec(FOUR_WAY, num_worlds=4, overrides={"horizon": 0.1}, autoreset="same_step")
     seen = [env.reset(seed=0)[0]]
     zero = np.zeros((env.num_envs, 2), dtype=np.float32)
     seen += [env.step(zero)[0] for _ in range(5)]
@@ -204,7 +203,7 @@ def test_observations_are_in_their_space(name: str) -> None:
 
 
 def test_saved_state() -> None:
-    env = coopenv.make_vec("urban_crossing", num_worlds=3, overrides={"horizon": 1.5})
+    env = coopenv.make_vec(FOUR_WAY, num_worlds=3, overrides={"horizon": 1.5})
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     actions = [actions_for(env, rng) for _ in range(40)]
@@ -256,8 +255,8 @@ def test_wrong_actions(actions: np.ndarray, message: str) -> None:
 
 def test_nan_on_the_device_harms_nobody_else() -> None:
     """Where actions cannot be checked without waiting for the device, one that is not finite counts as zero."""
-    env = coopenv.make_vec("urban_crossing", num_worlds=2, autoreset="disabled")
-    twin = coopenv.make_vec("urban_crossing", num_worlds=2, autoreset="disabled")
+    env = coopenv.make_vec(FOUR_WAY, num_worlds=2, autoreset="disabled")
+    twin = coopenv.make_vec(FOUR_WAY, num_worlds=2, autoreset="disabled")
     env.reset(seed=0)
     twin.reset(seed=0)
     for batch, value in ((env, np.nan), (twin, 0.0)):
@@ -361,7 +360,7 @@ def test_counts_may_be_of_numpy() -> None:
 
 @pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 def test_copies_go_on_alike_and_apart(duplicate: Callable[[Any], Any]) -> None:
-    env = coopenv.make_vec("urban_crossing", num_worlds=3, overrides={"horizon": 1.0})
+    env = coopenv.make_vec(FOUR_WAY, num_worlds=3, overrides={"horizon": 1.0})
     env.reset(seed=4)
     rng = np.random.default_rng(0)
     for _ in range(5):
@@ -376,7 +375,7 @@ def test_copies_go_on_alike_and_apart(duplicate: Callable[[Any], Any]) -> None:
 
 def test_dict_observations_are_the_flat_ones_by_field() -> None:
     options = {"num_worlds": 2, "overrides": {"horizon": 0.5}, "autoreset": "same_step"}
-    flat, parts = (coopenv.make_vec("urban_crossing", observation=kind, **options) for kind in ("flat", "dict"))
+    flat, parts = (coopenv.make_vec(FOUR_WAY, observation=kind, **options) for kind in ("flat", "dict"))
     rows, named = flat.reset(seed=1)[0], parts.reset(seed=1)[0]
     for _ in range(6):
         assert parts.observation_space.contains(named)
@@ -388,7 +387,7 @@ def test_dict_observations_are_the_flat_ones_by_field() -> None:
 
 
 def test_infos_of_the_batch_are_those_of_the_single_world() -> None:
-    batch, single = coopenv.make_vec("urban_crossing", num_worlds=1), coopenv.parallel_env("urban_crossing")
+    batch, single = coopenv.make_vec(FOUR_WAY, num_worlds=1), coopenv.parallel_env(FOUR_WAY)
     batch.reset(seed=2)
     single.reset(seed=2)
     for _ in range(3):
@@ -402,11 +401,11 @@ def test_infos_of_the_batch_are_those_of_the_single_world() -> None:
 
 
 def test_observer_by_name_and_unknown_words() -> None:
-    assert coopenv.make_vec("urban_crossing", num_worlds=1, observer="robust").scenario.observer.name == "robust"
+    assert coopenv.make_vec(FOUR_WAY, num_worlds=1, observer="robust").scenario.observer.name == "robust"
     with pytest.raises(coopenv.CoopenvError, match="unknown observation 'box'; known: flat, dict"):
-        coopenv.make_vec("urban_crossing", num_worlds=1, observation="box")  # type: ignore[arg-type]
+        coopenv.make_vec(FOUR_WAY, num_worlds=1, observation="box")  # type: ignore[arg-type]
 
 
 def test_autoreset_mode_is_an_attribute() -> None:
-    env = coopenv.make_vec("urban_crossing", num_worlds=1, autoreset="same_step")
+    env = coopenv.make_vec(FOUR_WAY, num_worlds=1, autoreset="same_step")
     assert env.autoreset_mode is AutoresetMode.SAME_STEP

@@ -16,6 +16,7 @@ from pettingzoo.test import api_test, seed_test
 from pettingzoo.utils.wrappers import RecordVideoParallel
 
 import coopenv
+from tests.helpers.four_way import FOUR_WAY
 
 CROSSING = "coopenv/UrbanCrossing-v0"
 SHORT = {"horizon": 3.0}
@@ -23,7 +24,7 @@ GYMNASIUM = tuple(int(part) for part in gymnasium.__version__.split(".")[:2])
 
 
 def batch(**options: Any) -> coopenv.CooperativeVectorEnv:
-    return coopenv.make_vec("urban_crossing", num_worlds=3, **options)
+    return coopenv.make_vec(FOUR_WAY, num_worlds=3, **options)
 
 
 def wide_turns(env: gymnasium.vector.VectorEnv) -> np.ndarray:
@@ -74,7 +75,7 @@ def test_time_aware_observation_knows_the_horizon() -> None:
 
 
 def test_agents_are_a_copy_and_unknown_ones_are_named() -> None:
-    env = coopenv.parallel_env("urban_crossing")
+    env = coopenv.parallel_env(FOUR_WAY)
     env.reset(seed=0)
     env.agents.append("x")
     assert env.agents == env.possible_agents
@@ -85,7 +86,7 @@ def test_agents_are_a_copy_and_unknown_ones_are_named() -> None:
 
 
 def test_a_generator_for_wrappers_follows_the_seed() -> None:
-    env = coopenv.parallel_env("urban_crossing")
+    env = coopenv.parallel_env(FOUR_WAY)
     env.reset(seed=3)
     first = env.np_random.random()
     env.reset()
@@ -98,7 +99,7 @@ def test_a_generator_for_wrappers_follows_the_seed() -> None:
 def test_record_video_of_all_vehicles(tmp_path: Path) -> None:
     pytest.importorskip("moviepy", reason="RecordVideoParallel needs moviepy")
     env = RecordVideoParallel(
-        coopenv.parallel_env("urban_crossing", render_mode="rgb_array", overrides={"horizon": 0.5}), str(tmp_path)
+        coopenv.parallel_env(FOUR_WAY, render_mode="rgb_array", overrides={"horizon": 0.5}), str(tmp_path)
     )
     env.reset(seed=0)
     while env.agents:

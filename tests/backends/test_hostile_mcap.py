@@ -14,6 +14,7 @@ import pytest
 from coopenv import DataError
 from coopenv.backends.mcap import read_recording, write_recording
 from coopenv.backends.replay import Replay
+from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.mcap_edits import Sent, edit
 from tests.helpers.recordings import differences, simulated
 
@@ -131,7 +132,7 @@ def test_numbers_that_are_none(number: str, key: str, written: Path, tmp_path: P
 
 def test_a_scenario_of_others(written: Path, tmp_path: Path) -> None:
     """More vehicles than recorded would make kernels read behind the arrays."""
-    path, other = tmp_path / "hostile.mcap", simulated("urban_crossing", horizon=0.1).scenario
+    path, other = tmp_path / "hostile.mcap", simulated(FOUR_WAY, horizon=0.1).scenario
     assert other is not None
     edit(written, path, header=put("scenario", other.model_dump(mode="json")))
     refused(path, "scenario: other landmarks or vehicles than the setups")

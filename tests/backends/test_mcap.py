@@ -22,6 +22,7 @@ from coopenv.cli import main
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Truth
 from tests.helpers import mrclam_files
+from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import differences, simulated
 
 pytest.importorskip("mcap", reason="needs the extra 'log'")
@@ -38,7 +39,7 @@ def through(recording: Recording, folder: Path) -> Recording:
     [
         ("busy_intersection", {}),
         ("busy_intersection", {"v2x__delay": 3, "v2x__loss": 0.4, "v2x__staleness": 0.2, "observer__k": 2.0}),
-        ("urban_crossing", {"rates__observer": 25.0}),
+        (FOUR_WAY, {"rates__observer": 25.0}),
         ("crossing_path", {}),
     ],
 )
@@ -246,11 +247,11 @@ def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
 
 def test_command_records_a_simulation(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "drive.mcap"
-    arguments = ["record", "urban_crossing", "--seed", "3", "--policy", "random", "--set", "horizon=1.0"]
+    arguments = ["record", FOUR_WAY, "--seed", "3", "--policy", "random", "--set", "horizon=1.0"]
     assert main([*arguments, "--out", str(path)]) == 0
     assert "4 vehicles, 61 ticks, 1 s" in capsys.readouterr().out
     read = read_recording(path)
-    parked = simulated("urban_crossing", seed=3)
+    parked = simulated(FOUR_WAY, seed=3)
     assert read.scenario == parked.scenario
     assert not np.array_equal(read.truth.position[-1], parked.truth.position[-1])  # somebody drove
     assert main([*arguments, "--out", str(path)]) == 2

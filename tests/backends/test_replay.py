@@ -30,13 +30,14 @@ from coopenv.observers import Recording, run
 from coopenv.runs import record
 from coopenv.scenario import Scenario
 from tests.helpers import builders, mrclam_files
+from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import simulated
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "plain": ("busy_intersection", {}),
     "radio": ("busy_intersection", {"v2x__delay": 3, "v2x__loss": 0.4, "v2x__period": 2, "v2x__staleness": 0.2}),
     "cyclic, slow corrections": ("busy_intersection", {"topology__acyclic": False, "rates__observer": 25.0}),
-    "sensed": ("urban_crossing", {}),
+    "sensed": (FOUR_WAY, {}),
     "three moving landmarks": ("crossing_path", {"rates__odometry": 37.0}),
 }
 
@@ -140,7 +141,7 @@ def test_official_tests(data: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         parallel_api_test(coopenv.parallel_env("mrclam_6", data=data), num_cycles=200)
-        parallel_api_test(replayed(simulated("urban_crossing"), "mekf"), num_cycles=40)
+        parallel_api_test(replayed(simulated(FOUR_WAY), "mekf"), num_cycles=40)
     env = coopenv.parallel_env("mrclam_6", data=data)
     state_test(parallel_to_aec(env), env)
 

@@ -17,12 +17,13 @@ from coopenv.backends.replay import Replay
 from coopenv.backends.simulated import Simulated
 from coopenv.backends.tick_world import TickWorld, open_world
 from coopenv.runs import record
+from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import simulated
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "radio": ("busy_intersection", {"v2x.delay": 2, "v2x.loss": 0.2, "v2x.period": 2, "v2x.staleness": 0.2}),
-    "driven": ("urban_crossing", {"dynamics.latency": 0.05}),
-    "accelerations": ("urban_crossing", {"action.longitudinal": "acceleration"}),
+    "driven": (FOUR_WAY, {"dynamics.latency": 0.05}),
+    "accelerations": (FOUR_WAY, {"action.longitudinal": "acceleration"}),
     "slow corrections": ("crossing_path", {"rates.observer": 25.0, "rates.odometry": 37.0}),
     "robust": ("busy_intersection", {"observer.name": "robust"}),
     "plug-in": ("busy_intersection", {"observer.name": "mekf", "v2x.loss": 0.2}),
@@ -78,7 +79,7 @@ def test_a_recording_told_tick_by_tick_is_the_one_on_the_device(observer: str) -
 
 
 def test_a_recording_of_a_recording_is_the_recording() -> None:
-    recording = simulated("urban_crossing", 1, v2x__loss=0.2)
+    recording = simulated(FOUR_WAY, 1, v2x__loss=0.2)
     for backend in (Replay(recording, "drive"), tick_by_tick(Replay(recording, "drive"))):
         again = record(backend, 1)
         for name in ("rotation", "translation", "velocity", "bearings", "visible", "landmarks", "inbox_tick", "due"):

@@ -13,8 +13,9 @@ from coopenv.estimation.outcomes import Outcome
 from coopenv.evaluation import METRICS, Episodes, compare_paired, drive, held_out_seeds, score
 from coopenv.policies import load_agent
 from coopenv.runs import rollout
+from tests.helpers.four_way import FOUR_WAY
 
-SCENARIO = coopenv.load_scenario("urban_crossing", {"horizon": 16.0})
+SCENARIO = coopenv.load_scenario(FOUR_WAY, {"horizon": 16.0})
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +112,7 @@ def test_vehicles_that_are_not_there_do_not_count(episodes: Episodes) -> None:
 
 
 def test_vehicles_that_go_on_have_arrived_once_they_have() -> None:
-    scenario = coopenv.load_scenario("urban_crossing", {"horizon": 16.0})
+    scenario = coopenv.load_scenario(FOUR_WAY, {"horizon": 16.0})
     again = replace(drive(Engine(scenario, 2), load_agent("route_follower", scenario), held_out_seeds(0, 2)))
     time = again.travel_time.copy()
     on = again.arrivals.copy()

@@ -8,10 +8,11 @@ from typing import Any
 import coopenv
 from coopenv.scenario import Scenario, parse_scenario
 from coopenv.world.world import World
+from tests.helpers.four_way import FOUR_WAY
 
 
 def base() -> dict[str, Any]:
-    return coopenv.load_scenario("urban_crossing").model_dump(mode="json")
+    return coopenv.load_scenario(FOUR_WAY).model_dump(mode="json")
 
 
 def vehicles(count: int, edge: float) -> list[dict[str, Any]]:

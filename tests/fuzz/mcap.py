@@ -21,6 +21,7 @@ from coopenv.backends.replay import Replay
 from coopenv.observers.recording import Recording
 from tests.fuzz.scenarios import at, mutate, places
 from tests.helpers import mrclam_files
+from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.mcap_edits import Sent, edit
 from tests.helpers.recordings import simulated
 
@@ -33,7 +34,7 @@ def written() -> list[bytes]:
     """Return files that are as they should be."""
     made = [
         simulated("busy_intersection", horizon=0.2, v2x__delay=1),
-        simulated("urban_crossing", horizon=0.2),
+        simulated(FOUR_WAY, horizon=0.2),
         simulated("crossing_path", horizon=0.2, observer__k=2.0),
         robots(),
     ]

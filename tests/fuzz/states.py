@@ -12,12 +12,13 @@ from scipy.spatial.transform import Rotation
 
 import coopenv
 from coopenv import CoopenvError
+from tests.helpers.four_way import FOUR_WAY
 
 ENVIRONMENTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("busy_intersection", {"observer": "riccati", "dtype": "float32"}),
     ("busy_intersection", {"observer": "robust", "dtype": "float32"}),
-    ("urban_crossing", {"observer": "robust", "dtype": "float64"}),
-    ("urban_crossing", {"observer": "riccati", "dtype": "float32"}),
+    (FOUR_WAY, {"observer": "robust", "dtype": "float64"}),
+    (FOUR_WAY, {"observer": "riccati", "dtype": "float32"}),
     ("crossing_path", {"observer": "riccati", "dtype": "float64"}),
     ("busy_intersection_tracking", {"observer": "mekf", "dtype": "float64"}),
     ("busy_intersection_tracking", {"observer": "centralised", "dtype": "float32"}),

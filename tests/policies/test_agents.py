@@ -16,6 +16,7 @@ from coopenv.policies import agents_for, decide, find_agent, load_agent, load_po
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.runs.rollouts import rollout
 from coopenv.shipped import data_directory, list_agents
+from tests.helpers.four_way import FOUR_WAY
 
 PAIRS = [(agent, env) for agent in list_agents() for env in find_agent(agent).environments]
 
@@ -52,7 +53,7 @@ def test_agent_drives(agent: str, name: str) -> None:
 
 
 def test_the_route_follower_arrives_without_touching() -> None:
-    scenario = coopenv.load_scenario("urban_crossing")
+    scenario = coopenv.load_scenario(FOUR_WAY)
     worlds = range(500, 520)
     engine = Engine(scenario, len(worlds))
     follower, still = (
@@ -70,20 +71,20 @@ def stand_still(observations: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("top", "reverse"), [(1.0, False), (1.53, False), (2.0, True)])
 def test_the_route_follower_drives_at_its_speed_whatever_the_car_can_do(top: float, reverse: bool) -> None:
     overrides = {"dynamics.max_speed": top, "dynamics.reverse": reverse, "observer.name": "robust"}
-    scenario = coopenv.load_scenario("urban_crossing", overrides)
+    scenario = coopenv.load_scenario(FOUR_WAY, overrides)
     for cruise, expected in ((0.6, 0.6), (None, top)):
         trajectory = rollout(scenario, seed=1, policy=RouteFollower(scenario, cruise=cruise), steps=60)
         assert np.abs(trajectory.velocity[:, :, 0]).max() == pytest.approx(expected, abs=0.02)
 
 
 def test_the_route_follower_refuses_to_choose_accelerations() -> None:
-    scenario = coopenv.load_scenario("urban_crossing", {"action.longitudinal": "acceleration"})
+    scenario = coopenv.load_scenario(FOUR_WAY, {"action.longitudinal": "acceleration"})
     with pytest.raises(coopenv.CoopenvError, match=r"agent 'route_follower' cannot be built: it chooses speeds"):
         load_agent("route_follower", scenario)
 
 
 def test_policies_by_name() -> None:
-    scenario = coopenv.load_scenario("urban_crossing")
+    scenario = coopenv.load_scenario(FOUR_WAY)
     rows = np.zeros((4, 132), dtype=np.float32)
     assert not load_policy("zero", scenario, 0)(rows).any()
     first, again, other = (load_policy("random", scenario, seed)(rows) for seed in (1, 1, 2))
@@ -112,7 +113,7 @@ def right(observations):
 
 def test_agents_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    scenario, rows = coopenv.load_scenario("urban_crossing"), np.zeros((3, 132), dtype=np.float32)
+    scenario, rows = coopenv.load_scenario(FOUR_WAY), np.zeros((3, 132), dtype=np.float32)
     folder = tmp_path / "lefty"
     folder.mkdir()
     (folder / "own.py").write_text(OWN)
@@ -147,11 +148,11 @@ def test_agents_in_code_that_are_none(text: str, message: str, tmp_path: Path, m
     monkeypatch.chdir(tmp_path)
     Path("own.py").write_text(OWN)
     with pytest.raises(coopenv.CoopenvError, match=message):
-        load_policy(text, coopenv.load_scenario("urban_crossing"), 0)
+        load_policy(text, coopenv.load_scenario(FOUR_WAY), 0)
 
 
 def test_bad_agents(tmp_path: Path) -> None:
-    scenario = coopenv.load_scenario("urban_crossing")
+    scenario = coopenv.load_scenario(FOUR_WAY)
     with pytest.raises(
         coopenv.CoopenvError, match=r"unknown agent 'routefollower' \(did you mean 'route_follower'\?\)"
     ):
@@ -194,5 +195,5 @@ def test_a_policy_that_remembers_is_told_when_an_episode_begins() -> None:
 
     policy = Counting()
     for _ in range(2):
-        rollout(coopenv.load_scenario("urban_crossing"), policy=policy, steps=3)
+        rollout(coopenv.load_scenario(FOUR_WAY), policy=policy, steps=3)
     assert policy.asked == 3

@@ -15,8 +15,9 @@ import coopenv
 from coopenv.api.terms.layout import observation_layout
 from coopenv.policies import load_agent
 from coopenv.policies.network import Network, NetworkCard, layout_hash, layout_tables
+from tests.helpers.four_way import FOUR_WAY
 
-ENV = "urban_crossing"
+ENV = FOUR_WAY
 Tensors = dict[str, np.ndarray]
 
 

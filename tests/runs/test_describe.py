@@ -23,6 +23,7 @@ from coopenv.scenario.bodies import ConstantMotion, InitialEstimate, SegmentMoti
 from coopenv.scenario.files import apply_vehicle_defaults, parse_scenario
 from coopenv.scenario.json_schema import schema_text
 from coopenv.shipped import data_directory
+from tests.helpers.four_way import FOUR_WAY
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "scenario.schema.json"
 
@@ -65,7 +66,7 @@ def test_the_sections_of_the_busy_intersection() -> None:
     assert "off by 90 deg about z" in text
     assert "Horizon: 50 s, 500 decisions of 6 camera ticks each." in text
     assert "wheelbase" not in text
-    assert "wheelbase" in described("urban_crossing", 100)
+    assert "wheelbase" in described(FOUR_WAY, 100)
 
 
 def test_settings_of_the_image_are_left_out_where_there_is_none() -> None:
@@ -166,13 +167,13 @@ def validator() -> Any:
     return jsonschema.Draft202012Validator(schema)
 
 
-def raw(name: str) -> dict[str, Any]:
-    return tomllib.loads((data_directory("envs") / f"{name}.toml").read_text())
+def raw(path: Path | str) -> dict[str, Any]:
+    return tomllib.loads(Path(path).read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("name", coopenv.list_envs())
 def test_every_environment_satisfies_the_schema(name: str, validator: Any) -> None:
-    assert [error.message for error in validator.iter_errors(raw(name))] == []
+    assert [error.message for error in validator.iter_errors(raw(data_directory("envs") / f"{name}.toml"))] == []
 
 
 @pytest.mark.parametrize(
@@ -194,22 +195,22 @@ def test_every_environment_satisfies_the_schema(name: str, validator: Any) -> No
     ],
 )
 def test_the_schema_refuses_unknown_keys_as_the_loader_does(path: tuple[Any, ...], validator: Any) -> None:
-    document = raw("urban_crossing")
+    document = raw(FOUR_WAY)
     node: Any = document
     for part in path:
         node = node.setdefault(part, {}) if isinstance(part, str) else node[part]
     node["misspelt"] = 1
     assert not validator.is_valid(document)
     with pytest.raises(coopenv.ScenarioError, match="misspelt"):
-        parse_scenario(apply_vehicle_defaults(copy.deepcopy(document)), "urban_crossing")
+        parse_scenario(apply_vehicle_defaults(copy.deepcopy(document)), "four_way")
 
 
 def test_vehicles_may_leave_out_what_the_defaults_say(validator: Any) -> None:
-    document = raw("urban_crossing")
+    document = raw(FOUR_WAY)
     document["vehicle_defaults"]["goal"] = {"position": [5.0, 5.0, 0.0]}
     for vehicle in document["vehicles"]:
         vehicle["goal"] = {"radius": 1.0}
-    parse_scenario(apply_vehicle_defaults(copy.deepcopy(document)), "urban_crossing")
+    parse_scenario(apply_vehicle_defaults(copy.deepcopy(document)), "four_way")
     assert validator.is_valid(document)
     del document["horizon"]
     assert not validator.is_valid(document)

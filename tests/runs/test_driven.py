@@ -11,6 +11,7 @@ import coopenv
 from coopenv.errors import CoopenvError
 from coopenv.policies import load_agent
 from coopenv.runs.driven import drive_vehicles
+from tests.helpers.four_way import FOUR_WAY
 
 OVERRIDES: dict[str, Any] = {"horizon": 8.0, "termination.after_arrival": "park"}
 
@@ -21,10 +22,10 @@ def follow(observations: np.ndarray) -> np.ndarray:
 
 
 def test_episodes_are_those_of_the_environment() -> None:
-    scenario = coopenv.load_scenario("urban_crossing", OVERRIDES)
+    scenario = coopenv.load_scenario(FOUR_WAY, OVERRIDES)
     episodes = drive_vehicles(scenario, follow, 5, 2)
     assert [(e.world, e.vehicle) for e in episodes] == [(w, f"vehicle_{i + 1}") for w in range(2) for i in range(4)]
-    env = coopenv.parallel_env("urban_crossing", overrides=OVERRIDES)
+    env = coopenv.parallel_env(FOUR_WAY, overrides=OVERRIDES)
     for world in range(2):
         mine = {e.vehicle: e for e in episodes if e.world == world}
         observations, infos = env.reset(seed=5, options={"world": world})

@@ -21,6 +21,7 @@ from coopenv.policies.base import zero_policy
 from coopenv.runs.keyboard import Keyboard, Keys
 from coopenv.runs.live import Clock, drive_by_hand, watch
 from coopenv.viz.window import Window
+from tests.helpers.four_way import FOUR_WAY
 
 AT_ONCE = Clock(np.inf)
 SHORT = {"horizon": 3.0}
@@ -56,7 +57,7 @@ class Unseen(Window):
 
 
 def test_watching_shows_the_episode() -> None:
-    scenario, window = coopenv.load_scenario("urban_crossing", SHORT), Unseen()
+    scenario, window = coopenv.load_scenario(FOUR_WAY, SHORT), Unseen()
     stage = watch(scenario, load_agent("route_follower", scenario), 1, console(), window, AT_ONCE)
     assert len(window.pictures) == 33  # the start is there twice, and so is the end
     assert (window.pictures[2] != window.pictures[20]).any()
@@ -67,13 +68,13 @@ def test_watching_ends_when_the_window_is_closed() -> None:
     def close(window: Unseen, number: int) -> None:
         window.open = number < 5
 
-    scenario, window = coopenv.load_scenario("urban_crossing", SHORT), Unseen(close)
+    scenario, window = coopenv.load_scenario(FOUR_WAY, SHORT), Unseen(close)
     watch(scenario, load_agent("route_follower", scenario), 1, console(), window, AT_ONCE)
     assert len(window.pictures) == 5
 
 
 def test_keys_are_speed_and_steering() -> None:
-    scenario, window = coopenv.load_scenario("urban_crossing"), Unseen()
+    scenario, window = coopenv.load_scenario(FOUR_WAY), Unseen()
     driver = Keyboard(scenario, 2, zero_policy(), Keys(window.canvas))
     rows = np.zeros((4, 132), dtype=np.float32)
 
@@ -100,7 +101,7 @@ def test_keys_are_speed_and_steering() -> None:
 
 
 def test_keys_accelerate_where_the_action_is_acceleration() -> None:
-    scenario, window = coopenv.load_scenario("urban_crossing", {"action.longitudinal": "acceleration"}), Unseen()
+    scenario, window = coopenv.load_scenario(FOUR_WAY, {"action.longitudinal": "acceleration"}), Unseen()
     driver = Keyboard(scenario, 0, zero_policy(), Keys(window.canvas))
     found = [driver(np.zeros((4, 132)))[0, 0]]
     for key in ("up", "down"):
@@ -124,7 +125,7 @@ def test_driving_by_hand_again_and_away() -> None:
         window.release("up")
         window.press("escape")
 
-    scenario = coopenv.load_scenario("urban_crossing", {"vehicle_defaults.motion.initial_speed": 0.0})
+    scenario = coopenv.load_scenario(FOUR_WAY, {"vehicle_defaults.motion.initial_speed": 0.0})
     stage = drive_by_hand(scenario, 0, zero_policy(), 4, console(), window, AT_ONCE)
     assert len(window.pictures) == 22
     assert stage.engine.view("seed")[0] == 5
@@ -132,7 +133,7 @@ def test_driving_by_hand_again_and_away() -> None:
 
 def test_the_vehicle_goes_where_the_keys_say() -> None:
     window = Unseen(lambda window, number: window.press("up") if number == 2 else None)
-    scenario = coopenv.load_scenario("urban_crossing", SHORT)
+    scenario = coopenv.load_scenario(FOUR_WAY, SHORT)
     stage = drive_by_hand(scenario, 1, load_agent("route_follower", scenario), 0, console(), window, AT_ONCE)
     start, now = (stage.engine.view(name)[0, 13] for name in ("start_position", "position"))
     assert now[1] - start[1] > 1.2 and abs(now[0] - start[0]) < 0.4  # northbound

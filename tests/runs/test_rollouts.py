@@ -22,11 +22,12 @@ from coopenv.runs import Rollout, rollout
 from coopenv.runs.metrics import outcome_line, run_metrics, vehicle_metrics
 from coopenv.runs.table import legend, metrics_table, remarks
 from coopenv.runs.video import GIF_SIZE, GifFilm, frame_stride
+from tests.helpers.four_way import FOUR_WAY
 
 CASES: list[tuple[str, dict[str, Any]]] = [
     *((name, {}) for name in coopenv.list_envs()),
-    *(("urban_crossing", {"dynamics.latency": ticks / 60.0}) for ticks in (0, 1, 3, 6)),
-    ("urban_crossing", {"action.longitudinal": "acceleration", "rates.decision": 5.0}),
+    *((FOUR_WAY, {"dynamics.latency": ticks / 60.0}) for ticks in (0, 1, 3, 6)),
+    (FOUR_WAY, {"action.longitudinal": "acceleration", "rates.decision": 5.0}),
     ("busy_intersection", {"v2x.delay": 7, "v2x.period": 4, "v2x.loss": 0.3, "rates.observer": 25.0}),
 ]
 
@@ -95,7 +96,7 @@ def test_steps_are_decisions_and_end_at_the_horizon() -> None:
 
 
 def test_policies_are_seeded_and_reach_the_vehicles() -> None:
-    scenario = coopenv.load_scenario("urban_crossing")
+    scenario = coopenv.load_scenario(FOUR_WAY)
     first, again = (rollout(scenario, seed=4, steps=20, policy="random") for _ in range(2))
     assert np.array_equal(first.position, again.position)
     assert not np.array_equal(first.position, rollout(scenario, seed=5, steps=20, policy="random").position)
@@ -108,7 +109,7 @@ def test_policies_are_seeded_and_reach_the_vehicles() -> None:
 
 
 def test_the_run_ends_with_the_last_vehicle() -> None:
-    scenario = coopenv.load_scenario("urban_crossing", {"vehicles.*.goal.radius": 30.0})
+    scenario = coopenv.load_scenario(FOUR_WAY, {"vehicles.*.goal.radius": 30.0})
     recording = Rollout(scenario)
     ticks = list(recording.play())
     assert ticks == list(range(scenario.ticks_per_decision + 1))
@@ -212,7 +213,7 @@ def vehicles_of(name: str, policy: str = "zero", **overrides: Any) -> tuple[Roll
 
 
 def test_figures_of_a_vehicle_end_with_it() -> None:
-    recording, vehicles = vehicles_of("urban_crossing", "route_follower")
+    recording, vehicles = vehicles_of(FOUR_WAY, "route_follower")
     run, endings = recording.trajectory(), recording.endings()
     assert min(ending.time for ending in endings) < run.t[-1] - 1.0
     for i, (vehicle, ending) in enumerate(zip(vehicles, endings, strict=True)):

@@ -24,6 +24,7 @@ from coopenv.training.export import export, network_of, onnx_model
 from coopenv.training.normalised import LEAST_VARIANCE, NormalisedEnv
 from coopenv.training.settings import Clone, Evaluation, Plan, Ppo, Settings
 from coopenv.training.trainer import Trainer
+from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.train
 torch.set_num_threads(1)
@@ -31,8 +32,8 @@ SMALL = Ppo(vehicles=16, decisions=32, epochs=1)
 
 
 def trainer_of(**settings: object) -> Trainer:
-    plan = Plan("urban_crossing", Settings(ppo=SMALL, **settings), seed=0)
-    return Trainer(plan, coopenv.load_scenario("urban_crossing"), threads=1)
+    plan = Plan(FOUR_WAY, Settings(ppo=SMALL, **settings), seed=0)
+    return Trainer(plan, coopenv.load_scenario(FOUR_WAY), threads=1)
 
 
 @pytest.fixture(scope="module")
@@ -58,8 +59,8 @@ def test_numpy_and_onnx_agree_with_torch(trained: Trainer, tmp_path: Path) -> No
 
 
 def test_statistics_are_those_of_vehicles_under_way() -> None:
-    env = NormalisedEnv(make_sb3_vec_env("urban_crossing", num_worlds=2, seed=0), clip=6.0, reward_scale=0.1)
-    twin = make_sb3_vec_env("urban_crossing", num_worlds=2, seed=0)
+    env = NormalisedEnv(make_sb3_vec_env(FOUR_WAY, num_worlds=2, seed=0), clip=6.0, reward_scale=0.1)
+    twin = make_sb3_vec_env(FOUR_WAY, num_worlds=2, seed=0)
     env.reset()
     seen = [twin.reset()]
     actions = np.column_stack([np.ones(8), np.linspace(0.2, 0.5, 8)]).astype(np.float32)  # walls, one after another
@@ -121,9 +122,9 @@ def test_learns_to_drive_faster_where_nothing_else_counts(tmp_path: Path) -> Non
     }
     ppo = Ppo(vehicles=64, decisions=16, gamma=0.9, learning_rate=3e-3)
     settings = Settings(steps=40_000, scenario=overrides, ppo=ppo, evaluation=Evaluation(final_worlds=8))
-    results = train(Plan("urban_crossing", settings, seed=2), tmp_path / "agent", threads=1)
+    results = train(Plan(FOUR_WAY, settings, seed=2), tmp_path / "agent", threads=1)
     figures = {result.metric: result for result in results}
-    scenario = coopenv.load_scenario("urban_crossing", overrides)
+    scenario = coopenv.load_scenario(FOUR_WAY, overrides)
     half_speed = figures_of(lambda observations: np.zeros((len(observations), 2)), scenario)
     assert figures["return"].ci_low > half_speed["return"].ci_high
 

@@ -34,6 +34,7 @@ from coopenv.viz.labels import place_names
 from coopenv.viz.observability import observability_figure
 from coopenv.viz.topology import topology_figure
 from coopenv.viz.trajectories import trajectory_figure_2d, trajectory_figure_3d
+from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.synthetic import make_trajectory
 
 NAMES = [f"{name}.png" for name in FIGURE_NAMES]
@@ -388,7 +389,7 @@ def test_no_name_covers_the_end_of_a_vehicle(draw: Callable[[Trajectory], Figure
 
 
 def test_plan_shows_roads_and_buildings_of_a_scenario(run: Trajectory) -> None:
-    scenario = coopenv.load_scenario("urban_crossing")
+    scenario = coopenv.load_scenario(FOUR_WAY)
     figure = trajectory_figure_2d(run, scenario=scenario)
     assert len(figure.axes[0].patches) == len(scenario.roads) + len(scenario.obstacles)
     assert {"road", "building"} <= texts(figure)

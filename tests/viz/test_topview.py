@@ -34,6 +34,7 @@ from coopenv.viz.topview_geometry import (
 )
 from coopenv.viz.topview_ground import HEIGHT, PANEL, ROW, TABLE_TOP, WIDTH
 from tests.helpers.builders import scenario
+from tests.helpers.four_way import FOUR_WAY
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +134,7 @@ def test_lines_of_sight_say_who_sees_whom_and_what_is_hidden() -> None:
 
 
 def test_ended_vehicles_are_marked() -> None:
-    engine = Engine(load_scenario("urban_crossing"))
+    engine = Engine(load_scenario(FOUR_WAY))
     engine.reset([0])
     view = TopView(engine.world.scenario)
     plain = view.draw(engine)
@@ -148,7 +149,7 @@ def test_ended_vehicles_are_marked() -> None:
 
 
 def test_world_0_of_a_batch_is_drawn() -> None:
-    scenario = load_scenario("urban_crossing")
+    scenario = load_scenario(FOUR_WAY)
     one, two = Engine(scenario), Engine(scenario, worlds=2)
     one.reset([5])
     two.reset([5, 6])
@@ -244,8 +245,8 @@ def test_limits_hold_the_whole_prescribed_episode(name: str) -> None:
 
 
 def test_limits_follow_the_map_origin() -> None:
-    low, high = limits(load_scenario("urban_crossing"))
-    moved = limits(load_scenario("urban_crossing", {"map.origin": [3.0, -2.0, 0.5]}))
+    low, high = limits(load_scenario(FOUR_WAY))
+    moved = limits(load_scenario(FOUR_WAY, {"map.origin": [3.0, -2.0, 0.5]}))
     np.testing.assert_allclose(moved, np.array([low, high]) - [3.0, -2.0])
 
 

@@ -11,6 +11,7 @@ import warp as wp
 import coopenv
 from coopenv.backends.simulated import Simulated
 from coopenv.world.launch import start_warp
+from tests.helpers.four_way import FOUR_WAY
 
 start_warp()
 CUDA = pytest.param("cuda:0", marks=pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device"))
@@ -18,7 +19,7 @@ OVERRIDES: dict[str, Any] = {"horizon": 3.0}
 
 
 @pytest.mark.parametrize("device", ["cpu", CUDA])
-@pytest.mark.parametrize("name", ["busy_intersection", "urban_crossing"])
+@pytest.mark.parametrize("name", ["busy_intersection", FOUR_WAY])
 def test_worlds_agree_with_the_cpu(name: str, device: str) -> None:
     scenario = coopenv.load_scenario(name, OVERRIDES)
     worlds = [Simulated(scenario).world(5, "float64", where, None) for where in ("cpu", device)]
@@ -41,8 +42,8 @@ def test_worlds_agree_with_the_cpu(name: str, device: str) -> None:
 def test_tensors_share_memory_and_agree_with_numpy(device: str, autoreset: str) -> None:
     torch = pytest.importorskip("torch", reason="needs torch")
     options: dict[str, Any] = {"num_worlds": 4, "autoreset": autoreset, "overrides": OVERRIDES}
-    tensors = coopenv.make_vec("urban_crossing", device=device, arrays="torch", **options)
-    arrays = coopenv.make_vec("urban_crossing", **options)
+    tensors = coopenv.make_vec(FOUR_WAY, device=device, arrays="torch", **options)
+    arrays = coopenv.make_vec(FOUR_WAY, **options)
     seen, _ = tensors.reset(seed=3)
     assert str(seen.device) == device and seen.dtype == torch.float32
     np.testing.assert_allclose(seen.cpu().numpy(), arrays.reset(seed=3)[0], atol=1e-4)

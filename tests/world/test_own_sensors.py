@@ -17,6 +17,7 @@ from coopenv.observers.briefing import briefing_of
 from coopenv.runs import record
 from coopenv.scenario import Scenario, load_scenario, parse_scenario
 from tests.helpers.builders import command, constant, run, same_bits, scenario, simulate, start, vehicle
+from tests.helpers.four_way import FOUR_WAY
 
 SENSED = {"mode": "sensed", "acyclic": True}
 ASIDE = (2.0, -1.0, 0.5)
@@ -42,10 +43,10 @@ def test_what_a_vehicle_does_not_give_is_the_scenarios() -> None:
 
 def test_tables_equal_to_the_scenarios_change_nothing() -> None:
     """Half of the vehicles have everything written out once more."""
-    plain = load_scenario("urban_crossing")
+    plain = load_scenario(FOUR_WAY)
     parts = {part: getattr(plain, part).model_dump() for part in ("camera", "noise", "dynamics")}
     written = {f"vehicles.{i}.{part}": table for i in (1, 3) for part, table in parts.items()}
-    worlds = [simulate(load_scenario("urban_crossing", given), 2) for given in ({}, written)]
+    worlds = [simulate(load_scenario(FOUR_WAY, given), 2) for given in ({}, written)]
     assert worlds[0].scenario != worlds[1].scenario
     for world in worlds:
         world.reset([1, 2])

@@ -23,6 +23,7 @@ from coopenv.policies.base import decide, random_policy, zero_policy
 from coopenv.runs import record
 from coopenv.scenario import load_scenario
 from tests.helpers.builders import run, same_bits, scenario, simulate, start, vehicle
+from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.warp_calls import DTYPES
 
 PAN = {"limit": 1.2, "rate": 0.9}
@@ -108,7 +109,7 @@ def test_it_sees_as_a_camera_that_is_mounted_so(dtype: str) -> None:
 
 def test_without_it_nothing_changes() -> None:
     """With a pan of zero, truth, bearings and estimates are what they are without the third entry."""
-    plain, able = (simulate(load_scenario("urban_crossing", given), 2) for given in ({}, {"action.pan": PAN}))
+    plain, able = (simulate(load_scenario(FOUR_WAY, given), 2) for given in ({}, {"action.pan": PAN}))
     for world, size in ((plain, 2), (able, 3)):
         world.reset([3, 4])
         actions = np.random.default_rng(0).uniform(-1, 1, (2, 4, 2))
@@ -126,7 +127,7 @@ def test_estimates_stay_consistent_while_it_pans(observer: str) -> None:
     worlds = 24 if observer == "robust" else 4
     starts = {"vehicles.*.initial_estimate": {"position_radius": 0.05, "orientation_angle": 0.02}}
     given = {**CROSSING, **starts, "action.longitudinal": "speed", "horizon": 8.0}
-    env = coopenv.make_vec("urban_crossing", num_worlds=worlds, observer=observer, dtype="float64", overrides=given)
+    env = coopenv.make_vec(FOUR_WAY, num_worlds=worlds, observer=observer, dtype="float64", overrides=given)
     env.reset(seed=11)
     generator, nees = np.random.default_rng(1), []
     for step in range(70):
@@ -142,7 +143,7 @@ def test_estimates_stay_consistent_while_it_pans(observer: str) -> None:
 
 
 def test_an_action_has_three_entries_everywhere() -> None:
-    env = coopenv.parallel_env("urban_crossing", overrides=CROSSING)
+    env = coopenv.parallel_env(FOUR_WAY, overrides=CROSSING)
     observations, _ = env.reset(seed=0)
     assert env.action_space("vehicle_1").shape == (3,)
     layout = env.observation_layout
@@ -152,7 +153,7 @@ def test_an_action_has_three_entries_everywhere() -> None:
     assert observations["vehicle_1"][layout["camera_pan"].slice] == pytest.approx([0.5], abs=1e-5)
     with pytest.raises(ActionError, match=r"shape \(2,\), expected \(3,\)"):
         env.step({agent: np.zeros(2) for agent in env.agents})
-    vec = coopenv.make_vec("urban_crossing", num_worlds=2, overrides=CROSSING)
+    vec = coopenv.make_vec(FOUR_WAY, num_worlds=2, overrides=CROSSING)
     vec.reset(seed=0)
     assert vec.action_space.shape == (8, 3)
     vec.step(vec.action_space.sample())
@@ -173,7 +174,7 @@ def test_a_command_carries_it() -> None:
 
 
 def test_a_recording_replays_to_the_same_observations(tmp_path: Path) -> None:
-    made = load_scenario("urban_crossing", {**CROSSING, "horizon": 3.0})
+    made = load_scenario(FOUR_WAY, {**CROSSING, "horizon": 3.0})
     policy = lambda observations: np.tile([-0.5, 0.1, 0.8], (len(observations), 1))  # noqa: E731
     recording = record(made, 3, policy)
     assert recording.pan is not None and recording.pan.max() > 0.9

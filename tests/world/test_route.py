@@ -7,6 +7,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import coopenv
+from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.route_calls import places, points
 from tests.helpers.warp_calls import DTYPES, EPSILON
 
@@ -84,7 +85,7 @@ def test_no_route(dtype: str) -> None:
 
 def test_a_vehicle_that_leaves_its_route_ends_there() -> None:
     overrides = {"termination.off_route": 1.5, "obstacles": []}
-    env = coopenv.parallel_env("urban_crossing", overrides=overrides)
+    env = coopenv.parallel_env(FOUR_WAY, overrides=overrides)
     _, infos = env.reset(seed=0)
     goal, left = np.array(env.scenario.vehicles[0].goal.position[:2]), 0
     begin = infos["vehicle_1"]["truth"]["position"][:2]

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 import coopenv
 from coopenv.estimation.outcomes import Sight
 from tests.helpers.builders import same_bits, simulate
+from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.warp_calls import DTYPES
 
 WORLDS, DECISIONS = 6, 60
@@ -24,7 +25,7 @@ ERRORS = {"noise.odometry_scale": 0.03, "noise.gyro_bias": 0.01}
 @cache
 def driven(sensing: str, dtype: str = "float64") -> list[dict[str, np.ndarray]]:
     """Return the state after each decision under the same actions; the camera misses, and is bounded by its image."""
-    scenario = coopenv.load_scenario("urban_crossing", {"sensing": sensing, "camera.miss_probability": 0.3, **ERRORS})
+    scenario = coopenv.load_scenario(FOUR_WAY, {"sensing": sensing, "camera.miss_probability": 0.3, **ERRORS})
     world = simulate(scenario, WORLDS, dtype)
     world.reset(range(WORLDS))
     generator = np.random.default_rng(2)
@@ -70,7 +71,7 @@ def test_what_is_sensed_anyway_has_the_same_noise() -> None:
 def _deviations(state: dict[str, np.ndarray]) -> np.ndarray:
     """Return the angles (W, N, A) between measured and true bearings, rad."""
     forward = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-    scenario = coopenv.load_scenario("urban_crossing")
+    scenario = coopenv.load_scenario(FOUR_WAY)
     markers = np.array([agent.marker for agent in (*scenario.landmarks, *scenario.vehicles)])
     R, position = state["rotation"], state["position"]
     point = position + np.einsum("waij,aj->wai", R, markers)

@@ -9,13 +9,14 @@ from coopenv.api.engine import Engine
 from coopenv.errors import ScenarioError
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import load_scenario
+from tests.helpers.four_way import FOUR_WAY
 
 SEEN = {"camera.range": 30.0, "camera.miss_probability": 0.0, "topology.acyclic": True, "obstacles": []}
 
 
 def engine_of(**changes: object) -> Engine:
     names = {key.replace("__", "."): value for key, value in changes.items()}
-    engine = Engine(load_scenario("urban_crossing", {**SEEN, **names}), 1, "float64")
+    engine = Engine(load_scenario(FOUR_WAY, {**SEEN, **names}), 1, "float64")
     engine.reset([0])
     return engine
 
@@ -82,4 +83,4 @@ def test_a_fast_vehicle_forgets_the_blocks_that_it_skips() -> None:
 
 def test_a_distance_is_positive() -> None:
     with pytest.raises(ScenarioError, match=r"observer\.gramian_distance: "):
-        load_scenario("urban_crossing", {"observer.gramian_distance": 0.0})
+        load_scenario(FOUR_WAY, {"observer.gramian_distance": 0.0})

@@ -12,6 +12,7 @@ from coopenv.api.engine import Engine
 from coopenv.api.terms.layout import observation_layout
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario, load_scenario
+from tests.helpers.four_way import FOUR_WAY
 from tests.oracles.geometry import in_field_of_view, is_occluded, point_in_camera
 
 GROUPS = ["uncertainty", "sightings", "map", "route", "self"]
@@ -19,7 +20,7 @@ GROUPS = ["uncertainty", "sightings", "map", "route", "self"]
 
 def scenario_with(**more: Any) -> Scenario:
     far = {"position_scale": 50.0, "map_scale": 50.0, "age_scale": 1000.0, "include": GROUPS}
-    return load_scenario("urban_crossing", {f"observation.{key}": value for key, value in {**far, **more}.items()})
+    return load_scenario(FOUR_WAY, {f"observation.{key}": value for key, value in {**far, **more}.items()})
 
 
 def driven(scenario: Scenario, steps: int = 12, worlds: int = 4) -> Engine:
@@ -198,7 +199,7 @@ def nearness(ego: Any, landmark: Any) -> Any:
 
 def test_fields_of_ones_own_per_landmark() -> None:
     coopenv.register_observation("nearness", nearness, per="landmark", low=0)
-    envs = coopenv.make_vec("urban_crossing", num_worlds=2, overrides={"observation.include": ["map", "nearness"]})
+    envs = coopenv.make_vec(FOUR_WAY, num_worlds=2, overrides={"observation.include": ["map", "nearness"]})
     envs.reset(seed=0)
     observations = envs.step(np.zeros(envs.action_space.shape))[0]
     layout = envs.observation_layout
@@ -212,7 +213,7 @@ def test_fields_of_ones_own_per_landmark() -> None:
 def test_a_planar_observation_leaves_out_what_a_car_cannot_change() -> None:
     whole, planar = ({"observation.include": ["estimate", "odometry", "map", "goal"]} for _ in range(2))
     planar["observation.planar"] = True
-    a, b = (coopenv.make_vec("urban_crossing", num_worlds=2, overrides=o) for o in (whole, planar))
+    a, b = (coopenv.make_vec(FOUR_WAY, num_worlds=2, overrides=o) for o in (whole, planar))
     one, two = a.reset(seed=0)[0], b.reset(seed=0)[0]
     for name, kept in {
         "estimate_position": [0, 1],
@@ -232,7 +233,7 @@ def test_a_planar_observation_leaves_out_what_a_car_cannot_change() -> None:
 def test_scales_and_centers_of_single_fields() -> None:
     names = {"observation.include": ["position_std", "odometry_age", "log_determinant", "goal"]}
     changed = {**names, "observation.scales.log_determinant": 20.0, "observation.centers.log_determinant": -4.0}
-    a, b = (coopenv.make_vec("urban_crossing", num_worlds=2, overrides=o) for o in (names, changed))
+    a, b = (coopenv.make_vec(FOUR_WAY, num_worlds=2, overrides=o) for o in (names, changed))
     one, two = a.reset(seed=0)[0], b.reset(seed=0)[0]
     assert list(a.observation_layout) == ["goal", "position_std", "odometry_age", "log_determinant"]
     value = a.observation_layout["log_determinant"].values(one)
@@ -252,7 +253,7 @@ def test_scales_and_centers_of_single_fields() -> None:
 )
 def test_errors_are_one_line(key: str, value: Any, message: str) -> None:
     with pytest.raises(coopenv.ScenarioError, match=message):
-        load_scenario("urban_crossing", {f"observation.{key}": value})
+        load_scenario(FOUR_WAY, {f"observation.{key}": value})
 
 
 def test_what_is_excluded_is_left_out_and_nothing_else() -> None:

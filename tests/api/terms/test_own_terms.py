@@ -20,6 +20,7 @@ from coopenv.estimation.outcomes import Outcome
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.scenario.files import scenario_path
 from coopenv.scenario.terms import REWARD_TERMS
+from tests.helpers.four_way import FOUR_WAY
 
 
 def error_again(ego: Any, truth: Any) -> Any:
@@ -79,7 +80,7 @@ COPIES = {"velocity_again": "velocity", "bearing_again": "bearings", "age_again"
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_copies_of_built_in_terms_agree_in_one_world(dtype: str) -> None:
-    env = coopenv.parallel_env("urban_crossing", overrides=OWN, dtype=dtype)
+    env = coopenv.parallel_env(FOUR_WAY, overrides=OWN, dtype=dtype)
     weights = env.scenario.reward.by_name
     rng = np.random.default_rng(0)
     observations, infos = env.reset(seed=0)
@@ -107,11 +108,9 @@ def test_copies_of_built_in_terms_agree_in_a_batch(autoreset: str) -> None:
     none = dict.fromkeys(REWARD_TERMS.built_in, 0.0)
     own_weights = {**none, "control_again": 0.0, "error_again": 1.0}
     options: dict[str, Any] = {"num_worlds": 3, "autoreset": autoreset}
-    own = coopenv.make_vec(
-        "urban_crossing", **options, overrides={**OWN, "horizon": 0.5, "reward.weights": own_weights}
-    )
+    own = coopenv.make_vec(FOUR_WAY, **options, overrides={**OWN, "horizon": 0.5, "reward.weights": own_weights})
     plain = {"reward": {"privileged": True, "weights": {**none, "position_error": 1.0}}, "horizon": 0.5}
-    other = coopenv.make_vec("urban_crossing", **options, overrides=plain)
+    other = coopenv.make_vec(FOUR_WAY, **options, overrides=plain)
     own_layout, layout = own.observation_layout, other.observation_layout
     rng = np.random.default_rng(0)
     steps = [(own.reset(seed=0)[0], other.reset(seed=0)[0])]
@@ -129,14 +128,14 @@ def test_copies_of_built_in_terms_agree_in_a_batch(autoreset: str) -> None:
 def test_conditions_of_ones_own_end_episodes(face: str) -> None:
     overrides = {"termination.second_decision": True, "termination.far_off": True, "termination.privileged": True}
     if face == "parallel":
-        env = coopenv.parallel_env("urban_crossing", overrides=overrides)
+        env = coopenv.parallel_env(FOUR_WAY, overrides=overrides)
         env.reset(seed=0)
         for terminates in (False, True):
             _, _, terminated, truncated, infos = env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
             assert set(terminated.values()) == {terminates} and not any(truncated.values())
         assert {info["outcome"] for info in infos.values()} == {"second_decision"} and not env.agents
         return
-    env = coopenv.make_vec("urban_crossing", num_worlds=2, overrides=overrides)
+    env = coopenv.make_vec(FOUR_WAY, num_worlds=2, overrides=overrides)
     env.reset(seed=0)
     ended = [env.step(np.zeros(env.action_space.shape, np.float32))[4]["ended"].tolist() for _ in range(3)]
     assert ended == [
@@ -430,7 +429,7 @@ def test_what_is_no_number_is_found(terms: str, message: str, face: str, tmp_pat
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
 def test_infos_of_a_batch_hold_every_term(autoreset: str) -> None:
     overrides = {**OWN, "horizon": 0.2}
-    envs = coopenv.make_vec("urban_crossing", num_worlds=2, overrides=overrides, autoreset=autoreset)
+    envs = coopenv.make_vec(FOUR_WAY, num_worlds=2, overrides=overrides, autoreset=autoreset)
     weights = envs.scenario.reward.by_name
     envs.reset(seed=0)
     for _ in range(2):

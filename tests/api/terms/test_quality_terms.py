@@ -11,10 +11,11 @@ import pytest
 import coopenv
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import Scenario, load_scenario
+from tests.helpers.four_way import FOUR_WAY
 
 QUALITY = ("position_uncertainty", "position_error_per_metre")
 OVER_A_WAY = {"observer.gramian_distance": 8.0}
-PLACES = {"urban_crossing": OVER_A_WAY, "urban_crossing, nobody sees far": {"camera.range": 3.0, **OVER_A_WAY}}
+PLACES = {FOUR_WAY: OVER_A_WAY, f"{FOUR_WAY}, nobody sees far": {"camera.range": 3.0, **OVER_A_WAY}}
 DRIVERS = ("stand still", "creep", "constant speed", "give way", "weave")
 
 
@@ -118,7 +119,7 @@ def test_whoever_drives_scores_above_standing_still_at_any_weight(place: str, na
 
 @pytest.mark.parametrize("name", DRIVERS)
 def test_information_gain_is_what_the_end_has_more_than_the_start(name: str) -> None:
-    run = drive("urban_crossing", name)
+    run = drive(FOUR_WAY, name)
     potential = -run.values["log_determinant"] / 6
     steps = run.counts.sum(axis=0)
     end = np.take_along_axis(potential, steps[None], axis=0)[0]
@@ -146,4 +147,4 @@ def test_a_vehicle_without_a_goal_pays_nothing() -> None:
 @pytest.mark.parametrize(("key", "value"), [("uncertainty_cap", 0.0), ("uncertainty_threshold", -0.1)])
 def test_settings_have_bounds(key: str, value: float) -> None:
     with pytest.raises(coopenv.ScenarioError, match=f"reward.{key}: "):
-        load_scenario("urban_crossing", {f"reward.{key}": value})
+        load_scenario(FOUR_WAY, {f"reward.{key}": value})

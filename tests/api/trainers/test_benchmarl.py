@@ -14,6 +14,7 @@ from benchmarl.experiment import Experiment, ExperimentConfig
 from benchmarl.models.mlp import MlpConfig
 
 from coopenv.api.trainers.benchmarl import task
+from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = [pytest.mark.benchmarl, pytest.mark.filterwarnings("ignore")]
 torch.set_num_threads(1)
@@ -37,7 +38,7 @@ def configuration(folder: Path) -> ExperimentConfig:
 def test_trains(algorithm: type[MappoConfig], tmp_path: Path) -> None:
     model = MlpConfig(num_cells=[64, 64], activation_class=torch.nn.Tanh, layer_class=torch.nn.Linear)
     experiment = Experiment(
-        task=task("urban_crossing", overrides={"horizon": 10.0}),
+        task=task(FOUR_WAY, overrides={"horizon": 10.0}),
         algorithm_config=algorithm.get_from_yaml(),
         model_config=model,
         critic_model_config=model,
@@ -53,7 +54,7 @@ def test_trains(algorithm: type[MappoConfig], tmp_path: Path) -> None:
 
 
 def test_specs() -> None:
-    crossing = task("urban_crossing")
+    crossing = task(FOUR_WAY)
     env = crossing.get_env_fun(num_envs=1, continuous_actions=True, seed=0, device="cpu")()
     assert crossing.group_map(env) == {"vehicle": [f"vehicle_{i}" for i in range(1, 5)]}
     assert crossing.max_steps(env) == 400
@@ -64,8 +65,8 @@ def test_specs() -> None:
 
 
 def test_every_world_has_a_seed_of_its_own() -> None:
-    make = task("urban_crossing").get_env_fun(num_envs=2, continuous_actions=True, seed=7, device="cpu")
+    make = task(FOUR_WAY).get_env_fun(num_envs=2, continuous_actions=True, seed=7, device="cpu")
     first, second = (make().reset()["vehicle", "observation"] for _ in range(2))
     assert not torch.equal(first, second)
-    again = task("urban_crossing").get_env_fun(num_envs=2, continuous_actions=True, seed=7, device="cpu")
+    again = task(FOUR_WAY).get_env_fun(num_envs=2, continuous_actions=True, seed=7, device="cpu")
     assert torch.equal(first, again().reset()["vehicle", "observation"])

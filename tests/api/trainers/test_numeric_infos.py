@@ -8,10 +8,11 @@ from pettingzoo.test import parallel_api_test
 
 import coopenv
 from coopenv.api.trainers.numeric_infos import NUMBERS, PlainInfos
+from tests.helpers.four_way import FOUR_WAY
 
 
 def test_infos_are_numbers_and_hold_no_truth() -> None:
-    env, full = PlainInfos(coopenv.parallel_env("urban_crossing")), coopenv.parallel_env("urban_crossing")
+    env, full = PlainInfos(coopenv.parallel_env(FOUR_WAY)), coopenv.parallel_env(FOUR_WAY)
     observations, infos = env.reset(seed=3)
     expected, complete = full.reset(seed=3)
     for _ in range(20):
@@ -27,7 +28,7 @@ def test_infos_are_numbers_and_hold_no_truth() -> None:
 
 
 def test_events_show_once_and_actions_of_the_dead_are_dropped() -> None:
-    env = PlainInfos(coopenv.parallel_env("urban_crossing"))
+    env = PlainInfos(coopenv.parallel_env(FOUR_WAY))
     env.reset(seed=0)
     turns = {agent: np.array([1.0, 0.2 + 0.1 * i], dtype=np.float32) for i, agent in enumerate(env.possible_agents)}
     collided = dict.fromkeys(env.possible_agents, 0.0)
@@ -40,14 +41,14 @@ def test_events_show_once_and_actions_of_the_dead_are_dropped() -> None:
 
 
 def test_missing_action_is_still_an_error() -> None:
-    env = PlainInfos(coopenv.parallel_env("urban_crossing"))
+    env = PlainInfos(coopenv.parallel_env(FOUR_WAY))
     env.reset(seed=0)
     with pytest.raises(coopenv.ActionError, match="no action for 'vehicle_1'"):
         env.step({})
 
 
 def test_conforms() -> None:
-    env = PlainInfos(coopenv.parallel_env("urban_crossing"))
+    env = PlainInfos(coopenv.parallel_env(FOUR_WAY))
     parallel_api_test(env, num_cycles=100)
     env.reset(seed=0)
     assert env.state_space.contains(env.state())

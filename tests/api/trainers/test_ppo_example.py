@@ -20,6 +20,7 @@ import torch
 from safetensors.torch import load_file
 
 import coopenv
+from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.train
 torch.set_num_threads(1)
@@ -98,7 +99,7 @@ def test_statistics_are_those_of_all_rows_taken_in(ppo: ModuleType) -> None:
 def test_outcomes_are_told_whatever_is_paid_for_them(ppo: ModuleType, weights: dict[str, float]) -> None:
     """Arrivals and collisions are counted by what the world says, not by the sign of the reward."""
     overrides = {"horizon": 20.0, **weights}
-    env = coopenv.make_vec("urban_crossing", num_worlds=4, overrides=overrides, autoreset="disabled", arrays="torch")
+    env = coopenv.make_vec(FOUR_WAY, num_worlds=4, overrides=overrides, autoreset="disabled", arrays="torch")
     env.reset(seed=0)
     tally = ppo.Tally(env.num_envs, "cpu", env.engine.reward_terms)
     over = torch.zeros(env.num_envs, dtype=torch.bool)
@@ -141,7 +142,7 @@ def rollout(ppo: ModuleType, env: coopenv.CooperativeVectorEnv, steps: int, bias
 
 
 def test_reset_steps_are_left_out(ppo: ModuleType) -> None:
-    env = coopenv.make_vec("urban_crossing", num_worlds=2, overrides={"horizon": 1.0}, arrays="torch")
+    env = coopenv.make_vec(FOUR_WAY, num_worlds=2, overrides={"horizon": 1.0}, arrays="torch")
     buffer = rollout(ppo, env, 33, [-1.0, 0.0])
     acted = torch.tensor([True] * 10 + [False]).repeat(3)
     assert torch.equal(buffer["valid"], acted[:, None].expand(-1, env.num_envs))
@@ -151,7 +152,7 @@ def test_reset_steps_are_left_out(ppo: ModuleType) -> None:
 
 
 def test_parked_vehicles_are_left_out(ppo: ModuleType) -> None:
-    env = coopenv.make_vec("urban_crossing", num_worlds=2, overrides={"horizon": 20.0}, arrays="torch")
+    env = coopenv.make_vec(FOUR_WAY, num_worlds=2, overrides={"horizon": 20.0}, arrays="torch")
     steps = 201
     buffer = rollout(ppo, env, steps, [1.0, 0.4])  # a wide turn into a wall
     parked = torch.zeros(env.num_envs, dtype=torch.bool)

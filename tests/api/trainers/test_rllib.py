@@ -16,6 +16,7 @@ from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.env.multi_agent_env_runner import MultiAgentEnvRunner
 
 from coopenv.api.trainers.rllib import CooperativeMultiAgentEnv
+from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.rllib
 torch.set_num_threads(1)
@@ -32,7 +33,7 @@ def shared_policy(**env_config: Any) -> PPOConfig:
     """Return PPO with one policy for all vehicles, in this process."""
     return (
         PPOConfig()
-        .environment(CooperativeMultiAgentEnv, env_config={"env": "urban_crossing", **env_config})
+        .environment(CooperativeMultiAgentEnv, env_config={"env": FOUR_WAY, **env_config})
         .env_runners(num_env_runners=0, num_envs_per_env_runner=2)
         .learners(num_learners=0)
         .multi_agent(policies={"shared"}, policy_mapping_fn=lambda agent, episode, **_: "shared")
@@ -88,7 +89,7 @@ def drive(env: CooperativeMultiAgentEnv) -> tuple[dict[str, int], int, dict[str,
 
 
 def test_deaths_end_single_vehicles() -> None:
-    ended, steps, terminated, truncated = drive(CooperativeMultiAgentEnv({"env": "urban_crossing"}))
+    ended, steps, terminated, truncated = drive(CooperativeMultiAgentEnv({"env": FOUR_WAY}))
     assert len(ended) == 4 and len(set(ended.values())) > 1
     assert steps == max(ended.values())
     assert terminated["__all__"] and not truncated["__all__"]
@@ -96,9 +97,9 @@ def test_deaths_end_single_vehicles() -> None:
 
 def test_step_that_mixes_a_death_and_the_horizon() -> None:
     """Only the vehicle that ended by itself is flagged as terminated; the others are cut off."""
-    ended, *_ = drive(CooperativeMultiAgentEnv({"env": "urban_crossing"}))
+    ended, *_ = drive(CooperativeMultiAgentEnv({"env": FOUR_WAY}))
     first, step = min(ended.items(), key=lambda item: item[1])
-    config = {"env": "urban_crossing", "overrides": {"horizon": step / 10}}
+    config = {"env": FOUR_WAY, "overrides": {"horizon": step / 10}}
     _, steps, terminated, truncated = drive(CooperativeMultiAgentEnv(config))
     assert steps == step
     assert terminated[first] and sum(terminated.values()) == 1

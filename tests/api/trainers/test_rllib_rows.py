@@ -18,6 +18,7 @@ from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
 
 import coopenv
 from coopenv.api.trainers.rllib import CooperativeRows
+from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.rllib
 torch.set_num_threads(1)
@@ -38,7 +39,7 @@ def two_nodes() -> Iterator[None]:
 def ppo(runners: int, rows: int = ROWS, **env_config: Any) -> PPOConfig:
     return (
         PPOConfig()
-        .environment(CooperativeRows, env_config={"env": "urban_crossing", "overrides": SHORT, **env_config})
+        .environment(CooperativeRows, env_config={"env": FOUR_WAY, "overrides": SHORT, **env_config})
         .env_runners(
             num_env_runners=runners,
             num_envs_per_env_runner=rows,
@@ -80,4 +81,4 @@ def test_episodes_are_those_of_vehicles() -> None:
 
 def test_other_vectorisation_is_refused() -> None:
     with pytest.raises(coopenv.CoopenvError, match="gym_env_vectorize_mode='vector_entry_point'"):
-        CooperativeRows({"env": "urban_crossing"})
+        CooperativeRows({"env": FOUR_WAY})

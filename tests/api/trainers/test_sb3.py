@@ -16,13 +16,14 @@ import coopenv
 from coopenv import CoopenvError
 from coopenv.api.trainers.sb3 import make_sb3_vec_env
 from coopenv.scenario.terms import REWARD_TERMS
+from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.train
 torch.set_num_threads(1)  # small networks: torch's threads and the batch's would only wait for one another
 
 
 def test_ppo_trains_with_monitor_and_normalisation() -> None:
-    env = VecNormalize(VecMonitor(make_sb3_vec_env("urban_crossing", num_worlds=8)))
+    env = VecNormalize(VecMonitor(make_sb3_vec_env(FOUR_WAY, num_worlds=8)))
     model = PPO("MlpPolicy", env, n_steps=64, batch_size=256, n_epochs=2, seed=0, device="cpu")
     model.learn(8192)
     assert model.num_timesteps >= 8192
@@ -39,7 +40,7 @@ def test_time_limit_is_not_learnt_as_a_death() -> None:
         "observation.include": ["odometry"],  # nothing that tells the time left
         "termination": {"collision": False, "arrival": False},
     }
-    env = make_sb3_vec_env("urban_crossing", num_worlds=16, overrides=overrides)
+    env = make_sb3_vec_env(FOUR_WAY, num_worlds=16, overrides=overrides)
     model = PPO(
         "MlpPolicy", env, gamma=0.95, n_steps=40, batch_size=640, n_epochs=10, learning_rate=3e-3, seed=1, device="cpu"
     )
@@ -70,19 +71,19 @@ def test_terminal_observations_and_flags() -> None:
 
 
 def test_seeding() -> None:
-    env = make_sb3_vec_env("urban_crossing", num_worlds=3)
+    env = make_sb3_vec_env(FOUR_WAY, num_worlds=3)
     env.seed(7)
     first = env.reset()
     second = env.reset()
     env.seed(7)
     assert np.array_equal(env.reset(), first)
     assert not np.array_equal(first, second)
-    single, _ = coopenv.parallel_env("urban_crossing").reset(seed=7, options={"world": 1})
+    single, _ = coopenv.parallel_env(FOUR_WAY).reset(seed=7, options={"world": 1})
     assert np.array_equal(first[4:8], np.stack(list(single.values())))  # world 1 of the batch
 
 
 def test_options_of_a_reset_count_once_and_its_settings_hold() -> None:
-    env = make_sb3_vec_env("urban_crossing", num_worlds=2)
+    env = make_sb3_vec_env(FOUR_WAY, num_worlds=2)
     env.set_options({"difficulty": "hard", "parameters": {"camera_range": np.array([0.5, 0.75])}})
     for _ in range(2):
         env.reset()
@@ -105,7 +106,7 @@ def test_methods_reach_the_batch() -> None:
 
 def test_step_before_reset() -> None:
     with pytest.raises(coopenv.CoopenvError, match="before reset"):
-        make_sb3_vec_env("urban_crossing", num_worlds=2).step(np.zeros((8, 2)))
+        make_sb3_vec_env(FOUR_WAY, num_worlds=2).step(np.zeros((8, 2)))
 
 
 @pytest.mark.parametrize(
@@ -121,7 +122,7 @@ def test_bad_actions(actions: np.ndarray, message: str) -> None:
 
 def test_a_reward_in_python_is_earned_and_starts_anew_with_its_world() -> None:
     env = make_sb3_vec_env(
-        "urban_crossing",
+        FOUR_WAY,
         num_worlds=2,
         overrides={"horizon": 0.5},
         seed=0,

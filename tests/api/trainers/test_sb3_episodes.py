@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 import coopenv
 from coopenv.api.trainers.sb3 import CooperativeSB3VecEnv, make_sb3_vec_env
 from coopenv.api.trainers.sb3_buffer import ActingRowsBuffer
+from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.train
 torch.set_num_threads(1)
@@ -37,7 +38,7 @@ class AtSpeeds:
 @pytest.fixture(scope="module")
 def by_hand() -> dict[str, np.ndarray]:
     """Return what one episode per vehicle comes to, stepped by hand: return, decisions, whether it arrived."""
-    env = coopenv.make_vec("urban_crossing", num_worlds=WORLDS, autoreset="disabled", overrides=SHORT)
+    env = coopenv.make_vec(FOUR_WAY, num_worlds=WORLDS, autoreset="disabled", overrides=SHORT)
     observation, _ = env.reset(seed=SEED)
     returned, length, ended = np.zeros(env.num_envs), np.zeros(env.num_envs, int), np.zeros(env.num_envs, int)
     under_way = np.ones(env.num_envs, bool)
@@ -53,7 +54,7 @@ def by_hand() -> dict[str, np.ndarray]:
 
 
 def test_evaluate_policy_gives_the_true_return(by_hand: dict[str, np.ndarray]) -> None:
-    env = make_sb3_vec_env("urban_crossing", num_worlds=WORLDS, overrides=SHORT, seed=SEED)
+    env = make_sb3_vec_env(FOUR_WAY, num_worlds=WORLDS, overrides=SHORT, seed=SEED)
     returns, lengths = evaluate_policy(AtSpeeds(), env, env.num_envs, return_episode_rewards=True)
     assert sorted(returns) == pytest.approx(sorted(by_hand["return"]), abs=1e-3)
     assert sorted(lengths) == sorted(by_hand["length"])
@@ -61,7 +62,7 @@ def test_evaluate_policy_gives_the_true_return(by_hand: dict[str, np.ndarray]) -
 
 def test_a_monitor_on_top_finds_the_same_return(by_hand: dict[str, np.ndarray]) -> None:
     with pytest.warns(UserWarning, match="already wrapped with a `Monitor`"):
-        env = VecMonitor(make_sb3_vec_env("urban_crossing", num_worlds=WORLDS, overrides=SHORT, seed=SEED))
+        env = VecMonitor(make_sb3_vec_env(FOUR_WAY, num_worlds=WORLDS, overrides=SHORT, seed=SEED))
     returns, _ = evaluate_policy(AtSpeeds(), env, env.num_envs, return_episode_rewards=True)
     assert sorted(returns) == pytest.approx(sorted(by_hand["return"]), abs=1e-3)
 
@@ -69,7 +70,7 @@ def test_a_monitor_on_top_finds_the_same_return(by_hand: dict[str, np.ndarray]) 
 @pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
 def test_logged_means_are_those_of_true_episodes(algorithm: str) -> None:
     """`ep_rew_mean`, `ep_len_mean` and `success_rate` against sums over the rewards that the algorithm was given."""
-    env = Witness(make_sb3_vec_env("urban_crossing", num_worlds=4, overrides=SHORT, seed=SEED))
+    env = Witness(make_sb3_vec_env(FOUR_WAY, num_worlds=4, overrides=SHORT, seed=SEED))
     shared = {"seed": 0, "device": "cpu", "stats_window_size": 10_000}
     if algorithm == "PPO":
         model: Any = PPO("MlpPolicy", env, n_steps=125, batch_size=400, n_epochs=1, **shared)
@@ -107,7 +108,7 @@ class Witness(VecEnvWrapper):
 
 
 def test_infos_at_the_end_of_an_episode() -> None:
-    env = make_sb3_vec_env("urban_crossing", num_worlds=WORLDS, overrides=SHORT, seed=SEED)
+    env = make_sb3_vec_env(FOUR_WAY, num_worlds=WORLDS, overrides=SHORT, seed=SEED)
     weights = env.scenario.reward.by_name
     observation, seen = env.reset(), []
     for _ in range(DECISIONS):
@@ -126,7 +127,7 @@ def test_infos_at_the_end_of_an_episode() -> None:
 
 
 def test_buffer_gives_rows_under_way_alone() -> None:
-    env = make_sb3_vec_env("urban_crossing", num_worlds=4, overrides=SHORT, seed=SEED)
+    env = make_sb3_vec_env(FOUR_WAY, num_worlds=4, overrides=SHORT, seed=SEED)
     model = PPO(
         *("MlpPolicy", env),
         **{"n_steps": 160, "batch_size": 256, "n_epochs": 1, "seed": 0, "device": "cpu"},
@@ -147,7 +148,7 @@ def test_buffer_gives_rows_under_way_alone() -> None:
 
 @pytest.mark.parametrize("duplicate", [copy.copy, copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 def test_copies_go_on_alike_and_apart(duplicate: Any) -> None:
-    env = make_sb3_vec_env("urban_crossing", num_worlds=2, overrides={"horizon": 1.0}, seed=SEED)
+    env = make_sb3_vec_env(FOUR_WAY, num_worlds=2, overrides={"horizon": 1.0}, seed=SEED)
     env.reset()
     actions = np.full((env.num_envs, 2), 0.3, np.float32)
     for _ in range(4):
@@ -161,7 +162,7 @@ def test_copies_go_on_alike_and_apart(duplicate: Any) -> None:
 
 
 def test_dict_observations_drive_a_policy_with_several_inputs() -> None:
-    env = make_sb3_vec_env("urban_crossing", num_worlds=2, observation="dict", overrides={"horizon": 1.0})
+    env = make_sb3_vec_env(FOUR_WAY, num_worlds=2, observation="dict", overrides={"horizon": 1.0})
     model = PPO("MultiInputPolicy", env, n_steps=16, batch_size=64, n_epochs=1, device="cpu")
     model.learn(256)
     assert model.num_timesteps >= 256
@@ -169,5 +170,5 @@ def test_dict_observations_drive_a_policy_with_several_inputs() -> None:
 
 def test_options_that_it_chooses_itself() -> None:
     with pytest.raises(coopenv.CoopenvError, match="chooses autoreset itself"):
-        make_sb3_vec_env("urban_crossing", num_worlds=1, autoreset="disabled")
-    assert make_sb3_vec_env("urban_crossing", num_worlds=1, observer="robust").scenario.observer.name == "robust"
+        make_sb3_vec_env(FOUR_WAY, num_worlds=1, autoreset="disabled")
+    assert make_sb3_vec_env(FOUR_WAY, num_worlds=1, observer="robust").scenario.observer.name == "robust"

@@ -20,13 +20,14 @@ from torchrl.objectives.value import GAE
 
 import coopenv
 from coopenv.api.trainers.numeric_infos import PlainInfos
+from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = [pytest.mark.torchrl, pytest.mark.filterwarnings("ignore:PettingZoo in TorchRL is tested")]
 torch.set_num_threads(1)
 
 
 def crossing(**overrides: Any) -> PettingZooWrapper:
-    world = PlainInfos(coopenv.parallel_env("urban_crossing", overrides=overrides))
+    world = PlainInfos(coopenv.parallel_env(FOUR_WAY, overrides=overrides))
     return PettingZooWrapper(world, done_on_any=False, use_mask=True, return_state=True)
 
 

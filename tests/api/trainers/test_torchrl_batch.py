@@ -13,6 +13,7 @@ from torchrl.envs.utils import check_env_specs
 import coopenv
 from coopenv.api.statistics import RecordVehicleEpisodes
 from coopenv.api.trainers.torchrl import batched_env
+from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.torchrl
 torch.set_num_threads(1)
@@ -21,7 +22,7 @@ STEPS = 150
 
 
 def test_specs() -> None:
-    env = batched_env("urban_crossing", **OPTIONS)
+    env = batched_env(FOUR_WAY, **OPTIONS)
     assert env.batch_size == torch.Size([12])
     check_env_specs(env)
 
@@ -29,13 +30,13 @@ def test_specs() -> None:
 def test_episodes_are_those_of_vehicles() -> None:
     """Under wide turns, which end against walls or at the horizon: every end and all rewards are those of the batch."""
     actions = np.column_stack([np.ones(12), np.linspace(0.0, 0.5, 12)]).astype(np.float32)
-    env = batched_env("urban_crossing", **OPTIONS)
+    env = batched_env(FOUR_WAY, **OPTIONS)
     env.set_seed(0)
     always = torch.from_numpy(actions)
     rollout = env.rollout(STEPS, lambda observation: always.clone(), break_when_any_done=False)
     told = {name: rollout["next", name].squeeze(-1).numpy() for name in ("done", "truncated", "reward")}
 
-    batch = RecordVehicleEpisodes(coopenv.make_vec("urban_crossing", autoreset="disabled", **OPTIONS), 1000)
+    batch = RecordVehicleEpisodes(coopenv.make_vec(FOUR_WAY, autoreset="disabled", **OPTIONS), 1000)
     batch.reset(seed=0)
     batch.reset()  # as `rollout` does
     ends, rewards = np.zeros((12, STEPS), dtype=bool), np.zeros((12, STEPS))

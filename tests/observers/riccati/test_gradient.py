@@ -12,6 +12,7 @@ from coopenv.observers.riccati.gradient import DifferentiableWorld, check_differ
 from coopenv.scenario import Scenario
 from coopenv.seeds import world_keys
 from tests.helpers.builders import simulate
+from tests.helpers.four_way import FOUR_WAY
 
 SMOOTH: dict[str, Any] = {
     "noise.enabled": False,
@@ -24,7 +25,7 @@ SEED, DECISIONS, WORLDS = 3, 8, 2
 
 
 def scenario(**more: Any) -> Scenario:
-    return coopenv.load_scenario("urban_crossing", {**SMOOTH, **more})
+    return coopenv.load_scenario(FOUR_WAY, {**SMOOTH, **more})
 
 
 @pytest.fixture(scope="module", params=["speed", "acceleration"])

@@ -12,6 +12,7 @@ from coopenv.api.engine import Engine
 from coopenv.observers import run
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
+from tests.helpers.four_way import FOUR_WAY
 from tests.oracles.batch import small_errors
 from tests.oracles.riccati import Riccati
 
@@ -65,7 +66,7 @@ def test_hamel_samson_is_the_riccati_observer_without_neighbours() -> None:
     assert (alone.bytes_per_second == 0).all()
 
 
-@pytest.mark.parametrize("name", ["urban_crossing", "crossing_path"])
+@pytest.mark.parametrize("name", [FOUR_WAY, "crossing_path"])
 def test_it_is_the_embedded_observer_where_sight_is_sensed_and_vehicles_are_driven(name: str) -> None:
     scenario = load_scenario(name, {"horizon": 3.0})
     actions = np.linspace(-0.3, 0.6, 2 * len(scenario.vehicles)).reshape(1, -1, 2)

@@ -21,6 +21,7 @@ from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from coopenv.world.world import World
 from tests.helpers.builders import constant, scenario, vehicle
+from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.replays import Played, replayed
 from tests.helpers.robust_scenes import crowd, everybody_sees_everybody, noise_free, small_errors
 from tests.oracles.robust.joint import RobustJoint
@@ -68,7 +69,7 @@ CASES: dict[str, Callable[[float], Recording]] = {
     "landmarks lost": lambda horizon: FAULTS["landmarks_lost"].applied(near(recorded(horizon=horizon)), 4)[0],
     "slow corrections": lambda horizon: near(recorded(horizon=horizon, rates__observer=25.0, rates__odometry=37.0)),
     "cyclic": lambda horizon: near(recorded(horizon=horizon, topology__acyclic=False)),
-    "sensed": lambda horizon: recorded("urban_crossing", horizon=horizon),
+    "sensed": lambda horizon: recorded(FOUR_WAY, horizon=horizon),
     "three landmarks": lambda horizon: recorded("crossing_path", horizon=horizon),
     "errors that last": lambda horizon: near(recorded(horizon=horizon, **dotted(LASTING))),
     "errors that last, any start": lambda horizon: random_start(recorded(horizon=horizon, **dotted(LASTING)), 2),

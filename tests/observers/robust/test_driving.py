@@ -12,6 +12,7 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.files import load_scenario
 from coopenv.world.world import World
 from tests.helpers.builders import reset, simulate
+from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.warp_calls import DTYPES
 
 Driver = Callable[[World, int, np.ndarray], np.ndarray | float]
@@ -28,7 +29,7 @@ def square(**overrides: object) -> Scenario:
     landmarks = [{"name": f"L{n}", "position": [x, y, HEIGHTS[n % 5]]} for n, (x, y) in enumerate(CORNERS + SIDES)]
     start = {"vehicle_defaults.initial_estimate": {"position_radius": 0.3, "orientation_angle": 0.15}}
     open_space = {"obstacles": [], "landmarks": landmarks, "camera.range": 6.0, "horizon": 20.0}
-    return load_scenario("urban_crossing", {**open_space, **start, "observer.name": "robust", **overrides})
+    return load_scenario(FOUR_WAY, {**open_space, **start, "observer.name": "robust", **overrides})
 
 
 def estimates(world: World) -> tuple[np.ndarray, np.ndarray]:
