@@ -125,7 +125,7 @@ def stepper(world: World, warm_up: int, advance: Callable[[int], None] | None = 
         warm_up: decisions after a start that do not count.
         advance: runs the camera ticks of one decision; None: `world.advance`.
     """
-    ticks, (W, N) = int(world.model.ticks_per_decision), world.actions.shape
+    ticks, (W, N) = int(world.model.ticks_per_decision), world.actions.shape[:2]
     world.actions.assign(np.random.default_rng(0).uniform(-1, 1, (W, N, 2)).astype(world.precision.numpy))
 
     def run(decisions: int) -> None:

@@ -197,7 +197,7 @@ def test_an_environment_that_changed_since(here: Path, capsys: pytest.CaptureFix
     wait_until(lambda: (here / "agent" / "checkpoint.safetensors").is_file() or first.poll() is not None)
     os.killpg(first.pid, signal.SIGKILL)
     first.communicate()
-    (here / "mine.toml").write_text(source.read_text().replace("range = 12.0", "range = 6.0"))
+    (here / "mine.toml").write_text(source.read_text().replace("range = 6.0", "range = 5.0"))
     assert main(["train", "mine.toml", "--out", "agent", "--resume"]) == 2
     assert "mine.toml has changed since; remove the file to start anew" in capsys.readouterr().err
 

@@ -36,7 +36,20 @@ def ppo() -> ModuleType:
     return module
 
 
-FEW = ["--num-worlds", "4", "--rollout", "16", "--total-steps", "1024", "--minibatches", "2", "--epochs", "2"]
+FEW = [
+    "--env",
+    FOUR_WAY,
+    "--num-worlds",
+    "4",
+    "--rollout",
+    "16",
+    "--total-steps",
+    "1024",
+    "--minibatches",
+    "2",
+    "--epochs",
+    "2",
+]
 
 
 def few(ppo: ModuleType, folder: Path, *more: str) -> Any:
