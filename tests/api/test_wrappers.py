@@ -66,7 +66,9 @@ def test_record_video_of_one_vehicle(tmp_path: Path) -> None:
 
 def test_time_aware_observation_knows_the_horizon() -> None:
     env = gymnasium.make(CROSSING)
-    assert env.spec is not None and env.spec.max_episode_steps == 400
+    scenario = coopenv.load_scenario("urban_crossing")
+    assert env.spec is not None
+    assert env.spec.max_episode_steps == round(scenario.horizon * scenario.rates.decision)
     aware = gymnasium.wrappers.TimeAwareObservation(env)
     assert aware.observation_space.contains(aware.reset(seed=0)[0])
 
