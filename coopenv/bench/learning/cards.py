@@ -23,8 +23,9 @@ COMPARED = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m")
 
 
 def stale_groups(study: Study, folder: Path) -> list[Group]:
-    """Return the groups whose card does not tell of all runs that are finished."""
-    return [group for group in study.groups if _finished(study, group, folder) != _told(folder / group.name)]
+    """Return the groups with finished runs whose card does not tell of just these."""
+    finished = {group: _finished(study, group, folder) for group in study.groups}
+    return [group for group, runs in finished.items() if runs and runs != _told(folder / group.name)]
 
 
 def write(study: Study, group: Group, folder: Path, judge: Judge) -> None:

@@ -21,10 +21,11 @@ class Judge:
         """Take so many worlds of either block."""
         self.worlds = worlds
         self._known: dict[tuple[str, ...], Episodes] = {}
+        self._merits: dict[tuple[str, ...], float] = {}
 
     def results(self, environment: str, agent: str | Path, overrides: Mapping[str, Any] | None = None) -> list[Result]:
         """Return the figures of an agent in the reported worlds, under overrides of the environment."""
-        return score(self._episodes(environment, agent, overrides or {}, REPORTED))
+        return score(self._reported(environment, agent, overrides or {}))
 
     def ideal(self, environment: str, agent: str) -> list[Result]:
         """Return those of an agent that sees everything."""
@@ -32,25 +33,33 @@ class Judge:
 
     def against(self, environment: str, agent: str | Path, other: str | Path) -> list[Difference]:
         """Return how much an agent's figures differ from another's in the same worlds."""
-        own, others = (self._episodes(environment, each, {}, REPORTED) for each in (agent, other))
+        own, others = (self._reported(environment, each, {}) for each in (agent, other))
         return compare_paired(own, others)
 
     def merit(self, environment: str, agent: Path, overrides: Mapping[str, Any]) -> float:
         """Return the mean return of an agent by the reward that it learnt from, in worlds of the other block."""
-        figures = {
-            result.metric: result.mean for result in score(self._episodes(environment, agent, overrides, CHOSEN))
-        }
-        return figures["return"]
+        key = _key(environment, agent, overrides)
+        if key not in self._merits:
+            results = score(self._drive(environment, agent, overrides, CHOSEN))
+            self._merits[key] = {result.metric: result.mean for result in results}["return"]
+        return self._merits[key]
 
-    def _episodes(self, environment: str, agent: str | Path, overrides: Mapping[str, Any], block: int) -> Episodes:
-        weights = sorted(str(path.stat().st_mtime_ns) for path in Path(agent).glob("*.safetensors"))
-        key = (environment, str(agent), repr(sorted(overrides.items())), str(block), *weights)
+    def _reported(self, environment: str, agent: str | Path, overrides: Mapping[str, Any]) -> Episodes:
+        key = _key(environment, agent, overrides)
         if key not in self._known:
-            scenario = open_simulation(environment, overrides)
-            engine = Engine(scenario, self.worlds)
-            try:
-                seeds = held_out_seeds(block, self.worlds)
-                self._known[key] = drive(engine, load_agent(agent, scenario), seeds)
-            finally:
-                engine.close()
+            self._known[key] = self._drive(environment, agent, overrides, REPORTED)
         return self._known[key]
+
+    def _drive(self, environment: str, agent: str | Path, overrides: Mapping[str, Any], block: int) -> Episodes:
+        scenario = open_simulation(environment, overrides)
+        engine = Engine(scenario, self.worlds)
+        try:
+            return drive(engine, load_agent(agent, scenario), held_out_seeds(block, self.worlds))
+        finally:
+            engine.close()
+
+
+def _key(environment: str, agent: str | Path, overrides: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what episodes depend on: weights that are trained anew are another agent."""
+    weights = sorted(str(path.stat().st_mtime_ns) for path in Path(agent).glob("*.safetensors"))
+    return (environment, str(agent), repr(sorted(overrides.items())), *weights)

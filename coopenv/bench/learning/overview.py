@@ -7,7 +7,7 @@ from typing import Any
 from coopenv.bench.agents import cards, table
 from coopenv.bench.agents.seeds_section import percent
 from coopenv.bench.agents.table import cell
-from coopenv.bench.learning.cards import relative
+from coopenv.bench.learning.cards import COMPARED, relative
 from coopenv.bench.learning.judge import Judge
 from coopenv.bench.learning.study import Group, Study
 from coopenv.evaluation import Difference
@@ -16,8 +16,7 @@ from coopenv.files import replace_text
 PAGE_FILE = "README.md"
 BASE_ARM = "plain"
 """The arm that others are compared with."""
-FIGURES = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m")
-COLUMNS = {metric: table.COLUMNS[metric] for metric in FIGURES}
+COLUMNS = {metric: table.COLUMNS[metric] for metric in COMPARED}
 """Metric, its heading, and the factor to the heading's unit."""
 INTRODUCTION = """# Agents
 

@@ -71,6 +71,17 @@ def test_interrupted_goes_on_and_leaves_every_agent_with_its_card(tmp_path: Path
     assert page.count("## open_square") == 1 and "`open_square_quality` against `open_square_plain`: e50" in page
 
 
+def test_settings_that_changed_train_anew_what_was_finished(tmp_path: Path) -> None:
+    (tmp_path / "train.toml").write_text(SETTINGS)
+    (tmp_path / "study.toml").write_text(STUDY)
+    for steps in ("2000", "2400"):
+        (tmp_path / "train.toml").write_text(SETTINGS.replace("2000", steps))
+        process = start((*COMMAND, "--only", "plain,1"), tmp_path)
+        _, errors = process.communicate(timeout=300)
+        assert process.returncode == 0, errors
+        assert read_settings(tmp_path / "open_square_plain" / "train.toml").steps == int(steps)
+
+
 def test_settings_of_another_training_are_not_gone_on_with(tmp_path: Path) -> None:
     (tmp_path / "train.toml").write_text(SETTINGS)
     (tmp_path / "study.toml").write_text(STUDY)
