@@ -144,7 +144,7 @@ def test_a_vehicle_that_is_lost_says_nothing_and_finds_itself_again():
     assert not all(said)
     assert said[-1]
     assert result.position_error[-1, 0] < 0.1
-    assert (result.position_error[-1] < 0.9).all()  # the last vehicle's bound is 0.3 m by then
+    assert (result.position_error[-1] < 0.6).all()
 
 
 def test_silence_keeps_a_follower_going():
