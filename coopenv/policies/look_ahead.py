@@ -31,7 +31,7 @@ class LookAhead(RouteFollower):
         self,
         scenario: Scenario,
         *,
-        price: float = 6.0,
+        price: float = 4.0,
         tolerated: float = 0.02,
         bearing_std: float = 0.01,
         drift: float = 0.05,
