@@ -10,7 +10,7 @@ import os
 import shutil
 import threading
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -91,6 +91,25 @@ def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Pat
                 raise OutputError(f"cannot replace {folder}: {why}") from None
             _written(folder, place)
         sync(place.parent)
+
+
+@contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """Make a folder and those above it, where need be; if what follows fails, those that stayed empty are none again.
+
+    Raises:
+        OutputError: it cannot be made.
+    """
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        yield folder
+    except BaseException:
+        with suppress(OSError):
+            for place in made:
+                place.rmdir()
+        raise
 
 
 def check_file(path: str | Path) -> None:

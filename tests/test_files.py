@@ -17,7 +17,7 @@ import pytest
 
 from coopenv import staging
 from coopenv.errors import OutputError
-from coopenv.files import check_file, replacing_file, replacing_folder, writing
+from coopenv.files import check_file, new_folder, replacing_file, replacing_folder, writing
 from tests.helpers.processes import small_disk
 
 NAMES = ("a.txt", "b.txt", "c.txt", "sometimes.txt")
@@ -100,6 +100,19 @@ def kill_writers(place: Path, kills: int) -> None:
     assert generation_of(place / "result") == 10**6
     assert (place / "result" / "mine" / "deep.txt").read_text() == "mine too"
     assert hidden(place) == []
+
+
+def test_a_new_folder_goes_again_with_what_failed_in_it(tmp_path: Path) -> None:
+    with new_folder(tmp_path / "kept") as made:
+        assert made.is_dir()
+    for left in ([], ["file"]):
+        with pytest.raises(OutputError), new_folder(tmp_path / "kept" / "a" / "b"):
+            for name in left:
+                (tmp_path / "kept" / "a" / name).write_text("")
+            raise OutputError("full")
+        assert [path.name for path in (tmp_path / "kept").rglob("*")] == (["a", "file"] if left else [])
+    with pytest.raises(OutputError, match="cannot write to "), new_folder(tmp_path / "kept" / "a" / "file" / "c"):
+        pass
 
 
 def test_killed_writers_leave_a_whole_result(place: Path) -> None:

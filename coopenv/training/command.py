@@ -11,7 +11,8 @@ from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
 from coopenv.errors import CoopenvError
 from coopenv.evaluation import Result, drive, held_out_seeds, score
-from coopenv.files import check_file, replacing_folder
+from coopenv.files import check_file, new_folder, replacing_folder
+from coopenv.policies import load_agent
 from coopenv.seeds import evaluation_seed
 from coopenv.training import checkpoint
 from coopenv.training.export import EXPORTED, export
@@ -85,11 +86,14 @@ def train(
     kept = checkpoint.read(path) if resume else None
     if kept is None and path.is_file():
         raise CoopenvError(f"{out} holds an unfinished training: go on with --resume, or remove {path}")
-    out.mkdir(parents=True, exist_ok=True)
-    check_file(path)
-    trainer = Trainer(plan, scenario, threads, str(logs or out / LOGS))
+    if kept is None and plan.settings.clone is not None:
+        load_agent(plan.settings.clone.agent, scenario)  # raises before anything is made
+    trainer = Trainer(plan, scenario, threads)
     curve = kept.curve if kept is not None else []
     try:
+        with new_folder(out), new_folder(logs or out / LOGS) as tensorboard:
+            check_file(path)
+            trainer.log_to(str(tensorboard))
         if kept is not None:
             checkpoint.restore(kept, trainer)
         else:

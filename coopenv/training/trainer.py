@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from stable_baselines3 import PPO
-from stable_baselines3.common.logger import configure
+from stable_baselines3.common.logger import Logger, configure
 
 from coopenv.api.trainers.sb3 import CooperativeSB3VecEnv
 from coopenv.api.trainers.sb3_buffer import ActingRowsBuffer
@@ -22,14 +22,13 @@ from coopenv.training.watch import Status, Watch
 class Trainer:
     """A policy that all vehicles share, and everything that its next update depends on."""
 
-    def __init__(self, plan: Plan, scenario: Scenario, threads: int | None = None, logs: str | None = None) -> None:
+    def __init__(self, plan: Plan, scenario: Scenario, threads: int | None = None) -> None:
         """Build worlds and networks.
 
         Args:
             plan: what to train.
             scenario: of the environment, the plan's overrides applied.
             threads: shares of the batch on the CPU.
-            logs: folder for TensorBoard; None: nothing is written.
         """
         torch.set_num_threads(1)  # small matrices: more threads mostly wait for one another and for the worlds'
         self.plan, self.scenario = plan, scenario
@@ -70,8 +69,12 @@ class Trainer:
             seed=plan.seed,
             device="cpu",
         )
-        self.model.set_logger(configure(logs, ["tensorboard"] if logs else []))
+        self.model.set_logger(Logger(None, []))
         self._watch = Watch(self.batch)
+
+    def log_to(self, folder: str) -> None:
+        """Write for TensorBoard from now on, to a folder that is there."""
+        self.model.set_logger(configure(folder, ["tensorboard"]))
 
     def begin(self) -> None:
         """Clone another driver, where the settings say so, and start the first episodes."""

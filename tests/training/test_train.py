@@ -17,9 +17,11 @@ pytest.importorskip("tensorboard", reason="needs the extra 'train'")
 
 import coopenv
 from coopenv.cli import main
+from coopenv.errors import CoopenvError
 from coopenv.policies import find_agent, load_agent
 from coopenv.policies.loader import read_card
-from coopenv.training.settings import read_settings
+from coopenv.training.command import train
+from coopenv.training.settings import Plan, read_settings
 from tests.helpers.processes import COOPENV, start, wait_until
 
 pytestmark = pytest.mark.train
@@ -221,3 +223,25 @@ def test_mistakes_are_one_line(
     assert main(arguments) == 2
     told = capsys.readouterr().err
     assert message in told and told.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("threads", "logs", "extra", "message"),
+    [
+        (0, None, "", "threads must be at least 1"),
+        (1, "a_file", "", "cannot write to a_file: "),
+        (1, "a_file/logs", "", "cannot write to a_file/logs: "),
+        (1, None, "vehicles = 100_000_000", "would need"),
+        (1, None, "[clone]\nagent = 'nobody'", "unknown agent 'nobody'"),
+    ],
+)
+def test_a_training_that_cannot_begin_leaves_nothing(
+    threads: int, logs: str | None, extra: str, message: str, here: Path
+) -> None:
+    (here / "a_file").write_text("")
+    (here / "bad.toml").write_text(f"[ppo]\n{extra}\n")
+    before = {path.name for path in here.iterdir()}
+    plan = Plan("urban_crossing", read_settings(here / "bad.toml"), 0, None, {})
+    with pytest.raises(CoopenvError, match=message):
+        train(plan, Path("new", "agent"), threads=threads, logs=None if logs is None else Path(logs))
+    assert {path.name for path in here.iterdir()} == before
