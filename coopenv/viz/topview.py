@@ -43,9 +43,14 @@ class TopView:
     move are kept and updated.
     """
 
-    def __init__(self, scenario: Scenario) -> None:
-        """Draw the ground."""
-        self.scenario = scenario
+    def __init__(self, scenario: Scenario, *, panel: bool = True) -> None:
+        """Draw the ground.
+
+        Args:
+            scenario: of the engine.
+            panel: table and legend beside the map; without them the mean error of those under way stands above it.
+        """
+        self.scenario, self._panel = scenario, panel
         self._landmarks = len(scenario.landmarks)
         self._figure, self._axes = ground.new_ground(scenario)
         self._layers = Layers(self._figure, self._axes)
@@ -59,7 +64,7 @@ class TopView:
         self._window = Window(scenario.title)
 
     def draw(self, engine: Any) -> np.ndarray:
-        """Return an (H, W, 3) uint8 picture of world 0."""
+        """Return an (H, W, 3) uint8 picture of world 0, as wide as the map if that is all."""
         view = {name: np.asarray(engine.view(name)[0], float) for name in _FIELDS}
         R, position = view["rotation"], view["position"]
         R_hat, p_hat = view["estimate_rotation"], view["estimate_position"]
@@ -74,7 +79,8 @@ class TopView:
         self._place_sight(R, position, view["sight"], view["pan"])
         self._place_marks(R, position, view["ended"])
         self._write(view, sigma, float(engine.view("tick")[0]) / self.scenario.rates.camera)
-        return self._layers.paint()
+        picture = self._layers.paint()
+        return picture if self._panel else picture[:, : ground.MAP_WIDTH].copy()
 
     def show(self, picture: np.ndarray) -> None:
         """Show a picture in a window, if there is a display."""
@@ -136,8 +142,9 @@ class TopView:
     def _prepare_table(self) -> None:
         count = len(self.scenario.vehicles)
         shown = min(count, ground.MOST_ROWS)
-        place = ground.pixels(ground.PANEL, ground.HEIGHT - 21)
-        title = self._figure.text(*place, "", fontsize=NORMAL + 1.5, weight="bold", color=INK)
+        x, aligned = (ground.PANEL, "left") if self._panel else (ground.MAP_RIGHT, "right")
+        place = ground.pixels(x, ground.HEIGHT - 21)
+        title = self._figure.text(*place, "", fontsize=NORMAL + 1.5, weight="bold", color=INK, ha=aligned)
         self._time = self._layers.keep(title)
         look: dict[str, Any] = {"fontsize": ground.SMALLER, "family": "monospace"}
         head = f"{'':4}{'error':>7}{'error':>7}{'3σ':>7}{'sees':>6}\n{'':4}{'[m]':>7}{'[deg]':>7}{'[m]':>7}"
@@ -219,7 +226,10 @@ class TopView:
             name.set_position((x, y))
 
     def _write(self, view: dict[str, np.ndarray], sigma: np.ndarray, time: float) -> None:
-        self._time.set_text(f"t = {time:.2f} s")
+        under_way = view["position_error"][view["ended"] == Outcome.UNDER_WAY]
+        word = "mean error" if len(self.scenario.vehicles) > 1 else "error"
+        error = f"{word} {fixed(under_way.mean(), 2)} m   " if len(under_way) and not self._panel else ""
+        self._time.set_text(f"{error}t = {time:.2f} s")
         seen = np.sum(view["sight"] == Sight.VISIBLE, axis=-1)
         possible = np.sum(view["sight"] != Sight.NOT_A_NEIGHBOUR, axis=-1)
         for i, row in enumerate(self._rows):

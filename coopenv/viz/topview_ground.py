@@ -19,7 +19,8 @@ from coopenv.viz.topview_geometry import limits, road_corners
 WIDTH, HEIGHT = 896, 672  # px; multiples of 16, as video codecs like them
 _LEFT, _BOTTOM, _SIDE = 54, 46, 592  # px, of the square axes
 _WORDS = 36  # px, from the axes to what is written beside them, whatever numbers stand between
-PANEL = _LEFT + _SIDE + 12  # px, left edge of the panel
+MAP_RIGHT, MAP_WIDTH = _LEFT + _SIDE, _LEFT + _SIDE + 6  # px, right edge of the axes, and with what stands out there
+PANEL = MAP_RIGHT + 12  # px, left edge of the panel
 SMALLER = 6.5  # pt
 ROW = 16  # px
 TABLE_TOP = HEIGHT - 66  # px

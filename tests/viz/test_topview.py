@@ -19,6 +19,7 @@ import coopenv
 from coopenv.api.engine import Engine
 from coopenv.estimation.metrics import error_coordinates
 from coopenv.estimation.outcomes import Sight
+from coopenv.format import fixed
 from coopenv.scenario import load_scenario
 from coopenv.scenario.bodies import Obstacle
 from coopenv.scenario.sensing import Camera
@@ -32,7 +33,7 @@ from coopenv.viz.topview_geometry import (
     pointers,
     position_covariance,
 )
-from coopenv.viz.topview_ground import HEIGHT, PANEL, ROW, TABLE_TOP, WIDTH
+from coopenv.viz.topview_ground import HEIGHT, MAP_WIDTH, PANEL, ROW, TABLE_TOP, WIDTH
 from tests.helpers.builders import scenario
 from tests.helpers.four_way import FOUR_WAY
 
@@ -107,6 +108,21 @@ def test_equal_states_give_equal_pictures_whatever_was_drawn_before(start: Any) 
     start.set_state(state)
     np.testing.assert_array_equal(start.render(), picture)
     np.testing.assert_array_equal(TopView(start.scenario).draw(start.engine), picture)
+
+
+def test_a_map_alone_has_time_and_error_above_it(start: Any) -> None:
+    drive(start, 30)
+    whole, view = start.render(), TopView(start.scenario, panel=False)
+    alone = view.draw(start.engine)
+    below = HEIGHT - int(view._axes.get_window_extent().y1)
+    assert alone.shape == (HEIGHT, MAP_WIDTH, 3)
+    np.testing.assert_array_equal(alone[below:], whole[below:, :MAP_WIDTH])
+    error = start.engine.view("position_error")[0]
+    seconds = 30.0 / start.scenario.rates.decision
+    assert view._time.get_text() == f"mean error {fixed(error.mean(), 2)} m   t = {seconds:.2f} s"
+    extent = view._time.get_window_extent()
+    assert extent.x1 <= MAP_WIDTH
+    assert extent.x0 > 0.4 * MAP_WIDTH  # left of it is room for an agent's name
 
 
 def test_the_legend_speaks_of_bodies_since_landmarks_have_them_too() -> None:

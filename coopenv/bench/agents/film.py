@@ -15,11 +15,9 @@ from coopenv.runs.console import Progress
 from coopenv.runs.episode import play
 from coopenv.runs.video import frame_stride, open_film
 from coopenv.viz.topview import TopView
-from coopenv.viz.topview_ground import PANEL
 
 COLUMNS = 3
 WIDEST = 1920  # px
-MARGIN = 6  # px, by which the legend beside the map stands out
 
 
 def write_film(evaluation: Evaluation, folder: Path, log: Console) -> Path:
@@ -36,13 +34,14 @@ def write_film(evaluation: Evaluation, folder: Path, log: Console) -> Path:
 
 
 def pictures_of(entrant: Entrant, seed: int) -> Iterator[np.ndarray]:
-    """Yield the pictures, (H, W, 3) uint8, of a driver's episode; the title is its name."""
+    """Yield the pictures, (H, W, 3) uint8, of a driver's episode: its name, the error and the time above the map."""
     scenario = entrant.scenario
-    view, engine = TopView(scenario.model_copy(update={"title": entrant.name})), Engine(scenario)
+    view = TopView(scenario.model_copy(update={"title": entrant.name}), panel=False)
+    engine = Engine(scenario)
     try:
         for tick in play(engine, [seed], scenario.horizon_ticks, entrant.policy, to_the_end=False):
             if tick % frame_stride(scenario) == 0:
-                yield view.draw(engine)[:, : PANEL - MARGIN]
+                yield view.draw(engine)
     finally:
         engine.close()
         view.close()
