@@ -47,14 +47,14 @@ def is_finished(study: Study, run: Run, folder: Path) -> bool:
 
 
 def perform(task: Task) -> None:
-    """Train on one core, going on from a checkpoint where there is one.
+    """Train on one core, going on from a checkpoint where there is one of the same training.
 
     Raises:
-        CoopenvError: there is the checkpoint of another training, or what `train` raises.
+        CoopenvError: what `train` raises.
     """
     path = task.out / CHECKPOINT_FILE
-    resume = path.is_file()
-    if resume and read(path).plan != task.plan:
-        raise CoopenvError(f"{path}: of a training with other settings; remove it to start anew")
+    resume = path.is_file() and read(path).plan == task.plan
+    if not resume:
+        path.unlink(missing_ok=True)  # of a training with other settings
     task.logs.mkdir(parents=True, exist_ok=True)
     train(task.plan, task.out, resume=resume, threads=1, logs=task.logs)
