@@ -64,7 +64,7 @@ def export(
 def network_of(trainer: Trainer) -> dict[str, np.ndarray]:
     """Return the tensors of the mean action, float32, by the names that `coopenv.policies.network` reads."""
     policy = trainer.model.policy
-    layers = [layer for layer in policy.mlp_extractor.policy_net if isinstance(layer, nn.Linear)]
+    layers: list[Any] = [layer for layer in policy.mlp_extractor.policy_net if isinstance(layer, nn.Linear)]
     tensors = {"observation.mean": trainer.env.statistics.mean, "observation.std": trainer.env.std}
     for i, layer in enumerate([*layers, policy.action_net]):
         tensors[f"layers.{i}.weight"] = layer.weight.detach().numpy()
