@@ -22,6 +22,7 @@ HALF_ACCELERATION = 0.5 * MAX_ACCELERATION
 THIRD = 1.0 / 3.0
 """Also the variance of a uniform distribution over [-1, 1], which the paper's noise has on the image plane."""
 NOTHING = -1  # in place of a member: the bearing cannot be used now
+SEARCH, RESECTION, TRACKING = 0, 1, 2  # what bearings are for
 
 
 @wp.func
@@ -75,11 +76,12 @@ def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, 
 
 @wp.func
 def set_line_to_member(
-    model: Any, memory: Any, world: int, i: int, n: int, member: int, heard: bool, tick: int, b: Any
+    model: Any, memory: Any, world: int, i: int, n: int, member: int, heard: bool, tick: int, b: Any, purpose: int
 ):
     """Let a bearing be to a member, which has moved on since its last message that was fused.
 
-    By its odometry as far as messages tell it, and from there by its last twist.
+    By its odometry as far as messages tell it, and from there by its last twist. Until a second message tells that,
+    its bearing says nothing, but for a resection: there it has gone as little as in the search that comes before.
     """
     stands = memory.member[world, i, member].report.tick
     sender = memory.member[world, i, member].vehicle
@@ -97,7 +99,12 @@ def set_line_to_member(
     if age > wp.float64(0.0):
         away = wp.float64(HALF_ACCELERATION) * age * age
         variance += odometry_noise(model, i, age)[1] + away * away
-        if memory.member[world, i, member].has_twist == 1:
+        if memory.member[world, i, member].has_twist == 0:
+            if purpose == TRACKING:
+                return
+            going = wp.float64(MAX_SPEED) * age
+            variance += going * going
+        else:
             half_turn = memory.member[world, i, member].w * (wp.float64(0.5) * age)
             gone = gone + turned * (exp_so3(half_turn) * memory.member[world, i, member].v * age)
             variance += memory.member[world, i, member].velocity_variance * age * age
@@ -105,7 +112,7 @@ def set_line_to_member(
 
 
 @wp.func
-def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int, searching: bool) -> int:
+def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int, purpose: int) -> int:
     """Set the line of sight of each bearing to a landmark or a vehicle; return how many there are.
 
     In a search vehicles are where they say that they are, otherwise where they are believed to be.
@@ -120,7 +127,7 @@ def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
             if sender < 0:
                 z = vec3d(marker_position(model, state, world, target))
                 set_line(memory, world, n, 0, b, z, wp.float64(0.0))
-            elif searching:
+            elif purpose == SEARCH:
                 if is_heard(model, state, memory, world, i, sender, tick):
                     variance = received_variance(model, memory, world, i, sender, tick)
                     set_line(memory, world, n, 0, b, memory.inbox[world, i, sender].pose.p, variance)
@@ -128,7 +135,7 @@ def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
                 member = index_of(memory, world, i, sender)
                 if member > 0:
                     heard = is_heard(model, state, memory, world, i, sender, tick)
-                    set_line_to_member(model, memory, world, i, n, member, heard, tick, b)
+                    set_line_to_member(model, memory, world, i, n, member, heard, tick, b, purpose)
             if memory.line[world, n].member != NOTHING:
                 seen += 1
     return seen

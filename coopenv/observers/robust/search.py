@@ -14,7 +14,7 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import carried, distance_squared, is_known
 from coopenv.observers.robust.belief import begin_belief, own_estimate
 from coopenv.observers.robust.correction import iterated_update
-from coopenv.observers.robust.measurements import NOTHING, innovation_squared, set_lines
+from coopenv.observers.robust.measurements import NOTHING, SEARCH, innovation_squared, set_lines
 from coopenv.observers.robust.memory import Estimate, Hypothesis, Pose, Search
 from coopenv.observers.robust.solutions import is_new, next_triple, solve_triple
 
@@ -157,7 +157,7 @@ def solve_frame(model: Any, memory: Any, world: int, i: int, seen: int, period: 
 @wp.func
 def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> bool:
     """Take a frame's bearings; return whether one hypothesis alone is left after some frames."""
-    seen = set_lines(model, state, memory, world, i, now.tick, True)
+    seen = set_lines(model, state, memory, world, i, now.tick, SEARCH)
     if memory.search[world, i].hypotheses == 0:
         if seen >= 3:
             solve_frame(model, memory, world, i, seen, now.period)

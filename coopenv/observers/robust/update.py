@@ -14,7 +14,7 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import between, carried, inverse6, is_regular, odometry_noise, with_noise
 from coopenv.observers.robust.belief import apply_error
 from coopenv.observers.robust.correction import iterated_update
-from coopenv.observers.robust.measurements import NOTHING, innovation_squared, set_lines
+from coopenv.observers.robust.measurements import NOTHING, RESECTION, TRACKING, innovation_squared, set_lines
 from coopenv.observers.robust.memory import Anchor, Estimate, mat66d, vec2d, vec6d
 from coopenv.observers.robust.odometry import begin_errors, lasting_noise
 from coopenv.observers.robust.search import begin_search
@@ -58,7 +58,7 @@ def set_anchor(memory: Any, world: int, i: int, P: Any, tick: int):
 @wp.func
 def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
     """Correct the belief by every bearing that fits it; search anew when most do not."""
-    set_lines(model, state, memory, world, i, now.tick, False)
+    set_lines(model, state, memory, world, i, now.tick, TRACKING)
     share, fitting, nis = gate(model, memory, world, i)
     state.nis[world, i] = nis
     state.nis_dof[world, i] = 2 * fitting
@@ -125,7 +125,7 @@ def write_resected_covariance(memory: Any, world: int, i: int, lines: int, inver
 def resect(model: Any, state: Any, memory: Any, world: int, i: int, tick: int) -> bool:
     """Put the vehicle where a frame's bearings see it, by least squares from where it is; return whether that works."""
     lines = model.target_count[i]
-    set_lines(model, state, memory, world, i, tick, False)
+    set_lines(model, state, memory, world, i, tick, RESECTION)
     inverse = mat66d()
     for step in range(constants.GAUSS_NEWTON_STEPS):
         _, fitting, _ = gate(model, memory, world, i)

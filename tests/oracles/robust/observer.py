@@ -191,7 +191,7 @@ class Robust:
             self._look(tick)
             return
         self._begin(found, tick)
-        if resect(self.belief, lambda: self._view(tick)) and is_known(self.belief.P[:6, :6]):
+        if resect(self.belief, lambda: self._view(tick, True)) and is_known(self.belief.P[:6, :6]):
             self.search = None
 
     def _begin(self, pose: Belief, tick: Tick) -> None:
@@ -374,7 +374,7 @@ class Robust:
                     tick.time,
                 )
 
-    def _view(self, tick: Tick) -> View:
+    def _view(self, tick: Tick, resecting: bool = False) -> View:
         """Return the frame's bearings to landmarks and to members of the belief, as measurements."""
         belief = self.belief
         heard = {report.vehicles[0]: report for report in self._reports(tick)}
@@ -390,11 +390,16 @@ class Robust:
                 member, contact = belief.members[place], self.contacts.get(vehicle)
                 turned, gone, stands, variance = self._gone(member, heard.get(vehicle))
                 age = tick.time - stands
+                unknown = 0.0  # m, how far it may have gone, where nobody has told how fast it goes
+                if age > SAME_TIME and member.v is None:
+                    if not resecting:
+                        continue
+                    unknown = MAX_SPEED * age
                 point = gone + turned.dot(member.carried(age))
                 z.append(member.p + member.R.dot(point))
                 places.append(place)
                 points.append(point)
-                drift.append(variance + self._drift(age) + member.velocity_variance * max(age, 0.0) ** 2)
+                drift.append(variance + unknown**2 + self._drift(age) + member.velocity_variance * max(age, 0.0) ** 2)
                 counts.append(contact is None or contact.trusted)
             else:
                 continue
