@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import coopenv
 from coopenv.api.engine import Engine
+from coopenv.evaluation.episodes import driven_vehicles
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.terms import GROUPS
 from tests.helpers.four_way import FOUR_WAY
@@ -14,14 +18,25 @@ from tests.helpers.four_way import FOUR_WAY
 OBSERVERS = ("riccati", "robust")
 MOVABLE = [name for name in coopenv.list_envs() if load_scenario(name).backend == "simulated"]
 """Environments whose vehicles a saved state can put elsewhere; highway-env puts its own back where it has them."""
+ON_HIGHWAY = [name for name in coopenv.list_envs() if load_scenario(name).backend == "highway"]
+BELIEVED = (
+    "estimate_position",
+    "estimate_rotation",
+    "covariance",
+    "log_determinant",
+    "position_std",
+    "targets_in_view",
+)
+SENT = ("outbox", "observer_outbox")
+"""How fields of a saved state begin that hold messages, of the radio and of an observer."""
 
 EVERYTHING = {"observation.include": list(GROUPS)}
 
 
-def silent(name: str, observer: str) -> Scenario:
+def silent(name: str, observer: str, more: dict[str, Any] | None = None) -> Scenario:
     """An environment whose cameras see nothing, so that no measurement can depend on where anybody is."""
     blind = {"topology.mode": "sensed", "camera.range": 1e-6, "observer.name": observer}
-    return load_scenario(name, {**EVERYTHING, **blind})
+    return load_scenario(name, {**EVERYTHING, **blind, **(more or {})})
 
 
 @pytest.mark.parametrize("observer", OBSERVERS)
@@ -40,6 +55,29 @@ def test_observation_does_not_move_with_hidden_truth(name: str, observer: str) -
         seen = engine.view("observation")
         assert np.array_equal(seen[0], seen[1])
     assert not np.allclose(engine.view("position_error")[0], engine.view("position_error")[1])
+
+
+@pytest.mark.parametrize("observer", OBSERVERS)
+@pytest.mark.parametrize("name", ON_HIGHWAY)
+def test_what_only_highway_env_knows_is_not_observed_told_or_estimated(name: str, observer: str) -> None:
+    """In world 1 its driven cars are elsewhere, and see and hear nobody there either."""
+    pytest.importorskip("highway_env", reason="needs the extra highway")
+    scenario = silent(name, observer, {"v2x.range": 1e-6})
+    engine = Engine(scenario, 2, "float64")
+    engine.reset([5, 5])
+    driven, state, away = driven_vehicles(scenario), engine.get_state(), np.array([0.3, -0.2])
+    for i in driven:
+        state["position"][1, len(scenario.landmarks) + i, :2] += away
+        state["highway"][1]._cars[i].position += away * (1.0, -1.0)  # its y axis points down
+    engine.set_state(state)
+    for _ in range(8):
+        engine.step(np.zeros((2, len(scenario.vehicles), 2)))
+        known = {name: engine.view(name) for name in ("observation", *BELIEVED)}
+        known |= {name: values for name, values in engine.get_state().items() if name.startswith(SENT)}
+        for field, values in known.items():
+            assert_allclose(values[1, driven], values[0, driven], atol=1e-9, err_msg=field)
+    apart = engine.view("position_error")[1, driven] - engine.view("position_error")[0, driven]
+    assert (abs(apart) > 1e-3).all()
 
 
 @pytest.mark.parametrize("observer", OBSERVERS)
