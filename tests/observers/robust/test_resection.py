@@ -5,8 +5,9 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.rotations import exp_so3
-from tests.oracles.robust.belief import Belief, Member, View
+from tests.oracles.robust.belief import Belief, Member
 from tests.oracles.robust.resection import resect
+from tests.oracles.robust.sight import View
 from tests.oracles.robust.tracklets import left_error
 
 R, P = Rotation.random(None, np.random.default_rng(3)).as_matrix(), np.array([1.0, -2.0, 0.5])

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,11 +22,12 @@ from coopenv.observers.robust.constants import (
     MAX_ACCELERATION,
     MAX_GROWTH,
     MAX_LINEARISATIONS,
-    MIN_ERROR_STD,
     RELINEARISATION_ANGLE,
     SAME_TIME,
 )
 from tests.oracles.robust.matrices import solve_positive
+from tests.oracles.robust.odometry import as_noise
+from tests.oracles.robust.sight import Sight
 
 
 @dataclass
@@ -61,70 +61,6 @@ class Member:
 ERRORS = -1
 """In place of a vehicle's number: the errors of one's own odometry, (bias (3,), scale, 0, 0), `w` and `v` of the
 member."""
-
-
-@dataclass(frozen=True)
-class Lasting:
-    """Variances of errors of odometry that last, as declared."""
-
-    bias: Array  # (3,) (rad/s)^2
-    scale: float
-    bias_walk: Array  # (3,) per second
-    scale_walk: float
-
-    @classmethod
-    def of(cls, noise: SensorNoise) -> Lasting:
-        """Return what a vehicle is told."""
-        bias, walk = np.square(noise.gyro_bias), np.square(noise.gyro_bias_walk)
-        return cls(bias, noise.odometry_scale**2, walk, noise.odometry_scale_walk**2)
-
-    @property
-    def any(self) -> bool:
-        """Whether there are any."""
-        return bool(self.bias.any() or self.bias_walk.any() or self.scale or self.scale_walk)
-
-    @property
-    def start(self) -> Array:
-        """(6, 6) covariance before anything is known."""
-        return np.diag([*np.maximum([*self.bias, self.scale], MIN_ERROR_STD**2), 1.0, 1.0])
-
-
-def as_noise(P: Array | None, dp: Array, dt: float, correlated: float) -> Array:
-    """Return the variances (6,) of an increment by errors that last, of covariance P, if they were noise."""
-    if P is None:
-        return np.zeros(6)
-    time = max(correlated, dt)
-    return np.repeat([P.diagonal()[:3].max() * dt * time, P[3, 3] * dp.dot(dp) * time / max(dt, SAME_TIME)], 3)
-
-
-class Sight(NamedTuple):
-    """Bearings as measurements, residual = H x + noise, at the poses believed."""
-
-    H: Array  # (m, 2, 6n)
-    residual: Array  # (m, 2) rad
-    ahead: NDArray[np.bool_]  # (m,) whether the target is in front of the bearing at all
-    distance: Array  # (m,) m
-    bend: Array  # (m,) rad^2, the variance of what is not linear in x
-
-    def normalised(self, P: Array, noise: Array) -> Array:
-        """Return (m,) the normalised innovations squared under P and noise variances (m,)."""
-        H = self.H
-        S = H.reshape(-1, len(P)).dot(P).reshape(H.shape) @ H.transpose(0, 2, 1)
-        a, b, c = S[:, 0, 0] + noise, S[:, 0, 1], S[:, 1, 1] + noise
-        x, y = self.residual[:, 0], self.residual[:, 1]
-        result: Array = (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
-        return result
-
-
-class View(NamedTuple):
-    """A frame's bearings to known targets."""
-
-    sight: Sight
-    noise: Array  # (m,) variances
-    nis: Array  # (m,) normalised innovations squared
-    fits: NDArray[np.bool_]  # (m,) whether they fit the belief
-    missed: float | None
-    """Share of those that do not, without bearings to distrusted senders; None if there is no bearing."""
 
 
 class Belief:

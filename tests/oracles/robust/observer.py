@@ -22,7 +22,7 @@ import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
-from coopenv.estimation.rotations import exp_so3, orthonormalise
+from coopenv.estimation.rotations import orthonormalise
 from coopenv.observers.contract import Estimate, Message, SensorNoise, Setup, Tick
 from coopenv.observers.robust.constants import (
     AGREEMENT_DISTANCE,
@@ -34,13 +34,10 @@ from coopenv.observers.robust.constants import (
     ERRORS_TIME,
     HEALTHY_SHARE,
     HEALTHY_TIME,
-    JUMP_GATE,
     LOST_SHARE,
     LOST_TIME,
     MAX_ACCELERATION,
     MAX_MEMBERS,
-    MAX_SMOOTH_ACCELERATION,
-    MAX_SMOOTH_ANGULAR_ACCELERATION,
     MAX_SPEED,
     MESSAGE_GATE,
     MIN_ANGULAR_VELOCITY_STD,
@@ -48,14 +45,14 @@ from coopenv.observers.robust.constants import (
     NEWS_TIME,
     SAME_TIME,
 )
-from tests.oracles.robust.belief import Belief, Lasting, Member, View, as_noise, errors_of
+from tests.oracles.robust.belief import Belief, Member, errors_of
 from tests.oracles.robust.eviction import room_for
 from tests.oracles.robust.matrices import solve_positive
+from tests.oracles.robust.odometry import Lasting, as_noise, trapezoidal
 from tests.oracles.robust.resection import resect
 from tests.oracles.robust.search import Search, Sighting, is_known
+from tests.oracles.robust.sight import View
 from tests.oracles.robust.tracklets import Report, from_message, left_error, mask_of, to_message, tracklet
-
-SMOOTH = MAX_SMOOTH_ANGULAR_ACCELERATION, MAX_SMOOTH_ACCELERATION
 
 
 @dataclass
@@ -117,7 +114,8 @@ class Robust:
 
     def update(self, tick: Tick) -> Estimate:
         """Take one camera tick."""
-        tick, jumps = self._trapezoidal(tick)
+        before, self.sample = self.sample, (tick.angular_velocity, tick.velocity)
+        tick, jumps = trapezoidal(tick, before, self.noise.odometry_period, self.sample_noise)
         dR, dp = self.belief.corrected(tick.rotation, tick.translation, tick.dt)
         tick = replace(tick, rotation=dR, translation=dp)
         self._walk(tick.dt)
@@ -152,26 +150,6 @@ class Robust:
         if self.belief.errors is not None:
             walk = np.append(self.lasting.bias_walk, self.lasting.scale_walk) * dt
             self.belief.P[6:10, 6:10] += np.diag(walk)
-
-    def _trapezoidal(self, tick: Tick) -> tuple[Tick, Array]:
-        """Return a tick whose increment has the half change of the held sample that holding it has left out.
-
-        Also the variances (6,) of what has changed at once, at an unknown time between two samples.
-        """
-        before, self.sample = self.sample, (tick.angular_velocity, tick.velocity)
-        if before is None:
-            return tick, np.zeros(6)
-        T = self.noise.odometry_period
-        changes = [b - a for a, b in zip(before, self.sample, strict=True)]
-        turn, step = (0.5 * T * change for change in changes)
-        translation = tick.translation + tick.rotation.dot(step)
-        jumps = [
-            change.dot(change) * T * T / 12.0
-            if change.dot(change) > max(JUMP_GATE * std**2, (smooth * T) ** 2)
-            else 0.0
-            for change, std, smooth in zip(changes, self.sample_noise, SMOOTH, strict=True)
-        ]
-        return replace(tick, rotation=tick.rotation.dot(exp_so3(turn)), translation=translation), np.repeat(jumps, 3)
 
     def message(self) -> Message:
         """Return pose, covariance and odometry, or nothing while the pose is not known."""

@@ -8,7 +8,8 @@ import numpy as np
 
 from coopenv.estimation.arrays import solve
 from coopenv.observers.robust.constants import GAUSS_NEWTON_STEPS, MIN_INFORMATION_RATIO
-from tests.oracles.robust.belief import Belief, View
+from tests.oracles.robust.belief import Belief
+from tests.oracles.robust.sight import View
 
 
 def resect(belief: Belief, look: Callable[[], View]) -> bool:

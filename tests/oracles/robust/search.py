@@ -35,8 +35,9 @@ from coopenv.observers.robust.constants import (
 )
 from tests.helpers.p3p import solve_one
 from tests.oracles.p3p import solve_p3p
-from tests.oracles.robust.belief import Belief, Sight
+from tests.oracles.robust.belief import Belief
 from tests.oracles.robust.matrices import invert_positive
+from tests.oracles.robust.sight import Sight
 from tests.oracles.robust.tracklets import left_error
 
 

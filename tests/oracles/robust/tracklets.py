@@ -19,8 +19,9 @@ from coopenv.estimation.rotations import exp_so3, log_so3, orthonormalise, skew
 from coopenv.observers.contract import Message, SensorNoise
 from coopenv.observers.mekf import LeftError
 from coopenv.observers.robust.constants import ERRORS_TIME, MASK_BITS
-from tests.oracles.robust.belief import Belief, Member, as_noise, recentring
+from tests.oracles.robust.belief import Belief, Member, recentring
 from tests.oracles.robust.matrices import invert_positive
+from tests.oracles.robust.odometry import as_noise
 
 
 def mask_of(vehicles: set[int]) -> np.uint64:
