@@ -83,7 +83,7 @@ def test_a_budget_in_minutes_is_spent_by_the_clock() -> None:
     trainer = trainer_of(minutes=1e-6)
     assert trainer.status.share == 0.0
     assert trainer.update().share == 1.0
-    trainer.continue_at(steps=128, seconds=3e-5)
+    trainer.continue_at(steps=128, seconds=3e-5, cpu_seconds=0.0)
     assert (trainer.status.steps, trainer.status.share) == (128, pytest.approx(0.5))
 
 
