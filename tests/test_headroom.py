@@ -12,14 +12,14 @@ from coopenv.evaluation import Episodes, compare_paired, drive, held_out_seeds, 
 from coopenv.policies import load_agent
 from coopenv.scenario import load_scenario
 
-ENVIRONMENTS = ("open_square", "facade", "behind_truck", "urban_crossing")
-WORLDS = 48
+ENVIRONMENTS = ("open_square", "facade", "behind_truck", "urban_crossing", "large_crossing")
 
 
 @cache
 def episodes(environment: str, agent: str, sensing: str = "sensed") -> Episodes:
     scenario = load_scenario(environment, {"sensing": sensing})
-    return drive(Engine(scenario, WORLDS), load_agent(agent, scenario), held_out_seeds(9, WORLDS))
+    worlds = 48 if len(scenario.vehicles) <= 4 else 64 // len(scenario.vehicles)
+    return drive(Engine(scenario, worlds), load_agent(agent, scenario), held_out_seeds(9, worlds))
 
 
 def figures(environment: str, agent: str, sensing: str = "sensed") -> dict[str, tuple[float, float, float]]:

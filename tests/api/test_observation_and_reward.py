@@ -27,6 +27,10 @@ EXCEPTIONS = {
         "message_forward": "and goes the same way as the car",
     },
     "facade": {"map_in_view": "the nearest landmark stands beside the car, out of its camera's view"},
+    "large_crossing": {
+        "map_in_view": "the nearest landmarks stand beside the car, out of its camera's view",
+        "message_forward": "only the last car hears the last but one, which drives at a right angle to it",
+    },
     "urban_crossing": {"map_in_view": "the nearest landmarks stand beside the car, out of its camera's view"},
 }
 """Fields with an entry that hardly varies, and why it is there."""
@@ -61,7 +65,8 @@ def drivers(scenario: Any) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
 
 @cache
 def run(name: str, driver: str) -> Run:
-    envs = coopenv.make_vec(name, num_worlds=24, autoreset="disabled")
+    vehicles = len(KNOWN[name].vehicles)
+    envs = coopenv.make_vec(name, num_worlds=24 if vehicles <= 4 else 48 // vehicles, autoreset="disabled")
     engine, policy = envs.engine, drivers(envs.scenario)[driver]
     term = engine.reward_terms.index("position_uncertainty")
     observations, _ = envs.reset(seed=3)
