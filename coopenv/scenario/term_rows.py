@@ -39,6 +39,11 @@ FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
         ("message_mask", "neighbour", 1, "bool", 1, 0, "1: a message is at hand and not stale"),
         ("message_age", "neighbour", 1, "s", "age_scale", 0, "time since it was sent"),
     ],
+    "clearance": [
+        ("message_clearance", "neighbour", 2, "m", 2, -1,
+         "how near it comes in 6 s if it goes straight on at top speed and oneself goes along the way so, or stands; "
+         "4: farther, or unheard", None, 2.0),
+    ],
     "goal": [
         ("goal", "vehicle", 3, "m", "position_scale", -1,
          "goal seen from one's own estimate, body frame; 0 without a goal", XY),

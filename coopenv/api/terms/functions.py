@@ -7,6 +7,7 @@ privileged. Records: see `coopenv.api.terms.records`.
 import warp as wp
 
 from coopenv.api.step_results import DEGREES
+from coopenv.api.terms.conflict import FAR, nearest_going, nearest_waiting
 from coopenv.api.terms.map_view import MapLandmark
 from coopenv.api.terms.records import Ego, Neighbour, Target, Truth, log10
 from coopenv.world.collision import COLLIDED, OFF_ROUTE
@@ -109,6 +110,17 @@ def message_mask(ego: Ego, neighbour: Neighbour):
 @wp.func
 def message_age(ego: Ego, neighbour: Neighbour):
     return neighbour.age
+
+
+@wp.func
+def message_clearance(ego: Ego, neighbour: Neighbour):
+    result = wp.vec2(FAR, FAR)
+    if neighbour.heard:
+        place, R = wp.vec2(neighbour.position[0], neighbour.position[1]), neighbour.rotation
+        forward = wp.vec2(R[0, 0], R[1, 0])
+        result[0] = nearest_going(ego.route_ahead, ego.route_step, ego.top_speed, place, forward)
+        result[1] = nearest_waiting(ego.top_speed, place, forward)
+    return result
 
 
 @wp.func

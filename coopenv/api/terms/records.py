@@ -64,6 +64,8 @@ class Ego:
     route_heading: wp.float32  # rad, estimated heading less that of its way
     route_left: wp.float32  # m of its way to the goal
     route_ahead: wp.vec4  # rad to the left, where its way is 1, 2, 4 and 8 steps ahead
+    route_step: wp.float32  # m
+    top_speed: wp.float32  # m/s
     goal: wp.vec3  # m, seen from the estimate, body; 0 without a goal
     arrived: wp.int32  # arrivals at a goal in this step
     outcome: wp.int32  # `Outcome` in the step of arrival or collision, else UNDER_WAY
@@ -192,6 +194,8 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     ego.route_heading = wp.float32(turn)
     ego.route_left = wp.float32(left)
     ego.route_ahead = ahead
+    ego.route_step = wp.float32(model.route_step)
+    ego.top_speed = wp.max(wp.float32(model.dynamics[vehicle].max_speed), 1.0e-3)
     if model.scene.goal_radius[vehicle] > p.dtype(0.0):
         ego.goal = wp.vec3(wp.transpose(R) * state.goal[world, vehicle] - p)
     if results.alive[world, vehicle]:
