@@ -29,6 +29,7 @@ EXCEPTIONS = {
     "facade": {"map_in_view": "the nearest landmark stands beside the car, out of its camera's view"},
     "large_crossing": {
         "map_in_view": "the nearest landmarks stand beside the car, out of its camera's view",
+        "message_clearance": "whom the last slots are of, who goes before it in the order, seldom comes near",
         "message_forward": "only the last car hears the last but one, which drives at a right angle to it",
     },
     "urban_crossing": {"map_in_view": "the nearest landmarks stand beside the car, out of its camera's view"},
@@ -90,16 +91,18 @@ def run(name: str, driver: str) -> Run:
 def test_scales_give_every_entry_a_deviation_between_a_tenth_and_one(name: str) -> None:
     runs = [run(name, driver) for driver in ("follow", "slow", "look around", "peek")]
     entries = np.concatenate([each.observations for each in runs])
-    table, outside = [f"\n{name}: {'entry':24s} {'std':>6s} {'min':>6s} {'max':>6s} {'clipped':>8s}"], set()
+    table, least = [f"\n{name}: {'entry':24s} {'std':>6s} {'min':>6s} {'max':>6s} {'clipped':>8s}"], {}
     for title, field in runs[0].layout.items():
         for k in range(field.start, field.stop):
             x = entries[:, k]
             std, clipped = x.std(), np.mean(np.abs(x) >= 1.0)
             table.append(f"{title}[{k - field.start}]: {std:6.3f} {x.min():6.2f} {x.max():6.2f} {clipped:8.2f}")
-            if not 0.1 <= std <= 1.0:
-                outside.add(title)
+            least[title] = min(std, least.get(title, 1.0))
+            assert std <= 1.0, table[-1]
     print("\n".join(table))
-    assert outside == set(EXCEPTIONS.get(name, {}))
+    exceptions = EXCEPTIONS.get(name, {})
+    assert not [title for title, std in least.items() if std < 0.1 and title not in exceptions]
+    assert not [title for title in exceptions if least[title] > 0.12], "an exception without its reason"
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
