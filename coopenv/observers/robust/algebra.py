@@ -133,12 +133,27 @@ def sheared(P: Any, S: Any):
 
 
 @wp.func
+def forward(step: Pose, M: Any):
+    """Return F M for a 6x6 matrix M, see `transition`: by rows, a fourth of the time that the product of two takes."""
+    R = step.R
+    p = step.p
+    u = M[3] + p[2] * M[1] - p[1] * M[2]
+    v = M[4] + p[0] * M[2] - p[2] * M[0]
+    w = M[5] + p[1] * M[0] - p[0] * M[1]
+    return wp.matrix_from_rows(
+        R[0, 0] * M[0] + R[1, 0] * M[1] + R[2, 0] * M[2],
+        R[0, 1] * M[0] + R[1, 1] * M[1] + R[2, 1] * M[2],
+        R[0, 2] * M[0] + R[1, 2] * M[1] + R[2, 2] * M[2],
+        R[0, 0] * u + R[1, 0] * v + R[2, 0] * w,
+        R[0, 1] * u + R[1, 1] * v + R[2, 1] * w,
+        R[0, 2] * u + R[1, 2] * v + R[2, 2] * w,
+    )
+
+
+@wp.func
 def propagated(P: Any, step: Pose):
     """Return F P F^T for a symmetric 6x6 matrix P, see `transition`."""
-    M = sheared(P, -skew(step.p))
-    E = wp.transpose(step.R)
-    B = E * block3(M, 0, 3) * step.R
-    return join6(E * block3(M, 0, 0) * step.R, B, wp.transpose(B), E * block3(M, 3, 3) * step.R)
+    return forward(step, wp.transpose(forward(step, P)))
 
 
 @wp.func

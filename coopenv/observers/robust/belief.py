@@ -12,12 +12,12 @@ import warp as wp
 from coopenv.estimation.linalg import block3, cholesky6, symmetric_part
 from coopenv.observers.robust.algebra import (
     displaced,
+    forward,
     lower_blocks,
     moved,
     propagated,
     recentred,
     recentring,
-    transition,
     with_noise,
 )
 from coopenv.observers.robust.constants import FORGET_TIME, MAX_GROWTH, SAME_TIME
@@ -59,10 +59,9 @@ def own_estimate(memory: Any, world: int, i: int):
 def propagate(memory: Any, world: int, i: int, n: int, step: Pose, noise: Any):
     """Carry a member through an increment of odometry with noise."""
     memory.member[world, i, n].pose = moved(memory.member[world, i, n].pose, step)
-    F = transition(step)
     for k in range(memory.belief[world, i].members):
         if k != n:
-            block = F * memory.P[world, i, n, k]
+            block = forward(step, memory.P[world, i, n, k])
             memory.P[world, i, n, k] = block
             memory.P[world, i, k, n] = wp.transpose(block)
     memory.P[world, i, n, n] = with_noise(propagated(memory.P[world, i, n, n], step), noise)

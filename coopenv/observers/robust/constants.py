@@ -61,6 +61,9 @@ KNOWN_ANGLE, KNOWN_POSITION = 0.2, 2.0
 """rad and m, standard deviation per axis below which a pose is linearised about and sent. Chosen."""
 MAX_HYPOTHESES = 6  # most hypotheses at once: P3P has four solutions at most, the prior is one more. Chosen
 PERTURBATION = 2.0  # standard deviations by which measurements are moved to find solutions that noise may hide
+PROBLEMS = 1 + 3 * 2 * 5
+"""Problems of three bearings: as measured; each moved to either side along two axes across it, and its point along
+three."""
 MAX_BEARING_COST = 25.0
 """Most that one bearing costs (chi-square of 2, 1 - 4e-6): below `PRUNE_GAP`, so that one wrong association decides
 nothing."""
@@ -70,6 +73,9 @@ MAX_BEST_COST = 80.0
 """Most that the best may cost beyond twice what is expected of a true one: `MAX_PRIOR_COST` and one wrong bearing."""
 CLEAR_TIME, PATIENCE = 0.25, 15.0
 """s, for which all solutions must have been well determined, and after which that is asked no more. Chosen."""
+DOUBT_TIME = 0.1
+"""s from a frame in which a solution was not well determined to the next look: what has to change is the vehicle's
+place, or what its neighbours know. Chosen."""
 MIN_SEARCH_TIME = 0.5  # s, before a hypothesis becomes the belief. Chosen
 MAX_SPEED = 1.0  # m/s at which a sender may have gone on since a message that is used in the search. Chosen
 CORRELATION_FACTOR = 4.0

@@ -8,7 +8,7 @@ from coopenv.observers.robust.algebra import displaced, recentring
 from coopenv.observers.robust.belief import apply_corrections, subtract_block
 from coopenv.observers.robust.constants import MAX_LINEARISATIONS, RELINEARISATION_ANGLE
 from coopenv.observers.robust.measurements import linearise
-from coopenv.observers.robust.memory import mat66d, vec6d
+from coopenv.observers.robust.memory import Frame, mat66d, vec6d
 
 
 @wp.func
@@ -20,16 +20,16 @@ def store_poses(memory: Any, world: int, i: int):
 
 
 @wp.func
-def linearise_again(model: Any, memory: Any, world: int, i: int, share: Any):
+def linearise_again(frame: Frame, memory: Any, world: int, i: int, share: Any):
     """Linearise the lines at where a share of the correction puts the poses, in the errors about those before."""
     for k in range(memory.belief[world, i].members):
         correction = share * memory.scratch[world, k].correction
         memory.scratch[world, k].last_correction = correction
         memory.scratch[world, k].recentring = recentring(correction)
         memory.member[world, i, k].pose = displaced(memory.scratch[world, k].pose, correction)
-    for n in range(model.target_count[i]):
+    for n in range(frame.lines):
         if memory.line[world, n].fits == 1:
-            linearise(model, memory, world, i, n)
+            linearise(frame, memory, world, i, n)
             member = memory.line[world, n].member
             memory.line[world, n].jacobian = memory.line[world, n].jacobian * memory.scratch[world, 0].recentring
             if member > 0:
@@ -40,30 +40,30 @@ def linearise_again(model: Any, memory: Any, world: int, i: int, share: Any):
 @wp.func
 def across_line(memory: Any, world: int, n: int, m: int):
     """Return the covariance, 2x2, of what the n-th line measures with what is left of the m-th one's innovation."""
-    S = memory.line[world, n].jacobian * memory.gain[world, m, 0]
+    S = memory.line[world, n].jacobian * wp.transpose(memory.gain[world, m, 0])
     member = memory.line[world, n].member
     if member > 0:
-        S = S + memory.line[world, n].member_jacobian * memory.gain[world, m, member]
+        S = S + memory.line[world, n].member_jacobian * wp.transpose(memory.gain[world, m, member])
     return S
 
 
 @wp.func
 def set_gain(memory: Any, world: int, i: int, n: int):
-    """Set a line's `gain`, P H^T with the covariance that the lines before leave, and its `weight` S^-1."""
+    """Set a line's `gain`, H P with the covariance that the lines before leave, and its `weight` S^-1."""
     members = memory.belief[world, i].members
     member = memory.line[world, n].member
-    Ht = wp.transpose(memory.line[world, n].jacobian)
+    H = memory.line[world, n].jacobian
     for k in range(members):
-        memory.gain[world, n, k] = memory.P[world, i, k, 0] * Ht
+        memory.gain[world, n, k] = H * memory.P[world, i, 0, k]
     if member > 0:
-        Ht = wp.transpose(memory.line[world, n].member_jacobian)
+        H = memory.line[world, n].member_jacobian
         for k in range(members):
-            memory.gain[world, n, k] = memory.gain[world, n, k] + memory.P[world, i, k, member] * Ht
+            memory.gain[world, n, k] = memory.gain[world, n, k] + H * memory.P[world, i, member, k]
     for m in range(n):
         if memory.line[world, m].fits == 1:
-            share = memory.line[world, m].weight * wp.transpose(across_line(memory, world, n, m))
+            share = across_line(memory, world, n, m) * memory.line[world, m].weight
             for k in range(members):
-                memory.gain[world, n, k] = memory.gain[world, n, k] - memory.gain[world, m, k] * share
+                memory.gain[world, n, k] = memory.gain[world, n, k] - share * memory.gain[world, m, k]
     S = memory.line[world, n].noise * wp.identity(2, wp.float64) + across_line(memory, world, n, n)
     memory.line[world, n].weight = wp.inverse(S)
 
@@ -92,7 +92,7 @@ def correct_by_lines(memory: Any, world: int, i: int, lines: int):
                 residual = residual + memory.line[world, n].member_jacobian * error_left(memory, world, member)
             weighted = memory.line[world, n].weight * residual
             for k in range(members):
-                correction = memory.scratch[world, k].correction + memory.gain[world, n, k] * weighted
+                correction = memory.scratch[world, k].correction + weighted * memory.gain[world, n, k]
                 memory.scratch[world, k].correction = correction
 
 
@@ -104,8 +104,8 @@ def condense(memory: Any, world: int, i: int, lines: int):
             block = mat66d()
             for n in range(lines):
                 if memory.line[world, n].fits == 1:
-                    K = memory.gain[world, n, k] * memory.line[world, n].weight
-                    block = block + K * wp.transpose(memory.gain[world, n, j])
+                    K = memory.line[world, n].weight * memory.gain[world, n, k]
+                    block = block + wp.transpose(K) * memory.gain[world, n, j]
             subtract_block(memory, world, i, k, j, block)
 
 
@@ -149,7 +149,7 @@ def next_share(memory: Any, world: int, i: int, lines: int, first: bool):
 
 
 @wp.func
-def iterated_update(model: Any, memory: Any, world: int, i: int):
+def iterated_update(frame: Frame, memory: Any, world: int, i: int):
     """Correct by the lines that fit, linearised anew half way, or where they put the poses if that is far.
 
     Far, these are Gauss-Newton steps. Near, gain and innovation depend on the same noise: linearised where the poses
@@ -158,13 +158,13 @@ def iterated_update(model: Any, memory: Any, world: int, i: int):
     Source: Bell and Cathey, The iterated Kalman filter update as a Gauss-Newton method, IEEE Transactions on Automatic
     Control 38(2), 1993.
     """
-    lines = model.target_count[i]
+    lines = frame.lines
     store_poses(memory, world, i)
     correct_by_lines(memory, world, i, lines)
     share = next_share(memory, world, i, lines, True)
     step = int(1)
     while share > wp.float64(0.0) and step < MAX_LINEARISATIONS:
-        linearise_again(model, memory, world, i, share)
+        linearise_again(frame, memory, world, i, share)
         correct_by_lines(memory, world, i, lines)
         share = next_share(memory, world, i, lines, False)
         step += 1

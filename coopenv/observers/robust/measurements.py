@@ -13,7 +13,7 @@ from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust.algebra import between, odometry_noise
 from coopenv.observers.robust.belief import index_of
 from coopenv.observers.robust.constants import BEND_FACTOR, CORRELATION_FACTOR, MAX_ACCELERATION, MAX_SPEED
-from coopenv.observers.robust.memory import mat26d, vec3d
+from coopenv.observers.robust.memory import Frame, mat26d, vec3d
 from coopenv.observers.robust.odometry import increment_noise
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.v2x import fresh
@@ -21,7 +21,6 @@ from coopenv.world.v2x import fresh
 HALF_ACCELERATION = 0.5 * MAX_ACCELERATION
 THIRD = 1.0 / 3.0
 """Also the variance of a uniform distribution over [-1, 1], which the paper's noise has on the image plane."""
-NOTHING = -1  # in place of a member: the bearing cannot be used now
 SEARCH, RESECTION, TRACKING = 0, 1, 2  # what bearings are for
 
 
@@ -77,8 +76,8 @@ def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, 
 @wp.func
 def set_line_to_member(
     model: Any, memory: Any, world: int, i: int, n: int, member: int, heard: bool, tick: int, b: Any, purpose: int
-):
-    """Let a bearing be to a member, which has moved on since its last message that was fused.
+) -> bool:
+    """Let a bearing be to a member, which has moved on since its last message that was fused; return whether it is.
 
     By its odometry as far as messages tell it, and from there by its last twist. Until a second message tells that,
     its bearing says nothing, but for a resection: there it has gone as little as in the search that comes before.
@@ -101,7 +100,7 @@ def set_line_to_member(
         variance += odometry_noise(model, i, age)[1] + away * away
         if memory.member[world, i, member].has_twist == 0:
             if purpose == TRACKING:
-                return
+                return False
             going = wp.float64(MAX_SPEED) * age
             variance += going * going
         else:
@@ -109,36 +108,44 @@ def set_line_to_member(
             gone = gone + turned * (exp_so3(half_turn) * memory.member[world, i, member].v * age)
             variance += memory.member[world, i, member].velocity_variance * age * age
     set_line(memory, world, n, member, b, gone, variance)
+    return True
 
 
 @wp.func
-def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int, purpose: int) -> int:
-    """Set the line of sight of each bearing to a landmark or a vehicle; return how many there are.
+def set_line_to_target(
+    model: Any, state: Any, memory: Any, world: int, i: int, n: int, target: int, tick: int, purpose: int
+) -> bool:
+    """Let the n-th line be the bearing to a target in view; return whether that can be used now."""
+    b = vec3d(body_bearing(model, state, world, i, target))
+    sender = target - model.landmarks
+    if sender < 0:
+        set_line(memory, world, n, 0, b, vec3d(marker_position(model, state, world, target)), wp.float64(0.0))
+        return True
+    heard = is_heard(model, state, memory, world, i, sender, tick)
+    if purpose == SEARCH:
+        if heard:
+            variance = received_variance(model, memory, world, i, sender, tick)
+            set_line(memory, world, n, 0, b, memory.inbox[world, i, sender].pose.p, variance)
+        return heard
+    member = index_of(memory, world, i, sender)
+    if member > 0:
+        return set_line_to_member(model, memory, world, i, n, member, heard, tick, b, purpose)
+    return False
+
+
+@wp.func
+def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int, purpose: int):
+    """Set the lines of sight of the bearings to landmarks and vehicles that can be used, and return their frame.
 
     In a search vehicles are where they say that they are, otherwise where they are believed to be.
     """
-    seen = int(0)
+    lines = int(0)
     for n in range(model.target_count[i]):
         target = model.targets[i, n]
-        memory.line[world, n].member = NOTHING
         if state.sight[world, i, target] == VISIBLE:
-            b = vec3d(body_bearing(model, state, world, i, target))
-            sender = target - model.landmarks
-            if sender < 0:
-                z = vec3d(marker_position(model, state, world, target))
-                set_line(memory, world, n, 0, b, z, wp.float64(0.0))
-            elif purpose == SEARCH:
-                if is_heard(model, state, memory, world, i, sender, tick):
-                    variance = received_variance(model, memory, world, i, sender, tick)
-                    set_line(memory, world, n, 0, b, memory.inbox[world, i, sender].pose.p, variance)
-            else:
-                member = index_of(memory, world, i, sender)
-                if member > 0:
-                    heard = is_heard(model, state, memory, world, i, sender, tick)
-                    set_line_to_member(model, memory, world, i, n, member, heard, tick, b, purpose)
-            if memory.line[world, n].member != NOTHING:
-                seen += 1
-    return seen
+            if set_line_to_target(model, state, memory, world, i, lines, target, tick, purpose):
+                lines += 1
+    return Frame(lines, vec3d(model.camera[i].position), bearing_variance(model, i))
 
 
 @wp.func
@@ -150,39 +157,45 @@ def bend_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: An
     noise of that size. `turn` is from the member's body to the vehicle's.
     """
     V = block3(memory.P[world, i, 0, 0], 3, 3)
-    if member > 0:
-        C = block3(memory.P[world, i, 0, member], 3, 3) * wp.transpose(turn)
-        V = V + turn * block3(memory.P[world, i, member, member], 3, 3) * wp.transpose(turn) - C - wp.transpose(C)
-    along = wp.max(wp.dot(u, V * u), wp.float64(0.0))
-    across = wp.max(wp.trace(V) - along, wp.float64(0.0))
+    along = wp.dot(u, V * u)
+    total = wp.trace(V)
+    if member > 0:  # of V + turn W turn^T - C turn^T - turn C^T
+        W = block3(memory.P[world, i, member, member], 3, 3)
+        C = block3(memory.P[world, i, 0, member], 3, 3)
+        w = wp.transpose(turn) * u
+        along += wp.dot(w, W * w) - wp.float64(2.0) * wp.dot(u, C * w)
+        total += wp.trace(W) - wp.float64(2.0) * wp.ddot(C, turn)
+    along = wp.max(along, wp.float64(0.0))
+    across = wp.max(total - along, wp.float64(0.0))
     square = distance * distance
     return wp.float64(BEND_FACTOR) * along * across / (square * square)
 
 
 @wp.func
-def linearise(model: Any, memory: Any, world: int, i: int, n: int):
+def linearise(frame: Frame, memory: Any, world: int, i: int, n: int):
     """Linearise the n-th bearing, residual = H x + noise; return whether its target is ahead of the camera."""
     member = memory.line[world, n].member
     point = memory.line[world, n].point
     bearing = memory.line[world, n].bearing
     own = memory.member[world, i, 0].pose
     z = point
+    turn = wp.identity(3, wp.float64)
     if member > 0:
         theirs = memory.member[world, i, member].pose
         z = theirs.p + theirs.R * point
+        turn = wp.transpose(own.R) * theirs.R
     a = wp.transpose(own.R) * (z - own.p)
-    d = a - vec3d(model.camera[i].position)
+    d = a - frame.lever
     distance = wp.max(wp.length(d), wp.float64(1.0e-9))
-    u = d / distance
+    inverse = wp.float64(1.0) / distance
+    u = d * inverse
     T = tangent_basis(u)
-    B = T / distance
+    B = T * inverse
     H = mat26d()
     H[:, :3] = B * skew(a)
     H[:, 3:] = -B
     memory.line[world, n].jacobian = H
-    turn = wp.identity(3, wp.float64)
     if member > 0:
-        turn = wp.transpose(own.R) * memory.member[world, i, member].pose.R
         G = B * turn
         H[:, :3] = -(G * skew(point))
         H[:, 3:] = G
@@ -190,22 +203,21 @@ def linearise(model: Any, memory: Any, world: int, i: int, n: int):
     memory.line[world, n].residual = T * bearing
     memory.line[world, n].distance = distance
     bend = bend_variance(memory, world, i, member, turn, u, distance)
-    place = memory.line[world, n].variance / (distance * distance)
-    memory.line[world, n].noise = bearing_variance(model, i) + place + bend
+    memory.line[world, n].noise = frame.variance + memory.line[world, n].variance * inverse * inverse + bend
     return wp.dot(u, bearing) > wp.float64(0.0)
 
 
 @wp.func
-def innovation_squared(model: Any, memory: Any, world: int, i: int, n: int):
+def innovation_squared(frame: Frame, memory: Any, world: int, i: int, n: int):
     """Linearise a line and return its normalised innovation squared, infinite where the target is not ahead."""
-    if not linearise(model, memory, world, i, n):
+    if not linearise(frame, memory, world, i, n):
         return wp.float64(wp.inf)
     member = memory.line[world, n].member
     residual = memory.line[world, n].residual
     H = memory.line[world, n].jacobian
-    S = memory.line[world, n].noise * wp.identity(2, wp.float64) + H * (memory.P[world, i, 0, 0] * wp.transpose(H))
+    S = memory.line[world, n].noise * wp.identity(2, wp.float64) + (H * memory.P[world, i, 0, 0]) * wp.transpose(H)
     if member > 0:
         G = memory.line[world, n].member_jacobian
-        cross = H * (memory.P[world, i, 0, member] * wp.transpose(G))
-        S = S + cross + wp.transpose(cross) + G * (memory.P[world, i, member, member] * wp.transpose(G))
+        cross = (H * memory.P[world, i, 0, member]) * wp.transpose(G)
+        S = S + cross + wp.transpose(cross) + (G * memory.P[world, i, member, member]) * wp.transpose(G)
     return wp.dot(residual, wp.inverse(S) * residual)

@@ -21,7 +21,6 @@ mat22d: Any = wp.mat22d
 mat33d: Any = wp.mat33d
 vec6d: Any = wp.types.vector(6, wp.float64)
 mat26d: Any = wp.types.matrix((2, 6), wp.float64)
-mat62d: Any = wp.types.matrix((6, 2), wp.float64)
 mat66d: Any = wp.types.matrix((6, 6), wp.float64)
 mat66f: Any = wp.types.matrix((6, 6), wp.float32)
 
@@ -103,7 +102,7 @@ class Search:
     hypotheses: wp.int32  # how many
     followed_time: wp.float64  # s for which hypotheses have been followed
     waited_time: wp.float64  # s for which there were none
-    clear_time: wp.float64  # s for which the last frames' solutions have been well determined
+    clear_time: wp.float64  # s for which the frames' solutions have been well determined; below 0: s to the next look
     attempts: wp.int32
 
 
@@ -118,10 +117,19 @@ class Hypothesis:
 
 
 @wp.struct
+class Frame:
+    """What the bearings of a frame have in common; small, because functions are handed copies of their arguments."""
+
+    lines: wp.int32  # how many bearings can be used
+    lever: vec3d  # m, of the camera in the body
+    variance: wp.float64  # rad^2, of a bearing per tangent axis
+
+
+@wp.struct
 class Line:
     """A bearing of the frame as a measurement; scratch, see measurements.py."""
 
-    member: wp.int32  # that it is to; 0: to a point in the map; `NOTHING`: not used
+    member: wp.int32  # that it is to; 0: to a point in the map
     bearing: vec3d  # body frame
     point: vec3d  # m, in the member's body or in the map
     variance: wp.float64  # m^2, of the point per axis
@@ -159,7 +167,7 @@ class RobustMemory:
     inbox: array("WNN", Report)  # per receiver and sender
     line: array("WA", Line)
     scratch: array("WK", Scratch)
-    gain: array("WAK", mat62d)  # scratch: of a line in a member, not yet weighted, see correction.py
+    gain: array("WAK", mat26d)  # scratch: of a line in a member, transposed and not yet weighted, see correction.py
 
 
 ERRORS = 1  # the member that stands for the odometry's errors, where there is one, see odometry.py
@@ -182,7 +190,7 @@ def clear(model: Any, memory: Any, world: int, i: int):
     for n in range(model.agents):
         memory.line[world, n] = Line()
         for k in range(members):
-            memory.gain[world, n, k] = mat62d()
+            memory.gain[world, n, k] = mat26d()
 
 
 LARGE = numbers(LARGEST**3)
@@ -226,7 +234,7 @@ def rules_for(members: int) -> dict[str, Rule]:
         "P": Rule("a covariance", lambda P, fields, model: are_joint(P, fields["observer_belief.members"]), axes=4),
         "anchor.estimate.P": COVARIANCE,
         "search.hypotheses": whole(0, MAX_HYPOTHESES),
-        "line.member": whole(-1, members - 1),
+        "line.member": whole(0, members - 1),
         **where("belief.members", {"member.pose.R": ROTATION, "member.vehicle": whole(0, "vehicles")}),
         **where("search.active", {"search.prior.pose.R": ROTATION, "search.prior.P": COVARIANCE}),
         **where("search.hypotheses", {"hypothesis.estimate.pose.R": ROTATION, "hypothesis.estimate.P": COVARIANCE}),

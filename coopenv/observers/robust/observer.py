@@ -15,11 +15,14 @@ from coopenv.estimation.so3 import orthonormalise, skew
 from coopenv.observers.robust.algebra import distance_squared, is_known, odometry_noise, sheared
 from coopenv.observers.robust.belief import begin_belief, own_estimate
 from coopenv.observers.robust.constants import SAME_PRIOR
+from coopenv.observers.robust.measurements import RESECTION, TRACKING, set_lines
 from coopenv.observers.robust.memory import Estimate, Pose, clear, mat33d, vec3d
 from coopenv.observers.robust.odometry import begin_errors, increment_noise, propagate_own, take_odometry, walk_errors
 from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
 from coopenv.observers.robust.tracklets import bit_of
 from coopenv.observers.robust.update import resect, set_anchor, update
+
+BELIEVING, SEARCHING, FOUND = 0, 1, 2  # how a vehicle stands to its pose; found in the search at this tick
 
 
 @wp.func
@@ -77,26 +80,34 @@ def make_start(clear_messages: Any, receive: Any) -> Any:
     return start
 
 
+@wp.func
+def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> int:
+    """Search for the pose; with one hypothesis left, believe in the prior if it is that, else in the hypothesis."""
+    if not advance_search(model, state, memory, world, i, now):
+        return SEARCHING
+    prior = memory.search[world, i].prior
+    found = memory.hypothesis[world, i, 0].estimate
+    confirmed = is_known(prior.P) and distance_squared(prior, found) < wp.float64(SAME_PRIOR)
+    if confirmed:
+        found = prior
+    restart_belief(model, memory, world, i, found)
+    return wp.where(confirmed, BELIEVING, FOUND)
+
+
+@wp.func
+def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, standing: int):
+    """Correct the belief by a frame; that of a pose that has just been found, take from this frame alone."""
+    purpose = wp.where(standing == BELIEVING, TRACKING, RESECTION)
+    frame = set_lines(model, state, memory, world, i, now.tick, purpose)
+    if standing == BELIEVING:
+        memory.search[world, i].active = 0
+        update(model, state, memory, world, i, now, frame)
+    elif resect(frame, memory, world, i) and is_known(memory.P[world, i, 0, 0]):
+        memory.search[world, i].active = 0
+
+
 def make_estimate(receive: Any, fuse_messages: Any) -> Any:
     """Return the Warp function of one tick, given those that take what the radio delivers and fuse it."""
-
-    @wp.func
-    def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
-        """Search for the pose; with one hypothesis left, go on with the prior if it is that, else with this frame."""
-        if not advance_search(model, state, memory, world, i, now):
-            return
-        prior = memory.search[world, i].prior
-        found = memory.hypothesis[world, i, 0].estimate
-        confirmed = is_known(prior.P) and distance_squared(prior, found) < wp.float64(SAME_PRIOR)
-        if confirmed:
-            found = prior
-        restart_belief(model, memory, world, i, found)
-        fuse_messages(model, state, memory, world, i, now.tick)
-        if confirmed:
-            memory.search[world, i].active = 0
-            update(model, state, memory, world, i, now)
-        elif resect(model, state, memory, world, i, now.tick) and is_known(memory.P[world, i, 0, 0]):
-            memory.search[world, i].active = 0
 
     @wp.func
     def estimate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
@@ -106,17 +117,20 @@ def make_estimate(receive: Any, fuse_messages: Any) -> Any:
         receive(model, state, memory, world, i)
         step, jump = take_odometry(model, state, memory, world, i, now.period)
         walk_errors(model, memory, world, i, now.period)
+        standing = int(BELIEVING)
         if memory.search[world, i].active == 1:
             noise = increment_noise(model, memory, world, i, step, now.period) + jump
             propagate_search(memory, world, i, step, noise)
+            standing = SEARCHING
             if now.due:
-                search(model, state, memory, world, i, now)
+                standing = search(model, state, memory, world, i, now)
         else:
             noise = odometry_noise(model, i, now.period) + jump
             propagate_own(memory, world, i, step, noise, now.period)
+        if standing != SEARCHING:
             fuse_messages(model, state, memory, world, i, now.tick)
             if now.due:
-                update(model, state, memory, world, i, now)
+                correct(model, state, memory, world, i, now, standing)
         write(state, memory, world, i)
         if now.due:
             state.corrected_tick[world, i] = now.tick

@@ -14,8 +14,8 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import carried, distance_squared, is_known
 from coopenv.observers.robust.belief import begin_belief, own_estimate
 from coopenv.observers.robust.correction import iterated_update
-from coopenv.observers.robust.measurements import NOTHING, SEARCH, innovation_squared, set_lines
-from coopenv.observers.robust.memory import Estimate, Hypothesis, Pose, Search
+from coopenv.observers.robust.measurements import SEARCH, innovation_squared, set_lines
+from coopenv.observers.robust.memory import Estimate, Frame, Hypothesis, Pose, Search
 from coopenv.observers.robust.solutions import is_new, next_triple, solve_triple
 
 
@@ -75,26 +75,27 @@ def prune(memory: Any, world: int, i: int):
 
 
 @wp.func
-def follow_hypothesis(model: Any, memory: Any, world: int, i: int, h: int, used: Any):
+def follow_hypothesis(frame: Frame, memory: Any, world: int, i: int, h: int, used: Any):
     """Add the frame's bearings, but those used already, to the cost of a hypothesis; correct it by those that fit."""
     begin_belief(memory, world, i, memory.hypothesis[world, i, h].estimate)
     fitting = int(0)
-    for n in range(model.target_count[i]):
-        memory.line[world, n].fits = 0
-        if memory.line[world, n].member != NOTHING and n != used[0] and n != used[1] and n != used[2]:
-            nis = innovation_squared(model, memory, world, i, n)
+    for n in range(frame.lines):
+        fits = int(0)
+        if n != used[0] and n != used[1] and n != used[2]:
+            nis = innovation_squared(frame, memory, world, i, n)
             if nis < wp.float64(constants.BEARING_GATE):
-                memory.line[world, n].fits = 1
-                fitting += 1
+                fits = 1
             memory.hypothesis[world, i, h].cost += wp.min(nis, wp.float64(constants.MAX_BEARING_COST))
             memory.hypothesis[world, i, h].bearings += 1
+        memory.line[world, n].fits = fits
+        fitting += fits
     if fitting > 0:
-        iterated_update(model, memory, world, i)
+        iterated_update(frame, memory, world, i)
         memory.hypothesis[world, i, h].estimate = own_estimate(memory, world, i)
 
 
 @wp.func
-def add_prior(model: Any, memory: Any, world: int, i: int):
+def add_prior(memory: Any, world: int, i: int):
     """Add the prior as a hypothesis if it is known well enough to be followed."""
     prior = memory.search[world, i].prior
     if is_known(prior.P):
@@ -102,40 +103,41 @@ def add_prior(model: Any, memory: Any, world: int, i: int):
         memory.hypothesis[world, i, h] = Hypothesis()
         memory.hypothesis[world, i, h].estimate = prior
         memory.search[world, i].hypotheses = h + 1
-        follow_hypothesis(model, memory, world, i, h, wp.vec3i(-1, -1, -1))
 
 
 @wp.func
-def chosen_triple(model: Any, memory: Any, world: int, i: int, seen: int):
+def chosen_triple(frame: Frame, memory: Any, world: int, i: int):
     """Return three well placed bearings, others at every attempt."""
-    triples = seen * (seen - 1) * (seen - 2) // 6
+    triples = frame.lines * (frame.lines - 1) * (frame.lines - 2) // 6
     lines = wp.vec3i(0, 0, 0)
     size = wp.float64(wp.inf)
     number = int(-1)
     for _ in range(memory.search[world, i].attempts % triples + 1):
-        lines, size, number = next_triple(memory, world, model.target_count[i], size, number)
+        lines, size, number = next_triple(memory, world, frame.lines, size, number)
     return lines
 
 
 @wp.func
-def solve_frame(model: Any, memory: Any, world: int, i: int, seen: int, period: Any):
-    """Follow a known prior at first; then a frame's solutions, too, if for a while all were well determined.
+def wait(memory: Any, world: int, i: int, period: Any) -> bool:
+    """Count the time of a frame; return whether to look at it: not soon after one that was in doubt."""
+    memory.search[world, i].waited_time += period
+    memory.search[world, i].clear_time += period
+    patient = memory.search[world, i].waited_time < wp.float64(constants.PATIENCE)
+    return not patient or memory.search[world, i].clear_time > wp.float64(-constants.SAME_TIME)
 
-    Every attempt takes other bearings. Where two solutions nearly meet, the region where they may be is no ellipsoid,
-    and noise makes them come and go; meanwhile a follower's leaders improve, which sets them apart.
+
+@wp.func
+def solve_chosen(frame: Frame, memory: Any, world: int, i: int, lines: Any, period: Any) -> bool:
+    """Solve a triple; return whether its solutions are hypotheses now: if for a while all were well determined.
+
+    Where two solutions nearly meet, the region where they may be is no ellipsoid, and noise makes them come and go;
+    meanwhile a follower's leaders improve, which sets them apart.
     """
-    if memory.search[world, i].attempts == 0 and is_known(memory.search[world, i].prior.P):
-        add_prior(model, memory, world, i)
-        memory.search[world, i].attempts = 1
-        memory.search[world, i].followed_time = wp.float64(0.0)
-        return
-    lines = chosen_triple(model, memory, world, i, seen)
-    waited = memory.search[world, i].waited_time + period
-    clear = memory.search[world, i].clear_time + period
-    patient = waited < wp.float64(constants.PATIENCE)
+    clear = wp.max(memory.search[world, i].clear_time, period)
+    patient = memory.search[world, i].waited_time < wp.float64(constants.PATIENCE)
     following = not patient or clear >= wp.float64(constants.CLEAR_TIME)
-    if not solve_triple(model, memory, world, i, lines, patient, following):
-        clear = wp.float64(0.0)
+    if not solve_triple(frame, memory, world, i, lines, patient, following):
+        clear = wp.float64(-constants.DOUBT_TIME)
         following = False
     if following:
         for h in range(memory.search[world, i].hypotheses):
@@ -143,28 +145,53 @@ def solve_frame(model: Any, memory: Any, world: int, i: int, seen: int, period: 
             memory.hypothesis[world, i, h].cost = wp.min(distance, wp.float64(constants.MAX_PRIOR_COST))
             memory.hypothesis[world, i, h].prior_distance = distance
             memory.hypothesis[world, i, h].bearings = 0
-            follow_hypothesis(model, memory, world, i, h, lines)
-        add_prior(model, memory, world, i)
-        sort_hypotheses(memory, world, i)
-        memory.search[world, i].hypotheses = wp.min(memory.search[world, i].hypotheses, constants.MAX_HYPOTHESES)
+        clear = wp.float64(0.0)
+    memory.search[world, i].clear_time = clear
+    return following
+
+
+@wp.func
+def begin_hypotheses(frame: Frame, memory: Any, world: int, i: int, period: Any):
+    """Begin with a known prior at first, then with a frame's solutions, too; every attempt takes other bearings.
+
+    Return the bearings that have been used, and for how many hypotheses.
+    """
+    lines = wp.vec3i(-1, -1, -1)
+    solved = int(0)
+    following = memory.search[world, i].attempts == 0 and is_known(memory.search[world, i].prior.P)
+    if not following:
+        if wait(memory, world, i, period):
+            lines = chosen_triple(frame, memory, world, i)
+            following = solve_chosen(frame, memory, world, i, lines, period)
+            solved = memory.search[world, i].hypotheses
+    if following:
+        add_prior(memory, world, i)
         memory.search[world, i].attempts += 1
         memory.search[world, i].followed_time = wp.float64(0.0)
-        clear = wp.float64(0.0)
-    memory.search[world, i].waited_time = waited
-    memory.search[world, i].clear_time = clear
+    return lines, solved
 
 
 @wp.func
 def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> bool:
     """Take a frame's bearings; return whether one hypothesis alone is left after some frames."""
-    seen = set_lines(model, state, memory, world, i, now.tick, SEARCH)
-    if memory.search[world, i].hypotheses == 0:
-        if seen >= 3:
-            solve_frame(model, memory, world, i, seen, now.period)
+    frame = set_lines(model, state, memory, world, i, now.tick, SEARCH)
+    beginning = memory.search[world, i].hypotheses == 0
+    lines = wp.vec3i(-1, -1, -1)
+    solved = int(0)
+    if beginning:
+        if frame.lines < 3:
+            return False
+        lines, solved = begin_hypotheses(frame, memory, world, i, now.period)
+    for h in range(memory.search[world, i].hypotheses):
+        used = wp.vec3i(-1, -1, -1)
+        if h < solved:
+            used = lines
+        follow_hypothesis(frame, memory, world, i, h, used)
+    if beginning:
+        sort_hypotheses(memory, world, i)
+        memory.search[world, i].hypotheses = wp.min(memory.search[world, i].hypotheses, constants.MAX_HYPOTHESES)
         return False
     memory.search[world, i].followed_time += now.period
-    for h in range(memory.search[world, i].hypotheses):
-        follow_hypothesis(model, memory, world, i, h, wp.vec3i(-1, -1, -1))
     prune(memory, world, i)
     alone = memory.search[world, i].hypotheses == 1
     return alone and memory.search[world, i].followed_time >= wp.float64(constants.MIN_SEARCH_TIME)

@@ -12,8 +12,8 @@ from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import distance_squared, inverse6, is_known, is_regular
 from coopenv.observers.robust.belief import begin_belief
-from coopenv.observers.robust.measurements import NOTHING, bearing_variance, linearise, tangent_basis
-from coopenv.observers.robust.memory import Estimate, Pose, mat33d, mat66d, vec3d
+from coopenv.observers.robust.measurements import linearise, tangent_basis
+from coopenv.observers.robust.memory import Estimate, Frame, Pose, mat33d, mat66d
 from coopenv.observers.robust.p3p import camera_pose, solve_triangle
 
 
@@ -30,19 +30,14 @@ def next_triple(memory: Any, world: int, count: int, size: Any, number: int):
     for n0 in range(count):
         for n1 in range(n0 + 1, count):
             for n2 in range(n1 + 1, count):
-                if (
-                    memory.line[world, n0].member != NOTHING
-                    and memory.line[world, n1].member != NOTHING
-                    and memory.line[world, n2].member != NOTHING
-                ):
-                    a = memory.line[world, n0].bearing
-                    area = wp.length(wp.cross(memory.line[world, n1].bearing - a, memory.line[world, n2].bearing - a))
-                    later = area < size or (area == size and here > number)
-                    if later and area > best_size:
-                        best = wp.vec3i(n0, n1, n2)
-                        best_size = area
-                        best_number = here
-                    here += 1
+                a = memory.line[world, n0].bearing
+                area = wp.length(wp.cross(memory.line[world, n1].bearing - a, memory.line[world, n2].bearing - a))
+                later = area < size or (area == size and here > number)
+                if later and area > best_size:
+                    best = wp.vec3i(n0, n1, n2)
+                    best_size = area
+                    best_number = here
+                here += 1
     return best, best_size, best_number
 
 
@@ -56,13 +51,13 @@ def angles_within(P: Any, most: Any) -> bool:
 
 
 @wp.func
-def covariance_of(model: Any, memory: Any, world: int, i: int, lines: Any, patient: bool):
+def covariance_of(frame: Frame, memory: Any, world: int, i: int, lines: Any, patient: bool):
     """Return whether three bearings determine the pose believed well enough, and its covariance."""
     M = mat66d()
     for n in range(3):
-        linearise(model, memory, world, i, lines[n])
+        linearise(frame, memory, world, i, lines[n])
         H = memory.line[world, lines[n]].jacobian
-        M += (wp.transpose(H) * H) / memory.line[world, lines[n]].noise
+        M += (wp.transpose(H) * (wp.float64(1.0) / memory.line[world, lines[n]].noise)) * H
     P = symmetric_part(inverse6(M))
     if patient:  # then the information is far from singular, and needs no costly spectrum
         return is_known(P), P
@@ -90,7 +85,7 @@ def add_hypothesis(memory: Any, world: int, i: int, estimate: Estimate):
 
 
 @wp.func
-def solve(model: Any, memory: Any, world: int, i: int, lines: Any, b: Any, z: Any, patient: bool, following: bool):
+def solve(frame: Frame, memory: Any, world: int, i: int, lines: Any, b: Any, z: Any, patient: bool, following: bool):
     """Solve one problem of bearings b and points z, rows; return whether `patient` finds all solutions determined.
 
     They become hypotheses if they are to be followed.
@@ -99,9 +94,9 @@ def solve(model: Any, memory: Any, world: int, i: int, lines: Any, b: Any, z: An
     for n in range(count):
         R, camera = camera_pose(b, z, distances[n])
         if wp.isfinite(wp.ddot(R, R) + wp.dot(camera, camera)):
-            pose = Pose(R, camera - R * vec3d(model.camera[i].position))
+            pose = Pose(R, camera - R * frame.lever)
             begin_belief(memory, world, i, Estimate(pose, mat66d()))
-            determined, P = covariance_of(model, memory, world, i, lines, patient)
+            determined, P = covariance_of(frame, memory, world, i, lines, patient)
             if patient and not determined:
                 return False
             if following and determined:
@@ -110,47 +105,45 @@ def solve(model: Any, memory: Any, world: int, i: int, lines: Any, b: Any, z: An
 
 
 @wp.func
-def solve_perturbed(
-    model: Any, memory: Any, world: int, i: int, lines: Any, b: Any, z: Any, n: int, patient: bool, following: bool
-):
-    """Solve the problems in which the n-th bearing or point is perturbed; return as `solve` does.
+def problem(frame: Frame, memory: Any, world: int, lines: Any, number: int):
+    """Return whether there is the problem of a number, below `PROBLEMS`, and its bearings and points, rows.
 
-    To each side there are five: two axes across the bearing, three of the point.
+    The first is as measured. In the others a bearing is perturbed along an axis across it, or its point if that is not
+    exactly known, to one side or the other.
     """
-    variance = memory.line[world, lines[n]].variance / wp.float64(constants.CORRELATION_FACTOR)
-    step = wp.float64(constants.PERTURBATION)
-    for _ in range(2):
-        for axis in range(5):
-            moved_b = b
-            moved_z = z
-            if axis < 2:
-                across = step * wp.sqrt(bearing_variance(model, i))
-                moved_b[n] = wp.normalize(b[n] + across * tangent_basis(b[n])[axis])
-            else:
-                moved_z[n, axis - 2] = z[n, axis - 2] + step * wp.sqrt(variance)
-            if axis < 2 or variance > wp.float64(0.0):
-                if not solve(model, memory, world, i, lines, moved_b, moved_z, patient, following):
-                    return False
-        step = -step
-    return True
-
-
-@wp.func
-def solve_triple(model: Any, memory: Any, world: int, i: int, lines: Any, patient: bool, following: bool) -> bool:
-    """Make hypotheses of the poses that agree with three bearings, in their order, if they are to be followed.
-
-    Return False, without hypotheses, if a solution is not well determined and one is `patient` enough to wait.
-    """
-    memory.search[world, i].hypotheses = 0
     b = mat33d()
     z = mat33d()
     for n in range(3):
         b[n] = memory.line[world, lines[n]].bearing
         z[n] = memory.line[world, lines[n]].point
-    determined = solve(model, memory, world, i, lines, b, z, patient, following)
-    for n in range(3):
-        if determined:
-            determined = solve_perturbed(model, memory, world, i, lines, b, z, n, patient, following)
-    if not determined:
-        memory.search[world, i].hypotheses = 0
-    return determined
+    exists = bool(True)
+    if number > 0:
+        n = (number - 1) // 10
+        axis = (number - 1) % 5
+        step = wp.float64(constants.PERTURBATION)
+        if (number - 1) // 5 % 2 == 1:
+            step = -step
+        if axis < 2:
+            across = step * wp.sqrt(frame.variance)
+            b[n] = wp.normalize(b[n] + across * tangent_basis(b[n])[axis])
+        else:
+            variance = memory.line[world, lines[n]].variance / wp.float64(constants.CORRELATION_FACTOR)
+            z[n, axis - 2] = z[n, axis - 2] + step * wp.sqrt(variance)
+            exists = variance > wp.float64(0.0)
+    return exists, b, z
+
+
+@wp.func
+def solve_triple(frame: Frame, memory: Any, world: int, i: int, lines: Any, patient: bool, following: bool) -> bool:
+    """Make hypotheses of the poses that agree with three bearings, in their order, if they are to be followed.
+
+    Return False, without hypotheses, if a solution is not well determined and one is `patient` enough to wait.
+    """
+    memory.search[world, i].hypotheses = 0
+    for number in range(constants.PROBLEMS):
+        exists, b, z = problem(frame, memory, world, lines, number)
+        if exists:
+            if not solve(frame, memory, world, i, lines, b, z, patient, following):
+                memory.search[world, i].hypotheses = 0
+                return False
+    return True

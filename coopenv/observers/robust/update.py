@@ -14,14 +14,14 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import between, carried, inverse6, is_regular, odometry_noise, with_noise
 from coopenv.observers.robust.belief import apply_error
 from coopenv.observers.robust.correction import iterated_update
-from coopenv.observers.robust.measurements import NOTHING, RESECTION, TRACKING, innovation_squared, set_lines
-from coopenv.observers.robust.memory import Anchor, Estimate, mat66d, vec2d, vec6d
+from coopenv.observers.robust.measurements import innovation_squared
+from coopenv.observers.robust.memory import Anchor, Estimate, Frame, mat66d, vec2d, vec6d
 from coopenv.observers.robust.odometry import begin_errors, lasting_noise
 from coopenv.observers.robust.search import begin_search
 
 
 @wp.func
-def gate(model: Any, memory: Any, world: int, i: int):
+def gate(frame: Frame, memory: Any, world: int, i: int):
     """Linearise the lines and mark those that fit; return the share of the others, how many fit, and their NIS.
 
     Bearings to distrusted senders do not count in the share; it is -1 if none counts.
@@ -30,18 +30,18 @@ def gate(model: Any, memory: Any, world: int, i: int):
     missed = int(0)
     fitting = int(0)
     total = wp.float64(0.0)
-    for n in range(model.target_count[i]):
-        memory.line[world, n].fits = 0
+    for n in range(frame.lines):
+        nis = innovation_squared(frame, memory, world, i, n)
+        fits = int(0)
+        if nis >= wp.float64(0.0) and nis < wp.float64(constants.BEARING_GATE):
+            fits = 1
+            total += nis
+        memory.line[world, n].fits = fits
+        fitting += fits
         member = memory.line[world, n].member
-        if member != NOTHING:
-            nis = innovation_squared(model, memory, world, i, n)
-            if nis >= wp.float64(0.0) and nis < wp.float64(constants.BEARING_GATE):
-                memory.line[world, n].fits = 1
-                fitting += 1
-                total += nis
-            if member == 0 or memory.member[world, i, member].distrusted == 0:
-                counted += 1
-                missed += 1 - memory.line[world, n].fits
+        if member == 0 or memory.member[world, i, member].distrusted == 0:
+            counted += 1
+            missed += 1 - fits
     share = wp.float64(-1.0)
     if counted > 0:
         share = wp.float64(missed) / wp.float64(counted)
@@ -56,14 +56,13 @@ def set_anchor(memory: Any, world: int, i: int, P: Any, tick: int):
 
 
 @wp.func
-def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
-    """Correct the belief by every bearing that fits it; search anew when most do not."""
-    set_lines(model, state, memory, world, i, now.tick, TRACKING)
-    share, fitting, nis = gate(model, memory, world, i)
+def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, frame: Frame):
+    """Correct the belief by every bearing of a frame that fits it; search anew when most do not."""
+    share, fitting, nis = gate(frame, memory, world, i)
     state.nis[world, i] = nis
     state.nis_dof[world, i] = 2 * fitting
     if fitting > 0:
-        iterated_update(model, memory, world, i)
+        iterated_update(frame, memory, world, i)
     if share < wp.float64(0.0):
         return
     weight = wp.min(wp.float64(1.0), now.period / wp.float64(constants.LOST_TIME))
@@ -122,13 +121,12 @@ def write_resected_covariance(memory: Any, world: int, i: int, lines: int, inver
 
 
 @wp.func
-def resect(model: Any, state: Any, memory: Any, world: int, i: int, tick: int) -> bool:
+def resect(frame: Frame, memory: Any, world: int, i: int) -> bool:
     """Put the vehicle where a frame's bearings see it, by least squares from where it is; return whether that works."""
-    lines = model.target_count[i]
-    set_lines(model, state, memory, world, i, tick, RESECTION)
+    lines = frame.lines
     inverse = mat66d()
     for step in range(constants.GAUSS_NEWTON_STEPS):
-        _, fitting, _ = gate(model, memory, world, i)
+        _, fitting, _ = gate(frame, memory, world, i)
         M = mat66d()
         b = vec6d()
         for n in range(lines):

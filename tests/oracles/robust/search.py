@@ -20,6 +20,7 @@ from coopenv.observers.robust.constants import (
     BEARING_GATE,
     CLEAR_TIME,
     CORRELATION_FACTOR,
+    DOUBT_TIME,
     KNOWN_ANGLE,
     KNOWN_POSITION,
     MAX_BEARING_COST,
@@ -32,6 +33,7 @@ from coopenv.observers.robust.constants import (
     PRUNE_GAP,
     SAME_HYPOTHESIS,
     SAME_PRIOR,
+    SAME_TIME,
 )
 from tests.helpers.p3p import solve_one
 from tests.oracles.p3p import solve_p3p
@@ -81,6 +83,7 @@ class Search:
         self.prior = Belief(vehicle, R, p, P)
         self.bank: list[Hypothesis] = []
         self.age, self.waited, self.clear, self.attempts = 0.0, 0.0, 0.0, 0
+        self.next_look = 0.0  # not before so much has been waited
 
     @property
     def best(self) -> Belief:
@@ -116,9 +119,14 @@ class Search:
         triples = sorted(combinations(range(len(sightings)), 3), key=lambda c: -_spread(sightings, c))
         three = triples[self.attempts % len(triples)]
         self.waited += tick.dt
+        if self.waited < min(PATIENCE, self.next_look - SAME_TIME):
+            return
         poses = self._poses(tick, [sightings[n] for n in three], variance)
-        self.clear = 0.0 if poses is None else self.clear + tick.dt
-        if poses is None or (self.clear < CLEAR_TIME and self.waited < PATIENCE):
+        if poses is None:
+            self.clear, self.next_look = 0.0, self.waited + DOUBT_TIME
+            return
+        self.clear += tick.dt
+        if self.clear < CLEAR_TIME and self.waited < PATIENCE:
             return
         solutions = self._different(poses)
         for hypothesis in solutions:
