@@ -13,6 +13,7 @@ from coopenv.errors import CoopenvError
 from coopenv.evaluation import Result, drive, held_out_seeds, score
 from coopenv.files import check_file, new_folder, replacing_folder
 from coopenv.policies import load_agent
+from coopenv.scenario import Scenario
 from coopenv.seeds import evaluation_seed
 from coopenv.training import checkpoint
 from coopenv.training.export import EXPORTED, export
@@ -45,6 +46,20 @@ def resumed_plan(out: Path) -> Plan:
     if not (out / checkpoint.CHECKPOINT_FILE).is_file() and (out / EXPORTED[0]).is_file():
         raise CoopenvError(f"nothing to resume: {out} holds a finished agent and no checkpoint")
     return checkpoint.read(out / checkpoint.CHECKPOINT_FILE).plan
+
+
+def possible(plan: Plan) -> Scenario:
+    """Return the scenario of a training, before anything is made.
+
+    Raises:
+        CoopenvError: nobody is driven there, or the driver to begin as lacks what it needs to see.
+    """
+    scenario = open_simulation(plan.environment, plan.all_overrides)
+    if not scenario.driven:
+        raise CoopenvError(f"{plan.environment}: all motion here is prescribed, there is nothing to learn")
+    if plan.settings.clone is not None:
+        load_agent(plan.settings.clone.agent, scenario)
+    return scenario
 
 
 def train(
@@ -80,14 +95,10 @@ def train(
         OutputError: something cannot be written; the last checkpoint stays.
     """
     tell, path = reports or Reports(), out / checkpoint.CHECKPOINT_FILE
-    scenario = open_simulation(plan.environment, plan.all_overrides)
-    if not scenario.driven:
-        raise CoopenvError(f"{plan.environment}: all motion here is prescribed, there is nothing to learn")
+    scenario = possible(plan)
     kept = checkpoint.read(path) if resume else None
     if kept is None and path.is_file():
         raise CoopenvError(f"{out} holds an unfinished training: go on with --resume, or remove {path}")
-    if kept is None and plan.settings.clone is not None:
-        load_agent(plan.settings.clone.agent, scenario)  # raises before anything is made
     trainer = Trainer(plan, scenario, threads)
     curve = kept.curve if kept is not None else []
     try:

@@ -148,7 +148,7 @@ def read_settings(
         path: a TOML file with the keys of `Settings`; under `environments` and `arms` tables of the same keys by name.
         arm: the table under `arms` whose values go before the others.
         environment: name of the one that is trained in; the table under `environments`, if there is one, goes before
-            what is for all.
+            what is for all, and the table of the arm under its own `arms` before everything.
         **changes: values that go before those of the file, where they are not None.
 
     Raises:
@@ -156,15 +156,21 @@ def read_settings(
     """
     where, raw = (str(path), _read(path)) if path is not None else ("settings", {})
     raw["scenario"] = _flat(raw.get("scenario", {}), where)
-    tables = {kind: _tables(raw.pop(kind, {}), f"{where}: {kind}") for kind in ("environments", "arms")}
-    if arm is not None and arm not in tables["arms"]:
-        known = f"{suggest(arm, tables['arms'])}; known: {', '.join(tables['arms']) or 'none'}"
-        raise CoopenvError(f"{where}: no arm '{arm}'{known}")
-    for kind, name in (("environments", environment), ("arms", arm)):
-        if name in tables[kind]:
-            chosen = tables[kind][name]
-            flat = _flat(chosen.get("scenario", {}), f"{where}: {kind}.{name}")
-            raw = _merged(raw, {**chosen, "scenario": flat})
+    environments = _tables(raw.pop("environments", {}), f"{where}: environments")
+    arms = _tables(raw.pop("arms", {}), f"{where}: arms")
+    here = dict(environments.get(environment or "", {}))
+    table = f"environments.{environment}"
+    arms_here = _tables(here.pop("arms", {}), f"{where}: {table}.arms")
+    for name in (*arms_here, *([arm] if arm is not None else [])):
+        if name not in arms:
+            known = f"{suggest(name, arms)}; known: {', '.join(arms) or 'none'}"
+            raise CoopenvError(f"{where}: no arm '{name}'{known}")
+    changed = {table: here}
+    if arm is not None:
+        changed |= {f"arms.{arm}": arms[arm], f"{table}.arms.{arm}": arms_here.get(arm, {})}
+    for place, change in changed.items():
+        scenario = _flat(change.get("scenario", {}), f"{where}: {place}")
+        raw = _merged(raw, {**change, "scenario": scenario})
     raw.update({name: value for name, value in changes.items() if value is not None})
     if "steps" in raw and "minutes" in raw:
         raise CoopenvError(f"{where}: steps and minutes: give one of them")

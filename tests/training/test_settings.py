@@ -19,6 +19,7 @@ vehicles = 8
 [environments.open_square]
 scenario.reward.weights.position_error = 0.2
 ppo = { gamma = 0.8 }
+arms.blind = { steps = 3000, scenario = { camera.range = 0.7 } }
 [arms.blind]
 steps = 2000
 scenario = { camera.range = 0.5, "reward.weights.position_error" = 0.0 }
@@ -59,7 +60,8 @@ def test_an_arm_changes_what_it_names(path: Path) -> None:
 def test_an_environment_goes_before_all_and_an_arm_before_it(path: Path) -> None:
     here, blind = (read_settings(path, arm, "open_square") for arm in (None, "blind"))
     assert (here.scenario["reward.weights.position_error"], here.ppo.gamma, here.steps) == (0.2, 0.8, 1000)
-    assert (blind.scenario["reward.weights.position_error"], blind.ppo.gamma, blind.steps) == (0.0, 0.9, 2000)
+    assert (blind.scenario["reward.weights.position_error"], blind.ppo.gamma, blind.steps) == (0.0, 0.9, 3000)
+    assert blind.scenario["camera.range"] == 0.7  # what the arm changes here only
     assert read_settings(path, None, "facade") == read_settings(path)
 
 
@@ -85,6 +87,7 @@ def test_a_plan_survives_as_plain_data(path: Path) -> None:
         ("[clone]\nepisodes = 3", r"train\.toml: clone\.agent: Field required"),
         ("steps = 10\nminutes = 1", r"train\.toml: steps and minutes: give one of them"),
         ("scenario = 3", r"train\.toml: scenario: expected a table"),
+        ("[environments.facade]\narms = 3", r"train\.toml: environments\.facade\.arms: expected tables by name"),
         ("arms = 3", r"train\.toml: arms: expected tables by name"),
         ("steps = ", r"train\.toml: not valid TOML"),
     ],
@@ -93,11 +96,14 @@ def test_mistakes_are_one_line(text: str, message: str, tmp_path: Path) -> None:
     path = tmp_path / "train.toml"
     path.write_text(text)
     with pytest.raises(coopenv.CoopenvError, match=message):
-        read_settings(path)
+        read_settings(path, environment="facade")
 
 
 def test_missing_file_and_unknown_arm(path: Path) -> None:
     with pytest.raises(coopenv.CoopenvError, match=r"no arm 'blnd' \(did you mean 'blind'\?\); known: blind"):
         read_settings(path, "blnd")
+    path.write_text(FILE.replace("arms.blind =", "arms.blnd ="))
+    with pytest.raises(coopenv.CoopenvError, match=r"no arm 'blnd' \(did you mean 'blind'\?\)"):
+        read_settings(path, environment="open_square")
     with pytest.raises(coopenv.CoopenvError, match=r"nowhere\.toml: cannot be read: No such file"):
         read_settings(path.with_name("nowhere.toml"))

@@ -9,7 +9,7 @@ from coopenv.bench.learning.study import Run, Study
 from coopenv.errors import CoopenvError
 from coopenv.policies.loader import AGENT_FILE, read_card
 from coopenv.training.checkpoint import CHECKPOINT_FILE, read
-from coopenv.training.command import train
+from coopenv.training.command import possible, train
 from coopenv.training.export import scenario_digest
 from coopenv.training.settings import SETTINGS_FILE, Plan, read_settings
 
@@ -24,12 +24,18 @@ class Task:
 
 
 def tasks(study: Study, folder: Path, logs: Path) -> list[Task]:
-    """Return the trainings of a study that are not finished."""
-    return [
-        Task(study.plan(run), folder / run.folder, logs / run.folder)
-        for run in study.runs
-        if not is_finished(study, run, folder)
-    ]
+    """Return the trainings of a study that are not finished.
+
+    Raises:
+        CoopenvError: one of them is not possible: better now than when the others have been waited for.
+    """
+    runs = [run for run in study.runs if not is_finished(study, run, folder)]
+    for run in runs:
+        try:
+            possible(study.plan(run))
+        except CoopenvError as error:
+            raise CoopenvError(f"{run.folder}: {error}") from None
+    return [Task(study.plan(run), folder / run.folder, logs / run.folder) for run in runs]
 
 
 def is_finished(study: Study, run: Run, folder: Path) -> bool:

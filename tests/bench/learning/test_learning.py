@@ -97,3 +97,16 @@ def test_settings_that_changed_train_anew_what_was_interrupted(tmp_path: Path) -
     assert second.returncode == 0, errors
     assert read_settings(agent / "train.toml").steps == 3000
     assert not kept.exists()
+
+
+def test_what_cannot_be_trained_is_told_before_anything_is(tmp_path: Path) -> None:
+    (tmp_path / "train.toml").write_text(
+        SETTINGS
+        + '[environments.open_square.arms.plain]\nscenario.observation.exclude = ["map"]\nclone.agent = "peek"\n'
+    )
+    (tmp_path / "study.toml").write_text(STUDY)
+    process = start(COMMAND, tmp_path)
+    _, errors = process.communicate(timeout=100)
+    assert process.returncode == 2
+    assert "open_square_plain/seed_1: agent 'peek' cannot be built: the observation lacks map_position" in errors
+    assert not list(tmp_path.glob("open_square_*"))
