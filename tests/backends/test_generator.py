@@ -54,7 +54,7 @@ def test_it_does_so_with_other_observers(observer: str) -> None:
 
 @pytest.mark.parametrize("observer", OBSERVERS)
 def test_vehicles_find_out_where_they_are(observer: str) -> None:
-    env = make(Fleet(observer), dtype="float64")
+    env = make(Fleet(observer), dtype="float64" if observer == "riccati" else "float32")
     last = rollout(env, 2, 100)[-1]
     for info in last[-1].values():
         assert info["position_error"] < 0.1 and info["orientation_error"] < 3.0

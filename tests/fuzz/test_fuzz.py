@@ -7,7 +7,7 @@ import pytest
 from tests.fuzz import large
 from tests.fuzz.harness import run_cases
 
-COUNTS = {"states": (60, 1000), "scenarios": (60, 3000), "mrclam": (60, 500), "mcap": (60, 2000)}
+COUNTS = {"states": (40, 1000), "scenarios": (20, 3000), "mrclam": (60, 500), "mcap": (40, 2000)}
 """How many cases of a kind: quick, and all."""
 
 

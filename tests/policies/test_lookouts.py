@@ -32,6 +32,7 @@ def figures(engine: Engine, name: str) -> dict[str, float]:
     return {result.metric: result.mean for result in score(found)}
 
 
+@pytest.mark.slow
 def test_lookouts_know_their_place_better_at_little_time(engine: Engine) -> None:
     follower, peek, planner = (figures(engine, name) for name in ("route_follower", "peek", "look_ahead"))
     assert peek["e95_m"] < 0.5 * follower["e95_m"] and peek["e50_m"] < 0.5 * follower["e50_m"]

@@ -16,6 +16,7 @@ from tests.helpers.robust_observers import OpenJoint, OpenRobust
 from tests.helpers.robust_scenes import everybody_sees_everybody, noise_free, shifted, small_errors
 from tests.oracles.robust.joint import RobustJoint
 
+JOINT = pytest.param("robust_joint", marks=pytest.mark.slow)
 BOTH = pytest.mark.parametrize("name", ["robust", "robust_joint"])
 
 
@@ -81,12 +82,12 @@ def misled(name, record, lie=None):
 
 
 @pytest.mark.parametrize("fault", ["v2x_loss", "v2x_delay", "lying_neighbour", "landmarks_lost"])
-@BOTH
+@pytest.mark.parametrize("name", ["robust", JOINT])
 def test_faults_do_not_mislead(name, fault):
     assert not any(misled(name, *FAULTS[fault].applied(small_errors(12.0, seed), seed)) for seed in range(5))
 
 
-@BOTH
+@pytest.mark.parametrize("name", ["robust", JOINT])
 def test_wrong_associations_mislead_in_the_first_frames_only(name):
     """Uncertain by 1 m and 10 degrees, a follower cannot tell two vehicles apart, and one swap of theirs passes."""
     wrong = [FAULTS["wrong_association"].applied(small_errors(12.0, seed), seed)[0] for seed in range(5)]
