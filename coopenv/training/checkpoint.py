@@ -111,9 +111,20 @@ def _arrays(trainer: Trainer) -> Arrays:
     }
     _, key, position, *_ = np.random.get_state()
     arrays |= {"random/torch": torch.get_rng_state().numpy(), "random/numpy": np.append(key, np.uint32(position))}
-    if trainer.batch.engine.plugins is None:  # observers on the host are objects of anybody's: new episodes begin then
-        arrays |= {f"world/{name}": values for name, values in trainer.batch.get_state().items()}
+    arrays |= {f"world/{name}": values for name, values in _worlds(trainer).items()}
     return {name: np.array(values, order="C") for name, values in arrays.items()}
+
+
+def _worlds(trainer: Trainer) -> Arrays:
+    """Return the episodes under way; nothing where objects are part of them, so that new ones begin on resuming.
+
+    Such are observers on the host, which are anybody's, and the environments of highway-env.
+    """
+    if trainer.batch.engine.plugins is not None:
+        return {}
+    state: Mapping[str, object] = trainer.batch.get_state()
+    arrays = {name: values for name, values in state.items() if isinstance(values, np.ndarray)}
+    return arrays if len(arrays) == len(state) else {}
 
 
 def _restore(checkpoint: Checkpoint, trainer: Trainer) -> None:

@@ -128,6 +128,24 @@ def test_killed_and_resumed_learns_the_same(here: Path, reference: Path) -> None
     same(finished(here / "agent"), finished(reference))
 
 
+@pytest.mark.slow
+def test_worlds_of_highway_env_begin_anew_where_a_killed_training_goes_on(here: Path) -> None:
+    """Their state is objects, which no checkpoint holds."""
+    pytest.importorskip("highway_env", reason="needs the extra 'highway'")
+    (here / "small.toml").write_text(SETTINGS.replace("= 6.0", "= 3.0").replace("vehicles = 16", "vehicles = 4"))
+    training = (*COOPENV, "train", "highway_roundabout", "--out", "agent")
+    first = start((*training, "--settings", "small.toml", "--steps", "300"), here)
+    kept = here / "agent" / "checkpoint.safetensors"
+    wait_until(lambda: kept.is_file() or first.poll() is not None)
+    assert kept.is_file(), first.communicate()[1]
+    os.killpg(first.pid, signal.SIGKILL)
+    first.communicate()
+    second = start((*training, "--resume"), here)
+    _, errors = second.communicate(timeout=300)
+    assert second.returncode == 0, errors
+    load_agent(here / "agent", coopenv.load_scenario("highway_roundabout"))
+
+
 def test_interrupted_says_how_to_go_on(here: Path) -> None:
     process = start((*COOPENV, *fresh()), here)
     wait_until(lambda: (here / "agent" / "checkpoint.safetensors").is_file() or process.poll() is not None)
