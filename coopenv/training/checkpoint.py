@@ -27,6 +27,22 @@ Arrays = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
+class Outputs:
+    """What a training writes besides the agent, as its command line says."""
+
+    onnx: bool = False
+    logs: Path | None = None
+    """Folder for TensorBoard; None: in the agent's folder."""
+
+    def or_else(self, kept: "Outputs") -> "Outputs":
+        """Return them with those of another command line where this one says nothing."""
+        return Outputs(self.onnx or kept.onnx, self.logs or kept.logs)
+
+
+NONE = Outputs()
+
+
+@dataclass(frozen=True)
 class Checkpoint:
     """What a file holds."""
 
@@ -37,9 +53,10 @@ class Checkpoint:
     progress: dict[str, Any]
     curve: list[dict[str, float]]
     arrays: Arrays
+    outputs: Outputs
 
 
-def save(path: Path, trainer: Trainer, curve: list[dict[str, float]]) -> None:
+def save(path: Path, trainer: Trainer, curve: list[dict[str, float]], outputs: Outputs = NONE) -> None:
     """Write a checkpoint in the place of the one before.
 
     Raises:
@@ -51,6 +68,8 @@ def save(path: Path, trainer: Trainer, curve: list[dict[str, float]]) -> None:
         "scenario": trainer.scenario.model_dump_json(),
         "progress": trainer.progress(),
         "curve": curve,
+        "onnx": outputs.onnx,
+        "logs": None if outputs.logs is None else str(outputs.logs.absolute()),
     }
     with replacing_file(path) as new, writing(path):
         try:
@@ -76,7 +95,9 @@ def read(path: Path) -> Checkpoint:
         plan = Plan.of_document(header["plan"])
         told = header["progress"]
         progress = {"steps": int(told["steps"]), **{name: float(told[name]) for name in ("seconds", "cpu_seconds")}}
-        return Checkpoint(path, plan, header["scenario"], progress, header["curve"], arrays)
+        logs = header.get("logs")  # checkpoints of before there was such an entry go on without
+        outputs = Outputs(bool(header.get("onnx")), None if logs is None else Path(logs))
+        return Checkpoint(path, plan, header["scenario"], progress, header["curve"], arrays, outputs)
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
         if isinstance(error, CoopenvError):
             raise

@@ -80,7 +80,7 @@ def train(
     Args:
         plan: what to train.
         out: the agent's folder.
-        resume: go on from the folder's checkpoint, which is of the same plan.
+        resume: go on from the folder's checkpoint, which is of the same plan, and with the outputs that it began with.
         threads: shares of the batch on the CPU; results do not depend on it.
         onnx: also write an ONNX model.
         logs: folder for TensorBoard.
@@ -99,31 +99,41 @@ def train(
     kept = checkpoint.read(path) if resume else None
     if kept is None and path.is_file():
         raise CoopenvError(f"{out} holds an unfinished training: go on with --resume, or remove {path}")
+    outputs = checkpoint.Outputs(onnx, logs)
+    if kept is not None:
+        outputs = outputs.or_else(kept.outputs)
     trainer = Trainer(plan, scenario, threads)
     curve = kept.curve if kept is not None else []
     try:
-        with new_folder(out), new_folder(logs or out / LOGS) as tensorboard:
+        with new_folder(out), new_folder(outputs.logs or out / LOGS) as tensorboard:
             check_file(path)
             trainer.log_to(str(tensorboard))
         if kept is not None:
             checkpoint.restore(kept, trainer)
         else:
             trainer.begin()
-        _learn(trainer, path, curve, threads, tell)
+        _learn(trainer, path, curve, outputs, threads, tell)
         worlds = plan.settings.evaluation.final_worlds
         results = _judge(trainer, held_out_seeds(0, worlds), threads, tell)
         with replacing_folder(out, NAMES) as folder:
-            export(folder, trainer, results, curve, onnx)
+            export(folder, trainer, results, curve, outputs.onnx)
     finally:
         trainer.close()
     return results
 
 
-def _learn(trainer: Trainer, path: Path, curve: list[dict[str, float]], threads: int | None, tell: Reports) -> None:
+def _learn(
+    trainer: Trainer,
+    path: Path,
+    curve: list[dict[str, float]],
+    outputs: checkpoint.Outputs,
+    threads: int | None,
+    tell: Reports,
+) -> None:
     """Update until the budget is spent; judge and write a checkpoint every so often."""
     evaluation = trainer.plan.settings.evaluation
     if not path.is_file():
-        _save(trainer, path, curve)
+        _save(trainer, path, curve, outputs)
     while trainer.status.share < 1.0:
         before = trainer.status.steps // evaluation.every
         status = trainer.update()
@@ -133,11 +143,11 @@ def _learn(trainer: Trainer, path: Path, curve: list[dict[str, float]], threads:
             means = {result.metric: result.mean for result in _judge(trainer, seeds, threads, tell)}
             trainer.record(means)
             curve.append({"steps": status.steps, "seconds": round(status.seconds, 1), **means})
-            _save(trainer, path, curve)
+            _save(trainer, path, curve, outputs)
 
 
-def _save(trainer: Trainer, path: Path, curve: list[dict[str, float]]) -> None:
-    checkpoint.save(path, trainer, curve)
+def _save(trainer: Trainer, path: Path, curve: list[dict[str, float]], outputs: checkpoint.Outputs) -> None:
+    checkpoint.save(path, trainer, curve, outputs)
     interrupts.note(f"kept: {path} after {trainer.status.steps} steps; go on with --resume")
 
 

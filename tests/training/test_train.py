@@ -129,6 +129,18 @@ def test_killed_and_resumed_learns_the_same(here: Path, reference: Path) -> None
 
 
 @pytest.mark.slow
+def test_what_else_was_to_be_written_is_written_after_resuming(here: Path) -> None:
+    pytest.importorskip("onnx", reason="needs the extra 'onnx'")
+    killed_at_the_start(here, "--onnx", "--logs", "logs")
+    before = len(list((here / "logs").glob("events.*")))
+    process = start((*COOPENV, *command("--resume")), here)
+    assert process.wait(300) == 0
+    assert (here / "agent" / "policy.onnx").is_file()
+    assert len(list((here / "logs").glob("events.*"))) == before + 1
+    assert not (here / "agent" / "tensorboard").exists()
+
+
+@pytest.mark.slow
 def test_worlds_of_highway_env_begin_anew_where_a_killed_training_goes_on(here: Path) -> None:
     """Their state is objects, which no checkpoint holds."""
     pytest.importorskip("highway_env", reason="needs the extra 'highway'")
@@ -167,8 +179,8 @@ def test_a_truncated_checkpoint_is_one_line(left: int, here: Path, capsys: pytes
     assert told.count("\n") == 1
 
 
-def killed_at_the_start(here: Path) -> None:
-    process = start((*COOPENV, *fresh()), here)
+def killed_at_the_start(here: Path, *more: str) -> None:
+    process = start((*COOPENV, *fresh(*more)), here)
     wait_until(lambda: (here / "agent" / "checkpoint.safetensors").is_file() or process.poll() is not None)
     os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
