@@ -16,7 +16,7 @@ from coopenv.policies import load_agent
 from coopenv.scenario import Scenario
 from coopenv.seeds import evaluation_seed
 from coopenv.training import checkpoint
-from coopenv.training.export import EXPORTED, export
+from coopenv.training.export import EXPORTED, check_onnx, export
 from coopenv.training.settings import Plan
 from coopenv.training.trainer import Trainer
 from coopenv.training.watch import Status
@@ -90,8 +90,8 @@ def train(
         The results on held-out maps, as in `agent.toml`.
 
     Raises:
-        CoopenvError: the plan does not describe a possible training, there is nothing to resume, or there is an
-            unfinished training that is not to be resumed.
+        CoopenvError: the plan does not describe a possible training, there is nothing to resume, there is an unfinished
+            training that is not to be resumed, or the package onnx is missing.
         OutputError: something cannot be written; the last checkpoint stays.
     """
     tell, path = reports or Reports(), out / checkpoint.CHECKPOINT_FILE
@@ -102,6 +102,8 @@ def train(
     outputs = checkpoint.Outputs(onnx, logs)
     if kept is not None:
         outputs = outputs.or_else(kept.outputs)
+    if outputs.onnx:
+        check_onnx()
     trainer = Trainer(plan, scenario, threads)
     curve = kept.curve if kept is not None else []
     try:

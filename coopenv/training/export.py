@@ -4,7 +4,7 @@ import csv
 import platform
 from collections.abc import Mapping, Sequence
 from hashlib import sha256
-from importlib import metadata
+from importlib import import_module, metadata
 from pathlib import Path
 from shlex import join
 from typing import Any
@@ -152,16 +152,18 @@ def _versions() -> dict[str, str]:
     return {name: metadata.version(name) for name in PACKAGES}
 
 
-def onnx_model(tensors: Mapping[str, np.ndarray], clip: float) -> bytes:
-    """Return an ONNX model from raw observations, (rows, D), to actions, (rows, A) in [-1, 1].
-
-    Raises:
-        CoopenvError: the package onnx is not installed.
-    """
+def check_onnx() -> None:
+    """Find out before any work whether ONNX models can be written. Raises CoopenvError: the package is missing."""
     try:
-        from onnx import TensorProto, checker, helper, numpy_helper
-    except ImportError:
-        raise CoopenvError("--onnx needs the package onnx: pip install '.[onnx]'") from None
+        import_module("onnx")
+    except ImportError as error:
+        raise CoopenvError(f"--onnx needs the package onnx: pip install '.[onnx]' ({error})") from None
+
+
+def onnx_model(tensors: Mapping[str, np.ndarray], clip: float) -> bytes:
+    """Return an ONNX model from raw observations, (rows, D), to actions, (rows, A) in [-1, 1]; see `check_onnx`."""
+    from onnx import TensorProto, checker, helper, numpy_helper
+
     constants = {**tensors, "clip.low": np.float32(-clip), "clip.high": np.float32(clip)}
     constants |= {"action.low": np.float32(-1.0), "action.high": np.float32(1.0)}
     del constants["log_std"]

@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import signal
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -275,3 +276,10 @@ def test_a_training_that_cannot_begin_leaves_nothing(
     with pytest.raises(CoopenvError, match=message):
         train(plan, Path("new", "agent"), threads=threads, logs=None if logs is None else Path(logs))
     assert {path.name for path in here.iterdir()} == before
+
+
+def test_without_onnx_no_training_begins(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(CoopenvError, match="--onnx needs the package onnx"):
+        train(Plan("urban_crossing", read_settings(here / "train.toml"), 0), Path("agent"), onnx=True)
+    assert not (here / "agent").exists()
