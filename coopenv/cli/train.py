@@ -34,6 +34,7 @@ def train(
     threads: Annotated[int | None, typer.Option(min=1, help="Threads of the simulation (default: by cores).")] = None,
     logs: Annotated[Path | None, typer.Option(help="Folder for TensorBoard (default: tensorboard/ in --out).")] = None,
     onnx: Onnx = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an agent that is in the folder.")] = False,
     as_json: options.AsJson = False,
 ) -> None:
     """Train one policy for all vehicles with PPO, and write it as an agent.
@@ -78,7 +79,9 @@ def train(
 
     with Progress(log, "starting", total=1.0) as progress:
         reports = Reports(lambda status: progress.update(status.share, status.line), judged)
-        results = perform(plan, folder, resume=resume, threads=threads, onnx=onnx, logs=logs, reports=reports)
+        results = perform(
+            plan, folder, resume=resume, threads=threads, onnx=onnx, logs=logs, force=force, reports=reports
+        )
     if as_json:
         options.print_json({"agent": str(folder), "results": [asdict(result) for result in results]})
         return

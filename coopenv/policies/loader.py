@@ -18,6 +18,8 @@ from coopenv.shipped import data_directory, list_agents
 Kind = Literal["learned", "scripted", "reference"]
 """Trained; written by hand; or a yardstick that says what is possible."""
 AGENT_FILE = "agent.toml"
+CARD_FILES = ("card.json", "card.md")
+"""What `coopenv evaluate --write-card` writes beside it."""
 
 
 class AgentCard(BaseModel):

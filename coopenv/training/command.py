@@ -9,10 +9,11 @@ import numpy as np
 from coopenv import interrupts
 from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
-from coopenv.errors import CoopenvError
+from coopenv.errors import CoopenvError, OutputError
 from coopenv.evaluation import Result, drive, held_out_seeds, score
 from coopenv.files import check_file, new_folder, replacing_folder
 from coopenv.policies import load_agent
+from coopenv.policies.loader import AGENT_FILE, CARD_FILES
 from coopenv.scenario import Scenario
 from coopenv.seeds import evaluation_seed
 from coopenv.training import checkpoint
@@ -21,7 +22,8 @@ from coopenv.training.settings import Plan
 from coopenv.training.trainer import Trainer
 from coopenv.training.watch import Status
 
-NAMES = (*EXPORTED, checkpoint.CHECKPOINT_FILE)
+NAMES = (*EXPORTED, checkpoint.CHECKPOINT_FILE, *CARD_FILES)
+"""Of files that an agent's folder can hold; a card tells of one agent only, and goes with it."""
 LOGS = "tensorboard"
 WHILE_LEARNING = 2**30
 """Number of the first seed for evaluation that is looked at while learning; `coopenv evaluate` begins with number 0."""
@@ -43,7 +45,7 @@ def resumed_plan(out: Path) -> Plan:
     Raises:
         CoopenvError: there is none, or its checkpoint is damaged.
     """
-    if not (out / checkpoint.CHECKPOINT_FILE).is_file() and (out / EXPORTED[0]).is_file():
+    if not (out / checkpoint.CHECKPOINT_FILE).is_file() and (out / AGENT_FILE).is_file():
         raise CoopenvError(f"nothing to resume: {out} holds a finished agent and no checkpoint")
     return checkpoint.read(out / checkpoint.CHECKPOINT_FILE).plan
 
@@ -70,6 +72,7 @@ def train(
     threads: int | None = None,
     onnx: bool = False,
     logs: Path | None = None,
+    force: bool = False,
     reports: Reports | None = None,
 ) -> list[Result]:
     """Train a policy and write it as an agent to a folder.
@@ -84,6 +87,7 @@ def train(
         threads: shares of the batch on the CPU; results do not depend on it.
         onnx: also write an ONNX model.
         logs: folder for TensorBoard.
+        force: let the new agent, once it is finished, take the place of one that is there.
         reports: who is told.
 
     Returns:
@@ -92,13 +96,16 @@ def train(
     Raises:
         CoopenvError: the plan does not describe a possible training, there is nothing to resume, there is an unfinished
             training that is not to be resumed, or the package onnx is missing.
-        OutputError: something cannot be written; the last checkpoint stays.
+        OutputError: there is an agent that is not to be replaced, or something cannot be written; the last checkpoint
+            stays.
     """
     tell, path = reports or Reports(), out / checkpoint.CHECKPOINT_FILE
     scenario = possible(plan)
     kept = checkpoint.read(path) if resume else None
     if kept is None and path.is_file():
         raise CoopenvError(f"{out} holds an unfinished training: go on with --resume, or remove {path}")
+    if kept is None and (out / AGENT_FILE).exists() and not force:
+        raise OutputError(f"{out / AGENT_FILE}: exists already; --force replaces the agent")
     outputs = checkpoint.Outputs(onnx, logs)
     if kept is not None:
         outputs = outputs.or_else(kept.outputs)

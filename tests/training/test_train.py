@@ -278,6 +278,28 @@ def test_a_training_that_cannot_begin_leaves_nothing(
     assert {path.name for path in here.iterdir()} == before
 
 
+def test_an_agent_that_is_there_stays(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (here / "agent").mkdir()
+    (here / "agent" / "agent.toml").write_text("mine")
+    assert main(fresh()) == 2
+    assert capsys.readouterr().err == "error: agent/agent.toml: exists already; --force replaces the agent\n"
+    assert [path.name for path in (here / "agent").iterdir()] == ["agent.toml"]
+
+
+@pytest.mark.slow
+def test_a_forced_training_replaces_an_agent_and_its_cards_at_its_end(here: Path) -> None:
+    (here / "agent").mkdir()
+    for name in ("agent.toml", "card.json", "card.md", "mine.py"):
+        (here / "agent" / name).write_text("mine")
+    killed_at_the_start(here, "--force")
+    assert {(here / "agent" / name).read_text() for name in ("agent.toml", "card.json", "card.md")} == {"mine"}
+    process = start((*COOPENV, *command("--resume")), here)
+    assert process.wait(300) == 0
+    finished(here / "agent")
+    assert (here / "agent" / "mine.py").read_text() == "mine"
+    assert not list((here / "agent").glob("card.*"))
+
+
 def test_without_onnx_no_training_begins(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(CoopenvError, match="--onnx needs the package onnx"):

@@ -11,9 +11,10 @@ from coopenv.bench.agents.table import COLUMNS, cell
 from coopenv.errors import CoopenvError
 from coopenv.files import check_file, replace_text
 from coopenv.jsonable import json_text
+from coopenv.policies.loader import CARD_FILES
 from coopenv.shipped import version
 
-JSON_FILE, TEXT_FILE = "card.json", "card.md"
+JSON_FILE, TEXT_FILE = CARD_FILES
 
 
 def check(entrants: Sequence[Entrant]) -> None:

@@ -55,6 +55,8 @@ def is_finished(study: Study, run: Run, folder: Path) -> bool:
 def perform(task: Task) -> None:
     """Train on one core, going on from a checkpoint where there is one of the same training.
 
+    An agent that is there has been trained otherwise than the study says, and is replaced.
+
     Raises:
         CoopenvError: what `train` raises.
     """
@@ -63,4 +65,4 @@ def perform(task: Task) -> None:
     if not resume:
         path.unlink(missing_ok=True)  # of a training with other settings
     task.logs.mkdir(parents=True, exist_ok=True)
-    train(task.plan, task.out, resume=resume, threads=1, logs=task.logs)
+    train(task.plan, task.out, resume=resume, threads=1, logs=task.logs, force=True)
