@@ -32,7 +32,7 @@ class AgentCard(BaseModel):
     entry: str
     """`package.module:Class`, or `file.py:Class` in the agent's folder; called with the scenario and the options."""
     environments: tuple[str, ...]
-    """Environments that it was made for."""
+    """Environments that it was made for: names, or TOML files in the agent's folder."""
     kind: Kind = "scripted"
     options: dict[str, Any] = {}
     network: NetworkCard | None = None
@@ -53,6 +53,7 @@ class Agent:
     """A class, which is built with the scenario and the options, or else a policy."""
     kind: Kind = "scripted"
     environments: tuple[str, ...] = ()
+    """Names, or paths of TOML files."""
     options: Mapping[str, Any] = field(default_factory=dict)
     description: str = ""
     folder: Path | None = None
@@ -117,6 +118,9 @@ def find_agent(name_or_place: str | Path) -> Agent:
         raise CoopenvError(f"{folder / AGENT_FILE}: entry: expected file.py:Class or package.module:Class")
     entry = user_code.absolute(card.entry, folder)
     known = card.model_dump(exclude={"title", "entry", "network", "training", "results"})
+    known["environments"] = tuple(
+        str(folder / environment) if environment.endswith(".toml") else environment for environment in card.environments
+    )
     if card.network is not None:
         known["options"] |= {"folder": folder, "network": card.network}
     return Agent(folder.resolve().name, entry, folder=folder, **known)

@@ -124,7 +124,7 @@ def train(
         _learn(trainer, path, curve, outputs, threads, tell)
         worlds = plan.settings.evaluation.final_worlds
         results = _judge(trainer, held_out_seeds(0, worlds), threads, tell)
-        with replacing_folder(out, NAMES) as folder:
+        with replacing_folder(out, (*NAMES, trainer.environment.name)) as folder:
             export(folder, trainer, results, curve, outputs.onnx)
     finally:
         trainer.close()

@@ -50,6 +50,8 @@ def export(
     weights = save(tensors)
     with writing(folder):
         (folder / WEIGHTS_FILE).write_bytes(weights)
+        if trainer.environment.text is not None:
+            (folder / trainer.environment.name).write_text(trainer.environment.text, encoding="utf-8")
         (folder / SETTINGS_FILE).write_text(_settings(trainer.plan), encoding="utf-8")
         (folder / AGENT_FILE).write_text(_card(trainer, results, sha256(weights).hexdigest()), encoding="utf-8")
         if curve:
@@ -73,10 +75,10 @@ def network_of(trainer: Trainer) -> dict[str, np.ndarray]:
     return {name: np.ascontiguousarray(values, dtype=np.float32) for name, values in tensors.items()}
 
 
-def command_of(plan: Plan) -> str:
-    """Return the command that trains the same once more, from the folder's own settings."""
-    environment = Path(plan.environment).stem
-    return join(["coopenv", "train", environment, "--settings", SETTINGS_FILE, "--seed", str(plan.seed)])
+def command_of(trainer: Trainer) -> str:
+    """Return the command that trains the same once more, in the agent's folder."""
+    name, seed = trainer.environment.name, str(trainer.plan.seed)
+    return join(["coopenv", "train", name, "--settings", SETTINGS_FILE, "--seed", seed])
 
 
 def scenario_digest(scenario: Scenario) -> str:
@@ -91,7 +93,7 @@ def _settings(plan: Plan) -> str:
 
 
 def _card(trainer: Trainer, results: Sequence[Result], digest: str) -> str:
-    plan, environment = trainer.plan, Path(trainer.plan.environment).stem
+    plan, environment = trainer.plan, trainer.environment
     observation, action = layout_tables(observation_layout(trainer.scenario))
     card = NetworkCard(
         weights=WEIGHTS_FILE,
@@ -103,15 +105,15 @@ def _card(trainer: Trainer, results: Sequence[Result], digest: str) -> str:
     )
     arm = f", arm {plan.arm}" if plan.arm else ""
     document = tomlkit.document()
-    document["title"] = f"Learned driver of {environment}"
+    document["title"] = f"Learned driver of {environment.title}"
     document["description"] = f"PPO, one policy for all vehicles{arm}, seed {plan.seed}."
     document["kind"] = "learned"
     document["entry"] = ENTRY
-    document["environments"] = [environment]
+    document["environments"] = [environment.name]
     document["network"] = _with_rows(card.model_dump(), "observation", "action")
     document["training"] = {
-        "command": command_of(plan),
-        "environment": environment,
+        "command": command_of(trainer),
+        "environment": environment.name,
         "seed": plan.seed,
         "scenario": scenario_digest(trainer.scenario),
         **({"arm": plan.arm} if plan.arm else {}),

@@ -14,6 +14,7 @@ from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.evaluation.episodes import driven_vehicles
 from coopenv.scenario import Scenario
 from coopenv.training.cloning import clone
+from coopenv.training.environment_file import environment_file
 from coopenv.training.normalised import NormalisedEnv
 from coopenv.training.settings import Plan
 from coopenv.training.watch import Status, Watch
@@ -32,6 +33,7 @@ class Trainer:
         """
         torch.set_num_threads(1)  # small matrices: more threads mostly wait for one another and for the worlds'
         self.plan, self.scenario = plan, scenario
+        self.environment = environment_file(plan.environment)
         ppo = plan.settings.ppo
         rows = CooperativeVectorEnv(
             scenario,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shlex
 import signal
 import sys
 from pathlib import Path
@@ -139,6 +140,25 @@ def test_what_else_was_to_be_written_is_written_after_resuming(here: Path) -> No
     assert (here / "agent" / "policy.onnx").is_file()
     assert len(list((here / "logs").glob("events.*"))) == before + 1
     assert not (here / "agent" / "tensorboard").exists()
+
+
+@pytest.mark.slow
+def test_the_agent_of_a_file_of_ones_own_takes_it_along(here: Path) -> None:
+    """Its environment is found, and the command on its card trains once more, when nothing but its folder is left."""
+    source = coopenv.shipped.data_directory("envs") / "open_square.toml"
+    mine = here / "elsewhere" / "my_square.toml"
+    mine.parent.mkdir()
+    mine.write_text(source.read_text())
+    options = ["--settings", "train.toml", "--steps", "400", "--threads", "1", "--out", "agent"]
+    assert main(["train", "elsewhere/my_square.toml", *options]) == 0
+    mine.unlink()
+    agent = find_agent("agent")
+    assert coopenv.load_scenario(agent.environments[0]) == coopenv.load_scenario("open_square")
+    card = read_card(here / "agent")
+    assert card.title == "Learned driver of my_square"
+    again = (*COOPENV, *shlex.split(card.training["command"])[1:], "--out", "../again")
+    assert start(again, here / "agent").wait(300) == 0
+    same(load_file(here / "again" / "weights.safetensors"), load_file(here / "agent" / "weights.safetensors"))
 
 
 @pytest.mark.slow
