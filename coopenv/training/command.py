@@ -1,10 +1,9 @@
 """`coopenv train`: learn, judge on held-out maps, keep checkpoints, and write the agent's folder. Needs `train`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
 
 from coopenv import interrupts
 from coopenv.api.engine import Engine
@@ -19,7 +18,7 @@ from coopenv.seeds import evaluation_seed
 from coopenv.training import checkpoint
 from coopenv.training.export import EXPORTED, check_onnx, export
 from coopenv.training.settings import Plan
-from coopenv.training.trainer import Trainer
+from coopenv.training.trainer import DivergedError, Trainer
 from coopenv.training.watch import Status
 
 NAMES = (*EXPORTED, checkpoint.CHECKPOINT_FILE, *CARD_FILES)
@@ -121,14 +120,27 @@ def train(
             checkpoint.restore(kept, trainer)
         else:
             trainer.begin()
-        _learn(trainer, path, curve, outputs, threads, tell)
         worlds = plan.settings.evaluation.final_worlds
-        results = _judge(trainer, held_out_seeds(0, worlds), threads, tell)
+        with _kept_from_before(path):
+            _learn(trainer, path, curve, outputs, threads, tell)
+            results = _judge(trainer, held_out_seeds(0, worlds), threads, tell)
         with replacing_folder(out, (*NAMES, trainer.environment.name)) as folder:
             export(folder, trainer, results, curve, outputs.onnx)
     finally:
         trainer.close()
     return results
+
+
+@contextmanager
+def _kept_from_before(path: Path) -> Iterator[None]:
+    """Say where a training that diverges has left its last checkpoint."""
+    try:
+        yield
+    except DivergedError as error:
+        if not path.is_file():
+            raise
+        kept = f"{path} is kept as it was after {checkpoint.read(path).progress['steps']} steps"
+        raise DivergedError(f"{error}; {kept}, remove it to begin anew with other settings") from None
 
 
 def _learn(
@@ -162,13 +174,9 @@ def _save(trainer: Trainer, path: Path, curve: list[dict[str, float]], outputs: 
 
 def _judge(trainer: Trainer, seeds: list[int], threads: int | None, tell: Reports) -> list[Result]:
     """Return how the mean action drives in held-out worlds."""
-
-    def mean_action(observations: np.ndarray) -> np.ndarray:
-        return np.asarray(trainer.model.predict(trainer.env.normalise(observations), deterministic=True)[0])
-
     engine = Engine(trainer.scenario, len(seeds), threads=threads)
     try:
-        results = score(drive(engine, mean_action, seeds))
+        results = score(drive(engine, trainer.mean_action, seeds))
     finally:
         engine.close()
     tell.judged(trainer.status.steps, results)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from coopenv.errors import CoopenvError, suggest
 from coopenv.scenario.base import NonNegative, Part, Positive, Probability
@@ -51,6 +51,12 @@ class Ppo(Part):
     """Widths of the hidden layers, tanh, of the policy and of the value."""
     observation_clip: Positive = 6.0
     """Observations are normalised by their running mean and standard deviation and clipped to this."""
+
+    @model_validator(mode="after")
+    def _check_rollout(self) -> "Ppo":
+        if self.vehicles * self.decisions < 2:
+            raise ValueError("decisions: one decision of one vehicle is no rollout, advantages need two at least")
+        return self
 
 
 class Clone(Part):

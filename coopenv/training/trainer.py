@@ -1,9 +1,12 @@
 """One training: the batch, Stable-Baselines3's PPO on it, and how far it is. Needs the extra `train`."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from time import monotonic, process_time
 from typing import Any
 
+import numpy as np
 import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Logger, configure
@@ -11,6 +14,7 @@ from stable_baselines3.common.logger import Logger, configure
 from coopenv.api.trainers.sb3 import CooperativeSB3VecEnv
 from coopenv.api.trainers.sb3_buffer import ActingRowsBuffer
 from coopenv.api.vector_env import CooperativeVectorEnv
+from coopenv.errors import CoopenvError
 from coopenv.evaluation.episodes import driven_vehicles
 from coopenv.scenario import Scenario
 from coopenv.training.cloning import clone
@@ -18,6 +22,13 @@ from coopenv.training.environment_file import environment_file
 from coopenv.training.normalised import NormalisedEnv
 from coopenv.training.settings import Plan
 from coopenv.training.watch import Status, Watch
+
+TORCH_REFUSES = "Expected parameter"
+"""So begins what torch says of a distribution whose parameters are not finite."""
+
+
+class DivergedError(CoopenvError):
+    """What was learnt is not finite."""
 
 
 class Trainer:
@@ -91,13 +102,45 @@ class Trainer:
         self.env.start()
 
     def update(self) -> Status:
-        """Collect one rollout and learn from it."""
+        """Collect one rollout and learn from it.
+
+        Raises:
+            DivergedError: the policy is no longer finite.
+        """
         begin, cpu_begin = monotonic(), process_time()
         self._share = self._spent()
-        self.model.learn(self._rollout, callback=self._watch, reset_num_timesteps=False)
+        with self._finite():
+            self.model.learn(self._rollout, callback=self._watch, reset_num_timesteps=False)
         self._seconds += monotonic() - begin
         self.cpu_seconds += process_time() - cpu_begin
         return self.status
+
+    def mean_action(self, observations: np.ndarray) -> np.ndarray:
+        """Return what the policy does without exploring, (rows, A), where it observes (rows, D).
+
+        Raises:
+            DivergedError: it is not finite.
+        """
+        with self._finite():
+            return np.asarray(self.model.predict(self.env.normalise(observations), deterministic=True)[0])
+
+    @contextmanager
+    def _finite(self) -> Iterator[None]:
+        """Say in one line that a policy is no longer finite, which torch finds out when it draws actions, or nobody."""
+        try:
+            yield
+        except ValueError as error:
+            if not str(error).startswith(TORCH_REFUSES):
+                raise
+            raise self._diverged() from None
+        if not all(bool(values.isfinite().all()) for values in self.model.policy.parameters()):
+            raise self._diverged()
+
+    def _diverged(self) -> DivergedError:
+        names = ("learning_rate", "initial_std", "reward_scale", "max_gradient")
+        told = [f"ppo.{name} = {getattr(self.plan.settings.ppo, name):g}" for name in names]
+        when = f"after {self.model.num_timesteps} steps the policy is not finite"
+        return DivergedError(f"the training diverged: {when}; look at {', '.join(told)}")
 
     @property
     def status(self) -> Status:

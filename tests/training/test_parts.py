@@ -87,6 +87,19 @@ def test_a_budget_in_minutes_is_spent_by_the_clock() -> None:
     assert (trainer.status.steps, trainer.status.share) == (128, pytest.approx(0.5))
 
 
+@pytest.mark.parametrize("broken", ["weights", "exploration"])
+def test_a_policy_that_is_not_finite_is_told_in_one_line(broken: str) -> None:
+    trainer = trainer_of(steps=1024)
+    policy = trainer.model.policy
+    with torch.no_grad():
+        if broken == "weights":
+            policy.value_net.weight[:] = torch.nan  # which no action shows
+        else:
+            policy.log_std[:] = -1e9  # finite, but it draws nothing
+    with pytest.raises(coopenv.CoopenvError, match=r"diverged: after 0 steps .* ppo\.learning_rate = 0\.001"):
+        trainer.mean_action(np.zeros((1, 132), dtype=np.float32))
+
+
 def figures_of(policy: Policy, scenario: Scenario) -> dict[str, Result]:
     results = score(drive(Engine(scenario, 8), policy, held_out_seeds(0, 8)))
     return {result.metric: result for result in results}

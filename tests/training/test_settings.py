@@ -83,6 +83,7 @@ def test_a_plan_survives_as_plain_data(path: Path) -> None:
     [
         ("[ppo]\nvehicls = 3", r"train\.toml: ppo\.vehicls: unknown key \(did you mean 'vehicles'\?\)"),
         ("[ppo]\ngamma = 1.5", r"train\.toml: ppo\.gamma: Input should be less than 1, got 1\.5"),
+        ("[ppo]\nvehicles = 1\ndecisions = 1", r"train\.toml: ppo\.decisions: one decision of one vehicle"),
         ("[ppo]\nhidden = []", r"train\.toml: ppo\.hidden: .*at least 1"),
         ("[clone]\nepisodes = 3", r"train\.toml: clone\.agent: Field required"),
         ("steps = 10\nminutes = 1", r"train\.toml: steps and minutes: give one of them"),

@@ -143,6 +143,20 @@ def test_what_else_was_to_be_written_is_written_after_resuming(here: Path) -> No
 
 
 @pytest.mark.slow
+def test_a_training_that_diverges_says_so_and_keeps_its_checkpoint(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "train.toml").write_text(SETTINGS.replace("[ppo]", "[ppo]\nlearning_rate = 1e9"))
+    for arguments in (fresh(), command("--resume")):
+        assert main(arguments) == 2
+        *_, told = capsys.readouterr().err.splitlines()
+        assert told.startswith("error: the training diverged: after ")
+        assert "ppo.learning_rate = 1e+09" in told
+        assert "agent/checkpoint.safetensors is kept as it was after 0 steps" in told
+        assert not (here / "agent" / "agent.toml").exists()
+
+
+@pytest.mark.slow
 def test_the_agent_of_a_file_of_ones_own_takes_it_along(here: Path) -> None:
     """Its environment is found, and the command on its card trains once more, when nothing but its folder is left."""
     source = coopenv.shipped.data_directory("envs") / "open_square.toml"
