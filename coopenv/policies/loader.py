@@ -1,7 +1,7 @@
 """Find and load drivers: a folder of `agents/`, a folder anywhere, or a place in code."""
 
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -20,6 +20,8 @@ Kind = Literal["learned", "scripted", "reference"]
 AGENT_FILE = "agent.toml"
 CARD_FILES = ("card.json", "card.md")
 """What `coopenv evaluate --write-card` writes beside it."""
+CHECKPOINT_FILE = "checkpoint.safetensors"
+"""What stands in its place while an agent is trained."""
 
 
 class AgentCard(BaseModel):
@@ -112,7 +114,7 @@ def find_agent(name_or_place: str | Path) -> Agent:
         return Agent(name.rpartition(":")[2], user_code.absolute(name))
     folder = data_directory("agents") / name if name in names else Path(name)
     if not (folder / AGENT_FILE).is_file():
-        raise CoopenvError(f"unknown agent '{name}'{suggest(name, names)}; known: {', '.join(names)}")
+        raise _not_found("agent", name, names)
     card = read_card(folder)
     if not user_code.is_reference(card.entry):
         raise CoopenvError(f"{folder / AGENT_FILE}: entry: expected file.py:Class or package.module:Class")
@@ -124,6 +126,15 @@ def find_agent(name_or_place: str | Path) -> Agent:
     if card.network is not None:
         known["options"] |= {"folder": folder, "network": card.network}
     return Agent(folder.resolve().name, entry, folder=folder, **known)
+
+
+def _not_found(what: str, name: str, known: Sequence[str]) -> CoopenvError:
+    """Return the error that says what is behind a name in place of an agent, or which names there are."""
+    if (Path(name) / CHECKPOINT_FILE).is_file():
+        return CoopenvError(f"{name} holds an unfinished training: go on with coopenv train ENV --out {name} --resume")
+    if name.endswith(".py"):
+        return CoopenvError(f"{name}: name a class or function in it: {name}:Class")
+    return CoopenvError(f"unknown {what} '{name}'{suggest(name, known)}; known: {', '.join(known)}")
 
 
 def agents_for(environment: str) -> list[str]:
@@ -149,6 +160,5 @@ def load_policy(name: str, scenario: Scenario, seed: int) -> Policy:
     if name in PLAIN:
         return PLAIN[name](seed, scenario.action.size)
     if name not in list_agents() and not user_code.is_reference(name) and not (Path(name) / AGENT_FILE).is_file():
-        known = [*PLAIN, *list_agents()]
-        raise CoopenvError(f"unknown policy '{name}'{suggest(name, known)}; known: {', '.join(known)}")
+        raise _not_found("policy", name, [*PLAIN, *list_agents()])
     return load_agent(name, scenario)

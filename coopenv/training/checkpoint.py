@@ -20,7 +20,6 @@ from coopenv.files import replacing_file, writing
 from coopenv.training.settings import Plan
 from coopenv.training.trainer import Trainer
 
-CHECKPOINT_FILE = "checkpoint.safetensors"
 FORMAT = 2
 HEADER = "coopenv_checkpoint"
 Arrays = dict[str, np.ndarray]

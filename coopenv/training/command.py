@@ -12,7 +12,7 @@ from coopenv.errors import CoopenvError, OutputError
 from coopenv.evaluation import Result, drive, held_out_seeds, score
 from coopenv.files import check_file, new_folder, replacing_folder
 from coopenv.policies import load_agent
-from coopenv.policies.loader import AGENT_FILE, CARD_FILES
+from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE
 from coopenv.scenario import Scenario
 from coopenv.seeds import evaluation_seed
 from coopenv.training import checkpoint
@@ -21,7 +21,7 @@ from coopenv.training.settings import Plan
 from coopenv.training.trainer import DivergedError, Trainer
 from coopenv.training.watch import Status
 
-NAMES = (*EXPORTED, checkpoint.CHECKPOINT_FILE, *CARD_FILES)
+NAMES = (*EXPORTED, CHECKPOINT_FILE, *CARD_FILES)
 """Of files that an agent's folder can hold; a card tells of one agent only, and goes with it."""
 LOGS = "tensorboard"
 WHILE_LEARNING = 2**30
@@ -44,9 +44,9 @@ def resumed_plan(out: Path) -> Plan:
     Raises:
         CoopenvError: there is none, or its checkpoint is damaged.
     """
-    if not (out / checkpoint.CHECKPOINT_FILE).is_file() and (out / AGENT_FILE).is_file():
+    if not (out / CHECKPOINT_FILE).is_file() and (out / AGENT_FILE).is_file():
         raise CoopenvError(f"nothing to resume: {out} holds a finished agent and no checkpoint")
-    return checkpoint.read(out / checkpoint.CHECKPOINT_FILE).plan
+    return checkpoint.read(out / CHECKPOINT_FILE).plan
 
 
 def possible(plan: Plan) -> Scenario:
@@ -98,7 +98,7 @@ def train(
         OutputError: there is an agent that is not to be replaced, or something cannot be written; the last checkpoint
             stays.
     """
-    tell, path = reports or Reports(), out / checkpoint.CHECKPOINT_FILE
+    tell, path = reports or Reports(), out / CHECKPOINT_FILE
     scenario = possible(plan)
     kept = checkpoint.read(path) if resume else None
     if kept is None and path.is_file():

@@ -151,6 +151,18 @@ def test_agents_in_code_that_are_none(text: str, message: str, tmp_path: Path, m
         load_policy(text, coopenv.load_scenario(FOUR_WAY), 0)
 
 
+def test_what_is_nearly_an_agent_is_told_how_to_become_one(tmp_path: Path) -> None:
+    (tmp_path / "begun").mkdir()
+    (tmp_path / "begun" / "checkpoint.safetensors").write_bytes(b"")
+    (tmp_path / "mine.py").write_text("class Mine: ...")
+    scenario = coopenv.load_scenario("open_square")
+    for name, message in (("begun", "unfinished training: go on with .* --resume"), ("mine.py", r"mine\.py:Class$")):
+        with pytest.raises(coopenv.CoopenvError, match=message):
+            find_agent(tmp_path / name)
+        with pytest.raises(coopenv.CoopenvError, match=message):
+            load_policy(str(tmp_path / name), scenario, 0)
+
+
 def test_bad_agents(tmp_path: Path) -> None:
     scenario = coopenv.load_scenario(FOUR_WAY)
     with pytest.raises(

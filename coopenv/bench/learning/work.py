@@ -7,8 +7,8 @@ from pathlib import Path
 from coopenv.backends.sources import open_simulation
 from coopenv.bench.learning.study import Run, Study
 from coopenv.errors import CoopenvError
-from coopenv.policies.loader import AGENT_FILE, read_card
-from coopenv.training.checkpoint import CHECKPOINT_FILE, read
+from coopenv.policies.loader import AGENT_FILE, CHECKPOINT_FILE, read_card
+from coopenv.training.checkpoint import read
 from coopenv.training.command import possible, train
 from coopenv.training.export import scenario_digest
 from coopenv.training.settings import SETTINGS_FILE, Plan, read_settings
