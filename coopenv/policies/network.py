@@ -1,6 +1,7 @@
 """A learned policy: normalisation and a multilayer perceptron, in NumPy, from weights without pickle."""
 
 import json
+import math
 from collections.abc import Mapping
 from hashlib import sha256
 from pathlib import Path
@@ -11,7 +12,7 @@ from pydantic import BaseModel, ConfigDict
 from safetensors import SafetensorError
 from safetensors.numpy import load
 
-from coopenv.api.terms.layout import Layout, observation_layout
+from coopenv.api.terms.layout import Layout, observation_layout, settings_of_meaning
 from coopenv.errors import CoopenvError
 from coopenv.scenario import Scenario
 
@@ -29,12 +30,12 @@ class Entry(BaseModel):
     low: float
     high: float
     scale: float
+    center: float
     unit: str
 
     def told(self) -> dict[str, float | str]:
         """Return what must be the same wherever the field stands."""
-        size = {"size": self.stop - self.start}
-        return {**size, "low": self.low, "high": self.high, "scale": self.scale, "unit": self.unit}
+        return {"size": self.stop - self.start, **self.model_dump(exclude={"start", "stop"})}
 
 
 class NetworkCard(BaseModel):
@@ -47,30 +48,32 @@ class NetworkCard(BaseModel):
     sha256: str
     """Of the file."""
     layout: str
-    """`layout_hash` of the two tables below."""
+    """`layout_hash` of the three tables below."""
     clip: float
     """Normalised observations are clipped to it."""
     observation: dict[str, Entry]
     action: dict[str, Entry]
+    settings: dict[str, float]
+    """Of the scenario, by dotted key: those that say what the entries mean beside these tables."""
 
 
 def layout_tables(layout: Layout) -> tuple[dict[str, Entry], dict[str, Entry]]:
     """Return what a network depends on: fields of the observation, and those of the action, by name in their order."""
     observation = {
-        name: Entry(start=f.start, stop=f.stop, low=f.low, high=1.0, scale=f.scale, unit=f.unit)
+        name: Entry(start=f.start, stop=f.stop, low=f.low, high=1.0, scale=f.scale, center=f.center, unit=f.unit)
         for name, f in layout.items()
     }
     action = {
-        f.name: Entry(start=i, stop=i + 1, low=f.low, high=f.high, scale=1.0, unit=f.unit)
+        f.name: Entry(start=i, stop=i + 1, low=f.low, high=f.high, scale=1.0, center=0.0, unit=f.unit)
         for i, f in enumerate(layout.action)
     }
     return observation, action
 
 
-def layout_hash(observation: Mapping[str, Entry], action: Mapping[str, Entry]) -> str:
-    """Return the first 16 hexadecimal digits of SHA-256 over both tables as JSON."""
+def layout_hash(observation: Mapping[str, Entry], action: Mapping[str, Entry], settings: Mapping[str, float]) -> str:
+    """Return the first 16 hexadecimal digits of SHA-256 over the three tables as JSON."""
     tables = [{name: entry.model_dump() for name, entry in table.items()} for table in (observation, action)]
-    return sha256(json.dumps(tables).encode()).hexdigest()[:16]
+    return sha256(json.dumps([*tables, dict(settings)]).encode()).hexdigest()[:16]
 
 
 class Network:
@@ -88,17 +91,18 @@ class Network:
             network: what its `agent.toml` says.
 
         Raises:
-            CoopenvError: the environment's observation or action is not what it was trained with, or the weights cannot
-                be read or are not those that the agent was saved with.
+            CoopenvError: the environment's observation or action is not what it was trained with, or a setting is not
+                that says what they mean, or the weights cannot be read or are not those that the agent was saved with.
         """
         observation, action = layout_tables(observation_layout(scenario))
         _compare("observation", network.observation, observation)
         _compare("action", network.action, action)
         _check_order(network.action, action)
+        _compare_settings(network.settings, settings_of_meaning(scenario, network.observation))
         fields = [observation[name] for name in network.observation]
         self._columns = np.concatenate([np.arange(field.start, field.stop) for field in fields])
         path = folder / network.weights
-        if network.layout != layout_hash(network.observation, network.action):
+        if network.layout != layout_hash(network.observation, network.action, network.settings):
             raise CoopenvError(f"{folder / 'agent.toml'}: network.layout is not the hash of its tables")
         self._clip = np.float32(network.clip)
         tensors = _load(path, network.sha256)
@@ -128,6 +132,13 @@ def _compare(what: str, trained: Mapping[str, Entry], here: Mapping[str, Entry])
         for (key, value), now in pairs:
             if value != now if isinstance(value, str) else not np.isclose(value, now, rtol=1e-9):
                 raise CoopenvError(f"{before} had {key} {value!r} and has {now!r} here")
+
+
+def _compare_settings(trained: Mapping[str, float], here: Mapping[str, float]) -> None:
+    for key in sorted({*trained, *here}):
+        before, now = trained.get(key), here.get(key)
+        if before is None or now is None or not math.isclose(before, now, rel_tol=1e-9):
+            raise CoopenvError(f"it was trained with another {key}, {before!r}, and it is {now!r} here")
 
 
 def _check_order(trained: Mapping[str, Entry], here: Mapping[str, Entry]) -> None:

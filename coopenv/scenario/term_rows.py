@@ -87,6 +87,14 @@ FIELDS: dict[str, list[tuple[Any, ...]]] = {  # group: name, columns
     ],
 }  # fmt: skip
 
+SETTINGS: dict[str, tuple[str, ...]] = {  # what entries mean also depends on these, beside their scale and center
+    "gramian_min_eigenvalue": ("observer.gramian_window", "observer.gramian_distance"),
+    "soft_observability": ("observer.gramian_window", "observer.gramian_distance", "reward.observability_floor"),
+    "message_clearance": ("observation.route_step", "dynamics.max_speed"),
+    "route_ahead": ("observation.route_step",),
+}
+SETTINGS_OF_ACTIONS = ("rates.decision", "dynamics.max_speed")
+
 REWARDS: list[tuple[str, str, bool, str]] = [  # name, unit, privileged, meaning
     ("progress", "m", True, "Decrease of the true way to the goal: along the drawn route, else as the crow flies"),
     ("arrival", "1", False, "1 in the step of arrival"),

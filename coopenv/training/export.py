@@ -14,7 +14,7 @@ import tomlkit
 from safetensors.numpy import save
 from torch import nn
 
-from coopenv.api.terms.layout import observation_layout
+from coopenv.api.terms.layout import observation_layout, settings_of_meaning
 from coopenv.errors import CoopenvError
 from coopenv.evaluation import Result
 from coopenv.files import writing
@@ -95,13 +95,15 @@ def _settings(plan: Plan) -> str:
 def _card(trainer: Trainer, results: Sequence[Result], digest: str) -> str:
     plan, environment = trainer.plan, trainer.environment
     observation, action = layout_tables(observation_layout(trainer.scenario))
+    settings = settings_of_meaning(trainer.scenario, observation)
     card = NetworkCard(
         weights=WEIGHTS_FILE,
         sha256=digest,
-        layout=layout_hash(observation, action),
+        layout=layout_hash(observation, action, settings),
         clip=plan.settings.ppo.observation_clip,
         observation=observation,
         action=action,
+        settings=settings,
     )
     arm = f", arm {plan.arm}" if plan.arm else ""
     document = tomlkit.document()

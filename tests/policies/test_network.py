@@ -12,7 +12,7 @@ import pytest
 from safetensors.numpy import save
 
 import coopenv
-from coopenv.api.terms.layout import observation_layout
+from coopenv.api.terms.layout import observation_layout, settings_of_meaning
 from coopenv.policies import load_agent
 from coopenv.policies.network import Network, NetworkCard, layout_hash, layout_tables
 from tests.helpers.four_way import FOUR_WAY
@@ -34,11 +34,13 @@ def tensors_for(inputs: int, outputs: int = 2) -> Tensors:
 
 def write(folder: Path, tensors: Tensors, overrides: dict[str, Any] | None = None, **changes: Any) -> NetworkCard:
     """Write weights and return a card for an environment's layout."""
-    observation, action = layout_tables(observation_layout(coopenv.load_scenario(ENV, overrides)))
+    scenario = coopenv.load_scenario(ENV, overrides)
+    observation, action = layout_tables(observation_layout(scenario))
+    settings = settings_of_meaning(scenario, observation)
     data = save(tensors)
     (folder / "weights.safetensors").write_bytes(data)
-    values = {"sha256": sha256(data).hexdigest(), "layout": layout_hash(observation, action), **changes}
-    fields: dict[str, Any] = {"observation": observation, "action": action}
+    values = {"sha256": sha256(data).hexdigest(), "layout": layout_hash(observation, action, settings), **changes}
+    fields: dict[str, Any] = {"observation": observation, "action": action, "settings": settings}
     return NetworkCard(weights="weights.safetensors", clip=5.0, **{**fields, **values})
 
 
@@ -79,6 +81,40 @@ def test_another_layout_is_refused_by_its_first_field(overrides: dict[str, Any],
     card = write(tmp_path, tensors_for(132))
     with pytest.raises(coopenv.CoopenvError, match=message):
         Network(coopenv.load_scenario(ENV, overrides), folder=tmp_path, network=card)
+
+
+WHOLE = ["route", "clearance", "uncertainty", "messages", "quality"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        ({"observation.centers.route_offset": 0.8}, r"'route_offset' had center 0\.0 and has 0\.8 here"),
+        ({"observation.route_step": 1.0}, r"another observation\.route_step, 0\.5, and it is 1\.0 here"),
+        ({"observer.gramian_window": 2.0}, r"another observer\.gramian_window, 1\.0, and it is 2\.0 here"),
+        ({"observer.gramian_distance": 3.0}, r"another observer\.gramian_distance, None, and it is 3\.0 here"),
+        ({"reward.observability_floor": 1e-4}, r"another reward\.observability_floor, 1e-05, and it is 0\.0001 here"),
+        ({"rates.decision": 5.0}, r"another rates\.decision, 10\.0, and it is 5\.0 here"),
+        ({"dynamics.max_speed": 1.5, "action.longitudinal": "acceleration"}, r"another dynamics\.max_speed, 1\.0"),
+    ],
+)
+def test_what_gives_entries_another_meaning_is_refused_with_both_values(
+    overrides: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    """The size of the observation is the same: without this an agent would drive by what it misreads."""
+    common = {"observation.include": WHOLE, **({k: v for k, v in overrides.items() if k == "action.longitudinal"})}
+    size = observation_layout(coopenv.load_scenario(ENV, common)).size
+    card = write(tmp_path, tensors_for(size), common)
+    Network(coopenv.load_scenario(ENV, common), folder=tmp_path, network=card)
+    with pytest.raises(coopenv.CoopenvError, match=message):
+        Network(coopenv.load_scenario(ENV, {**common, **overrides}), folder=tmp_path, network=card)
+
+
+def test_settings_of_fields_that_it_does_not_read_may_differ(tmp_path: Path) -> None:
+    few = {"observation.include": ["goal", "odometry"]}
+    card = write(tmp_path, tensors_for(observation_layout(coopenv.load_scenario(ENV, few)).size), few)
+    other = {"observation.include": ["goal", "odometry", "route"], "observation.route_step": 1.0}
+    Network(coopenv.load_scenario(ENV, other), folder=tmp_path, network=card)
 
 
 def without(tensors: Tensors, name: str) -> Tensors:

@@ -147,7 +147,10 @@ def test_an_agent_of_a_longer_action_is_not_this_one(trained: Trainer, tmp_path:
     text = (
         (tmp_path / "agent.toml")
         .read_text()
-        .replace("[network.action]", "[network.action]\npan = {start=2, stop=3, low=-1, high=1, scale=1, unit='rad'}")
+        .replace(
+            "[network.action]",
+            "[network.action]\npan = {start=2, stop=3, low=-1, high=1, scale=1, center=0, unit='rad'}",
+        )
     )
     (tmp_path / "agent.toml").write_text(text)
     with pytest.raises(coopenv.CoopenvError, match="another action: 'pan' is not in this environment"):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from gymnasium import spaces
 from coopenv.errors import CoopenvError
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import Dynamics
+from coopenv.scenario.term_rows import SETTINGS, SETTINGS_OF_ACTIONS
 from coopenv.scenario.terms import GROUPS, OBSERVATION_FIELDS, ObservationField
 from coopenv.world.command import STEERING
 
@@ -161,6 +162,22 @@ def action_fields(scenario: Scenario, limits: Dynamics | None = None) -> tuple[A
     entries = first, ActionField("steering", "rad", -steering, steering)
     pan = scenario.action.pan
     return entries if pan is None else (*entries, ActionField("pan", "rad", -pan.limit, pan.limit))
+
+
+def settings_of_meaning(scenario: Scenario, fields: Iterable[str]) -> dict[str, float]:
+    """Return the settings by dotted key, but those that are not set, that say what entries mean beside the layout.
+
+    They are those of the given fields and of actions. `dynamics` is the first vehicle's, whichever table says it.
+    `horizon` is none of them: it is the unit of `time_left`.
+    """
+    keys = {key for name in fields for key in SETTINGS.get(name, ())} | {*SETTINGS_OF_ACTIONS}
+    values = {}
+    for key in sorted(keys):
+        section, name = key.split(".")
+        value = getattr(scenario.limits[0] if section == "dynamics" else getattr(scenario, section), name)
+        if value is not None:
+            values[key] = float(value)
+    return values
 
 
 def flat_space(layout: Mapping[str, Field]) -> spaces.Box:
