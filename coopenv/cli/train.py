@@ -78,7 +78,9 @@ def train(
         log.print(f"{at:>10,} steps, held-out maps: {_told(results)}", soft_wrap=True)
 
     with Progress(log, "starting", total=1.0) as progress:
-        reports = Reports(lambda status: progress.update(status.share, status.line), judged)
+        reports = Reports(
+            lambda status: progress.update(status.share, status.line), judged, lambda line: progress.update(0.0, line)
+        )
         results = perform(
             plan, folder, resume=resume, threads=threads, onnx=onnx, logs=logs, force=force, reports=reports
         )

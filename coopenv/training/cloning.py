@@ -1,5 +1,7 @@
 """A start from another driver: its actions and its returns, learnt by regression. Needs the extra `train`."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
@@ -14,7 +16,13 @@ BATCH = 512  # rows per gradient step
 
 
 def clone(
-    policy: ActorCriticPolicy, env: NormalisedEnv, settings: Clone, gamma: float, reward_scale: float, seed: int
+    policy: ActorCriticPolicy,
+    env: NormalisedEnv,
+    settings: Clone,
+    gamma: float,
+    reward_scale: float,
+    seed: int,
+    tell: Callable[[str], None] = lambda line: None,
 ) -> None:
     """Fit the mean action to what a driver does, and the value to the discounted rewards that follow.
 
@@ -28,15 +36,17 @@ def clone(
         gamma: discount per decision.
         reward_scale: of the rewards that the value is to predict.
         seed: of the worlds, the noise and the order of rows.
+        tell: called with what is being done, and how far it is.
     """
-    raw, actions, returns = watch(env.venv.envs, settings, gamma, seed)
+    raw, actions, returns = watch(env.venv.envs, settings, gamma, seed, tell)
     env.statistics.update(raw)
     observations = torch.from_numpy(env.normalise(raw))
     targets = torch.from_numpy(actions.astype(np.float32))
     values = torch.from_numpy((reward_scale * returns).astype(np.float32))
     optimiser = torch.optim.Adam(policy.parameters(), settings.learning_rate)
     shuffle = torch.Generator().manual_seed(seed)
-    for _ in range(settings.epochs):
+    for epoch in range(settings.epochs):
+        tell(f"learning from {settings.agent}: pass {epoch + 1} of {settings.epochs}")
         for rows in torch.randperm(len(observations), generator=shuffle).split(BATCH):
             latent_policy, latent_value = policy.mlp_extractor(observations[rows])
             action_error = policy.action_net(latent_policy) - targets[rows]
@@ -48,7 +58,7 @@ def clone(
 
 
 def watch(
-    like: CooperativeVectorEnv, settings: Clone, gamma: float, seed: int
+    like: CooperativeVectorEnv, settings: Clone, gamma: float, seed: int, tell: Callable[[str], None]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return observations (rows, D), the driver's actions (rows, A), and the discounted returns from there (rows,)."""
     scenario = like.scenario
@@ -61,6 +71,7 @@ def watch(
     under_way = np.ones(env.num_envs, dtype=bool)
     steps: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
     while under_way.any():
+        tell(f"watching {settings.agent}: {len(steps) / scenario.rates.decision:.0f} of {scenario.horizon:g} s")
         action = decide(driver, observation, len(action_fields(scenario)))
         tried = np.clip(action + settings.noise * noise.standard_normal(action.shape), -1.0, 1.0)
         before, acted = observation, under_way

@@ -36,6 +36,8 @@ class Reports:
     """After every update."""
     judged: Callable[[int, list[Result]], None] = lambda steps, results: None
     """After every look at held-out maps: decisions of vehicles so far, and figures."""
+    cloning: Callable[[str], None] = lambda line: None
+    """Before the first update, where another driver is cloned: what is being done, and how far it is."""
 
 
 def resumed_plan(out: Path) -> Plan:
@@ -119,7 +121,7 @@ def train(
         if kept is not None:
             checkpoint.restore(kept, trainer)
         else:
-            trainer.begin()
+            trainer.begin(tell.cloning)
         worlds = plan.settings.evaluation.final_worlds
         with _kept_from_before(path):
             _learn(trainer, path, curve, outputs, threads, tell)

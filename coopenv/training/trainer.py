@@ -1,7 +1,7 @@
 """One training: the batch, Stable-Baselines3's PPO on it, and how far it is. Needs the extra `train`."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import monotonic, process_time
 from typing import Any
@@ -89,8 +89,8 @@ class Trainer:
         """Write for TensorBoard from now on, to a folder that is there."""
         self.model.set_logger(configure(folder, ["tensorboard"]))
 
-    def begin(self) -> None:
-        """Clone another driver, where the settings say so, and start the first episodes."""
+    def begin(self, tell: Callable[[str], None] = lambda line: None) -> None:
+        """Clone another driver, where the settings say so, and start the first episodes; `tell` hears how far it is."""
         settings = self.plan.settings
         if settings.clone is not None:
             clone(
@@ -98,6 +98,7 @@ class Trainer:
                 gamma=settings.ppo.gamma,
                 reward_scale=settings.ppo.reward_scale,
                 seed=self.plan.seed,
+                tell=tell,
             )
         self.env.start()
 

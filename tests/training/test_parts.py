@@ -114,7 +114,11 @@ def test_a_clone_drives_like_its_model() -> None:
         return trainer.model.predict(trainer.env.normalise(observations), deterministic=True)[0]
 
     before = figures_of(mean_action, scenario)
-    trainer.begin()
+    lines: list[str] = []
+    trainer.begin(lines.append)
+    assert lines[0] == f"watching route_follower: 0 of {scenario.horizon:g} s"
+    assert lines[-40] == "learning from route_follower: pass 1 of 40"
+    assert len(lines) - 40 <= scenario.horizon * scenario.rates.decision  # one per decision
     after = figures_of(mean_action, scenario)
     model = figures_of(load_agent("route_follower", scenario), scenario)
     assert before["arrival_rate"].mean < 0.4 and model["arrival_rate"].mean == 1.0
