@@ -90,3 +90,28 @@ def test_the_programs_on_agents_run(tmp_path: Path, capsys: pytest.CaptureFixtur
     policy = load_agent(f"{tmp_path / 'mine.py'}:Mine", scenario)
     rows = np.zeros((3, observation_layout(scenario).size), dtype=np.float32)
     np.testing.assert_array_equal(policy(rows), [[0.0, 0.0]] * 3)
+
+
+@pytest.mark.train
+def test_the_page_on_trainers_drives_with_the_result_of_the_one_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With weights that have learnt nothing, which the page's program takes for those of `examples/train_ppo.py`."""
+    torch = pytest.importorskip("torch", reason="needs the extra train")
+    from safetensors.torch import save_file
+
+    monkeypatch.setattr(sys, "path", [*sys.path, str(DOCS.parent / "examples")])
+    from train_ppo import Policy
+
+    torch.manual_seed(0)
+    size = observation_layout(load_scenario("urban_crossing")).size
+    (tmp_path / "out" / "ppo").mkdir(parents=True)
+    save_file(
+        Policy(size, 2, hidden=64, initial_std=0.5).state_dict(), tmp_path / "out" / "ppo" / "weights.safetensors"
+    )
+    monkeypatch.chdir(tmp_path)
+    (block,) = (block for block in python_blocks(DOCS / "trainers.md") if "train_ppo" in block)
+    program: dict[str, Any] = {}
+    exec(compile(block, "trainers.md", "exec"), program)
+    ends = capsys.readouterr().out.splitlines()
+    assert sorted(line.partition(":")[0] for line in ends) == sorted(program["env"].possible_agents)
