@@ -211,8 +211,15 @@ def where(used: str, rules: dict[str, Rule]) -> dict[str, Rule]:
 
 
 def _others(rule: Rule) -> Rule:
-    """Return the rule of what is kept of the other members, not of the vehicle itself."""
-    return rule._replace(holds=lambda v, *rest: np.insert(rule.holds(v[:, :, 1:], *rest), 0, True, axis=2))
+    """Return the rule of what is kept of the other vehicles, not of the vehicle itself and its odometry's errors."""
+
+    def holds(values: Any, fields: Any, model: Any) -> Any:
+        others = fields["observer_belief.others"][..., None]
+        mask = np.asarray(rule.holds(values, fields, model))
+        of_own = np.arange(values.shape[2]) < others
+        return mask | of_own.reshape(*of_own.shape, *(1,) * (mask.ndim - of_own.ndim))
+
+    return rule._replace(holds=holds)
 
 
 def rules_for(members: int) -> dict[str, Rule]:
