@@ -15,7 +15,10 @@ LOST = {"position_radius": 4.0, "orientation_angle": "uniform"}
 SURE = {"position_radius": 0.1, "orientation_angle": 0.02}
 
 
-def noisy(horizon: float = 5.0, observer: str = "robust") -> Scenario:
+LASTING = {"odometry_scale": 0.02, "gyro_bias": 0.005}
+
+
+def noisy(horizon: float = 5.0, observer: str = "robust", **errors: float) -> Scenario:
     """Return a world in which one vehicle knows its start, one searches, and one needs the others."""
     wide = {"orientation": "body", "miss_probability": 0.1, "position": [0.2, 0.0, 0.1]}
     return scenario(
@@ -30,7 +33,7 @@ def noisy(horizon: float = 5.0, observer: str = "robust") -> Scenario:
             ),
         ],
         horizon=horizon,
-        noise={"velocity": 0.1, "angular_velocity": 0.05, "bearing": {"model": "isotropic", "scale": 0.003}},
+        noise={"velocity": 0.1, "angular_velocity": 0.05, "bearing": {"model": "isotropic", "scale": 0.003}, **errors},
         camera=wide,
         v2x={"delay": 2, "loss": 0.3},
         observer={"name": observer},
@@ -86,14 +89,18 @@ def test_a_reset_by_mask_touches_the_masked_only() -> None:
     assert_same(played(world, 60), played(straight, 60), ~mask, ~mask)
 
 
-@pytest.mark.parametrize(("dtype", "observer"), [*((dtype, "robust") for dtype in DTYPES), ("float64", "robust_joint")])
-def test_a_saved_state_continues_as_if_nothing_happened(dtype: str, observer: str) -> None:
-    world = start(noisy(observer=observer), [1, 2], dtype)
+@pytest.mark.parametrize(
+    ("dtype", "observer", "errors"),
+    [*((dtype, "robust", {}) for dtype in DTYPES), ("float64", "robust", LASTING), ("float64", "robust_joint", {})],
+)
+def test_a_saved_state_continues_as_if_nothing_happened(dtype: str, observer: str, errors: dict[str, float]) -> None:
+    description = noisy(5.0, observer, **errors)
+    world = start(description, [1, 2], dtype)
     played(world, 24)  # the second vehicle is still searching
     saved = world.get_state()
     assert saved["observer_search.active"].any() and saved["observer_search.hypotheses"].any()
     straight = played(world, 90)
-    other = start(noisy(observer=observer), [77, 78], dtype)
+    other = start(description, [77, 78], dtype)
     played(other, 42)
     other.set_state(saved)
     assert_same(saved, other.get_state())
