@@ -66,7 +66,23 @@ class Difficulty(_Factors):
     level: Annotated[float, Field(ge=0.0, le=1.0)] | Literal["easy", "normal", "hard"] = 0.5
     """Difficulty unless `reset(options={"difficulty": ...})` says otherwise; `easy` is 0, `normal` 0.5, `hard` 1."""
 
+    @model_validator(mode="after")
+    def _level_has_a_meaning(self) -> Self:
+        if self.number != LEVELS["normal"] and not self.matters:
+            raise ValueError("level: nothing depends on it; give factors, such as camera_range = [1.25, 0.75]")
+        return self
+
     @property
     def number(self) -> float:
         """The level as a number."""
         return LEVELS[self.level] if isinstance(self.level, str) else self.level
+
+    @property
+    def matters(self) -> bool:
+        """Whether anything depends on it."""
+        return any(easy != hard for easy, hard in map(self.factors, PARAMETERS))
+
+    @property
+    def neutral(self) -> bool:
+        """Whether every factor is 1 at its level: as if there were no difficulties."""
+        return all(easy + (hard - easy) * self.number == 1.0 for easy, hard in map(self.factors, PARAMETERS))

@@ -83,7 +83,8 @@ def command_of(trainer: Trainer) -> str:
 
 def scenario_digest(scenario: Scenario) -> str:
     """Return the first 16 hexadecimal digits of SHA-256 over what a scenario sets, whatever it is called."""
-    told = scenario.model_dump_json(exclude={"title", "description", "source"}, exclude_defaults=True)
+    aside = {"title", "description", "source", *(["difficulty"] if scenario.difficulty.neutral else [])}
+    told = scenario.model_dump_json(exclude=aside, exclude_defaults=True)
     return sha256(told.encode()).hexdigest()[:16]
 
 

@@ -78,7 +78,7 @@ def test_rows_of_absent_vehicles_are_never_alive_and_never_terminate(autoreset: 
 
 
 def test_options_reach_every_interface() -> None:
-    made = sometimes(randomisation={"camera_range": [0.5, 1.0]})
+    made = sometimes(randomisation={"camera_range": [0.5, 1.0]}, difficulty={"v2x_loss": [0.0, 2.0]})
     column = list(PARAMETERS).index("camera_range")
     one = CooperativeLocalisationEnv(made, "test")
     one.reset(seed=1, options={"parameters": {"camera_range": 0.25}, "difficulty": "easy"})
@@ -93,7 +93,8 @@ def test_options_reach_every_interface() -> None:
 
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
 def test_settings_hold_for_automatic_resets(autoreset: str) -> None:
-    env = batch(sometimes(randomisation={"camera_range": [0.5, 1.0]}), 4, autoreset=autoreset)
+    made = sometimes(randomisation={"camera_range": [0.5, 1.0]}, difficulty={"v2x_loss": [0.0, 2.0]})
+    env = batch(made, 4, autoreset=autoreset)
     column = list(PARAMETERS).index("camera_range")
     factors = np.array([0.1, 0.2, 0.3, 0.4])
     env.reset(seed=0, options={"parameters": {"camera_range": factors}, "difficulty": factors})

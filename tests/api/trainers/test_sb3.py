@@ -83,7 +83,7 @@ def test_seeding() -> None:
 
 
 def test_options_of_a_reset_count_once_and_its_settings_hold() -> None:
-    env = make_sb3_vec_env(FOUR_WAY, num_worlds=2)
+    env = make_sb3_vec_env(FOUR_WAY, num_worlds=2, overrides={"difficulty.v2x_loss": [0.0, 2.0]})
     env.set_options({"difficulty": "hard", "parameters": {"camera_range": np.array([0.5, 0.75])}})
     for _ in range(2):
         env.reset()
