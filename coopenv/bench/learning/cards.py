@@ -28,6 +28,12 @@ def stale_groups(study: Study, folder: Path) -> list[Group]:
     return [group for group, runs in finished.items() if runs and runs != _told(folder / group.name)]
 
 
+def is_current(study: Study, group: Group, folder: Path) -> bool:
+    """Return whether a group has a card that tells of its finished runs, as study and environment are now."""
+    runs = _finished(study, group, folder)
+    return bool(runs) and runs == _told(folder / group.name)
+
+
 def write(study: Study, group: Group, folder: Path, judge: Judge) -> None:
     """Write the agent and the card of a group of which some runs are finished.
 

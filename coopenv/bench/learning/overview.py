@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from coopenv.bench.agents import cards, table
 from coopenv.bench.agents.seeds_section import percent
 from coopenv.bench.agents.table import cell
-from coopenv.bench.learning.cards import COMPARED, relative
+from coopenv.bench.learning.cards import COMPARED, is_current, relative
 from coopenv.bench.learning.judge import Judge
 from coopenv.bench.learning.study import Group, Study
 from coopenv.evaluation import Difference
@@ -30,11 +31,11 @@ vehicles under way, from 3 s on; e95 of seeds in their order."""
 
 
 def write(study: Study, folder: Path, judge: Judge) -> None:
-    """Write the page of all agents that have a card."""
+    """Write the page of all agents that have a card; it leaves out those that are to be trained anew."""
     parts = [INTRODUCTION]
     for environment in study.environments:
         groups = [group for group in study.groups if group.environment == environment]
-        found = {group: card for group in groups if "study" in (card := cards.read(folder / group.name))}
+        found = {group: cards.read(folder / group.name) for group in groups if is_current(study, group, folder)}
         if found:
             parts.append(_section(environment, found, folder, judge))
     replace_text(folder / PAGE_FILE, "\n".join(parts))
@@ -60,13 +61,26 @@ def _section(environment: str, found: dict[Group, dict[str, Any]], folder: Path,
         if base is not None and group != base:
             best, bases = (folder / g.name / f"seed_{found[g]['study']['best']}" for g in (group, base))
             differences = judge.against(environment, best, bases)
-            lines.append(f"- `{group.name}` against `{base.name}`: {_told(differences)}.")
+            change = f"{_told(differences)}; median seed against median seed: {_medians(found[group], found[base])}"
+            lines.append(f"- `{group.name}` against `{base.name}`: {change}.")
     return "\n".join([*lines, ""])
 
 
 def _row(name: str, figures: dict[str, Any], errors: str) -> str:
     cells = [cell(figures[metric], factor) for metric, (_, factor) in COLUMNS.items()]
     return f"| {name} | {' | '.join(cells)} | {errors} |"
+
+
+def _medians(card: dict[str, Any], base: dict[str, Any]) -> str:
+    """Return how the medians over seeds differ, which no lucky seed moves."""
+    told = []
+    for word, metric in (("e50", "e50_m"), ("e95", "e95_m")):
+        own, other = (
+            median(entry["results"][metric]["mean"] for entry in each["study"]["seeds"].values())
+            for each in (card, base)
+        )
+        told.append(f"{word} {100 * (own / other - 1):+.0f} %")
+    return ", ".join(told)
 
 
 def _told(differences: Sequence[Difference]) -> str:
