@@ -64,7 +64,7 @@ class Difficulty(_Factors):
     """Factors [at difficulty 0, at difficulty 1], straight between; those that are drawn multiply them."""
 
     level: Annotated[float, Field(ge=0.0, le=1.0)] | Literal["easy", "normal", "hard"] = 0.5
-    """Difficulty unless `reset(options={"difficulty": ...})` says otherwise; `easy` is 0, `normal` 0.5, `hard` 1."""
+    """Unless the options of a reset say otherwise; `easy` is 0, `normal` 0.5, `hard` 1."""
 
     @model_validator(mode="after")
     def _level_has_a_meaning(self) -> Self:

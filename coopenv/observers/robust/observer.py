@@ -75,6 +75,7 @@ def make_start(clear_messages: Any, receive: Any) -> Any:
         set_anchor(memory, world, i, initial.P, 0)
         if not is_known(initial.P):
             begin_search(memory, world, i, initial)
+        write(state, memory, world, i)
         receive(model, state, memory, world, i)
 
     return start

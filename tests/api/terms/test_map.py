@@ -109,9 +109,9 @@ def test_a_vehicle_that_is_heard_hides_what_is_behind_it() -> None:
     """By the oracle, and often: the truck."""
     more = {"include": ["map"], "map_size": 14, "map_scale": 50.0}
     scenario = load_scenario("behind_truck", {f"observation.{key}": value for key, value in more.items()})
-    engine = driven(scenario, steps=0)
+    engine = driven(scenario, steps=0, worlds=8)
     for _ in range(90):
-        engine.step(np.tile([1.0, 0.0], (4, 2, 1)))
+        engine.step(np.tile([1.0, 0.0], (8, 2, 1)))
     R, p = estimates(engine)
     marks = np.array([engine.view("position")[:, k] for k in range(14)]).swapaxes(0, 1)
     found = []
