@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 SENSED = {"topology.mode": "sensed"}
-ENVIRONMENT, TRAINED = "busy_intersection", "urban_crossing"
+ENVIRONMENT, TRAINED, LEARNING = "busy_intersection", "urban_crossing", "open_square"
 OBSERVERS = ("riccati", "robust")
 SIZES = (4_096, 16_384, 65_536, 262_144)
 
@@ -42,6 +42,9 @@ def plan(device: str, sizes: tuple[int, ...] = SIZES, quick: bool = False) -> li
             stages.append(
                 Stage(f"throughput, {observer}, {size}", "throughput", 40.0, {**world, **pace, "worlds": size})
             )
+        drawn = {**world, **pace, "environment": LEARNING, "overrides": {"observer.name": observer}}
+        name = f"throughput, {observer} in {LEARNING}, {sizes[0]}"
+        stages.append(Stage(name, "throughput", 60.0, {**drawn, "worlds": sizes[0]}))
         if observer == OBSERVERS[0]:
             stages += [Stage("training", "training", 120.0, _training(device, quick)), _tests(device, quick)]
     return stages

@@ -84,9 +84,11 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.connected, self.lane_keeping = connected, lane_keeping
         self._load = partial(load_scenario, scenario)
         self._overrides = {**(overrides or {}), **({} if sensing is None else {"sensing": sensing})}
-        if self._load(self._overrides).highway is None:
+        declared = self._load(self._overrides).highway
+        if declared is None:
             raise CoopenvError(f'EstimatedKinematics: {scenario} has not backend = "highway"')
-        self._engines: dict[int, Engine] = {}
+        self._most = declared.most_vehicles
+        self._engines: dict[tuple[int, int], Engine] = {}
         self._rng = np.random.default_rng()
         self._cars: list[Any] = []  # connected ones, then the agent's, which hears all of them
 
@@ -114,6 +116,8 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
         traffic = [car for car in road.vehicles if car is not agent]
         traffic.sort(key=lambda car: float(np.linalg.norm(car.position - agent.position)))
         self._cars = [*traffic[: self.connected], agent]
+        while self._most < 2 * len(road.vehicles):  # traffic may join later
+            self._most *= 2
         road.step = partial(self._step_road, road.step)
         self.highway.observation_type.observe = partial(self._observe, self.highway.observation_type.observe)
         if self.lane_keeping:
@@ -130,16 +134,16 @@ class EstimatedKinematics(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     @property
     def _engine(self) -> Engine:
-        """Sensors and observers for as many cars as there are."""
-        count = len(self._cars)
-        if count not in self._engines:
+        """Sensors and observers for as many cars as there are, among at most so many."""
+        count, most = len(self._cars), self._most
+        if (count, most) not in self._engines:
             frequency = float(self.highway.config["simulation_frequency"])
             cars = [{"motion": {"kind": "traffic"}}] * (count - 1) + [{"motion": {"kind": "driven"}}]
             rates = {"rates.camera": frequency, "rates.decision": frequency, "rates.odometry": 5.0 * frequency}
-            fixed = {"horizon": LONGEST, "vehicles": cars, "routes": [], **rates}
+            fixed = {"horizon": LONGEST, "vehicles": cars, "routes": [], "highway.most_vehicles": most, **rates}
             scenario: Scenario = self._load({**self._overrides, **fixed})
-            self._engines[count] = Engine(scenario, 1, backend=Followed(scenario))
-        return self._engines[count]
+            self._engines[count, most] = Engine(scenario, 1, backend=Followed(scenario))
+        return self._engines[count, most]
 
     @property
     def _world(self) -> FollowedWorld:

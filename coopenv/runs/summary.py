@@ -73,7 +73,8 @@ def _vehicles(scenario: Scenario) -> str:
         own.max_speed for own, v in zip(scenario.limits, scenario.vehicles, strict=True) if v.motion.kind == "driven"
     ]
     parts = [f"{driven} driven by actions, up to {_span(fastest)} m/s"] if driven else []
-    others = f"{len(scenario.vehicles) - driven} " + ("in traffic" if scenario.highway else "with prescribed motion")
+    prescribed = "prescribed" if driven else "with prescribed motion"
+    others = f"{len(scenario.vehicles) - driven} " + ("in traffic" if scenario.highway else prescribed)
     parts += [others] if driven < len(scenario.vehicles) else []
     return "; ".join([*parts, *([f"{goals} with a goal"] if goals else [])])
 

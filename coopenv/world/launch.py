@@ -59,6 +59,13 @@ def kernel(function: Function, precision_name: str, differentiable: bool = False
     return wp.Kernel(func=function, key=function.__name__, module=module)
 
 
+def run_seldom() -> dict[str, Any]:
+    """Return options of kernels that run once per episode: compiled sooner, without Warp's far inlining."""
+    flags = (wp.config.cpu_compiler_flags or "").split()
+    kept = " ".join(flag for flag in flags if not flag.startswith("-mllvm"))
+    return {"cpu_compiler_flags": kept} if len(kept.split()) < len(flags) else {}
+
+
 def default_threads(worlds: int, device: str) -> int:
     """Return how many threads to split a batch over: all cores (or COOPENV_THREADS) on the CPU, if it is large."""
     if device != "cpu":

@@ -12,6 +12,7 @@ import warp as wp
 
 from coopenv.world.command import decide
 from coopenv.world.embedded import Embedded, Now, Source, regular_tick
+from coopenv.world.launch import run_seldom
 from coopenv.world.quality import sample_gramian
 from coopenv.world.v2x import broadcast
 
@@ -85,7 +86,7 @@ def restart_kernel(source: Source, observer: Embedded) -> Kernel:
                 start(model, state, memory, world, vehicle)
                 send(model, state, memory, world, vehicle, 0)
 
-    return _named(restart, source.name, observer.name, **observer.options)
+    return _named(restart, source.name, observer.name, **{**run_seldom(), **observer.options})
 
 
 def decide_kernel(model: Any, state: Any, actions: wp.array3d(dtype=Any), hold: wp.array(dtype=wp.int32)):

@@ -190,7 +190,7 @@ def test_a_run_says_who_was_absent() -> None:
     assert "2 absent" in outcome_line(run)
 
 
-@pytest.mark.parametrize("observer", ["riccati", "robust", "mekf"])
+@pytest.mark.parametrize("observer", ["riccati", "robust", pytest.param("mekf", marks=pytest.mark.slow)])
 def test_observers_know_where_landmarks_have_been_drawn(observer: str) -> None:
     """Embedded and on the host: without noise the estimate goes to the truth, whatever the map."""
     group = {"name": "g", "count": 6, "boxes": [{"center": [0, 0], "half": [6, 6]}], "height": [0.5, 3.0]}

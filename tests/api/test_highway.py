@@ -13,6 +13,7 @@ from coopenv import CoopenvError
 pytest.importorskip("highway_env", reason="needs the extra highway")
 
 from gymnasium.utils.env_checker import check_env
+from highway_env.envs.highway_env import HighwayEnv
 from highway_env.envs.intersection_env import IntersectionEnv, MultiAgentIntersectionEnv
 from highway_env.envs.roundabout_env import RoundaboutEnv
 
@@ -97,6 +98,13 @@ def test_without_bearings_errors_grow() -> None:
     assert errors["ideal"] < errors["sensed"] < 0.2 < 1.0 < errors["blind"]
 
 
+def test_there_may_be_more_traffic_than_the_scenario_expects() -> None:
+    env = wrapped(HighwayEnv, config={"vehicles_count": 50}, overrides={"highway.most_vehicles": 8})
+    record = episode(env, 0, 2)
+    assert len(env.highway.road.vehicles) > 40
+    assert all(np.isfinite(step[-1]["localisation"]["position_error"]) for step in record)
+
+
 def test_its_own_control_may_act_on_the_estimate() -> None:
     aside = {}
     for lane_keeping in (False, True):
@@ -106,7 +114,7 @@ def test_its_own_control_may_act_on_the_estimate() -> None:
     assert aside[False] < 0.01 and aside[True] > 0.3
 
 
-@pytest.mark.parametrize("observer", ["riccati", "mekf"])
+@pytest.mark.parametrize("observer", ["riccati", pytest.param("mekf", marks=pytest.mark.slow)])
 def test_any_observer_and_any_observation(observer: str) -> None:
     config = {"observation": {"type": "OccupancyGrid", "features": ["presence", "vx", "vy"]}}
     env = wrapped(config=config, overrides={"observer.name": observer})

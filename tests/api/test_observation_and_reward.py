@@ -65,9 +65,12 @@ def drivers(scenario: Any) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
 
 
 @cache
-def run(name: str, driver: str) -> Run:
+def run(name: str, driver: str, weight: float | None = None) -> Run:
+    """Drive all vehicles; with a weight of the price of uncertainty other than the file's."""
     vehicles = len(KNOWN[name].vehicles)
-    envs = coopenv.make_vec(name, num_worlds=24 if vehicles <= 4 else 48 // vehicles, autoreset="disabled")
+    overrides = {} if weight is None else {"reward.weights.position_uncertainty": weight}
+    worlds = 24 if vehicles <= 4 else 48 // vehicles
+    envs = coopenv.make_vec(name, num_worlds=worlds, autoreset="disabled", overrides=overrides)
     engine, policy = envs.engine, drivers(envs.scenario)[driver]
     term = engine.reward_terms.index("position_uncertainty")
     observations, _ = envs.reset(seed=3)
@@ -116,5 +119,14 @@ def test_the_price_of_uncertainty_goes_with_the_true_error(name: str) -> None:
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_standing_still_earns_least(name: str) -> None:
+    """Of those who stay on the road: who leaves it at full lock has an end of its own, and pays for that."""
     still = run(name, "stand").total
     assert all(run(name, driver).total > still for driver in ("follow", "slow", "look around"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("weight", [0.0, 1.0, 100.0])
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_standing_still_earns_least_at_any_weight(name: str, weight: float) -> None:
+    still = run(name, "stand", weight).total
+    assert all(run(name, driver, weight).total > still for driver in ("follow", "slow", "look around"))

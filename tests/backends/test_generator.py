@@ -52,7 +52,7 @@ def test_it_does_so_with_other_observers(observer: str) -> None:
     official_tests(of(observer))
 
 
-@pytest.mark.parametrize("observer", OBSERVERS)
+@pytest.mark.parametrize("observer", [*OBSERVERS[:2], pytest.param(OBSERVERS[2], marks=pytest.mark.slow)])
 def test_vehicles_find_out_where_they_are(observer: str) -> None:
     env = make(Fleet(observer), dtype="float64" if observer == "riccati" else "float32")
     last = rollout(env, 2, 100)[-1]

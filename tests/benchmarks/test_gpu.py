@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks.gpu import work
 from benchmarks.gpu.__main__ import PAGE, main
-from benchmarks.gpu.plan import OBSERVERS, SIZES, Stage, plan
+from benchmarks.gpu.plan import ENVIRONMENT, LEARNING, OBSERVERS, SIZES, Stage, plan
 from benchmarks.gpu.prepare import requirements
 from benchmarks.gpu.runner import failures, run
 from benchmarks.gpu.table import BEGIN, END, put, section
@@ -26,8 +26,9 @@ def test_every_stage_has_work_and_a_limit() -> None:
     assert all(stage.work in work.WORK and 0.0 < stage.limit <= 150.0 for stage in stages)
     assert len({stage.name for stage in stages}) == len(stages)
     batches = [stage.arguments for stage in stages if stage.work == "throughput"]
-    measured = {(batch["overrides"]["observer.name"], batch["worlds"]) for batch in batches}
-    assert measured == {(observer, size) for observer in OBSERVERS for size in SIZES}
+    measured = {(b["environment"], b["overrides"]["observer.name"], b["worlds"]) for b in batches}
+    sizes = {(ENVIRONMENT, observer, size) for observer in OBSERVERS for size in SIZES}
+    assert measured == sizes | {(LEARNING, observer, SIZES[0]) for observer in OBSERVERS}
     assert max(SIZES) == 262_144 and min(SIZES) == 4_096
 
 

@@ -28,7 +28,7 @@ def scenario(**more: Any) -> Scenario:
     return coopenv.load_scenario(FOUR_WAY, {**SMOOTH, **more})
 
 
-@pytest.fixture(scope="module", params=["speed", "acceleration"])
+@pytest.fixture(scope="module", params=["speed", pytest.param("acceleration", marks=pytest.mark.slow)])
 def made(request: pytest.FixtureRequest) -> Scenario:
     return scenario(**{"action.longitudinal": request.param})
 

@@ -91,7 +91,11 @@ def test_a_reset_by_mask_touches_the_masked_only() -> None:
 
 @pytest.mark.parametrize(
     ("dtype", "observer", "errors"),
-    [*((dtype, "robust", {}) for dtype in DTYPES), ("float64", "robust", LASTING), ("float64", "robust_joint", {})],
+    [
+        *((dtype, "robust", {}) for dtype in DTYPES),
+        ("float64", "robust", LASTING),
+        pytest.param("float64", "robust_joint", {}, marks=pytest.mark.slow),
+    ],
 )
 def test_a_saved_state_continues_as_if_nothing_happened(dtype: str, observer: str, errors: dict[str, float]) -> None:
     description = noisy(5.0, observer, **errors)
