@@ -12,7 +12,7 @@ from coopenv.evaluation import Difference, Episodes, compare_paired, drive, held
 from coopenv.policies import load_agent
 from coopenv.scenario import load_scenario
 
-WORLDS = {"open_square": 32, "facade": 48, "behind_truck": 48, "urban_crossing": 24, "large_crossing": 6}
+WORLDS = {"open_square": 48, "facade": 48, "behind_truck": 48, "urban_crossing": 48, "large_crossing": 6}
 """How many suffice for intervals that tell the drivers apart."""
 MOST_TIME = 0.05
 """Share of the travel time that looking may cost."""

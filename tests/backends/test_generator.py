@@ -52,9 +52,17 @@ def test_it_does_so_with_other_observers(observer: str) -> None:
     official_tests(of(observer))
 
 
-@pytest.mark.parametrize("observer", [*OBSERVERS[:2], pytest.param(OBSERVERS[2], marks=pytest.mark.slow)])
-def test_vehicles_find_out_where_they_are(observer: str) -> None:
-    env = make(Fleet(observer), dtype="float64" if observer == "riccati" else "float32")
+@pytest.mark.parametrize(
+    ("observer", "dtype"),
+    [
+        ("riccati", "float64"),
+        ("robust", "float32"),
+        pytest.param("robust", "float64", marks=pytest.mark.slow),
+        pytest.param("mekf", "float64", marks=pytest.mark.slow),
+    ],
+)
+def test_vehicles_find_out_where_they_are(observer: str, dtype: str) -> None:
+    env = make(Fleet(observer), dtype=dtype)
     last = rollout(env, 2, 100)[-1]
     for info in last[-1].values():
         assert info["position_error"] < 0.1 and info["orientation_error"] < 3.0
