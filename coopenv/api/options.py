@@ -98,9 +98,7 @@ def world_parameters(options: Mapping[str, Any], worlds: int, scenario: Scenario
             level = LEVELS[level]
         found["difficulty"] = _numbers("option 'difficulty'", level, worlds, 0.0, 1.0)
         if value is not None and not scenario.difficulty.matters:
-            raise CoopenvError(
-                "option 'difficulty': nothing depends on it here: no factors under [difficulty]"
-            )
+            raise CoopenvError("option 'difficulty': nothing depends on it here: no factors under [difficulty]")
     return found
 
 
