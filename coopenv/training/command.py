@@ -15,7 +15,8 @@ from coopenv.policies import load_agent
 from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE
 from coopenv.scenario import Scenario
 from coopenv.seeds import evaluation_seed
-from coopenv.training import checkpoint
+from coopenv.training import checkpoint, settings_file
+from coopenv.training.environment_file import environment_file
 from coopenv.training.export import EXPORTED, check_onnx, export
 from coopenv.training.settings import Plan
 from coopenv.training.trainer import DivergedError, Trainer
@@ -97,8 +98,8 @@ def train(
     Raises:
         CoopenvError: the plan does not describe a possible training, there is nothing to resume, there is an unfinished
             training that is not to be resumed, or the package onnx is missing.
-        OutputError: there is an agent that is not to be replaced, or something cannot be written; the last checkpoint
-            stays.
+        OutputError: there is an agent that is not to be replaced, or a `train.toml` of the user's with other settings,
+            or something cannot be written; the last checkpoint stays.
     """
     tell, path = reports or Reports(), out / CHECKPOINT_FILE
     scenario = possible(plan)
@@ -107,6 +108,7 @@ def train(
         raise CoopenvError(f"{out} holds an unfinished training: go on with --resume, or remove {path}")
     if kept is None and (out / AGENT_FILE).exists() and not force:
         raise OutputError(f"{out / AGENT_FILE}: exists already; --force replaces the agent")
+    settings_file.check(out, plan, environment_file(plan.environment).name)
     outputs = checkpoint.Outputs(onnx, logs)
     if kept is not None:
         outputs = outputs.or_else(kept.outputs)
@@ -127,6 +129,7 @@ def train(
             _learn(trainer, path, curve, outputs, threads, tell)
             results = _judge(trainer, held_out_seeds(0, worlds), threads, tell)
         with replacing_folder(out, (*NAMES, trainer.environment.name)) as folder:
+            settings_file.write(folder, out, plan, trainer.environment.name)
             export(folder, trainer, results, curve, outputs.onnx)
     finally:
         trainer.close()

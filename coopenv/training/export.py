@@ -22,7 +22,8 @@ from coopenv.policies.loader import AGENT_FILE
 from coopenv.policies.network import ENTRY, NetworkCard, layout_hash, layout_tables
 from coopenv.scenario import Scenario
 from coopenv.shipped import version
-from coopenv.training.settings import SETTINGS_FILE, Plan
+from coopenv.training import settings_file
+from coopenv.training.settings import SETTINGS_FILE
 from coopenv.training.trainer import Trainer
 
 WEIGHTS_FILE, CURVE_FILE, ONNX_FILE = "weights.safetensors", "curve.csv", "policy.onnx"
@@ -34,7 +35,7 @@ PACKAGES = ("numpy", "warp-lang", "torch", "stable-baselines3")
 def export(
     folder: Path, trainer: Trainer, results: Sequence[Result], curve: list[dict[str, float]], onnx: bool = False
 ) -> None:
-    """Write everything that an agent's folder holds.
+    """Write everything that an agent's folder holds, but for its settings (`settings_file.write`).
 
     Args:
         folder: to write to.
@@ -52,7 +53,6 @@ def export(
         (folder / WEIGHTS_FILE).write_bytes(weights)
         if trainer.environment.text is not None:
             (folder / trainer.environment.name).write_text(trainer.environment.text, encoding="utf-8")
-        (folder / SETTINGS_FILE).write_text(_settings(trainer.plan), encoding="utf-8")
         (folder / AGENT_FILE).write_text(_card(trainer, results, sha256(weights).hexdigest()), encoding="utf-8")
         if curve:
             with (folder / CURVE_FILE).open("w", newline="", encoding="utf-8") as file:
@@ -88,11 +88,6 @@ def scenario_digest(scenario: Scenario) -> str:
     return sha256(told.encode()).hexdigest()[:16]
 
 
-def _settings(plan: Plan) -> str:
-    values = plan.settings.model_dump(mode="json", exclude_none=True)
-    return tomlkit.dumps({**values, "scenario": plan.all_overrides})
-
-
 def _card(trainer: Trainer, results: Sequence[Result], digest: str) -> str:
     plan, environment = trainer.plan, trainer.environment
     observation, action = layout_tables(observation_layout(trainer.scenario))
@@ -119,6 +114,7 @@ def _card(trainer: Trainer, results: Sequence[Result], digest: str) -> str:
         "environment": environment.name,
         "seed": plan.seed,
         "scenario": scenario_digest(trainer.scenario),
+        "settings": settings_file.settings_digest(plan),
         **({"arm": plan.arm} if plan.arm else {}),
         "steps": trainer.status.steps,
         "minutes": round(trainer.status.seconds / 60.0, 2),

@@ -334,6 +334,24 @@ def test_a_forced_training_replaces_an_agent_and_its_cards_at_its_end(here: Path
     assert not list((here / "agent").glob("card.*"))
 
 
+@pytest.mark.slow
+def test_settings_in_the_agents_folder_stay_as_the_user_wrote_them(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (here / "agent").mkdir()
+    mine = here / "agent" / "train.toml"
+    mine.write_text(f"# my own words\n{SETTINGS.replace('3000', '400')}")
+    before = mine.read_bytes()
+    own = command("--settings", "agent/train.toml")
+    assert main([*own, "--steps", "800"]) == 2
+    assert capsys.readouterr().err.startswith("error: agent/train.toml: no agent's, and this training has other")
+    assert [path.name for path in (here / "agent").iterdir()] == ["train.toml"]
+    for arguments in (own, [*own, "--force"]):
+        assert main(arguments) == 0
+        assert mine.read_bytes() == before
+    assert read_card(here / "agent").training["steps"] == 400
+
+
 def test_without_onnx_no_training_begins(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(CoopenvError, match="--onnx needs the package onnx"):
