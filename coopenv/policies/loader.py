@@ -1,5 +1,6 @@
 """Find and load drivers: a folder of `agents/`, a folder anywhere, or a place in code."""
 
+import shlex
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -22,6 +23,8 @@ CARD_FILES = ("card.json", "card.md")
 """What `coopenv evaluate --write-card` writes beside it."""
 CHECKPOINT_FILE = "checkpoint.safetensors"
 """What stands in its place while an agent is trained."""
+LATER_FIELDS = {"center", "settings"}
+"""Of a learned agent's tables: what the first versions did not write, and cannot be guessed."""
 
 
 class AgentCard(BaseModel):
@@ -90,15 +93,32 @@ def read_card(folder: Path) -> AgentCard:
         CoopenvError: the file is not valid.
     """
     path = folder / AGENT_FILE
+    raw: dict[str, Any] = {}
     try:
-        return AgentCard.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        raw = tomllib.loads(path.read_text(encoding="utf-8"))
+        return AgentCard.model_validate(raw)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise CoopenvError(f"{path}: not valid TOML: {error}") from None
     except OSError as error:
         raise CoopenvError(f"{path}: cannot be read: {error.strerror or error}") from None
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise CoopenvError(f"{path}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        errors = error.errors(include_url=False)
+        if all(each["type"] == "missing" and each["loc"][-1] in LATER_FIELDS for each in errors):
+            renewal = _training_anew(folder, raw.get("training"))
+            raise CoopenvError(f"{path}: saved by an earlier version of coopenv; train it anew: {renewal}") from None
+        raise CoopenvError(f"{path}: {'.'.join(map(str, errors[0]['loc']))}: {errors[0]['msg']}") from None
+
+
+def _training_anew(folder: Path, training: Any) -> str:
+    """Return the command that puts an agent in the place of one that was trained by an earlier version."""
+    told = training if isinstance(training, dict) else {}
+    name = str(told.get("environment", "ENV"))
+    words = ["coopenv", "train", str(folder / name) if name.endswith(".toml") else name]
+    if (folder / "train.toml").is_file():
+        words += ["--settings", str(folder / "train.toml")]
+    if "seed" in told:
+        words += ["--seed", str(told["seed"])]
+    return shlex.join([*words, "--out", str(folder), "--force"])
 
 
 def find_agent(name_or_place: str | Path) -> Agent:

@@ -13,7 +13,7 @@ from safetensors.numpy import save
 
 import coopenv
 from coopenv.api.terms.layout import observation_layout, settings_of_meaning
-from coopenv.policies import load_agent
+from coopenv.policies import find_agent, load_agent
 from coopenv.policies.network import Network, NetworkCard, layout_hash, layout_tables
 from tests.helpers.four_way import FOUR_WAY
 
@@ -163,3 +163,45 @@ def test_an_incomplete_card_names_the_field(tmp_path: Path) -> None:
     )
     with pytest.raises(coopenv.CoopenvError, match=r"agent\.toml: network\.clip: Input should be a valid number"):
         load_agent(tmp_path, coopenv.load_scenario(ENV))
+
+
+OLD = """
+title = "Old"
+description = "Of an earlier version."
+kind = "learned"
+entry = "coopenv.policies.network:Network"
+environments = ["{environment}"]
+[network]
+weights = "weights.safetensors"
+sha256 = "0"
+layout = "0"
+clip = 6.0
+{network}
+[training]
+{training}
+"""
+NO_CENTER = """settings = {}
+observation = { goal = {start = 0, stop = 2, low = -1.0, high = 1.0, scale = 8.0, unit = "m"} }
+action = {}"""
+NO_SETTINGS = "observation = {}\naction = {}"
+
+
+@pytest.mark.parametrize(
+    ("network", "training", "command"),
+    [
+        (NO_CENTER, 'environment = "facade"\nseed = 3', "facade --settings old/train.toml --seed 3 --out old --force"),
+        (NO_SETTINGS, 'environment = "my.toml"', "old/my.toml --settings old/train.toml --out old --force"),
+        (NO_SETTINGS, "", "ENV --settings old/train.toml --out old --force"),
+    ],
+)
+def test_one_of_an_earlier_version_is_told_how_to_train_it_anew(
+    network: str, training: str, command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "train.toml").write_text("")
+    (tmp_path / "old" / "agent.toml").write_text(OLD.format(environment="facade", network=network, training=training))
+    with pytest.raises(coopenv.CoopenvError) as error:
+        find_agent("old")
+    told = "old/agent.toml: saved by an earlier version of coopenv; train it anew: coopenv train"
+    assert str(error.value) == f"{told} {command}"
