@@ -11,11 +11,14 @@ from rich.console import Console
 from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
+from coopenv.world import kernel_cache
+from coopenv.world.launch import start_warp
+
 T = TypeVar("T")
 
 LINE_PERIOD = 10.0  # s between lines of progress where there is no terminal
 HINT_FROM = 20.0  # s of work left after the first piece of it, from which on there is a line at once
-COMPILE_NOTICE_AFTER = 1.5  # s; kernels in the cache load well within it, compiling takes longer
+COMPILE_NOTICE_AFTER = 1.5  # s between looks for what is being compiled; less need not be told
 
 
 class Progress:
@@ -89,11 +92,18 @@ class Progress:
 
 @contextmanager
 def compile_notice(log: Console) -> Iterator[None]:
-    """Say what takes so long when kernels are not found in Warp's cache."""
-    timer = threading.Timer(COMPILE_NOTICE_AFTER, lambda: log.print("compiling kernels (once per machine) ..."))
-    timer.daemon = True
-    timer.start()
+    """Say what takes so long where Warp compiles kernels that are not in its cache."""
+    start_warp()
+    before, over = kernel_cache.modules(), threading.Event()
+
+    def watch() -> None:
+        while not over.wait(COMPILE_NOTICE_AFTER):
+            if kernel_cache.modules() - before:
+                log.print("compiling kernels (once per machine) ...")
+                return
+
+    threading.Thread(target=watch, daemon=True).start()
     try:
         yield
     finally:
-        timer.cancel()
+        over.set()

@@ -62,6 +62,14 @@ def cache_folder() -> Path:
     return Path(wp.config.kernel_cache_dir or "")
 
 
+def modules() -> set[str]:
+    """Return the names of the folders of compiled modules; those that are being compiled have one, too."""
+    try:
+        return {entry.name for entry in cache_folder().iterdir()}
+    except OSError:
+        return set()
+
+
 def probe() -> None:
     """Make sure that the cache can be written. Raises KernelCacheError: it cannot."""
     with _written(), tempfile.TemporaryFile(dir=cache_folder()) as stream:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from pathlib import Path
 from time import sleep
 
 import pytest
@@ -10,6 +11,7 @@ from rich.console import Console
 
 from coopenv.runs import console as module
 from coopenv.runs.console import Progress, compile_notice
+from coopenv.world import kernel_cache
 
 
 @pytest.fixture
@@ -64,8 +66,35 @@ def test_an_error_ends_the_lines(text: io.StringIO) -> None:
     assert not progress._lines.is_alive()
 
 
-def test_compiling_is_told_when_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "COMPILE_NOTICE_AFTER", 0.01)
+@pytest.fixture
+def looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
+    """Let kernels be kept in a folder of their own, with one in it, and return a list of what is found there."""
+    looked: list[set[str]] = []
+    modules = kernel_cache.modules
+
+    def look() -> set[str]:
+        looked.append(modules())
+        return looked[-1]
+
+    monkeypatch.setattr(module, "COMPILE_NOTICE_AFTER", 0.001)
+    monkeypatch.setattr(kernel_cache, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(kernel_cache, "modules", look)
+    (tmp_path / "wp_known_0123456").mkdir()
+    return looked
+
+
+def test_compiling_is_told_once(looks: list[set[str]], tmp_path: Path) -> None:
     text = io.StringIO()
     with compile_notice(Console(file=text)):
+        (tmp_path / "wp_new_0123456_p1_t2").mkdir()
         wait_for(text, "compiling kernels (once per machine) ...\n")
+        (tmp_path / "wp_newer_0123456").mkdir()
+    assert text.getvalue().count("compiling") == 1
+
+
+def test_loading_what_is_in_the_cache_is_not_compiling(looks: list[set[str]]) -> None:
+    text = io.StringIO()
+    with compile_notice(Console(file=text)):
+        while len(looks) < 10:
+            sleep(0.001)
+    assert text.getvalue() == ""
