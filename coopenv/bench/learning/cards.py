@@ -22,24 +22,26 @@ BASELINES = ("route_follower", "peek", "look_ahead")
 COMPARED = ("arrival_rate", "collision_rate", "travel_time_s", "e50_m", "e95_m")
 
 
-def stale_groups(study: Study, folder: Path) -> list[Group]:
-    """Return the groups with finished runs whose card does not tell of just these."""
-    finished = {group: _finished(study, group, folder) for group in study.groups}
-    return [group for group, runs in finished.items() if runs and runs != _told(folder / group.name)]
+def finished_groups(study: Study, folder: Path) -> dict[Group, list[Run]]:
+    """Return the runs that are finished, as study and environments are now, of each group that has any."""
+    done = {group: [Run(group, seed) for seed in study.seeds] for group in study.groups}
+    done = {group: [run for run in runs if is_finished(study, run, folder)] for group, runs in done.items()}
+    return {group: runs for group, runs in done.items() if runs}
 
 
-def is_current(study: Study, group: Group, folder: Path) -> bool:
-    """Return whether a group has a card that tells of its finished runs, as study and environment are now."""
-    runs = _finished(study, group, folder)
-    return bool(runs) and runs == _told(folder / group.name)
+def is_told(group: Group, runs: Sequence[Run], folder: Path) -> bool:
+    """Return whether a group has a card that tells of just these finished runs."""
+    seeds = cards.read(folder / group.name).get("study", {}).get("seeds", {})
+    told = {int(seed): entry["runs"]["sha256"] for seed, entry in seeds.items()}
+    return told == {run.seed: _trained(folder / run.folder)["sha256"] for run in runs}
 
 
-def write(study: Study, group: Group, folder: Path, judge: Judge) -> None:
+def write(study: Study, group: Group, finished: Sequence[Run], folder: Path, judge: Judge) -> None:
     """Write the agent and the card of a group of which some runs are finished.
 
     Which seed is the best is decided by the return that it learnt from, in held-out worlds of their own.
     """
-    runs = {seed: Run(group, seed) for seed in _finished(study, group, folder)}
+    runs = {run.seed: run for run in finished}
     overrides, place = study.settings[group].scenario, folder / group.name
     merits = {seed: judge.merit(group.environment, folder / run.folder, overrides) for seed, run in runs.items()}
     best = max(merits, key=lambda seed: merits[seed])
@@ -80,19 +82,6 @@ def write(study: Study, group: Group, folder: Path, judge: Judge) -> None:
     }
     replace_text(place / cards.JSON_FILE, json_text(card))
     replace_text(place / cards.TEXT_FILE, cards.text(description, card))
-
-
-def _finished(study: Study, group: Group, folder: Path) -> dict[int, str]:
-    """Return the digest of the weights of every seed that is finished."""
-    runs = {seed: Run(group, seed) for seed in study.seeds}
-    done = {seed: folder / run.folder for seed, run in runs.items() if is_finished(study, run, folder)}
-    return {seed: _trained(place)["sha256"] for seed, place in done.items()}
-
-
-def _told(place: Path) -> dict[int, str]:
-    """Return the digests of which a card tells."""
-    seeds = cards.read(place).get("study", {}).get("seeds", {})
-    return {int(seed): entry["runs"]["sha256"] for seed, entry in seeds.items()}
 
 
 def _trained(place: Path) -> dict[str, Any]:

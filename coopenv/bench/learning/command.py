@@ -43,11 +43,12 @@ def run(study: Study, part: Study, folder: Path, logs: Path, jobs: int, worlds: 
     folder.mkdir(parents=True, exist_ok=True)
 
     def judge_finished() -> None:
-        stale = cards.stale_groups(study, folder)
-        for group in stale:
-            cards.write(study, group, folder, judge)
+        finished = cards.finished_groups(study, folder)
+        stale = {group: runs for group, runs in finished.items() if not cards.is_told(group, runs, folder)}
+        for group, runs in stale.items():
+            cards.write(study, group, runs, folder, judge)
         if stale or not (folder / overview.PAGE_FILE).exists():
-            overview.write(study, folder, judge)
+            overview.write(list(finished), folder, judge)
 
     with Progress(
         log, f"{total - len(missing)} of {total} trainings were done", total=len(missing) or None

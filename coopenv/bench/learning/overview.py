@@ -8,9 +8,9 @@ from typing import Any
 from coopenv.bench.agents import cards, table
 from coopenv.bench.agents.seeds_section import percent
 from coopenv.bench.agents.table import cell
-from coopenv.bench.learning.cards import COMPARED, is_current, relative
+from coopenv.bench.learning.cards import COMPARED, relative
 from coopenv.bench.learning.judge import Judge
-from coopenv.bench.learning.study import Group, Study
+from coopenv.bench.learning.study import Group
 from coopenv.evaluation import Difference
 from coopenv.files import replace_text
 
@@ -30,14 +30,12 @@ LEGEND = """With 95 % intervals over {worlds} held-out worlds, the same for all;
 vehicles under way, from 3 s on; e95 of seeds in their order."""
 
 
-def write(study: Study, folder: Path, judge: Judge) -> None:
-    """Write the page of all agents that have a card; it leaves out those that are to be trained anew."""
+def write(groups: Sequence[Group], folder: Path, judge: Judge) -> None:
+    """Write the page of agents, each of which has a card; those that are to be trained anew are left out of it."""
     parts = [INTRODUCTION]
-    for environment in study.environments:
-        groups = [group for group in study.groups if group.environment == environment]
-        found = {group: cards.read(folder / group.name) for group in groups if is_current(study, group, folder)}
-        if found:
-            parts.append(_section(environment, found, folder, judge))
+    for environment in dict.fromkeys(group.environment for group in groups):
+        found = {group: cards.read(folder / group.name) for group in groups if group.environment == environment}
+        parts.append(_section(environment, found, folder, judge))
     replace_text(folder / PAGE_FILE, "\n".join(parts))
 
 

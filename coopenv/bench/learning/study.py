@@ -65,11 +65,6 @@ class Study:
         return list(self.settings)
 
     @property
-    def environments(self) -> list[str]:
-        """In their order."""
-        return list(dict.fromkeys(group.environment for group in self.settings))
-
-    @property
     def runs(self) -> Iterator[Run]:
         """All trainings; every agent's first one before any agent's second."""
         return (Run(group, seed) for seed in self.seeds for group in self.groups)
