@@ -19,6 +19,7 @@ class RouteFollower(Driver):
         cruise: float | None = None,
         look_ahead: float = 1.0,
         clearance: float = 0.9,
+        closest: float = 0.75,
         foresight: float = 6.0,
     ) -> None:
         """Choose the manner of driving.
@@ -27,11 +28,12 @@ class RouteFollower(Driver):
             scenario: of the environment.
             cruise: speed when nothing is in the way, m/s; also what others are expected to drive (None: top speed).
             look_ahead: distance of the point of the way that is pursued, m.
-            clearance: distance to keep between reference points, m.
+            clearance: distance to keep between reference points, m, where it does not know how sure it is of its own.
+            closest: distance to keep where it is sure, m; its standard deviation is added, up to `clearance`.
             foresight: how far ahead to look for others, s.
         """
         super().__init__(scenario, cruise=cruise, look_ahead=look_ahead)
-        self.clearance, self.foresight = clearance, foresight
+        self.clearance, self.closest, self.foresight = clearance, closest, foresight
 
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
         """See `Driver.drive`."""
@@ -55,7 +57,14 @@ class RouteFollower(Driver):
         going = nearest(points, distance / self.cruise, place, self.cruise * forward, mask, self.foresight)
         stay = np.zeros((len(observations), 2, 2))
         waiting = nearest(stay, np.array([0.0, 1.0]), place, self.cruise * forward, mask, self.foresight)
-        return np.where((going >= self.clearance) | (going > waiting), self.cruise, 0.0)
+        return np.where((going >= self.distance_to_keep(observations)) | (going > waiting), self.cruise, 0.0)
+
+    def distance_to_keep(self, observations: np.ndarray) -> np.ndarray | float:
+        """Return how far from others to stay, m, one or (rows,): farther, the less sure one is of one's own place."""
+        if "position_std" not in self.layout:
+            return self.clearance
+        std = 10.0 ** self.read(observations, "position_std")[:, 0]
+        return np.asarray(np.minimum(self.closest + std, self.clearance))
 
 
 def nearest(
