@@ -120,6 +120,12 @@ def test_giving_way(x: float, y: float, angle: float, speed: float) -> None:
     assert RouteFollower(SCENARIO).speed(observation(**other(x, y, angle)))[0] == speed
 
 
+@pytest.mark.parametrize(("std", "speed"), [(0.03, 1.0), (0.3, 0.0)])
+def test_who_is_sure_of_its_place_passes_closer(std: float, speed: float) -> None:
+    crossing = other(3.0, -(3.0 - 0.83 * np.sqrt(2.0)), np.pi / 2)  # passes 0.83 m away
+    assert RouteFollower(SCENARIO).speed(observation(position_std=np.log10(std), **crossing))[0] == speed
+
+
 def test_the_nearest_approach_is_that_of_fine_steps() -> None:
     rng = np.random.default_rng(2)
     path = np.cumsum(np.concatenate([np.zeros((6, 1, 2)), rng.normal(size=(6, 3, 2))], axis=1), axis=1)
