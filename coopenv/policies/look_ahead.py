@@ -2,10 +2,11 @@
 
 from functools import partial
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
-from coopenv.policies.belief import Belief
+from coopenv.policies.belief import LEAST_ODDS, Belief
 from coopenv.policies.occluders import Occluders, unhidden
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.policies.view import FieldOfView
@@ -15,7 +16,34 @@ OFFSETS = (0.0, 0.2, -0.2, 0.4, -0.4, 0.6, -0.6, 0.8, -0.8)  # rad, of the headi
 STEP, FIRST, STEPS = 0.4, 4, 10  # s; steps with the first of two offsets; steps in all
 HOLD = 2  # decisions that a plan is kept
 OUTSIDE, BACK = 5.0, 0.5  # s/s for each metre too far out; s for each metre from the way at the end of a plan
+LEAST_BEARING_STD = 0.001  # rad, of a frame: where there is no noise to speak of
+BENT = 4.0  # weight of what the linearisation of a bearing leaves out
 FAR = 3.0  # m, how much farther one would drive blind after a plan
+
+
+class _Path(NamedTuple):
+    """Where plans have led to, (rows, plans) each, m and rad, in the own frame of the start."""
+
+    x: np.ndarray
+    y: np.ndarray
+    heading: np.ndarray
+    along: np.ndarray
+    """Way made."""
+    aside: np.ndarray
+    """To the left of the way."""
+
+    def moved(
+        self, wanted: np.ndarray, bend: np.ndarray, stride: float, most: float
+    ) -> tuple["_Path", np.ndarray, np.ndarray]:
+        """Return the path a stride farther, turned to a wanted heading by so much at most, and its displacement."""
+        heading = self.heading + np.clip((wanted - self.heading + np.pi) % (2 * np.pi) - np.pi, -most, most)
+        dx, dy = stride * np.cos(heading), stride * np.sin(heading)
+        along = self.along + stride * np.cos(heading - bend)
+        return _Path(self.x + dx, self.y + dy, heading, along, self.aside + stride * np.sin(heading - bend)), dx, dy
+
+    def repeated(self, count: int) -> "_Path":
+        """Return every plan so many times in a row."""
+        return _Path(*(np.repeat(part, count, axis=1) for part in self))
 
 
 class LookAhead(RouteFollower):
@@ -33,8 +61,6 @@ class LookAhead(RouteFollower):
         *,
         price: float = 4.0,
         tolerated: float = 0.02,
-        bearing_std: float = 0.01,
-        drift: float = 0.05,
         farthest: float = 0.8,
     ) -> None:
         """Choose what matters.
@@ -43,16 +69,20 @@ class LookAhead(RouteFollower):
             scenario: of the environment.
             price: seconds that a second with a standard deviation of 1 m is worth.
             tolerated: standard deviation that costs nothing, m.
-            bearing_std: of what one step tells of a landmark in view, rad.
-            drift: growth of the standard deviation by odometry, m per root metre.
             farthest: offset from the way that costs nothing, m.
         """
         super().__init__(scenario)
         self.view, self.occluders = FieldOfView(scenario.camera), Occluders(scenario, self.layout)
         self.price, self.tolerated, self.farthest = price, tolerated, farthest
-        self.information, self.drift = bearing_std**-2, drift**2
+        noise, rates = scenario.noise, scenario.rates
+        per_second = rates.odometry if noise.odometry_rate == "sample" else noise.odometry_rate
+        self.drift = noise.velocity**2 / per_second + (noise.odometry_scale * self.cruise) ** 2  # m^2/s
+        self.turn_drift = noise.angular_velocity**2 / per_second + np.max(noise.gyro_bias) ** 2  # rad^2/s
+        self.bearing = max(noise.bearing.scale, LEAST_BEARING_STD) ** 2
+        self.frames = rates.camera if noise.bearing.rate == "sample" else noise.bearing.rate
         plans = product(OFFSETS, repeat=2)
         self._first, self._second = (np.array(part, dtype=np.float32) for part in zip(*plans, strict=True))
+        self._offsets = np.array(OFFSETS, dtype=np.float32)
         self._sharpest = np.tan(self.layout.action[1].high) / self.wheelbase  # rad/m
         self._left = np.zeros(0, dtype=int)
         self._plan = np.zeros(0, dtype=int)
@@ -83,33 +113,37 @@ class LookAhead(RouteFollower):
         way, bends = self._way(observations)
         landmarks = self.read(observations, "map_position")[..., :2]
         boxes = self.occluders.boxes(partial(self.read, observations))
-        known = self.information * self.known(observations)[:, None]
-        belief = self._belief(observations)
-        shape = len(observations), len(self._first)
+        known = self.known(observations)[:, None]
+        belief, offsets, now = self._belief(observations), self._offsets, self._start(observations)
+        cost, stride = np.zeros_like(now.x), self.cruise * STEP
+        for step in range(STEPS):
+            if step == FIRST:  # each first leg goes on with each second one
+                count = len(self._offsets)
+                now, belief, cost = now.repeated(count), belief.repeated(count), np.repeat(cost, count, axis=1)
+                offsets = np.tile(self._offsets, count)
+            bend = np.take_along_axis(way, np.searchsorted(bends, now.along, side="right") - 1, axis=1)
+            wanted = bend + np.where(offsets == 0.0, -np.arctan(now.aside / self.look_ahead), offsets)
+            now, dx, dy = now.moved(wanted, bend, stride, self._sharpest * stride)
+            belief = belief.driven(dx, dy, self.drift * STEP, self.turn_drift * STEP)
+            place = np.stack([now.x, now.y], axis=-1)
+            line = landmarks[:, None] - place[:, :, None]
+            bearing, radial, lateral = belief.along(line)
+            odds = self.view.odds(line, now.heading[..., None], np.sqrt(bearing), np.sqrt(radial)) * known
+            camera = place + self.view.ahead * np.stack([np.cos(now.heading), np.sin(now.heading)], axis=-1)
+            odds = odds * unhidden(boxes, odds > LEAST_ODDS, camera, landmarks, stride * (step + 1))
+            bend_variance = BENT * radial * lateral / np.maximum((line**2).sum(axis=-1), 0.01) ** 2
+            belief = belief.measured(line, (self.bearing + bend_variance) / (self.frames * STEP), odds)
+            cost = cost + STEP * self.price * np.maximum(belief.std - self.tolerated, 0.0)
+            cost = cost + STEP * OUTSIDE * np.maximum(np.abs(now.aside) - self.farthest, 0.0)
+        later = belief.driven(FAR * np.cos(now.heading), FAR * np.sin(now.heading), 0.0, 0.0)
+        cost = cost + self.price * FAR / self.cruise * np.maximum(later.std - self.tolerated, 0.0)
+        return np.asarray(cost - now.along / self.cruise + BACK * np.abs(now.aside))
+
+    def _start(self, observations: np.ndarray) -> "_Path":
+        shape = len(observations), len(self._offsets)
         x, y, heading, along = (np.zeros(shape, dtype=np.float32) for _ in range(4))
         aside = np.repeat(self.read(observations, "route_offset"), shape[1], axis=1)
-        cost = np.zeros(shape)
-        stride = self.cruise * STEP
-        for step in range(STEPS):
-            bend = np.take_along_axis(way, np.searchsorted(bends, along, side="right") - 1, axis=1)
-            offset = self._first if step < FIRST else self._second
-            wanted = bend + np.where(offset == 0.0, -np.arctan(aside / self.look_ahead), offset)
-            most = self._sharpest * stride
-            heading = heading + np.clip((wanted - heading + np.pi) % (2 * np.pi) - np.pi, -most, most)
-            dx, dy = stride * np.cos(heading), stride * np.sin(heading)
-            x, y = x + dx, y + dy
-            along = along + stride * np.cos(heading - bend)
-            aside = aside + stride * np.sin(heading - bend)
-            place, forward = np.stack([x, y], axis=-1), np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-            line = landmarks[:, None] - place[:, :, None]
-            seen = self.view.sees(line, heading[..., None]) & (known > 0.0)
-            seen = unhidden(boxes, seen, place + self.view.ahead * forward, landmarks, stride * (step + 1))
-            belief = belief.driven(dx, dy, self.drift * stride, 1e-5).measured(line, known * seen)
-            cost += STEP * self.price * np.maximum(belief.std - self.tolerated, 0.0)
-            cost += STEP * OUTSIDE * np.maximum(np.abs(aside) - self.farthest, 0.0)
-        later = belief.driven(FAR * np.cos(heading), FAR * np.sin(heading), 0.0, 0.0)
-        cost += self.price * FAR / self.cruise * np.maximum(later.std - self.tolerated, 0.0)
-        return np.asarray(cost - along / self.cruise + BACK * np.abs(aside))
+        return _Path(x, y, heading, along, aside)
 
     def _way(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the directions of the pieces of the way, (rows, P), rad, own frame, and where they begin, (P,), m."""

@@ -30,10 +30,29 @@ class FieldOfView:
             offset: (..., 2), m, from the vehicle's reference point.
             heading: (...), rad, of the camera, in the same frame.
         """
-        forward = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-        line = offset - self.ahead * forward
-        along = (line * forward).sum(axis=-1)
-        aside = forward[..., 0] * line[..., 1] - forward[..., 1] * line[..., 0]
-        angle = np.arctan2(aside, along)
-        near = (line**2).sum(axis=-1) <= self.reach**2
-        return np.asarray(near & (angle <= self.left) & (angle >= self.right))
+        angle, distance = self._polar(offset, heading)
+        return np.asarray((distance <= self.reach) & (angle <= self.left) & (angle >= self.right))
+
+    def odds(self, offset: np.ndarray, heading: np.ndarray, angle_std: np.ndarray, range_std: np.ndarray) -> np.ndarray:
+        """Return how likely points are in view where their direction and distance are uncertain, (...) in [0, 1].
+
+        Args:
+            offset: (..., 2), m, from the vehicle's reference point.
+            heading: (...), rad, of the camera, in the same frame.
+            angle_std: (...), rad, above 0.
+            range_std: (...), m, above 0.
+        """
+        angle, distance = self._polar(offset, heading)
+        inside = np.minimum(self.left - angle, angle - self.right)
+        return np.asarray(_share(inside / angle_std) * _share((self.reach - distance) / range_std))
+
+    def _polar(self, offset: np.ndarray, heading: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return direction, rad, and distance, m, of points from the camera, (...)."""
+        cosine, sine = np.cos(heading), np.sin(heading)
+        x, y = offset[..., 0] - self.ahead * cosine, offset[..., 1] - self.ahead * sine
+        return np.arctan2(cosine * y - sine * x, cosine * x + sine * y), np.sqrt(x * x + y * y)
+
+
+def _share(margin: np.ndarray) -> np.ndarray:
+    """Return the share of a uniform distribution of standard deviation 1 that lies below a margin."""
+    return np.clip(0.5 + margin / (2.0 * math.sqrt(3.0)), 0.0, 1.0)
