@@ -1,9 +1,9 @@
 """How certain a vehicle would be of its pose after driving somewhere: planar covariances, rolled forward.
 
 Extended Kalman filter with bearings to known landmarks. Source: Thrun, Burgard and Fox, Probabilistic Robotics, 2005,
-3.3 and 7.5. What is measured does not matter, only from where, so the covariance of a plan is known beforehand; Prentice
-and Roy, The belief roadmap, International Journal of Robotics Research 28, 2009. Measurements that may be missing count
-by their odds; Sinopoli et al., Kalman filtering with intermittent observations, IEEE Transactions on Automatic Control
+3.3 and 7.5. What is measured does not matter, only from where, so the covariance of a plan is known beforehand;
+Prentice and Roy, The belief roadmap, International Journal of Robotics Research 28, 2009. Measurements that may be
+missing count by their odds; Sinopoli et al., Kalman filtering with intermittent observations, IEEE Transactions on Automatic Control
 49, 2004.
 """
 
@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 LEAST_ODDS = 0.02  # below them a bearing counts as missing
+
 
 class Belief(NamedTuple):
     """Entries (...) of the covariance of x, y (m) and heading (rad), in any fixed frame."""
@@ -42,7 +43,7 @@ class Belief(NamedTuple):
         )
 
     def along(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return what is uncertain of landmarks: variances of bearing (rad^2), of distance and across it (m^2), (..., K).
+        """Return variances (..., K) of landmarks' bearing, rad^2, of their distance and of what is across it, m^2.
 
         Args:
             offset: (..., K, 2), m, from the vehicle to the landmarks.

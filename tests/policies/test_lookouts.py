@@ -158,16 +158,39 @@ def test_beliefs_are_those_of_a_kalman_filter() -> None:
     dx, dy, landmarks = 0.4, -0.3, np.array([[[2.0, 1.0], [-1.0, 3.0], [4.0, 4.0]]])
     F = np.array([[1.0, 0.0, -dy], [0.0, 1.0, dx], [0.0, 0.0, 1.0]])
     P = F @ P @ F.T + np.diag([0.01, 0.01, 0.002])
-    weight = np.array([[100.0, 50.0, 0.0]])
-    for offset, w in zip(landmarks[0], weight[0], strict=True):
-        if w:
-            square_ = offset @ offset
-            H = np.array([[offset[1] / square_, -offset[0] / square_, -1.0]])
-            K = P @ H.T / (H @ P @ H.T + 1.0 / w)
+    variance = np.array([[0.01, 0.02, 0.01]])
+    predicted = belief.driven(np.array([dx]), np.array([dy]), 0.01, 0.002)
+    uncertain = predicted.along(landmarks)
+    for k, (offset, r) in enumerate(zip(landmarks[0], variance[0], strict=True)):
+        square_ = offset @ offset
+        H = np.array([[offset[1] / square_, -offset[0] / square_, -1.0]])
+        along, across = offset / np.sqrt(square_), np.array([-offset[1], offset[0]]) / np.sqrt(square_)
+        if k == 0:
+            expected = [(H @ P @ H.T).item(), along @ P[:2, :2] @ along, across @ P[:2, :2] @ across]
+            np.testing.assert_allclose([part[0, 0] for part in uncertain], expected, rtol=1e-9)
+        if k < 2:
+            K = P @ H.T / (H @ P @ H.T + r)
             P = (np.eye(3) - K @ H) @ P
-    found = belief.driven(np.array([dx]), np.array([dy]), 0.01, 0.002).measured(landmarks, weight)
+    found = predicted.measured(landmarks, variance, np.array([[1.0, 1.0, 0.0]]))
     np.testing.assert_allclose(np.concatenate(found), P[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]], rtol=1e-9)
     assert found.std == pytest.approx(np.sqrt(P[0, 0] + P[1, 1]))
+
+
+def test_a_bearing_that_may_be_missing_counts_by_its_odds() -> None:
+    none = np.zeros(1)
+    belief = Belief(np.ones(1), none, none, np.full(1, 2.0), none, np.full(1, 0.1))
+    line, variance = np.array([[[3.0, 1.0]]]), np.full((1, 1), 0.001)
+    never, maybe, surely = (belief.measured(line, variance, np.full((1, 1), odds)) for odds in (0.0, 0.3, 1.0))
+    np.testing.assert_allclose(np.array(maybe), 0.7 * np.array(never) + 0.3 * np.array(surely), atol=1e-12)
+
+
+def test_what_is_in_view_is_less_certain_near_the_edges_and_far_away() -> None:
+    view = FieldOfView(SCENARIO.camera)
+    offset = np.array([[3.0, 0.0], [3.0, 1.5], [3.0, -1.5], [3.0, 8.0], [40.0, 0.0]])
+    odds = view.odds(offset, np.zeros(5), np.full(5, 0.1), np.full(5, 0.2))
+    assert odds[0] == 1.0 and (odds[1:3] > 0.1).all() and (odds[1:3] < 1.0).all() and (odds[3:] == 0.0).all()
+    sharp = view.odds(offset, np.zeros(5), np.full(5, 1e-6), np.full(5, 1e-6))
+    assert (sharp == view.sees(offset, np.zeros(5))).all()
 
 
 def test_a_field_of_view_is_that_of_the_camera() -> None:
