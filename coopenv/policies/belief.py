@@ -3,8 +3,8 @@
 Extended Kalman filter with bearings to known landmarks. Source: Thrun, Burgard and Fox, Probabilistic Robotics, 2005,
 3.3 and 7.5. What is measured does not matter, only from where, so the covariance of a plan is known beforehand;
 Prentice and Roy, The belief roadmap, International Journal of Robotics Research 28, 2009. Measurements that may be
-missing count by their odds; Sinopoli et al., Kalman filtering with intermittent observations, IEEE Transactions on Automatic Control
-49, 2004.
+missing count by their odds; Sinopoli et al., Kalman filtering with intermittent observations, IEEE Transactions on
+Automatic Control 49, 2004.
 """
 
 from typing import NamedTuple
