@@ -59,8 +59,8 @@ class LookAhead(RouteFollower):
         self,
         scenario: Scenario,
         *,
-        price: float = 4.0,
-        tolerated: float = 0.02,
+        price: float = 10.0,
+        tolerated: float = 0.06,
         farthest: float = 0.8,
     ) -> None:
         """Choose what matters.
