@@ -10,6 +10,12 @@ from coopenv.scenario import Scenario
 MULTIPLES = np.array([1.0, 2.0, 4.0, 8.0])
 """Of `observation.route_step`: how far ahead the entries of `route_ahead` are."""
 
+SMALL = (0.586, 0.25)
+"""Length and width, m, of the car that distances are chosen for (SVEA); they grow with larger ones."""
+
+PURSUED = 5.0
+"""Decisions in which one gets to the point that is pursued, at least: one steers before one is past it."""
+
 
 class Driver(ABC):
     """A policy that chooses speed and steering for every row from its observation alone."""
@@ -17,13 +23,13 @@ class Driver(ABC):
     needs: tuple[str, ...] = ()
     """Fields of the observation without which it cannot drive."""
 
-    def __init__(self, scenario: Scenario, *, cruise: float | None = None, look_ahead: float = 1.0) -> None:
+    def __init__(self, scenario: Scenario, *, cruise: float | None = None, look_ahead: float | None = None) -> None:
         """Learn where everything stands in an observation.
 
         Args:
             scenario: of the environment.
             cruise: speed when nothing is in the way, m/s (None: top speed).
-            look_ahead: distance of the point of the way that is pursued, m.
+            look_ahead: distance of the point of the way that is pursued, m (None: 1 m, or more where cars are fast).
 
         Raises:
             ValueError: the observation lacks a field, or the environment does not take speeds.
@@ -35,7 +41,13 @@ class Driver(ABC):
         if missing := [name for name in (*self.needs, "way") if name not in known]:
             raise ValueError(f"the observation lacks {', '.join(missing)} (way: the group route or goal)")
         self.cruise = self.layout.action[0].high if cruise is None else cruise
-        self.look_ahead, self.wheelbase = look_ahead, scenario.dynamics.wheelbase
+        least = PURSUED * self.cruise / scenario.rates.decision
+        self.look_ahead = max(1.0, least) if look_ahead is None else look_ahead
+        self.length, self.width = body_of_driven(scenario)
+        self.scale = max(1.0, self.length / SMALL[0])
+        # The reference point of highway-env's cars is midway between axles that stand at their ends, not the rear one.
+        self.midway = scenario.backend == "highway"
+        self.wheelbase = self.length if self.midway else scenario.dynamics.wheelbase
         self._distances = scenario.observation.route_step * MULTIPLES
 
     @abstractmethod
@@ -89,7 +101,15 @@ class Driver(ABC):
         beside.
         """
         turn = np.clip((direction + np.pi) % (2.0 * np.pi) - np.pi, -np.pi / 2.0, np.pi / 2.0)
-        return np.asarray(np.arctan(2.0 * self.wheelbase * np.sin(turn) / self.look_ahead))
+        circle = self.look_ahead + (self.wheelbase * np.cos(turn) if self.midway else 0.0)
+        return np.asarray(np.arctan(2.0 * self.wheelbase * np.sin(turn) / circle))
+
+
+def body_of_driven(scenario: Scenario) -> tuple[float, float]:
+    """Return length and width, m, of the longest vehicle that is driven; `SMALL` where none has a body."""
+    bodies = [vehicle.body.size for vehicle in scenario.vehicles if vehicle.motion.kind == "driven" and vehicle.body]
+    length, width, _ = max(bodies, default=(*SMALL, 0.0))
+    return length, width
 
 
 class ConstantSpeed(Driver):

@@ -21,7 +21,7 @@ class IntelligentDriver(RouteFollower):
         scenario: Scenario,
         *,
         cruise: float | None = None,
-        look_ahead: float = 1.0,
+        look_ahead: float | None = None,
         time_gap: float = 0.8,
         standstill_gap: float = 0.3,
         acceleration: float = 1.0,
@@ -33,7 +33,7 @@ class IntelligentDriver(RouteFollower):
         Args:
             scenario: of the environment.
             cruise: desired speed, m/s (None: top speed).
-            look_ahead: distance of the point of the way that is pursued, m.
+            look_ahead: distance of the point of the way that is pursued, m (None: see `Driver`).
             time_gap: to the vehicle ahead, s.
             standstill_gap: between bumpers, m.
             acceleration: largest, m/s^2.

@@ -31,12 +31,12 @@ class Peek(RouteFollower):
         Args:
             scenario: of the environment.
             threshold: standard deviation of the position from which on it peeks, m.
-            ahead: how far ahead the view is predicted, m.
+            ahead: how far ahead the view is predicted, m; in proportion farther for a car that is longer than `SMALL`.
             farthest: offset from the way from which on it does not lead farther away, m.
         """
         super().__init__(scenario)
         self.view, self.occluders = FieldOfView(scenario.camera), Occluders(scenario, self.layout)
-        self.threshold, self.ahead, self.farthest = np.log10(threshold), ahead, farthest
+        self.threshold, self.ahead, self.farthest = np.log10(threshold), ahead * self.scale, farthest
         self.pans = next((field.high for field in self.layout.action if field.name == "pan"), 0.0)
 
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:

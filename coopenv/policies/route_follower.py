@@ -5,6 +5,15 @@ import numpy as np
 from coopenv.policies.driver import Driver
 from coopenv.scenario import Scenario
 
+GAP = 0.25
+"""m, between bodies."""
+
+SOON = 1.0
+"""s; cars that stop within this drive at full speed or stand; others are on the way between the two for long."""
+
+REACTION = 0.5
+"""s; cars that stop slowly look ahead for as long as stopping takes and this: their guesses are good for no longer."""
+
 
 class RouteFollower(Driver):
     """Pure pursuit of the way by the vehicle's own estimate; stops where driving on would come too close to others.
@@ -17,23 +26,29 @@ class RouteFollower(Driver):
         scenario: Scenario,
         *,
         cruise: float | None = None,
-        look_ahead: float = 1.0,
+        look_ahead: float | None = None,
         clearance: float = 0.9,
         closest: float = 0.75,
-        foresight: float = 6.0,
+        foresight: float | None = None,
     ) -> None:
         """Choose the manner of driving.
 
         Args:
             scenario: of the environment.
             cruise: speed when nothing is in the way, m/s; also what others are expected to drive (None: top speed).
-            look_ahead: distance of the point of the way that is pursued, m.
+            look_ahead: distance of the point of the way that is pursued, m (None: see `Driver`).
             clearance: distance to keep between reference points, m, where it does not know how sure it is of its own.
             closest: distance to keep where it is sure, m; its standard deviation is added, up to `clearance`.
-            foresight: how far ahead to look for others, s.
+                Both are at least what keeps cars `GAP` apart of which one stands across the other's way.
+            foresight: how far ahead to look for others, s (None: 6 s, or less where cars stop slowly, see `REACTION`).
         """
         super().__init__(scenario, cruise=cruise, look_ahead=look_ahead)
-        self.clearance, self.closest, self.foresight = clearance, closest, foresight
+        least = (self.length + self.width) / 2.0 + GAP
+        self.clearance, self.closest = max(clearance, least), max(closest, least)
+        stopping = self.cruise / scenario.dynamics.max_acceleration
+        nimble = stopping <= SOON
+        self.foresight = (6.0 if nimble else stopping + REACTION) if foresight is None else foresight
+        self.paces = (1.0,) if nimble else (0.0, 0.5, 1.0)
 
     def drive(self, observations: np.ndarray) -> tuple[np.ndarray, ...]:
         """See `Driver.drive`."""
@@ -48,15 +63,17 @@ class RouteFollower(Driver):
     def speed(self, observations: np.ndarray) -> np.ndarray:
         """Return the speeds, (rows,) in m/s: nothing, where going on comes too close and waiting does not.
 
-        Others are expected to go straight on at the speed `cruise`.
+        Others are expected to go straight on at the speed `cruise`, or at any of `paces` of it.
         """
         if "message_mask" not in self.layout:
             return np.full(len(observations), self.cruise)
         mask, place, forward = self.heard(observations)
         points, distance = self.way_ahead(observations)
-        going = nearest(points, distance / self.cruise, place, self.cruise * forward, mask, self.foresight)
-        stay = np.zeros((len(observations), 2, 2))
-        waiting = nearest(stay, np.array([0.0, 1.0]), place, self.cruise * forward, mask, self.foresight)
+        stay = np.zeros((len(observations), 2, 2)), np.array([0.0, 1.0])
+        going, waiting = (
+            np.min([nearest(*own, place, pace * self.cruise * forward, mask, self.foresight) for pace in self.paces], 0)
+            for own in ((points, distance / self.cruise), stay)
+        )
         return np.where((going >= self.distance_to_keep(observations)) | (going > waiting), self.cruise, 0.0)
 
     def distance_to_keep(self, observations: np.ndarray) -> np.ndarray | float:
