@@ -33,14 +33,15 @@ def road_of(engine: Engine, world: int = 0) -> Any:
 def test_cars_are_where_highway_env_has_them_with_y_up() -> None:
     engine = engine_of(CROSSING)
     engine.reset([5])
-    engine.set_actions(np.full((1, 4, 2), [0.6, 0.1]))
+    vehicles = engine.view("actions").shape[1]
+    engine.set_actions(np.full((1, vehicles, 2), [0.6, 0.1]))
     for _ in range(10):
         engine.step()
     L = engine.world.model.landmarks
     everybody = road_of(engine).vehicles
     places = {(round(float(car.position[0]), 6), round(float(-car.position[1]), 6)): car for car in everybody}
-    assert len(everybody) > 4
-    for i in range(4):
+    assert len(everybody) > vehicles
+    for i in range(vehicles):
         x, y, z = engine.view("position")[0, L + i].tolist()
         car = places.pop((round(x, 6), round(y, 6)))
         R = engine.view("rotation")[0, L + i]
@@ -100,7 +101,8 @@ def test_traffic_drives_itself_whatever_it_is_told() -> None:
 def test_worlds_of_a_batch_are_those_of_their_seeds(name: str) -> None:
     batch = engine_of(name, 2)
     batch.reset([7, 8])
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (15, 1, 4, 2))
+    vehicles = batch.view("actions").shape[1]
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (15, 1, vehicles, 2))
     for action in actions:
         batch.step(np.tile(action, (2, 1, 1)))
     for world, seed in enumerate((7, 8)):
@@ -110,7 +112,7 @@ def test_worlds_of_a_batch_are_those_of_their_seeds(name: str) -> None:
             single.step(action)
         for field in ("position", "estimate_position", "observation", "traffic_position"):
             assert np.array_equal(single.view(field)[0], batch.view(field)[world]), field
-    assert not np.array_equal(batch.view("position")[0, -4:], batch.view("position")[1, -4:])
+    assert not np.array_equal(batch.view("position")[0, -vehicles:], batch.view("position")[1, -vehicles:])
 
 
 def test_the_next_episode_is_another_one_and_a_mask_leaves_the_others() -> None:
@@ -234,9 +236,9 @@ def test_a_plain_environment_in_the_same_program_changes_nothing(monkeypatch: py
         ({"highway.speed": 5}, r"highway\.speed: unknown key; allowed: config, dynamical, id, most_vehicles"),
         ({"rates.camera": 12.5, "rates.decision": 12.5}, r"rates\.camera: highway-env steps a whole number"),
         ({"dynamics.wheelbase": 2.7}, r"dynamics\.wheelbase: highway-env has its own; allowed: max_acceleration"),
-        ({"vehicles.3.initial_pose.position": [0.0, 0.0, 0.0]}, r"vehicles\.3\.initial_pose: highway-env draws it"),
-        ({"vehicles.0.motion.initial_speed": 3.0}, r"vehicles\.0\.motion\.initial_speed: highway-env draws it"),
-        ({"vehicles.3.motion": {"kind": "static"}}, r"vehicles\.3\.motion\.kind: 'static' is not known to highway-env"),
+        ({"vehicles.0.initial_pose.position": [0.0, 0.0, 0.0]}, r"vehicles\.0\.initial_pose: highway-env draws it"),
+        ({"vehicles.3.motion.initial_speed": 3.0}, r"vehicles\.3\.motion\.initial_speed: highway-env draws it"),
+        ({"vehicles.0.motion": {"kind": "static"}}, r"vehicles\.0\.motion\.kind: 'static' is not known to highway-env"),
         ({"vehicles": [{"motion": {"kind": "traffic"}}]}, "vehicles: highway-env needs at least one that is driven"),
     ],
 )
@@ -248,10 +250,11 @@ def test_what_cannot_be_is_said_in_one_line(overrides: dict[str, Any], why: str)
 def test_what_is_missing_shows_when_it_begins() -> None:
     two = [{"motion": {"kind": "driven"}}] * 2
     crowd = [{"motion": {"kind": "driven"}}] + [{"motion": {"kind": "traffic"}}] * 9
+    many = {"highway.config.initial_vehicle_count": 14}
     for name, overrides, why in (
         (ROUNDABOUT, {"vehicles": two}, "vehicles: 2 are driven, but highway-env drives 1 there"),
         (ROUNDABOUT, {"vehicles": crowd}, "vehicles: 9 are in traffic, but highway-env has fewer there"),
-        (CROSSING, {"highway.most_vehicles": 0}, r"highway\.most_vehicles: 0 are too few"),
+        (CROSSING, {"highway.most_vehicles": 0, **many}, r"highway\.most_vehicles: 0 are too few"),
     ):
         env = coopenv.parallel_env(name, overrides=overrides)
         with pytest.raises(CoopenvError, match=why):
@@ -310,18 +313,20 @@ def test_its_way_can_be_driven_by_what_is_observed(name: str, speed: float, seed
     ahead = 2.0 * env.scenario.observation.route_step
     top, widest = env.scenario.dynamics.max_speed, env.scenario.action.steering
     assert widest is not None
+    place = next(i for i, vehicle in enumerate(env.scenario.vehicles) if vehicle.motion.kind == "driven")
+    driver = env.possible_agents[place]
     observations, infos = env.reset(seed=seed)
     offset = []
-    while "vehicle_1" in env.agents:
-        seen = observations["vehicle_1"]
+    while driver in env.agents:
+        seen = observations[driver]
         beta = np.arcsin(np.clip(2.5 * 2.0 * np.sin(seen["route_ahead"][..., 1].item()) / ahead, -0.9, 0.9))
         actions = {agent: np.array([-1.0, 0.0]) for agent in env.agents}
-        actions["vehicle_1"] = np.array([2.0 * speed / top - 1.0, np.arctan(2.0 * np.tan(beta)) / widest])
+        actions[driver] = np.array([2.0 * speed / top - 1.0, np.arctan(2.0 * np.tan(beta)) / widest])
         observations, *_, infos = env.step(actions)
-        offset.append(abs(float(observations["vehicle_1"]["route_offset"].item())))
-    assert infos["vehicle_1"]["outcome"] == "arrived"
+        offset.append(abs(float(observations[driver]["route_offset"].item())))
+    assert infos[driver]["outcome"] == "arrived"
     assert max(offset[5:]) < 1.0
-    engine, agent = env.engine, env.engine.world.model.landmarks
+    engine, agent = env.engine, env.engine.world.model.landmarks + place
     driven = engine.world._simulations[0].environment.vehicle
     engine.step(ticks=2)
     assert engine.view("present")[0, agent] == 0  # who has arrived leaves

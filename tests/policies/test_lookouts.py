@@ -14,6 +14,7 @@ from coopenv.policies.peek import Peek
 from coopenv.policies.route_follower import RouteFollower, nearest
 from coopenv.policies.stop_when_lost import StopWhenLost
 from coopenv.policies.view import FieldOfView
+from coopenv.scenario import load_scenario
 from coopenv.shipped import list_agents
 from tests.helpers.square import GROUPS, square
 
@@ -209,3 +210,35 @@ def test_what_is_needed_is_named() -> None:
     nowhere = square(observation={"include": ["odometry"]})
     with pytest.raises(ValueError, match=r"the observation lacks way \(way: the group route or goal\)"):
         load_agent("constant_speed", nowhere)
+
+
+def test_distances_fit_the_car() -> None:
+    """Those of small cars are what they are told; a full-size one keeps room for a car across its way."""
+    small, large = RouteFollower(SCENARIO), RouteFollower(load_scenario("highway_intersection"))
+    assert (small.clearance, small.closest, small.look_ahead, small.foresight) == (0.9, 0.75, 1.0, 6.0)
+    assert small.paces == (1.0,)
+    assert large.clearance == large.closest == pytest.approx((5.0 + 2.0) / 2.0 + 0.25)
+    assert large.look_ahead == pytest.approx(10.0)  # five decisions at 10 m/s
+    assert large.foresight == pytest.approx(2.5)  # 2 s to stop from 10 m/s, and half a second
+    assert Peek(load_scenario("highway_intersection")).ahead == pytest.approx(0.4 * 5.0 / 0.586)
+
+
+def test_it_steers_cars_of_highway_env_on_the_circle_that_it_pursues() -> None:
+    """highway-env's kinematic bicycle, from the published equations, gets to the point that is pursued."""
+    driver = RouteFollower(load_scenario("highway_intersection"))
+    for direction in (-0.4, 0.1, 0.5):
+        steering = driver.pursue(np.array([direction])).item()
+        slip = np.arctan(np.tan(steering) / 2.0)  # of the direction of motion from the heading
+        curvature = np.sin(slip) / 2.5
+        assert curvature == pytest.approx(2.0 * np.sin(direction - slip) / driver.look_ahead)
+
+
+@pytest.mark.parametrize(("brakes", "speed"), [(5.0, -1.0), (20.0, 1.0)])
+def test_who_stops_slowly_stops_for_one_across_its_way_that_may_stand(brakes: float, speed: float) -> None:
+    """Driving at full speed the other would be gone in time."""
+    driver = RouteFollower(load_scenario("highway_intersection", {"dynamics.max_acceleration": brakes}))
+    row = np.zeros((1, max(field.stop for field in driver.layout.values())), dtype=np.float32)
+    for name, values in (("message_mask", [1.0]), ("message_position", [12.0 / 60.0]), ("message_forward", [0.0, 1.0])):
+        start = driver.layout[name].start
+        row[0, start : start + len(values)] = values
+    assert driver(row)[0, 0] == speed
