@@ -69,11 +69,14 @@ class RouteFollower(Driver):
             return np.full(len(observations), self.cruise)
         mask, place, forward = self.heard(observations)
         points, distance = self.way_ahead(observations)
-        stay = np.zeros((len(observations), 2, 2)), np.array([0.0, 1.0])
-        going, waiting = (
-            np.min([nearest(*own, place, pace * self.cruise * forward, mask, self.foresight) for pace in self.paces], 0)
-            for own in ((points, distance / self.cruise), stay)
-        )
+        velocities = [pace * self.cruise * forward for pace in self.paces]
+
+        def least(path: np.ndarray, times: np.ndarray) -> np.ndarray:
+            found = [nearest(path, times, place, velocity, mask, self.foresight) for velocity in velocities]
+            return np.asarray(np.min(found, axis=0))
+
+        going = least(points, distance / self.cruise)
+        waiting = least(np.zeros((len(observations), 2, 2)), np.array([0.0, 1.0]))
         return np.where((going >= self.distance_to_keep(observations)) | (going > waiting), self.cruise, 0.0)
 
     def distance_to_keep(self, observations: np.ndarray) -> np.ndarray | float:
