@@ -132,8 +132,10 @@ def test_drivers_know_their_errors(environment: str, agent: str, lasting: dict[s
         engine.step()
         found.append(nees_of(engine.world))
     nees, errors = (np.array(part)[20:] for part in zip(*found, strict=True))
-    vehicles = np.nanmean(nees, axis=0)  # by world, so that one that strays until the end counts as the others do
-    std = np.nanstd(vehicles, axis=0) / np.sqrt(128)
+    known = np.isfinite(nees).sum(axis=0)
+    # By world, so that one that strays until the end counts as the others do; not there at all: NaN.
+    vehicles = np.where(known > 0, np.nansum(nees, axis=0) / np.maximum(known, 1), np.nan)
+    std = np.nanstd(vehicles, axis=0) / np.sqrt((known > 0).sum(axis=0))
     means = np.nanmean(vehicles, axis=0)
     told = ", ".join(f"{mean:.2f} +- {error:.2f}" for mean, error in zip(means, std, strict=True))
     tell(f"{environment}, {agent}, by vehicle {told}", lasting, nees, errors)
