@@ -48,8 +48,8 @@ def test_a_lookout_knows_far_better_where_it_is_and_loses_little_time(environmen
 
 @pytest.mark.slow
 @pytest.mark.parametrize("environment", WORLDS)
-def test_many_worlds_do_not_show_that_more_time_is_lost_either(environment: str) -> None:
-    assert change_of_time(environment, 10).relative_ci_low <= MOST_TIME
+def test_many_worlds_show_how_little_time_is_lost(environment: str) -> None:
+    assert change_of_time(environment, 10).relative <= MOST_TIME
 
 
 @pytest.mark.parametrize("environment", WORLDS)
