@@ -55,7 +55,7 @@ def describe(
     for part in describe_scenario(scenario) if everything else summary(name, scenario, recorded):
         out.print(part)
     if not everything:
-        out.print("\nMore: --all (every vehicle, setting and field), --json (all of it as data).")
+        out.print("More: --all (every vehicle, setting and field), --json (all of it as data).")
 
 
 def schema(out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None) -> None:

@@ -36,7 +36,9 @@ def test_single_world_is_world_0_bit_for_bit(name: str, dtype: str) -> None:
     singles = [coopenv.parallel_env(name, dtype=dtype) for _ in range(3)]
     for world, single in enumerate(singles):
         first, _ = single.reset(seed=40, options={"world": world})
-        assert np.array_equal(batch.world_major(observations)[world], np.stack(list(first.values())))
+        there = batch.engine.view("alive")[world]
+        assert list(first) == [agent for agent, alive in zip(single.possible_agents, there, strict=True) if alive]
+        assert np.array_equal(batch.world_major(observations)[world][there], np.stack(list(first.values())))
     for _ in range(60):
         actions = batch.world_major(actions_for(batch, rng))
         observations, rewards, terminated, truncated, infos = batch.step(actions.reshape(-1, 2))

@@ -60,6 +60,8 @@ def assert_equal(a: Any, b: Any) -> None:
 def official_tests(make: Make) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        if any(vehicle.presence < 1.0 for vehicle in make().scenario.vehicles):  # who is not there does not end either
+            warnings.filterwarnings("ignore", "No agents present but not all possible_agents are terminated")
         parallel_api_test(make(), num_cycles=600)
         api_test(parallel_to_aec(make()), num_cycles=1500)
     with warnings.catch_warnings():
@@ -175,7 +177,7 @@ def ends_by_itself(make: Make) -> None:
     assert env.agents == []
     horizon = round(env.scenario.horizon * env.scenario.rates.decision)
     assert len(steps) - 1 <= horizon
-    for agent in env.possible_agents:
+    for agent in steps[0][0]:
         last = [step for step in steps[1:] if agent in step[1]][-1]
         assert last[2][agent] != last[3][agent]
         assert isinstance(last[2][agent], bool) and isinstance(last[3][agent], bool)
