@@ -77,13 +77,13 @@ def test_odometry_is_that_of_the_motion(dynamical: bool) -> None:
 def test_commands_are_speeds_and_steering_to_the_left() -> None:
     env = coopenv.parallel_env(ROUNDABOUT, dtype="float64", overrides=EXACT)
     _, infos = env.reset(seed=1)
-    assert infos["vehicle_1"]["truth"]["position"][1] < -40.0
+    assert infos["vehicle_4"]["truth"]["position"][1] < -40.0
     for _ in range(12):
         env.step({agent: np.array([-0.5, 0.0]) for agent in env.agents})
-    assert env.engine.view("speed")[0, 0] == pytest.approx(3.0, abs=1e-6)
+    assert env.engine.view("speed")[0, 3] == pytest.approx(3.0, abs=1e-6)
     *_, infos = env.step({agent: np.array([-0.5, 1.0]) for agent in env.agents})
-    assert infos["vehicle_1"]["truth"]["angular_velocity"][2] > 0.2
-    assert env.engine.view("steering")[0, 0] == pytest.approx(0.5)
+    assert infos["vehicle_4"]["truth"]["angular_velocity"][2] > 0.2
+    assert env.engine.view("steering")[0, 3] == pytest.approx(0.5)
 
 
 def test_traffic_drives_itself_whatever_it_is_told() -> None:
@@ -92,8 +92,8 @@ def test_traffic_drives_itself_whatever_it_is_told() -> None:
         env = coopenv.parallel_env(ROUNDABOUT, dtype="float64")
         env.reset(seed=4)
         for _ in range(5):
-            *_, infos = env.step({a: np.array([0.0, 0.0] if a == "vehicle_1" else [action] * 2) for a in env.agents})
-        moved.append([infos[f"vehicle_{i}"]["truth"]["position"] for i in (2, 3, 4)])
+            *_, infos = env.step({a: np.array([0.0, 0.0] if a == "vehicle_4" else [action] * 2) for a in env.agents})
+        moved.append([infos[f"vehicle_{i}"]["truth"]["position"] for i in (1, 2, 3)])
     assert_allclose(*moved)
 
 
@@ -151,10 +151,10 @@ def test_other_traffic_hides_what_is_behind_it() -> None:
         engine = engine_of(ROUNDABOUT, camera__range=200.0, obstacles=[], camera__miss_probability=0.0, **overrides)
         engine.reset([1])
         if hidden:
-            put_a_car(engine, *(engine.view("position")[0, 3, :2] + (0.0, 8.0)))
+            put_a_car(engine, *(engine.view("position")[0, 3 + 3, :2] + (0.0, 8.0)))
         engine.set_actions(np.full((1, 4, 2), [-1.0, 0.0]))
         engine.step(ticks=1)
-        seen.append(Sight(int(engine.view("sight")[0, 0, 0])))
+        seen.append(Sight(int(engine.view("sight")[0, 3, 0])))
     assert seen == [Sight.VISIBLE, Sight.OCCLUDED_BY_BODY]
 
 
@@ -162,11 +162,11 @@ def test_to_touch_other_traffic_is_a_collision() -> None:
     engine = engine_of(ROUNDABOUT)
     engine.reset([1])
     L = engine.world.model.landmarks
-    put_a_car(engine, *(engine.view("position")[0, L, :2] + (0.0, 12.0)))
+    put_a_car(engine, *(engine.view("position")[0, L + 3, :2] + (0.0, 12.0)))
     engine.set_actions(np.full((1, 4, 2), [1.0, 0.0]))
-    while engine.view("ended")[0, 0] == 0:
+    while engine.view("ended")[0, 3] == 0:
         engine.step()
-    assert engine.view("ended")[0, 0] == 2 and engine.view("tick")[0] < 20
+    assert engine.view("ended")[0, 3] == 2 and engine.view("tick")[0] < 20
 
 
 def test_who_leaves_the_road_has_arrived() -> None:
