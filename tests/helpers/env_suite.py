@@ -60,7 +60,9 @@ def assert_equal(a: Any, b: Any) -> None:
 def official_tests(make: Make) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        if any(vehicle.presence < 1.0 for vehicle in make().scenario.vehicles):  # who is not there does not end either
+        if any(vehicle.presence < 1.0 for vehicle in make().scenario.vehicles):
+            parallel_api_test(make(overrides={"vehicles.*.presence": 1.0}), num_cycles=600)
+            # Who is not there does not end either.
             warnings.filterwarnings("ignore", "No agents present but not all possible_agents are terminated")
         parallel_api_test(make(), num_cycles=600)
         api_test(parallel_to_aec(make()), num_cycles=1500)
