@@ -13,10 +13,12 @@ PACKAGE = Path(__file__).resolve().parents[1] / "coopenv"
 ROOMS = (
     ("errors", "shipped", "machine", "files", "staging", "interrupts", "format", "jsonable", "user_code", "seeds"),
     ("scenario",),
+    ("svea",),
     ("estimation",),
     ("world",),
     ("observers",),
     ("backends",),
+    ("fake",),
     ("viz",),
     ("api",),
     ("policies",),

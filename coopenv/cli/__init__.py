@@ -19,6 +19,7 @@ from coopenv.cli.evaluate import evaluate
 from coopenv.cli.live import play, watch
 from coopenv.cli.page import page
 from coopenv.cli.run import record_command, run
+from coopenv.cli.svea import svea
 from coopenv.cli.train import train
 from coopenv.errors import CoopenvError
 from coopenv.shipped import version as installed_version
@@ -45,6 +46,7 @@ app.command()(watch)
 app.command()(play)
 app.command()(page)
 app.add_typer(bench, name="bench")
+app.add_typer(svea, name="svea")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

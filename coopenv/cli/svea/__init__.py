@@ -1,0 +1,5 @@
+"""`coopenv svea`: cars, real ones and fakes. Commands import what they need when they run."""
+
+import typer
+
+svea = typer.Typer(name="svea", help="SVEA cars, real ones and fakes.", no_args_is_help=True, rich_markup_mode=None)

@@ -1,0 +1,215 @@
+"""The deployment file: which cars there are, how they are reached, and what they may do."""
+
+import tomllib
+from collections import Counter
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from coopenv.errors import CoopenvError, listed, shown, suggest
+from coopenv.svea.limits import HARDEST, Limits
+
+MARKERS = range(1, 8)
+"""Numbers of markers: the Pixy2 tells apart seven colour signatures."""
+
+Name = Annotated[str, Field(max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+Marker = Annotated[int, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0.0, le=1e6)]
+Number = Annotated[float, Field(ge=-1e6, le=1e6)]
+Point = tuple[Number, Number]
+
+
+class DeploymentError(CoopenvError):
+    """A deployment file does not describe a fleet that can drive."""
+
+
+class Part(BaseModel):
+    """A section of the file; unknown keys are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class Tls(Part):
+    """Certificates of the transport; paths are relative to the file."""
+
+    root_ca: Path
+    """Certificate of who signs the others'."""
+    certificate: Path | None = None
+    """Own certificate, where this end listens or the other one asks for it."""
+    key: Path | None = None
+    """Private key of it."""
+
+
+def _endpoint(text: str) -> str:
+    """Refuse what is no endpoint such as tcp/127.0.0.1:7447."""
+    protocol, slash, address = text.partition("/")
+    if not slash or protocol not in ("tcp", "tls", "quic", "udp", "nats") or ":" not in address:
+        raise ValueError(f"{text!r} is no endpoint, expected for example tcp/127.0.0.1:7447")
+    return text
+
+
+Endpoint = Annotated[str, AfterValidator(_endpoint)]
+
+
+class Network(Part):
+    """How the cars are reached."""
+
+    kind: Literal["zenoh", "nats", "ros1"] = "zenoh"
+    """`zenoh`: CDR under the keys of zenoh-bridge-ros2dds; `nats`: the authors' wire; `ros1`: topics of a ROS
+    master."""
+    connect: tuple[Endpoint, ...] = ("tcp/127.0.0.1:7447",)
+    """Where the router (or the broker) is."""
+    tls: Tls | None = None
+
+
+class Car(Part):
+    """One car."""
+
+    name: Name
+    """As in its topics, `fleet/NAME/...`."""
+    vehicle: str | None = None
+    """The vehicle of the environment that it is (default: in the order of the file)."""
+    landmark: str | None = None
+    """Or the moving landmark that it is: a car whose position is known and which nobody here drives."""
+    marker: Marker | None = None
+    """Number of the marker that it carries, 1..7 (none: no camera can tell it)."""
+
+
+class Sensors(Part):
+    """Which topics are read."""
+
+    odometry: Literal["wheel+imu", "wheel", "odometry"] = "wheel+imu"
+    """Where the body twist comes from: speed of the wheels and turn rate of the IMU, the wheels alone, or the car's own
+    filter."""
+    detections: Literal["detections", "bearings"] = "detections"
+    """`detections`: pixels, from which distortion is removed here; `bearings`: unit vectors of the authors' node."""
+    distorted: bool = True
+    """Whether `bearings` were made of pixels whose distortion had not been removed, as the authors' are."""
+    truth: bool = True
+    """Whether motion capture is read: for infos, metrics and safety, never for observations."""
+
+
+class Safety(Part):
+    """What stops the cars. Limits above the hard ones of `coopenv.svea.limits` are refused."""
+
+    max_speed: float = Field(default=0.5, gt=0.0, le=HARDEST.speed)
+    """m/s"""
+    max_steering: float = Field(default=0.5235987755982988, gt=0.0, le=HARDEST.steering)
+    """rad"""
+    max_acceleration: float = Field(default=1.0, gt=0.0, le=HARDEST.acceleration)
+    """m/s^2"""
+    max_steering_rate: float = Field(default=2.0, gt=0.0, le=HARDEST.steering_rate)
+    """rad/s"""
+    reverse: bool = False
+    """Whether cars may drive backwards."""
+    odometry_age: Positive = 0.15
+    """s without odometry after which all cars are stopped."""
+    truth_age: Positive = 0.5
+    """s without motion capture, where a geofence or a separation needs it."""
+    geofence: tuple[Point, ...] = ()
+    """Corners of a polygon, map, m, that no car may leave (none: no fence)."""
+    separation: float = Field(default=0.0, ge=0.0, le=100.0)
+    """Least distance between two cars, m (0: not watched)."""
+    judge: Literal["truth", "estimate"] = "truth"
+    """By what fence and separation are judged."""
+    missed_deadlines: int = Field(default=5, ge=1)
+    """Decisions in a row that may come late."""
+    min_battery: float = Field(default=0.1, ge=0.0, le=1.0)
+    """Share of the battery below which cars are not armed."""
+    max_clock_offset: Positive = 0.02
+    """s between clocks of cars and of this computer, beyond which nothing is armed."""
+
+    @property
+    def limits(self) -> Limits:
+        """The limits of commands."""
+        speeds = (self.max_speed, self.max_steering, self.max_acceleration, self.max_steering_rate)
+        return Limits(*speeds, reverse=self.reverse)
+
+
+class Security(Part):
+    """Signatures of commands and of what cars tell each other."""
+
+    keys: Path | None = None
+    """File with keys, see `coopenv svea keys` (relative to this file); none: nothing is signed or checked."""
+    identity: Name = "station"
+    """Whose key this end signs with, where it is no car."""
+
+
+class Deployment(Part):
+    """A fleet and what it is used for."""
+
+    environment: str
+    """Name of an environment, or TOML file (relative to this file): who is there, how they sense, talk and estimate."""
+    overrides: dict[str, Any] = Field(default={})
+    """Dotted keys of it."""
+    cars: tuple[Car, ...] = Field(min_length=1, max_length=64)
+    markers: dict[str, Marker] = Field(default={})
+    """Numbers of the markers of landmarks, by name."""
+    network: Network = Network()
+    sensors: Sensors = Sensors()
+    safety: Safety = Safety()
+    security: Security = Security()
+    fakes: bool = False
+    """Whether the cars are fakes, which can be put where an episode begins."""
+    folder: Path = Field(default=Path(), exclude=True)
+    """Where the file is; set by `load_deployment`."""
+
+    @model_validator(mode="after")
+    def _nothing_is_used_twice(self) -> Self:
+        given: dict[str, list[Any]] = {
+            "cars: the name": [car.name for car in self.cars],
+            "cars: the vehicle": [car.vehicle for car in self.cars if car.vehicle is not None],
+            "cars: the landmark": [car.landmark for car in self.cars if car.landmark is not None],
+            "markers: the number": [*self.markers.values(), *(c.marker for c in self.cars if c.marker is not None)],
+        }
+        for what, values in given.items():
+            for value, times in Counter(values).items():
+                if times > 1:
+                    raise ValueError(f"{what} {value!r} is used twice")
+        for what, number in [*self.markers.items(), *((c.name, c.marker) for c in self.cars if c.marker is not None)]:
+            if number not in MARKERS:
+                raise ValueError(f"marker {number} of {what}: the camera knows {MARKERS[0]} to {MARKERS[-1]} only")
+        for i, car in enumerate(self.cars):
+            if car.vehicle is not None and car.landmark is not None:
+                raise ValueError(f"cars.{i}: is a vehicle or a landmark, not both")
+        return self
+
+    @property
+    def driven(self) -> tuple[Car, ...]:
+        """The cars that are vehicles, in the order of the file."""
+        return tuple(car for car in self.cars if car.landmark is None)
+
+    def car(self, name: str) -> Car:
+        """Return a car by name. Raises DeploymentError: there is none."""
+        names = [car.name for car in self.cars]
+        if name not in names:
+            raise DeploymentError(f"unknown car {shown(name)}{suggest(name, names)}; known: {listed(names)}")
+        return self.cars[names.index(name)]
+
+
+def load_deployment(path: str | Path) -> Deployment:
+    """Read a deployment file.
+
+    Raises:
+        DeploymentError: it cannot be read, or one line says which field is not what it must be.
+    """
+    path = Path(path)
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise DeploymentError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except ValueError as error:
+        raise DeploymentError(f"{path}: not valid TOML: {error}") from None
+    return parse_deployment(raw, path)
+
+
+def parse_deployment(raw: dict[str, Any], path: Path) -> Deployment:
+    """Validate plain data that stands, or could stand, in a file; errors as for `load_deployment`."""
+    try:
+        made = Deployment.model_validate(raw)
+    except ValidationError as error:
+        from coopenv.scenario.validation import one_line  # the gate of a car has no need of scenarios
+
+        raise DeploymentError(one_line(error, path.name, Deployment)) from None
+    return made.model_copy(update={"folder": path.parent})

@@ -1,0 +1,114 @@
+"""Zenoh, under the keys of zenoh-bridge-ros2dds: a ROS name without its leading slash, the payload plain CDR."""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from coopenv.errors import CoopenvError
+from coopenv.svea.transport.base import Arrival, Callback, LinkError
+
+LEASE = 1000  # ms after which a process that has frozen no longer counts as present
+
+
+class Zenoh:
+    """A Zenoh session as a transport."""
+
+    def __init__(self, session: Any, module: Any) -> None:
+        self._session, self._zenoh = session, module
+        self._kept: list[Any] = []  # what is declared ends when nobody holds it
+
+    def publish(
+        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
+    ) -> None:
+        """Send, see `Transport`."""
+        z = self._zenoh
+        try:
+            self._session.put(
+                topic,
+                payload,
+                attachment=attachment or None,
+                express=urgent,
+                priority=z.Priority.REAL_TIME if urgent else z.Priority.DATA,
+                congestion_control=z.CongestionControl.BLOCK if reliable else z.CongestionControl.DROP,
+            )
+        except z.ZError:  # the session is closed
+            return
+
+    def subscribe(self, pattern: str, callback: Callback) -> None:
+        """Subscribe, see `Transport`."""
+
+        def arrive(sample: Any) -> None:
+            attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            callback(Arrival(str(sample.key_expr), sample.payload.to_bytes(), time.time_ns(), attachment))
+
+        self._kept.append(self._session.declare_subscriber(pattern, arrive))
+
+    def announce(self, name: str) -> None:
+        """Announce, see `Transport`."""
+        self._kept.append(self._session.liveliness().declare_token(name))
+
+    def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
+        """Watch, see `Transport`."""
+
+        def change(sample: Any) -> None:
+            callback(str(sample.key_expr), sample.kind == self._zenoh.SampleKind.PUT)
+
+        self._kept.append(self._session.liveliness().declare_subscriber(pattern, change, history=True))
+
+    def close(self) -> None:
+        """End the session."""
+        self._kept.clear()
+        if not self._session.is_closed():
+            self._session.close()
+
+
+def open_zenoh(
+    mode: Literal["client", "peer", "router"],
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    tls: "dict[str, Path] | None" = None,
+    timeout: float = 2.0,
+) -> Zenoh:
+    """Open a session that uses the given endpoints and nothing else: nothing is looked for by multicast.
+
+    Args:
+        mode: "client" of a router, "peer" of other peers, or a "router" itself.
+        connect: endpoints to connect to, e.g. "tcp/127.0.0.1:7447" or "tls/car:7447".
+        listen: endpoints to listen at.
+        tls: files by their keys of Zenoh's `transport.link.tls`, e.g. `root_ca_certificate`.
+        timeout: s to wait for the endpoints to connect to.
+
+    Raises:
+        CoopenvError: the extra is not installed, or an endpoint is not one.
+        LinkError: an endpoint cannot be reached, or cannot be listened at.
+    """
+    try:
+        import zenoh
+    except ImportError:
+        raise CoopenvError("Zenoh needs an extra: pip install '.[svea]'") from None
+    config = zenoh.Config()
+    entries: dict[str, Any] = {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "connect/endpoints": list(connect),
+        "listen/endpoints": list(listen),
+        "connect/timeout_ms": int(timeout * 1000),
+        "connect/exit_on_failure": bool(connect),
+        "transport/link/tx/lease": LEASE,
+        **{f"transport/link/tls/{key}": str(path) for key, path in (tls or {}).items()},
+    }
+    try:
+        for key, value in entries.items():
+            config.insert_json5(key, json.dumps(value))
+        return Zenoh(zenoh.open(config), zenoh)
+    except zenoh.ZError as error:
+        where = ", ".join([*connect, *listen])
+        raise LinkError(f"{where}: no Zenoh there ({_reason(error)})") from None
+
+
+def _reason(error: Exception) -> str:
+    """Return the first sentence of Zenoh's error."""
+    return str(error).split(" at /")[0].split("\n")[0][:120]
