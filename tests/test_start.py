@@ -23,6 +23,8 @@ LIGHT |= {
         for name in ("bench", "complete", "dataset", "evaluate", "live", "options", "page", "run", "show", "train")
     ),
 }
+COMMANDS_OF_CARS = Path(coopenv.__file__).parent / "cli" / "svea"
+LIGHT |= {"cli.svea", *(f"cli.svea.{path.stem}" for path in COMMANDS_OF_CARS.glob("[a-z]*.py"))}
 
 
 def modules_after(statement: str) -> set[str]:

@@ -131,7 +131,7 @@ class Security(Part):
     """Signatures of commands and of what cars tell each other."""
 
     keys: Path | None = None
-    """File with keys, see `coopenv svea keys` (relative to this file); none: nothing is signed or checked."""
+    """Folder of keys, see `coopenv svea keys` (relative to this file); none: nothing is signed or checked."""
     identity: Name = "station"
     """Whose key this end signs with, where it is no car."""
 
