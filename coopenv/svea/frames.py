@@ -1,0 +1,77 @@
+"""Frames of a camera as bearings: from pixels, and from the authors' unit vectors."""
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coopenv.errors import CoopenvError
+from coopenv.svea.lens import rays
+from coopenv.svea.samples import Array, Calibration, Detections
+
+MOST = 1000
+"""Blocks of a frame."""
+
+UNIT = 1e-3
+"""How far from 1 the length of a bearing may be."""
+
+
+def detections(message: Any, calibration: Calibration, known: Collection[int] | None) -> Detections:
+    """Return the bearings of an ObjectInfoArrayStamped, by the largest block of each marker.
+
+    Dropped and counted: other blocks of a marker, those of unknown markers, without an area, or outside the image.
+    """
+    blocks = _few(message.objects, "objects")
+    rows = [(b.signature, b.center_x, b.center_y, b.width, b.height) for b in blocks]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    bearings, there = rays(table[:, 1:3], calibration)
+    there &= (table[:, 3:] >= 0.0).all(axis=-1)
+    return _frame(table[:, 0].astype(np.int64), bearings, there, table[:, 3] * table[:, 4], known)
+
+
+def bearings(message: Any, calibration: Calibration | None, known: Collection[int] | None) -> Detections:
+    """Return the bearings of an ObjectBearingArrayStamped, whose vectors point from the target to the camera.
+
+    Args:
+        message: of the authors' node, which keeps the order of the camera, largest block first: the first counts.
+        calibration: of the camera if distortion was not removed from the pixels of the vectors: then they give back
+            the pixels. None: it was.
+        known: markers that there are (None: all).
+
+    Dropped and counted: later ones of a marker, those of unknown markers, without length 1, and with a calibration
+    those outside the image.
+    """
+    rows = [(b.id, b.bearing_x, b.bearing_y, b.bearing_z) for b in _few(message.bearing, "bearing")]
+    table = np.array(rows, dtype=np.float64).reshape(-1, 4)
+    with np.errstate(all="ignore"):
+        rays_ = -table[:, 1:]
+        lengths = np.linalg.norm(rays_, axis=-1)
+        there = np.abs(lengths - 1.0) <= UNIT
+        rays_ /= lengths[:, None]
+        if calibration is not None:
+            there &= rays_[:, 2] > 1e-6
+            flat = np.where(there[:, None], rays_[:, :2] / rays_[:, 2:], 0.0)
+            pixels = flat * calibration.focal_length + np.asarray(calibration.principal_point)
+            rays_, imaged = rays(np.round(pixels, 3), calibration)  # of single precision
+            there &= imaged
+    return _frame(table[:, 0].astype(np.int64), rays_, there, -np.arange(len(table), dtype=np.float64), known)
+
+
+def _few(entries: Any, field: str) -> Any:
+    if len(entries) > MOST:
+        raise CoopenvError(f"{field}: {len(entries)} entries, a camera has at most {MOST}")
+    return entries
+
+
+def _frame(
+    markers: NDArray[np.int64], unit: Array, there: NDArray[np.bool_], size: Array, known: Collection[int] | None
+) -> Detections:
+    """Return a frame with the largest entry of each marker among those that are `there`, in the order of markers."""
+    best: dict[int, int] = {}
+    for i in np.flatnonzero(there):
+        marker = int(markers[i])
+        if (known is None or marker in known) and (marker not in best or size[i] > size[best[marker]]):
+            best[marker] = int(i)
+    chosen = [best[marker] for marker in sorted(best)]
+    return Detections(tuple(sorted(best)), unit[chosen].reshape(-1, 3), len(markers) - len(chosen))
