@@ -9,14 +9,19 @@ from coopenv.scenario.sensing import ROTATION_OF_CAMERA, Camera, Noise, Rates
 from coopenv.scenario.starts import rotation_of
 
 
+def camera_to_body(c: Camera) -> np.ndarray:
+    """Return the rotation (3, 3) of a camera in its body."""
+    named = ROTATION_OF_CAMERA.get(c.orientation) if isinstance(c.orientation, str) else None
+    return rotation_of(None, c.orientation) if named is None else named
+
+
 def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
     """Return the values of the model's `Camera`."""
     on = float(noise.enabled)
-    named = ROTATION_OF_CAMERA.get(c.orientation) if isinstance(c.orientation, str) else None
     same = ("position", "image_size", "focal_length", "principal_point")
     return {
         **{name: getattr(c, name) for name in same},
-        "rotation": rotation_of(None, c.orientation) if named is None else named,
+        "rotation": camera_to_body(c),
         "pinhole": int(c.model == "pinhole"),
         **dict(zip(("k1", "k2", "p1", "p2", "k3"), c.distortion, strict=True)),
         "max_radius": _monotone_radius(c.distortion),

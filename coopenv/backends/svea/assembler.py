@@ -1,0 +1,220 @@
+"""From samples of all cars to ticks.
+
+A tick has a row per car. What it says holds for one moment of that car, its *moment*: when the camera frame of the tick
+was exposed. Odometry is integrated over the real time from one moment to the next, so that a late frame corrects the
+pose that the car had when it was exposed, and not the one that it has when the frame arrives. Without a new frame the
+moment goes on with the clock, as far behind it as the last frame was, and nothing is in view. Estimates and truth of a
+tick are those of the moment as well; how long ago it was is the tick's `bearing_age`.
+"""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coopenv.backends.svea.binding import Binding
+from coopenv.backends.svea.frames import Frames
+from coopenv.backends.svea.odometer import Odometer
+from coopenv.backends.svea.pose_track import PoseTrack
+from coopenv.backends.svea.v2x import message_of
+from coopenv.estimation.arrays import Array
+from coopenv.observers.contract import Received
+from coopenv.observers.recording import Sensed, Truth, is_due, sealed
+from coopenv.scenario.starts import rotation_of
+from coopenv.svea.samples import Detections, Pose, Report, Sample, Twist
+from coopenv.svea.topics import TOPICS, Role
+from coopenv.world.build_sensors import camera_to_body
+
+LATE = round((TOPICS[Role.DETECTIONS].max_age or 0.0) * 1e9)
+SILENT = round((TOPICS[Role.ODOMETRY].max_age or 0.0) * 1e9)
+"""ns without odometry after which nothing is said to have come from a car."""
+STALE = round((TOPICS[Role.ESTIMATE].max_age or 0.0) * 1e9)
+"""ns after which what another car has said no longer counts."""
+FUTURE = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
+NS = 1e-9
+
+
+class _Car:
+    """What has come from one car."""
+
+    def __init__(self) -> None:
+        self.odometer, self.frames, self.track = Odometer(), Frames(), PoseTrack()
+        self.moment: int | None = None
+        self.lag = 0  # ns by which the last frame was behind its tick
+        self.exposed: int | None = None  # when the last frame was
+
+
+class Assembler:
+    """Keeps what has come and makes ticks of it; what it gives follows from the order of calls alone."""
+
+    def __init__(self, binding: Binding, offsets: Mapping[str, int] | None = None) -> None:
+        """Begin with nothing.
+
+        Args:
+            binding: who is who.
+            offsets: ns to add to a car's stamps to have them on the receiver's clock (none: they are on it).
+        """
+        self.binding = binding
+        self._offsets = dict(offsets or {})
+        scenario = binding.scenario
+        self._period = round(1e9 / scenario.rates.camera)
+        self._ratio = (scenario.rates.observer or scenario.rates.camera) / scenario.rates.camera
+        self._origin = origin = np.array(scenario.map.origin)
+        places = [np.array(m.position) + rotation_of(m.yaw, None) @ np.array(m.marker) for m in scenario.landmarks]
+        self._landmarks = np.array(places).reshape(-1, 3) - origin
+        self._led: dict[int, int] = {}  # landmark to the stamp of its last position
+        self._to_body = [camera_to_body(camera) for camera in scenario.cameras]
+        self._markers = [np.array(vehicle.marker) for vehicle in scenario.vehicles]
+        self._cars = [_Car() for _ in scenario.vehicles]
+        self._heard: dict[int, dict[Role, tuple[int, Pose | Report]]] = {}
+        self._begin = 0
+        self.refused: Counter[str] = Counter()
+        """Samples that were not used, by reason."""
+
+    def put(self, sample: Sample) -> None:
+        """Take a sample."""
+        stamp, value = sample.stamp + self._offsets.get(sample.car, 0), sample.value
+        if stamp > sample.received + FUTURE:
+            self.refused["stamp in the future"] += 1
+        elif sample.car in self.binding.leaders:
+            self._put_leader(self.binding.leaders[sample.car], sample.role, stamp, value)
+        elif sample.car not in self.binding.cars:
+            self.refused["unknown car"] += 1
+        else:
+            self._put_vehicle(self.binding.cars[sample.car], sample.role, stamp, value)
+
+    def _put_leader(self, landmark: int, role: Role, stamp: int, value: object) -> None:
+        if role in (Role.ESTIMATE, Role.POINT) and isinstance(value, Pose) and stamp > self._led.get(landmark, 0):
+            marker = np.array(self.binding.scenario.landmarks[landmark].marker)
+            message = message_of(self._on_map(value), marker)
+            if message.position is not None:
+                self._landmarks[landmark], self._led[landmark] = message.position, stamp
+
+    def _put_vehicle(self, vehicle: int, role: Role, stamp: int, value: object) -> None:
+        car = self._cars[vehicle]
+        if isinstance(value, Twist):
+            car.odometer.put(stamp, value)
+        elif isinstance(value, Detections):
+            self.refused["detections left out"] += value.dropped
+            car.frames.put(stamp, value)
+        elif role is Role.TRUTH and isinstance(value, Pose):
+            car.track.put(stamp, self._on_map(value))
+        elif isinstance(value, Pose | Report) and vehicle not in self.binding.local:
+            known = self._heard.setdefault(vehicle, {})
+            if role in known and stamp <= known[role][0]:
+                self.refused["message out of order"] += 1
+                return
+            known[role] = stamp, self._on_map(value) if isinstance(value, Pose) else value
+
+    def _on_map(self, pose: Pose) -> Pose:
+        """Return a pose in the coordinates of the scenario's file as one on its map."""
+        return replace(pose, position=pose.position - self._origin)
+
+    def begin(self, now: int) -> Sensed:
+        """Return tick 0 at a time in ns; what came before says where the cars are now."""
+        self._begin = now
+        for car in self._cars:
+            while car.frames.take(-1, now) is not None:
+                pass
+            car.moment, car.lag, car.exposed = now - self._period, 0, None
+            car.odometer.increment(now - self._period, now - self._period)
+        self._heard.clear()
+        return self._sensed(0, now)
+
+    def tick(self, index: int, now: int) -> Sensed:
+        """Return tick number `index` at a time in ns."""
+        return self._sensed(index, now)
+
+    def truth(self, vehicle: int, now: int) -> tuple[Array, Array]:
+        """Return the rotation and position of a vehicle by motion capture, NaN where it is not known."""
+        return self._cars[vehicle].track.at(now)
+
+    def _sensed(self, index: int, now: int) -> Sensed:
+        N, T, L = len(self._cars), len(self.binding.scenario.target_names), len(self._landmarks)
+        rotation, translation = np.tile(np.eye(3), (N, 1, 1)), np.zeros((N, 3))
+        velocity, angular_velocity = np.zeros((N, 3)), np.zeros((N, 3))
+        bearings, visible = np.full((N, T, 3), np.nan), np.zeros((N, T), bool)
+        odometry_age, bearing_age = np.full(N, np.inf), np.zeros(N)
+        missing, late = np.zeros(N, bool), np.zeros(N, bool)
+        truth = Truth(np.full((N, 3, 3), np.nan), np.full((N, 3), np.nan))
+        for i, car in enumerate(self._cars):
+            frame = self._advance(car, index, now, i, rotation, translation)
+            truth.rotation[i], truth.position[i] = car.track.at(car.moment or now)
+            if i not in self.binding.local:
+                missing[i] = True
+                continue
+            stamp = car.odometer.stamp
+            age = now - stamp if stamp is not None else None
+            missing[i] = age is None or age > SILENT
+            odometry_age[i] = np.inf if age is None else max(age, 0) * NS
+            velocity[i], angular_velocity[i] = car.odometer.twist
+            bearing_age[i] = (now - car.exposed) * NS if car.exposed is not None else (now - self._begin) * NS
+            if frame is not None:
+                late[i] = car.lag > LATE
+                self._see(i, frame, now, bearings[i], visible[i])
+        return Sensed(
+            index=index,
+            dt=1.0 / self.binding.scenario.rates.camera,
+            due=bool(is_due(index, self._ratio)),
+            time=(now - self._begin) * NS,
+            rotation=rotation,
+            translation=translation,
+            velocity=velocity,
+            angular_velocity=angular_velocity,
+            bearings=bearings,
+            visible=visible,
+            landmarks=sealed(self._landmarks.copy()),
+            odometry_age=odometry_age,
+            bearing_age=bearing_age,
+            missing=missing,
+            late=late,
+            truth=truth if np.isfinite(truth.position).any() else None,
+            inbox_tick=np.full((N, N), -1, dtype=np.int64) if self.binding.remote else None,
+            messages=self._messages(now),
+        )
+
+    def _advance(
+        self, car: _Car, index: int, now: int, i: int, rotation: Array, translation: Array
+    ) -> Detections | None:
+        """Move a car's moment to that of its next frame, or on with the clock; return the frame."""
+        before = car.moment if car.moment is not None else now
+        taken = car.frames.take(before, now) if index > 0 else None
+        if taken is not None:
+            moment, frame = taken
+            car.lag, car.exposed = now - moment, moment
+        else:  # half a period more, so that the frame that comes too late for this tick is after it
+            moment, frame = max(before, now - car.lag - self._period // 2), None
+        if index > 0:
+            rotation[i], translation[i] = car.odometer.increment(before, moment)
+        car.moment = moment
+        return frame
+
+    def _see(self, i: int, frame: Detections, now: int, bearings: Array, visible: NDArray[np.bool_]) -> None:
+        """Write a frame's bearings into a car's row, (T, 3) and (T,)."""
+        for marker, ray in zip(frame.markers, frame.bearings, strict=True):
+            target = self.binding.targets.get(marker)
+            if target is None or target == len(self._landmarks) + i:
+                self.refused["unknown marker"] += 1
+            elif target in self.binding.leaders.values() and now - self._led.get(target, 0) > STALE:
+                self.refused["landmark of unknown position"] += 1
+            else:
+                bearings[target], visible[target] = self._to_body[i] @ ray, True
+
+    def _messages(self, now: int) -> dict[tuple[int, int], Received]:
+        """Return what has come from vehicles that are estimated elsewhere since the last tick."""
+        found = {}
+        for sender, by_role in self._heard.items():
+            newest = by_role.get(Role.REPORT) or by_role.get(Role.ESTIMATE) or by_role.get(Role.POINT)
+            if newest is None:
+                continue
+            stamp, value = newest
+            if now - stamp > STALE:
+                self.refused["stale message"] += 1
+                continue
+            for receiver in self.binding.local:
+                message = message_of(value, self._markers[sender])
+                found[receiver, sender] = Received(message, max(0, now - stamp) * NS)
+        self._heard.clear()
+        return found

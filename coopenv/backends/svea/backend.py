@@ -1,0 +1,291 @@
+"""The SVEA backend: cars on a network in place of the simulated ones."""
+
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from coopenv.backends.base import Capabilities, Command, Health
+from coopenv.backends.svea.assembler import Assembler
+from coopenv.backends.svea.binding import Binding
+from coopenv.backends.svea.checks import problems_of
+from coopenv.backends.svea.gates import Gates
+from coopenv.backends.svea.intake import VELOCITY, Intake
+from coopenv.backends.svea.pacer import Pacer
+from coopenv.backends.svea.station import Station
+from coopenv.backends.svea.status import StatusBoard
+from coopenv.backends.svea.tape import Tape
+from coopenv.backends.svea.v2x import Told, checked, estimate_message, report_message
+from coopenv.backends.svea.watchdog import Watchdog, Watched
+from coopenv.errors import CoopenvError, shown, suggest
+from coopenv.estimation.arrays import Array
+from coopenv.observers.recording import Sensed
+from coopenv.svea.codec import encode
+from coopenv.svea.deployment import Deployment
+from coopenv.svea.signing import Signer, Verifier
+from coopenv.svea.topics import TOPICS, Role, presence_of, topic_of
+from coopenv.svea.transport.base import Arrival, Transport
+from coopenv.svea.warm_up import warm_up
+
+OPTIONS = ("arm", "options")
+FIRST_WORD = 3.0  # s that cars have to be heard in at the first reset
+SETTLE = 0.5  # s that fakes have to stand where they were put
+RESET_TOPIC = "fleet/coopenv/reset"
+
+
+@dataclass
+class LinkHealth(Health):
+    """What has come over the network as well."""
+
+    missed: int = 0  # decisions that came too late for their first tick
+    refused: dict[str, int] = field(default_factory=dict)  # samples that were not used, by reason
+
+
+class Svea:
+    """Cars as a source of ticks.
+
+    `reset(options={"arm": True})` lets them drive; without it everything happens but that commands are sent. An episode
+    ends early when the watchdog stops the cars; `notes` say why.
+    """
+
+    def __init__(
+        self,
+        deployment: Deployment,
+        binding: Binding,
+        transport: Transport,
+        signer: Signer | None = None,
+        verifier: Verifier | None = None,
+        tape: Tape | None = None,
+    ) -> None:
+        """Listen to the cars.
+
+        Args:
+            deployment: the fleet.
+            binding: who is who in it.
+            transport: how it is reached; closed with the backend.
+            signer: signs what is sent (None: nothing is signed).
+            verifier: knows the cars' keys (None: signatures do not count).
+            tape: writes down what comes.
+        """
+        self.deployment, self.binding, self.scenario = deployment, binding, binding.scenario
+        self._transport, self._signer, self._tape = transport, signer, tape
+        names = binding.names
+        self._local = {names[i]: i for i in binding.local}
+        self.capabilities = Capabilities(
+            truth=deployment.sensors.truth,
+            driven=True,
+            real_time=True,
+            ticks=None,
+            batched=False,
+            estimated=None if not binding.remote else binding.local,
+        )
+        self.health = LinkHealth()
+        self.intake = Intake(binding, deployment.sensors)
+        said = {topic_of(name, role): name for name in binding.cars for role in (Role.ESTIMATE, Role.REPORT)}
+        self.station = Station(transport, self.intake.topics, verifier, said)
+        self.gates = Gates(transport, tuple(self._local), deployment.safety.limits, signer)
+        self.board = StatusBoard(transport, tuple(self._local))
+        rates = self.scenario.rates
+        self._pacer = Pacer(1.0 / rates.camera, self.scenario.ticks_per_decision)
+        self._assembler = Assembler(binding)
+        self._places: dict[str, Array] = {}
+        self._estimates: dict[str, Array] = {}
+        self.watchdog = Watchdog(
+            deployment.safety, self.station, self.gates, self._watched(), self._positions, 1.0 / rates.decision
+        )
+        transport.watch(presence_of("*"), self._presence)
+        self.board.on_override = self.watchdog.set_overridden
+        self._armed, self._heard_once, self._began, self._index = False, False, 0, 0
+        self._presented = presence_of(deployment.security.identity)
+        transport.announce(self._presented)
+        self._closed = threading.Lock()
+        warm_up()
+
+    def _watched(self) -> dict[str, Watched]:
+        safety, sensors = self.deployment.safety, self.deployment.sensors
+        judged = (safety.geofence or safety.separation > 0.0) and safety.judge == "truth"
+        return {
+            name: Watched(
+                tuple(topic_of(name, role) for role in VELOCITY[sensors.odometry]),
+                topic_of(name, Role.TRUTH) if judged else None,
+            )
+            for name in self._local
+        }
+
+    def _presence(self, key: str, there: bool) -> None:
+        name = key.rsplit("/", 1)[-1]
+        if name in self._local:
+            self.watchdog.set_present(name, there)
+
+    def _positions(self) -> Mapping[str, Array]:
+        return self._places if self.deployment.safety.judge == "truth" else self._estimates
+
+    @property
+    def clock(self) -> float:
+        """Time since the reset, s."""
+        return (self._pacer.now() - self._began) * 1e-9 if self._began else 0.0
+
+    def reset(self, seed: int | None, options: Mapping[str, Any]) -> Sensed:
+        """Begin an episode; cars move only with the option `arm`.
+
+        Raises:
+            CoopenvError: an option is not known, or something is not as it has to be before wheels turn.
+        """
+        self._stop("reset")
+        arm = _checked(options)
+        if self.deployment.fakes:
+            self._place_fakes(0 if seed is None else seed)
+        self._listen()
+        if arm:
+            self._arm()
+        self._assembler = Assembler(self.binding)
+        for arrival in self.station.drain():
+            self._take(arrival)
+        self._began, self._index = self._pacer.start(), 0
+        if self._tape is not None:
+            self._tape.begin(self._began, seed)
+        return self._counted(self._assembler.begin(self._began))
+
+    def _listen(self) -> None:
+        """Wait until the cars have been heard, but not for ever: they need not be there as long as nobody drives."""
+        until = time.monotonic() + (0.0 if self._heard_once else FIRST_WORD)
+        topics = [topic for watched in self._watched().values() for topic in watched.odometry]
+        while time.monotonic() < until and any(self.station.silence(topic) > 1.0 for topic in topics):
+            time.sleep(0.02)
+        self._heard_once = True
+        self._drain()
+
+    def _place_fakes(self, seed: int) -> None:
+        from coopenv.svea.codec import make
+
+        self._transport.publish(RESET_TOPIC, encode(make("std_msgs/msg/Int64", data=seed % 2**63)), reliable=True)
+        time.sleep(SETTLE)
+
+    def _arm(self) -> None:
+        for problem in problems_of(self):
+            raise CoopenvError(f"not armed: {problem}")
+        self.gates.begin()
+        self.watchdog.arm()
+        self._armed = True
+
+    def advance(self, command: Command) -> Iterator[Sensed]:
+        """Send the commands and yield the ticks of one decision, each when it is due."""
+        self._pacer.decide()
+        self.health.missed = self._pacer.missed
+        self.watchdog.beat(self._pacer.in_a_row)
+        if self._armed:
+            self.gates.next()
+            for name, i in self._local.items():
+                speed, steering, acceleration = command.speed[i], command.steering[i], command.acceleration[i]
+                self.gates.command(name, float(speed), float(steering), float(acceleration))
+        for _ in range(self.scenario.ticks_per_decision):
+            if self._armed and self.watchdog.trip is not None:
+                self._armed = False
+                return
+            now = self._pacer.wait()
+            self._drain()
+            self._index += 1
+            if self._tape is not None:
+                self._tape.tick(self._index, now)
+            yield self._counted(self._assembler.tick(self._index, now))
+
+    def _drain(self) -> None:
+        arrivals = self.station.drain()
+        self.health.received += len(arrivals)
+        for arrival in arrivals:
+            self._take(arrival)
+        now = self._pacer.now()
+        self._places = {name: self._assembler.truth(i, now)[1] for name, i in self._local.items()}
+
+    def _take(self, arrival: Arrival) -> None:
+        if self._tape is not None:
+            self._tape.write(arrival)
+        for sample in self.intake.samples(arrival):
+            self._assembler.put(sample)
+
+    def _counted(self, tick: Sensed) -> Sensed:
+        local = list(self.binding.local)
+        missing = np.asarray(tick.missing)[local]
+        self.health.ticks += 1
+        self.health.late += int(np.asarray(tick.late)[local].sum())
+        self.health.missing += int(missing.sum())
+        self.health.empty += int((~tick.visible[local].any(axis=-1) & ~missing).sum())
+        refused = self._assembler.refused + self.station.dropped
+        for counts in self.intake.rejected.values():
+            refused += counts
+        self.health.refused, self.health.rejected = dict(refused), sum(refused.values())
+        return tick
+
+    def tell(self, told: Sequence[Told]) -> None:
+        """Send what the vehicles estimated here have to say, as they believe to be at the present tick."""
+        for each in told:
+            name, moment = self.binding.names[each.vehicle], self._assembler.moment(each.vehicle)
+            if not checked(each):
+                continue
+            self._estimates[name] = each.position
+            self._publish(name, Role.ESTIMATE, estimate_message(each, moment))
+            report = report_message(each, moment)
+            if report is not None:
+                self._publish(name, Role.REPORT, report)
+
+    def _publish(self, name: str, role: Role, message: Any) -> None:
+        topic, payload = topic_of(name, role), encode(message)
+        signature = b"" if self._signer is None else self._signer.sign(topic, payload)
+        self._transport.publish(topic, payload, signature)
+
+    def notes(self, vehicle: int) -> dict[str, Any]:
+        """Return what a vehicle's info tells of its car and of the network."""
+        name = self.binding.names[vehicle]
+        gate, trip = self.gates.states.get(name), self.watchdog.trip
+        offset = self.intake.offsets[name].seconds
+        return {
+            "name": name,
+            "armed": self._armed,
+            "stopped": "" if trip is None else trip.reason,
+            "stopped_by": "" if trip is None else trip.car or "",
+            "gate": "unknown" if gate is None else gate.state,
+            "gate_rejections": {} if gate is None else dict(gate.rejections),
+            "rejections": dict(self.health.refused),
+            "missed_deadlines": self.health.missed,
+            "lateness_p99": self._pacer.late(0.99),
+            "clock_offset": float("nan") if offset is None else offset,
+        }
+
+    def stop(self, reason: str) -> None:
+        """Bring the cars to a stand at once and end the episode."""
+        self._stop(reason)
+
+    def _stop(self, reason: str) -> None:
+        if self._armed:
+            self.gates.end()
+            if reason != "reset":
+                self.watchdog.stop(reason)
+        self.watchdog.disarm()
+        self._armed = False
+
+    def close(self) -> None:
+        """Stop, and leave the network."""
+        if not self._closed.acquire(blocking=False):
+            return
+        self._stop("closed")
+        self.watchdog.close()
+        if self._tape is not None:
+            self._tape.close()
+        self._transport.close()
+
+
+def _checked(options: Mapping[str, Any]) -> bool:
+    """Return whether cars are to drive. Raises CoopenvError: an option is not known."""
+    for key in options:
+        if key not in OPTIONS:
+            raise CoopenvError(f"unknown option {shown(key)}{suggest(str(key), OPTIONS)}; known: arm")
+    arm = options.get("arm", False)
+    if not isinstance(arm, bool):
+        raise CoopenvError(f"option 'arm' must be true or false, got {shown(arm)}")
+    return arm
+
+
+TYPES = {role: topic.type for role, topic in TOPICS.items()}

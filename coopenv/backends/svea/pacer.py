@@ -1,0 +1,63 @@
+"""Real time: absolute deadlines, none of which is made up for once it has been missed."""
+
+import time
+from collections import deque
+
+import numpy as np
+
+KEPT = 100_000  # lateness of so many ticks is kept for the statistics
+
+
+class Pacer:
+    """Ticks of a fixed period; times in ns of one clock that never jumps and agrees with the wall clock at the start."""
+
+    def __init__(self, period: float, per_decision: int) -> None:
+        """Give the period of ticks in s, and how many make a decision."""
+        self._period, self._per_decision = round(period * 1e9), per_decision
+        self._wall = time.time_ns() - time.monotonic_ns()
+        self._due = 0
+        self.missed = 0
+        """Decisions that came too late for their first tick, whose time was left out."""
+        self.in_a_row = 0
+        self.lateness: deque[float] = deque(maxlen=KEPT)
+        """s by which ticks were given after their time."""
+
+    def now(self) -> int:
+        """Return the time."""
+        return time.monotonic_ns() + self._wall
+
+    def start(self) -> int:
+        """Begin: the next tick is due a period from now. Returns the time."""
+        self._wall = time.time_ns() - time.monotonic_ns()
+        self.missed = self.in_a_row = 0
+        self.lateness.clear()
+        self._due = self.now()
+        return self._due
+
+    def decide(self) -> None:
+        """Begin a decision: where its first tick was due before, count it and go on from now."""
+        behind = self.now() - (self._due + self._period)
+        if behind > 0:
+            self.missed += 1
+            self.in_a_row += 1
+            decision = self._period * self._per_decision
+            self._due += -(-behind // decision) * decision
+        else:
+            self.in_a_row = 0
+
+    def wait(self) -> int:
+        """Sleep until the next tick is due and return the time then."""
+        self._due += self._period
+        left = self._due - self.now()
+        if left > 0:
+            time.sleep(left * 1e-9)
+        elif left < -self._period:  # the computer stood still within a decision
+            self.missed += 1
+            self._due -= left
+        now = self.now()
+        self.lateness.append((now - self._due) * 1e-9)
+        return now
+
+    def late(self, share: float) -> float:
+        """Return the lateness that a share of the ticks did not exceed, s; 0 where there were none."""
+        return float(np.quantile(self.lateness, share)) if self.lateness else 0.0
