@@ -11,8 +11,8 @@ from coopenv.errors import ActionError, suggest
 class ActionReader:
     """Turns {agent: (A,)} into (1, N, A), clipped to [-1, 1]."""
 
-    def __init__(self, possible_agents: Sequence[str], engine: Engine) -> None:
-        self._index = {agent: i for i, agent in enumerate(possible_agents)}
+    def __init__(self, index: Mapping[str, int], engine: Engine) -> None:
+        self._index = index  # of possible agents among the vehicles
         self._engine = engine
         self._size = engine.view("actions").shape[-1]
 

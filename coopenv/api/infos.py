@@ -6,6 +6,7 @@ import numpy as np
 from gymnasium import spaces
 
 from coopenv.api.engine import Engine
+from coopenv.backends.base import Conversing
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.scenario import Scenario
 from coopenv.world.state import LASTING_ERRORS
@@ -24,6 +25,7 @@ class InfoWriter:
         self._index = {agent: i for i, agent in enumerate(scenario.vehicle_names)}
         self._targets, self._landmarks = scenario.target_names, len(scenario.landmarks)
         self._outcomes = outcome_words(scenario)
+        self._backend = engine.backend if isinstance(engine.backend, Conversing) else None
         self._lasting = LASTING_ERRORS if scenario.has_lasting_errors else ()
         self._tick_length = 1.0 / scenario.rates.camera
 
@@ -72,6 +74,7 @@ class InfoWriter:
                 "outcome": self._outcomes[ended[i]],
                 "late_ticks": late[i],
                 "missing_ticks": missing[i],
+                **({} if self._backend is None else {"car": self._backend.notes(i)}),
             }
         return infos
 

@@ -77,17 +77,19 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             "is_parallelizable": True,
         }
         self.engine = Engine(scenario, 1, dtype, device, backend=backend, reward=reward)
-        self.possible_agents = list(scenario.vehicle_names)
+        here = backend.capabilities.estimated
+        names = scenario.vehicle_names
+        self.possible_agents = [name for i, name in enumerate(names) if here is None or i in here]
         self._agents: list[str] = []
         self._np_random: np.random.Generator | None = None
-        self._index = {agent: i for i, agent in enumerate(self.possible_agents)}
+        self._index = {agent: names.index(agent) for agent in self.possible_agents}
         self._flat = observation == "flat"
         layout = self.engine.layout
         space: spaces.Space[Any] = flat_space(layout) if self._flat else dict_space(layout)
         self.observation_spaces = {agent: space for agent in self.possible_agents}
         self.action_spaces = {agent: action_space(scenario) for agent in self.possible_agents}
         self.state_space = state_space(scenario)
-        self._read_actions = ActionReader(self.possible_agents, self.engine)
+        self._read_actions = ActionReader(self._index, self.engine)
         self._infos = InfoWriter(self.engine, scenario)
         self._pictures = Pictures(self.engine, scenario)
 
@@ -146,8 +148,8 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
             self._np_random = seeding.np_random(keys[0])[0]
         with self.engine.stopping():
             self.engine.reset(keys, options=own, parameters=parameters)
-        there = self.engine.view("ended")[0] != ABSENT
-        self._agents = [agent for agent, is_there in zip(self.possible_agents, there, strict=True) if is_there]
+        ended = self.engine.view("ended")[0]
+        self._agents = [agent for agent, i in self._index.items() if ended[i] != ABSENT]
         if self.render_mode == "human":
             self.render()
         return self._observations(self._agents), self._infos(self._agents)

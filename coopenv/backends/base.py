@@ -7,7 +7,7 @@ has nothing visible (`Sensed`). A backend never waits longer than its deadlines;
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Generator, Iterable, Iterator, Mapping
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol, Self, runtime_checkable
@@ -17,6 +17,7 @@ import numpy as np
 from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.observers.briefing import briefing_of
+from coopenv.observers.contract import Message
 from coopenv.observers.recording import Briefing, Sensed
 from coopenv.scenario import Scenario
 from coopenv.world.command import ACCELERATION, PAN, SPEED, STEERING
@@ -59,6 +60,18 @@ class Capabilities:
     ticks: int | None  # how many there are, the start included; None: no end of its own
     batched: bool  # it makes worlds on a device itself (`WorldBackend`)
     recorded: bool = False  # its ticks are always the same ones: neither seeds nor commands change anything
+    estimated: tuple[int, ...] | None = None  # vehicles that are estimated here and are agents (None: all)
+
+
+@dataclass(frozen=True)
+class Told:
+    """What one vehicle has to say after a tick."""
+
+    vehicle: int
+    rotation: Array  # (3, 3) body to map, estimated
+    position: Array  # (3,) of the body's origin, map, m
+    covariance: Array  # (6, 6) over (2 lambda, p)
+    message: Message | None  # of an observer that has messages of its own
 
 
 @dataclass
@@ -118,6 +131,29 @@ class Backend(Protocol):
 
     def close(self) -> None:
         """Stop, and let go of everything; may be called again."""
+        ...
+
+
+@runtime_checkable
+class Conversing(Protocol):
+    """A backend whose vehicles are among others that are estimated elsewhere, and which tells of its links."""
+
+    def tell(self, told: Sequence[Told]) -> None:
+        """Send what the vehicles that are estimated here have to say after the present tick, or at its start."""
+        ...
+
+    def notes(self, vehicle: int) -> dict[str, Any]:
+        """Return what a vehicle's info says of the machine that it is and of its links, always the same keys."""
+        ...
+
+
+@runtime_checkable
+class Repeating(Protocol):
+    """A backend whose episodes have been before: what a reset draws is what was drawn then."""
+
+    @property
+    def drawn(self) -> tuple[int, int]:
+        """Key of the random draws, and number of the episode, of the episode that has begun last."""
         ...
 
 

@@ -7,7 +7,7 @@ from typing import Any, NoReturn, cast
 
 import numpy as np
 
-from coopenv.backends.base import Backend, Command, SensingWorld, WorldBackend
+from coopenv.backends.base import Backend, Command, Conversing, Repeating, SensingWorld, Told, WorldBackend
 from coopenv.backends.replay.kernels import BY_RADIO, RECORDED, record_struct, true_twists
 from coopenv.backends.tick_checks import MEASURED, check_tick, is_sound
 from coopenv.errors import CoopenvError
@@ -80,8 +80,14 @@ class TickWorld(SensingWorld):
         self._present = _nothing(self.briefing)
         self._clear_marks()
         self._take(self._backend.reset(None if keys is None or keys[0] is None else int(keys[0]), options or {}), 0)
+        if isinstance(self._backend, Repeating):
+            key, episode = self._backend.drawn
+            self.state.seed.assign(np.array([key], dtype=np.uint64))
+            self.state.episode.assign(np.array([(episode - 1) % 2**32], dtype=np.uint32))
+            keys = None
         super().reset(keys, mask)
         self._receive()
+        self._tell()
 
     def load(self) -> None:
         """Load the kernels, see `World.load`."""
@@ -95,6 +101,13 @@ class TickWorld(SensingWorld):
             if over or not self.fetch():
                 return
             super().advance(1)
+            self._tell()
+
+    def finish(self, active: Any) -> None:
+        """End the tick, see `World.finish`."""
+        super().finish(active)
+        if active.numpy()[0] != 0:
+            self._tell()
 
     def fetch(self) -> bool:
         """Get the next tick from the backend, which is sent its command first where a decision begins."""
@@ -181,6 +194,23 @@ class TickWorld(SensingWorld):
                 self.view("inbox_position")[0, receiver, sender] = position
                 self.view("inbox_tick")[0, receiver, sender] = sent
         self._present = replace(now, messages=accepted)
+
+    def _tell(self) -> None:
+        """Let the backend send what its vehicles have to say, if it wants to and a message is due."""
+        if not isinstance(self._backend, Conversing) or int(self.view("tick")[0]) % self.briefing.period != 0:
+            return
+        here = self._backend.capabilities.estimated
+        self._backend.tell([self._told(i) for i in (range(self.model.vehicles) if here is None else here)])
+
+    def _told(self, vehicle: int) -> Told:
+        view, message = self.view, None
+        if self.observer.messages is not None:
+            memory = views_of(self.memory, fields(self.observer.memory), vehicle)
+            state = views_of(self.state, state_fields(self.precision), vehicle)
+            message = self.observer.messages.write(SimpleNamespace(memory=memory, state=state))
+        R = np.array(view("estimate_rotation")[0, vehicle], dtype=float)
+        position = R @ np.array(view("estimate_position")[0, vehicle], dtype=float)
+        return Told(vehicle, R, position, np.array(view("covariance")[0, vehicle], dtype=float), message)
 
     def _read(self, receiver: int, sender: int, message: Message, sent: int) -> bool:
         """Hand a message to the embedded observer, if that has messages of its own; return whether it can read it."""

@@ -51,6 +51,9 @@ float64[16] covariance
 """,
 }
 
+TICK = "coopenv_msgs/msg/Tick"
+"""Type of the marks in a file of a drive."""
+
 ROS_2 = {
     **CAMERA,
     "mavros_msgs/msg/ManualControl": """
@@ -103,6 +106,12 @@ geometry_msgs/Pose pose  # of the body
 float64[36] covariance  # rotation (rad), then position (m); see docs/robust.md
 geometry_msgs/Pose odometry  # dead reckoning since the start
 uint64 depends_on  # a bit per vehicle whose information is in it
+""",
+    TICK: """
+std_msgs/Header header
+int64 index  # 0: an episode begins
+uint64 key  # of its random draws
+uint32 episode
 """,
     "coopenv_msgs/msg/Arm": """
 std_msgs/Header header

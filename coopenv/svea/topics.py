@@ -61,6 +61,8 @@ TOPICS = {
 
 PREFIX = "fleet"
 MOTION_CAPTURE = "qualisys"
+TICK_TOPIC = "coopenv/tick"  # in files only
+RESET_TOPIC = "fleet/coopenv/reset"  # std_msgs/msg/Int64, a seed: fakes go to their start
 
 
 def topic_of(car: str, role: Role) -> str:

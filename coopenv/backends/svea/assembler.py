@@ -127,12 +127,17 @@ class Assembler:
         """Return tick number `index` at a time in ns."""
         return self._sensed(index, now)
 
+    def moment(self, vehicle: int) -> int:
+        """Return the time in ns for which the present tick of a vehicle holds, on the receiver's clock."""
+        moment = self._cars[vehicle].moment
+        return self._begin if moment is None else moment
+
     def truth(self, vehicle: int, now: int) -> tuple[Array, Array]:
         """Return the rotation and position of a vehicle by motion capture, NaN where it is not known."""
         return self._cars[vehicle].track.at(now)
 
     def _sensed(self, index: int, now: int) -> Sensed:
-        N, T, L = len(self._cars), len(self.binding.scenario.target_names), len(self._landmarks)
+        N, T = len(self._cars), len(self.binding.scenario.target_names)
         rotation, translation = np.tile(np.eye(3), (N, 1, 1)), np.zeros((N, 3))
         velocity, angular_velocity = np.zeros((N, 3)), np.zeros((N, 3))
         bearings, visible = np.full((N, T, 3), np.nan), np.zeros((N, T), bool)

@@ -8,32 +8,31 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.base import Capabilities, Command, Health
+from coopenv.backends.base import Capabilities, Command, Health, Told
 from coopenv.backends.svea.assembler import Assembler
 from coopenv.backends.svea.binding import Binding
-from coopenv.backends.svea.checks import problems_of
+from coopenv.backends.svea.checks import Fleet, problems_of
 from coopenv.backends.svea.gates import Gates
 from coopenv.backends.svea.intake import VELOCITY, Intake
 from coopenv.backends.svea.pacer import Pacer
 from coopenv.backends.svea.station import Station
 from coopenv.backends.svea.status import StatusBoard
 from coopenv.backends.svea.tape import Tape
-from coopenv.backends.svea.v2x import Told, checked, estimate_message, report_message
+from coopenv.backends.svea.v2x import checked, estimate_message, report_message
 from coopenv.backends.svea.watchdog import Watchdog, Watched
 from coopenv.errors import CoopenvError, shown, suggest
 from coopenv.estimation.arrays import Array
 from coopenv.observers.recording import Sensed
-from coopenv.svea.codec import encode
+from coopenv.svea.codec import encode, make
 from coopenv.svea.deployment import Deployment
 from coopenv.svea.signing import Signer, Verifier
-from coopenv.svea.topics import TOPICS, Role, presence_of, topic_of
+from coopenv.svea.topics import RESET_TOPIC, Role, presence_of, topic_of
 from coopenv.svea.transport.base import Arrival, Transport
 from coopenv.svea.warm_up import warm_up
 
 OPTIONS = ("arm", "options")
 FIRST_WORD = 3.0  # s that cars have to be heard in at the first reset
 SETTLE = 0.5  # s that fakes have to stand where they were put
-RESET_TOPIC = "fleet/coopenv/reset"
 
 
 @dataclass
@@ -99,6 +98,7 @@ class Svea:
         transport.watch(presence_of("*"), self._presence)
         self.board.on_override = self.watchdog.set_overridden
         self._armed, self._heard_once, self._began, self._index = False, False, 0, 0
+        self._key, self._episode = 0, 0
         self._presented = presence_of(deployment.security.identity)
         transport.announce(self._presented)
         self._closed = threading.Lock()
@@ -141,12 +141,11 @@ class Svea:
         self._listen()
         if arm:
             self._arm()
-        self._assembler = Assembler(self.binding)
-        for arrival in self.station.drain():
-            self._take(arrival)
+        self._drain()
         self._began, self._index = self._pacer.start(), 0
+        self._key, self._episode = (self._key, self._episode + 1) if seed is None else (seed, 0)
         if self._tape is not None:
-            self._tape.begin(self._began, seed)
+            self._tape.begin(self._began, self._key % 2**64, self._episode)
         return self._counted(self._assembler.begin(self._began))
 
     def _listen(self) -> None:
@@ -159,13 +158,12 @@ class Svea:
         self._drain()
 
     def _place_fakes(self, seed: int) -> None:
-        from coopenv.svea.codec import make
-
         self._transport.publish(RESET_TOPIC, encode(make("std_msgs/msg/Int64", data=seed % 2**63)), reliable=True)
         time.sleep(SETTLE)
 
     def _arm(self) -> None:
-        for problem in problems_of(self):
+        calibrations = {name: self.intake.calibrations[name] for name in self._local}
+        for problem in problems_of(Fleet(self.deployment, calibrations, self.station, self.intake, self.board)):
             raise CoopenvError(f"not armed: {problem}")
         self.gates.begin()
         self.watchdog.arm()
@@ -202,7 +200,7 @@ class Svea:
 
     def _take(self, arrival: Arrival) -> None:
         if self._tape is not None:
-            self._tape.write(arrival)
+            self._tape.write(arrival.topic, arrival.payload, arrival.received)
         for sample in self.intake.samples(arrival):
             self._assembler.put(sample)
 
@@ -286,6 +284,3 @@ def _checked(options: Mapping[str, Any]) -> bool:
     if not isinstance(arm, bool):
         raise CoopenvError(f"option 'arm' must be true or false, got {shown(arm)}")
     return arm
-
-
-TYPES = {role: topic.type for role, topic in TOPICS.items()}

@@ -47,7 +47,8 @@ def bind(scenario: Scenario, cars: Sequence[Car], markers: Mapping[str, int], wh
     driven, leaders = [car for car in cars if car.landmark is None], [car for car in cars if car.landmark is not None]
     if len(driven) != len(vehicles):
         raise CoopenvError(
-            f"{where}: cars: {len(driven)} of them are vehicles, the environment has {len(vehicles)}: {listed(vehicles)}"
+            f"{where}: cars: {len(driven)} of them are vehicles, the environment has {len(vehicles)}: "
+            f"{listed(vehicles)}"
         )
     left = [name for name in vehicles if name not in {car.vehicle for car in driven}]
     chosen = {}

@@ -74,7 +74,9 @@ class Gates:
         self.session, self._sequence = secrets.token_hex(8), 0
         for car in self._states:
             if self._states[car].age > OLD:
-                raise CoopenvError(f"{car}: no gate has spoken on {topic_of(car, Role.GATE)}: is `coopenv svea gate` running there?")
+                raise CoopenvError(
+                    f"{car}: no gate has spoken on {topic_of(car, Role.GATE)}: is `coopenv svea gate` running there?"
+                )
         until = time.monotonic() + PATIENCE
         while closed := [c for c, s in self.states.items() if (s.state, s.session) != ("armed", self.session)]:
             if time.monotonic() > until:

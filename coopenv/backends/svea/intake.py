@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from coopenv.backends.svea.binding import Binding
 from coopenv.errors import CoopenvError
+from coopenv.scenario.sensing import Camera
 from coopenv.svea.codec import decode, stamp_of
 from coopenv.svea.deployment import Sensors
 from coopenv.svea.reading import read
@@ -62,13 +63,11 @@ class Intake:
         self.offsets = {name: ClockOffset.unknown() for name in binding.cars}
         self.rejected: dict[str, Counter[str]] = {name: Counter() for name in (*binding.cars, *binding.leaders)}
         """Messages that could not be used, by car and role."""
+        self.calibrations = {name: _calibration(binding.scenario.cameras[i]) for name, i in binding.cars.items()}
+        """Of the environment, by car."""
         for name, vehicle in binding.cars.items():
-            camera = binding.scenario.cameras[vehicle]
-            calibration = Calibration(
-                camera.image_size, camera.focal_length, camera.principal_point, camera.distortion
-            )
             for role in roles_of(sensors, vehicle in binding.local):
-                self._topics[topic_of(name, role)] = name, role, calibration
+                self._topics[topic_of(name, role)] = name, role, self.calibrations[name]
         for name in binding.leaders:
             self._topics[topic_of(name, Role.ESTIMATE)] = name, Role.ESTIMATE, None
 
@@ -93,3 +92,7 @@ class Intake:
         if car in self.offsets and role is not Role.TRUTH:
             self.offsets[car].put(stamp, arrival.received)
         yield Sample(car, role, stamp, arrival.received, value)
+
+
+def _calibration(camera: Camera) -> Calibration:
+    return Calibration(camera.image_size, camera.focal_length, camera.principal_point, camera.distortion)

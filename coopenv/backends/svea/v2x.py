@@ -1,11 +1,11 @@
 """What cars tell each other: estimates as ROS has them, and this project's messages to observers."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from coopenv.backends.base import Told
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import skew
 from coopenv.observers.contract import Message
@@ -13,17 +13,6 @@ from coopenv.observers.riccati_coordinates import left_covariance
 from coopenv.observers.robust.messages import from_six
 from coopenv.svea.codec import header, make
 from coopenv.svea.samples import Pose, Report
-
-
-@dataclass(frozen=True)
-class Told:
-    """What one vehicle has to say after a tick."""
-
-    vehicle: int
-    rotation: Array  # (3, 3) body to map
-    position: Array  # (3,) of the body's origin, map, m
-    covariance: Array  # (6, 6) over (2 lambda, p)
-    message: Message | None  # of an observer that has messages of its own
 
 
 def message_of(value: Pose | Report, marker: Array) -> Message:
@@ -52,7 +41,9 @@ def estimate_message(told: Told, stamp: int) -> Any:
     return make(
         "geometry_msgs/msg/PoseWithCovarianceStamped",
         header=header(stamp, "map"),
-        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=_pose(told.rotation, told.position), covariance=covariance),
+        pose=make(
+            "geometry_msgs/msg/PoseWithCovariance", pose=_pose(told.rotation, told.position), covariance=covariance
+        ),
     )
 
 
