@@ -1,4 +1,4 @@
-"""From messages as they come to samples: decoded, checked, counted. The same for live cars and for recordings of them."""
+"""From messages to samples: decoded, checked, counted; the same for live cars and for recordings of them."""
 
 from collections import Counter, deque
 from collections.abc import Iterator

@@ -9,7 +9,7 @@ KEPT = 100_000  # lateness of so many ticks is kept for the statistics
 
 
 class Pacer:
-    """Ticks of a fixed period; times in ns of one clock that never jumps and agrees with the wall clock at the start."""
+    """Ticks of a fixed period; times are in ns of a clock that never jumps, set by the wall clock at the start."""
 
     def __init__(self, period: float, per_decision: int) -> None:
         """Give the period of ticks in s, and how many make a decision."""

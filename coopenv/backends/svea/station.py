@@ -53,7 +53,7 @@ class Station:
         expected = self._signers.get(arrival.topic)
         if self._verifier is None or expected is None:
             return True
-        return self._verifier.signer(arrival.topic, arrival.payload, arrival.attachment) == expected
+        return bool(self._verifier.signer(arrival.topic, arrival.payload, arrival.attachment) == expected)
 
     def drain(self) -> list[Arrival]:
         """Return what has come since the last call, in the order in which it was received."""

@@ -1,8 +1,8 @@
 """What goes over the network, written to an MCAP file as it comes, and marks of when ticks were made of it.
 
-The file is a ROS 2 bag that other tools read: every message stands under its own topic and type. What goes beyond that is
-the topic `coopenv/tick` and an attachment that says which fleet and environment it was; with both, a replay makes the
-same ticks again, bit for bit (`coopenv.backends.svea.drive`).
+The file is a ROS 2 bag that other tools read: every message stands under its own topic and type. What goes beyond that
+is the topic `coopenv/tick` and an attachment that says which fleet and environment it was; with both, a replay makes
+the same ticks again, bit for bit (`coopenv.backends.svea.drive`).
 """
 
 import queue

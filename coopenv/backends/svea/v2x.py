@@ -1,6 +1,6 @@
 """What cars tell each other: estimates as ROS has them, and this project's messages to observers."""
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,7 +21,7 @@ def message_of(value: Pose | Report, marker: Array) -> Message:
     A position without an orientation gives the marker's height alone.
     """
     if isinstance(value, Report):
-        return Message(value.position, value.rotation, value.covariance, value.extra)
+        return Message(value.position, value.rotation, value.covariance, cast(dict[str, Array], value.extra))
     if value.rotation is None:
         return Message(value.position + np.array([0.0, 0.0, marker[2]]))
     arm = value.rotation @ marker

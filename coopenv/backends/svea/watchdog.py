@@ -147,7 +147,7 @@ class Watchdog:
 
             fence = Polygon(s.geofence)
             for car, place in places.items():
-                if np.isfinite(place).all() and not fence.contains_point(place[:2]):
+                if np.isfinite(place).all() and not fence.contains_point((float(place[0]), float(place[1]))):
                     yield Trip(f"{car}: left the geofence at ({place[0]:.2f}, {place[1]:.2f}) m", car)
         if s.separation > 0.0:
             names = [car for car, place in places.items() if np.isfinite(place).all()]
