@@ -1,7 +1,9 @@
 """What a car may be told to do."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+
+from coopenv.errors import CoopenvError
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,24 @@ class Limits:
             and (-self.speed if self.reverse else 0.0) - SLACK <= speed <= self.speed + SLACK
             and abs(steering) <= self.steering + SLACK
         )
+
+    def approach(self, before: tuple[float, float], wanted: tuple[float, float], dt: float) -> tuple[float, float]:
+        """Return the (speed, steering) nearest to what is wanted that can follow after dt s; both in m/s and rad."""
+        speed = _toward(before[0], wanted[0], self.acceleration * dt)
+        return speed, _toward(before[1], wanted[1], self.steering_rate * dt)
+
+    def check(self) -> "Limits":
+        """Return these limits. Raises CoopenvError: one of them is not above zero, or beyond the hardest."""
+        for field in fields(self):
+            value, most = getattr(self, field.name), getattr(HARDEST, field.name)
+            if field.name != "reverse" and not 0.0 < value <= most:
+                raise CoopenvError(f"limit of {field.name.replace('_', ' ')}: must be above 0, at most {most:.4g}")
+        return self
+
+
+def _toward(before: float, wanted: float, most: float) -> float:
+    """Return `wanted`, or what is `most` from `before` towards it."""
+    return wanted if abs(wanted - before) <= most else before + math.copysign(most, wanted - before)
 
 
 SLACK = 1e-6
