@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from coopenv.errors import CoopenvError, listed, shown, suggest
-from coopenv.svea.limits import HARDEST, Limits
+from coopenv.svea.limits import HARDEST, USUAL, Limits
 
 MARKERS = range(1, 8)
 """Numbers of markers: the Pixy2 tells apart seven colour signatures."""
@@ -93,13 +93,13 @@ class Sensors(Part):
 class Safety(Part):
     """What stops the cars. Limits above the hard ones of `coopenv.svea.limits` are refused."""
 
-    max_speed: float = Field(default=0.5, gt=0.0, le=HARDEST.speed)
+    max_speed: float = Field(default=USUAL.speed, gt=0.0, le=HARDEST.speed)
     """m/s"""
-    max_steering: float = Field(default=0.5235987755982988, gt=0.0, le=HARDEST.steering)
+    max_steering: float = Field(default=USUAL.steering, gt=0.0, le=HARDEST.steering)
     """rad"""
-    max_acceleration: float = Field(default=1.0, gt=0.0, le=HARDEST.acceleration)
+    max_acceleration: float = Field(default=USUAL.acceleration, gt=0.0, le=HARDEST.acceleration)
     """m/s^2"""
-    max_steering_rate: float = Field(default=2.0, gt=0.0, le=HARDEST.steering_rate)
+    max_steering_rate: float = Field(default=USUAL.steering_rate, gt=0.0, le=HARDEST.steering_rate)
     """rad/s"""
     reverse: bool = False
     """Whether cars may drive backwards."""

@@ -49,3 +49,6 @@ SLACK = 1e-6
 
 HARDEST = Limits(speed=1.53, steering=math.pi / 6, acceleration=2.0, steering_rate=4.0, reverse=True)
 """Beyond which no file can go: 90 % of the low gear, and what a SVEA's servo does."""
+
+USUAL = Limits(speed=0.5, steering=math.pi / 6, acceleration=1.0, steering_rate=2.0)
+"""Where nothing else is said."""

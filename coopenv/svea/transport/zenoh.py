@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -68,7 +68,7 @@ def open_zenoh(
     mode: Literal["client", "peer", "router"],
     connect: Sequence[str] = (),
     listen: Sequence[str] = (),
-    tls: "dict[str, Path] | None" = None,
+    tls: "Mapping[str, Path] | None" = None,
     timeout: float = 2.0,
 ) -> Zenoh:
     """Open a session that uses the given endpoints and nothing else: nothing is looked for by multicast.

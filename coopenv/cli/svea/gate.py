@@ -1,0 +1,66 @@
+"""`coopenv svea gate`: what stands between the network and the wheels, on the car's own computer."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+Speed = typer.Option(help="Most m/s [default: 0.5].", show_default=False)
+Angle = typer.Option(help="Most rad of steering [default: 0.5236].", show_default=False)
+Acceleration = typer.Option(help="Most m/s^2, either way [default: 1].", show_default=False)
+Rate = typer.Option(help="Most rad/s of steering [default: 2].", show_default=False)
+
+
+def gate(
+    car: Annotated[str, typer.Option(help="Name of this car, as in its topics: svea7.")],
+    deployment: Annotated[
+        Path | None,
+        typer.Argument(metavar="[DEPLOYMENT.toml]", help="Deployment with network, keys and limits; options win."),
+    ] = None,
+    connect: Annotated[
+        str | None, typer.Option(help="Zenoh router, that of this car's zenoh-bridge-ros2dds: tcp/127.0.0.1:7447.")
+    ] = None,
+    keys: Annotated[
+        Path | None, typer.Option(help="Folder with CAR.pem and public.toml of `coopenv svea keys`.")
+    ] = None,
+    station: Annotated[str | None, typer.Option(help="Whose commands count [default: station].")] = None,
+    max_speed: Annotated[float | None, Speed] = None,
+    max_steering: Annotated[float | None, Angle] = None,
+    max_acceleration: Annotated[float | None, Acceleration] = None,
+    max_steering_rate: Annotated[float | None, Rate] = None,
+    reverse: Annotated[bool | None, typer.Option("--reverse", help="Let the car drive backwards.")] = None,
+) -> None:
+    """Pass on commands that are fresh, signed, in order and inside the limits; else keep the car neutral.
+
+    Runs on the car until it is interrupted; the car then gets neutral. It starts disarmed, and the station arms it for
+    a session. Without a valid command for 0.2 s the car gets neutral until there is a newer one. A stop, from anybody,
+    holds until the next arming. Clocks of car and station must agree to 50 ms (chrony). What the gate rejects is
+    counted in its status, fleet/CAR/coopenv/gate.
+
+    Limits beyond 1.53 m/s, 0.5236 rad, 2 m/s^2 and 4 rad/s are refused.
+    """
+    from coopenv import interrupts
+    from coopenv.svea.gate.core import Gate
+    from coopenv.svea.gate.process import CLOCK, Link, run
+    from coopenv.svea.gate.settings import Settings
+    from coopenv.svea.transport.zenoh import open_zenoh
+
+    bounds = {"speed": max_speed, "steering": max_steering, "acceleration": max_acceleration}
+    given = Settings.of(car, deployment).changed(
+        connect=connect and (connect,),
+        keys=keys,
+        station=station,
+        limits={**bounds, "steering_rate": max_steering_rate, "reverse": reverse},
+    )
+    signer, verifier = given.identities()
+    if verifier is None:
+        print("warning: without --keys whoever reaches the router can drive this car", file=sys.stderr)
+    transport = open_zenoh("client", given.connect, tls=given.tls)
+    try:
+        link = Link(Gate(car, given.limits, CLOCK, verifier, given.station), car, transport, signer)
+        interrupts.note(f"{car} is in neutral")
+        print(f"{car}: gate ready at {', '.join(given.connect)}", flush=True)
+        run(link)
+    finally:
+        transport.close()

@@ -1,0 +1,76 @@
+"""What a gate is told when it starts, by a deployment file and by options."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coopenv.errors import CoopenvError, shown
+from coopenv.svea.limits import USUAL, Limits
+from coopenv.svea.signing import LONGEST_IDENTITY, is_identity
+
+if TYPE_CHECKING:
+    from coopenv.svea.deployment import Deployment
+    from coopenv.svea.signing import Signer, Verifier
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Of one gate."""
+
+    car: str
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    limits: Limits = USUAL
+    keys: Path | None = None  # folder
+    station: str = "station"
+    tls: Mapping[str, Path] = field(default_factory=dict)  # files, as `open_zenoh` takes them
+
+    @classmethod
+    def of(cls, car: str, path: Path | None) -> Settings:
+        """Return the settings for a car by a deployment file, or the usual ones.
+
+        Raises:
+            CoopenvError: the name is none, the file cannot be read, knows no such car, or its network is not Zenoh.
+        """
+        if path is None:
+            if not is_identity(car):
+                raise CoopenvError(f"--car {shown(car)}: expected 1 to {LONGEST_IDENTITY} letters, digits, _ or -")
+            return cls(car)
+        from coopenv.svea.deployment import load_deployment
+
+        read = load_deployment(path)
+        if read.network.kind != "zenoh":
+            raise CoopenvError(f"{path}: network.kind is {read.network.kind!r}, a gate can be reached by 'zenoh' only")
+        keys = None if read.security.keys is None else read.folder / read.security.keys
+        connect, limits = read.network.connect, read.safety.limits
+        return cls(read.car(car).name, connect, limits, keys, read.security.identity, _tls(read))
+
+    def changed(self, limits: Mapping[str, Any], **values: Any) -> Settings:
+        """Return these settings with others in place of some; None leaves one as it is.
+
+        Raises:
+            CoopenvError: a limit is beyond the hardest.
+        """
+        bounds = replace(self.limits, **{name: value for name, value in limits.items() if value is not None})
+        rest = {name: value for name, value in values.items() if value is not None}
+        return replace(self, limits=bounds.check(), **rest)
+
+    def identities(self) -> tuple[Signer | None, Verifier | None]:
+        """Return what signs as the car and what knows the station. Raises CoopenvError: a key is missing or unsafe."""
+        if self.keys is None:
+            return None, None
+        from coopenv.svea.keys import check_known, load_signer, load_verifier
+
+        verifier = load_verifier(self.keys)
+        check_known(verifier, self.station, self.keys)
+        return load_signer(self.keys, self.car), verifier
+
+
+def _tls(deployment: Deployment) -> dict[str, Path]:
+    tls = deployment.network.tls
+    if tls is None:
+        return {}
+    files = {"root_ca_certificate": tls.root_ca, "connect_certificate": tls.certificate, "connect_private_key": tls.key}
+    return {name: deployment.folder / path for name, path in files.items() if path is not None}
