@@ -1,6 +1,7 @@
 """Go through an episode camera tick by camera tick, and keep what an engine shows at each."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +11,12 @@ from coopenv.seeds import world_keys
 
 
 def play(
-    engine: Engine, seeds: Sequence[int], ticks: int, policy: Policy | None = None, to_the_end: bool = True
+    engine: Engine,
+    seeds: Sequence[int],
+    ticks: int,
+    policy: Policy | None = None,
+    to_the_end: bool = True,
+    options: Mapping[str, Any] | None = None,
 ) -> Iterator[int]:
     """Start an episode in every world and yield the number of each camera tick, from 0, once the worlds are there.
 
@@ -20,12 +26,13 @@ def play(
         ticks: after the start; fewer where the backend has no more.
         policy: drives the first world; None: action zero.
         to_the_end: go on when all vehicles of the first world have ended.
+        options: for a backend that takes some at a reset.
 
     Raises:
         CoopenvError: the policy returns actions of another shape.
     """
     with engine.stopping():
-        engine.reset([world_keys(seed)[0] for seed in seeds])
+        engine.reset([world_keys(seed)[0] for seed in seeds], options=options)
         engine.set_actions(np.zeros_like(engine.view("actions")))
         width = engine.view("actions").shape[-1]
         if policy is not None:

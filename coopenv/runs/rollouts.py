@@ -1,8 +1,8 @@
 """Run one world by decisions of a policy and record it at every camera tick."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,8 +42,12 @@ class Rollout:
         device: str = "cpu",
         policy: str | Policy = "zero",
         backend: Backend | None = None,
+        options: Mapping[str, Any] | None = None,
     ) -> None:
-        """Build the world; arguments as for `rollout`, and where the scenario's ticks come from (None: simulated)."""
+        """Build the world; arguments as for `rollout`, but for those of its ticks.
+
+        `backend` is where they come from (None: simulated), and `options` what it is told at the reset.
+        """
         if steps is not None and steps < 1:
             raise CoopenvError(f"steps must be at least 1, got {steps}")
         self.engine = Engine(scenario, 1, dtype, device, backend=backend)
@@ -54,6 +58,7 @@ class Rollout:
         if steps is not None:
             self.ticks_planned = min(self.ticks_planned, steps * scenario.ticks_per_decision)
         self.wall_time = 0.0
+        self._options = options
         self._views = Views(self.engine, RECORDED)
 
     @property
@@ -70,7 +75,8 @@ class Rollout:
         start = perf_counter()
         self._views = Views(self.engine, RECORDED)
         self.wall_time = 0.0
-        for tick in play(self.engine, [self.seed], self.ticks_planned, self.policy, to_the_end=False):
+        moments = play(self.engine, [self.seed], self.ticks_planned, self.policy, False, self._options)
+        for tick in moments:
             self._views.take()
             self.wall_time += perf_counter() - start
             yield tick

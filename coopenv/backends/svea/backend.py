@@ -81,9 +81,12 @@ class Svea:
             batched=False,
             estimated=None if not binding.remote else binding.local,
         )
-        self.health = LinkHealth()
+        self.link = LinkHealth()
+        self.health: Health = self.link
         self.intake = Intake(binding, deployment.sensors)
-        said = {topic_of(name, role): name for name in binding.cars for role in (Role.ESTIMATE, Role.REPORT)}
+        own = deployment.security.identity
+        heard = (*binding.cars, *binding.leaders)
+        said = {topic_of(name, role): (name, own) for name in heard for role in (Role.ESTIMATE, Role.REPORT)}
         self.station = Station(transport, self.intake.topics, verifier, said)
         self.gates = Gates(transport, tuple(self._local), deployment.safety.limits, signer)
         self.board = StatusBoard(transport, tuple(self._local))
@@ -172,7 +175,7 @@ class Svea:
     def advance(self, command: Command) -> Iterator[Sensed]:
         """Send the commands and yield the ticks of one decision, each when it is due."""
         self._pacer.decide()
-        self.health.missed = self._pacer.missed
+        self.link.missed = self._pacer.missed
         self.watchdog.beat(self._pacer.in_a_row)
         if self._armed:
             self.gates.next()
@@ -214,7 +217,7 @@ class Svea:
         refused = self._assembler.refused + self.station.dropped
         for counts in self.intake.rejected.values():
             refused += counts
-        self.health.refused, self.health.rejected = dict(refused), sum(refused.values())
+        self.link.refused, self.health.rejected = dict(refused), sum(refused.values())
         return tick
 
     def tell(self, told: Sequence[Told]) -> None:
@@ -246,11 +249,15 @@ class Svea:
             "stopped_by": "" if trip is None else trip.car or "",
             "gate": "unknown" if gate is None else gate.state,
             "gate_rejections": {} if gate is None else dict(gate.rejections),
-            "rejections": dict(self.health.refused),
-            "missed_deadlines": self.health.missed,
+            "rejections": dict(self.link.refused),
+            "missed_deadlines": self.link.missed,
             "lateness_p99": self._pacer.late(0.99),
             "clock_offset": float("nan") if offset is None else offset,
         }
+
+    def lateness(self, share: float) -> float:
+        """Return by how much at most that share of the ticks came after their time, s."""
+        return self._pacer.late(share)
 
     def stop(self, reason: str) -> None:
         """Bring the cars to a stand at once and end the episode."""

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 
 from coopenv.svea.signing import Verifier
 from coopenv.svea.transport.base import Arrival, Transport
@@ -16,7 +16,11 @@ class Station:
     """Keeps messages by topic; its callbacks run in threads of the transport and only store."""
 
     def __init__(
-        self, transport: Transport, topics: Iterable[str], verifier: Verifier | None, signers: dict[str, str]
+        self,
+        transport: Transport,
+        topics: Iterable[str],
+        verifier: Verifier | None,
+        signers: Mapping[str, Collection[str]],
     ) -> None:
         """Subscribe.
 
@@ -24,7 +28,7 @@ class Station:
             transport: the network.
             topics: what to subscribe to.
             verifier: checks signatures; None: nothing is signed.
-            signers: topic to who has to have signed it, for those that others could forge.
+            signers: topic to who may have signed it, for those that others could forge.
         """
         self._lock = threading.Lock()
         self._waiting: dict[str, deque[Arrival]] = {topic: deque(maxlen=MOST_WAITING) for topic in topics}
@@ -53,7 +57,7 @@ class Station:
         expected = self._signers.get(arrival.topic)
         if self._verifier is None or expected is None:
             return True
-        return bool(self._verifier.signer(arrival.topic, arrival.payload, arrival.attachment) == expected)
+        return self._verifier.signer(arrival.topic, arrival.payload, arrival.attachment) in expected
 
     def drain(self) -> list[Arrival]:
         """Return what has come since the last call, in the order in which it was received."""

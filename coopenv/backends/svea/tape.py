@@ -7,9 +7,9 @@ the same ticks again, bit for bit (`coopenv.backends.svea.drive`).
 
 import queue
 import threading
+import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from coopenv.errors import CoopenvError, OutputError
 from coopenv.files import writing
@@ -104,9 +104,9 @@ class Tape:
 class Taped:
     """A transport whose outgoing messages are written to a tape as well."""
 
-    def __init__(self, transport: Transport, tape: Tape, now: Any) -> None:
-        """Wrap a transport; `now` tells the time in ns."""
-        self._transport, self._tape, self._now = transport, tape, now
+    def __init__(self, transport: Transport, tape: Tape) -> None:
+        """Wrap a transport."""
+        self._transport, self._tape = transport, tape
         self.subscribe, self.announce = transport.subscribe, transport.announce
         self.watch, self.close = transport.watch, transport.close
 
@@ -115,4 +115,4 @@ class Taped:
     ) -> None:
         """Send, see `Transport`, and write down."""
         self._transport.publish(topic, payload, attachment, urgent=urgent, reliable=reliable)
-        self._tape.write(topic, payload, self._now())
+        self._tape.write(topic, payload, time.time_ns())

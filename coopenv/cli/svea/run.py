@@ -1,0 +1,52 @@
+"""`coopenv svea run`: observe cars, or drive them."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from coopenv.cli import options
+
+
+def run(
+    config: Annotated[Path, typer.Argument(metavar="DEPLOYMENT.toml", help="Which cars, and how they are reached.")],
+    car: Annotated[
+        str | None,
+        typer.Option(help="Estimate and drive this car alone and hear the others (default: all, as an edge server)."),
+    ] = None,
+    arm: Annotated[
+        bool, typer.Option("--arm", help="Let the cars drive. Without it everything happens but that.")
+    ] = False,
+    policy: options.PolicyName = "zero",
+    seed: options.Seed = 0,
+    steps: Annotated[int | None, typer.Option(min=1, help="Decisions to run (default: up to the horizon).")] = None,
+    record: Annotated[Path | None, typer.Option(help="MCAP file for all that comes and goes.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the results (default: out/DEPLOYMENT).")] = None,
+    overrides: options.Overrides = None,
+    steady_from: options.SteadyFrom = None,
+    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
+    as_json: options.AsJson = False,
+) -> None:
+    """Run an environment on cars: observers estimate, a policy drives, tables and figures follow.
+
+    Without --arm no command is sent: run it beside the car that somebody else drives.
+    """
+    from coopenv.backends.svea.opening import open_svea
+    from coopenv.runs.command import execute, report
+    from coopenv.runs.links import links_report
+    from coopenv.runs.rollouts import Rollout
+
+    changes, log = options.parse_overrides(overrides), options.console(stderr=True)
+    with options.warned():
+        backend = open_svea(config, None, changes, car, record)
+    try:
+        rollout = Rollout(backend.scenario, seed, steps, policy=policy, backend=backend, options={"arm": arm})
+        folder = out or Path("out") / config.stem
+        result = execute(config.stem, rollout, folder, log, changes, steady_from, None if no_figures else "png", False)
+    finally:
+        backend.close()
+    if as_json:
+        options.print_json(result)
+        return
+    report(rollout, result, folder, options.console())
+    links_report(backend, options.console())

@@ -1,0 +1,31 @@
+"""What a run on cars says of its links: what came, what was refused, and how well time was kept."""
+
+from rich.console import Console
+from rich.table import Table
+
+from coopenv.backends.svea.backend import Svea
+
+
+def links_report(backend: Svea, out: Console) -> None:
+    """Print a table with a row per car, and a line on time and on why it ended."""
+    health, cars = backend.link, backend.binding
+    table = Table(title="Links", title_justify="left", box=None)
+    for name in ("car", "gate", "clock offset", "messages refused", "gate refused"):
+        table.add_column(name, justify="left" if name in ("car", "gate") else "right")
+    for vehicle in cars.local:
+        notes = backend.notes(vehicle)
+        offset = f"{1e3 * notes['clock_offset']:.1f} ms"
+        refused = str(sum(backend.intake.rejected[notes["name"]].values()))
+        table.add_row(notes["name"], notes["gate"], offset, refused, str(sum(notes["gate_rejections"].values())))
+    out.print(table)
+    late = 1e3 * backend.lateness(0.99)
+    out.print(
+        f"{health.received} messages, {health.ticks} ticks, {health.missed} missed deadlines, "
+        f"wake-up lateness p99 {late:.2f} ms",
+        soft_wrap=True,
+    )
+    if left_out := [f"{name} {count}" for name, count in health.refused.items() if count]:
+        out.print(f"Left out: {', '.join(left_out)}", soft_wrap=True)
+    trip = backend.watchdog.trip
+    if trip is not None:
+        out.print(f"Stopped: {trip.reason}", soft_wrap=True)
