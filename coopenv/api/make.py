@@ -31,6 +31,9 @@ def parallel_env(
     data: str | Path | None = None,
     variant: str | None = None,
     reward: RewardFunction | None = None,
+    deployment: str | Path | None = None,
+    car: str | None = None,
+    record: str | Path | None = None,
 ) -> CooperativeLocalisationEnv:
     """Return an environment by name (`coopenv.list_envs()`), from a TOML file, or from a recording.
 
@@ -42,8 +45,8 @@ def parallel_env(
         render_mode: None, "rgb_array" or "human".
         observer: estimator that every vehicle runs, embedded or a plug-in: a name, a class, or where one stands
             (`mine.py:Mine`, `package.module:Mine`); None: as the scenario says.
-        backend: where measurements come from, "simulated", "highway" or "replay", or a `coopenv.backends.base.Backend`,
-            which has its own scenario; None: as the name says.
+        backend: where measurements come from, "simulated", "highway", "replay" or "svea", or a
+            `coopenv.backends.base.Backend`, which has its own scenario; None: as the name says.
         observation: "flat" Box or one-level "dict".
         device: "cpu" or a CUDA device.
         dtype: "float32" or "float64" (of the world; observations are float32).
@@ -52,6 +55,9 @@ def parallel_env(
         variant: of a recorded data set: "landmarks", "landmarks+robots" (the default) or "blind".
         reward: a function of a `coopenv.api.reward.Step` that returns the rewards (1, vehicles); None: the weighted
             sum of the scenario's terms.
+        deployment: file that says which cars there are; for `backend="svea"`, see docs/cars.md.
+        car: the one that is estimated and driven here, the others are heard (None: all of them).
+        record: MCAP file to which all that comes from the cars and goes to them is written.
 
     Raises:
         UnknownEnvironmentError: no such environment.
@@ -59,7 +65,14 @@ def parallel_env(
         CoopenvError: another argument is not valid.
     """
     return CooperativeLocalisationEnv(
-        open_backend(name_or_path, backend, _with_observer(overrides, observer), data, variant),
+        open_backend(
+            name_or_path,
+            backend,
+            _with_observer(overrides, observer),
+            data,
+            variant,
+            {"deployment": deployment, "car": car, "record": record},
+        ),
         Path(str(name_or_path)).stem,
         render_mode=render_mode,
         observation=observation,

@@ -13,8 +13,7 @@ from coopenv.errors import CoopenvError, DataError, suggest
 from coopenv.observers.recording import Recording
 from coopenv.scenario import Scenario, load_scenario
 
-BACKENDS = ("simulated", "highway", "replay")
-PLANNED = ("svea",)  # backends that there will be
+BACKENDS = ("simulated", "highway", "replay", "svea")
 
 LOG_SUFFIX = ".mcap"
 DATASETS = re.compile(r"mrclam_\d+")
@@ -97,6 +96,7 @@ def open_backend(
     overrides: Mapping[str, Any],
     data: str | Path | None = None,
     variant: str | None = None,
+    cars: Mapping[str, Any] | None = None,
 ) -> Backend:
     """Return where the ticks of an environment or a recording come from.
 
@@ -106,20 +106,29 @@ def open_backend(
         overrides: dotted scenario keys.
         data: folder of the data sets.
         variant: of a data set.
+        cars: arguments of `coopenv.backends.svea.opening.open_svea`, which `backend="svea"` needs: `deployment`, and
+            `car` and `record`.
 
     Raises:
         CoopenvError: any of it does not exist or does not fit.
     """
+    given = {key: value for key, value in (cars or {}).items() if value is not None}
+    if backend == "svea":
+        return _open_cars(name_or_path, overrides, {**given, "data": data, "variant": variant})
     if isinstance(backend, Backend):
-        for key, value in {**overrides, "data": data, "variant": variant}.items():
+        for key, value in {**overrides, **given, "data": data, "variant": variant}.items():
             if value is not None:
                 raise CoopenvError(f"{key}: {type(backend).__name__} has its scenario already, choose it there")
         return backend
-    if backend in PLANNED:
-        raise CoopenvError(f"backend '{backend}' is planned, but not there yet; known: {', '.join(BACKENDS)}")
+    for key in given:
+        raise CoopenvError(f"{key}: is for backend='svea'")
     if backend is not None and backend not in BACKENDS:
         known = f"{suggest(str(backend), BACKENDS)}; known: {', '.join(BACKENDS)}"
         raise CoopenvError(f"unknown backend '{backend}'{known}")
+    if backend in (None, "replay") and kind_of(name_or_path) is Kind.LOG and _is_drive(name_or_path):
+        from coopenv.backends.svea.drive import Drive
+
+        return Drive(name_or_path, overrides)
     if backend == "replay" or (backend is None and is_recorded(name_or_path)):
         return Replay(open_recording(name_or_path, data, variant), Path(name_or_path).name, overrides)
     for what, value in (("data", data), ("variant", variant)):
@@ -129,3 +138,24 @@ def open_backend(
     if backend not in (None, scenario.backend):
         raise CoopenvError(f"backend '{backend}': {name_or_path} says backend = \"{scenario.backend}\"")
     return simulation_of(scenario)
+
+
+def _is_drive(path: str | Path) -> bool:
+    """Return whether a log file is a drive of cars."""
+    from coopenv.backends.svea.drive import is_drive
+
+    return is_drive(path)
+
+
+def _open_cars(name: str | Path, overrides: Mapping[str, Any], given: Mapping[str, Any]) -> Backend:
+    """Return the cars of a deployment file: that which is given, or `name` itself."""
+    from coopenv.backends.svea.opening import open_svea
+
+    for key in ("data", "variant"):
+        if given[key] is not None:
+            raise CoopenvError(f"{key} is for recorded data, backend='svea' has cars")
+    deployment = given.get("deployment")
+    if deployment is None and not str(name).endswith(".toml"):
+        raise CoopenvError(f"deployment: needed by backend='svea': the file that says which cars drive {name}")
+    environment = None if deployment is None else str(name)
+    return open_svea(deployment or name, environment, overrides, given.get("car"), given.get("record"))

@@ -87,7 +87,7 @@ class TickWorld(SensingWorld):
             keys = None
         super().reset(keys, mask)
         self._receive()
-        self._tell()
+        self._end_tick()
 
     def load(self) -> None:
         """Load the kernels, see `World.load`."""
@@ -101,13 +101,13 @@ class TickWorld(SensingWorld):
             if over or not self.fetch():
                 return
             super().advance(1)
-            self._tell()
+            self._end_tick()
 
     def finish(self, active: Any) -> None:
         """End the tick, see `World.finish`."""
         super().finish(active)
         if active.numpy()[0] != 0:
-            self._tell()
+            self._end_tick()
 
     def fetch(self) -> bool:
         """Get the next tick from the backend, which is sent its command first where a decision begins."""
@@ -195,12 +195,16 @@ class TickWorld(SensingWorld):
                 self.view("inbox_tick")[0, receiver, sender] = sent
         self._present = replace(now, messages=accepted)
 
-    def _tell(self) -> None:
-        """Let the backend send what its vehicles have to say, if it wants to and a message is due."""
-        if not isinstance(self._backend, Conversing) or int(self.view("tick")[0]) % self.briefing.period != 0:
-            return
+    def _end_tick(self) -> None:
+        """Take over what vehicles that are estimated elsewhere say of themselves, and let the backend send the rest."""
         here = self._backend.capabilities.estimated
-        self._backend.tell([self._told(i) for i in (range(self.model.vehicles) if here is None else here)])
+        for (_, sender), received in self._present.messages.items() if here is not None else ():
+            R, place = received.message.rotation, received.message.position
+            if R is not None and place is not None:
+                self.view("estimate_rotation")[0, sender] = R
+                self.view("estimate_position")[0, sender] = R.T @ place - self.briefing.setups[sender].marker
+        if isinstance(self._backend, Conversing) and int(self.view("tick")[0]) % self.briefing.period == 0:
+            self._backend.tell([self._told(i) for i in (range(self.model.vehicles) if here is None else here)])
 
     def _told(self, vehicle: int) -> Told:
         view, message = self.view, None

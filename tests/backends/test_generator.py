@@ -341,7 +341,7 @@ def test_what_it_cannot_do_is_said() -> None:
     with pytest.raises(CoopenvError, match=r"observer\.name: Fleet has its scenario already"):
         make(Fleet(), observer="mekf")
     for backend, why in (
-        ("svea", "backend 'svea' is planned, but not there yet; known: simulated, highway, replay"),
+        ("svea", "deployment: needed by backend='svea': the file that says which cars drive"),
         (5, "unknown backend '5'"),
     ):
         with pytest.raises(CoopenvError, match=why):
