@@ -51,6 +51,8 @@ class TickWorld(SensingWorld):
         super().__init__(scenario, 1, dtype, device, 1, observer, start_covariances(scenario))
         self._present = _nothing(self.briefing)
         self._ticks: Iterator[Sensed] = iter(())
+        self._adopted: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        """Rotation and body-frame position by which vehicles that are estimated elsewhere believe to be."""
 
     def sensed(self, world: int, k: int) -> Sensed:
         """Return the present tick."""
@@ -78,6 +80,7 @@ class TickWorld(SensingWorld):
         """Begin an episode of the backend, see `World.reset`."""
         self._ticks = iter(())
         self._present = _nothing(self.briefing)
+        self._adopted.clear()
         self._clear_marks()
         self._take(self._backend.reset(None if keys is None or keys[0] is None else int(keys[0]), options or {}), 0)
         if isinstance(self._backend, Repeating):
@@ -201,8 +204,9 @@ class TickWorld(SensingWorld):
         for (_, sender), received in self._present.messages.items() if here is not None else ():
             R, place = received.message.rotation, received.message.position
             if R is not None and place is not None:
-                self.view("estimate_rotation")[0, sender] = R
-                self.view("estimate_position")[0, sender] = R.T @ place - self.briefing.setups[sender].marker
+                self._adopted[sender] = R, R.T @ place - self.briefing.setups[sender].marker
+        for sender, (R, p) in self._adopted.items():
+            self.view("estimate_rotation")[0, sender], self.view("estimate_position")[0, sender] = R, p
         if isinstance(self._backend, Conversing) and int(self.view("tick")[0]) % self.briefing.period == 0:
             self._backend.tell([self._told(i) for i in (range(self.model.vehicles) if here is None else here)])
 
