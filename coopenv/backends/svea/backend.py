@@ -168,6 +168,7 @@ class Svea:
         calibrations = {name: self.intake.calibrations[name] for name in self._local}
         for problem in problems_of(Fleet(self.deployment, calibrations, self.station, self.intake, self.board)):
             raise CoopenvError(f"not armed: {problem}")
+        self.watchdog.forget()
         self.gates.begin()
         self.watchdog.arm()
         self._armed = True

@@ -67,10 +67,15 @@ class Watchdog:
         self._thread = threading.Thread(target=self._watch, name="coopenv watchdog", daemon=True)
         self._thread.start()
 
+    def forget(self) -> None:
+        """Stop the cars no longer for what was before, so that they can be armed."""
+        with self._lock:
+            self.trip = None
+
     def arm(self) -> None:
         """Look after the cars from now on."""
         with self._lock:
-            self.trip, self._armed, self._beat, self._missed = None, True, time.monotonic(), 0
+            self._armed, self._beat, self._missed = True, time.monotonic(), 0
 
     def disarm(self) -> None:
         """Look no longer: the cars stand."""
