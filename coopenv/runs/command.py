@@ -1,6 +1,6 @@
 """`coopenv run`: simulate with progress shown, write the results, print the table."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -37,10 +37,12 @@ def execute(
     steady_from: float | None,
     figures: str | None,
     video: bool,
+    describe: Callable[[], str] | None = None,
 ) -> dict[str, Any]:
     """Run, write to the folder `out`, and return what `run --json` prints: the metrics, and the paths of the files.
 
-    A run that does not reach its end writes nothing. `figures` is their format; None: no figures.
+    A run that does not reach its end writes nothing. `figures` is their format; None: no figures. `describe` says what
+    is shown beside the bar meanwhile.
 
     Raises:
         CoopenvError: an argument is not valid, or the results cannot be written.
@@ -53,7 +55,7 @@ def execute(
         with compile_notice(log):
             run.engine.load()
         film = open_film(folder, scenario.rates.camera / frame_stride(scenario)) if video else None
-        _simulate(run, film, log)
+        _simulate(run, film, log, describe)
         trajectory = run.trajectory()
         judged, endings = trajectory.where_truth_is_known(), run.endings()
         if len(judged.t) < 2:
@@ -80,7 +82,7 @@ def execute(
     return {**metrics, "files": [out / path.name for path in paths]}
 
 
-def _simulate(run: Rollout, film: Film | None, log: Console) -> None:
+def _simulate(run: Rollout, film: Film | None, log: Console, describe: Callable[[], str] | None) -> None:
     """Play a run to its end."""
     view = None
     if film is not None:
@@ -93,7 +95,7 @@ def _simulate(run: Rollout, film: Film | None, log: Console) -> None:
             if tick % stride == 0:
                 if film is not None and view is not None:
                     film.add(view.draw(run.engine))
-                progress.update(tick)
+                progress.update(tick, describe() if describe is not None else None)
 
 
 def report(run: Rollout, result: Mapping[str, Any], folder: Path, out: Console) -> None:

@@ -6,6 +6,17 @@ from rich.table import Table
 from coopenv.backends.svea.backend import Svea
 
 
+def links_line(backend: Svea) -> str:
+    """Return the state of the links in a few words, for a line that is shown while it runs."""
+    parts = []
+    for vehicle in backend.binding.local:
+        notes = backend.notes(vehicle)
+        refused = sum(notes["gate_rejections"].values()) + sum(backend.intake.rejected[notes["name"]].values())
+        parts.append(f"{notes['name']} {notes['gate']}" + (f", {refused} refused" if refused else ""))
+    late = f"; {backend.link.missed} deadlines missed" if backend.link.missed else ""
+    return "; ".join(parts) + late
+
+
 def links_report(backend: Svea, out: Console) -> None:
     """Print a table with a row per car, and a line on time and on why it ended."""
     health, cars = backend.link, backend.binding

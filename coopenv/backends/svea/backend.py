@@ -252,7 +252,7 @@ class Svea:
             "gate_rejections": {} if gate is None else dict(gate.rejections),
             "rejections": dict(self.link.refused),
             "missed_deadlines": self.link.missed,
-            "lateness_p99": self._pacer.late(0.99),
+            "lateness": self._pacer.lateness[-1] if self._pacer.lateness else 0.0,
             "clock_offset": float("nan") if offset is None else offset,
         }
 

@@ -1,5 +1,6 @@
 """`coopenv svea run`: observe cars, or drive them."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -33,7 +34,7 @@ def run(
     """
     from coopenv.backends.svea.opening import open_svea
     from coopenv.runs.command import execute, report
-    from coopenv.runs.links import links_report
+    from coopenv.runs.links import links_line, links_report
     from coopenv.runs.rollouts import Rollout
 
     changes, log = options.parse_overrides(overrides), options.console(stderr=True)
@@ -42,7 +43,9 @@ def run(
     try:
         rollout = Rollout(backend.scenario, seed, steps, policy=policy, backend=backend, options={"arm": arm})
         folder = out or Path("out") / config.stem
-        result = execute(config.stem, rollout, folder, log, changes, steady_from, None if no_figures else "png", False)
+        figures = None if no_figures else "png"
+        watched = partial(links_line, backend)
+        result = execute(config.stem, rollout, folder, log, changes, steady_from, figures, False, watched)
     finally:
         backend.close()
     if as_json:
