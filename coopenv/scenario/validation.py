@@ -31,7 +31,9 @@ def one_line(error: ValidationError, where: str, model: type[BaseModel]) -> str:
         return f"{where}: {field}: unknown key{hint}{more}"
     if first["type"] in ("union_tag_not_found", "union_tag_invalid"):
         return f"{where}: {field}.{_kind_message(first)}{more}"
-    message = first["msg"].removeprefix("Value error, ").replace("valid tuple", "list")
+    message = (
+        first["msg"].removeprefix("Value error, ").replace("valid tuple", "list").replace("Tuple should", "List should")
+    )
     if first["type"] == "missing" and isinstance(keys[-1], int):
         return f"{where}: {field.rpartition('.')[0]}: too few entries, number {keys[-1] + 1} is missing{more}"
     if first["type"] == "value_error":  # our own checks: their messages start with the field that they are about

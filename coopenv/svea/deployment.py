@@ -5,16 +5,18 @@ from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from coopenv.errors import CoopenvError, listed, shown, suggest
 from coopenv.svea.limits import HARDEST, USUAL, Limits
+from coopenv.svea.network import Network, Part
 
 MARKERS = range(1, 8)
 """Numbers of markers: the Pixy2 tells apart seven colour signatures."""
 
 Name = Annotated[str, Field(max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 Marker = Annotated[int, Field(ge=0)]
+Agent = Annotated[int, Field(ge=0, le=9999)]
 Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 Point = tuple[Number, Number]
@@ -22,45 +24,6 @@ Point = tuple[Number, Number]
 
 class DeploymentError(CoopenvError):
     """A deployment file does not describe a fleet that can drive."""
-
-
-class Part(BaseModel):
-    """A section of the file; unknown keys are refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
-
-
-class Tls(Part):
-    """Certificates of the transport; paths are relative to the file."""
-
-    root_ca: Path
-    """Certificate of who signs the others'."""
-    certificate: Path | None = None
-    """Own certificate, where this end listens or the other one asks for it."""
-    key: Path | None = None
-    """Private key of it."""
-
-
-def _endpoint(text: str) -> str:
-    """Refuse what is no endpoint such as tcp/127.0.0.1:7447."""
-    protocol, slash, address = text.partition("/")
-    if not slash or protocol not in ("tcp", "tls", "quic", "udp", "nats") or ":" not in address:
-        raise ValueError(f"{text!r} is no endpoint, expected for example tcp/127.0.0.1:7447")
-    return text
-
-
-Endpoint = Annotated[str, AfterValidator(_endpoint)]
-
-
-class Network(Part):
-    """How the cars are reached."""
-
-    kind: Literal["zenoh", "nats", "ros1"] = "zenoh"
-    """`zenoh`: CDR under the keys of zenoh-bridge-ros2dds; `nats`: the authors' wire; `ros1`: topics of a ROS
-    master."""
-    connect: tuple[Endpoint, ...] = ("tcp/127.0.0.1:7447",)
-    """Where the router (or the broker) is."""
-    tls: Tls | None = None
 
 
 class Car(Part):
@@ -74,6 +37,13 @@ class Car(Part):
     """Or the moving landmark that it is: a car whose position is known and which nobody here drives."""
     marker: Marker | None = None
     """Number of the marker that it carries, 1..7 (none: no camera can tell it)."""
+    agent: Agent | None = None
+    """Its number in the authors' names, `agentN/...`, on `nats` and `ros1` (default: that of its marker)."""
+
+    @property
+    def agent_number(self) -> int | None:
+        """Its number in the authors' names; None: it has none."""
+        return self.marker if self.agent is None else self.agent
 
 
 class Sensors(Part):
@@ -163,6 +133,7 @@ class Deployment(Part):
             "cars: the landmark": [car.landmark for car in self.cars if car.landmark is not None],
             "markers: the number": [*self.markers.values(), *(c.marker for c in self.cars if c.marker is not None)],
         }
+        given["cars: the agent (or marker)"] = [c.agent_number for c in self.cars if c.agent_number is not None]
         for what, values in given.items():
             for value, times in Counter(values).items():
                 if times > 1:
@@ -201,6 +172,8 @@ def load_deployment(path: str | Path) -> Deployment:
         raise DeploymentError(f"{path}: cannot be read ({error.strerror or error})") from None
     except ValueError as error:
         raise DeploymentError(f"{path}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise DeploymentError(f"{path}: lists or tables stand too deep in one another") from None
     return parse_deployment(raw, path)
 
 

@@ -2,14 +2,17 @@
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 from coopenv.errors import CoopenvError
 from coopenv.svea.transport.base import Arrival, Callback, LinkError
+from coopenv.svea.transport.certificates import Certificates
+from coopenv.svea.transport.endpoints import SECURE, address_of, trouble_at
 
 LEASE = 1000  # ms after which a process that has frozen no longer counts as present
+RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
+"""How often a lost router is tried again: a session goes on within a second or so of its being back."""
 
 
 class Zenoh:
@@ -68,7 +71,7 @@ def open_zenoh(
     mode: Literal["client", "peer", "router"],
     connect: Sequence[str] = (),
     listen: Sequence[str] = (),
-    tls: "Mapping[str, Path] | None" = None,
+    tls: Certificates | None = None,
     timeout: float = 2.0,
 ) -> Zenoh:
     """Open a session that uses the given endpoints and nothing else: nothing is looked for by multicast.
@@ -77,13 +80,16 @@ def open_zenoh(
         mode: "client" of a router, "peer" of other peers, or a "router" itself.
         connect: endpoints to connect to, e.g. "tcp/127.0.0.1:7447" or "tls/car:7447".
         listen: endpoints to listen at.
-        tls: files by their keys of Zenoh's `transport.link.tls`, e.g. `root_ca_certificate`.
+        tls: certificates, which endpoints `tls/...` need; others are refused then, so that nothing goes in the clear.
         timeout: s to wait for the endpoints to connect to.
 
     Raises:
         CoopenvError: the extra is not installed, or an endpoint is not one.
         LinkError: an endpoint cannot be reached, or cannot be listened at.
     """
+    for endpoint in (*connect, *listen):
+        if (address_of(endpoint).protocol in SECURE) != (tls is not None):
+            raise CoopenvError(f"{endpoint}: tls/... and certificates (tls) go together")
     try:
         import zenoh
     except ImportError:
@@ -97,18 +103,25 @@ def open_zenoh(
         "listen/endpoints": list(listen),
         "connect/timeout_ms": int(timeout * 1000),
         "connect/exit_on_failure": bool(connect),
+        "connect/retry": RETRY,
         "transport/link/tx/lease": LEASE,
-        **{f"transport/link/tls/{key}": str(path) for key, path in (tls or {}).items()},
+        # How long a reliable message may keep its sender waiting, us, before the link counts as broken.
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": LEASE * 1000,
+        **{f"transport/link/tls/{key}": value for key, value in (tls.for_zenoh() if tls else {}).items()},
     }
     try:
         for key, value in entries.items():
             config.insert_json5(key, json.dumps(value))
         return Zenoh(zenoh.open(config), zenoh)
     except zenoh.ZError as error:
-        where = ", ".join([*connect, *listen])
-        raise LinkError(f"{where}: no Zenoh there ({_reason(error)})") from None
+        where = ", ".join([*connect, *listen]) or "no endpoints"
+        raise LinkError(f"{where}: no Zenoh there ({_reason(error, connect, tls)})") from None
 
 
-def _reason(error: Exception) -> str:
-    """Return the first sentence of Zenoh's error."""
+def _reason(error: Exception, connect: Sequence[str], tls: Certificates | None) -> str:
+    """Return why a connection fails where that can be found out, else the first sentence of Zenoh's error."""
+    context = tls.context() if tls else None
+    for endpoint in connect:
+        if trouble := trouble_at(address_of(endpoint), context, 1.0):
+            return trouble
     return str(error).split(" at /")[0].split("\n")[0][:120]

@@ -1,0 +1,74 @@
+"""The network in the deployment file: which wire, where, and its certificates."""
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from coopenv.errors import listed, shown
+from coopenv.svea.transport.endpoints import SECURE, address_of
+
+
+class Part(BaseModel):
+    """A section of the file; unknown keys are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class Tls(Part):
+    """Certificates of the transport; paths are relative to the file."""
+
+    root_ca: Path
+    """Certificate of who signs the others'."""
+    certificate: Path | None = None
+    """Own certificate, where this end listens or the other one asks for it."""
+    key: Path | None = None
+    """Private key of it, which only its owner can read."""
+
+    @model_validator(mode="after")
+    def _both_or_none(self) -> Self:
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key: give both or none")
+        return self
+
+
+def _endpoint(text: str) -> str:
+    """Refuse what is no endpoint such as tcp/127.0.0.1:7447."""
+    address_of(text)
+    return text
+
+
+Endpoint = Annotated[str, AfterValidator(_endpoint)]
+
+WIRES = {
+    "zenoh": ("tcp/127.0.0.1:7447", ("tcp", "tls", "quic", "udp")),
+    "nats": ("nats/127.0.0.1:4222", ("nats", "tcp", "tls")),
+    "ros1": ("tcp/127.0.0.1:11311", ("tcp",)),
+}
+"""Kinds of networks: where they are if nothing is said, and which protocols they have."""
+
+
+class Network(Part):
+    """How the cars are reached."""
+
+    kind: Literal["zenoh", "nats", "ros1"] = "zenoh"
+    """`zenoh`: CDR under the keys of zenoh-bridge-ros2dds; `nats`: the authors' wire; `ros1`: topics of a ROS
+    master."""
+    connect: tuple[Endpoint, ...] = Field(
+        default_factory=lambda given: (WIRES[given.get("kind", "zenoh")][0],), min_length=1
+    )
+    """Where the router, the broker or the ROS master is (default: on this computer, at its usual port)."""
+    tls: Tls | None = None
+    """Needed by endpoints `tls/...`, and only by them."""
+
+    @model_validator(mode="after")
+    def _endpoints_fit(self) -> Self:
+        for endpoint in self.connect:
+            protocol, allowed = address_of(endpoint).protocol, WIRES[self.kind][1]
+            if protocol not in allowed:
+                raise ValueError(f"connect: {shown(endpoint)}: {self.kind} has {listed(allowed)}")
+            if protocol in SECURE and self.tls is None:
+                raise ValueError(f"tls: is missing, {endpoint} needs at least its root_ca")
+            if protocol not in SECURE and self.tls is not None:
+                raise ValueError(f"connect: {endpoint} would go in the clear; with network.tls it is tls/...")
+        return self

@@ -1,0 +1,120 @@
+"""What every transport does, tried on each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+
+import pytest
+
+from coopenv.svea.transport.base import Arrival, Transport
+from coopenv.svea.transport.local import Hub
+from coopenv.svea.transport.zenoh import open_zenoh
+from tests.helpers.processes import wait_until
+from tests.helpers.wire import free_port
+
+Connect = Callable[[], Transport]
+
+
+def local() -> Iterator[Connect]:
+    yield Hub().connect
+
+
+def zenoh() -> Iterator[Connect]:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    router = open_zenoh("router", listen=[endpoint])
+    yield lambda: open_zenoh("client", connect=[endpoint])
+    router.close()
+
+
+NETWORKS = [pytest.param(local, id="local"), pytest.param(zenoh, id="zenoh")]
+
+
+@pytest.fixture(params=NETWORKS)
+def connect(request: pytest.FixtureRequest) -> Iterator[Connect]:
+    """Open connections to one network; all end with the test."""
+    with ExitStack() as stack:
+        for opened in request.param():
+
+            def ending(opened: Connect = opened) -> Transport:
+                transport = opened()
+                stack.callback(transport.close)
+                return transport
+
+            yield ending
+            stack.close()
+
+
+def heard_by(receiver: Transport, pattern: str) -> list[Arrival]:
+    """Return what a receiver hears from now on, filled as it comes."""
+    heard: list[Arrival] = []
+    receiver.subscribe(pattern, heard.append)
+    return heard
+
+
+def settle(sender: Transport, receiver: Transport) -> None:
+    """Wait until what the receiver has subscribed to is known to the sender."""
+    heard = heard_by(receiver, "fleet/settle")
+
+    def arrived() -> bool:
+        sender.publish("fleet/settle", b"")
+        return bool(heard)
+
+    wait_until(arrived)
+
+
+def test_messages_arrive_in_order_with_what_is_beside_them(connect: Connect) -> None:
+    sender, receiver = connect(), connect()
+    heard = heard_by(receiver, "fleet/svea7/x")
+    settle(sender, receiver)
+    payloads = [bytes([i]) * (i + 1) for i in range(50)]
+    for payload in payloads:
+        sender.publish("fleet/svea7/x", payload, b"\0signed\xff" + payload, reliable=True)
+    wait_until(lambda: len(heard) == 50)
+    assert [arrival.payload for arrival in heard] == payloads
+    assert [arrival.attachment for arrival in heard] == [b"\0signed\xff" + payload for payload in payloads]
+    assert {arrival.topic for arrival in heard} == {"fleet/svea7/x"}
+
+
+def test_patterns_choose(connect: Connect) -> None:
+    sender, receiver = connect(), connect()
+    one, all_, exact = (heard_by(receiver, p) for p in ("fleet/*/x", "fleet/a/**", "fleet/a/x/y"))
+    settle(sender, receiver)
+    for topic in ("fleet/a/x", "fleet/b/x", "fleet/a/x/y", "fleet/b/y", "fleet/a"):
+        sender.publish(topic, topic.encode(), urgent=True, reliable=True)
+    sender.publish("fleet/a/end", b"", reliable=True)
+    wait_until(lambda: len(all_) == 4 and len(one) == 2 and len(exact) == 1)
+    assert sorted(arrival.topic for arrival in one) == ["fleet/a/x", "fleet/b/x"]
+    assert sorted(arrival.topic for arrival in all_) == ["fleet/a", "fleet/a/end", "fleet/a/x", "fleet/a/x/y"]
+    assert [arrival.payload for arrival in exact] == [b"fleet/a/x/y"]
+
+
+def test_who_is_there_is_seen_by_those_who_came_before_and_after(connect: Connect) -> None:
+    early, car, late = connect(), connect(), connect()
+    seen: list[tuple[str, bool]] = []
+    seen_late: list[tuple[str, bool]] = []
+    everything = heard_by(early, "**")
+    early.watch("fleet/alive/*", lambda *change: seen.append(change))
+    car.announce("fleet/alive/svea7")
+    car.announce("fleet/elsewhere/svea7")
+    wait_until(lambda: seen)
+    late.watch("fleet/alive/*", lambda *change: seen_late.append(change))
+    wait_until(lambda: seen_late)
+    car.close()
+    wait_until(lambda: len(seen) == 2 and len(seen_late) == 2)
+    assert seen == seen_late == [("fleet/alive/svea7", True), ("fleet/alive/svea7", False)]
+    assert not everything
+
+
+def test_a_closed_connection_is_silent(connect: Connect) -> None:
+    sender, closed, receiver = connect(), connect(), connect()
+    heard, unheard = heard_by(receiver, "fleet/x"), heard_by(closed, "fleet/x")
+    settle(sender, closed)
+    settle(sender, receiver)
+    closed.close()
+    closed.close()
+    closed.publish("fleet/x", b"closed")
+    sender.publish("fleet/x", b"open", reliable=True)
+    wait_until(lambda: heard)
+    assert [arrival.payload for arrival in heard] == [b"open"]
+    assert not unheard
