@@ -1,0 +1,43 @@
+"""From a deployment file to its network."""
+
+from coopenv.errors import CoopenvError
+from coopenv.svea.deployment import Deployment, DeploymentError
+from coopenv.svea.network import Tls
+from coopenv.svea.transport.base import Transport
+from coopenv.svea.transport.certificates import Certificates
+
+
+def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:
+    """Connect to the network of a fleet; topics are those of `coopenv.svea.topics` on every kind of network.
+
+    Args:
+        deployment: says where, how and with which certificates.
+        timeout: s to wait for the router, broker or master.
+
+    Raises:
+        DeploymentError: certificates that cannot be used, or what the kind of network cannot do.
+        LinkError: nobody answers there.
+        CoopenvError: an extra is not installed.
+    """
+    network = deployment.network
+    certificates = certificates_of(deployment)
+    from coopenv.svea.transport.zenoh import open_zenoh
+
+    return open_zenoh("client", network.connect, tls=certificates, timeout=timeout)
+
+
+def certificates_of(deployment: Deployment) -> Certificates | None:
+    """Return the files of `network.tls`, checked (None: there is no such section); errors as for `open_transport`."""
+    tls = deployment.network.tls
+    if tls is None:
+        return None
+    try:
+        return _found(tls, deployment)
+    except CoopenvError as error:
+        raise DeploymentError(f"network.{error}") from None
+
+
+def _found(tls: Tls, deployment: Deployment) -> Certificates:
+    own = None if tls.certificate is None else deployment.folder / tls.certificate
+    key = None if tls.key is None else deployment.folder / tls.key
+    return Certificates(deployment.folder / tls.root_ca, own, key)
