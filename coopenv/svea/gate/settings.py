@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +12,8 @@ from coopenv.svea.limits import USUAL, Limits
 from coopenv.svea.signing import LONGEST_IDENTITY, is_identity
 
 if TYPE_CHECKING:
-    from coopenv.svea.deployment import Deployment
     from coopenv.svea.signing import Signer, Verifier
+    from coopenv.svea.transport.certificates import Certificates
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Settings:
     limits: Limits = USUAL
     keys: Path | None = None  # folder
     station: str = "station"
-    tls: Mapping[str, Path] = field(default_factory=dict)  # files, as `open_zenoh` takes them
+    tls: Certificates | None = None
 
     @classmethod
     def of(cls, car: str, path: Path | None) -> Settings:
@@ -39,13 +39,14 @@ class Settings:
                 raise CoopenvError(f"--car {shown(car)}: expected 1 to {LONGEST_IDENTITY} letters, digits, _ or -")
             return cls(car)
         from coopenv.svea.deployment import load_deployment
+        from coopenv.svea.transport.open import certificates_of
 
         read = load_deployment(path)
         if read.network.kind != "zenoh":
             raise CoopenvError(f"{path}: network.kind is {read.network.kind!r}, a gate can be reached by 'zenoh' only")
         keys = None if read.security.keys is None else read.folder / read.security.keys
         connect, limits = read.network.connect, read.safety.limits
-        return cls(read.car(car).name, connect, limits, keys, read.security.identity, _tls(read))
+        return cls(read.car(car).name, connect, limits, keys, read.security.identity, certificates_of(read))
 
     def changed(self, limits: Mapping[str, Any], **values: Any) -> Settings:
         """Return these settings with others in place of some; None leaves one as it is.
@@ -66,11 +67,3 @@ class Settings:
         verifier = load_verifier(self.keys)
         check_known(verifier, self.station, self.keys)
         return load_signer(self.keys, self.car), verifier
-
-
-def _tls(deployment: Deployment) -> dict[str, Path]:
-    tls = deployment.network.tls
-    if tls is None:
-        return {}
-    files = {"root_ca_certificate": tls.root_ca, "connect_certificate": tls.certificate, "connect_private_key": tls.key}
-    return {name: deployment.folder / path for name, path in files.items() if path is not None}
