@@ -94,6 +94,14 @@ class Dynamics(Part):
     """First-order lag of the steering, s."""
     latency: NonNegative = 0.0
     """Dead time between a decision and its effect, s; at most one decision period."""
+    dead_band: NonNegative = 0.0
+    """Speed commands of a smaller magnitude do not move the car, as its speed controller has them, m/s."""
+
+    @model_validator(mode="after")
+    def _can_move(self) -> Self:
+        if self.dead_band > self.max_speed:
+            raise ValueError(f"dead_band: {self.dead_band:g} m/s is above max_speed ({self.max_speed:g} m/s)")
+        return self
 
 
 class Pan(Part):

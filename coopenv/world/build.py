@@ -150,7 +150,7 @@ def _motion(scenario: Scenario) -> dict[str, Any]:
 
 def _dynamics(d: Dynamics, scenario: Scenario) -> dict[str, Any]:
     accelerates, pan = scenario.action.longitudinal == "acceleration", scenario.action.pan
-    same = ("wheelbase", "max_speed", "max_acceleration", "max_steering", "max_steering_rate")
+    same = ("wheelbase", "max_speed", "max_acceleration", "max_steering", "max_steering_rate", "dead_band")
     return {
         **{name: getattr(d, name) for name in same},
         "min_speed": -d.max_speed if d.reverse else 0.0,

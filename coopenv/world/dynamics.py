@@ -61,7 +61,10 @@ def first_order_lag(value: Any, target: Any, dt: Any, lag: Any, rate: Any):
 @wp.func
 def actuate(d: Any, speed: Any, steering: Any, command: Any, dt: Any):
     """Return (speed, steering) after dt under a command and limits `d`, see `coopenv.world.command`."""
-    new_speed = first_order_lag(speed, command[SPEED], dt, d.speed_lag, command[ACCELERATION])
+    wanted = command[SPEED]
+    if wp.abs(wanted) < d.dead_band:
+        wanted = type(wanted)(0.0)
+    new_speed = first_order_lag(speed, wanted, dt, d.speed_lag, command[ACCELERATION])
     angle = wp.clamp(command[STEERING], -d.max_steering, d.max_steering)
     new_steering = first_order_lag(steering, angle, dt, d.steering_lag, d.max_steering_rate)
     return wp.clamp(new_speed, d.min_speed, d.max_speed), new_steering

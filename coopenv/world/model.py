@@ -77,6 +77,7 @@ def model_struct(p: Precision) -> Any:
         speed_lag: scalar
         steering_lag: scalar
         latency_ticks: wp.int32
+        dead_band: scalar  # m/s
         acceleration_mode: wp.int32  # 1: the first entry of an action is an acceleration
         action_steering: scalar  # of an action of 1
         pan_limit: scalar  # of the camera; 0: it does not turn

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from coopenv.errors import CoopenvError
 from tests.helpers.builders import command, run, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES
 
@@ -199,6 +200,31 @@ def test_latency_holds_the_last_action(latency_ticks: int) -> None:
         command(world, [-1.0, -1.0])
         world.advance(6)
         assert world.get_state()["steering"][0, 0] > 0.1
+
+
+@pytest.mark.parametrize(("dead_band", "moves"), [(0.0, True), (0.2, True), (0.31, False)])
+def test_commands_within_the_dead_band_do_not_move(dead_band: float, moves: bool) -> None:
+    """A command of 0.3 m/s; one above the band is followed as without it, and steering always is."""
+    made = {"dead_band": dead_band}
+    wanted = (2 * 0.3 / 1.53 - 1, 0.5)
+    rows = path(drive(driven(made), [wanted] * 20))
+    assert_allclose(rows[-1, 3], 0.3 if moves else 0.0, atol=1e-6)
+    assert rows[-1, 4] > 0.3
+    if moves:
+        assert_allclose(rows, path(drive(driven(), [wanted] * 20)), atol=0.0)
+    stopping = path(drive(driven(made, speed=1.0), [wanted] * 30))
+    assert_allclose(stopping[-1, 3], 0.3 if moves else 0.0, atol=1e-6)
+
+
+def test_the_dead_band_holds_backwards_too() -> None:
+    rows = path(drive(driven({"reverse": True, "dead_band": 0.4}), [(-0.2, 0.0)] * 10 + [(-0.4, 0.0)] * 20))
+    assert_allclose(rows[10, 3], 0.0, atol=1e-12)
+    assert_allclose(rows[-1, 3], -0.4 * 1.53, atol=1e-6)
+
+
+def test_a_dead_band_above_the_top_speed_is_refused() -> None:
+    with pytest.raises(CoopenvError, match=r"dynamics\.?.*dead_band: 2 m/s is above max_speed \(1\.53 m/s\)"):
+        driven({"dead_band": 2.0})
 
 
 def run_within_decision(world: Any, ticks: int) -> list[dict[str, np.ndarray]]:
