@@ -1,0 +1,24 @@
+"""`coopenv svea router`: what the cars and the station connect to."""
+
+import threading
+from typing import Annotated
+
+import typer
+
+
+def router(
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(help="Endpoint to listen at (default: tcp/127.0.0.1:7447, this computer alone). Repeatable."),
+    ] = None,
+) -> None:
+    """Run a Zenoh router until it is interrupted; it prints `ready` when it can be reached."""
+    from coopenv.svea.transport.zenoh import open_zenoh
+
+    endpoints = listen or ["tcp/127.0.0.1:7447"]
+    transport = open_zenoh("router", listen=endpoints)
+    try:
+        print(f"ready at {', '.join(endpoints)}", flush=True)
+        threading.Event().wait()
+    finally:
+        transport.close()

@@ -1,0 +1,105 @@
+"""What may go wrong with a fake car, on request: `KIND[=VALUE][@START[+DURATION]]`."""
+
+import re
+from dataclasses import dataclass
+
+from coopenv.errors import CoopenvError, listed, shown, suggest
+
+
+class FaultError(CoopenvError):
+    """A fault is not one."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What a kind of fault does, and what its value means."""
+
+    meaning: str
+    default: float | None  # None: a value is needed
+    low: float
+    high: float
+
+
+KINDS = {
+    "freeze": Kind("its computer stands still: nothing is sent, no command is obeyed", 1.0, 1.0, 1.0),
+    "kill": Kind("the process ends at once", 1.0, 1.0, 1.0),
+    "loss": Kind("share of all messages that are lost, both ways", None, 0.0, 1.0),
+    "delay": Kind("s by which all messages come later, both ways", None, 0.0, 60.0),
+    "clock_offset": Kind("s that its clock is ahead", None, -1e6, 1e6),
+    "clock_drift": Kind("s per second that its clock gains", None, -0.1, 0.1),
+    "false_blocks": Kind("per second, blocks of the camera where nothing is", None, 0.0, 1e3),
+    "duplicate_blocks": Kind("share of blocks that are reported twice", 1.0, 0.0, 1.0),
+    "swapped_signatures": Kind("blocks of a frame have each other's numbers", 1.0, 1.0, 1.0),
+}
+FORM = re.compile(r"(?P<kind>\w+)(=(?P<value>[^@]+))?(@(?P<start>[^+]+)(\+(?P<duration>.+))?)?")
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault."""
+
+    kind: str
+    value: float
+    start: float = 0.0  # s after it is asked for
+    duration: float = float("inf")  # s
+
+
+def parse_fault(text: str) -> Fault:
+    """Read a fault, for example `loss=0.2@5+10`.
+
+    Raises:
+        FaultError: the kind is unknown, or a number is none or out of bounds.
+    """
+    found = FORM.fullmatch(text.strip())
+    if found is None:
+        raise FaultError(f"fault {shown(text)}: expected KIND[=VALUE][@START[+DURATION]]; kinds: {listed([*KINDS])}")
+    name = found["kind"]
+    if name not in KINDS:
+        raise FaultError(f"unknown fault {shown(name)}{suggest(name, KINDS)}; known: {listed([*KINDS])}")
+    kind = KINDS[name]
+    if found["value"] is None and kind.default is None:
+        raise FaultError(f"fault {name}: needs a value, {name}=NUMBER ({kind.meaning})")
+    value = kind.default if found["value"] is None else _number(name, "value", found["value"], kind.low, kind.high)
+    start = _number(name, "start", found["start"] or "0", 0.0, 1e6)
+    duration = float("inf") if found["duration"] is None else _number(name, "duration", found["duration"], 0.0, 1e6)
+    return Fault(name, float(value or 0.0), start, duration)
+
+
+def _number(name: str, what: str, text: str, low: float, high: float) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = float("nan")
+    if not low <= number <= high:
+        raise FaultError(f"fault {name}: {what} {shown(text)} must be a number from {low:g} to {high:g}")
+    return number
+
+
+class Faults:
+    """The faults of a car; times in ns on one clock."""
+
+    def __init__(self) -> None:
+        self._known: list[tuple[int, int | None, Fault]] = []
+
+    def add(self, fault: Fault, now: int) -> None:
+        """Let a fault happen, its start counted from now."""
+        begin = now + round(fault.start * 1e9)
+        end = None if fault.duration == float("inf") else begin + round(fault.duration * 1e9)
+        self._known.append((begin, end, fault))
+
+    def value(self, kind: str, now: int) -> float:
+        """Return the value of a kind of fault, 0 where it does not happen; of several the last that was asked for."""
+        return next((f.value for _, f in self._active(kind, now)), 0.0)
+
+    def clock_error(self, now: int) -> int:
+        """Return how far the car's clock is ahead, ns."""
+        offset = self.value("clock_offset", now) * 1e9
+        drifted = next((f.value * (now - begin) for begin, f in self._active("clock_drift", now)), 0.0)
+        return round(offset + drifted)
+
+    def _active(self, kind: str, now: int) -> list[tuple[int, Fault]]:
+        return [
+            (begin, fault)
+            for begin, end, fault in reversed(self._known)
+            if fault.kind == kind and begin <= now and (end is None or now < end)
+        ]

@@ -1,0 +1,154 @@
+"""What a fake car measures, as the messages of the real ones; stamps in ns."""
+
+from typing import Any
+
+import numpy as np
+
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.metrics import quaternion_wxyz
+from coopenv.fake.camera import Block, bearings_of
+from coopenv.svea.codec import header, make
+from coopenv.svea.samples import Calibration
+
+GRAVITY = 9.81  # m/s^2
+
+
+def detections(stamp: int, blocks: list[Block]) -> Any:
+    """Return the ObjectInfoArrayStamped of a frame; one without blocks is a frame as well."""
+    objects = [
+        make(
+            "pixy_camera/msg/ObjectInfo",
+            signature=b.signature,
+            center_x=b.x,
+            center_y=b.y,
+            width=b.width,
+            height=b.height,
+            angle=0,
+            index=b.index,
+            age=b.age,
+        )
+        for b in blocks
+    ]
+    return make("pixy_camera/msg/ObjectInfoArrayStamped", header=header(stamp, "camera"), objects=objects)
+
+
+def bearings(stamp: int, blocks: list[Block], calibration: Calibration) -> Any:
+    """Return the ObjectBearingArrayStamped of a frame."""
+    unit = bearings_of(blocks, calibration).tolist()
+    entries = [
+        make("pixy_camera/msg/ObjectBearing", id=b.signature, bearing_x=x, bearing_y=y, bearing_z=z)
+        for b, (x, y, z) in zip(blocks, unit, strict=True)
+    ]
+    return make("pixy_camera/msg/ObjectBearingArrayStamped", header=header(stamp, "camera"), bearing=entries)
+
+
+def camera_info(stamp: int, c: Calibration) -> Any:
+    """Return the CameraInfo of a lens."""
+    (fx, fy), (cx, cy), (width, height) = c.focal_length, c.principal_point, c.image_size
+    region = make(
+        "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
+    )
+    return make(
+        "sensor_msgs/msg/CameraInfo",
+        header=header(stamp, "camera"),
+        height=height,
+        width=width,
+        distortion_model="plumb_bob",
+        d=np.array(c.distortion),
+        k=np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        r=np.eye(3).ravel(),
+        p=np.array([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
+        binning_x=0,
+        binning_y=0,
+        roi=region,
+    )
+
+
+def wheel(stamp: int, car: str, speed: float, turn_rate: float, variances: tuple[float, float]) -> Any:
+    """Return the TwistWithCovarianceStamped of the wheels; variances of speed and turn rate."""
+    covariance = np.diag([variances[0], 0.0, 0.0, 0.0, 0.0, variances[1]])
+    return make(
+        "geometry_msgs/msg/TwistWithCovarianceStamped",
+        header=header(stamp, f"{car}/base_link"),
+        twist=_twist_with_covariance((speed, 0.0, 0.0), (0.0, 0.0, turn_rate), covariance),
+    )
+
+
+def imu(stamp: int, car: str, turn_rates: Array, variance: float) -> Any:
+    """Return the Imu: turn rates, and the weight of a car on a plane; it knows no orientation."""
+    unknown = np.array([-1.0, *np.zeros(8)])
+    return make(
+        "sensor_msgs/msg/Imu",
+        header=header(stamp, f"{car}/imu"),
+        orientation=_quaternion(np.eye(3)),
+        orientation_covariance=unknown,
+        angular_velocity=_vector(turn_rates),
+        angular_velocity_covariance=(variance * np.eye(3)).ravel(),
+        linear_acceleration=_vector((0.0, 0.0, GRAVITY)),
+        linear_acceleration_covariance=np.zeros(9),
+    )
+
+
+def odometry(stamp: int, frames: tuple[str, str], pose: tuple[Array, Array], twist: tuple[Array, Array]) -> Any:
+    """Return an Odometry: pose (rotation, position) in the first frame, twist (velocity, turn rate) in the second."""
+    return make(
+        "nav_msgs/msg/Odometry",
+        header=header(stamp, frames[0]),
+        child_frame_id=frames[1],
+        pose=_pose_with_covariance(*pose),
+        twist=_twist_with_covariance(*twist, np.zeros((6, 6))),
+    )
+
+
+def estimate(stamp: int, rotation: Array, position: Array) -> Any:
+    """Return the PoseWithCovarianceStamped of a car whose pose is known, in the map."""
+    return make(
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        header=header(stamp, "map"),
+        pose=_pose_with_covariance(rotation, position),
+    )
+
+
+def state(stamp: int, armed: bool) -> Any:
+    """Return the State of the flight controller."""
+    more = {"connected": True, "guided": False, "manual_input": True, "mode": "MANUAL", "system_status": 4}
+    return make("mavros_msgs/msg/State", header=header(stamp), armed=armed, **more)
+
+
+def remote(stamp: int) -> Any:
+    """Return the RCIn of sticks that nobody moves."""
+    channels = np.full(8, 1500, dtype=np.uint16)
+    return make("mavros_msgs/msg/RCIn", header=header(stamp), rssi=200, channels=channels)
+
+
+def battery(stamp: int, share: float) -> Any:
+    """Return the BatteryState of a battery of which a share is left."""
+    amounts = {"voltage": 10.5 + 2.1 * share, "temperature": 25.0, "current": -1.0}
+    capacity = {"charge": 5.0 * share, "capacity": 5.0, "design_capacity": 5.0, "percentage": share}
+    status = {"power_supply_status": 2, "power_supply_health": 1, "power_supply_technology": 3, "present": True}
+    cells = {"cell_voltage": np.zeros(0, np.float32), "cell_temperature": np.zeros(0, np.float32)}
+    names = {"location": "", "serial_number": ""}
+    kind = "sensor_msgs/msg/BatteryState"
+    return make(kind, header=header(stamp), **amounts, **capacity, **status, **cells, **names)
+
+
+def _twist_with_covariance(linear: Any, angular: Any, covariance: Array) -> Any:
+    twist = make("geometry_msgs/msg/Twist", linear=_vector(linear), angular=_vector(angular))
+    return make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=covariance.ravel())
+
+
+def _pose_with_covariance(rotation: Array, position: Array) -> Any:
+    x, y, z = (float(value) for value in position)
+    place = make("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    pose = make("geometry_msgs/msg/Pose", position=place, orientation=_quaternion(rotation))
+    return make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
+
+
+def _quaternion(rotation: Array) -> Any:
+    w, x, y, z = quaternion_wxyz(rotation).tolist()
+    return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def _vector(values: Any) -> Any:
+    x, y, z = (float(value) for value in values)
+    return make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
