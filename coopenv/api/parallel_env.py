@@ -16,7 +16,7 @@ from coopenv.api.options import OF_TESTS, SETTINGS, checked_options, world_numbe
 from coopenv.api.pictures import Pictures
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
-from coopenv.backends.base import Backend, Health
+from coopenv.backends.base import EPISODE_OVER, Backend, Health
 from coopenv.backends.sources import simulation_of
 from coopenv.errors import CoopenvError, shown, suggest
 from coopenv.scenario import Scenario
@@ -174,6 +174,8 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         rewards, terminated, truncated = (dict(zip(alive, [of[i] for i in indices], strict=True)) for of in values)
         result = self._observations(alive), rewards, terminated, truncated, self._infos(alive)
         self._agents = [agent for agent in alive if not (terminated[agent] or truncated[agent])]
+        if not self._agents and self.engine.backend.capabilities.real_time:
+            self.engine.backend.stop(EPISODE_OVER)
         if self.render_mode == "human":
             self.render()
         return result

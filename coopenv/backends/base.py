@@ -50,6 +50,10 @@ class Command:
         return np.stack([self.speed, self.steering, self.acceleration, pan], axis=-1)
 
 
+EPISODE_OVER = "the episode is over"
+"""Reason to stop a backend in real time when nobody drives any more."""
+
+
 @dataclass(frozen=True)
 class Capabilities:
     """What a backend can do."""

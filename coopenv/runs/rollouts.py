@@ -8,7 +8,7 @@ import numpy as np
 
 from coopenv.api.engine import Engine
 from coopenv.api.infos import outcome_words
-from coopenv.backends.base import Backend
+from coopenv.backends.base import EPISODE_OVER, Backend
 from coopenv.errors import CoopenvError
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.trajectory import Trajectory
@@ -81,6 +81,8 @@ class Rollout:
             self.wall_time += perf_counter() - start
             yield tick
             start = perf_counter()
+        if self.engine.backend.capabilities.real_time:
+            self.engine.backend.stop(EPISODE_OVER)
 
     def _recorded(self, name: str) -> np.ndarray:
         """Return (K, ...) of one view."""

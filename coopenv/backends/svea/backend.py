@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.base import Capabilities, Command, Health, Told
+from coopenv.backends.base import EPISODE_OVER, Capabilities, Command, Health, Told
 from coopenv.backends.svea.assembler import Assembler
 from coopenv.backends.svea.binding import Binding
 from coopenv.backends.svea.checks import Fleet, problems_of
@@ -31,6 +31,8 @@ from coopenv.svea.transport.base import Arrival, Transport
 from coopenv.svea.warm_up import warm_up
 
 OPTIONS = ("arm", "options")
+EXPECTED = ("reset", "closed", EPISODE_OVER)
+"""Reasons to stop that are no emergency."""
 FIRST_WORD = 3.0  # s that cars have to be heard in at the first reset
 SETTLE = 0.5  # s that fakes have to stand where they were put
 
@@ -158,7 +160,7 @@ class Svea:
         while time.monotonic() < until and any(self.station.silence(topic) > 1.0 for topic in topics):
             time.sleep(0.02)
         self._heard_once = True
-        self._drain()
+        self.station.clear()
 
     def _place_fakes(self, seed: int) -> None:
         self._transport.publish(RESET_TOPIC, encode(make("std_msgs/msg/Int64", data=seed % 2**63)), reliable=True)
@@ -265,11 +267,11 @@ class Svea:
         self._stop(reason)
 
     def _stop(self, reason: str) -> None:
-        if self._armed:
+        if self._armed and reason in EXPECTED:
+            self.watchdog.disarm()
             self.gates.end()
-            if reason != "reset":
-                self.watchdog.stop(reason)
-        self.watchdog.disarm()
+        elif self._armed:
+            self.watchdog.stop(reason)
         self._armed = False
 
     def close(self) -> None:

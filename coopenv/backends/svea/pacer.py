@@ -16,6 +16,7 @@ class Pacer:
         self._period, self._per_decision = round(period * 1e9), per_decision
         self._wall = time.time_ns() - time.monotonic_ns()
         self._due = 0
+        self._begun = False
         self.missed = 0
         """Decisions that came too late for their first tick, whose time was left out."""
         self.in_a_row = 0
@@ -27,15 +28,17 @@ class Pacer:
         return time.monotonic_ns() + self._wall
 
     def start(self) -> int:
-        """Begin: the next tick is due a period from now. Returns the time."""
+        """Begin anew: time counts from the first decision on. Returns the time now."""
         self._wall = time.time_ns() - time.monotonic_ns()
         self.missed = self.in_a_row = 0
         self.lateness.clear()
-        self._due = self.now()
-        return self._due
+        self._begun = False
+        return self.now()
 
     def decide(self) -> None:
         """Begin a decision: where its first tick was due before, count it and go on from now."""
+        if not self._begun:
+            self._begun, self._due = True, self.now()
         behind = self.now() - (self._due + self._period)
         if behind > 0:
             self.missed += 1

@@ -60,7 +60,7 @@ class Watchdog:
         self._lock = threading.Lock()
         self._armed, self._closed = False, threading.Event()
         self.trip: Trip | None = None
-        self._beat = time.monotonic()
+        self._beat: float | None = None  # of the last decision; None: there has been none
         self._missed = 0
         self._present: dict[str, bool] = {}
         self._overridden: dict[str, bool] = {}
@@ -75,7 +75,7 @@ class Watchdog:
     def arm(self) -> None:
         """Look after the cars from now on."""
         with self._lock:
-            self._armed, self._beat, self._missed = True, time.monotonic(), 0
+            self._armed, self._beat, self._missed = True, None, 0
 
     def disarm(self) -> None:
         """Look no longer: the cars stand."""
@@ -141,7 +141,8 @@ class Watchdog:
                 yield Trip(f"{car}: its gate is {gate.state}", car)
         if self._missed >= s.missed_deadlines:
             yield Trip(f"{self._missed} decisions in a row came too late")
-        if (age := time.monotonic() - self._beat) > (s.missed_deadlines + 1) * self._decision:
+        beat = self._beat
+        if beat is not None and (age := time.monotonic() - beat) > (s.missed_deadlines + 1) * self._decision:
             yield Trip(f"no decision for {age:.2f} s")
         yield from self._misplaced()
 
