@@ -26,7 +26,7 @@ from coopenv.svea.deployment import Deployment
 from coopenv.svea.gate.core import PERIOD, Gate
 from coopenv.svea.gate.process import Link
 from coopenv.svea.gate.terms import Clock
-from coopenv.svea.signing import Verifier
+from coopenv.svea.signing import Signer, Verifier
 from coopenv.svea.topics import PREFIX, RESET_TOPIC, TOPICS, Role, presence_of, topic_of
 from coopenv.svea.transport.base import Arrival, Transport
 from coopenv.svea.warm_up import warm_up
@@ -52,6 +52,7 @@ class Fake:
         seed: int = 0,
         faults: Iterable[Fault] = (),
         gate: bool = True,
+        signer: Signer | None = None,
         verifier: Verifier | None = None,
         clock: Clock = REAL,
         die: Callable[[], None] = end_process,
@@ -67,7 +68,8 @@ class Fake:
             seed: of where it starts and of its errors, which are those of the simulation with that key.
             faults: that it has, by times from now on.
             gate: whether commands come through a gate of its own; else it obeys ManualControl on the network.
-            verifier: knows the station's key, for the gate.
+            signer: signs what the gate says, as the car (None: nothing is signed).
+            verifier: knows the station's key, for the gate (None: signatures do not count).
             clock: wall and steady; the wall clock is that of motion capture.
             die: what the fault `kill` does.
             complain: told in one line of messages to the fake that make no sense.
@@ -93,7 +95,7 @@ class Fake:
         if self._drives and gate:
             car_clock = Clock(lambda: clock.wall() + self._faults.clock_error(clock.steady()), clock.steady)
             decides = Gate(name, deployment.safety.limits, car_clock, verifier, deployment.security.identity)
-            self._link = Link(decides, name, self._wire)  # which lets others see the car
+            self._link = Link(decides, name, self._wire, signer)  # which lets others see the car
             rates["gate"], self._acts["gate"] = 1e9 / PERIOD, self._tick_gate
         else:
             if self._drives:

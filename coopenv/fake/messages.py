@@ -45,9 +45,7 @@ def bearings(stamp: int, blocks: list[Block], calibration: Calibration) -> Any:
 def camera_info(stamp: int, c: Calibration) -> Any:
     """Return the CameraInfo of a lens."""
     (fx, fy), (cx, cy), (width, height) = c.focal_length, c.principal_point, c.image_size
-    region = make(
-        "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-    )
+    region = make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     return make(
         "sensor_msgs/msg/CameraInfo",
         header=header(stamp, "camera"),

@@ -1,31 +1,52 @@
 """A fake car as a process, or a thread: opened by its deployment, and run in real time."""
 
 import threading
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
-from coopenv.backends.svea.binding import Binding, bind
+from coopenv.backends.svea.binding import bind
+from coopenv.backends.svea.opening import scenario_of
 from coopenv.errors import CoopenvError
 from coopenv.fake.car import REAL, Fake
-from coopenv.scenario import load_scenario
-from coopenv.svea.deployment import Deployment
+from coopenv.fake.faults import Fault
+from coopenv.svea.deployment import load_deployment
+from coopenv.svea.keys import check_known, load_signer, load_verifier
+from coopenv.svea.transport.base import Transport
 
 REST = 0.002
 """s between two looks at the clock, at least: what falls due meanwhile is done together."""
 
 
-def binding_of(deployment: Deployment, car: str) -> Binding:
-    """Return who is who in the fleet of a car that is to be faked.
+def open_fake(
+    path: str | Path,
+    car: str,
+    transport: Transport,
+    *,
+    seed: int = 0,
+    faults: Iterable[Fault] = (),
+    gate: bool = True,
+    complain: Callable[[str], None] = lambda _: None,
+) -> Fake:
+    """Return a fake of a car of a deployment file; arguments as for `Fake`.
 
     Raises:
-        CoopenvError: the car is unknown, or the environment does not fit the fleet.
+        CoopenvError: the file or its environment is not valid, the car is unknown, or a key is missing.
     """
-    deployment.car(car)
-    name = deployment.environment
-    beside = deployment.folder / name
-    scenario = load_scenario(beside if Path(name).suffix == ".toml" else name, deployment.overrides)
+    fleet = load_deployment(path)
+    fleet.car(car)
+    scenario = scenario_of(fleet, None, {})
     if scenario.backend != "simulated":
-        raise CoopenvError(f"environment {name}: fakes are of simulated ones, this says backend = '{scenario.backend}'")
-    return bind(scenario, deployment.cars, deployment.markers, "deployment", None)
+        raise CoopenvError(f"{path}: environment: backend '{scenario.backend}' has no fakes; known: simulated")
+    binding = bind(scenario, fleet.cars, fleet.markers, Path(path).name, None)
+    signer = verifier = None
+    if fleet.security.keys is not None and gate:
+        folder = fleet.folder / fleet.security.keys
+        verifier = load_verifier(folder)
+        check_known(verifier, fleet.security.identity, folder)
+        signer = load_signer(folder, car)
+    more: dict[str, Any] = {"seed": seed, "faults": faults, "gate": gate, "complain": complain}
+    return Fake(fleet, binding, car, transport, signer=signer, verifier=verifier, **more)
 
 
 def run(fake: Fake, stop: threading.Event) -> None:

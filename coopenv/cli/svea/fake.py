@@ -26,29 +26,23 @@ def fake(
         bool, typer.Option(help="Whether commands come through a gate of its own; else it obeys ManualControl.")
     ] = True,
 ) -> None:
-    """Let a fake car drive, see and send until it is interrupted; it prints `ready` when it can be seen."""
-    from coopenv.fake.car import Fake
+    """Let a fake car drive, see and send until it is interrupted; it says so when it can be seen."""
+    from coopenv import interrupts
     from coopenv.fake.faults import parse_fault
-    from coopenv.fake.process import binding_of, run
+    from coopenv.fake.process import open_fake, run
     from coopenv.svea.deployment import load_deployment
+    from coopenv.svea.transport.open import open_transport
 
     faults = [parse_fault(text) for text in fault or ()]
-    fleet = load_deployment(deployment)
-    binding = binding_of(fleet, car)
-    transport = open_transport(fleet)
+    transport = open_transport(load_deployment(deployment))
+
+    def complain(line: str) -> None:
+        print(line, file=sys.stderr, flush=True)
+
     try:
-        made = Fake(
-            fleet,
-            binding,
-            car,
-            transport,
-            seed=seed,
-            faults=faults,
-            gate=gate,
-            verifier=None,
-            complain=lambda line: print(line, file=sys.stderr, flush=True),
-        )
-        print("ready", flush=True)
+        made = open_fake(deployment, car, transport, seed=seed, faults=faults, gate=gate, complain=complain)
+        interrupts.note(f"{car} is gone")
+        print(f"{car}: fake ready", flush=True)
         run(made, threading.Event())
     finally:
         transport.close()

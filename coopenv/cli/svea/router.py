@@ -12,13 +12,15 @@ def router(
         typer.Option(help="Endpoint to listen at (default: tcp/127.0.0.1:7447, this computer alone). Repeatable."),
     ] = None,
 ) -> None:
-    """Run a Zenoh router until it is interrupted; it prints `ready` when it can be reached."""
+    """Run a Zenoh router until it is interrupted; it says so when it can be reached."""
+    from coopenv import interrupts
     from coopenv.svea.transport.zenoh import open_zenoh
 
     endpoints = listen or ["tcp/127.0.0.1:7447"]
     transport = open_zenoh("router", listen=endpoints)
     try:
-        print(f"ready at {', '.join(endpoints)}", flush=True)
+        interrupts.note("the router is gone")
+        print(f"router ready at {', '.join(endpoints)}", flush=True)
         threading.Event().wait()
     finally:
         transport.close()
