@@ -54,20 +54,22 @@ class Pixy:
     def frame(self, now: int, rng: np.random.Generator) -> list[Block]:
         """Take a frame at a time in ns, the largest block first."""
         self._frames += 1
-        seen = [(agent, ray) for agent, ray in self._room.look(self._frames).items() if agent in self._markers]
-        self._ages = {agent: min(self._ages.get(agent, 0) + 1, OLDEST) for agent, _ in seen}
-        blocks = [self._block(agent, ray) for agent, ray in seen]
+        seen = {agent: ray for agent, ray in self._room.look(self._frames).items() if agent in self._markers}
+        self._ages = {agent: min(self._ages.get(agent, 0) + 1, OLDEST) for agent in seen}
+        blocks = self._blocks(seen) if seen else []
         blocks.sort(key=lambda block: -block.width * block.height)
         return self._with_faults(blocks, now, rng)
 
-    def _block(self, agent: int, ray: Array) -> Block:
-        c, depth = self.calibration, max(self._room.distance(agent), MARKER)
-        (flat,) = distort(ray[None, :2] / ray[2], c.distortion)
-        pixel = np.rint(flat * c.focal_length + c.principal_point).astype(int)
-        x, y = np.clip(pixel, 0, np.array(c.image_size) - 1).tolist()
-        width, height = (max(1, round(f * MARKER / depth)) for f in c.focal_length)
-        number = self._markers[agent]
-        return Block(number, x, y, width, height, index=number - 1, age=self._ages[agent])
+    def _blocks(self, seen: dict[int, Array]) -> list[Block]:
+        c, rays = self.calibration, np.array([*seen.values()])
+        flat = distort(rays[:, :2] / rays[:, 2:], c.distortion)
+        pixels = np.rint(flat * c.focal_length + c.principal_point).clip(0, np.array(c.image_size) - 1)
+        blocks = []
+        for agent, (x, y) in zip(seen, pixels.astype(int).tolist(), strict=True):
+            number, near = self._markers[agent], MARKER / max(self._room.distance(agent), MARKER)
+            width, height = (max(1, round(f * near)) for f in c.focal_length)
+            blocks.append(Block(number, x, y, width, height, index=number - 1, age=self._ages[agent]))
+        return blocks
 
     def _with_faults(self, blocks: list[Block], now: int, rng: np.random.Generator) -> list[Block]:
         faults, (width, height) = self._faults, self.calibration.image_size

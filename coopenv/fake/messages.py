@@ -1,11 +1,11 @@
 """What a fake car measures, as the messages of the real ones; stamps in ns."""
 
+import math
 from typing import Any
 
 import numpy as np
 
 from coopenv.estimation.arrays import Array
-from coopenv.estimation.metrics import quaternion_wxyz
 from coopenv.fake.camera import Block, bearings_of
 from coopenv.svea.codec import header, make
 from coopenv.svea.samples import Calibration
@@ -143,7 +143,17 @@ def _pose_with_covariance(rotation: Array, position: Array) -> Any:
 
 
 def _quaternion(rotation: Array) -> Any:
-    w, x, y, z = quaternion_wxyz(rotation).tolist()
+    """Return the quaternion of a rotation by its largest component; in plain numbers, as there are 200 a second."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    rows = (
+        (1.0 + a + e + i, h - f, c - g, d - b),
+        (h - f, 1.0 + a - e - i, b + d, c + g),
+        (c - g, b + d, 1.0 - a + e - i, f + h),
+        (d - b, c + g, f + h, 1.0 - a - e + i),
+    )  # 4 q q^T
+    largest = max(range(4), key=lambda k: rows[k][k])
+    scale = math.copysign(1.0 / math.sqrt(sum(v * v for v in rows[largest])), rows[largest][0] or 1.0)
+    w, x, y, z = (scale * v for v in rows[largest])
     return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 

@@ -1,5 +1,6 @@
 """The room as one fake car has it: it moves itself by the simulation's kernels, others are where they are heard."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ class Room(World):
         """
         super().__init__(scenario, 1, "float64", threads=1)
         self.agent, self.vehicle = agent, agent - self.model.landmarks
+        self._acceleration = scenario.limits[self.vehicle].max_acceleration if self.vehicle >= 0 else 0.0
         self._time, self._frame = wp.zeros(1, dtype=wp.float64), wp.zeros(1, dtype=wp.int32)
         self._time_value, self._frame_value = self._time.numpy(), self._frame.numpy()
 
@@ -54,8 +56,7 @@ class Room(World):
     def drive(self, duration: float, speed: float, steering: float) -> None:
         """Move by the bicycle under a command, m/s and rad, for a while, s."""
         self._time_value[0] = duration
-        acceleration = self.scenario.limits[self.vehicle].max_acceleration
-        self.view("command")[0, self.vehicle] = (speed, steering, acceleration, 0.0)
+        self.view("command")[0, self.vehicle] = (speed, steering, self._acceleration, 0.0)
         self._run("drive", drive_one, PerWorld(self._time), self.vehicle)
 
     def follow(self, time: float) -> None:
@@ -83,7 +84,7 @@ class Room(World):
     def distance(self, agent: int) -> float:
         """Return how far the body of another agent is, m."""
         place = self.view("position")[0]
-        return float(np.linalg.norm(place[agent] - place[self.agent]))
+        return math.dist(place[agent], place[self.agent])
 
     @property
     def twist(self) -> tuple[Array, Array]:
