@@ -163,7 +163,8 @@ class Svea:
         self.station.clear()
 
     def _place_fakes(self, seed: int) -> None:
-        self._transport.publish(RESET_TOPIC, encode(make("std_msgs/msg/Int64", data=seed % 2**63)), reliable=True)
+        signed = (seed + 2**63) % 2**64 - 2**63  # the same 64 bits
+        self._transport.publish(RESET_TOPIC, encode(make("std_msgs/msg/Int64", data=signed)), reliable=True)
         time.sleep(SETTLE)
 
     def _arm(self) -> None:

@@ -1,0 +1,77 @@
+"""Fake cars in threads of this process, on a network within it: all that is real but the sockets."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from coopenv.backends.svea.backend import Svea
+from coopenv.backends.svea.opening import open_svea
+from coopenv.fake.car import Fake, fault_topic
+from coopenv.fake.process import binding_of, run
+from coopenv.svea.codec import encode, make
+from coopenv.svea.deployment import load_deployment
+from coopenv.svea.transport.local import Hub
+
+PATIENT = """
+[safety] # a machine that runs many tests at once is slow
+odometry_age = 2.0
+missed_deadlines = 60
+max_clock_offset = 0.5
+"""
+
+OVERTAKING = """
+environment = "svea_overtaking"
+fakes = true
+markers = { SL1 = 1, SL2 = 2, SL4 = 4, SL5 = 5 }
+
+[[cars]]
+name = "svea7"
+marker = 7
+
+[[cars]]
+name = "svea1"
+marker = 6
+"""
+
+
+def write_fleet(folder: Path, text: str = OVERTAKING, safety: str = PATIENT) -> Path:
+    """Write a deployment file and return its path."""
+    path = folder / "fleet.toml"
+    path.write_text(text + safety)
+    return path
+
+
+@contextmanager
+def fakes(path: Path, **options: Any) -> Iterator[tuple[Hub, Mapping[str, Fake]]]:
+    """Let the cars of a deployment file live until the block ends."""
+    deployment, hub, over = load_deployment(path), Hub(), threading.Event()
+    links = [hub.connect() for _ in deployment.cars]
+    made = {
+        car.name: Fake(deployment, binding_of(deployment, car.name), car.name, link, die=over.set, **options)
+        for car, link in zip(deployment.cars, links, strict=True)
+    }
+    threads = [threading.Thread(target=run, args=(fake, over), daemon=True) for fake in made.values()]
+    for thread in threads:
+        thread.start()
+    try:
+        yield hub, made
+    finally:
+        over.set()
+        for thread in threads:
+            thread.join(timeout=5.0)
+        for link in links:
+            link.close()
+
+
+def cars(path: Path, hub: Hub, **options: Any) -> Svea:
+    """Return the cars as a backend."""
+    return open_svea(path, transport=hub.connect(), **options)
+
+
+def send_fault(hub: Hub, car: str, fault: str) -> None:
+    """Give a fake car a fault."""
+    hub.connect().publish(fault_topic(car), encode(make("std_msgs/msg/String", data=fault)))
