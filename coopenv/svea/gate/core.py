@@ -98,7 +98,7 @@ class Gate:
     def neutral(self) -> bytes:
         """Close for good and return the ManualControl of a car that stands."""
         self._come_to_a_stand(State.STOPPED)
-        return self.tick()
+        return write_manual(self._clock.wall(), to_manual(NEUTRAL))
 
     def status(self) -> bytes:
         """Return the GateStatus now."""

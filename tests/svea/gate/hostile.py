@@ -12,7 +12,7 @@ from tests.svea.gate import messages
 from tests.svea.gate.bench import CAR, MS
 
 Message = tuple[Role, bytes, bytes]
-NO_NUMBERS = (math.nan, math.inf, -math.inf, 1e30, -1e30, 0.51, -0.51)
+NO_ANGLES = (math.nan, math.inf, -math.inf, 1e30, -1e30, 0.6, -0.6)
 ROLES = (Role.COMMAND, Role.ARM)
 
 
@@ -59,7 +59,7 @@ def messages_of_strangers(
         dear = (
             lambda: signed(Role.COMMAND, command(), random.choice((stranger, forger, unknown))),
             lambda: (Role.COMMAND, command(), random.choice((b"", good, random.randbytes(random.randrange(120))))),
-            lambda: signed(Role.COMMAND, command(steering=random.choice(NO_NUMBERS))),
+            lambda: signed(Role.COMMAND, command(steering=random.choice(NO_ANGLES))),
             lambda: signed(Role.ARM, messages.arm(now(), session, random.randbytes(8).hex())),
             lambda: signed(Role.ARM, messages.arm(now(), session, "", random.random() < 0.5), forger),
             lambda: signed(Role.ARM, command()),
