@@ -11,7 +11,7 @@ from typing import Any
 from coopenv.backends.svea.backend import Svea
 from coopenv.backends.svea.opening import open_svea
 from coopenv.fake.car import Fake, fault_topic
-from coopenv.fake.process import binding_of, run
+from coopenv.fake.process import open_fake, run
 from coopenv.svea.codec import encode, make
 from coopenv.svea.deployment import load_deployment
 from coopenv.svea.transport.local import Hub
@@ -51,8 +51,7 @@ def fakes(path: Path, **options: Any) -> Iterator[tuple[Hub, Mapping[str, Fake]]
     deployment, hub, over = load_deployment(path), Hub(), threading.Event()
     links = [hub.connect() for _ in deployment.cars]
     made = {
-        car.name: Fake(deployment, binding_of(deployment, car.name), car.name, link, die=over.set, **options)
-        for car, link in zip(deployment.cars, links, strict=True)
+        car.name: open_fake(path, car.name, link, **options) for car, link in zip(deployment.cars, links, strict=True)
     }
     threads = [threading.Thread(target=run, args=(fake, over), daemon=True) for fake in made.values()]
     for thread in threads:

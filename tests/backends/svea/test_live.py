@@ -47,7 +47,8 @@ def drive(env: Env, steps: int, action: np.ndarray = AHEAD) -> dict[str, Any]:
 
 
 def place(made: dict[str, Fake], car: str) -> np.ndarray:
-    return np.array(made[car].room.pose[1])
+    room = made[car].room
+    return np.array(room.pose(room.agent)[1])
 
 
 def listen(hub: Hub, topic: str) -> list[Arrival]:
