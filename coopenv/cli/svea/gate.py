@@ -1,5 +1,7 @@
 """`coopenv svea gate`: what stands between the network and the wheels, on the car's own computer."""
 
+import os
+import signal
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -60,6 +62,8 @@ def gate(
     try:
         link = Link(Gate(car, given.limits, CLOCK, verifier, given.station), car, transport, signer)
         interrupts.note(f"{car} is in neutral")
+        if hasattr(signal, "SIGHUP"):  # a terminal that is closed ends the gate, too, but not before the car stands
+            signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
         print(f"{car}: gate ready at {', '.join(given.connect)}", flush=True)
         run(link)
     finally:

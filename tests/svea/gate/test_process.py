@@ -122,7 +122,7 @@ def test_what_comes_while_it_is_frozen_moves_nothing(
     station.drive()
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 143)])
 def test_a_signal_leaves_the_car_in_neutral(
     station: Station, gate: subprocess.Popen[str], number: signal.Signals, status: int
 ) -> None:
