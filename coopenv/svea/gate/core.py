@@ -3,11 +3,11 @@
 It starts disarmed. An arming by the station names a session and the nonce that the gate has shown last; the nonce is a
 new one after every start, arming, disarming and stop, so that an arming counts once and only if whoever sent it knew of
 the latest stop. A disarming needs no nonce. Armed, the gate lets commands of that session through, each newer than all
-before it, fresh by both clocks, finite, and inside the limits.
+before it, not older than 0.15 s, finite, and inside the limits. Until the first one the car stands.
 
-Without a valid command for 0.2 s the car gets neutral: the gate has timed out. Newer commands of the same session may
-go on from there: what a stalled link delivers late is older than 0.15 s and moves nothing, and what has just been sent
-is what the station wants now. The car then starts from a stand, at the limited acceleration.
+Without another one for 0.2 s the car gets neutral: the gate has timed out. Newer commands of the same session may go on
+from there: what a stalled link delivers late is older than 0.15 s and moves nothing, and what has just been sent is
+what the station wants now. The car then starts from a stand, at the limited acceleration.
 
 A stop stays until the next arming. It needs no signature: whoever asks for it gets it, as the worst that can come of it
 is a car that stands. Its `false` does nothing.
