@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,6 +34,7 @@ OPTIONS = ("arm", "options")
 EXPECTED = ("reset", "closed", EPISODE_OVER)
 """Reasons to stop that are no emergency."""
 FIRST_WORD = 3.0  # s that cars have to be heard in at the first reset
+CAMERA_WORD = 1.5  # s in which a camera has to say of itself what it is; some never do
 SETTLE = 0.5  # s that fakes have to stand where they were put
 
 
@@ -143,7 +144,7 @@ class Svea:
         arm = _checked(options)
         if self.deployment.fakes:
             self._place_fakes(0 if seed is None else seed)
-        self._listen()
+        self._listen(arm)
         if arm:
             self._arm()
         self._drain()
@@ -153,14 +154,15 @@ class Svea:
             self._tape.begin(self._began, self._key % 2**64, self._episode)
         return self._counted(self._assembler.begin(self._began))
 
-    def _listen(self) -> None:
+    def _listen(self, arm: bool) -> None:
         """Wait until the cars have been heard, but not for ever: they need not be there as long as nobody drives."""
-        until = time.monotonic() + (0.0 if self._heard_once else FIRST_WORD)
         topics = [topic for watched in self._watched().values() for topic in watched.odometry]
-        while time.monotonic() < until and any(self.station.silence(topic) > 1.0 for topic in topics):
-            time.sleep(0.02)
+        _wait(lambda: all(self.station.silence(topic) < 1.0 for topic in topics), 0 if self._heard_once else FIRST_WORD)
+        if arm:
+            _wait(lambda: all(self.board.calibration(name) is not None for name in self._local), CAMERA_WORD)
         self._heard_once = True
-        self.station.clear()
+        self._drain()
+        self.station.dropped.clear()
 
     def _place_fakes(self, seed: int) -> None:
         signed = (seed + 2**63) % 2**64 - 2**63  # the same 64 bits
@@ -284,6 +286,13 @@ class Svea:
         if self._tape is not None:
             self._tape.close()
         self._transport.close()
+
+
+def _wait(ready: Callable[[], bool], patience: float) -> None:
+    """Wait for something to become true, s at most."""
+    until = time.monotonic() + patience
+    while time.monotonic() < until and not ready():
+        time.sleep(0.02)
 
 
 def _checked(options: Mapping[str, Any]) -> bool:

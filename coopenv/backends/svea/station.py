@@ -67,12 +67,6 @@ class Station:
                 waiting.clear()
         return sorted(taken, key=lambda arrival: (arrival.received, arrival.topic))
 
-    def clear(self) -> None:
-        """Forget what waits, and what was dropped."""
-        self.drain()
-        with self._lock:
-            self.dropped.clear()
-
     def silence(self, topic: str) -> float:
         """Return for how long nothing has come on a topic, s; inf: never anything."""
         with self._lock:

@@ -14,6 +14,8 @@ from coopenv.svea.deployment import Safety
 
 PERIOD = 0.01  # s between looks
 REPEAT = 0.2  # s between emergency stops that are sent again
+OPEN = ("armed", "timed_out")
+"""States of a gate that takes commands: one that has timed out lets the car stand until the next one."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +139,7 @@ class Watchdog:
         for car, gate in self._gates.states.items():
             if gate.age > OLD:
                 yield Trip(f"{car}: its gate is silent for {gate.age:.2f} s", car)
-            elif gate.state != "armed" or gate.session != self._gates.session:
+            elif gate.state not in OPEN or gate.session != self._gates.session:
                 yield Trip(f"{car}: its gate is {gate.state}", car)
         if self._missed >= s.missed_deadlines:
             yield Trip(f"{self._missed} decisions in a row came too late")
