@@ -2,6 +2,7 @@
 
 import tomllib
 from collections import Counter
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -44,6 +45,33 @@ class Car(Part):
     def agent_number(self) -> int | None:
         """Its number in the authors' names; None: it has none."""
         return self.marker if self.agent is None else self.agent
+
+
+def refuse_repeated(cars: Sequence[Car], markers: Mapping[str, int], numbers: Container[int] | None = None) -> None:
+    """Refuse a name, vehicle, landmark or marker of two, with a ValueError that says which.
+
+    Args:
+        cars: a fleet.
+        markers: numbers of the markers of landmarks, by name.
+        numbers: those that the camera knows (None: any).
+    """
+    given: dict[str, list[Any]] = {
+        "cars: the name": [car.name for car in cars],
+        "cars: the vehicle": [car.vehicle for car in cars if car.vehicle is not None],
+        "cars: the landmark": [car.landmark for car in cars if car.landmark is not None],
+        "markers: the number": [*markers.values(), *(c.marker for c in cars if c.marker is not None)],
+        "cars: the agent (or marker)": [c.agent_number for c in cars if c.agent_number is not None],
+    }
+    for what, values in given.items():
+        for value, times in Counter(values).items():
+            if times > 1:
+                raise ValueError(f"{what} {value!r} is used twice")
+    for what, number in [*markers.items(), *((c.name, c.marker) for c in cars if c.marker is not None)]:
+        if numbers is not None and number not in numbers:
+            raise ValueError(f"marker {number} of {what}: the camera knows {MARKERS[0]} to {MARKERS[-1]} only")
+    for i, car in enumerate(cars):
+        if car.vehicle is not None and car.landmark is not None:
+            raise ValueError(f"cars.{i}: is a vehicle or a landmark, not both")
 
 
 class Sensors(Part):
@@ -127,23 +155,7 @@ class Deployment(Part):
 
     @model_validator(mode="after")
     def _nothing_is_used_twice(self) -> Self:
-        given: dict[str, list[Any]] = {
-            "cars: the name": [car.name for car in self.cars],
-            "cars: the vehicle": [car.vehicle for car in self.cars if car.vehicle is not None],
-            "cars: the landmark": [car.landmark for car in self.cars if car.landmark is not None],
-            "markers: the number": [*self.markers.values(), *(c.marker for c in self.cars if c.marker is not None)],
-        }
-        given["cars: the agent (or marker)"] = [c.agent_number for c in self.cars if c.agent_number is not None]
-        for what, values in given.items():
-            for value, times in Counter(values).items():
-                if times > 1:
-                    raise ValueError(f"{what} {value!r} is used twice")
-        for what, number in [*self.markers.items(), *((c.name, c.marker) for c in self.cars if c.marker is not None)]:
-            if number not in MARKERS:
-                raise ValueError(f"marker {number} of {what}: the camera knows {MARKERS[0]} to {MARKERS[-1]} only")
-        for i, car in enumerate(self.cars):
-            if car.vehicle is not None and car.landmark is not None:
-                raise ValueError(f"cars.{i}: is a vehicle or a landmark, not both")
+        refuse_repeated(self.cars, self.markers, MARKERS)
         return self
 
     @property

@@ -1,0 +1,186 @@
+"""Bags of a simulated drive: messages with real definitions, written by rosbags as ROS 1, ROS 2 sqlite3 or MCAP."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coopenv.estimation.rotations import log_so3
+from coopenv.observers import Recording
+from coopenv.runs.recorder import record
+from coopenv.scenario import load_scenario
+from coopenv.scenario.sensing import ROTATION_OF_CAMERA
+from coopenv.svea import codec
+from coopenv.svea.lens import distort
+
+BEGIN = 1_700_000_000_000_000_000  # ns
+DISTORTION = (-0.352043, 0.137879, 0.001953, 0.000628, 0.0)
+MARKERS = {"SL1": 1, "SL2": 2, "SL4": 4, "SL5": 5}
+MAP = """
+environment = "crossing_path"
+names = "authors"
+markers = { SL1 = 1, SL2 = 2, SL4 = 4, SL5 = 5 }
+
+[overrides]
+"camera.distortion" = [-0.352043, 0.137879, 0.001953, 0.000628, 0.0]
+"rates.odometry" = 60.0
+
+[[cars]]
+name = "svea3"
+marker = 7
+agent = "agent8"
+
+[[cars]]
+name = "svea1"
+landmark = "ML"
+marker = 3
+agent = "agent7"
+"""
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message; times in ns since the begin."""
+
+    topic: str
+    kind: str
+    stamp: int
+    received: int
+    fields: dict[str, Any]
+
+
+@cache
+def drive(seconds: float = 4.0, seed: int = 0) -> Recording:
+    """Return a drive past four landmarks, with the lens's distortion and whole pixels."""
+    overrides = {
+        "camera.distortion": DISTORTION,
+        "rates.odometry": 60.0,
+        "horizon": seconds,
+        "vehicles.0.motion": {
+            "kind": "segments",
+            "segments": [{"duration": 0.5}, {"duration": 2.1, "linear": [0.26, 0.0, 0.0], "angular": [0, 0, 0.1]}],
+        },
+        "landmarks.ML.position": [-0.5, 1.45, 0.0],
+        "landmarks.ML.motion": {"kind": "segments", "segments": [{"duration": 20.0, "linear": [0.26, 0.0, 0.0]}]},
+    }
+    return record(load_scenario("crossing_path", overrides), seed)
+
+
+def vector(kind: str, values: Any) -> tuple[str, dict[str, Any]]:
+    return f"geometry_msgs/msg/{kind}", dict(zip("xyz", map(float, values), strict=True))
+
+
+def pose(R: np.ndarray, p: np.ndarray) -> tuple[str, dict[str, Any]]:
+    half = 0.5 * log_so3(R)
+    angle = float(np.linalg.norm(half))
+    axis = half if angle < 1e-12 else half / angle * np.sin(angle)
+    turn = dict(zip("xyzw", [*map(float, axis), float(np.cos(angle))], strict=True))
+    return "geometry_msgs/msg/Pose", {"position": vector("Point", p), "orientation": ("geometry_msgs/msg/Quaternion", turn)}
+
+
+def messages(r: Recording) -> list[Message]:
+    """Return what the car and the moving landmark of a drive send, under the authors' names."""
+    found = []
+    for k in range(r.ticks):
+        t = round(k * 1e9 * r.dt)
+        found.append(Message("/agent8/pixy_node/objectsInfo", "pixy_camera/msg/ObjectInfoArrayStamped", t, t,
+                             {"objects": blocks(r, k)}))
+        if k + 1 < r.ticks:
+            found.append(Message("/agent8/actuation_twist", "geometry_msgs/msg/TwistWithCovarianceStamped", t, t,
+                                 {"twist": twist(r, k + 1)}))
+        R, p = r.truth.rotation[k, 0], r.truth.position[k, 0]
+        found.append(Message("/qualisys/svea3/pose", "geometry_msgs/msg/PoseStamped", t, t, {"pose": pose(R, p)}))
+        body = r.landmarks[k, 4] - np.array([0.16, 0.0, 0.0])  # marker (0.16, 0, 0.25): a point gives the height alone
+        point = body + np.array([0.16, 0.0, -0.25])
+        found.append(Message("/agent7/riccatiPoint", "geometry_msgs/msg/PointStamped", t, t, {"point": vector("Point", point)}))
+    return found
+
+
+def blocks(r: Recording, k: int) -> list[tuple[str, dict[str, Any]]]:
+    """Return the blocks of a frame, an unwanted small one among them."""
+    camera = load_scenario("crossing_path").cameras[0]
+    found = []
+    for target in np.flatnonzero(r.visible[k, 0]):
+        name = r.setups[0].target_names[target]
+        ray = ROTATION_OF_CAMERA["forward"].T @ r.bearings[k, 0, target]
+        flat = distort((ray[:2] / ray[2])[None], DISTORTION)[0]
+        u, v = np.round(flat * camera.focal_length + np.array(camera.principal_point)).astype(int).tolist()
+        number = MARKERS.get(name, 3)
+        for x, width in ((u, 9), (1, 2)):
+            row = {"signature": number, "center_x": x, "center_y": v, "width": width, "height": width}
+            found.append(("pixy_camera/msg/ObjectInfo", {**row, "angle": 0, "index": 0, "age": 1}))
+    return found
+
+
+def twist(r: Recording, k: int) -> tuple[str, dict[str, Any]]:
+    """Return the twist that leads to a tick when it is held since the last one; its rotation is small or none."""
+    turn = log_so3(r.rotation[k, 0])
+    linear = np.linalg.solve(_left_jacobian(turn), r.translation[k, 0])
+    both = {"linear": vector("Vector3", linear / r.dt), "angular": vector("Vector3", turn / r.dt)}
+    return "geometry_msgs/msg/TwistWithCovariance", {
+        "twist": ("geometry_msgs/msg/Twist", both), "covariance": np.diag([0.1] * 6).ravel()
+    }
+
+
+def _left_jacobian(turn: np.ndarray) -> np.ndarray:
+    x, y, z = turn
+    W = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + W / 2 + W @ W / 6 + W @ W @ W / 24
+
+
+def later(given: Iterable[Message], *, stamps: float = 0.0, received: float = 0.0, topics: str = "") -> list[Message]:
+    """Return messages with other times (s), those of topics that begin with a text."""
+    return [
+        replace(m, stamp=m.stamp + round(stamps * 1e9), received=m.received + round(received * 1e9))
+        if m.topic.startswith(topics) else m
+        for m in given
+    ]
+
+
+def write(path: Path, given: Iterable[Message], form: str) -> Path:
+    """Write a bag; `form` is ros1, sqlite3 or mcap. Return its path, with the suffix that the form has."""
+    ordered = sorted(given, key=lambda m: m.received)
+    if form == "ros1":
+        from rosbags.rosbag1 import Writer as Writer1
+
+        path = path.with_suffix(".bag")
+        with Writer1(path) as bag:
+            _fill(bag, ordered, codec.ros1(), lambda s, m, kind: s.serialize_ros1(m, kind))
+        return path
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    plugin = StoragePlugin.MCAP if form == "mcap" else StoragePlugin.SQLITE3
+    with Writer(path, version=9, storage_plugin=plugin) as bag:
+        _fill(bag, ordered, codec.ros2(), lambda s, m, kind: s.serialize_cdr(m, kind))
+    return path
+
+
+def _fill(bag: Any, ordered: list[Message], store: Any, encode: Any) -> None:
+    connections: dict[str, Any] = {}
+    for number, m in enumerate(ordered):
+        if m.topic not in connections:
+            connections[m.topic] = bag.add_connection(m.topic, m.kind, typestore=store)
+        message = _made(store, m.kind, {"header": _header(store, BEGIN + m.stamp, number), **m.fields})
+        bag.write(connections[m.topic], BEGIN + m.received, encode(store, message, m.kind))
+
+
+def _header(store: Any, stamp: int, number: int) -> Any:
+    time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
+    fields = {"stamp": time, "frame_id": ""}
+    kind = store.types["std_msgs/msg/Header"]
+    return kind(**fields, seq=number) if "seq" in kind.__dataclass_fields__ else kind(**fields)
+
+
+def _made(store: Any, kind: str, fields: dict[str, Any]) -> Any:
+    return store.types[kind](**{name: _value(store, value) for name, value in fields.items()})
+
+
+def _value(store: Any, value: Any) -> Any:
+    if isinstance(value, tuple):
+        return _made(store, *value)
+    return [_value(store, part) for part in value] if isinstance(value, list) else value
