@@ -30,6 +30,7 @@ def parallel_env(
     overrides: Mapping[str, Any] | None = None,
     data: str | Path | None = None,
     variant: str | None = None,
+    topics: str | Path | None = None,
     reward: RewardFunction | None = None,
     deployment: str | Path | None = None,
     car: str | None = None,
@@ -37,11 +38,11 @@ def parallel_env(
 ) -> CooperativeLocalisationEnv:
     """Return an environment by name (`coopenv.list_envs()`), from a TOML file, or from a recording.
 
-    A recording goes by as it was, whatever the actions; see docs/replay.md.
+    A recording goes by as it was, whatever the actions; see docs/replay.md, and docs/bags.md for ROS bags.
 
     Args:
-        name_or_path: for example "busy_intersection"; "mrclam_6" or "drive.mcap" replay what was recorded. Where
-            `backend` is an object, any name for the environment.
+        name_or_path: for example "busy_intersection"; "mrclam_6", "drive.mcap" or "drive.bag" replay what was
+            recorded. Where `backend` is an object, any name for the environment.
         render_mode: None, "rgb_array" or "human".
         observer: estimator that every vehicle runs, embedded or a plug-in: a name, a class, or where one stands
             (`mine.py:Mine`, `package.module:Mine`); None: as the scenario says.
@@ -53,6 +54,7 @@ def parallel_env(
         overrides: dotted scenario keys, for example {"noise.enabled": False}.
         data: folder of recorded data sets; None: what COOPENV_DATA says.
         variant: of a recorded data set: "landmarks", "landmarks+robots" (the default) or "blind".
+        topics: of a ROS bag: the TOML file that says what its topics are.
         reward: a function of a `coopenv.api.reward.Step` that returns the rewards (1, vehicles); None: the weighted
             sum of the scenario's terms.
         deployment: file that says which cars there are; for `backend="svea"`, see docs/cars.md.
@@ -72,6 +74,7 @@ def parallel_env(
             data,
             variant,
             {"deployment": deployment, "car": car, "record": record},
+            topics,
         ),
         Path(str(name_or_path)).stem,
         render_mode=render_mode,

@@ -1,22 +1,32 @@
 """Sources of ticks by name: the only place that knows what a name means."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from coopenv.backends.base import Backend
+from coopenv.backends.mcap.peek import metadata_names
 from coopenv.backends.replay import Replay
 from coopenv.backends.simulated import Simulated
 from coopenv.errors import CoopenvError, DataError, suggest
 from coopenv.observers.recording import Recording
 from coopenv.scenario import Scenario, load_scenario
 
+if TYPE_CHECKING:
+    from coopenv.backends.bags import Bag
+
 BACKENDS = ("simulated", "highway", "replay", "svea")
 
 LOG_SUFFIX = ".mcap"
+BAG_SUFFIXES = (".bag", ".db3")
+OURS = {"coopenv", "coopenv-drive"}
+"""Names of the metadata of MCAP files that are no bags of others."""
 DATASETS = re.compile(r"mrclam_\d+")
+
+
+IMPORT = "coopenv import {} --map topics.toml --out FILE.mcap"
 
 
 class Kind(Enum):
@@ -25,13 +35,32 @@ class Kind(Enum):
     ENVIRONMENT = "an environment by name or TOML file"
     LOG = "an MCAP file"
     DATASET = "a sub-dataset of MR.CLAM"
+    BAG = "a ROS bag, which needs a map of its topics"
 
 
 def kind_of(name: str | Path) -> Kind:
     """Return what a name stands for, whether or not it exists."""
+    if is_bag(name):
+        return Kind.BAG
     if str(name).endswith(LOG_SUFFIX):
         return Kind.LOG
     return Kind.DATASET if DATASETS.fullmatch(str(name)) else Kind.ENVIRONMENT
+
+
+def is_bag(name: str | Path, topics: str | Path | None = None) -> bool:
+    """Return whether a name is that of a ROS bag; of MCAP files it is whatever coopenv has not written.
+
+    An MCAP file that is not there or cannot be read counts as one if the map of its topics is given.
+    """
+    if str(name).endswith(BAG_SUFFIXES):
+        return True
+    if str(name).endswith(LOG_SUFFIX):
+        metadata = metadata_names(name)
+        return topics is not None if metadata is None else not metadata & OURS
+    try:
+        return (Path(name) / "metadata.yaml").is_file()
+    except (OSError, ValueError):  # what can be no path
+        return False
 
 
 def is_recorded(name: str | Path) -> bool:
@@ -57,6 +86,8 @@ def open_recording(name: str | Path, data: str | Path | None = None, variant: st
         from coopenv.backends.mcap import read_recording
 
         return read_recording(name)
+    if kind is Kind.BAG:
+        raise DataError(f"{name}: a ROS bag; make a recording of it with: {IMPORT.format(name)}")
     if kind is not Kind.DATASET:
         raise DataError(f"'{name}' is no recording; known: FILE{LOG_SUFFIX}, mrclam_1 .. mrclam_9")
     from coopenv.backends.mrclam import load_dataset, recording_of
@@ -97,26 +128,28 @@ def open_backend(
     data: str | Path | None = None,
     variant: str | None = None,
     cars: Mapping[str, Any] | None = None,
+    topics: str | Path | None = None,
 ) -> Backend:
     """Return where the ticks of an environment or a recording come from.
 
     Args:
-        name_or_path: environment, TOML file, MCAP file or data set.
+        name_or_path: environment, TOML file, MCAP file, ROS bag or data set.
         backend: one of `BACKENDS`; None: as the name says; a backend itself is returned as it is.
         overrides: dotted scenario keys.
         data: folder of the data sets.
         variant: of a data set.
         cars: arguments of `coopenv.backends.svea.opening.open_svea`, which `backend="svea"` needs: `deployment`, and
             `car` and `record`.
+        topics: map of the topics of a ROS bag.
 
     Raises:
         CoopenvError: any of it does not exist or does not fit.
     """
     given = {key: value for key, value in (cars or {}).items() if value is not None}
     if backend == "svea":
-        return _open_cars(name_or_path, overrides, {**given, "data": data, "variant": variant})
+        return _open_cars(name_or_path, overrides, {**given, "data": data, "variant": variant, "topics": topics})
     if isinstance(backend, Backend):
-        for key, value in {**overrides, **given, "data": data, "variant": variant}.items():
+        for key, value in {**overrides, **given, "data": data, "variant": variant, "topics": topics}.items():
             if value is not None:
                 raise CoopenvError(f"{key}: {type(backend).__name__} has its scenario already, choose it there")
         return backend
@@ -125,6 +158,10 @@ def open_backend(
     if backend is not None and backend not in BACKENDS:
         known = f"{suggest(str(backend), BACKENDS)}; known: {', '.join(BACKENDS)}"
         raise CoopenvError(f"unknown backend '{backend}'{known}")
+    if backend in (None, "replay") and is_bag(name_or_path, topics):
+        return open_bags([name_or_path], topics, overrides, data, variant)
+    if topics is not None:
+        raise CoopenvError(f"topics {topics}: is for ROS bags, '{name_or_path}' is none")
     if backend in (None, "replay") and kind_of(name_or_path) is Kind.LOG and _is_drive(name_or_path):
         from coopenv.backends.svea.drive import Drive
 
@@ -151,7 +188,7 @@ def _open_cars(name: str | Path, overrides: Mapping[str, Any], given: Mapping[st
     """Return the cars of a deployment file: that which is given, or `name` itself."""
     from coopenv.backends.svea.opening import open_svea
 
-    for key in ("data", "variant"):
+    for key in ("data", "variant", "topics"):
         if given[key] is not None:
             raise CoopenvError(f"{key} is for recorded data, backend='svea' has cars")
     deployment = given.get("deployment")
@@ -159,3 +196,22 @@ def _open_cars(name: str | Path, overrides: Mapping[str, Any], given: Mapping[st
         raise CoopenvError(f"deployment: needed by backend='svea': the file that says which cars drive {name}")
     environment = None if deployment is None else str(name)
     return open_svea(deployment or name, environment, overrides, given.get("car"), given.get("record"))
+
+
+def open_bags(
+    names: Sequence[str | Path],
+    topics: str | Path | None,
+    overrides: Mapping[str, Any] | None = None,
+    data: str | Path | None = None,
+    variant: str | None = None,
+) -> "Bag":
+    """Return ROS bags of one drive as a backend; arguments and errors as for `open_backend`."""
+    where = ", ".join(str(name) for name in names)
+    for what, value in (("data", data), ("variant", variant)):
+        if value is not None:
+            raise CoopenvError(f"{what} is for recorded data sets, {where} is a ROS bag")
+    if topics is None:
+        raise DataError(f"{where}: a ROS bag, which needs a map of its topics, --map topics.toml (see docs/bags.md)")
+    from coopenv.backends.bags import Bag
+
+    return Bag(names, topics, overrides)

@@ -13,6 +13,7 @@ import typer
 
 from coopenv import interrupts
 from coopenv.cli import show
+from coopenv.cli.bags import import_command
 from coopenv.cli.bench import bench
 from coopenv.cli.dataset import dataset
 from coopenv.cli.evaluate import evaluate
@@ -39,6 +40,7 @@ app.command()(show.describe)
 app.command()(show.schema)
 app.command()(run)
 app.command("record")(record_command)
+app.command("import")(import_command)
 app.command()(dataset)
 app.command()(train)
 app.command()(evaluate)

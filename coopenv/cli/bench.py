@@ -61,6 +61,7 @@ def bench_observers(
     engine: Annotated[str, typer.Option(help="Where to compute: `local`, or `ray` (an existing cluster).")] = "local",
     address: Annotated[str | None, typer.Option(help="Address of the Ray cluster, HOST:PORT (default: auto).")] = None,
     data: options.DataFolder = None,
+    topics: options.TopicMap = None,
     basin: Annotated[int, typer.Option(min=0, help="Random initial estimates for maps of the basins.")] = 0,
     overrides: options.Overrides = None,
     steady_from: options.SteadyFrom = None,
@@ -80,7 +81,9 @@ def bench_observers(
     printed, log = options.console(), options.console(stderr=True)
     with options.warned():
         changes, numbers = options.parse_overrides(overrides), range(first, first + seeds)
-        request = request_of(source, observers, variants, numbers, steady_from, basin, data, changes, overrides or ())
+        request = request_of(
+            source, observers, variants, numbers, steady_from, basin, data, changes, overrides or (), topics
+        )
         request.plan.source.check()
     perform(request, find_executor(engine, jobs, address), out, figures, printed, log, as_json)
     if open_report and out is not None:

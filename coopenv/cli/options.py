@@ -28,8 +28,8 @@ _source = partial(typer.Argument, autocompletion=complete.environments)
 Environment = Annotated[
     str, _source(metavar="ENV", help="Name of an environment (see `coopenv list`) or path of a TOML file.")
 ]
-_SOURCES = "Environment (name or TOML file), recorded robots (mrclam_1 .. mrclam_9) or a log file."
-Source = Annotated[str, _source(metavar="ENV|DATASET|FILE.mcap", help=_SOURCES)]
+_SOURCES = "Environment (name or TOML file), recorded robots (mrclam_1 .. mrclam_9), a log file or a ROS bag."
+Source = Annotated[str, _source(metavar="ENV|DATASET|FILE.mcap|BAG", help=_SOURCES)]
 Overrides = Annotated[
     list[str] | None,
     typer.Option(
@@ -55,6 +55,9 @@ DataFolder = Annotated[
 ]
 Variant = Annotated[
     str | None, typer.Option("--variant", help="Variant of a data set: landmarks, landmarks+robots or blind.")
+]
+TopicMap = Annotated[
+    Path | None, typer.Option("--map", help="TOML file that says what the topics of a ROS bag are (docs/bags.md).")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 SteadyFrom = Annotated[
@@ -94,12 +97,14 @@ def load(environment: str, overrides: dict[str, Any]) -> Any:
         return open_simulation(environment, overrides)
 
 
-def open_source(environment: str, overrides: dict[str, Any], data: Path | None, variant: str | None) -> Backend:
+def open_source(
+    environment: str, overrides: dict[str, Any], data: Path | None, variant: str | None, topics: Path | None = None
+) -> Backend:
     """Return where the ticks of an environment or a recording come from, warnings printed as one line each."""
     from coopenv.backends.sources import open_backend
 
     with warned():
-        return open_backend(environment, None, overrides, data, variant)
+        return open_backend(environment, None, overrides, data, variant, topics)
 
 
 @contextmanager

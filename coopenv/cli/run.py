@@ -29,6 +29,7 @@ def run(
     as_json: options.AsJson = False,
     data: options.DataFolder = None,
     variant: options.Variant = None,
+    topics: options.TopicMap = None,
 ) -> None:
     """Run an environment; write metrics, arrays and figures."""
     from coopenv.runs.command import execute, report
@@ -36,7 +37,7 @@ def run(
 
     changes, name = options.parse_overrides(overrides), Path(environment).stem
     refuse_for_recordings(environment, seed=seed, policy=policy)
-    backend = options.open_source(environment, changes, data, variant)
+    backend = options.open_source(environment, changes, data, variant, topics)
     rollout = Rollout(backend.scenario, seed, steps, dtype, device, policy, backend)
     folder, form, log = out or Path("out") / name, None if no_figures else figures.value, options.console(stderr=True)
     result = execute(name, rollout, folder, log, changes, steady_from, form, video)
@@ -49,10 +50,13 @@ def run(
 
 
 def refuse_for_recordings(environment: str, seed: int, policy: str) -> None:
-    """Refuse options that only a simulation knows where they are given for a recording."""
-    from coopenv.backends.sources import is_recorded
+    """Refuse options that only a simulation knows where they are given for a recording.
 
-    for option, value in (("--seed", seed), ("--policy", policy)):
+    Of a bag the initial estimates may be drawn.
+    """
+    from coopenv.backends.sources import is_bag, is_recorded
+
+    for option, value in (("--seed", 0 if is_bag(environment) else seed), ("--policy", policy)):
         if is_recorded(environment) and value not in (0, "zero"):
             raise CoopenvError(f"{option}: is for a simulation, {environment} is recorded")
 
@@ -65,6 +69,7 @@ def record_command(
     overrides: options.Overrides = None,
     data: options.DataFolder = None,
     variant: options.Variant = None,
+    topics: options.TopicMap = None,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
 ) -> None:
     """Write what vehicles sense to an MCAP file.
@@ -72,7 +77,7 @@ def record_command(
     The file holds every tick; Foxglove opens it and coopenv replays it.
     """
     from coopenv.backends.mcap import check_target, write_recording
-    from coopenv.backends.sources import is_recorded, open_recording
+    from coopenv.backends.sources import is_bag, is_recorded, open_recording
     from coopenv.runs.console import Progress
     from coopenv.runs.recorder import record
 
@@ -80,7 +85,14 @@ def record_command(
     if out.exists() and not force:
         raise OutputError(f"{out}: exists already; --force replaces it")
     changes, log = options.parse_overrides(overrides), options.console(stderr=True)
-    if is_recorded(environment):
+    if is_bag(environment, topics):
+        refuse_for_recordings(environment, seed, policy)
+        backend = options.open_source(environment, changes, data, variant, topics)
+        with Progress(log, "recording", total=1.0) as progress:
+            recording = record(backend, seed, policy, progress.update)
+    elif topics is not None:
+        raise CoopenvError(f"--map {topics}: is for ROS bags, {environment} is none")
+    elif is_recorded(environment):
         refuse_for_recordings(environment, seed, policy)
         if changes:
             raise CoopenvError(f"--set: is for a simulation, {environment} is recorded")

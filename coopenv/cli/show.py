@@ -40,13 +40,14 @@ def describe(
     as_json: options.AsJson = False,
     data: options.DataFolder = None,
     variant: options.Variant = None,
+    topics: options.TopicMap = None,
 ) -> None:
     """Say what an environment is: vehicles, sensors, observer."""
     from coopenv.runs.describe import describe_scenario
     from coopenv.runs.summary import document, summary
 
     name = Path(environment).stem
-    backend = options.open_source(environment, options.parse_overrides(overrides), data, variant)
+    backend = options.open_source(environment, options.parse_overrides(overrides), data, variant, topics)
     scenario, recorded = backend.scenario, backend.capabilities.recorded
     if as_json:
         options.print_json(document(name, scenario))

@@ -42,7 +42,7 @@ def scenario_path(name_or_path: str | Path) -> Path:
             raise UnknownEnvironmentError(f"no such scenario file: {shown(text)} ({reason})") from None
         if is_bag:
             raise UnknownEnvironmentError(
-                f"{path}: a ROS bag, which coopenv does not read; it replays the MCAP files of `coopenv record`"
+                f"{path}: a ROS bag is no scenario; it runs with a map of its topics: coopenv run BAG --map topics.toml"
             )
         if not there:
             raise UnknownEnvironmentError(f"no such scenario file: {shortened(str(path), 200)}")

@@ -29,17 +29,19 @@ markers = { SL1 = 1, SL2 = 2, SL4 = 4, SL5 = 5 }
 [overrides]
 "camera.distortion" = [-0.352043, 0.137879, 0.001953, 0.000628, 0.0]
 "rates.odometry" = 60.0
+"observer.P0" = [0.1, 0.1]
+"vehicles.0.initial_estimate" = { position = [0.2, 0.0, 0.1], yaw = 1.8 }
 
 [[cars]]
 name = "svea3"
 marker = 7
-agent = "agent8"
+agent = 8
 
 [[cars]]
 name = "svea1"
 landmark = "ML"
 marker = 3
-agent = "agent7"
+agent = 7
 """
 
 
@@ -60,13 +62,15 @@ def drive(seconds: float = 4.0, seed: int = 0) -> Recording:
     overrides = {
         "camera.distortion": DISTORTION,
         "rates.odometry": 60.0,
+        "observer.P0": (0.1, 0.1),
+        "vehicles.0.initial_estimate": {"position": [0.2, 0.0, 0.1], "yaw": 1.8},
         "horizon": seconds,
         "vehicles.0.motion": {
             "kind": "segments",
             "segments": [{"duration": 0.5}, {"duration": 2.1, "linear": [0.26, 0.0, 0.0], "angular": [0, 0, 0.1]}],
         },
         "landmarks.ML.position": [-0.5, 1.45, 0.0],
-        "landmarks.ML.motion": {"kind": "segments", "segments": [{"duration": 20.0, "linear": [0.26, 0.0, 0.0]}]},
+        "landmarks.ML.motion": {"kind": "segments", "segments": [{"duration": 2.0, "linear": [0.26, 0.0, 0.0]}]},
     }
     return record(load_scenario("crossing_path", overrides), seed)
 
@@ -80,7 +84,10 @@ def pose(R: np.ndarray, p: np.ndarray) -> tuple[str, dict[str, Any]]:
     angle = float(np.linalg.norm(half))
     axis = half if angle < 1e-12 else half / angle * np.sin(angle)
     turn = dict(zip("xyzw", [*map(float, axis), float(np.cos(angle))], strict=True))
-    return "geometry_msgs/msg/Pose", {"position": vector("Point", p), "orientation": ("geometry_msgs/msg/Quaternion", turn)}
+    return "geometry_msgs/msg/Pose", {
+        "position": vector("Point", p),
+        "orientation": ("geometry_msgs/msg/Quaternion", turn),
+    }
 
 
 def messages(r: Recording) -> list[Message]:
@@ -88,16 +95,32 @@ def messages(r: Recording) -> list[Message]:
     found = []
     for k in range(r.ticks):
         t = round(k * 1e9 * r.dt)
-        found.append(Message("/agent8/pixy_node/objectsInfo", "pixy_camera/msg/ObjectInfoArrayStamped", t, t,
-                             {"objects": blocks(r, k)}))
+        found.append(
+            Message(
+                "/agent8/pixy_node/objectsInfo",
+                "pixy_camera/msg/ObjectInfoArrayStamped",
+                t,
+                t,
+                {"objects": blocks(r, k)},
+            )
+        )
         if k + 1 < r.ticks:
-            found.append(Message("/agent8/actuation_twist", "geometry_msgs/msg/TwistWithCovarianceStamped", t, t,
-                                 {"twist": twist(r, k + 1)}))
+            found.append(
+                Message(
+                    "/agent8/actuation_twist",
+                    "geometry_msgs/msg/TwistWithCovarianceStamped",
+                    t,
+                    t,
+                    {"twist": twist(r, k + 1)},
+                )
+            )
         R, p = r.truth.rotation[k, 0], r.truth.position[k, 0]
         found.append(Message("/qualisys/svea3/pose", "geometry_msgs/msg/PoseStamped", t, t, {"pose": pose(R, p)}))
         body = r.landmarks[k, 4] - np.array([0.16, 0.0, 0.0])  # marker (0.16, 0, 0.25): a point gives the height alone
         point = body + np.array([0.16, 0.0, -0.25])
-        found.append(Message("/agent7/riccatiPoint", "geometry_msgs/msg/PointStamped", t, t, {"point": vector("Point", point)}))
+        found.append(
+            Message("/agent7/riccatiPoint", "geometry_msgs/msg/PointStamped", t, t, {"point": vector("Point", point)})
+        )
     return found
 
 
@@ -123,7 +146,8 @@ def twist(r: Recording, k: int) -> tuple[str, dict[str, Any]]:
     linear = np.linalg.solve(_left_jacobian(turn), r.translation[k, 0])
     both = {"linear": vector("Vector3", linear / r.dt), "angular": vector("Vector3", turn / r.dt)}
     return "geometry_msgs/msg/TwistWithCovariance", {
-        "twist": ("geometry_msgs/msg/Twist", both), "covariance": np.diag([0.1] * 6).ravel()
+        "twist": ("geometry_msgs/msg/Twist", both),
+        "covariance": np.diag([0.1] * 6).ravel(),
     }
 
 
@@ -137,7 +161,8 @@ def later(given: Iterable[Message], *, stamps: float = 0.0, received: float = 0.
     """Return messages with other times (s), those of topics that begin with a text."""
     return [
         replace(m, stamp=m.stamp + round(stamps * 1e9), received=m.received + round(received * 1e9))
-        if m.topic.startswith(topics) else m
+        if m.topic.startswith(topics)
+        else m
         for m in given
     ]
 

@@ -50,8 +50,6 @@ class Topics(Part):
 class BagCar(Car):
     """One car of the bag."""
 
-    agent: Name | None = None
-    """{agent} in the authors' names (default: `agent` and the number of its marker)."""
     body: Name | None = None
     """{body} in the names of motion capture (default: its name)."""
     topics: Topics = Topics()
@@ -59,7 +57,7 @@ class BagCar(Car):
     @property
     def names(self) -> dict[str, str]:
         """What stands for it in the names of a scheme."""
-        agent = self.agent or (self.name if self.marker is None else f"agent{self.marker}")
+        agent = self.name if self.agent_number is None else f"agent{self.agent_number}"
         return {"car": self.name, "agent": agent, "body": self.body or self.name}
 
 

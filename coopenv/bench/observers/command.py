@@ -47,13 +47,14 @@ def request_of(
     data: Path | None,
     overrides: Mapping[str, Any],
     assignments: Sequence[str],
+    topics: Path | None = None,
 ) -> Request:
     """Return the request behind the options of the command line, `overrides` being `assignments` as they are read.
 
     Raises:
         CoopenvError: something of it does not exist.
     """
-    source = find_source(text, overrides, data)
+    source = find_source(text, overrides, data, topics)
     given = list(dict.fromkeys(word.strip() for word in observers.split(","))) if observers else None
     plan = Plan.of(source, given, variants, seeds, steady_from)
     if basin:
@@ -68,6 +69,7 @@ def request_of(
     words += ["--basin", str(basin)] if basin else []
     words += [word for assignment in assignments for word in ("--set", assignment)]
     words += [] if data is None else ["--data", str(data)]
+    words += [] if topics is None else ["--map", str(topics)]
     return Request(plan, shlex.join(words), basin, {name: reason for name, reason in left_out.items() if reason})
 
 

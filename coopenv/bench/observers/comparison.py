@@ -141,6 +141,7 @@ def compare(
     overrides: Mapping[str, Any] | None = None,
     steady_from: float | None = None,
     data: str | Path | None = None,
+    topics: str | Path | None = None,
     jobs: int = 1,
 ) -> Comparison:
     """Compare observers on the same records.
@@ -149,19 +150,22 @@ def compare(
 
     Args:
         observers: names, classes, or where they stand (`mine.py:Mine`, `package.module:Mine`); None: all that suit.
-        environment: name, TOML file, recorded robots (`mrclam_1` to `mrclam_9`) or MCAP file.
+        environment: name, TOML file, recorded robots (`mrclam_1` to `mrclam_9`), MCAP file or ROS bag.
         seeds: how many (0, 1, ...), or which; what is recorded has one record whatever they are.
         variants: names, or "all": faults of an environment, what recorded robots see; None: the usual ones.
         overrides: dotted scenario keys, for example {"noise.enabled": False}.
         steady_from: start of the steady state, s; None: after 70 % of the run.
         data: folder of recorded data sets; None: what COOPENV_DATA says.
+        topics: TOML file that says what the topics of a ROS bag are.
         jobs: processes. More than one need a script whose own work stands below `if __name__ == "__main__":`, and
             classes that a module or file holds.
 
     Raises:
         CoopenvError: an argument is not valid, or names what does not exist.
     """
-    source = find_source(str(environment), overrides, None if data is None else Path(data))
+    source = find_source(
+        str(environment), overrides, *(None if path is None else Path(path) for path in (data, topics))
+    )
     source.check()
     plan = Plan.of(source, observers, variants, seeds, steady_from)
     with Progress(Console(stderr=True), plan.work, total=1.0) as progress:

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-from coopenv.backends.sources import Kind, kind_of, open_recording
+from coopenv.backends.base import Backend
+from coopenv.backends.sources import Kind, is_bag, kind_of, open_backend, open_recording
 from coopenv.bench.observers.faults import FAULTS, NOMINAL, Lie, followers
 from coopenv.errors import CoopenvError, DataWarning, suggest
 from coopenv.estimation.metrics import STEADY_SHARE, steady_start
@@ -86,9 +87,7 @@ class Simulated(Source):
 
     def obstacle(self, variant: str) -> str:
         """Return why no vehicle can lie to another, where that is so."""
-        L = len(self.scenario.landmarks)
-        followed = any(target >= L for targets in neighbour_sets(self.scenario) for target in targets)
-        return NOBODY_FOLLOWS if FAULTS[variant].lies and not followed else ""
+        return _nobody_follows(self.scenario) if FAULTS[variant].lies else ""
 
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
         """Return when the steady state starts, s."""
@@ -146,6 +145,39 @@ class LogFile(Source):
         return NOBODY_FOLLOWS if FAULTS[variant].lies and not followed else ""
 
 
+@dataclass(frozen=True)
+class Bags(Source):
+    """A ROS bag, with faults; what its environment draws follows from the seed."""
+
+    path: Path
+    topics: Path | None
+    overrides: Mapping[str, Any]
+    seeded: ClassVar[bool] = True
+
+    def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
+        """Return the bag as a record, with a fault."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DataWarning)  # `check` has told
+            return FAULTS[variant].applied(record(self._backend(), seed), seed)
+
+    def obstacle(self, variant: str) -> str:
+        """Return why no vehicle can lie to another, where that is so."""
+        return "" if not FAULTS[variant].lies else _nobody_follows(self._backend().scenario)
+
+    def check(self) -> None:
+        """Read the bag once."""
+        self._backend()
+
+    def _backend(self) -> Backend:
+        return open_backend(self.path, None, self.overrides, topics=self.topics)
+
+
+def _nobody_follows(scenario: Scenario) -> str:
+    L = len(scenario.landmarks)
+    followed = any(target >= L for targets in neighbour_sets(scenario) for target in targets)
+    return "" if followed else NOBODY_FOLLOWS
+
+
 def variant_rows() -> list[dict[str, str]]:
     """Return what `list variants` says of every variant."""
     kinds = {"environments, logs": Source.variants, "recorded robots": Robots.variants}
@@ -156,8 +188,10 @@ def _is_planar(recording: Recording) -> bool:
     return all(setup.planar for setup in recording.setups)
 
 
-def find_source(text: str, overrides: Mapping[str, Any] | None = None, data: Path | None = None) -> Source:
-    """Return the source of an environment's name, a scenario file, a sub-dataset's name or a log file.
+def find_source(
+    text: str, overrides: Mapping[str, Any] | None = None, data: Path | None = None, topics: Path | None = None
+) -> Source:
+    """Return the source of an environment's name, a scenario file, a sub-dataset's name, a log file or a ROS bag.
 
     Raises:
         CoopenvError: there is none of that name, or an option for what is no such source.
@@ -165,6 +199,10 @@ def find_source(text: str, overrides: Mapping[str, Any] | None = None, data: Pat
     kind = kind_of(text)
     if data is not None and kind is not Kind.DATASET:
         raise CoopenvError(f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9")
+    if is_bag(text, topics):
+        return Bags(Path(text).stem, Path(text), topics, dict(overrides or {}))
+    if topics is not None:
+        raise CoopenvError(f"--map {topics}: is for ROS bags, {text} is none")
     if kind is Kind.ENVIRONMENT:
         return Simulated(Path(text).stem, load_scenario(text, overrides))
     if overrides:
