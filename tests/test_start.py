@@ -20,7 +20,19 @@ LIGHT |= {
     "cli",
     *(
         f"cli.{name}"
-        for name in ("bench", "complete", "dataset", "evaluate", "live", "options", "page", "run", "show", "train")
+        for name in (
+            "bags",
+            "bench",
+            "complete",
+            "dataset",
+            "evaluate",
+            "live",
+            "options",
+            "page",
+            "run",
+            "show",
+            "train",
+        )
     ),
 }
 COMMANDS_OF_CARS = Path(coopenv.__file__).parent / "cli" / "svea"

@@ -155,19 +155,13 @@ def open_backend(
         return backend
     for key in given:
         raise CoopenvError(f"{key}: is for backend='svea'")
-    if backend is not None and backend not in BACKENDS:
-        known = f"{suggest(str(backend), BACKENDS)}; known: {', '.join(BACKENDS)}"
-        raise CoopenvError(f"unknown backend '{backend}'{known}")
+    _check_backend(backend)
     if backend in (None, "replay") and is_bag(name_or_path, topics):
         return open_bags([name_or_path], topics, overrides, data, variant)
     if topics is not None:
         raise CoopenvError(f"topics {topics}: is for ROS bags, '{name_or_path}' is none")
-    if backend in (None, "replay") and kind_of(name_or_path) is Kind.LOG and _is_drive(name_or_path):
-        from coopenv.backends.svea.drive import Drive
-
-        return Drive(name_or_path, overrides)
     if backend == "replay" or (backend is None and is_recorded(name_or_path)):
-        return Replay(open_recording(name_or_path, data, variant), Path(name_or_path).name, overrides)
+        return _open_recorded(name_or_path, overrides, data, variant)
     for what, value in (("data", data), ("variant", variant)):
         if value is not None:
             raise CoopenvError(f"{what} is for recorded data, '{name_or_path}' is simulated")
@@ -177,11 +171,22 @@ def open_backend(
     return simulation_of(scenario)
 
 
-def _is_drive(path: str | Path) -> bool:
-    """Return whether a log file is a drive of cars."""
-    from coopenv.backends.svea.drive import is_drive
+def _check_backend(backend: str | None) -> None:
+    if backend is not None and backend not in BACKENDS:
+        known = f"{suggest(str(backend), BACKENDS)}; known: {', '.join(BACKENDS)}"
+        raise CoopenvError(f"unknown backend '{backend}'{known}")
 
-    return is_drive(path)
+
+def _open_recorded(
+    name: str | Path, overrides: Mapping[str, Any], data: str | Path | None, variant: str | None
+) -> Backend:
+    """Return the replay of a recording, or of a drive of cars."""
+    if kind_of(name) is Kind.LOG:
+        from coopenv.backends.svea.drive import Drive, is_drive
+
+        if is_drive(name):
+            return Drive(name, overrides)
+    return Replay(open_recording(name, data, variant), Path(name).name, overrides)
 
 
 def _open_cars(name: str | Path, overrides: Mapping[str, Any], given: Mapping[str, Any]) -> Backend:

@@ -104,7 +104,7 @@ def open_source(
     from coopenv.backends.sources import open_backend
 
     with warned():
-        return open_backend(environment, None, overrides, data, variant, topics)
+        return open_backend(environment, None, overrides, data, variant, topics=topics)
 
 
 @contextmanager

@@ -227,7 +227,7 @@ def test_the_imu_tells_turns_where_there_is_one(tmp_path: Path) -> None:
             fields = {"orientation": pose["orientation"], "angular_velocity": turning, "linear_acceleration": none,
                       "linear_acceleration_covariance": np.zeros(9), **rest}  # fmt: skip
             imu.append(replace(m, topic="/imu", kind="sensor_msgs/msg/Imu", fields=fields))
-    text = MAP.replace('agent = 8', 'agent = 8\ntopics = { imu = "/imu" }')
+    text = MAP.replace("agent = 8", 'agent = 8\ntopics = { imu = "/imu" }')
     *_, last = opened(tmp_path, text, [*SHORT, *imu], "mcap").episode(None, {})
     assert_allclose(last.angular_velocity, [[0.0, 0.0, 0.7]])
 

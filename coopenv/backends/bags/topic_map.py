@@ -9,7 +9,8 @@ from pydantic import Field, ValidationError, model_validator
 from coopenv.backends.bags.names import READ
 from coopenv.errors import CoopenvError
 from coopenv.scenario.validation import one_line
-from coopenv.svea.deployment import Car, Marker, Name, Number, Part, Positive, refuse_repeated
+from coopenv.svea.deployment import Car, Marker, Name, Number, Positive, refuse_repeated
+from coopenv.svea.network import Part
 from coopenv.svea.topics import Role
 
 TopicName = Annotated[str, Field(max_length=256, pattern=r"^/[A-Za-z0-9_/~]+$")]
