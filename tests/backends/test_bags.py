@@ -21,6 +21,7 @@ from coopenv.errors import DataWarning
 from coopenv.observers import run
 from coopenv.observers.recording import Sensed
 from coopenv.runs.recorder import record
+from coopenv.scenario import load_scenario
 from tests.helpers import bags
 
 pytest.importorskip("rosbags", reason="needs the extra 'log'")
@@ -208,3 +209,54 @@ def test_messages_that_make_no_sense_are_left_out(folder: Path, tmp_path: Path) 
     with pytest.warns(DataWarning, match=r"svea3/pose: \d+ of 241 messages left out: truth: pose.position"):
         bag = Bag([path], folder / "topics.toml")
     assert_same(ticks_of(bag), ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")), atol=1e-3)
+
+
+TWO_CARS = """
+environment = "overtaking"
+markers = { SL1 = 1, SL2 = 2, SL4 = 4, SL5 = 5 }
+overrides = { "rates.odometry" = 60.0 }
+
+[[cars]]
+name = "svea7"
+vehicle = "vehicle_2"
+marker = 7
+
+[[cars]]
+name = "svea8"
+vehicle = "vehicle_1"
+marker = 6
+"""
+
+
+def test_two_cars_that_recorded_themselves_see_each_other(tmp_path: Path) -> None:
+    """Each on its own computer and in its own way, half a second apart; motion capture is in both files."""
+    drive = [{"duration": 0.3}, {"duration": 9.0, "linear": [0.26, 0.0, 0.0]}]
+    moving = {f"vehicles.{i}.motion": {"kind": "segments", "segments": drive} for i in (0, 1)}
+    ahead = {
+        "vehicles.0.initial_pose.position": [0.0, -1.2, 0.0],
+        "vehicles.0.initial_estimate.position": [0.1, -1.2, 0],
+    }
+    made = record(load_scenario("overtaking", {"horizon": 1.0, "rates.odometry": 60.0, **moving, **ahead}))
+    assert made.visible[:, 1, 4].all()  # vehicle_2 sees the other one
+    numbers, found = {0: 1, 1: 2, 2: 4, 3: 5, 4: 6, 5: 7}, []
+    for i, car in enumerate(("svea8", "svea7")):
+        own = {"blocks": f"/fleet/{car}/pixy/objects_info", "twist": f"/{car}/mavros/wheel_odometry/velocity"}
+        found.append(bags.of_vehicle(made, i, {**own, "truth": f"/qualisys/{car}/pose"}, numbers, (0.0,) * 5))
+    truth = [m for m in found[0] + found[1] if m.topic.startswith("/qualisys")]
+    first = bags.later(found[1] + truth, received=0.003)
+    second = bags.later([m for m in found[0] if m not in truth], stamps=0.5) + truth
+    paths = [
+        bags.write(tmp_path / "svea7", first, "mcap"),
+        bags.write(tmp_path / "svea8", bags.later(second, received=0.503), "ros1"),
+    ]
+    (tmp_path / "topics.toml").write_text(TWO_CARS, encoding="utf-8")
+    with pytest.warns(DataWarning, match=r"clock of svea8: stamps are -0\.497 s behind"):
+        bag = Bag(paths, tmp_path / "topics.toml")
+    ticks = ticks_of(bag)
+    assert len(ticks) > 55
+    for k in range(2, len(ticks) - 1):
+        assert_array_equal(ticks[k].visible, made.visible[k + 1])
+        assert_allclose(ticks[k].bearings, made.bearings[k + 1], atol=1e-8)
+        assert_allclose(ticks[k].translation, made.translation[k + 1], atol=2e-3)
+    replayed = run("robust", record(bag))
+    assert not replayed.failure and (replayed.bytes_per_second > 0.0).any()

@@ -20,7 +20,6 @@ from coopenv.svea.lens import distort
 
 BEGIN = 1_700_000_000_000_000_000  # ns
 DISTORTION = (-0.352043, 0.137879, 0.001953, 0.000628, 0.0)
-MARKERS = {"SL1": 1, "SL2": 2, "SL4": 4, "SL5": 5}
 MAP = """
 environment = "crossing_path"
 names = "authors"
@@ -90,60 +89,62 @@ def pose(R: np.ndarray, p: np.ndarray) -> tuple[str, dict[str, Any]]:
     }
 
 
+AUTHORS = {
+    "blocks": "/agent8/pixy_node/objectsInfo",
+    "twist": "/agent8/actuation_twist",
+    "truth": "/qualisys/svea3/pose",
+}
+NUMBERS = {0: 1, 1: 2, 2: 4, 3: 5, 4: 3}  # target to number of its marker
+
+
 def messages(r: Recording) -> list[Message]:
     """Return what the car and the moving landmark of a drive send, under the authors' names."""
-    found = []
+    found = of_vehicle(r, 0, AUTHORS, NUMBERS, DISTORTION)
     for k in range(r.ticks):
         t = round(k * 1e9 * r.dt)
-        found.append(
-            Message(
-                "/agent8/pixy_node/objectsInfo",
-                "pixy_camera/msg/ObjectInfoArrayStamped",
-                t,
-                t,
-                {"objects": blocks(r, k)},
-            )
-        )
-        if k + 1 < r.ticks:
-            found.append(
-                Message(
-                    "/agent8/actuation_twist",
-                    "geometry_msgs/msg/TwistWithCovarianceStamped",
-                    t,
-                    t,
-                    {"twist": twist(r, k + 1)},
-                )
-            )
-        R, p = r.truth.rotation[k, 0], r.truth.position[k, 0]
-        found.append(Message("/qualisys/svea3/pose", "geometry_msgs/msg/PoseStamped", t, t, {"pose": pose(R, p)}))
-        body = r.landmarks[k, 4] - np.array([0.16, 0.0, 0.0])  # marker (0.16, 0, 0.25): a point gives the height alone
-        point = body + np.array([0.16, 0.0, -0.25])
-        found.append(
-            Message("/agent7/riccatiPoint", "geometry_msgs/msg/PointStamped", t, t, {"point": vector("Point", point)})
-        )
+        point = r.landmarks[k, 4] - np.array([0.0, 0.0, 0.25])  # of a point only the marker's height is added
+        fields = {"point": vector("Point", point)}
+        found.append(Message("/agent7/riccatiPoint", "geometry_msgs/msg/PointStamped", t, t, fields))
     return found
 
 
-def blocks(r: Recording, k: int) -> list[tuple[str, dict[str, Any]]]:
-    """Return the blocks of a frame, an unwanted small one among them."""
+def of_vehicle(
+    r: Recording, i: int, names: dict[str, str], numbers: dict[int, int], distortion: tuple[float, ...]
+) -> list[Message]:
+    """Return what one vehicle senses: blocks, twists and its true pose at every tick."""
+    found = []
+    for k in range(r.ticks):
+        t = round(k * 1e9 * r.dt)
+        seen = {"objects": blocks(r, k, i, numbers, distortion)}
+        found.append(Message(names["blocks"], "pixy_camera/msg/ObjectInfoArrayStamped", t, t, seen))
+        if k + 1 < r.ticks:
+            moved = {"twist": twist(r, k + 1, i)}
+            found.append(Message(names["twist"], "geometry_msgs/msg/TwistWithCovarianceStamped", t, t, moved))
+        place = {"pose": pose(r.truth.rotation[k, i], r.truth.position[k, i])}
+        found.append(Message(names["truth"], "geometry_msgs/msg/PoseStamped", t, t, place))
+    return found
+
+
+def blocks(
+    r: Recording, k: int, i: int, numbers: dict[int, int], distortion: tuple[float, ...]
+) -> list[tuple[str, dict[str, Any]]]:
+    """Return the blocks of a frame, an unwanted small one of every marker among them."""
     camera = load_scenario("crossing_path").cameras[0]
     found = []
-    for target in np.flatnonzero(r.visible[k, 0]):
-        name = r.setups[0].target_names[target]
-        ray = ROTATION_OF_CAMERA["forward"].T @ r.bearings[k, 0, target]
-        flat = distort((ray[:2] / ray[2])[None], DISTORTION)[0]
+    for target in np.flatnonzero(r.visible[k, i]).tolist():
+        ray = ROTATION_OF_CAMERA["forward"].T @ r.bearings[k, i, target]
+        flat = distort((ray[:2] / ray[2])[None], distortion)[0]
         u, v = np.round(flat * camera.focal_length + np.array(camera.principal_point)).astype(int).tolist()
-        number = MARKERS.get(name, 3)
         for x, width in ((u, 9), (1, 2)):
-            row = {"signature": number, "center_x": x, "center_y": v, "width": width, "height": width}
+            row = {"signature": numbers[target], "center_x": x, "center_y": v, "width": width, "height": width}
             found.append(("pixy_camera/msg/ObjectInfo", {**row, "angle": 0, "index": 0, "age": 1}))
     return found
 
 
-def twist(r: Recording, k: int) -> tuple[str, dict[str, Any]]:
+def twist(r: Recording, k: int, i: int) -> tuple[str, dict[str, Any]]:
     """Return the twist that leads to a tick when it is held since the last one; its rotation is small or none."""
-    turn = log_so3(r.rotation[k, 0])
-    linear = np.linalg.solve(_left_jacobian(turn), r.translation[k, 0])
+    turn = log_so3(r.rotation[k, i])
+    linear = np.linalg.solve(_left_jacobian(turn), r.translation[k, i])
     both = {"linear": vector("Vector3", linear / r.dt), "angular": vector("Vector3", turn / r.dt)}
     return "geometry_msgs/msg/TwistWithCovariance", {
         "twist": ("geometry_msgs/msg/Twist", both),
