@@ -6,16 +6,15 @@ from typing import Any
 import numpy as np
 
 from coopenv.errors import CoopenvError, listed, shown
+from coopenv.svea.conditions import battery_of, calibration_of, remote_of, state_of
 from coopenv.svea.frames import bearings, detections
+from coopenv.svea.numbers import covariance_of, vector
 from coopenv.svea.quaternions import rotation_of, rotation_vector_of
-from coopenv.svea.samples import Array, Calibration, Pose, Report, Status, Twist, Value
+from coopenv.svea.samples import Array, Calibration, Pose, Report, Twist, Value
 from coopenv.svea.topics import Role
 
 FARTHEST, FASTEST, SPINNING = 1e7, 200.0, 100.0
 """m, m/s and rad/s beyond which a value is no car's."""
-
-STICKS, NEUTRAL, MOVED = 2, 1500, 100
-"""Channels of the remote control that drive, their pulse at rest and how far from it they count as moved, us."""
 
 
 def read(
@@ -77,14 +76,14 @@ def _own_odometry(message: Any) -> Twist:
 
 
 def _velocities(twist: Any) -> tuple[Array, Array]:
-    return _vector(twist.linear, "twist.linear", FASTEST), _vector(twist.angular, "twist.angular", SPINNING)
+    return vector(twist.linear, "twist.linear", FASTEST), vector(twist.angular, "twist.angular", SPINNING)
 
 
 def _turning(message: Any) -> Twist:
     """Return the turn rate of an Imu; -1 as first covariance says: not measured."""
     if float(message.angular_velocity_covariance[0]) == -1.0:
         return Twist(None, None)
-    return Twist(None, _vector(message.angular_velocity, "angular_velocity", SPINNING))
+    return Twist(None, vector(message.angular_velocity, "angular_velocity", SPINNING))
 
 
 def _pose(message: Any) -> Pose:
@@ -94,16 +93,16 @@ def _pose(message: Any) -> Pose:
 def _pose_with_covariance(message: Any) -> Pose:
     """Return the pose of a PoseWithCovarianceStamped or Odometry; a covariance of zeros says: not known."""
     pose = _placed(message.pose.pose)
-    covariance = _covariance(message.pose.covariance, "pose.covariance")
+    covariance = covariance_of(message.pose.covariance, "pose.covariance")
     return Pose(pose.position, pose.rotation, covariance if covariance.any() else None)
 
 
 def _placed(pose: Any) -> Pose:
-    return Pose(_vector(pose.position, "pose.position", FARTHEST), rotation_of(pose.orientation, "pose.orientation"))
+    return Pose(vector(pose.position, "pose.position", FARTHEST), rotation_of(pose.orientation, "pose.orientation"))
 
 
 def _point(message: Any) -> Pose:
-    return Pose(_vector(message.point, "point", FARTHEST))
+    return Pose(vector(message.point, "point", FARTHEST))
 
 
 def _report(message: Any) -> Report:
@@ -111,72 +110,13 @@ def _report(message: Any) -> Report:
     if not message.valid:
         return Report(None, None, None, {})
     pose, odometry = _placed(message.pose), message.odometry
-    moved = _vector(odometry.position, "odometry.position", FARTHEST)
+    moved = vector(odometry.position, "odometry.position", FARTHEST)
     turned = rotation_vector_of(odometry.orientation, "odometry.orientation")
     extra: dict[str, Any] = {
         "odometry": np.concatenate([turned, moved]),
         "depends_on": np.array([message.depends_on], dtype=np.uint64),
     }
-    return Report(pose.position, pose.rotation, _covariance(message.covariance, "covariance"), extra)
-
-
-def _calibration(message: Any) -> Calibration:
-    """Return the intrinsics of a CameraInfo; ROS 1 writes their names large."""
-    size = (int(message.width), int(message.height))
-    if not all(0 < side <= 100_000 for side in size):
-        raise CoopenvError(f"width, height: {size} is no image")
-    if message.distortion_model not in ("plumb_bob", ""):
-        raise CoopenvError(f"distortion_model: {shown(message.distortion_model)}, expected 'plumb_bob'")
-    matrix = _numbers(getattr(message, "k", getattr(message, "K", ())), "k", 1e6)
-    given = _numbers(getattr(message, "d", getattr(message, "D", ())), "d", 1e6)
-    if matrix.shape != (9,) or min(matrix[0], matrix[4]) <= 0.0 or matrix[1] != 0.0:
-        raise CoopenvError("k: no camera matrix with two positive focal lengths and no skew")
-    if given.shape not in ((0,), (4,), (5,)):
-        raise CoopenvError(f"d: {given.size} numbers, expected k1, k2, p1, p2, k3")
-    k1, k2, p1, p2, k3 = (*map(float, given), *[0.0] * (5 - given.size))
-    focal, centre = (float(matrix[0]), float(matrix[4])), (float(matrix[2]), float(matrix[5]))
-    return Calibration(size, focal, centre, (k1, k2, p1, p2, k3))
-
-
-def _state(message: Any) -> Status:
-    return Status(armed=bool(message.armed))
-
-
-def _remote(message: Any) -> Status:
-    """Return whether one of the two sticks of a car's remote control is moved; without a signal, none is."""
-    pulses = [int(pulse) for pulse in message.channels[:STICKS]]
-    signals = [pulse for pulse in pulses if 800 <= pulse <= 2200]
-    return Status(overridden=any(abs(pulse - NEUTRAL) > MOVED for pulse in signals))
-
-
-def _battery(message: Any) -> Status:
-    """Return the share that is left; NaN and -1 say: not known."""
-    share = float(message.percentage)
-    if np.isnan(share) or share == -1.0:
-        return Status()
-    if not 0.0 <= share <= 1.0:
-        raise CoopenvError(f"percentage: {share:g} is not in 0..1")
-    return Status(battery=share)
-
-
-def _vector(value: Any, field: str, most: float) -> Array:
-    """Return x, y, z as (3,), none of them larger than `most`."""
-    return _numbers((value.x, value.y, value.z), field, most)
-
-
-def _numbers(values: Any, field: str, most: float) -> Array:
-    numbers = np.array(values, dtype=np.float64)
-    if not (np.abs(numbers) <= most).all():
-        raise CoopenvError(f"{field}: {shown(numbers.tolist())} is not finite, or beyond {most:g}")
-    return numbers
-
-
-def _covariance(values: Any, field: str) -> Array:
-    """Return (6, 6) numbers whose diagonal is not negative and that are symmetric."""
-    matrix = _numbers(values, field, 1e12).reshape(6, 6)
-    if (matrix.diagonal() < 0.0).any() or not np.allclose(matrix, matrix.T, rtol=1e-6, atol=1e-9):
-        raise CoopenvError(f"{field}: is no covariance (symmetric, no negative variance)")
-    return matrix
+    return Report(pose.position, pose.rotation, covariance_of(message.covariance, "covariance"), extra)
 
 
 POSES: dict[str, Callable[[Any], Value]] = {
@@ -192,7 +132,7 @@ TWISTS: dict[str, Callable[[Any], Value]] = {
 READERS: dict[Role, dict[str, Callable[..., Value]]] = {
     Role.DETECTIONS: {"pixy_camera/msg/ObjectInfoArrayStamped": detections},
     Role.BEARINGS: {"pixy_camera/msg/ObjectBearingArrayStamped": bearings},
-    Role.CAMERA_INFO: {"sensor_msgs/msg/CameraInfo": _calibration},
+    Role.CAMERA_INFO: {"sensor_msgs/msg/CameraInfo": calibration_of},
     Role.ODOMETRY: TWISTS,
     Role.WHEEL: TWISTS,
     Role.IMU: {"sensor_msgs/msg/Imu": _turning},
@@ -200,8 +140,8 @@ READERS: dict[Role, dict[str, Callable[..., Value]]] = {
     Role.POINT: {"geometry_msgs/msg/PointStamped": _point},
     Role.REPORT: {"coopenv_msgs/msg/RobustReport": _report},
     Role.TRUTH: POSES,
-    Role.STATE: {"mavros_msgs/msg/State": _state},
-    Role.REMOTE: {"mavros_msgs/msg/RCIn": _remote},
-    Role.BATTERY: {"sensor_msgs/msg/BatteryState": _battery},
+    Role.STATE: {"mavros_msgs/msg/State": state_of},
+    Role.REMOTE: {"mavros_msgs/msg/RCIn": remote_of},
+    Role.BATTERY: {"sensor_msgs/msg/BatteryState": battery_of},
 }
 """Types of a role, and what reads them; roles of commands are not here."""
