@@ -21,6 +21,7 @@ from coopenv.backends.mcap.peek import metadata_names
 from coopenv.backends.sources import Kind, is_bag, kind_of
 from coopenv.cli import main
 from coopenv.errors import DataWarning
+from coopenv.scenario import load_scenario
 from coopenv.svea.samples import Detections
 from tests.helpers import bags
 from tests.helpers.bags import MAP
@@ -254,3 +255,8 @@ def test_the_map_of_the_page_is_one(tmp_path: Path) -> None:
 def test_a_camera_with_another_rate_is_told(tmp_path: Path) -> None:
     with pytest.warns(DataWarning, match=r'60\.0 frames per second, the environment has 30: .* "rates.camera" = 60\.0'):
         opened(tmp_path, MAP.replace("[overrides]", '[overrides]\n"rates.camera" = 30.0\n"rates.observer" = 30.0'))
+
+
+def test_a_bag_is_no_scenario() -> None:
+    with pytest.raises(CoopenvError, match=r"drive\.bag: a ROS bag is no scenario; .* run BAG --map topics.toml"):
+        load_scenario("drive.bag")

@@ -16,6 +16,7 @@ from coopenv import CoopenvError, DataError
 from coopenv.backends.bags import Bag
 from coopenv.backends.mcap import read_recording
 from coopenv.backends.sources import Kind, kind_of, open_recording
+from coopenv.backends.svea.tape import Tape
 from coopenv.cli import main
 from coopenv.errors import DataWarning
 from coopenv.observers import run
@@ -260,3 +261,19 @@ def test_two_cars_that_recorded_themselves_see_each_other(tmp_path: Path) -> Non
         assert_allclose(ticks[k].translation, made.translation[k + 1], atol=2e-3)
     replayed = run("robust", record(bag))
     assert not replayed.failure and (replayed.bytes_per_second > 0.0).any()
+
+
+def test_a_tape_of_cars_is_a_bag_too(folder: Path, tmp_path: Path) -> None:
+    names = {"/agent8/pixy_node/objectsInfo": "fleet/svea3/pixy/objects_info",
+             "/agent8/actuation_twist": "fleet/svea3/mavros/wheel_odometry/velocity",
+             "/qualisys/svea3/pose": "fleet/qualisys/svea3/pose",
+             "/agent7/riccatiPoint": "fleet/svea1/point"}  # fmt: skip
+    drive = bags.messages(bags.drive())
+    path = tmp_path / "tape.mcap"
+    tape = Tape(path, b"{}", {names[m.topic]: m.kind for m in drive})
+    for number, m in enumerate(drive):
+        tape.write(names[m.topic], bags.payload(m, number), bags.BEGIN + m.received)
+    tape.close()
+    assert kind_of(path) is Kind.LOG  # which is replayed as it was
+    text = bags.MAP.replace('"authors"', '"svea"') + '[cars.topics]\npoint = "/fleet/svea1/point"\n'
+    assert_same(ticks_of(open_bag(path, tmp_path, text)), ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")))

@@ -195,6 +195,13 @@ def _fill(bag: Any, ordered: list[Message], store: Any, encode: Any) -> None:
         bag.write(connections[m.topic], BEGIN + m.received, encode(store, message, m.kind))
 
 
+def payload(m: Message, number: int = 0) -> bytes:
+    """Return the CDR bytes of a message."""
+    return codec.encode(
+        _made(codec.ros2(), m.kind, {"header": _header(codec.ros2(), BEGIN + m.stamp, number), **m.fields})
+    )
+
+
 def _header(store: Any, stamp: int, number: int) -> Any:
     time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
     fields = {"stamp": time, "frame_id": ""}
