@@ -4,37 +4,50 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
 from coopenv.svea.transport.base import Arrival, Transport
 from coopenv.svea.transport.local import Hub
+from coopenv.svea.transport.nats import open_nats
 from coopenv.svea.transport.zenoh import open_zenoh
+from tests.helpers.brokers import nats_server
 from tests.helpers.processes import wait_until
 from tests.helpers.wire import free_port
 
 Connect = Callable[[], Transport]
 
 
-def local() -> Iterator[Connect]:
+def local(folder: Path) -> Iterator[Connect]:
     yield Hub().connect
 
 
-def zenoh() -> Iterator[Connect]:
+def zenoh(folder: Path) -> Iterator[Connect]:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     router = open_zenoh("router", listen=[endpoint])
     yield lambda: open_zenoh("client", connect=[endpoint])
     router.close()
 
 
-NETWORKS = [pytest.param(local, id="local"), pytest.param(zenoh, id="zenoh")]
+def nats(folder: Path) -> Iterator[Connect]:
+    port = free_port()
+    with nats_server(port, folder):
+        yield lambda: open_nats([f"nats/127.0.0.1:{port}"])
+
+
+NETWORKS = [
+    pytest.param(local, id="local"),
+    pytest.param(zenoh, id="zenoh"),
+    pytest.param(nats, id="nats", marks=pytest.mark.nats),
+]
 
 
 @pytest.fixture(params=NETWORKS)
-def connect(request: pytest.FixtureRequest) -> Iterator[Connect]:
+def connect(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Connect]:
     """Open connections to one network; all end with the test."""
     with ExitStack() as stack:
-        for opened in request.param():
+        for opened in request.param(tmp_path):
 
             def ending(opened: Connect = opened) -> Transport:
                 transport = opened()

@@ -1,0 +1,202 @@
+"""NATS, as the authors' cars talk to each other: a topic's name with dots for slashes, the payload as it is."""
+
+import asyncio
+import base64
+import binascii
+import ssl
+import threading
+import time
+from collections.abc import Callable, Coroutine, Sequence
+from contextlib import suppress
+from typing import Any
+
+from coopenv.errors import CoopenvError
+from coopenv.svea.transport.base import Arrival, Callback, LinkError
+from coopenv.svea.transport.certificates import Certificates
+from coopenv.svea.transport.endpoints import Address, address_of, trouble_at
+from coopenv.svea.transport.outbox import Letter, Outbox
+from coopenv.svea.transport.patterns import matcher
+from coopenv.svea.transport.presence import PERIOD, Presence
+from coopenv.svea.transport.subjects import subject_of, subjects_of, topic_of
+
+ATTACHMENT = "Coopenv-Attachment"
+"""Header, base64; the authors' connector looks at no headers."""
+
+HEARTBEATS = "presence/"
+"""Where announced names are said; no topic of anybody."""
+
+MOST_WAITING = 1024  # messages to send, and received ones per subscription; then the oldest, or the new ones, are lost
+PATIENCE = 1.0  # s
+PENDING_BYTES = 131_072  # that the library may hold: what waits longer than a broker's hiccup is of no use
+
+OPTIONS = {
+    "max_reconnect_attempts": -1,
+    "reconnect_time_wait": 0.2,
+    "ping_interval": 1,
+    "max_outstanding_pings": 2,
+    "pending_size": PENDING_BYTES,
+}
+
+
+class Nats:
+    """A connection to a broker as a transport; it lives in a thread of its own and comes back by itself."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="nats", daemon=True)
+        self._thread.start()
+        self._client: Any = None
+        self._outbox = Outbox(MOST_WAITING, PATIENCE)
+        self._wake = asyncio.Event()
+        self._presence = Presence(lambda name, payload: self.publish(HEARTBEATS + name, payload))
+        self._watching = False
+        self._closed = False
+
+    def open(self, connect: Callable[[], Coroutine[Any, Any, Any]], timeout: float) -> None:
+        """Connect within s; errors are the library's."""
+        self._client = self._wait(asyncio.wait_for(connect(), timeout), timeout + 5.0)
+        self._wait(self._start(), 5.0)
+
+    async def _start(self) -> None:
+        self._tasks = [asyncio.create_task(self._send()), asyncio.create_task(self._beat())]
+
+    def publish(
+        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
+    ) -> None:
+        """Send, see `Transport`."""
+        if self._closed:
+            return
+        patient = reliable and threading.current_thread() is not self._thread
+        self._outbox.put(Letter(topic, payload, attachment), urgent=urgent or reliable, patient=patient)
+        with suppress(RuntimeError):  # closed meanwhile
+            self._loop.call_soon_threadsafe(self._wake.set)
+
+    async def _send(self) -> None:
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            while (letter := self._outbox.take()) is not None:
+                if self._client.is_connected:  # else it is lost: nobody wants it later
+                    await self._post(letter)
+
+    async def _post(self, letter: Letter) -> None:
+        headers = {ATTACHMENT: base64.b64encode(letter.attachment).decode()} if letter.attachment else None
+        with suppress(Exception):  # whatever keeps it from being sent, it is lost
+            await self._client.publish(subject_of(letter.topic), letter.payload, headers=headers)
+
+    async def _beat(self) -> None:
+        while True:
+            await asyncio.sleep(PERIOD)
+            self._presence.beat()
+
+    def subscribe(self, pattern: str, callback: Callback) -> None:
+        """Subscribe, see `Transport`."""
+        matches = matcher(pattern)
+
+        async def arrive(message: Any) -> None:
+            topic = topic_of(message.subject)
+            if matches(topic) and not topic.startswith(HEARTBEATS):
+                callback(Arrival(topic, message.data, time.time_ns(), _attachment(message.headers)))
+
+        self._listen(pattern, arrive)
+
+    def announce(self, name: str) -> None:
+        """Announce, see `Transport`."""
+        self._presence.announce(name)
+
+    def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
+        """Watch, see `Transport`."""
+        self._presence.watch(pattern, callback)
+        if not self._watching:
+            self._watching = True
+
+            async def hear(message: Any) -> None:
+                self._presence.hear(topic_of(message.subject).removeprefix(HEARTBEATS), message.data)
+
+            self._listen(HEARTBEATS + "**", hear)
+
+    def _listen(self, pattern: str, arrive: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
+        async def subscribe() -> None:
+            for subject in subjects_of(pattern):
+                await self._client.subscribe(subject, cb=arrive, pending_msgs_limit=MOST_WAITING)
+            await self._client.flush(PATIENCE)
+
+        with suppress(Exception):  # the broker is away: the library subscribes when it is back
+            self._wait(subscribe(), 2.0 * PATIENCE)
+
+    def _wait(self, work: Coroutine[Any, Any, Any], timeout: float) -> Any:
+        """Have the loop do something; wait for it, unless this is the loop's own thread."""
+        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+        return None if threading.current_thread() is self._thread else future.result(timeout)
+
+    def close(self) -> None:
+        """End the connection and its thread."""
+        if self._closed:
+            return
+        self._presence.leave()
+        self._closed = True
+        with suppress(Exception):
+            self._wait(self._end(), 2.0 * PATIENCE)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(PATIENCE)
+
+    async def _end(self) -> None:
+        if self._client is None:
+            return
+        for task in self._tasks:
+            task.cancel()
+        while (letter := self._outbox.take()) is not None and self._client.is_connected:
+            await self._post(letter)
+        await self._client.close()
+
+
+def open_nats(connect: Sequence[str], tls: Certificates | None = None, timeout: float = 2.0) -> Nats:
+    """Connect to a broker.
+
+    Args:
+        connect: endpoints of one or of several brokers of a cluster, e.g. "nats/127.0.0.1:4222" or "tls/broker:4222".
+        tls: certificates, for endpoints `tls/...`.
+        timeout: s to wait for one of them.
+
+    Raises:
+        CoopenvError: the extra is not installed, or an endpoint is not one.
+        LinkError: no broker answers.
+    """
+    addresses = [address_of(endpoint) for endpoint in connect]
+    try:
+        import nats
+    except ImportError:
+        raise CoopenvError("NATS needs an extra: pip install '.[nats]'") from None
+
+    last: list[Exception] = []
+
+    async def keep(error: Exception) -> None:
+        """Keep the library from printing what it will try again."""
+        last[:] = [error]
+
+    context = tls.context() if tls else None
+    servers = [f"{'tls' if address.protocol == 'tls' else 'nats'}://{address.authority}" for address in addresses]
+    made = Nats()
+    try:
+        made.open(lambda: nats.connect(servers, error_cb=keep, tls=context, **OPTIONS), timeout)
+    except Exception as error:  # the library's own, of the network, of TLS
+        made.close()
+        reason = _reason(last[0] if last else error, addresses)
+        raise LinkError(f"{', '.join(connect)}: no NATS broker there ({reason})") from None
+    return made
+
+
+def _reason(error: Exception, addresses: Sequence[Address]) -> str:
+    """Return why no broker has answered."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"its certificate is refused: {error.verify_message}"
+    troubles = (trouble_at(address, None, 1.0) for address in addresses)
+    return next(filter(None, troubles), str(error) or "no answer in the language of NATS")
+
+
+def _attachment(headers: dict[str, str] | None) -> bytes:
+    try:
+        return base64.b64decode((headers or {}).get(ATTACHMENT, ""), validate=True)
+    except binascii.Error:
+        return b""
