@@ -47,6 +47,7 @@ TOPICS = {
     Role.IMU: Topic("mavros/imu/data_raw", "sensor_msgs/msg/Imu", 0.1),
     Role.ESTIMATE: Topic("v2x/estimate", "geometry_msgs/msg/PoseWithCovarianceStamped", 0.25),
     Role.REPORT: Topic("v2x/robust", "coopenv_msgs/msg/RobustReport", 0.25),
+    Role.POINT: Topic("v2x/point", "geometry_msgs/msg/PointStamped", 0.25),
     Role.STATE: Topic("mavros/state", "mavros_msgs/msg/State", 2.0),
     Role.REMOTE: Topic("mavros/rc/in", "mavros_msgs/msg/RCIn", 2.0),
     Role.BATTERY: Topic("mavros/battery", "sensor_msgs/msg/BatteryState", 2.0),

@@ -13,7 +13,7 @@ from coopenv.backends.svea.assembler import Assembler
 from coopenv.backends.svea.binding import Binding
 from coopenv.backends.svea.checks import Fleet, problems_of
 from coopenv.backends.svea.gates import Gates
-from coopenv.backends.svea.intake import VELOCITY, Intake
+from coopenv.backends.svea.intake import SPOKEN, VELOCITY, Intake
 from coopenv.backends.svea.pacer import Pacer
 from coopenv.backends.svea.station import Station
 from coopenv.backends.svea.status import StatusBoard
@@ -89,7 +89,7 @@ class Svea:
         self.intake = Intake(binding, deployment.sensors)
         own = deployment.security.identity
         heard = (*binding.cars, *binding.leaders)
-        said = {topic_of(name, role): (name, own) for name in heard for role in (Role.ESTIMATE, Role.REPORT)}
+        said = {topic_of(name, role): (name, own) for name in heard for role in SPOKEN}
         self.station = Station(transport, self.intake.topics, verifier, said)
         self.gates = Gates(transport, tuple(self._local), deployment.safety.limits, signer)
         self.board = StatusBoard(transport, tuple(self._local))

@@ -16,6 +16,9 @@ from coopenv.svea.transport.base import Arrival
 
 WINDOW = 2_000_000_000  # ns over which the least delay is looked for
 
+SPOKEN = (Role.ESTIMATE, Role.POINT, Role.REPORT)
+"""What cars tell each other."""
+
 VELOCITY = {"wheel+imu": (Role.WHEEL, Role.IMU), "wheel": (Role.WHEEL,), "odometry": (Role.ODOMETRY,)}
 
 
@@ -23,7 +26,7 @@ def roles_of(sensors: Sensors, local: bool) -> tuple[Role, ...]:
     """Return what is read of a car that is estimated here, or of one that is not."""
     heard: tuple[Role, ...] = (Role.TRUTH,) if sensors.truth else ()
     if not local:
-        return (*heard, Role.ESTIMATE, Role.REPORT)
+        return (*heard, *SPOKEN)
     return (*VELOCITY[sensors.odometry], Role(sensors.detections), *heard)
 
 
@@ -69,7 +72,8 @@ class Intake:
             for role in roles_of(sensors, vehicle in binding.local):
                 self._topics[topic_of(name, role)] = name, role, self.calibrations[name]
         for name in binding.leaders:
-            self._topics[topic_of(name, Role.ESTIMATE)] = name, Role.ESTIMATE, None
+            for role in (Role.ESTIMATE, Role.POINT):
+                self._topics[topic_of(name, role)] = name, role, None
 
     @property
     def topics(self) -> tuple[str, ...]:

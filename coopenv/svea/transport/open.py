@@ -1,5 +1,7 @@
 """From a deployment file to its network."""
 
+from collections.abc import Callable
+
 from coopenv.errors import CoopenvError
 from coopenv.svea.deployment import Deployment, DeploymentError
 from coopenv.svea.network import Tls
@@ -19,11 +21,23 @@ def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:
         LinkError: nobody answers there.
         CoopenvError: an extra is not installed.
     """
-    network = deployment.network
-    certificates = certificates_of(deployment)
+    network, certificates = deployment.network, certificates_of(deployment)
+    if network.kind == "nats":
+        from coopenv.svea.transport.nats import open_nats
+
+        return _translated(lambda: open_nats(network.connect, certificates, timeout), deployment)
     from coopenv.svea.transport.zenoh import open_zenoh
 
     return open_zenoh("client", network.connect, tls=certificates, timeout=timeout)
+
+
+def _translated(connect: Callable[[], Transport], deployment: Deployment) -> Transport:
+    """Return a connection to the authors' cars under our names."""
+    from coopenv.svea.transport.authors import Authors
+    from coopenv.svea.transport.counterparts import routes_of
+
+    routes = [route for car in deployment.cars for route in routes_of(car)]  # before anything is opened
+    return Authors(connect(), routes)
 
 
 def certificates_of(deployment: Deployment) -> Certificates | None:
