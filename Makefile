@@ -2,10 +2,11 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+APT := apt-get install --yes --no-install-recommends
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-train agents test-all test-matrix lint format bench stages gpu schema pages clean
+.PHONY: help demo test test-nats test-ros1 test-train agents test-all test-matrix lint format bench stages gpu schema pages clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -29,7 +30,23 @@ demo: $(VENV)/.base ## run the paper's busy intersection; table here, figures in
 	@$(BIN)/coopenv run busy_intersection --seed 0 --out out/busy_intersection
 
 test: lint ## lint, type check and all tests but the slow ones
-	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow"
+	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not nats and not ros1"
+
+test-nats: $(VENV)/.dev ## the tests that need a NATS broker (installs Debian's nats-server, as root)
+	@PATH="$$PATH:/usr/sbin"; command -v nats-server > /dev/null || $(APT) nats-server
+	@$(BIN)/python -m pytest -m nats tests/svea
+
+# ROS 1 is of the system's interpreter, which sees what Debian has installed.
+.venv-ros1/.dev: pyproject.toml constraints.txt
+	@/usr/bin/python3 -c 'import rospy, rosmaster, geometry_msgs' 2> /dev/null || \
+		$(APT) python3-venv python3-rospy python3-rosmaster python3-geometry-msgs
+	@/usr/bin/python3 -m venv --system-site-packages .venv-ros1
+	@.venv-ros1/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
+		--editable '.[svea]' hypothesis pytest
+	@touch $@
+
+test-ros1: .venv-ros1/.dev ## the tests that need a ROS 1 master (installs Debian's rospy, as root)
+	@.venv-ros1/bin/python -m pytest -m ros1 tests/svea
 
 $(VENV)/.train: $(VENV)/.dev
 	@echo "Installing torch and Stable-Baselines3 into $(VENV) (once) ..."
@@ -78,4 +95,4 @@ pages: $(VENV)/.base ## write the pages of the environments; MEASURE=--measure f
 	@$(BIN)/coopenv page --all $(MEASURE) --out docs/environments
 
 clean: ## remove the virtual environment and all results
-	@rm -rf $(VENV) .venv-gpu out build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	@rm -rf $(VENV) .venv-gpu .venv-ros1 out build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis

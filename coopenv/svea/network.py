@@ -63,6 +63,8 @@ class Network(Part):
 
     @model_validator(mode="after")
     def _endpoints_fit(self) -> Self:
+        if self.kind == "ros1" and len(self.connect) > 1:
+            raise ValueError("connect: there is one ROS master, more than one endpoint is given")
         for endpoint in self.connect:
             protocol, allowed = address_of(endpoint).protocol, WIRES[self.kind][1]
             if protocol not in allowed:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers.processes import wait_until
+from tests.helpers.wire import free_port
 
 
 def program(name: str) -> str:
@@ -48,3 +49,17 @@ def nats_server(port: int, folder: Path, *options: str) -> Iterator[subprocess.P
     command = (program("nats-server"), "--addr", "127.0.0.1", "--port", str(port), *options)
     with serving(command, port, folder) as server:
         yield server
+
+
+ROS_PORT = free_port()
+"""Of the master: a process can be a node of one master only, so all tests of this process use the same."""
+
+
+@contextmanager
+def ros_master() -> Iterator[str]:
+    """Run a ROS master and yield its endpoint."""
+    pytest.importorskip("rospy")
+    command = (program("rosmaster"), "--core", "--port", str(ROS_PORT))
+    environment = {"ROS_IP": "127.0.0.1", "ROS_MASTER_URI": f"http://127.0.0.1:{ROS_PORT}"}
+    with serving(command, ROS_PORT, Path.cwd(), **environment):
+        yield f"tcp/127.0.0.1:{ROS_PORT}"

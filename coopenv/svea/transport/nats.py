@@ -1,8 +1,6 @@
 """NATS, as the authors' cars talk to each other: a topic's name with dots for slashes, the payload as it is."""
 
 import asyncio
-import base64
-import binascii
 import ssl
 import threading
 import time
@@ -17,10 +15,7 @@ from coopenv.svea.transport.endpoints import Address, address_of, trouble_at
 from coopenv.svea.transport.outbox import Letter, Outbox
 from coopenv.svea.transport.patterns import matcher
 from coopenv.svea.transport.presence import PERIOD, Presence
-from coopenv.svea.transport.subjects import subject_of, subjects_of, topic_of
-
-ATTACHMENT = "Coopenv-Attachment"
-"""Header, base64; the authors' connector looks at no headers."""
+from coopenv.svea.transport.subjects import attachment_of, headers_of, subject_of, subjects_of, topic_of
 
 HEARTBEATS = "presence/"
 """Where announced names are said; no topic of anybody."""
@@ -80,7 +75,7 @@ class Nats:
                     await self._post(letter)
 
     async def _post(self, letter: Letter) -> None:
-        headers = {ATTACHMENT: base64.b64encode(letter.attachment).decode()} if letter.attachment else None
+        headers = headers_of(letter.attachment)
         with suppress(Exception):  # whatever keeps it from being sent, it is lost
             await self._client.publish(subject_of(letter.topic), letter.payload, headers=headers)
 
@@ -96,7 +91,7 @@ class Nats:
         async def arrive(message: Any) -> None:
             topic = topic_of(message.subject)
             if matches(topic) and not topic.startswith(HEARTBEATS):
-                callback(Arrival(topic, message.data, time.time_ns(), _attachment(message.headers)))
+                callback(Arrival(topic, message.data, time.time_ns(), attachment_of(message.headers)))
 
         self._listen(pattern, arrive)
 
@@ -140,6 +135,8 @@ class Nats:
         self._loop.call_soon_threadsafe(self._loop.stop)
         if threading.current_thread() is not self._thread:
             self._thread.join(PATIENCE)
+            if not self._thread.is_alive():
+                self._loop.close()
 
     async def _end(self) -> None:
         if self._client is None:
@@ -193,10 +190,3 @@ def _reason(error: Exception, addresses: Sequence[Address]) -> str:
         return f"its certificate is refused: {error.verify_message}"
     troubles = (trouble_at(address, None, 1.0) for address in addresses)
     return next(filter(None, troubles), str(error) or "no answer in the language of NATS")
-
-
-def _attachment(headers: dict[str, str] | None) -> bytes:
-    try:
-        return base64.b64decode((headers or {}).get(ATTACHMENT, ""), validate=True)
-    except binascii.Error:
-        return b""

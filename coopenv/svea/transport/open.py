@@ -22,22 +22,26 @@ def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:
         CoopenvError: an extra is not installed.
     """
     network, certificates = deployment.network, certificates_of(deployment)
+    if network.kind == "ros1":
+        from coopenv.svea.transport.ros1 import open_ros1
+
+        return _translated(lambda types: open_ros1(network.connect[0], types, timeout), deployment)
     if network.kind == "nats":
         from coopenv.svea.transport.nats import open_nats
 
-        return _translated(lambda: open_nats(network.connect, certificates, timeout), deployment)
+        return _translated(lambda _: open_nats(network.connect, certificates, timeout), deployment)
     from coopenv.svea.transport.zenoh import open_zenoh
 
     return open_zenoh("client", network.connect, tls=certificates, timeout=timeout)
 
 
-def _translated(connect: Callable[[], Transport], deployment: Deployment) -> Transport:
+def _translated(connect: Callable[[dict[str, str]], Transport], deployment: Deployment) -> Transport:
     """Return a connection to the authors' cars under our names."""
     from coopenv.svea.transport.authors import Authors
     from coopenv.svea.transport.counterparts import routes_of
 
     routes = [route for car in deployment.cars for route in routes_of(car)]  # before anything is opened
-    return Authors(connect(), routes)
+    return Authors(connect({route.name: route.theirs.type for route in routes}), routes)
 
 
 def certificates_of(deployment: Deployment) -> Certificates | None:

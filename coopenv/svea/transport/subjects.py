@@ -1,4 +1,10 @@
-"""Names of topics on NATS."""
+"""Topics and what is beside a message, as NATS has them."""
+
+import base64
+import binascii
+
+ATTACHMENT = "Coopenv-Attachment"
+"""Header, base64; the authors' connector looks at no headers."""
 
 
 def subject_of(topic: str) -> str:
@@ -22,3 +28,16 @@ def subjects_of(pattern: str) -> tuple[str, ...]:
         return (">",)
     alone = all(part == "**" for part in parts[first:])
     return (before, f"{before}.>") if alone else (f"{before}.>",)
+
+
+def headers_of(attachment: bytes) -> dict[str, str] | None:
+    """Return the headers of a message (None: it needs none)."""
+    return {ATTACHMENT: base64.b64encode(attachment).decode()} if attachment else None
+
+
+def attachment_of(headers: dict[str, str] | None) -> bytes:
+    """Return what is beside a message; nothing, if its header is none of ours."""
+    try:
+        return base64.b64decode((headers or {}).get(ATTACHMENT, ""), validate=True)
+    except (binascii.Error, ValueError):
+        return b""

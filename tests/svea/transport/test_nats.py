@@ -13,9 +13,14 @@ from typing import Any
 
 import pytest
 
+from coopenv.svea.codec import encode
+from coopenv.svea.deployment import parse_deployment
+from coopenv.svea.topics import TOPICS, Role, topic_of
 from coopenv.svea.transport.base import Arrival, LinkError
 from coopenv.svea.transport.certificates import Certificates
 from coopenv.svea.transport.nats import MOST_WAITING, open_nats
+from coopenv.svea.transport.open import open_transport
+from coopenv.svea.warm_up import empty
 from tests.helpers.authority import Authority
 from tests.helpers.brokers import nats_server
 from tests.helpers.processes import wait_until
@@ -132,3 +137,22 @@ def test_tls_of_the_broker(tmp_path: Path) -> None:
             open_nats(endpoint, Certificates(other.file), timeout=1.0)
         with pytest.raises(LinkError, match=r"no NATS broker there \([^\n]+\)$"):
             open_nats(endpoint, Certificates(fleet.file), timeout=1.0)
+
+
+@pytest.mark.nats
+def test_a_deployment_reaches_cars_over_the_authors_wire(tmp_path: Path) -> None:
+    port = free_port()
+    cars, network = [{"name": "svea1", "agent": 7}], {"kind": "nats", "connect": [f"nats/127.0.0.1:{port}"]}
+    fleet = parse_deployment({"environment": "e", "cars": cars, "network": network}, tmp_path / "lab.toml")
+    bearings, gate = topic_of("svea1", Role.BEARINGS), topic_of("svea1", Role.GATE)
+    with nats_server(port, tmp_path):
+        car, station = open_transport(fleet), open_transport(fleet)
+        heard: list[Arrival] = []
+        station.subscribe("fleet/svea1/**", heard.append)
+        sent = encode(empty(TOPICS[Role.BEARINGS].type))
+        car.publish(bearings, sent, b"signed")
+        car.publish(gate, b"status", reliable=True)
+        wait_until(lambda: len(heard) == 2)
+        car.close()
+        station.close()
+    assert {(a.topic, a.payload, a.attachment) for a in heard} == {(bearings, sent, b"signed"), (gate, b"status", b"")}

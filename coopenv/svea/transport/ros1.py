@@ -1,0 +1,168 @@
+"""Topics of a ROS 1 master by rospy, for cars with ROS noetic; payloads are ROS 1 bytes."""
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from typing import Any
+
+from coopenv.svea.transport.base import Arrival, Callback
+from coopenv.svea.transport.endpoints import address_of
+from coopenv.svea.transport.patterns import matcher
+from coopenv.svea.transport.presence import PERIOD, Presence
+from coopenv.svea.transport.ros1_node import ENVELOPE, Master, join, opened, raw_type, rospy, sealed
+
+PRESENCE = "coopenv/presence"
+MOST_WAITING = 256  # messages per topic and peer; then the oldest are lost
+PATIENCE = 0.5  # s that the first reliable message of a topic waits for somebody to hear it
+CHECKS = 4  # of the presence's beats until the master is looked at again
+
+
+class Ros1:
+    """The node of this process as a transport.
+
+    What is beside a message (its signature) travels only where the topic's type is our own: types of ROS 1 have no
+    place for it.
+    """
+
+    def __init__(self, master: Master, types: Mapping[str, str]) -> None:
+        """Take a master, and the ROS 1 types of topics that have one."""
+        self._master, self._types, self._rospy = master, dict(types), rospy()
+        self._lock = threading.RLock()
+        self._publishers: dict[str, Any] = {}
+        self._wanted: list[tuple[str, Callback]] = []
+        self._subscribers: dict[tuple[int, str], Any] = {}  # by place in `_wanted` and topic
+        self._presence = Presence(lambda name, payload: self.publish(PRESENCE, payload, name.encode()))
+        self._watching = False
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="ros1", daemon=True)
+        self._thread.start()
+
+    def publish(
+        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
+    ) -> None:
+        """Send, see `Transport`."""
+        if self._ended.is_set():
+            return
+        kind = self._types.get(topic, ENVELOPE)
+        with suppress(Exception):  # whatever keeps it from being sent, it is lost
+            publisher = self._publisher(topic, kind, reliable)
+            message = raw_type(kind)()
+            message._buff = payload if topic in self._types else sealed(payload, attachment)
+            publisher.publish(message)
+
+    def _publisher(self, topic: str, kind: str, patient: bool) -> Any:
+        with self._lock:
+            found = self._publishers.get(topic)
+            if found is not None:
+                return found
+            made = self._rospy.Publisher(f"/{topic}", raw_type(kind), queue_size=MOST_WAITING)
+            self._publishers[topic] = made
+        give_up = time.monotonic() + (PATIENCE if patient else 0.0)
+        while time.monotonic() < give_up and not made.get_num_connections():
+            time.sleep(0.01)
+        return made
+
+    def subscribe(self, pattern: str, callback: Callback) -> None:
+        """Subscribe, see `Transport`; topics of a pattern are found as they appear, a moment later."""
+        with self._lock:
+            self._wanted.append((pattern, callback))
+            if "*" not in pattern:
+                self._hear(len(self._wanted) - 1, pattern)
+        with suppress(OSError):
+            self._discover()
+
+    def _hear(self, place: int, topic: str) -> None:
+        callback, typed = self._wanted[place][1], topic in self._types
+
+        def arrive(message: Any) -> None:
+            content = (message._buff, b"") if typed else opened(message._buff)
+            if content is not None and not self._ended.is_set():
+                callback(Arrival(topic, content[0], time.time_ns(), content[1]))
+
+        made = raw_type(self._types.get(topic, ENVELOPE))
+        self._subscribers[place, topic] = self._rospy.Subscriber(
+            f"/{topic}", made, arrive, queue_size=MOST_WAITING, tcp_nodelay=True
+        )
+
+    def _discover(self) -> None:
+        """Subscribe to new topics that match a pattern and are of the type that is expected of them."""
+        with self._lock:
+            patterns = [(i, matcher(pattern)) for i, (pattern, _) in enumerate(self._wanted) if "*" in pattern]
+        published = self._master.ask("getPublishedTopics", "") if patterns else []
+        for name, kind in published or ():
+            topic = name.removeprefix("/")
+            if topic == PRESENCE or kind != self._types.get(topic, ENVELOPE).replace("/msg/", "/"):
+                continue
+            with self._lock:
+                for place, matches in patterns:
+                    if matches(topic) and (place, topic) not in self._subscribers and not self._ended.is_set():
+                        self._hear(place, topic)
+
+    def announce(self, name: str) -> None:
+        """Announce, see `Transport`."""
+        self._presence.announce(name)
+
+    def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
+        """Watch, see `Transport`."""
+        self._presence.watch(pattern, callback)
+        with self._lock:
+            if not self._watching:
+                self._watching = True
+                self._wanted.append((PRESENCE, self._heartbeat))
+                self._hear(len(self._wanted) - 1, PRESENCE)
+
+    def _heartbeat(self, arrival: Arrival) -> None:
+        self._presence.hear(arrival.attachment.decode(errors="replace"), arrival.payload)
+
+    def _beat(self) -> None:
+        beats = 0
+        while not self._ended.wait(PERIOD):
+            self._presence.beat()
+            beats += 1
+            with suppress(OSError):  # the master is away: those who know each other go on
+                self._discover()
+                if beats % CHECKS == 0 and self._master.ask("lookupNode", self._rospy.get_name()) is None:
+                    self._register_again()
+
+    def _register_again(self) -> None:
+        """Tell a master that has been started anew what this node has; rospy itself does not."""
+        with self._lock:
+            if not self._publishers and not self._subscribers:
+                return
+            self._unregister()
+            for place, (pattern, _) in enumerate(self._wanted):
+                if "*" not in pattern:
+                    self._hear(place, pattern)
+
+    def _unregister(self) -> None:
+        for thing in (*self._publishers.values(), *self._subscribers.values()):
+            with suppress(Exception):  # whom nobody knows cannot be struck off
+                thing.unregister()
+        self._publishers.clear()
+        self._subscribers.clear()
+
+    def close(self) -> None:
+        """Take back what this transport has published and subscribed; the node itself ends with the process."""
+        if self._ended.is_set():
+            return
+        self._presence.leave()
+        time.sleep(0.05)  # rospy sends in threads of its own
+        self._ended.set()
+        with self._lock:
+            self._unregister()
+
+
+def open_ros1(endpoint: str, types: Mapping[str, str], timeout: float = 2.0) -> Ros1:
+    """Become a node of a ROS master.
+
+    Args:
+        endpoint: of the master, e.g. "tcp/127.0.0.1:11311".
+        types: ROS 1 type by topic, without its leading slash; what is not in it is only for other coopenv ends.
+        timeout: s to wait for the master.
+
+    Raises:
+        CoopenvError: rospy is not installed, or the endpoint is not one.
+        LinkError: no master answers.
+    """
+    return Ros1(join(address_of(endpoint), timeout), types)
