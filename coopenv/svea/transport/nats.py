@@ -132,11 +132,19 @@ class Nats:
         self._closed = True
         with suppress(Exception):
             self._wait(self._end(), 2.0 * PATIENCE)
+        with suppress(Exception):  # what still waits for a broker that says nothing
+            self._wait(self._cancel(), PATIENCE)
         self._loop.call_soon_threadsafe(self._loop.stop)
         if threading.current_thread() is not self._thread:
             self._thread.join(PATIENCE)
             if not self._thread.is_alive():
                 self._loop.close()
+
+    async def _cancel(self) -> None:
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in others:
+            task.cancel()
+        await asyncio.gather(*others, return_exceptions=True)
 
     async def _end(self) -> None:
         if self._client is None:
