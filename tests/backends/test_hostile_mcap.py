@@ -76,7 +76,7 @@ def put(key: str, value: Any) -> Callable[[dict[str, Any]], dict[str, Any]]:
         ("ticks", 6, "tick 6: the recording ends at tick 5"),
         ("ticks", 8, "tick 7 is missing"),
         ("ticks", 0, "ticks: Input should be greater than or equal to 1"),
-        ("setups", [], "setups: Tuple should have at least 1 item"),
+        ("setups", [], "setups: List should have at least 1 item"),
         ("setups.1.targets", [0, 99], "setups.1.targets: not different targets of 0 .. 7 without 4"),
         ("setups.1.targets", [-5], "setups.1.targets.0"),
         ("setups.1.targets", [0, 0], "setups.1.targets: not different"),

@@ -208,7 +208,7 @@ def test_without_keys_it_warns(endpoint: str, tmp_path: Path) -> None:
         (["--car", CAR, "--max-speed", "2"], "limit of speed: must be above 0, at most 1.53"),
         (["--car", CAR, "--max-acceleration", "nan"], "limit of acceleration"),
         (["--car", CAR, "--keys", "nowhere"], "nowhere: cannot be read as a file of keys"),
-        (["--car", CAR, "--connect", "nonsense"], "nonsense: no Zenoh there"),
+        (["--car", CAR, "--connect", "nonsense"], "'nonsense' is no endpoint"),
         (["nothing.toml", "--car", CAR], "nothing.toml: cannot be read"),
         (["fleet.toml", "--car", "svea8"], "unknown car 'svea8'"),
         (["nats.toml", "--car", CAR], "network.kind is 'nats'"),
