@@ -12,7 +12,7 @@ from coopenv.api.actions import ActionReader
 from coopenv.api.choices import check_choice
 from coopenv.api.engine import Engine
 from coopenv.api.infos import InfoWriter, state_space, state_vector
-from coopenv.api.options import OF_TESTS, SETTINGS, checked_options, world_number, world_parameters
+from coopenv.api.options import IGNORED, SETTINGS, checked_options, world_number, world_parameters
 from coopenv.api.pictures import Pictures
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
@@ -141,7 +141,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         """
         first, own, parameters = 0, options or {}, None
         if self.engine.backend.capabilities.batched:
-            wanted, own = checked_options(options, ("world", *SETTINGS), OF_TESTS), {}
+            wanted, own = checked_options(options, ("world", *SETTINGS), IGNORED), {}
             first, parameters = world_number(wanted.get("world", 0)), world_parameters(wanted, 1, self.scenario)
         keys = None if seed is None else world_keys(seed, 1, first)
         if keys is not None:

@@ -21,7 +21,8 @@ BACKENDS = ("simulated", "highway", "replay", "svea")
 
 LOG_SUFFIX = ".mcap"
 BAG_SUFFIXES = (".bag", ".db3")
-OURS = {"coopenv", "coopenv-drive"}
+DRIVE = "coopenv-drive"
+OURS = {"coopenv", DRIVE}
 """Names of the metadata of MCAP files that are no bags of others."""
 DATASETS = re.compile(r"mrclam_\d+")
 
@@ -50,13 +51,15 @@ def kind_of(name: str | Path) -> Kind:
 def is_bag(name: str | Path, topics: str | Path | None = None) -> bool:
     """Return whether a name is that of a ROS bag; of MCAP files it is whatever coopenv has not written.
 
-    An MCAP file that is not there or cannot be read counts as one if the map of its topics is given.
+    With the map of its topics given it is one as well if it cannot be read, and if it is a drive of cars: that is both.
     """
     if str(name).endswith(BAG_SUFFIXES):
         return True
     if str(name).endswith(LOG_SUFFIX):
         metadata = metadata_names(name)
-        return topics is not None if metadata is None else not metadata & OURS
+        if metadata is None or DRIVE in metadata:
+            return topics is not None
+        return not metadata & OURS
     try:
         return (Path(name) / "metadata.yaml").is_file()
     except (OSError, ValueError):  # what can be no path

@@ -14,13 +14,14 @@ from coopenv.backends.svea.binding import Binding
 from coopenv.backends.svea.checks import Fleet, problems_of
 from coopenv.backends.svea.gates import Gates
 from coopenv.backends.svea.intake import SPOKEN, VELOCITY, Intake
+from coopenv.backends.svea.options import wants_to_arm
 from coopenv.backends.svea.pacer import Pacer
 from coopenv.backends.svea.station import Station
 from coopenv.backends.svea.status import StatusBoard
 from coopenv.backends.svea.tape import Tape
 from coopenv.backends.svea.v2x import checked, estimate_message, report_message
 from coopenv.backends.svea.watchdog import Watchdog, Watched
-from coopenv.errors import CoopenvError, shown, suggest
+from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.observers.recording import Sensed
 from coopenv.svea.codec import encode, make
@@ -30,7 +31,6 @@ from coopenv.svea.topics import RESET_TOPIC, Role, presence_of, topic_of
 from coopenv.svea.transport.base import Arrival, Transport
 from coopenv.svea.warm_up import warm_up
 
-OPTIONS = ("arm", "options")
 EXPECTED = ("reset", "closed", EPISODE_OVER)
 """Reasons to stop that are no emergency."""
 FIRST_WORD = 3.0  # s that cars have to be heard in at the first reset
@@ -91,7 +91,7 @@ class Svea:
         heard = (*binding.cars, *binding.leaders)
         said = {topic_of(name, role): (name, own) for name in heard for role in SPOKEN}
         self.station = Station(transport, self.intake.topics, verifier, said)
-        self.gates = Gates(transport, tuple(self._local), deployment.safety.limits, signer)
+        self.gates = Gates(transport, tuple(self._local), deployment.safety.limits, signer, verifier)
         self.board = StatusBoard(transport, tuple(self._local))
         rates = self.scenario.rates
         self._pacer = Pacer(1.0 / rates.camera, self.scenario.ticks_per_decision)
@@ -141,7 +141,7 @@ class Svea:
             CoopenvError: an option is not known, or something is not as it has to be before wheels turn.
         """
         self._stop("reset")
-        arm = _checked(options)
+        arm = wants_to_arm(options)
         if self.deployment.fakes:
             self._place_fakes(0 if seed is None else seed)
         self._listen(arm)
@@ -293,14 +293,3 @@ def _wait(ready: Callable[[], bool], patience: float) -> None:
     until = time.monotonic() + patience
     while time.monotonic() < until and not ready():
         time.sleep(0.02)
-
-
-def _checked(options: Mapping[str, Any]) -> bool:
-    """Return whether cars are to drive. Raises CoopenvError: an option is not known."""
-    for key in options:
-        if key not in OPTIONS:
-            raise CoopenvError(f"unknown option {shown(key)}{suggest(str(key), OPTIONS)}; known: arm")
-    arm = options.get("arm", False)
-    if not isinstance(arm, bool):
-        raise CoopenvError(f"option 'arm' must be true or false, got {shown(arm)}")
-    return arm

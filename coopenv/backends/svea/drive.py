@@ -10,6 +10,7 @@ from coopenv.backends.mcap.container import Container
 from coopenv.backends.svea.assembler import Assembler
 from coopenv.backends.svea.binding import Binding, bind
 from coopenv.backends.svea.intake import Intake
+from coopenv.backends.svea.options import wants_to_arm
 from coopenv.backends.svea.tape import ATTACHMENT, FORMAT, NAME
 from coopenv.errors import CoopenvError, DataError
 from coopenv.scenario.files import override, parse_scenario
@@ -110,7 +111,8 @@ class Drive(TickGenerator):
             raise DataError(f"{self._where}: damaged MCAP file ({type(error).__name__})") from None
 
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
-        """Go through the messages from the begin, giving the ticks of one episode."""
+        """Go through the messages from the begin, giving the ticks of one episode; `arm` moves nobody."""
+        wants_to_arm(options)
         wanted, self._next = self._next, (self._next + 1) % self._episodes
         intake, assembler = Intake(self.binding, self._deployment.sensors), Assembler(self.binding)
         number = -1

@@ -9,7 +9,7 @@ from typing import Any
 from coopenv.errors import CoopenvError
 from coopenv.svea.codec import decode, encode, header, make
 from coopenv.svea.limits import Limits
-from coopenv.svea.signing import Signer
+from coopenv.svea.signing import Signer, Verifier
 from coopenv.svea.topics import TOPICS, Role, topic_of
 from coopenv.svea.transport.base import Arrival, Transport
 
@@ -38,9 +38,16 @@ class GateState:
 class Gates:
     """The gates of some cars."""
 
-    def __init__(self, transport: Transport, cars: tuple[str, ...], limits: Limits, signer: Signer | None) -> None:
-        """Listen to the gates."""
-        self._transport, self._limits, self._signer = transport, limits, signer
+    def __init__(
+        self,
+        transport: Transport,
+        cars: tuple[str, ...],
+        limits: Limits,
+        signer: Signer | None,
+        verifier: Verifier | None,
+    ) -> None:
+        """Listen to the gates; with a verifier only to what they have signed."""
+        self._transport, self._limits, self._signer, self._verifier = transport, limits, signer, verifier
         self._lock = threading.Lock()
         self._states = {car: GateState() for car in cars}
         self._cars = {topic_of(car, Role.GATE): car for car in cars}
@@ -56,6 +63,9 @@ class Gates:
             return dict(self._states)
 
     def _hear(self, arrival: Arrival) -> None:
+        car, v = self._cars[arrival.topic], self._verifier
+        if v is not None and v.signer(arrival.topic, arrival.payload, arrival.attachment) != car:
+            return
         try:
             m = decode(arrival.payload, TOPICS[Role.GATE].type)
         except CoopenvError:
@@ -63,7 +73,7 @@ class Gates:
         counts = dict(zip(m.rejections, (int(n) for n in m.counts), strict=False))
         state = GateState(m.state, m.session, m.nonce, int(m.accepted), counts, time.monotonic())
         with self._lock:
-            self._states[self._cars[arrival.topic]] = state
+            self._states[car] = state
 
     def begin(self) -> None:
         """Arm all gates for a new session.

@@ -46,7 +46,6 @@ def gate(
     from coopenv.svea.gate.core import Gate
     from coopenv.svea.gate.process import CLOCK, Link, run
     from coopenv.svea.gate.settings import Settings
-    from coopenv.svea.transport.zenoh import open_zenoh
 
     bounds = {"speed": max_speed, "steering": max_steering, "acceleration": max_acceleration}
     given = Settings.of(car, deployment).changed(
@@ -58,7 +57,7 @@ def gate(
     signer, verifier = given.identities()
     if verifier is None:
         print("warning: without --keys whoever reaches the router can drive this car", file=sys.stderr)
-    transport = open_zenoh("client", given.connect, tls=given.tls)
+    transport = given.open()
     try:
         link = Link(Gate(car, given.limits, CLOCK, verifier, given.station), car, transport, signer)
         interrupts.note(f"{car} is in neutral")

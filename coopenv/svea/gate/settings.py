@@ -12,8 +12,9 @@ from coopenv.svea.limits import USUAL, Limits
 from coopenv.svea.signing import LONGEST_IDENTITY, is_identity
 
 if TYPE_CHECKING:
+    from coopenv.svea.deployment import Deployment
     from coopenv.svea.signing import Signer, Verifier
-    from coopenv.svea.transport.certificates import Certificates
+    from coopenv.svea.transport.base import Transport
 
 
 @dataclass(frozen=True)
@@ -25,28 +26,25 @@ class Settings:
     limits: Limits = USUAL
     keys: Path | None = None  # folder
     station: str = "station"
-    tls: Certificates | None = None
+    fleet: Deployment | None = None  # of the file, if there is one
 
     @classmethod
     def of(cls, car: str, path: Path | None) -> Settings:
         """Return the settings for a car by a deployment file, or the usual ones.
 
         Raises:
-            CoopenvError: the name is none, the file cannot be read, knows no such car, or its network is not Zenoh.
+            CoopenvError: the name is none, the file cannot be read, or knows no such car.
         """
         if path is None:
             if not is_identity(car):
                 raise CoopenvError(f"--car {shown(car)}: expected 1 to {LONGEST_IDENTITY} letters, digits, _ or -")
             return cls(car)
         from coopenv.svea.deployment import load_deployment
-        from coopenv.svea.transport.open import certificates_of
 
         read = load_deployment(path)
-        if read.network.kind != "zenoh":
-            raise CoopenvError(f"{path}: network.kind is {read.network.kind!r}, a gate can be reached by 'zenoh' only")
         keys = None if read.security.keys is None else read.folder / read.security.keys
         connect, limits = read.network.connect, read.safety.limits
-        return cls(read.car(car).name, connect, limits, keys, read.security.identity, certificates_of(read))
+        return cls(read.car(car).name, connect, limits, keys, read.security.identity, read)
 
     def changed(self, limits: Mapping[str, Any], **values: Any) -> Settings:
         """Return these settings with others in place of some; None leaves one as it is.
@@ -57,6 +55,17 @@ class Settings:
         bounds = replace(self.limits, **{name: value for name, value in limits.items() if value is not None})
         rest = {name: value for name, value in values.items() if value is not None}
         return replace(self, limits=bounds.check(), **rest)
+
+    def open(self) -> Transport:
+        """Connect to the network; errors as for `coopenv.svea.transport.open.open_transport`."""
+        if self.fleet is None:
+            from coopenv.svea.transport.zenoh import open_zenoh
+
+            return open_zenoh("client", self.connect)
+        from coopenv.svea.transport.open import open_transport
+
+        network = self.fleet.network.model_copy(update={"connect": self.connect})
+        return open_transport(self.fleet.model_copy(update={"network": network}))
 
     def identities(self) -> tuple[Signer | None, Verifier | None]:
         """Return what signs as the car and what knows the station. Raises CoopenvError: a key is missing or unsafe."""

@@ -211,7 +211,6 @@ def test_without_keys_it_warns(endpoint: str, tmp_path: Path) -> None:
         (["--car", CAR, "--connect", "nonsense"], "'nonsense' is no endpoint"),
         (["nothing.toml", "--car", CAR], "nothing.toml: cannot be read"),
         (["fleet.toml", "--car", "svea8"], "unknown car 'svea8'"),
-        (["nats.toml", "--car", CAR], "network.kind is 'nats'"),
         ([], "Missing option '--car'"),
     ],
 )
@@ -221,7 +220,6 @@ def test_mistakes_are_told_in_one_line(
     monkeypatch.chdir(tmp_path)
     fleet = f'environment = "x"\ncars = [{{name = "{CAR}"}}]\n'
     Path("fleet.toml").write_text(fleet)
-    Path("nats.toml").write_text(fleet + 'network.kind = "nats"')
     assert main(["svea", "gate", *options]) == 2
     error = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: without --keys")]
     assert len(error) == 1 and told in error[0]

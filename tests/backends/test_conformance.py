@@ -1,0 +1,233 @@
+"""One suite over all backends: the same spaces, the same meaning of actions, masks and ages, whatever gives the ticks.
+
+Simulator, fakes in this process, fakes in processes of their own over Zenoh, a recorded drive, and that drive as a bag.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pettingzoo.test import parallel_api_test
+
+import coopenv
+from coopenv.backends.svea.opening import open_svea
+from coopenv.errors import CoopenvError
+from coopenv.svea.codec import decode
+from coopenv.svea.topics import TOPICS, Role, topic_of
+from coopenv.svea.transport.base import Arrival
+from coopenv.svea.transport.zenoh import open_zenoh
+from tests.helpers.cars import OVERTAKING, PATIENT, cars, fakes, write_fleet
+from tests.helpers.processes import COOPENV, start, wait_until
+from tests.helpers.wire import free_port
+
+Env = coopenv.CooperativeLocalisationEnv
+Make = Callable[..., Env]
+
+GROUPS = ["estimate", "quality", "bearings", "odometry", "messages", "goal", "self"]
+OVERRIDES: dict[str, Any] = {"observation.include": GROUPS}
+AHEAD = np.array([0.2, 0.0], dtype=np.float32)
+TOPICS_OF_A_LAB = """
+environment = "svea_overtaking"
+markers = { SL1 = 1, SL2 = 2, SL4 = 4, SL5 = 5 }
+
+[overrides]
+"observation.include" = INCLUDE
+
+[[cars]]
+name = "svea7"
+marker = 7
+
+[[cars]]
+name = "svea1"
+marker = 6
+"""
+
+
+def simulated(**options: Any) -> Env:
+    return coopenv.parallel_env("svea_overtaking", overrides=OVERRIDES, **options)
+
+
+def in_process(path: Path, hub: Any, **options: Any) -> Env:
+    return coopenv.parallel_env("cars", backend=cars(path, hub, overrides=OVERRIDES), **options)
+
+
+def over_zenoh(path: Path, **options: Any) -> Env:
+    return coopenv.parallel_env("cars", backend=open_svea(path, overrides=OVERRIDES), **options)
+
+
+def recorded(path: Path, **options: Any) -> Env:
+    return coopenv.parallel_env(path, **options)
+
+
+def imported(path: Path, topics: Path, **options: Any) -> Env:
+    return coopenv.parallel_env(path, backend="replay", topics=topics, **options)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("conformance")
+
+
+@pytest.fixture(scope="module")
+def lab(folder: Path) -> Iterator[tuple[Path, Any]]:
+    path = write_fleet(folder)
+    with fakes(path) as (hub, _):
+        yield path, hub
+
+
+@pytest.fixture(scope="module")
+def processes(folder: Path) -> Iterator[Path]:
+    """Start a router and two fake cars, each a process."""
+    port = free_port()
+    network = f'[network]\nconnect = ["tcp/127.0.0.1:{port}"]\n'
+    path = folder / "zenoh.toml"
+    path.write_text(OVERTAKING + PATIENT + network)
+    with ExitStack() as stack:
+
+        def launch(*arguments: str) -> Any:
+            process = start([*COOPENV, "svea", *arguments], folder)
+            stack.callback(process.wait)
+            stack.callback(process.kill)
+            assert "ready" in process.stdout.readline()
+            return process
+
+        launch("router", "--listen", f"tcp/127.0.0.1:{port}")
+        first = start([*COOPENV, "svea", "fake", str(path), "--car", "svea7"], folder)  # both load at a time
+        stack.callback(first.wait)
+        stack.callback(first.kill)
+        launch("fake", str(path), "--car", "svea1")
+        assert first.stdout is not None and "ready" in first.stdout.readline()
+        yield path
+
+
+@pytest.fixture(scope="module")
+def drive(folder: Path, lab: tuple[Path, Any]) -> Path:
+    """Record a drive of a second and a half."""
+    path, hub = lab
+    env = coopenv.parallel_env("cars", backend=cars(path, hub, overrides=OVERRIDES, record=folder / "drive.mcap"))
+    env.reset(seed=5, options={"arm": True})
+    for _ in range(30):
+        env.step(dict.fromkeys(env.agents, AHEAD))
+    env.close()
+    return folder / "drive.mcap"
+
+
+@pytest.fixture(params=["simulated", "in process", "over zenoh", "drive", "bag"])
+def make(request: pytest.FixtureRequest, folder: Path) -> Make:
+    if request.param == "simulated":
+        return simulated
+    if request.param == "in process":
+        return partial(in_process, *request.getfixturevalue("lab"))
+    if request.param == "over zenoh":
+        return partial(over_zenoh, request.getfixturevalue("processes"))
+    path = request.getfixturevalue("drive")
+    if request.param == "drive":
+        return partial(recorded, path)
+    topics = folder / "topics.toml"
+    topics.write_text(TOPICS_OF_A_LAB.replace("INCLUDE", str(GROUPS).replace("'", '"')))
+    return partial(imported, path, topics)
+
+
+@pytest.mark.parametrize("observation", ["flat", "dict"])
+def test_spaces_are_those_of_the_simulator(make: Make, observation: Any) -> None:
+    expected, env = simulated(observation=observation), make(observation=observation)
+    try:
+        assert env.possible_agents == expected.possible_agents
+        for agent in env.possible_agents:
+            assert env.observation_space(agent) == expected.observation_space(agent)
+            assert env.action_space(agent) == expected.action_space(agent)
+        assert env.state_space == expected.state_space
+        assert env.observation_layout == expected.observation_layout
+    finally:
+        env.close()
+
+
+def test_it_passes_the_official_test(make: Make) -> None:
+    env = make()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        parallel_api_test(env, num_cycles=20)
+    env.close()
+
+
+def masks_and_ages(env: Env, agent: str, seen: dict[str, np.ndarray], info: dict[str, Any]) -> None:
+    """Check what masks and ages say against the info of the same step."""
+    targets = env.scenario.target_names
+    visible = [name in info["visible"] for name in targets]
+    neighbours = {name for name, there in zip(targets, seen["bearing_mask"], strict=False) if there}
+    assert set(np.unique(seen["bearing_mask"])) <= {0.0, 1.0} and set(np.unique(seen["message_mask"])) <= {0.0, 1.0}
+    for name in ("bearing_age", "odometry_age", "message_age"):
+        assert ((seen[name] >= 0.0) & (seen[name] <= 1.0)).all(), name
+    assert (seen["odometry_age"] < 0.5).all(), agent  # of a second
+    if any(visible):
+        assert neighbours
+
+
+def test_masks_and_ages_mean_the_same(make: Make) -> None:
+    env = make(observation="dict")
+    try:
+        env.reset(seed=5)
+        ever_seen, ever_heard, steps = False, False, 0
+        while env.agents and steps < 25:
+            observations, rewards, _, _, infos = env.step(dict.fromkeys(env.agents, AHEAD))
+            steps += 1
+            for agent, seen in observations.items():
+                assert env.observation_space(agent).contains(seen) and np.isfinite(rewards[agent])
+                assert all(part.dtype == np.float32 and np.isfinite(part).all() for part in seen.values())
+                masks_and_ages(env, agent, seen, infos[agent])
+                ever_seen |= bool(infos[agent]["visible"])
+            ever_heard |= bool(observations.get("vehicle_2", {"message_mask": np.zeros(1)})["message_mask"].any())
+        assert steps > 15 and ever_seen and ever_heard
+        assert all(info["position_error"] < 0.2 for info in infos.values())
+    finally:
+        env.close()
+
+
+def test_actions_mean_the_same_speeds_and_angles(lab: tuple[Path, Any], processes: Path) -> None:
+    """What goes out to the gates is what the simulated vehicles follow, whatever network it takes."""
+    path, hub = lab
+    actions = [np.array(a, np.float32) for a in ((-1.0, 0.0), (0.5, 1.0), (1.0, -1.0), (0.0, 0.3))]
+    expected = simulated()
+    expected.reset(seed=1)
+    wanted = []
+    for action in actions:
+        expected.step(dict.fromkeys(expected.possible_agents, action))
+        wanted.append(expected.engine.view("command")[0, :, :2].copy())
+    watch = open_zenoh("client", [line.split('"')[1] for line in processes.read_text().splitlines() if "tcp/" in line])
+    for network, env in ((hub.connect(), in_process(path, hub)), (watch, over_zenoh(processes))):
+        heard: list[Arrival] = []
+        network.subscribe(topic_of("svea7", Role.COMMAND), heard.append)
+        network.subscribe(topic_of("svea1", Role.COMMAND), heard.append)
+        try:
+            env.reset(seed=1, options={"arm": True})
+            for action in actions:
+                env.step(dict.fromkeys(env.possible_agents, action))
+            wait_until(lambda heard=heard: len(heard) >= 2 * len(actions))  # type: ignore[misc]
+        finally:
+            env.close()
+            network.close()
+        found = {
+            car: [decode(a.payload, TOPICS[Role.COMMAND].type).drive for a in heard if car in a.topic]
+            for car in ("svea7", "svea1")
+        }
+        for step, both in enumerate(wanted):
+            for car, (speed, steering) in zip(found, both, strict=True):
+                told = found[car][step]
+                np.testing.assert_allclose([told.speed, told.steering_angle], [speed, steering], atol=1e-6)
+
+
+@pytest.mark.parametrize("options", [{"nonsense": 1}])
+def test_unknown_options_are_refused(make: Make, options: dict[str, Any]) -> None:
+    env = make()
+    try:
+        with pytest.raises(CoopenvError, match="nonsense"):
+            env.reset(seed=0, options=options)
+    finally:
+        env.close()
