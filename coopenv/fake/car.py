@@ -1,7 +1,5 @@
 """A fake car: its room, sensors and wheels on one clock, and its end of the network."""
 
-import os
-import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -13,7 +11,7 @@ from coopenv.backends.svea.binding import Binding
 from coopenv.errors import CoopenvError
 from coopenv.fake.actuators import Actuators
 from coopenv.fake.camera import Pixy, calibration_of
-from coopenv.fake.faults import Fault, Faults, parse_fault
+from coopenv.fake.faults import Fault, Faults, end_process, fault_topic, parse_fault
 from coopenv.fake.neighbours import Neighbours
 from coopenv.fake.schedule import Schedule
 from coopenv.fake.sensors import Sensors
@@ -27,16 +25,11 @@ from coopenv.svea.gate.core import PERIOD, Gate
 from coopenv.svea.gate.process import Link
 from coopenv.svea.gate.terms import Clock
 from coopenv.svea.signing import Signer, Verifier
-from coopenv.svea.topics import PREFIX, RESET_TOPIC, TOPICS, Role, presence_of, topic_of
+from coopenv.svea.topics import RESET_TOPIC, TOPICS, Role, presence_of, topic_of
 from coopenv.svea.transport.base import Arrival, Transport
 from coopenv.svea.warm_up import warm_up
 
 REAL = Clock(time.time_ns, time.monotonic_ns)
-
-
-def end_process() -> None:
-    """End this process as if its computer had been switched off."""
-    os.kill(os.getpid(), signal.SIGKILL)
 
 
 class Fake:
@@ -210,8 +203,3 @@ class Fake:
             self._faults.add(parse_fault(text), self._clock.steady())
 
         self._inbox.append(add)
-
-
-def fault_topic(car: str) -> str:
-    """Return where a fake car hears of faults that it is to have, std_msgs/msg/String, see `faults`."""
-    return f"{PREFIX}/{car}/coopenv/fault"

@@ -1,9 +1,12 @@
 """What may go wrong with a fake car, on request: `KIND[=VALUE][@START[+DURATION]]`."""
 
+import os
 import re
+import signal
 from dataclasses import dataclass
 
 from coopenv.errors import CoopenvError, listed, shown, suggest
+from coopenv.svea.topics import PREFIX
 
 
 class FaultError(CoopenvError):
@@ -75,11 +78,25 @@ def _number(name: str, what: str, text: str, low: float, high: float) -> float:
     return number
 
 
+def fault_topic(car: str) -> str:
+    """Return where a fake car hears of faults that it is to have, std_msgs/msg/String."""
+    return f"{PREFIX}/{car}/coopenv/fault"
+
+
+def end_process() -> None:
+    """End this process as if its computer had been switched off."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
 class Faults:
     """The faults of a car; times in ns on one clock."""
 
     def __init__(self) -> None:
         self._known: list[tuple[int, int | None, Fault]] = []
+
+    def __bool__(self) -> bool:
+        """Whether any has been asked for."""
+        return bool(self._known)
 
     def add(self, fault: Fault, now: int) -> None:
         """Let a fault happen, its start counted from now."""
@@ -89,10 +106,14 @@ class Faults:
 
     def value(self, kind: str, now: int) -> float:
         """Return the value of a kind of fault, 0 where it does not happen; of several the last that was asked for."""
+        if not self._known:
+            return 0.0
         return next((f.value for _, f in self._active(kind, now)), 0.0)
 
     def clock_error(self, now: int) -> int:
         """Return how far the car's clock is ahead, ns."""
+        if not self._known:
+            return 0
         offset = self.value("clock_offset", now) * 1e9
         drifted = next((f.value * (now - begin) for begin, f in self._active("clock_drift", now)), 0.0)
         return round(offset + drifted)

@@ -14,7 +14,7 @@ from coopenv.svea.deployment import load_deployment
 from coopenv.svea.keys import check_known, load_signer, load_verifier
 from coopenv.svea.transport.base import Transport
 
-REST = 0.002
+REST = 0.004
 """s between two looks at the clock, at least: what falls due meanwhile is done together."""
 
 

@@ -38,15 +38,12 @@ class Schedule:
     @property
     def next(self) -> int:
         """When something is due next."""
-        return min(timer.due for timer in self._timers.values())
+        return min([timer.due for timer in self._timers.values()])
 
     def until(self, now: int) -> Iterator[tuple[int, str]]:
         """Yield (when, name) of all that is due up to now, in the order of time."""
-        while True:
-            name, timer = min(self._timers.items(), key=lambda item: item[1].due)
-            if timer.due > now:
-                return
-            due = timer.due
+        while (due := self.next) <= now:
+            name, timer = next((name, timer) for name, timer in self._timers.items() if timer.due == due)
             timer.regular += timer.period
             self._draw(timer)
             if due >= now - LATE:

@@ -57,7 +57,7 @@ class Wire:
     def flush(self) -> None:
         """Pass on what has been under way for long enough."""
         now = self._steady()
-        while True:
+        while self._late:
             with self._lock:
                 if not self._late or self._late[0][0] > now:
                     return
@@ -65,6 +65,9 @@ class Wire:
             act()
 
     def _pass_on(self, act: Callable[[], None]) -> None:
+        if not self._faults:
+            act()
+            return
         now, faults = self._steady(), self._faults
         if faults.value("freeze", now) or self._rng.random() < faults.value("loss", now):
             return

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coopenv.fake.car import fault_topic
-from coopenv.fake.faults import KINDS, Fault, FaultError, Faults, parse_fault
+from coopenv.fake.faults import KINDS, Fault, FaultError, Faults, fault_topic, parse_fault
 from coopenv.svea.codec import encode, make, stamp_of
 from coopenv.svea.topics import Role, topic_of
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage

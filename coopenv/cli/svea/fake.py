@@ -1,5 +1,6 @@
 """`coopenv svea fake`: a fake car, one process each."""
 
+import gc
 import sys
 import threading
 from pathlib import Path
@@ -41,6 +42,7 @@ def fake(
 
     try:
         made = open_fake(deployment, car, transport, seed=seed, faults=faults, gate=gate, complain=complain)
+        gc.freeze()  # what is there stays, and need not be looked through again and again
         interrupts.note(f"{car} is gone")
         print(f"{car}: fake ready", flush=True)
         run(made, threading.Event())
