@@ -158,7 +158,7 @@ def test_both_topics_are_read_as_the_same_rays() -> None:
         if number in places(stage):
             forward, left, up = turned(np.pi / 2).T @ (places(stage)[number] - [0.0, -1.0, 0.0]) - CAMERA
             true = np.array([-left, -up, forward]) / np.linalg.norm([forward, left, up])
-            assert np.arccos(min(ray @ true, 1.0)) < 0.008  # a pixel and the noise
+            assert np.arccos(min(ray @ true, 1.0)) < 0.015  # half a pixel and the noise
     stage.run(1.1)
     told = read(Role.CAMERA_INFO, stage.arrivals("svea7", Role.CAMERA_INFO)[-1])
     assert told == CALIBRATION

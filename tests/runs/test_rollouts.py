@@ -36,7 +36,7 @@ CASES: list[tuple[str, dict[str, Any]]] = [
 def test_recorded_ticks_equal_the_environment_stepped_by_decisions(name: str, overrides: dict[str, Any]) -> None:
     overrides = {**overrides, "horizon": 7.35}  # not a whole number of decisions
     scenario = coopenv.load_scenario(name, overrides)
-    actions = np.random.default_rng(5).uniform(-1.0, 1.0, (100, len(scenario.vehicles), 2))
+    actions = np.random.default_rng(5).uniform(-1.0, 1.0, (200, len(scenario.vehicles), 2))
     given = iter(actions)
     run = rollout(scenario, seed=7, policy=lambda observations: next(given))
     env = coopenv.parallel_env(name, dtype="float64", overrides=overrides)
