@@ -6,7 +6,7 @@ APT := apt-get install --yes --no-install-recommends
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-nats test-ros1 test-train agents test-all test-matrix lint format bench stages gpu schema pages clean
+.PHONY: help demo svea-demo test test-nats test-ros1 test-train agents test-all test-matrix lint format bench stages gpu schema pages clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -28,6 +28,14 @@ $(VENV)/.dev: $(VENV)/.base
 
 demo: $(VENV)/.base ## run the paper's busy intersection; table here, figures in out/busy_intersection
 	@$(BIN)/coopenv run busy_intersection --seed 0 --out out/busy_intersection
+
+$(VENV)/.svea: $(VENV)/.base
+	@echo "Installing what cars need into $(VENV) (once) ..."
+	@$(PIP) --editable '.[svea]'
+	@touch $@
+
+svea-demo: $(VENV)/.svea ## two fake cars overtake in real time; table here, figures in out/svea_overtaking, half a minute
+	@$(BIN)/coopenv svea demo --out out/svea_overtaking
 
 test: lint ## lint, type check and all tests but the slow ones
 	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not nats and not ros1"

@@ -7,7 +7,10 @@ from pathlib import Path
 
 @cache
 def data_directory(kind: str) -> Path:
-    """Return the folder of `envs` or `agents`: inside the installed wheel, else beside the checkout's package."""
+    """Return the folder of a `kind`, inside the installed wheel, else beside the checkout's package.
+
+    Kinds are `envs`, `agents` and `examples/fleet`.
+    """
     package = Path(__file__).resolve().parent
     shipped = package / "data" / kind
     return shipped if shipped.is_dir() else package.parent / kind

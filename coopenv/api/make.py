@@ -35,6 +35,7 @@ def parallel_env(
     deployment: str | Path | None = None,
     car: str | None = None,
     record: str | Path | None = None,
+    connect: str | None = None,
 ) -> CooperativeLocalisationEnv:
     """Return an environment by name (`coopenv.list_envs()`), from a TOML file, or from a recording.
 
@@ -60,6 +61,7 @@ def parallel_env(
         deployment: file that says which cars there are; for `backend="svea"`, see docs/cars.md.
         car: the one that is estimated and driven here, the others are heard (None: all of them).
         record: MCAP file to which all that comes from the cars and goes to them is written.
+        connect: endpoint of the cars' network in place of that of the deployment, for example "tcp/127.0.0.1:7447".
 
     Raises:
         UnknownEnvironmentError: no such environment.
@@ -73,7 +75,7 @@ def parallel_env(
             _with_observer(overrides, observer),
             data,
             variant,
-            {"deployment": deployment, "car": car, "record": record},
+            {"deployment": deployment, "car": car, "record": record, "connect": connect},
             topics,
         ),
         Path(str(name_or_path)).stem,

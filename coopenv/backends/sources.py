@@ -142,7 +142,7 @@ def open_backend(
         data: folder of the data sets.
         variant: of a data set.
         cars: arguments of `coopenv.backends.svea.opening.open_svea`, which `backend="svea"` needs: `deployment`, and
-            `car` and `record`.
+            `car`, `record` and `connect`.
         topics: map of the topics of a ROS bag.
 
     Raises:
@@ -203,7 +203,8 @@ def _open_cars(name: str | Path, overrides: Mapping[str, Any], given: Mapping[st
     if deployment is None and not str(name).endswith(".toml"):
         raise CoopenvError(f"deployment: needed by backend='svea': the file that says which cars drive {name}")
     environment = None if deployment is None else str(name)
-    return open_svea(deployment or name, environment, overrides, given.get("car"), given.get("record"))
+    options = {key: given[key] for key in ("car", "record", "connect") if key in given}
+    return open_svea(deployment or name, environment, overrides, **options)
 
 
 def open_bags(

@@ -59,6 +59,10 @@ Variant = Annotated[
 TopicMap = Annotated[
     Path | None, typer.Option("--map", help="TOML file that says what the topics of a ROS bag are (docs/bags.md).")
 ]
+Connect = Annotated[
+    str | None,
+    typer.Option(help="Endpoint of the network in place of the deployment's network.connect.", show_default=False),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 SteadyFrom = Annotated[
     float | None,

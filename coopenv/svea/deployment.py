@@ -171,8 +171,12 @@ class Deployment(Part):
         return self.cars[names.index(name)]
 
 
-def load_deployment(path: str | Path) -> Deployment:
+def load_deployment(path: str | Path, connect: str | None = None) -> Deployment:
     """Read a deployment file.
+
+    Args:
+        path: of the file.
+        connect: endpoint in place of the file's `network.connect`.
 
     Raises:
         DeploymentError: it cannot be read, or one line says which field is not what it must be.
@@ -186,6 +190,9 @@ def load_deployment(path: str | Path) -> Deployment:
         raise DeploymentError(f"{path}: not valid TOML: {error}") from None
     except RecursionError:
         raise DeploymentError(f"{path}: lists or tables stand too deep in one another") from None
+    network = raw.get("network", {})
+    if connect is not None and isinstance(network, dict):
+        raw["network"] = {**network, "connect": [connect]}
     return parse_deployment(raw, path)
 
 

@@ -52,6 +52,19 @@ def group_of(leader: int) -> list[str]:
     return found
 
 
+def mentioning(text: str) -> list[str]:
+    """Return the command lines of the living processes that have a text in them (Linux)."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            line = (path / "cmdline").read_text().replace("\0", " ")
+        except OSError:  # gone meanwhile
+            continue
+        if text in line:
+            found.append(line)
+    return found
+
+
 def workers_of(leader: int) -> list[str]:
     """Return those that `multiprocessing` has started to work."""
     return [line for line in group_of(leader) if "spawn_main" in line]

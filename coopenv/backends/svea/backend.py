@@ -261,6 +261,11 @@ class Svea:
             "clock_offset": float("nan") if offset is None else offset,
         }
 
+    @property
+    def delays(self) -> tuple[float, ...]:
+        """By how much each tick of this episode came after its time, s."""
+        return tuple(self._pacer.lateness)
+
     def lateness(self, share: float) -> float:
         """Return by how much at most that share of the ticks came after their time, s."""
         return self._pacer.late(share)

@@ -25,6 +25,7 @@ def open_svea(
     car: str | None = None,
     record: str | Path | None = None,
     transport: Transport | None = None,
+    connect: str | None = None,
 ) -> Svea:
     """Return the cars of a deployment file as a backend.
 
@@ -35,11 +36,12 @@ def open_svea(
         car: estimate and drive this one alone, the others are heard (None: all of them, as an edge server does).
         record: MCAP file to write what comes and goes to.
         transport: a network that is open already (None: as the file says).
+        connect: endpoint in place of the file's.
 
     Raises:
         CoopenvError: one line that names the file and the field, or what cannot be reached.
     """
-    deployment = load_deployment(path)
+    deployment = load_deployment(path, connect)
     scenario = scenario_of(deployment, environment, overrides or {})
     binding = bind(scenario, deployment.cars, deployment.markers, Path(path).name, car)
     signer, verifier = _keys(deployment, binding, car)

@@ -23,6 +23,7 @@ def fake(
             "delay, clock_offset, clock_drift, false_blocks, duplicate_blocks, swapped_signatures. Repeatable.",
         ),
     ] = None,
+    connect: options.Connect = None,
     gate: Annotated[
         bool, typer.Option(help="Whether commands come through a gate of its own; else it obeys ManualControl.")
     ] = True,
@@ -35,7 +36,7 @@ def fake(
     from coopenv.svea.transport.open import open_transport
 
     faults = [parse_fault(text) for text in fault or ()]
-    transport = open_transport(load_deployment(deployment))
+    transport = open_transport(load_deployment(deployment, connect))
 
     def complain(line: str) -> None:
         print(line, file=sys.stderr, flush=True)

@@ -21,6 +21,7 @@ def run(
     policy: options.PolicyName = "zero",
     seed: options.Seed = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Decisions to run (default: up to the horizon).")] = None,
+    connect: options.Connect = None,
     record: Annotated[Path | None, typer.Option(help="MCAP file for all that comes and goes.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the results (default: out/DEPLOYMENT).")] = None,
     overrides: options.Overrides = None,
@@ -39,7 +40,7 @@ def run(
 
     changes, log = options.parse_overrides(overrides), options.console(stderr=True)
     with options.warned():
-        backend = open_svea(config, None, changes, car, record)
+        backend = open_svea(config, None, changes, car, record, connect=connect)
     try:
         rollout = Rollout(backend.scenario, seed, steps, policy=policy, backend=backend, options={"arm": arm})
         folder = out or Path("out") / config.stem

@@ -1,0 +1,72 @@
+"""A router and fake cars as processes: they are there when asked for, and gone whatever happens."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import pytest
+
+from coopenv.backends.svea.binding import bind
+from coopenv.backends.svea.opening import scenario_of
+from coopenv.errors import CoopenvError
+from coopenv.fake.fleet import FakesError, fakes, free_port
+from coopenv.svea.deployment import DeploymentError, load_deployment
+from coopenv.svea.topics import presence_of
+from coopenv.svea.transport.zenoh import open_zenoh
+from tests.helpers.processes import ROOT, mentioning, wait_until
+
+FLEETS = sorted((ROOT / "examples" / "fleet").glob("*.toml"))
+OVERTAKING = ROOT / "examples" / "fleet" / "overtaking.toml"
+
+
+@pytest.mark.parametrize("path", FLEETS, ids=lambda path: path.stem)
+def test_the_shipped_fleets_are_those_of_their_environments(path: Path) -> None:
+    fleet = load_deployment(path)
+    scenario = scenario_of(fleet, None, {})
+    binding = bind(scenario, fleet.cars, fleet.markers, path.name, None)
+    carriers = {target for target in binding.targets.values()}
+    assert carriers == set(range(len(scenario.landmarks) + len(scenario.vehicles)))
+    assert fleet.fakes and fleet.network.connect == ("tcp/127.0.0.1:7447",)
+    assert all(f"fake {path.relative_to(ROOT)} --car {car.name}" in path.read_text() for car in fleet.cars)
+
+
+def test_an_endpoint_takes_the_place_of_the_files() -> None:
+    assert load_deployment(OVERTAKING, "tcp/10.0.0.1:1").network.connect == ("tcp/10.0.0.1:1",)
+    with pytest.raises(DeploymentError, match=r"network\.connect.*is no endpoint"):
+        load_deployment(OVERTAKING, "nonsense")
+
+
+def test_cars_come_and_go() -> None:
+    with pytest.raises(ZeroDivisionError), fakes(OVERTAKING) as endpoint:
+        here, there = open_zenoh("client", [endpoint]), set()
+        try:
+            here.watch(presence_of("*"), lambda key, present: (there.add if present else there.discard)(key))
+            wait_until(lambda: there == {presence_of("svea7"), presence_of("svea1")})
+            assert len(mentioning(endpoint)) == 3
+        finally:
+            here.close()
+        raise ZeroDivisionError
+    assert not mentioning(endpoint)
+
+
+def test_who_cannot_start_says_why() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(FakesError, match=rf"router has ended with status 2: tcp/127.0.0.1:{port}: no Zenoh there"):
+            fakes(OVERTAKING, port).__enter__()
+    assert not mentioning(f"tcp/127.0.0.1:{port}")
+
+
+def test_who_is_slow_is_not_waited_for() -> None:
+    port = free_port()
+    with pytest.raises(FakesError, match="router is not ready in time: it has said nothing"):
+        fakes(OVERTAKING, port, patience=0.05).__enter__()
+    assert not mentioning(f"tcp/127.0.0.1:{port}")
+
+
+def test_real_cars_have_no_fakes(tmp_path: Path) -> None:
+    file = tmp_path / "cars.toml"
+    file.write_text(OVERTAKING.read_text().replace("fakes = true", "fakes = false"))
+    with pytest.raises(CoopenvError, match=r"cars\.toml: fakes = true is missing"):
+        fakes(file).__enter__()

@@ -1,0 +1,68 @@
+"""`coopenv svea demo`: real processes in real time, none of which is left."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from coopenv.cli import app
+from coopenv.errors import CoopenvError
+from coopenv.fake.fleet import free_port
+from coopenv.runs.demo import FLEETS, Demo
+from tests.helpers.processes import COOPENV, DEADLOCK, mentioning, start, wait_until
+
+RESULTS = {"metrics.json", "trajectory.npz", "errors.png", "trajectories_2d.png", "topology.png"}
+
+
+def demo(folder: Path, port: int, *options: str) -> subprocess.Popen[str]:
+    return start((*COOPENV, "svea", "demo", "--port", str(port), *options), folder)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("environment", FLEETS)
+def test_the_demo_drives_and_can_be_run_again(environment: str, tmp_path: Path) -> None:
+    port = free_port()
+    process = demo(tmp_path, port, "--environment", environment)
+    printed, errors = process.communicate(timeout=4 * DEADLOCK)
+    assert process.returncode == 0, errors
+    assert not mentioning(f"127.0.0.1:{port}")
+    assert "RMSE" in printed and "vehicle_1: arrived at" in printed and "deadlines missed" in printed
+    assert {path.name for path in (tmp_path / "out" / environment).iterdir()} > RESULTS
+    driven = json.loads((tmp_path / "out" / environment / "metrics.json").read_text())
+    (command,) = (line.split(": ")[1] for line in printed.splitlines() if line.startswith("The drive, bit for bit"))
+    _, *arguments = command.split()
+    again = start((*COOPENV, *arguments, "--no-figures", "--json", "--out", "again"), tmp_path)
+    replayed = json.loads(again.communicate(timeout=DEADLOCK)[0])
+    assert driven["vehicles"] == replayed["vehicles"]
+    assert all(0.0 < vehicle["steady_position_rmse_m"] < 0.1 for vehicle in driven["vehicles"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", ["starting", "driving"])
+def test_an_interrupt_leaves_no_process_and_no_result(moment: str, tmp_path: Path) -> None:
+    port = free_port()
+    process = demo(tmp_path, port)
+    try:
+        wait_until(lambda: len(mentioning(f"127.0.0.1:{port}")) >= 2)
+        if moment == "driving":
+            drives = tmp_path / "out"
+            wait_until(lambda: any(path.stat().st_size > 50_000 for path in drives.glob(".*/*.mcap")))
+        os.kill(process.pid, signal.SIGINT)
+        _, errors = process.communicate(timeout=DEADLOCK)
+    finally:
+        process.kill()
+    assert process.returncode == 130 and "interrupted; nothing written" in errors
+    wait_until(lambda: not mentioning(f"127.0.0.1:{port}"))
+    assert not [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
+
+
+def test_other_environments_have_no_demo() -> None:
+    with pytest.raises(CoopenvError, match=r"svea_overtaken: has no fleet.*did you mean 'svea_overtaking'"):
+        _ = Demo("svea_overtaken", Path("out")).fleet
+    assert CliRunner().invoke(app, ["svea", "demo", "--environment", "facade"]).exit_code != 0
