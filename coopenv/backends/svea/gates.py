@@ -44,7 +44,7 @@ class Gates:
         cars: tuple[str, ...],
         limits: Limits,
         signer: Signer | None,
-        verifier: Verifier | None,
+        verifier: Verifier | None = None,
     ) -> None:
         """Listen to the gates; with a verifier only to what they have signed."""
         self._transport, self._limits, self._signer, self._verifier = transport, limits, signer, verifier
