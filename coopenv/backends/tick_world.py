@@ -53,6 +53,7 @@ class TickWorld(SensingWorld):
         self._ticks: Iterator[Sensed] = iter(())
         self._adopted: dict[int, tuple[np.ndarray, np.ndarray]] = {}
         """Rotation and body-frame position by which vehicles that are estimated elsewhere believe to be."""
+        self._parts: dict[int, SimpleNamespace] = {}
 
     def sensed(self, world: int, k: int) -> Sensed:
         """Return the present tick."""
@@ -213,9 +214,7 @@ class TickWorld(SensingWorld):
     def _told(self, vehicle: int) -> Told:
         view, message = self.view, None
         if self.observer.messages is not None:
-            memory = views_of(self.memory, fields(self.observer.memory), vehicle)
-            state = views_of(self.state, state_fields(self.precision), vehicle)
-            message = self.observer.messages.write(SimpleNamespace(memory=memory, state=state))
+            message = self.observer.messages.write(self._parts_of(vehicle))
         R = np.array(view("estimate_rotation")[0, vehicle], dtype=float)
         position = R @ np.array(view("estimate_position")[0, vehicle], dtype=float)
         return Told(vehicle, R, position, np.array(view("covariance")[0, vehicle], dtype=float), message)
@@ -224,13 +223,19 @@ class TickWorld(SensingWorld):
         """Hand a message to the embedded observer, if that has messages of its own; return whether it can read it."""
         if self.observer.messages is None:
             return True
-        memory = views_of(self.memory, fields(self.observer.memory), receiver)
-        state = views_of(self.state, state_fields(self.precision), receiver)
         try:
-            self.observer.messages.read(SimpleNamespace(memory=memory, state=state), sender, message, sent)
+            self.observer.messages.read(self._parts_of(receiver), sender, message, sent)
         except (CoopenvError, ValueError, TypeError, LookupError, ArithmeticError):
             return False
         return True
+
+    def _parts_of(self, vehicle: int) -> SimpleNamespace:
+        """Return a vehicle's part of the embedded observer's memory and of the state, as its messages see them."""
+        if vehicle not in self._parts:
+            memory = views_of(self.memory, fields(self.observer.memory), vehicle)
+            state = views_of(self.state, state_fields(self.precision), vehicle)
+            self._parts[vehicle] = SimpleNamespace(memory=memory, state=state)
+        return self._parts[vehicle]
 
 
 def _nothing(briefing: Briefing) -> Sensed:

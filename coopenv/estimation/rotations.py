@@ -95,6 +95,27 @@ def exp_se3(xi: Array) -> tuple[Array, Array]:
     return IDENTITY + a * S + b * SS, (left_jacobian @ rho[..., None])[..., 0]
 
 
+def rigid_exp(w: Array, v: Array) -> tuple[Array, Array]:
+    """Return the rotation (3, 3) and translation (3,) of Exp((w, v)), as `exp_se3` does of one pair, but faster.
+
+    Source: the closed form J v = a v + b w x v + c (w . v) w of the left Jacobian J of SO(3).
+    """
+    wx, wy, wz = w.tolist()
+    vx, vy, vz = v.tolist()
+    square = wx * wx + wy * wy + wz * wz
+    if square > 1e-8:
+        angle = math.sqrt(square)
+        a = math.sin(angle) / angle
+        b, c = 2.0 * (math.sin(angle / 2.0) / angle) ** 2, (1.0 - a) / square
+    else:
+        a, b, c = 1.0 - square / 6.0, 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
+    along = c * (wx * vx + wy * vy + wz * vz)
+    x = a * vx + b * (wy * vz - wz * vy) + along * wx
+    y = a * vy + b * (wz * vx - wx * vz) + along * wy
+    z = a * vz + b * (wx * vy - wy * vx) + along * wz
+    return exp_so3(w), np.array([x, y, z])
+
+
 def adjoint(R: Array, p: Array) -> Array:
     """Return Ad (6, 6) of T = (R, p): T Exp(xi) T^-1 = Exp(Ad xi)."""
     A = np.zeros((6, 6))

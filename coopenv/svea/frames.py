@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.errors import CoopenvError
-from coopenv.svea.lens import rays
+from coopenv.svea.lens import ray_of, rays
 from coopenv.svea.samples import Array, Calibration, Detections
 
 MOST = 1000
@@ -23,11 +23,19 @@ def detections(message: Any, calibration: Calibration, known: Collection[int] | 
     Dropped and counted: other blocks of a marker, those of unknown markers, without an area, or outside the image.
     """
     blocks = _few(message.objects, "objects")
-    rows = [(b.signature, b.center_x, b.center_y, b.width, b.height) for b in blocks]
-    table = np.array(rows, dtype=np.float64).reshape(-1, 5)
-    bearings, there = rays(table[:, 1:3], calibration)
-    there &= (table[:, 3:] >= 0.0).all(axis=-1)
-    return _frame(table[:, 0].astype(np.int64), bearings, there, table[:, 3] * table[:, 4], known)
+    width, height = calibration.image_size
+    best: dict[int, tuple[int, tuple[float, float, float]]] = {}  # marker to area and ray
+    for block in blocks:
+        u, v, marker = int(block.center_x), int(block.center_y), int(block.signature)
+        if not (0 <= u < width and 0 <= v < height and block.width >= 0 and block.height >= 0):
+            continue
+        if known is not None and marker not in known:
+            continue
+        area, ray = int(block.width) * int(block.height), ray_of(calibration, u, v)
+        if ray is not None and (marker not in best or area > best[marker][0]):
+            best[marker] = area, ray
+    unit = np.array([best[marker][1] for marker in sorted(best)], dtype=np.float64).reshape(-1, 3)
+    return Detections(tuple(sorted(best)), unit, len(blocks) - len(best))
 
 
 def bearings(message: Any, calibration: Calibration | None, known: Collection[int] | None) -> Detections:

@@ -74,6 +74,14 @@ def rays(pixels: Array, calibration: Calibration) -> tuple[Array, NDArray[np.boo
     return directions(flat), inside & there
 
 
+@lru_cache(maxsize=2**17)
+def ray_of(calibration: Calibration, u: int, v: int) -> tuple[float, float, float] | None:
+    """Return the ray of a whole pixel, as `rays` does; None: it has none. There are few enough to remember them all."""
+    unit, there = rays(np.array([[u, v]], dtype=np.float64), calibration)
+    x, y, z = unit[0].tolist()
+    return (x, y, z) if there[0] else None
+
+
 def directions(points: Array) -> Array:
     """Return the unit vectors (m, 3) through normalised image points (m, 2)."""
     through = np.concatenate([points, np.ones((len(points), 1))], axis=-1)

@@ -24,6 +24,8 @@ def numbers_of(values: Any, field: str, most: float) -> Array:
 def covariance_of(values: Any, field: str) -> Array:
     """Return (6, 6) numbers whose diagonal is not negative and that are symmetric."""
     matrix = numbers_of(values, field, 1e12).reshape(6, 6)
-    if (matrix.diagonal() < 0.0).any() or not np.allclose(matrix, matrix.T, rtol=1e-6, atol=1e-9):
+    if not matrix.any():  # often: not known
+        return matrix
+    if (matrix.diagonal() < 0.0).any() or (np.abs(matrix - matrix.T) > 1e-9 + 1e-6 * np.abs(matrix.T)).any():
         raise CoopenvError(f"{field}: is no covariance (symmetric, no negative variance)")
     return matrix

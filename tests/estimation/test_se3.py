@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.linalg import expm
 
-from coopenv.estimation.rotations import adjoint, exp_se3
+from coopenv.estimation.rotations import adjoint, exp_se3, rigid_exp
 
 
 def hat(xi: np.ndarray) -> np.ndarray:
@@ -44,3 +46,10 @@ def test_adjoint_carries_a_motion_to_the_other_side() -> None:
     rng = np.random.default_rng(2)
     T, xi = motion(rng.normal(size=6)), rng.normal(size=6)
     assert_allclose(motion(adjoint(T[:3, :3], T[:3, 3]) @ xi), T @ motion(xi) @ np.linalg.inv(T), atol=1e-12)
+
+
+@given(st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6), st.sampled_from([1.0, 1e-3, 1e-5, 0.0]))
+def test_one_pair_alone_is_the_same(values: list[float], scale: float) -> None:
+    xi = np.array(values) * scale
+    for one, many in zip(rigid_exp(xi[:3], xi[3:]), exp_se3(xi), strict=True):
+        np.testing.assert_allclose(one, many, atol=1e-9)

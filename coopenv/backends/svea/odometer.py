@@ -5,7 +5,7 @@ from collections import deque
 import numpy as np
 
 from coopenv.estimation.arrays import Array
-from coopenv.estimation.rotations import exp_se3
+from coopenv.estimation.rotations import rigid_exp
 from coopenv.svea.samples import Twist
 
 MOST_SAMPLES = 512
@@ -77,5 +77,6 @@ class Odometer:
 
     def _go(self, R: Array, p: Array, duration: int) -> tuple[Array, Array]:
         v, w = self._now
-        turn, step = exp_se3(np.concatenate([w, v]) * (duration * 1e-9))
-        return R @ turn, p + R @ step
+        seconds = duration * 1e-9
+        turn, step = rigid_exp(w * seconds, v * seconds)
+        return R.dot(turn), p + R.dot(step)
