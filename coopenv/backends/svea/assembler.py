@@ -68,7 +68,8 @@ class Assembler:
         self._to_body = [camera_to_body(camera) for camera in scenario.cameras]
         self._markers = [np.array(vehicle.marker) for vehicle in scenario.vehicles]
         self._cars = [_Car() for _ in scenario.vehicles]
-        self._heard: dict[int, dict[Role, tuple[int, Pose | Report]]] = {}
+        self._heard: dict[int, dict[Role, tuple[int, Pose | Report]]] = {}  # since the last tick
+        self._said: dict[tuple[int, Role], int] = {}  # stamp of a vehicle's last message
         self._begin = 0
         self.refused: Counter[str] = Counter()
         """Samples that were not used, by reason."""
@@ -102,11 +103,11 @@ class Assembler:
         elif role is Role.TRUTH and isinstance(value, Pose):
             car.track.put(stamp, self._on_map(value))
         elif isinstance(value, Pose | Report) and vehicle not in self.binding.local:
-            known = self._heard.setdefault(vehicle, {})
-            if role in known and stamp <= known[role][0]:
+            if stamp <= self._said.get((vehicle, role), 0):  # older, or replayed
                 self.refused["message out of order"] += 1
                 return
-            known[role] = stamp, self._on_map(value) if isinstance(value, Pose) else value
+            self._said[vehicle, role] = stamp
+            self._heard.setdefault(vehicle, {})[role] = stamp, self._on_map(value) if isinstance(value, Pose) else value
 
     def _on_map(self, pose: Pose) -> Pose:
         """Return a pose in the coordinates of the scenario's file as one on its map."""
