@@ -27,7 +27,7 @@ def drive(env, **options):
     record = [infos]
     while env.agents:
         actions = act(driver, {agent: observations[agent] for agent in env.agents})
-        observations, _rewards, _terminated, _truncated, infos = env.step(actions)
+        observations, *_, infos = env.step(actions)
         record.append(infos)
     env.close()
     return record

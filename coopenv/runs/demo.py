@@ -19,6 +19,8 @@ from coopenv.runs.command import execute, report
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.links import links_line, links_report
 from coopenv.runs.rollouts import Rollout
+from coopenv.runs.side_by_side import Episodes, side_by_side
+from coopenv.scenario import load_scenario
 from coopenv.shipped import data_directory
 
 FLEETS = {"svea_overtaking": "overtaking.toml", "svea_crossing": "crossing.toml"}
@@ -37,6 +39,10 @@ class Demo:
     policy: str = "route_follower"
     seed: int = 0
     overrides: Mapping[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+    """Further seeds are driven until the cars have driven so long, s."""
+    beside: bool = False
+    """Whether the same seeds are simulated, too, and stand beside."""
 
     @property
     def fleet(self) -> Path:
@@ -77,20 +83,19 @@ class Punctuality:
         )
 
 
-def run_demo(demo: Demo, port: int | None, seconds: float, log: Console, out: Console) -> None:
+def run_demo(demo: Demo, port: int | None, log: Console, out: Console) -> None:
     """Start everything, drive, report, and end everything.
 
     Args:
         demo: what is shown.
         port: of the router (None: a free one).
-        seconds: further seeds are driven until the cars have driven so long.
         log: progress.
         out: results.
 
     Raises:
         CoopenvError: a process does not start, the cars cannot be armed, or results cannot be written.
     """
-    fleet, kept = demo.fleet, Punctuality()
+    fleet, kept, driven = demo.fleet, Punctuality(), Episodes(STEADY_FROM)
     with writing(demo.drive.parent):
         demo.drive.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
@@ -99,12 +104,21 @@ def run_demo(demo: Demo, port: int | None, seconds: float, log: Console, out: Co
         tape = stack.enter_context(replacing_file(demo.drive))
         backend = open_svea(fleet, demo.environment, demo.overrides, record=tape, connect=router)
         stack.callback(backend.close)
-        _drive(demo, backend, seconds, kept, log, out)
+        _drive(demo, backend, kept, driven, log, out)
+    backends = {"fakes": driven}
+    if demo.beside:
+        backends["simulation"] = _simulate(demo, len(driven), log)
+    if len(driven) > 1 or demo.beside:
+        out.print()
+        out.print(side_by_side(backend.scenario.vehicle_names, backends))
+        out.print(f"RMSE: after {STEADY_FROM:g} s, up to the vehicle's end. SE: standard error over the seeds.")
+        out.print("Hidden: frames in which a static landmark is not seen.")
     out.print(kept.line(), soft_wrap=True)
     out.print(f"The drive, bit for bit: coopenv run {demo.drive} --steady-from {STEADY_FROM:g}", soft_wrap=True)
 
 
-def _drive(demo: Demo, backend: Svea, seconds: float, kept: Punctuality, log: Console, out: Console) -> None:
+def _drive(demo: Demo, backend: Svea, kept: Punctuality, driven: Episodes, log: Console, out: Console) -> None:
+    """Drive seed after seed; the first one is reported as a run."""
     run = Rollout(backend.scenario, demo.seed, policy=demo.policy, backend=backend, options={"arm": True})
     watched = partial(links_line, backend)
     name, changes = demo.environment, dict(demo.overrides)
@@ -112,13 +126,28 @@ def _drive(demo: Demo, backend: Svea, seconds: float, kept: Punctuality, log: Co
     kept.count(backend, run)
     report(run, result, demo.out, out)
     links_report(backend, out)
-    while kept.time < seconds and backend.watchdog.trip is None:
+    while backend.watchdog.trip is None:
+        driven.add(run)
+        if kept.time >= demo.seconds:
+            return
         run.seed += 1
-        with Progress(log, f"seed {run.seed}", run.ticks_planned) as progress:
+        with Progress(log, f"seed {run.seed}") as progress:
             for tick in run.play():
                 progress.update(tick, f"seed {run.seed}: {watched()}")
         kept.count(backend, run)
         ends = ", ".join(f"{ending.outcome} at {ending.time:.1f} s" for ending in run.endings())
         out.print(f"seed {run.seed}: {ends}", soft_wrap=True)
-    if backend.watchdog.trip is not None and kept.time < seconds:
-        out.print(f"Stopped: {backend.watchdog.trip.reason}", soft_wrap=True)
+    out.print(f"Stopped: {backend.watchdog.trip.reason}", soft_wrap=True)
+
+
+def _simulate(demo: Demo, episodes: int, log: Console) -> Episodes:
+    """Return the same seeds under the same policy in the simulation."""
+    run = Rollout(load_scenario(demo.environment, demo.overrides), demo.seed, policy=demo.policy)
+    simulated = Episodes(STEADY_FROM)
+    with compile_notice(log), Progress(log, "the same seeds in the simulation", episodes) as progress:
+        for run.seed in range(demo.seed, demo.seed + episodes):
+            for _ in run.play():
+                pass
+            simulated.add(run)
+            progress.advance()
+    return simulated

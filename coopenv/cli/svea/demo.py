@@ -23,6 +23,9 @@ def demo(
     seconds: Annotated[
         float, typer.Option(min=0.0, help="Go on with further seeds until the cars have driven so long, s.")
     ] = 0.0,
+    beside: Annotated[
+        bool, typer.Option("--beside", help="Simulate the same seeds, too, and print both side by side.")
+    ] = False,
     overrides: options.Overrides = None,
 ) -> None:
     """Let fake cars drive an experiment in real time: table, figures, and a drive that can be run again.
@@ -32,5 +35,6 @@ def demo(
     """
     from coopenv.runs.demo import Demo, run_demo
 
-    chosen = Demo(environment, out or Path("out") / environment, policy, seed, options.parse_overrides(overrides))
-    run_demo(chosen, port, seconds, options.console(stderr=True), options.console())
+    changes, folder = options.parse_overrides(overrides), out or Path("out") / environment
+    chosen = Demo(environment, folder, policy, seed, changes, seconds, beside)
+    run_demo(chosen, port, options.console(stderr=True), options.console())
