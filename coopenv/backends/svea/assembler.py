@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from coopenv.backends.svea.binding import Binding
 from coopenv.backends.svea.frames import Frames
 from coopenv.backends.svea.odometer import Odometer
+from coopenv.backends.svea.place_track import PlaceTrack
 from coopenv.backends.svea.pose_track import PoseTrack
 from coopenv.backends.svea.v2x import message_of
 from coopenv.estimation.arrays import Array
@@ -64,7 +65,7 @@ class Assembler:
         self._origin = origin = np.array(scenario.map.origin)
         places = [np.array(m.position) + rotation_of(m.yaw, None) @ np.array(m.marker) for m in scenario.landmarks]
         self._landmarks = np.array(places).reshape(-1, 3) - origin
-        self._led: dict[int, int] = {}  # landmark to the stamp of its last position
+        self._led = {landmark: PlaceTrack() for landmark in binding.leaders.values()}
         self._to_body = [camera_to_body(camera) for camera in scenario.cameras]
         self._markers = [np.array(vehicle.marker) for vehicle in scenario.vehicles]
         self._cars = [_Car() for _ in scenario.vehicles]
@@ -87,11 +88,11 @@ class Assembler:
             self._put_vehicle(self.binding.cars[sample.car], sample.role, stamp, value)
 
     def _put_leader(self, landmark: int, role: Role, stamp: int, value: object) -> None:
-        if role in (Role.ESTIMATE, Role.POINT) and isinstance(value, Pose) and stamp > self._led.get(landmark, 0):
+        if role in (Role.ESTIMATE, Role.POINT) and isinstance(value, Pose):
             marker = np.array(self.binding.scenario.landmarks[landmark].marker)
             message = message_of(self._on_map(value), marker)
             if message.position is not None:
-                self._landmarks[landmark], self._led[landmark] = message.position, stamp
+                self._led[landmark].put(stamp, message.position)
 
     def _put_vehicle(self, vehicle: int, role: Role, stamp: int, value: object) -> None:
         car = self._cars[vehicle]
@@ -171,7 +172,7 @@ class Assembler:
             angular_velocity=angular_velocity,
             bearings=bearings,
             visible=visible,
-            landmarks=sealed(self._landmarks.copy()),
+            landmarks=sealed(self._places()),
             odometry_age=odometry_age,
             bearing_age=bearing_age,
             missing=missing,
@@ -203,10 +204,18 @@ class Assembler:
             target = self.binding.targets.get(marker)
             if target is None or target == len(self._landmarks) + i:
                 self.refused["unknown marker"] += 1
-            elif target in self.binding.leaders.values() and now - self._led.get(target, 0) > STALE:
+            elif target in self._led and now - self._led[target].stamp > STALE:
                 self.refused["landmark of unknown position"] += 1
             else:
                 bearings[target], visible[target] = self._to_body[i] @ ray, True
+
+    def _places(self) -> Array:
+        """Return (L, 3) where the landmarks were when the frames of the tick were exposed, the mean of its moments."""
+        places: Array = self._landmarks.copy()
+        when = sum(self.moment(i) for i in self.binding.local) // len(self.binding.local)
+        for landmark, track in self._led.items():
+            places[landmark] = places[landmark] if track.stamp < 0 else track.at(when)
+        return places
 
     def _messages(self, now: int) -> dict[tuple[int, int], Received]:
         """Return what has come from vehicles that are estimated elsewhere since the last tick."""

@@ -1,0 +1,36 @@
+"""Where a moving landmark was, as it has told, at any time between."""
+
+from collections import deque
+
+import numpy as np
+
+from coopenv.estimation.arrays import Array
+
+KEPT = 64  # positions: a second of them
+
+
+class PlaceTrack:
+    """The last positions of one landmark; times in ns on one clock."""
+
+    def __init__(self) -> None:
+        self._places: deque[tuple[int, Array]] = deque(maxlen=KEPT)
+
+    @property
+    def stamp(self) -> int:
+        """When it was at the last one; -1: it has told none."""
+        return self._places[-1][0] if self._places else -1
+
+    def put(self, stamp: int, position: Array) -> None:
+        """Take a position (3,), unless it is older than one before."""
+        if stamp > self.stamp:
+            self._places.append((stamp, position))
+
+    def at(self, time: int) -> Array:
+        """Return the position (3,) at a time: between two on the straight line, else the nearest one that is known.
+
+        Nothing is put in for what is not known yet: a camera frame is older than the last position where messages come
+        in time.
+        """
+        stamps = np.array([stamp - time for stamp, _ in self._places], dtype=np.float64)
+        places = np.array([place for _, place in self._places])
+        return np.array([np.interp(0.0, stamps, axis) for axis in places.T])
