@@ -180,7 +180,8 @@ class Fake:
     def _tick_gate(self, due: int, _stamp: int) -> None:
         """Let the gate say what the wheels are to do; a computer that stands still says nothing."""
         if self._link is not None and not self._faults.value("freeze", due):
-            self._obey(self._link.tick(), due)
+            # The dead time of the scenario is that from a command to its effect, the gate's turn in it.
+            self._obey(self._link.tick(), max(self._link.commanded, due - PERIOD))
 
     def _obey(self, payload: bytes, at: int) -> None:
         manual = decode(payload, TOPICS[Role.MANUAL].type)

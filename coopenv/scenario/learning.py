@@ -96,6 +96,9 @@ class Dynamics(Part):
     """Dead time between a decision and its effect, s; at most one decision period."""
     dead_band: NonNegative = 0.0
     """Speed commands of a smaller magnitude do not move the car, as its speed controller has them, m/s."""
+    gated: bool = False
+    """Whether commands change from one decision to the next by no more than the acceleration and `max_steering_rate`
+    permit, as the gate of a SVEA car sees to; otherwise it is the car alone that takes its time."""
 
     @model_validator(mode="after")
     def _can_move(self) -> Self:

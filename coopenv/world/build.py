@@ -156,6 +156,7 @@ def _dynamics(d: Dynamics, scenario: Scenario) -> dict[str, Any]:
         "min_speed": -d.max_speed if d.reverse else 0.0,
         "speed_lag": 0.0 if accelerates else d.speed_time_constant,  # an acceleration acts at once
         "steering_lag": d.steering_time_constant,
+        "gated": int(d.gated),
         "latency_ticks": round(d.latency * scenario.rates.camera),
         "acceleration_mode": int(accelerates),
         "action_steering": scenario.action.steering or d.max_steering,

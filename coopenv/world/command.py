@@ -46,6 +46,16 @@ def command_of(d: Any, first: Any, steering: Any, pan: Any):
 
 
 @wp.func
+def gradually(d: Any, command: Any, before: Any, duration: Any):
+    """Return a command that differs from the one before by no more than is permitted in a decision's duration, s."""
+    step = command[ACCELERATION] * duration
+    turn = d.max_steering_rate * duration
+    command[SPEED] = wp.clamp(command[SPEED], before[SPEED] - step, before[SPEED] + step)
+    command[STEERING] = wp.clamp(command[STEERING], before[STEERING] - turn, before[STEERING] + turn)
+    return command
+
+
+@wp.func
 def decide(model: Any, state: Any, actions: Any, world: int):
     """Turn the actions of a decision that begins into commands; who has ended is to stand."""
     for vehicle in range(model.vehicles):
@@ -56,6 +66,9 @@ def decide(model: Any, state: Any, actions: Any, world: int):
         if model.action_size > 2:
             pan = state.action[world, vehicle, 2]
         command = command_of(model.dynamics[vehicle], first, state.action[world, vehicle, 1], pan)
+        if model.dynamics[vehicle].gated == 1:
+            duration = type(first)(model.camera_period) * type(first)(model.ticks_per_decision)
+            command = gradually(model.dynamics[vehicle], command, state.last_command[world, vehicle], duration)
         if state.ended[world, vehicle] != UNDER_WAY:
             command[SPEED] = type(first)(0.0)
             command[ACCELERATION] = model.dynamics[vehicle].max_acceleration

@@ -78,6 +78,7 @@ def model_struct(p: Precision) -> Any:
         steering_lag: scalar
         latency_ticks: wp.int32
         dead_band: scalar  # m/s
+        gated: wp.int32  # 1: commands change gradually
         acceleration_mode: wp.int32  # 1: the first entry of an action is an acceleration
         action_steering: scalar  # of an action of 1
         pan_limit: scalar  # of the camera; 0: it does not turn

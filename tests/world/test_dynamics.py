@@ -227,6 +227,30 @@ def test_a_dead_band_above_the_top_speed_is_refused() -> None:
         driven({"dead_band": 2.0})
 
 
+def test_gated_commands_change_as_fast_as_is_permitted() -> None:
+    """Without lags, so that speed and steering are the commands: 1 m/s^2 and 2 rad/s at ten decisions a second."""
+    made = {
+        "gated": True,
+        "max_acceleration": 1.0,
+        "max_steering_rate": 2.0,
+        "speed_time_constant": 0.0,
+        "steering_time_constant": 0.0,
+    }
+    rows = path(drive(driven(made), [(1.0, 1.0)] * 6 + [(-1.0, -1.0)] * 6))
+    decisions = np.arange(1, 7)
+    assert_allclose(rows[1:7, 3], np.minimum(0.1 * decisions, 1.53), atol=1e-9)
+    assert_allclose(rows[1:7, 4], np.minimum(0.2 * decisions, 0.6981317), atol=1e-6)
+    assert_allclose(rows[7:13, 3], 0.6 - 0.1 * decisions, atol=1e-9)
+    ungated = path(drive(driven({**made, "gated": False}), [(1.0, 1.0)] * 3))
+    assert_allclose(ungated[1:4, 3], 0.1 * decisions[:3], atol=1e-9)  # the car alone is as slow
+
+
+def test_a_gate_in_front_of_a_lag_is_slower_than_the_lag_alone() -> None:
+    gated, free = (path(drive(driven({"gated": g, "max_acceleration": 1.0}), [(0.0, 0.0)] * 10)) for g in (True, False))
+    assert (gated[1:6, 3] < free[1:6, 3] - 0.01).all()
+    assert_allclose(gated[-1, 3], free[-1, 3], atol=0.05)
+
+
 def run_within_decision(world: Any, ticks: int) -> list[dict[str, np.ndarray]]:
     """Return the state after 1, 2, ... ticks of one and the same decision."""
     saved, states = world.get_state(), []

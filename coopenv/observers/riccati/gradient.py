@@ -200,6 +200,7 @@ def check_differentiable(scenario: Scenario) -> None:
         "camera.quantise must be false and camera.undistort true": all(c.undistort and not c.quantise for c in cameras),
         "dynamics.latency must be the same for every vehicle": len({limits.latency for limits in scenario.limits}) == 1,
         "observer.name must be 'riccati' with k = 1": observer.name == "riccati" and observer.k == 1.0,
+        "dynamics.gated must be false": not any(limits.gated for limits in scenario.limits),
         "action.pan must not be there": scenario.action.pan is None,
         "rates.observer must not be below rates.camera": (scenario.rates.observer or math.inf) >= scenario.rates.camera,
     }

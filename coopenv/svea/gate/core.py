@@ -63,6 +63,11 @@ class Gate:
         return self._nonce
 
     @property
+    def commanded(self) -> int:
+        """When the last valid command came, steady clock, ns."""
+        return self._commanded
+
+    @property
     def state(self) -> State:
         """The state at this instant."""
         if self._wanted is not None and self._clock.steady() - self._commanded > TIMEOUT:

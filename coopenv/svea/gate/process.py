@@ -50,6 +50,12 @@ class Link:
         self._ticks += 1
         return payload
 
+    @property
+    def commanded(self) -> int:
+        """When the last valid command came, steady clock, ns."""
+        with self._lock:
+            return self._gate.commanded
+
     def tell(self) -> None:
         """Send the status, and that the car has been stopped if it has."""
         self.news.clear()
