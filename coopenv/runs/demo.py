@@ -106,9 +106,9 @@ def run_demo(demo: Demo, port: int | None, log: Console, out: Console) -> None:
         stack.callback(backend.close)
         _drive(demo, backend, kept, driven, log, out)
     backends = {"fakes": driven}
-    if demo.beside:
+    if demo.beside and driven:
         backends["simulation"] = _simulate(demo, len(driven), log)
-    if len(driven) > 1 or demo.beside:
+    if len(driven) > 1 or "simulation" in backends:
         out.print()
         out.print(side_by_side(backend.scenario.vehicle_names, backends))
         out.print(f"RMSE: after {STEADY_FROM:g} s, up to the vehicle's end. SE: standard error over the seeds.")

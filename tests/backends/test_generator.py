@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 import coopenv
 from coopenv import CoopenvError
 from coopenv.api.engine import Engine
+from coopenv.backends.base import Told
 from coopenv.observers import Message, Received, register, run
 from coopenv.observers.dead_reckoning import DeadReckoning
 from coopenv.observers.recording import Sensed
@@ -285,6 +286,36 @@ def test_messages_may_come_from_elsewhere(observer: str, extra: dict[str, np.nda
         assert [sorted(h) for h in heard] == [[], [], [0]] and heard[2][0][0] == 6
     if observer == "robust":
         assert engine.world.memory.inbox.numpy()["valid"][0].tolist() == [[0] * 3, [0] * 3, [1, 0, 0]]
+
+
+class Talkative(Fleet):
+    """Takes what vehicles have to say."""
+
+    def __init__(self, observer: str) -> None:
+        super().__init__(observer)
+        self.told: list[Told] = []
+
+    def tell(self, told: Sequence[Told]) -> None:
+        self.told.extend(told)
+
+    def notes(self, vehicle: int) -> dict[str, Any]:
+        return {}
+
+
+@pytest.mark.parametrize("observer", ["riccati", "robust"])
+def test_it_is_told_what_embedded_observers_say(observer: str) -> None:
+    fleet = Talkative(observer)
+    engine = Engine(fleet.scenario, 1, "float64", backend=fleet)
+    engine.reset([0])
+    engine.step(ticks=9)
+    assert [told.vehicle for told in fleet.told] == [0, 1, 2] * 10
+    for told in fleet.told[-3:]:
+        estimate = engine.view("estimate_position")[0, told.vehicle]
+        assert_allclose(told.rotation.T @ told.position, estimate)
+        assert told.message is not None
+        if observer == "riccati":  # the other one's reports are of a tick before
+            marker = told.rotation @ fleet.scenario.vehicles[told.vehicle].marker
+            assert_allclose(told.message.position, told.position + marker, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from collections import deque
 
 import numpy as np
 
+from coopenv.backends.svea.pose_track import LONGEST_GAP
 from coopenv.estimation.arrays import Array
 
 KEPT = 64  # positions: a second of them
@@ -26,11 +27,16 @@ class PlaceTrack:
             self._places.append((stamp, position))
 
     def at(self, time: int) -> Array:
-        """Return the position (3,) at a time: between two on the straight line, else the nearest one that is known.
+        """Return the position (3,) at a time: between two on the straight line, and for a while beyond the last one.
 
-        Nothing is put in for what is not known yet: a camera frame is older than the last position where messages come
-        in time.
+        Before the first one that is kept it is that one.
         """
+        last, place = self._places[-1]
+        if time > last and len(self._places) > 1:
+            before, earlier = self._places[-2]
+            if last - before <= LONGEST_GAP:
+                going: Array = place + (place - earlier) * (min(time - last, LONGEST_GAP) / (last - before))
+                return going
         stamps = np.array([stamp - time for stamp, _ in self._places], dtype=np.float64)
         places = np.array([place for _, place in self._places])
         return np.array([np.interp(0.0, stamps, axis) for axis in places.T])

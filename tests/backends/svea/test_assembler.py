@@ -120,6 +120,23 @@ def test_odometry_and_bearings_are_of_the_moment_when_the_frame_was_exposed() ->
     assert seen > 110  # hardly a frame is lost to the drift of two clocks
 
 
+def test_a_moving_landmark_is_where_it_was_when_the_frame_was_exposed() -> None:
+    given = [landmark(name, place) for name, place in LANDMARKS.items()]
+    ml = landmark("ML", (3.0, 0.0, 0.0), motion={"kind": "constant", "linear": [0.5, 0, 0]}, marker=[0.0, 0.0, 0.3])
+    fleet = [Car(name="car0", marker=5), Car(name="lead", landmark="ML", marker=4)]
+    assembler = Assembler(bind(world(landmarks=[*given, ml]), fleet, MARKERS, "lab.toml", None))
+    said = [
+        sample(Role.ESTIMATE, START + k * 16 * MS, Pose(np.array([3.0 + 0.5 * 0.016 * k, 0, 0]), np.eye(3)), "lead")
+        for k in range(120)
+    ]
+    samples = sorted((*Senses(Path(3.0), 2.0).samples, *said), key=lambda s: s.received)
+    for now, tick in ticks(assembler, samples, 0.5, 60):
+        t = (assembler.moment(0) - START) * 1e-9
+        assert assembler.moment(0) < now
+        if tick.index > 1:
+            np.testing.assert_allclose(tick.landmarks[3], [3.0 + 0.5 * t, 0.0, 0.3], atol=1e-6)
+
+
 def test_frames_that_do_not_come_leave_a_tick_in_which_nothing_is_seen() -> None:
     path = Path(3.0)
     samples = Senses(path, 3.0).samples
