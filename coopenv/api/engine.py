@@ -99,6 +99,9 @@ class Engine:
             self.plugins.start(np.flatnonzero(chosen))
         self._fresh.assign(chosen.astype(np.int32))
         self._report.fill("results fresh", self._fresh, self._fresh)
+        if self.backend.capabilities.real_time and not self.begun:
+            self.refresh()  # once, as every step does: the first one must not wait for its launch
+            self._report.fill("results fresh", self._fresh, self._fresh)
         self.begun = True
         return seeds
 

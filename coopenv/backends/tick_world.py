@@ -96,7 +96,10 @@ class TickWorld(SensingWorld):
     def load(self) -> None:
         """Load the kernels, see `World.load`."""
         super().load()
+        self.mask.fill_(1)  # so that nothing moves: in real time the first tick must not wait for its launch
+        super().advance(1)
         self.decide()
+        self.mask.zero_()
 
     def advance(self, ticks: int) -> None:
         """Run camera ticks, as many as the backend gives."""

@@ -1,5 +1,6 @@
 """The SVEA backend: cars on a network in place of the simulated ones."""
 
+import gc
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -147,6 +148,7 @@ class Svea:
         self._listen(arm)
         if arm:
             self._arm()
+        gc.collect()  # rather now than between two deadlines
         self._drain()
         self._began, self._index = self._pacer.start(), 0
         self._key, self._episode = (self._key, self._episode + 1) if seed is None else (seed, 0)
