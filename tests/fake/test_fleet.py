@@ -6,9 +6,11 @@ import socket
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from coopenv.backends.svea.binding import bind
 from coopenv.backends.svea.opening import scenario_of
+from coopenv.cli import app
 from coopenv.errors import CoopenvError
 from coopenv.fake.fleet import FakesError, fakes, free_port
 from coopenv.svea.deployment import DeploymentError, load_deployment
@@ -44,10 +46,25 @@ def test_cars_come_and_go() -> None:
             here.watch(presence_of("*"), lambda key, present: (there.add if present else there.discard)(key))
             wait_until(lambda: there == {presence_of("svea7"), presence_of("svea1")})
             assert len(mentioning(endpoint)) == 3
+            command = ["svea", "health", str(OVERTAKING), "--connect", endpoint, "--car"]
+            said = CliRunner().invoke(app, [*command, "svea7"])
+            assert said.output == "svea7: gate disarmed, 0 commands accepted, 0 messages refused\n"
         finally:
             here.close()
         raise ZeroDivisionError
     assert not mentioning(endpoint)
+
+
+def test_a_gate_that_is_not_there_is_not_well() -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    router = open_zenoh("router", listen=[endpoint])
+    try:
+        command = ["svea", "health", str(OVERTAKING), "--connect", endpoint, "--patience", "0.2", "--car"]
+        found = CliRunner().invoke(app, [*command, "svea7"])
+        assert isinstance(found.exception, CoopenvError)
+        assert "svea7: its gate has said nothing for 0.2 s on fleet/svea7/coopenv/gate" in str(found.exception)
+    finally:
+        router.close()
 
 
 def test_who_cannot_start_says_why() -> None:

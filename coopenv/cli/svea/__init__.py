@@ -5,6 +5,7 @@ import typer
 from coopenv.cli.svea.demo import demo
 from coopenv.cli.svea.fake import fake
 from coopenv.cli.svea.gate import gate
+from coopenv.cli.svea.health import health
 from coopenv.cli.svea.keys import keys
 from coopenv.cli.svea.router import router
 from coopenv.cli.svea.run import run
@@ -13,6 +14,7 @@ svea = typer.Typer(name="svea", help="SVEA cars, real ones and fakes.", no_args_
 svea.command()(demo)
 svea.command()(fake)
 svea.command()(gate)
+svea.command()(health)
 svea.command()(keys)
 svea.command()(router)
 svea.command()(run)

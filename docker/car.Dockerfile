@@ -1,0 +1,24 @@
+# The command gate of one car, and nothing else; see docs/cars.md.
+#
+#   docker build -f docker/car.Dockerfile -t coopenv-gate .
+#
+FROM python:3.11-slim
+
+ENV PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 PIP_NO_CACHE_DIR=1 PIP_DISABLE_PIP_VERSION_CHECK=1
+
+COPY . /src
+RUN pip install --constraint /src/constraints.txt '/src[svea]' && rm -rf /src
+
+# Keys and deployment are mounted here, readable for the user that runs the container and nobody else.
+VOLUME /etc/coopenv
+RUN useradd --system --uid 1000 --no-create-home coopenv
+USER coopenv
+
+ENV CAR=svea7
+# No port is exposed: the gate connects to the car's own bridge or router.
+HEALTHCHECK --interval=5s --timeout=5s --start-period=10s --retries=3 \
+    CMD coopenv svea health /etc/coopenv/fleet.toml --car "$CAR"
+
+# Neutral goes out before the gate does.
+STOPSIGNAL SIGTERM
+CMD exec coopenv svea gate /etc/coopenv/fleet.toml --car "$CAR"
