@@ -20,6 +20,9 @@ from coopenv.policies import load_agent
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
+from coopenv.svea.deployment import Car, Deployment, Safety, Security, Sensors
+from coopenv.svea.network import Network, Tls
+from coopenv.svea.topics import TOPICS
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -90,6 +93,22 @@ def test_the_programs_on_agents_run(tmp_path: Path, capsys: pytest.CaptureFixtur
     policy = load_agent(f"{tmp_path / 'mine.py'}:Mine", scenario)
     rows = np.zeros((3, observation_layout(scenario).size), dtype=np.float32)
     np.testing.assert_array_equal(policy(rows), [[0.0, 0.0]] * 3)
+
+
+def test_the_page_on_cars_lists_every_topic_and_field_of_the_deployment() -> None:
+    rows = [line for line in (DOCS / "cars.md").read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
+    for topic in TOPICS.values():
+        (row,) = (row for row in rows if row.startswith(f"| `{topic.suffix}` | `{topic.type.replace('/msg/', '/')}` |"))
+        age = row.split(" | ")[4].strip()
+        assert age == ("" if topic.max_age is None else f"{topic.max_age:g}")
+    parts = {"": Deployment, "cars.": Car, "network.": Network, "network.tls.": Tls}
+    parts |= {"sensors.": Sensors, "safety.": Safety, "security.": Security}
+    wanted = {f"{prefix}{name}" for prefix, part in parts.items() for name in part.model_fields}
+    told = {row.split("`")[1]: row.split("|")[2].strip() for row in rows}
+    assert wanted - told.keys() == {"folder", "network", "sensors", "safety", "security"}  # the last four are sections
+    for name, field in Safety.model_fields.items():
+        if isinstance(field.default, float):
+            assert float(told[f"safety.{name}"]) == pytest.approx(field.default, rel=1e-4)
 
 
 @pytest.mark.train
