@@ -142,13 +142,13 @@ class Svea:
             CoopenvError: an option is not known, or something is not as it has to be before wheels turn.
         """
         self._stop("reset")
+        _tidy_up()
         arm = wants_to_arm(options)
         if self.deployment.fakes:
             self._place_fakes(0 if seed is None else seed)
         self._listen(arm)
         if arm:
             self._arm()
-        gc.collect()  # rather now than between two deadlines
         self._drain()
         self._began, self._index = self._pacer.start(), 0
         self._key, self._episode = (self._key, self._episode + 1) if seed is None else (seed, 0)
@@ -293,6 +293,13 @@ class Svea:
         if self._tape is not None:
             self._tape.close()
         self._transport.close()
+        gc.unfreeze()
+
+
+def _tidy_up() -> None:
+    """Free memory now, and look no more at what is left: a look at everything takes longer than a decision may."""
+    gc.collect()
+    gc.freeze()
 
 
 def _wait(ready: Callable[[], bool], patience: float) -> None:

@@ -14,6 +14,7 @@ from coopenv.svea.deployment import Safety
 
 PERIOD = 0.01  # s between looks
 REPEAT = 0.2  # s between emergency stops that are sent again
+STALL = 0.05  # s by which a look may come late: beyond that messages wait to be received, and silence says nothing yet
 OPEN = ("armed", "timed_out")
 """States of a gate that takes commands: one that has timed out lets the car stand until the next one."""
 
@@ -111,8 +112,12 @@ class Watchdog:
         self._thread.join(timeout=1.0)
 
     def _watch(self) -> None:
-        repeated = 0.0
+        repeated, looked, stalled = 0.0, time.monotonic(), False
         while not self._closed.wait(PERIOD):
+            before, looked = looked, time.monotonic()
+            stalled = not stalled and looked - before > PERIOD + STALL
+            if stalled:  # once: the next look tells, and comes so soon that no car gets further for it
+                continue
             if self._armed:
                 try:
                     found = next(self._problems(), None)
