@@ -20,7 +20,7 @@ from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.links import links_line, links_report
 from coopenv.runs.rollouts import Rollout
 from coopenv.runs.side_by_side import Episodes, side_by_side
-from coopenv.scenario import load_scenario
+from coopenv.scenario import Scenario
 from coopenv.shipped import data_directory
 
 FLEETS = {"svea_overtaking": "overtaking.toml", "svea_crossing": "crossing.toml"}
@@ -43,10 +43,14 @@ class Demo:
     """Further seeds are driven until the cars have driven so long, s."""
     beside: bool = False
     """Whether the same seeds are simulated, too, and stand beside."""
+    deployment: Path | None = None
+    """One's own deployment file, whose cars are fakes; `environment` is its environment then."""
 
     @property
     def fleet(self) -> Path:
         """Its deployment file. Raises CoopenvError: the environment has none."""
+        if self.deployment is not None:
+            return self.deployment
         if self.environment not in FLEETS:
             known = f"{suggest(self.environment, FLEETS)}; known: {listed(list(FLEETS))}"
             raise CoopenvError(f"--environment {self.environment}: has no fleet of fakes{known}")
@@ -102,12 +106,13 @@ def run_demo(demo: Demo, port: int | None, log: Console, out: Console) -> None:
         with compile_notice(log), Progress(log, "starting a router and fake cars"):
             router = stack.enter_context(fakes(fleet, port, demo.seed))
         tape = stack.enter_context(replacing_file(demo.drive))
-        backend = open_svea(fleet, demo.environment, demo.overrides, record=tape, connect=router)
+        environment = None if demo.deployment else demo.environment
+        backend = open_svea(fleet, environment, demo.overrides, record=tape, connect=router)
         stack.callback(backend.close)
         _drive(demo, backend, kept, driven, log, out)
     backends = {"fakes": driven}
     if demo.beside and driven:
-        backends["simulation"] = _simulate(demo, len(driven), log)
+        backends["simulation"] = _simulate(demo, backend.scenario, len(driven), log)
     if len(driven) > 1 or "simulation" in backends:
         out.print()
         out.print(side_by_side(backend.scenario.vehicle_names, backends))
@@ -140,9 +145,9 @@ def _drive(demo: Demo, backend: Svea, kept: Punctuality, driven: Episodes, log: 
     out.print(f"Stopped: {backend.watchdog.trip.reason}", soft_wrap=True)
 
 
-def _simulate(demo: Demo, episodes: int, log: Console) -> Episodes:
+def _simulate(demo: Demo, scenario: Scenario, episodes: int, log: Console) -> Episodes:
     """Return the same seeds under the same policy in the simulation."""
-    run = Rollout(load_scenario(demo.environment, demo.overrides), demo.seed, policy=demo.policy)
+    run = Rollout(scenario, demo.seed, policy=demo.policy)
     simulated = Episodes(STEADY_FROM)
     with compile_notice(log), Progress(log, "the same seeds in the simulation", episodes) as progress:
         for run.seed in range(demo.seed, demo.seed + episodes):

@@ -66,6 +66,8 @@ def outcome_line(run: Rollout) -> str:
         end = f"all vehicles had ended by {max(ending.time for ending in run.endings()):.4g} s"
     elif run.ticks_recorded >= run.scenario.horizon_ticks:
         end = f"horizon reached at {time:g} s"
+    elif run.ticks_recorded < run.ticks_planned:
+        end = f"ended before its time, at {time:g} s"
     else:
         end = f"stopped after the steps asked for, at {time:g} s"
     return f"{end} ({', '.join(parts)})" if parts else end

@@ -27,10 +27,16 @@ def test_the_shipped_fleets_are_those_of_their_environments(path: Path) -> None:
     fleet = load_deployment(path)
     scenario = scenario_of(fleet, None, {})
     binding = bind(scenario, fleet.cars, fleet.markers, path.name, None)
-    carriers = {target for target in binding.targets.values()}
-    assert carriers == set(range(len(scenario.landmarks) + len(scenario.vehicles)))
+    landmarks = len(scenario.landmarks)
+    marked = {landmarks + binding.cars[car.name] for car in fleet.cars if car.marker and car.name in binding.cars}
+    assert set(binding.targets.values()) == marked | set(range(landmarks))
+    assert len(fleet.cars) == len(scenario.vehicles) + len(binding.leaders)
     assert fleet.fakes and fleet.network.connect == ("tcp/127.0.0.1:7447",)
-    assert all(f"fake {path.relative_to(ROOT)} --car {car.name}" in path.read_text() for car in fleet.cars)
+    commands = [line.removeprefix("#").split() for line in path.read_text().splitlines() if "coopenv svea" in line]
+    assert any("demo" in command for command in commands)
+    for command in commands:
+        for name in command:
+            assert not name.endswith(".toml") or name == str(path.relative_to(ROOT))
 
 
 def test_an_endpoint_takes_the_place_of_the_files() -> None:

@@ -15,7 +15,7 @@ from coopenv.cli import app
 from coopenv.errors import CoopenvError
 from coopenv.fake.fleet import free_port
 from coopenv.runs.demo import FLEETS, Demo
-from tests.helpers.processes import COOPENV, DEADLOCK, mentioning, start, wait_until
+from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, mentioning, start, wait_until
 
 RESULTS = {"metrics.json", "trajectory.npz", "errors.png", "trajectories_2d.png", "topology.png"}
 
@@ -66,6 +66,23 @@ def test_an_interrupt_leaves_no_process_and_no_result(moment: str, tmp_path: Pat
     assert process.returncode == 130 and "interrupted; nothing written" in errors
     wait_until(lambda: not mentioning(f"127.0.0.1:{port}"))
     assert not [path for path in (tmp_path / "out").rglob("*") if path.is_file()]
+
+
+@pytest.mark.slow
+def test_a_fleet_of_ones_own_is_driven(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.toml"
+    mine.write_text((ROOT / "examples" / "fleet" / "overtaking.toml").read_text())
+    for _ in range(ATTEMPTS):
+        process = demo(tmp_path, free_port(), "--fleet", "mine.toml", "--set", "horizon=3")
+        printed, errors = process.communicate(timeout=4 * DEADLOCK)
+        assert process.returncode == 0, errors
+        if "Stopped: " not in printed:
+            break
+    assert "horizon reached at 3 s" in printed
+    assert (tmp_path / "out" / "mine" / "metrics.json").exists() and (tmp_path / "out" / "mine.mcap").exists()
+    mine.write_text(mine.read_text().replace("fakes = true", ""))
+    refused = CliRunner().invoke(app, ["svea", "demo", "--fleet", str(mine)])
+    assert refused.exit_code != 0 and "fakes = true is missing" in refused.output
 
 
 def test_other_environments_have_no_demo() -> None:

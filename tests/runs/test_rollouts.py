@@ -150,7 +150,7 @@ def test_an_interrupted_run_keeps_what_was_recorded(tmp_path: Path) -> None:
             break
     trajectory = recording.trajectory()
     assert len(trajectory.t) == 101
-    assert outcome_line(recording) == "stopped after the steps asked for, at 1.66667 s"
+    assert outcome_line(recording) == "ended before its time, at 1.66667 s"
     trajectory.save(tmp_path / "run.npz")
     assert np.array_equal(Trajectory.load(tmp_path / "run.npz").position, trajectory.position)
 

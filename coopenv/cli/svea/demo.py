@@ -12,11 +12,15 @@ def demo(
     environment: Annotated[
         str, typer.Option(help="The experiment: svea_overtaking or svea_crossing.")
     ] = "svea_overtaking",
+    fleet: Annotated[
+        Path | None, typer.Option(help="Or a deployment file of your own, whose cars are fakes (fakes = true).")
+    ] = None,
     port: Annotated[
         int | None, typer.Option(min=1, max=65535, help="Port of the router on this computer (default: a free one).")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the results (default: out/ENVIRONMENT); the drive is beside it.")
+        Path | None,
+        typer.Option(help="Folder of the results (default: out/NAME of environment or file); the drive is beside it."),
     ] = None,
     policy: options.PolicyName = "route_follower",
     seed: options.Seed = 0,
@@ -35,6 +39,7 @@ def demo(
     """
     from coopenv.runs.demo import Demo, run_demo
 
-    changes, folder = options.parse_overrides(overrides), out or Path("out") / environment
-    chosen = Demo(environment, folder, policy, seed, changes, seconds, beside)
+    name = environment if fleet is None else fleet.stem
+    changes, folder = options.parse_overrides(overrides), out or Path("out") / name
+    chosen = Demo(name, folder, policy, seed, changes, seconds, beside, fleet)
     run_demo(chosen, port, options.console(stderr=True), options.console())

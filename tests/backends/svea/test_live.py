@@ -92,7 +92,7 @@ def test_nobody_drives_without_being_armed(lab: Any) -> None:
 
 def test_a_car_that_freezes_stops_all_and_arming_anew_recovers(lab: Any, tmp_path: Path) -> None:
     _, hub, made = lab
-    path = write_fleet(tmp_path, safety="[safety]\nodometry_age = 0.3\nmissed_deadlines = 60\nmax_clock_offset = 0.5\n")
+    path = write_fleet(tmp_path, safety="[safety]\nodometry_age = 1.0\nmissed_deadlines = 60\nmax_clock_offset = 0.5\n")
     env = env_of(cars(path, hub))
     try:
         env.reset(seed=4, options={"arm": True})
