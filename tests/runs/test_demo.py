@@ -82,7 +82,7 @@ def test_a_fleet_of_ones_own_is_driven(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "mine" / "metrics.json").exists() and (tmp_path / "out" / "mine.mcap").exists()
     mine.write_text(mine.read_text().replace("fakes = true", ""))
     refused = CliRunner().invoke(app, ["svea", "demo", "--fleet", str(mine)])
-    assert refused.exit_code != 0 and "fakes = true is missing" in refused.output
+    assert refused.exit_code != 0 and "fakes = true is missing" in str(refused.exception)
 
 
 def test_other_environments_have_no_demo() -> None:

@@ -36,6 +36,7 @@ EXPECTED = ("reset", "closed", EPISODE_OVER)
 """Reasons to stop that are no emergency."""
 FIRST_WORD = 3.0  # s that cars have to be heard in at the first reset
 CAMERA_WORD = 1.5  # s in which a camera has to say of itself what it is; some never do
+READY_WORD = 1.0  # s in which all has to be at once as arming wants it
 SETTLE = 0.5  # s that fakes have to stand where they were put
 
 
@@ -173,7 +174,9 @@ class Svea:
 
     def _arm(self) -> None:
         calibrations = {name: self.intake.calibrations[name] for name in self._local}
-        for problem in problems_of(Fleet(self.deployment, calibrations, self.station, self.intake, self.board)):
+        fleet = Fleet(self.deployment, calibrations, self.station, self.intake, self.board)
+        _wait(lambda: next(problems_of(fleet), None) is None, READY_WORD)
+        for problem in problems_of(fleet):
             raise CoopenvError(f"not armed: {problem}")
         self.watchdog.forget()
         self.gates.begin()

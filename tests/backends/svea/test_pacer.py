@@ -1,7 +1,8 @@
 """Deadlines, on a clock that the test moves."""
 
 import pytest
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 
 from coopenv.backends.svea import pacer as module
 from coopenv.backends.svea.pacer import Pacer
