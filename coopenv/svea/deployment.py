@@ -6,9 +6,10 @@ from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from coopenv.errors import CoopenvError, listed, shown, suggest
+from coopenv.svea.fence import Point, is_simple
 from coopenv.svea.limits import HARDEST, USUAL, Limits
 from coopenv.svea.network import Network, Part
 
@@ -20,7 +21,8 @@ Marker = Annotated[int, Field(ge=0)]
 Agent = Annotated[int, Field(ge=0, le=9999)]
 Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 Number = Annotated[float, Field(ge=-1e6, le=1e6)]
-Point = tuple[Number, Number]
+Age = Annotated[float, Field(gt=0.0, le=2.0)]
+Corner = tuple[Number, Number]
 
 
 class DeploymentError(CoopenvError):
@@ -101,14 +103,14 @@ class Safety(Part):
     """rad/s"""
     reverse: bool = False
     """Whether cars may drive backwards."""
-    odometry_age: Positive = 0.15
+    odometry_age: Age = 0.15
     """s without odometry after which all cars are stopped."""
-    truth_age: Positive = 0.5
-    """s without motion capture, where a geofence or a separation needs it."""
-    geofence: tuple[Point, ...] = ()
-    """Corners of a polygon, map, m, that no car may leave (none: no fence)."""
+    truth_age: Age = 0.5
+    """s for which a car's place may not be known, where a geofence or a separation needs it."""
+    geofence: tuple[Corner, ...] = ()
+    """Corners of a polygon, m, in the coordinates of the environment's file, that no car may leave (none: no fence)."""
     separation: float = Field(default=0.0, ge=0.0, le=100.0)
-    """Least distance between two cars, m (0: not watched)."""
+    """Least distance between a car that is driven and any other car of the fleet, m (0: not watched)."""
     judge: Literal["truth", "estimate"] = "truth"
     """By what fence and separation are judged."""
     missed_deadlines: int = Field(default=5, ge=1)
@@ -117,6 +119,13 @@ class Safety(Part):
     """Share of the battery below which cars are not armed."""
     max_clock_offset: Positive = 0.02
     """s between clocks of cars and of this computer, beyond which nothing is armed."""
+
+    @field_validator("geofence")
+    @classmethod
+    def _encloses_something(cls, corners: tuple[Point, ...]) -> tuple[Point, ...]:
+        if corners and not is_simple(corners):
+            raise ValueError("expected at least 3 corners of a polygon whose edges do not cross")
+        return corners
 
     @property
     def limits(self) -> Limits:

@@ -11,7 +11,7 @@ from coopenv.backends.bags.topic_map import TopicMap, load_map
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
 from coopenv.backends.svea.assembler import Assembler
 from coopenv.backends.svea.binding import Binding, bind
-from coopenv.backends.svea.options import wants_to_arm
+from coopenv.backends.svea.options import wishes_of
 from coopenv.errors import CoopenvError, DataError, DataWarning, ScenarioWarning
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.svea.samples import Sample
@@ -106,7 +106,7 @@ class Bag(TickGenerator):
 
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
         """Go through the bags tick by tick; the option `arm` moves nobody."""
-        wants_to_arm(options)
+        wishes_of(options)
         assembler, feed = Assembler(self.binding), _Feed(self.log)
         for k in range(self.scenario.horizon_ticks + 1):
             now = self._begin + round(k * NS / self._rate)

@@ -15,15 +15,15 @@ from coopenv.backends.svea.binding import Binding
 from coopenv.backends.svea.checks import Fleet, problems_of
 from coopenv.backends.svea.gates import Gates
 from coopenv.backends.svea.intake import SPOKEN, VELOCITY, Intake
-from coopenv.backends.svea.options import wants_to_arm
+from coopenv.backends.svea.options import wishes_of
 from coopenv.backends.svea.pacer import Pacer
 from coopenv.backends.svea.station import Station
 from coopenv.backends.svea.status import StatusBoard
 from coopenv.backends.svea.tape import Tape
 from coopenv.backends.svea.v2x import checked, estimate_message, report_message
-from coopenv.backends.svea.watchdog import Watchdog, Watched
+from coopenv.backends.svea.vitals import Vitals
+from coopenv.backends.svea.watchdog import Watchdog
 from coopenv.errors import CoopenvError
-from coopenv.estimation.arrays import Array
 from coopenv.observers.recording import Sensed
 from coopenv.svea.codec import encode, make
 from coopenv.svea.deployment import Deployment
@@ -98,10 +98,19 @@ class Svea:
         rates = self.scenario.rates
         self._pacer = Pacer(1.0 / rates.camera, self.scenario.ticks_per_decision)
         self._assembler = Assembler(binding)
-        self._places: dict[str, Array] = {}
-        self._estimates: dict[str, Array] = {}
+        self._origin = np.array(self.scenario.map.origin)
+        safety, self.vitals = deployment.safety, Vitals(deployment.safety.judge)
+        self._odometry = VELOCITY[deployment.sensors.odometry]
+        self._others = tuple(name for name in heard if name not in self._local)
         self.watchdog = Watchdog(
-            deployment.safety, self.station, self.gates, self._watched(), self._positions, 1.0 / rates.decision
+            safety,
+            self.station,
+            self.gates,
+            self.vitals,
+            tuple(self._local),
+            self._others,
+            self._odometry,
+            1.0 / rates.decision,
         )
         transport.watch(presence_of("*"), self._presence)
         self.board.on_override = self.watchdog.set_overridden
@@ -112,24 +121,10 @@ class Svea:
         self._closed = threading.Lock()
         warm_up()
 
-    def _watched(self) -> dict[str, Watched]:
-        safety, sensors = self.deployment.safety, self.deployment.sensors
-        judged = (safety.geofence or safety.separation > 0.0) and safety.judge == "truth"
-        return {
-            name: Watched(
-                tuple(topic_of(name, role) for role in VELOCITY[sensors.odometry]),
-                topic_of(name, Role.TRUTH) if judged else None,
-            )
-            for name in self._local
-        }
-
     def _presence(self, key: str, there: bool) -> None:
         name = key.rsplit("/", 1)[-1]
         if name in self._local:
             self.watchdog.set_present(name, there)
-
-    def _positions(self) -> Mapping[str, Array]:
-        return self._places if self.deployment.safety.judge == "truth" else self._estimates
 
     @property
     def clock(self) -> float:
@@ -144,12 +139,13 @@ class Svea:
         """
         self._stop("reset")
         _tidy_up()
-        arm = wants_to_arm(options)
+        wishes = wishes_of(options)
         if self.deployment.fakes:
             self._place_fakes(0 if seed is None else seed)
-        self._listen(arm)
-        if arm:
-            self._arm()
+        self.vitals.begin(self._pacer.now())
+        self._listen(wishes.arm)
+        if wishes.arm:
+            self._arm(wishes.release)
         self._drain()
         self._began, self._index = self._pacer.start(), 0
         self._key, self._episode = (self._key, self._episode + 1) if seed is None else (seed, 0)
@@ -159,7 +155,7 @@ class Svea:
 
     def _listen(self, arm: bool) -> None:
         """Wait until the cars have been heard, but not for ever: they need not be there as long as nobody drives."""
-        topics = [topic for watched in self._watched().values() for topic in watched.odometry]
+        topics = [topic_of(name, role) for name in self._local for role in self._odometry]
         _wait(lambda: all(self.station.silence(topic) < 1.0 for topic in topics), 0 if self._heard_once else FIRST_WORD)
         if arm:
             _wait(lambda: all(self.board.calibration(name) is not None for name in self._local), CAMERA_WORD)
@@ -172,16 +168,32 @@ class Svea:
         self._transport.publish(RESET_TOPIC, encode(make("std_msgs/msg/Int64", data=signed)), reliable=True)
         time.sleep(SETTLE)
 
-    def _arm(self) -> None:
+    def _arm(self, release: bool) -> None:
         calibrations = {name: self.intake.calibrations[name] for name in self._local}
-        fleet = Fleet(self.deployment, calibrations, self.station, self.intake, self.board)
-        _wait(lambda: next(problems_of(fleet), None) is None, READY_WORD)
-        for problem in problems_of(fleet):
-            raise CoopenvError(f"not armed: {problem}")
+        fleet = Fleet(self.deployment, calibrations, self.station, self.intake, self.board, self.vitals, self._others)
+
+        def problem() -> str | None:
+            self._drain()
+            return next(problems_of(fleet), None)
+
+        _wait(lambda: problem() is None, READY_WORD)
+        if found := problem():
+            raise CoopenvError(f"not armed: {found}")
+        self._refuse_stopped(release)
         self.watchdog.forget()
         self.gates.begin()
         self.watchdog.arm()
         self._armed = True
+
+    def _refuse_stopped(self, release: bool) -> None:
+        """Refuse to set cars going again that somebody else has stopped, unless that is asked for."""
+        if self.deployment.fakes or release:
+            return
+        for car in sorted(self.gates.stopped_by_others):
+            raise CoopenvError(
+                f"not armed: {car}: somebody has stopped it; once you know why, release it "
+                '(`coopenv svea run --release`, options={"arm": True, "release": True})'
+            )
 
     def advance(self, command: Command) -> Iterator[Sensed]:
         """Send the commands and yield the ticks of one decision, each when it is due."""
@@ -209,14 +221,14 @@ class Svea:
         self.health.received += len(arrivals)
         for arrival in arrivals:
             self._take(arrival)
-        now = self._pacer.now()
-        self._places = {name: self._assembler.truth(i, now)[1] for name, i in self._local.items()}
+        self.vitals.looked = self._pacer.now()
 
     def _take(self, arrival: Arrival) -> None:
         if self._tape is not None:
             self._tape.write(arrival.topic, arrival.payload, arrival.received)
         for sample in self.intake.samples(arrival):
             self._assembler.put(sample)
+            self.vitals.put(sample)
 
     def _counted(self, tick: Sensed) -> Sensed:
         local = list(self.binding.local)
@@ -237,7 +249,8 @@ class Svea:
             name, moment = self.binding.names[each.vehicle], self._assembler.moment(each.vehicle)
             if not checked(each):
                 continue
-            self._estimates[name] = each.position
+            if self.deployment.safety.judge == "estimate":
+                self.vitals.place(name, each.position + self._origin, moment)
             self._publish(name, Role.ESTIMATE, estimate_message(each, moment))
             report = report_message(each, moment)
             if report is not None:
@@ -293,10 +306,12 @@ class Svea:
             return
         self._stop("closed")
         self.watchdog.close()
-        if self._tape is not None:
-            self._tape.close()
-        self._transport.close()
-        gc.unfreeze()
+        try:
+            if self._tape is not None:
+                self._tape.close()
+        finally:
+            self._transport.close()
+            gc.unfreeze()
 
 
 def _tidy_up() -> None:

@@ -1,13 +1,15 @@
 """What has to be so before wheels turn."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
+from coopenv.backends.svea.bounds import misplaced
 from coopenv.backends.svea.intake import VELOCITY, Intake
 from coopenv.backends.svea.station import Station
 from coopenv.backends.svea.status import StatusBoard
+from coopenv.backends.svea.vitals import Vitals
 from coopenv.svea.deployment import Deployment
 from coopenv.svea.samples import Calibration
 from coopenv.svea.topics import Role, topic_of
@@ -26,6 +28,8 @@ class Fleet:
     station: Station
     intake: Intake
     board: StatusBoard
+    vitals: Vitals
+    others: Collection[str]  # cars of the fleet that are not driven here
 
 
 def problems_of(fleet: Fleet) -> Iterator[str]:
@@ -36,14 +40,15 @@ def problems_of(fleet: Fleet) -> Iterator[str]:
             topic = topic_of(car, role)
             if (age := fleet.station.silence(topic)) > safety.odometry_age:
                 yield f"{car}: no odometry on {topic} {_since(age)}"
+            if (age := fleet.vitals.age(car, role)) > safety.odometry_age:
+                yield f"{car}: nothing new that could be used on {topic} {_since(age)}"
         camera = topic_of(car, Role(sensors.detections))
         if (age := fleet.station.silence(camera)) > safety.odometry_age:
             yield f"{car}: no camera frames on {camera} {_since(age)}"
-        if (safety.geofence or safety.separation > 0.0) and safety.judge == "truth":
-            topic = topic_of(car, Role.TRUTH)
-            if (age := fleet.station.silence(topic)) > safety.truth_age:
-                yield f"{car}: no motion capture on {topic} {_since(age)}, by which fence and separation are judged"
         yield from _about_itself(fleet, car)
+    if safety.judge == "truth":  # what cars believe is not known before they drive
+        for car, wrong in misplaced(safety, fleet.vitals, fleet.calibrations, fleet.others):
+            yield f"{car}: {wrong}"
 
 
 def _about_itself(fleet: Fleet, car: str) -> Iterator[str]:

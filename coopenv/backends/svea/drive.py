@@ -10,7 +10,7 @@ from coopenv.backends.mcap.container import Container
 from coopenv.backends.svea.assembler import Assembler
 from coopenv.backends.svea.binding import Binding, bind
 from coopenv.backends.svea.intake import Intake
-from coopenv.backends.svea.options import wants_to_arm
+from coopenv.backends.svea.options import wishes_of
 from coopenv.backends.svea.tape import ATTACHMENT, FORMAT, NAME
 from coopenv.errors import CoopenvError, DataError
 from coopenv.scenario.files import override, parse_scenario
@@ -112,7 +112,7 @@ class Drive(TickGenerator):
 
     def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
         """Go through the messages from the begin, giving the ticks of one episode; `arm` moves nobody."""
-        wants_to_arm(options)
+        wishes_of(options)
         wanted, self._next = self._next, (self._next + 1) % self._episodes
         intake, assembler = Intake(self.binding, self._deployment.sensors), Assembler(self.binding)
         number = -1

@@ -3,17 +3,20 @@
 import secrets
 import threading
 import time
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
 from coopenv.errors import CoopenvError
-from coopenv.svea.codec import decode, encode, header, make
+from coopenv.svea.codec import MOST_BYTES, decode, encode, header, make, stamp_of
 from coopenv.svea.limits import Limits
 from coopenv.svea.signing import Signer, Verifier
 from coopenv.svea.topics import TOPICS, Role, topic_of
 from coopenv.svea.transport.base import Arrival, Transport
 
 PATIENCE = 1.0  # s in which a gate has to answer
+WORD = 0.5  # s in which every gate has spoken once more
+LATE, AHEAD = 500_000_000, 50_000_000  # ns by which a status may be old, or ahead of this clock
 OLD = 1.0  # s after which a gate that says nothing counts as gone
 POLL = 0.01  # s
 
@@ -51,6 +54,12 @@ class Gates:
         self._lock = threading.Lock()
         self._states = {car: GateState() for car in cars}
         self._cars = {topic_of(car, Role.GATE): car for car in cars}
+        self._stamps = dict.fromkeys(cars, 0)
+        self._stopping = False
+        self.stopped_by_others: set[str] = set()
+        """Cars that somebody else has stopped, since their last arming."""
+        self.dropped = {car: Counter[str]() for car in cars}
+        """What gates seem to have said and was not believed, by car and reason."""
         self.session = ""
         self._sequence = 0
         for topic in self._cars:
@@ -64,39 +73,71 @@ class Gates:
 
     def _hear(self, arrival: Arrival) -> None:
         car, v = self._cars[arrival.topic], self._verifier
+        if len(arrival.payload) > MOST_BYTES:
+            self.dropped[car]["too long"] += 1
+            return
         if v is not None and v.signer(arrival.topic, arrival.payload, arrival.attachment) != car:
+            self.dropped[car]["signature"] += 1
             return
         try:
             m = decode(arrival.payload, TOPICS[Role.GATE].type)
         except CoopenvError:
+            self.dropped[car]["malformed"] += 1
+            return
+        stamp = stamp_of(m)
+        if not -AHEAD <= arrival.received - stamp <= LATE:
+            self.dropped[car]["stale" if stamp < arrival.received else "future"] += 1
             return
         counts = dict(zip(m.rejections, (int(n) for n in m.counts), strict=False))
         state = GateState(m.state, m.session, m.nonce, int(m.accepted), counts, time.monotonic())
         with self._lock:
-            self._states[car] = state
+            if stamp < self._stamps[car]:
+                self.dropped[car]["out of order"] += 1
+                return
+            self._stamps[car], self._states[car] = stamp, state
+            if m.state == "stopped" and not self._stopping:
+                self.stopped_by_others.add(car)
 
     def begin(self) -> None:
         """Arm all gates for a new session.
 
         Raises:
-            CoopenvError: a gate is not there or does not open; all are closed again then.
+            CoopenvError: a gate is not there, does not open, or is stopped meanwhile; all are closed again then.
         """
         self.session, self._sequence = secrets.token_hex(8), 0
-        for car in self._states:
-            if self._states[car].age > OLD:
-                raise CoopenvError(
-                    f"{car}: no gate has spoken on {topic_of(car, Role.GATE)}: is `coopenv svea gate` running there?"
-                )
+        before = self._fresh_states()
+        with self._lock:
+            self._stopping = False
         until = time.monotonic() + PATIENCE
         while closed := [c for c, s in self.states.items() if (s.state, s.session) != ("armed", self.session)]:
+            states = self.states
+            for car in closed:
+                if states[car].state == "stopped" and states[car].nonce != before[car].nonce:
+                    self.end()
+                    raise CoopenvError(f"{car}: was stopped while it was being armed")
             if time.monotonic() > until:
                 self.end()
-                state = self.states[closed[0]]
-                why = "; ".join(f"{reason}: {count}" for reason, count in state.rejections.items()) or "no reason told"
-                raise CoopenvError(f"{closed[0]}: the gate did not open, it is {state.state} ({why})")
+                raise CoopenvError(f"{closed[0]}: {_why_closed(before[closed[0]], states[closed[0]])}")
             for car in closed:
                 self._arm(car, True)
             time.sleep(5 * POLL)
+        with self._lock:
+            self.stopped_by_others.clear()
+
+    def _fresh_states(self) -> dict[str, GateState]:
+        """Return what each gate says now, not what it said before the last stop. Raises CoopenvError: one is silent."""
+        asked = time.monotonic()
+        while any(state.heard < asked for state in self.states.values()) and time.monotonic() < asked + WORD:
+            time.sleep(POLL)
+        for car, state in self.states.items():
+            if state.age <= OLD:
+                continue
+            if self.dropped[car]:
+                why = ", ".join(f"{reason} {count}" for reason, count in self.dropped[car].items())
+                raise CoopenvError(f"{car}: what its gate says is not believed ({why}): are keys and clocks the same?")
+            topic = topic_of(car, Role.GATE)
+            raise CoopenvError(f"{car}: no gate has spoken on {topic}: is `coopenv svea gate` running there?")
+        return self.states
 
     def end(self) -> None:
         """Close all gates; cars come to a stand."""
@@ -113,6 +154,8 @@ class Gates:
 
     def stop(self) -> None:
         """Tell every gate to stop at once and to stay so."""
+        with self._lock:
+            self._stopping = True
         for car in self._states:
             self._send(car, Role.STOP, make(TOPICS[Role.STOP].type, data=True))
 
@@ -141,3 +184,15 @@ class Gates:
         signature = b"" if self._signer is None else self._signer.sign(topic, payload)
         kind = TOPICS[role]
         self._transport.publish(topic, payload, signature, urgent=kind.urgent, reliable=kind.reliable)
+
+
+def _why_closed(before: GateState, now: GateState) -> str:
+    """Return why a gate has not opened, by what it has refused since."""
+    news = {r: n - before.rejections.get(r, 0) for r, n in now.rejections.items() if n > before.rejections.get(r, 0)}
+    if "signature" in news:
+        return (
+            "its gate refuses this end's signature: is it told to trust this one (--station), "
+            "and is its public.toml that of this end's key?"
+        )
+    why = ", ".join(f"{reason} {count}" for reason, count in news.items()) or "no reason told"
+    return f"the gate did not open, it is {now.state} ({why})"

@@ -72,7 +72,7 @@ class Intake:
             for role in roles_of(sensors, vehicle in binding.local):
                 self._topics[topic_of(name, role)] = name, role, self.calibrations[name]
         for name in binding.leaders:
-            for role in (Role.ESTIMATE, Role.POINT):
+            for role in (Role.ESTIMATE, Role.POINT, *((Role.TRUTH,) if sensors.truth else ())):
                 self._topics[topic_of(name, role)] = name, role, None
 
     @property

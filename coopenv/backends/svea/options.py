@@ -1,24 +1,36 @@
 """What `env.reset(options={...})` takes on cars, and on what they have recorded."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from coopenv.errors import CoopenvError, shown, suggest
 
-OPTIONS = ("arm", "options")
-"""The second one is passed by PettingZoo's own tests and means nothing."""
+OPTIONS = ("arm", "release", "options")
+"""The last one is passed by PettingZoo's own tests and means nothing."""
 
 
-def wants_to_arm(options: Mapping[str, Any]) -> bool:
-    """Return whether cars are to drive: the option `arm`.
+@dataclass(frozen=True)
+class Wishes:
+    """What is asked for."""
+
+    arm: bool = False
+    """Whether cars are to drive."""
+    release: bool = False
+    """Whether that holds for cars, too, that somebody else has stopped."""
+
+
+def wishes_of(options: Mapping[str, Any]) -> Wishes:
+    """Return what is asked for.
 
     Raises:
         CoopenvError: an option is not known, or not what it must be.
     """
     for key in options:
         if key not in OPTIONS:
-            raise CoopenvError(f"unknown option {shown(key)}{suggest(str(key), OPTIONS)}; known: arm")
-    arm = options.get("arm", False)
-    if not isinstance(arm, bool):
-        raise CoopenvError(f"option 'arm' must be true or false, got {shown(arm)}")
-    return arm
+            raise CoopenvError(f"unknown option {shown(key)}{suggest(str(key), OPTIONS)}; known: arm, release")
+    found = {name: options.get(name, False) for name in OPTIONS[:2]}
+    for name, value in found.items():
+        if not isinstance(value, bool):
+            raise CoopenvError(f"option '{name}' must be true or false, got {shown(value)}")
+    return Wishes(**found)

@@ -5,6 +5,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Collection, Iterable, Mapping
 
+from coopenv.svea.codec import MOST_BYTES
 from coopenv.svea.signing import Verifier
 from coopenv.svea.transport.base import Arrival, Transport
 
@@ -35,7 +36,7 @@ class Station:
         self._last: dict[str, float] = {}
         self._verifier, self._signers = verifier, signers
         self.dropped: Counter[str] = Counter()
-        """Messages by why they were dropped before anybody looked at them: overflow, signature."""
+        """Messages by why they were dropped before anybody looked at them: overflow, signature, too long."""
         for topic in self._waiting:
             transport.subscribe(topic, self._keep)
 
@@ -43,15 +44,21 @@ class Station:
         waiting = self._waiting.get(arrival.topic)
         if waiting is None:
             return
+        if len(arrival.payload) > MOST_BYTES:
+            self._drop("too long")
+            return
         if not self._is_genuine(arrival):
-            with self._lock:
-                self.dropped["signature"] += 1
+            self._drop("signature")
             return
         with self._lock:
             if len(waiting) == MOST_WAITING:
                 self.dropped["overflow"] += 1
             waiting.append(arrival)
             self._last[arrival.topic] = time.monotonic()
+
+    def _drop(self, why: str) -> None:
+        with self._lock:
+            self.dropped[why] += 1
 
     def _is_genuine(self, arrival: Arrival) -> bool:
         expected = self._signers.get(arrival.topic)

@@ -2,29 +2,22 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
+from coopenv.backends.svea.bounds import misplaced
 from coopenv.backends.svea.gates import OLD, Gates
 from coopenv.backends.svea.station import Station
-from coopenv.estimation.arrays import Array
+from coopenv.backends.svea.vitals import Vitals
+from coopenv.errors import CoopenvError
 from coopenv.svea.deployment import Safety
+from coopenv.svea.topics import Role, topic_of
 
 PERIOD = 0.01  # s between looks
 REPEAT = 0.2  # s between emergency stops that are sent again
 STALL = 0.05  # s by which a look may come late: beyond that messages wait to be received, and silence says nothing yet
 OPEN = ("armed", "timed_out")
 """States of a gate that takes commands: one that has timed out lets the car stand until the next one."""
-
-
-@dataclass(frozen=True)
-class Watched:
-    """What the watchdog looks at of one car."""
-
-    odometry: tuple[str, ...]  # topics, of which each has to come
-    truth: str | None  # topic; None: it is not watched
 
 
 @dataclass(frozen=True)
@@ -44,8 +37,10 @@ class Watchdog:
         safety: Safety,
         station: Station,
         gates: Gates,
-        cars: Mapping[str, Watched],
-        positions: Callable[[], Mapping[str, Array]],
+        vitals: Vitals,
+        cars: Collection[str],
+        others: Collection[str],
+        odometry: Collection[Role],
         decision: float,
     ) -> None:
         """Begin to look.
@@ -54,12 +49,14 @@ class Watchdog:
             safety: what is allowed.
             station: where messages come.
             gates: of the cars.
-            cars: what is watched, by name.
-            positions: where the cars are by what judges them, map, m; NaN: not known.
+            vitals: what the messages have told.
+            cars: those that are driven here.
+            others: the other ones of the fleet.
+            odometry: what each car has to measure.
             decision: s between decisions.
         """
-        self._safety, self._station, self._gates, self._cars = safety, station, gates, cars
-        self._positions, self._decision = positions, decision
+        self._safety, self._station, self._gates, self._vitals = safety, station, gates, vitals
+        self._cars, self._others, self._odometry, self._decision = cars, others, odometry, decision
         self._lock = threading.Lock()
         self._armed, self._closed = False, threading.Event()
         self.trip: Trip | None = None
@@ -76,7 +73,9 @@ class Watchdog:
             self.trip = None
 
     def arm(self) -> None:
-        """Look after the cars from now on."""
+        """Look after the cars from now on. Raises CoopenvError: nobody would."""
+        if not self._thread.is_alive():
+            raise CoopenvError("not armed: the watchdog has ended")
         with self._lock:
             self._armed, self._beat, self._missed = True, None, 0
 
@@ -118,54 +117,51 @@ class Watchdog:
             stalled = not stalled and looked - before > PERIOD + STALL
             if stalled:  # once: the next look tells, and comes so soon that no car gets further for it
                 continue
-            if self._armed:
-                try:
-                    found = next(self._problems(), None)
-                except Exception as error:  # a watchdog that fails has to stop the cars
-                    found = Trip(f"the watchdog failed: {type(error).__name__}: {error}")
-                if found is not None:
-                    self.stop(found.reason, found.car)
-            elif self.trip is not None and time.monotonic() - repeated > REPEAT:
-                repeated = time.monotonic()
-                self._gates.stop()
+            try:
+                if self._armed:
+                    self._look()
+                elif self.trip is not None and looked - repeated > REPEAT:
+                    repeated = looked
+                    self._gates.stop()
+            except Exception:  # of the network, while it is told to stop: it is told again
+                continue
+
+    def _look(self) -> None:
+        try:
+            found = next(self._problems(), None)
+        except Exception as error:  # a watchdog that fails has to stop the cars
+            found = Trip(f"the watchdog failed: {type(error).__name__}: {error}")
+        if found is not None:
+            self.stop(found.reason, found.car)
 
     def _problems(self) -> Iterator[Trip]:
-        s = self._safety
-        for car, watched in self._cars.items():
-            for topic in watched.odometry:
-                if (age := self._station.silence(topic)) > s.odometry_age:
-                    yield Trip(f"{car}: no odometry on {topic} for {age:.2f} s", car)
-            if watched.truth is not None and (age := self._station.silence(watched.truth)) > s.truth_age:
-                yield Trip(f"{car}: no motion capture on {watched.truth} for {age:.2f} s", car)
-            if self._present.get(car) is False:
-                yield Trip(f"{car}: is gone", car)
-            if self._overridden.get(car):
-                yield Trip(f"{car}: is driven by remote control", car)
+        for car in self._cars:
+            yield from self._of_car(car)
         for car, gate in self._gates.states.items():
             if gate.age > OLD:
                 yield Trip(f"{car}: its gate is silent for {gate.age:.2f} s", car)
             elif gate.state not in OPEN or gate.session != self._gates.session:
                 yield Trip(f"{car}: its gate is {gate.state}", car)
-        if self._missed >= s.missed_deadlines:
+        missed, beat = self._safety.missed_deadlines, self._beat
+        if self._missed >= missed:
             yield Trip(f"{self._missed} decisions in a row came too late")
-        beat = self._beat
-        if beat is not None and (age := time.monotonic() - beat) > (s.missed_deadlines + 1) * self._decision:
+        if beat is None:
+            return
+        if (age := time.monotonic() - beat) > (missed + 1) * self._decision:
             yield Trip(f"no decision for {age:.2f} s")
-        yield from self._misplaced()
+        for car, wrong in misplaced(self._safety, self._vitals, self._cars, self._others):
+            yield Trip(f"{car}: {wrong}", car)
 
-    def _misplaced(self) -> Iterator[Trip]:
-        s, places = self._safety, self._positions()
-        if s.geofence:
-            from matplotlib.path import Path as Polygon
-
-            fence = Polygon(s.geofence)
-            for car, place in places.items():
-                if np.isfinite(place).all() and not fence.contains_point((float(place[0]), float(place[1]))):
-                    yield Trip(f"{car}: left the geofence at ({place[0]:.2f}, {place[1]:.2f}) m", car)
-        if s.separation > 0.0:
-            names = [car for car, place in places.items() if np.isfinite(place).all()]
-            for i, car in enumerate(names):
-                for other in names[i + 1 :]:
-                    distance = float(np.linalg.norm(places[car][:2] - places[other][:2]))
-                    if distance < s.separation:
-                        yield Trip(f"{car} and {other}: {distance:.2f} m apart, {s.separation:g} m is the least", car)
+    def _of_car(self, car: str) -> Iterator[Trip]:
+        longest = self._safety.odometry_age
+        for role in self._odometry:
+            topic = topic_of(car, role)
+            if (age := self._station.silence(topic)) > longest:
+                yield Trip(f"{car}: no odometry on {topic} for {age:.2f} s", car)
+            # Only the step loop reads messages, so that this means nothing before the first step.
+            if self._beat is not None and (age := self._vitals.age(car, role)) > longest:
+                yield Trip(f"{car}: nothing new that could be used on {topic} for {age:.2f} s", car)
+        if self._present.get(car) is False:
+            yield Trip(f"{car}: is gone", car)
+        if self._overridden.get(car):
+            yield Trip(f"{car}: is driven by remote control", car)

@@ -18,6 +18,9 @@ def run(
     arm: Annotated[
         bool, typer.Option("--arm", help="Let the cars drive. Without it everything happens but that.")
     ] = False,
+    release: Annotated[
+        bool, typer.Option("--release", help="With --arm: also cars that somebody has stopped. Know why, first.")
+    ] = False,
     policy: options.PolicyName = "zero",
     seed: options.Seed = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Decisions to run (default: up to the horizon).")] = None,
@@ -42,7 +45,8 @@ def run(
     with options.warned():
         backend = open_svea(config, None, changes, car, record, connect=connect)
     try:
-        rollout = Rollout(backend.scenario, seed, steps, policy=policy, backend=backend, options={"arm": arm})
+        wishes = {"arm": arm, "release": release}
+        rollout = Rollout(backend.scenario, seed, steps, policy=policy, backend=backend, options=wishes)
         folder = out or Path("out") / config.stem
         figures = None if no_figures else "png"
         watched = partial(links_line, backend)

@@ -229,20 +229,65 @@ def test_a_camera_of_another_calibration_is_not_trusted(lab: Any, tmp_path: Path
     refuses(path, hub, "its camera says focal_length = .* the environment says")
 
 
+FENCE = "geofence = [[-1, -4], [1, -4], [1, {}], [-1, {}]]\n"
+
+
 @pytest.mark.parametrize(
     ("safety", "why"),
-    [
-        ("geofence = [[-9, -9], [9, -9], [9, -8], [-9, -8]]\n", "left the geofence"),
-        ("separation = 5.0\n", "m apart, 5 m is the least"),
-    ],
+    [(FENCE.format(-2.3, -2.3), "left the geofence"), ("separation = 0.7\n", "m from svea1, 0.7 m is the least")],
 )
 def test_cars_that_go_where_they_must_not_are_stopped(lab: Any, tmp_path: Path, safety: str, why: str) -> None:
     _, hub, _ = lab
     env = env_of(cars(write_fleet(tmp_path, safety=PATIENT + safety), hub))
     try:
         env.reset(seed=0, options={"arm": True})
-        infos = drive(env, 40)
+        infos: dict[str, Any] = {}
+        for _ in range(100):
+            if not env.agents:
+                break
+            infos = env.step({"vehicle_1": np.array([1.0, 0.0]), "vehicle_2": np.array([-1.0, 0.0])})[-1]
         assert not env.agents and why in infos["vehicle_1"]["car"]["stopped"]
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("safety", "why"),
+    [
+        ("geofence = [[-9, -9], [9, -9], [9, -8], [-9, -8]]\n", "not armed: svea7: left the geofence"),
+        ("separation = 5.0\n", "not armed: svea7: .* m from svea1, 5 m is the least"),
+    ],
+)
+def test_cars_are_not_armed_where_they_must_not_be(lab: Any, tmp_path: Path, safety: str, why: str) -> None:
+    refuses(write_fleet(tmp_path, safety=PATIENT + safety), lab[1], why)
+
+
+def test_one_car_alone_keeps_its_distance_from_all(lab: Any, tmp_path: Path) -> None:
+    _, hub, _ = lab
+    path = write_fleet(tmp_path, safety=PATIENT + "separation = 5.0\n")
+    env = env_of(cars(path, hub, car="svea7"))
+    try:
+        with pytest.raises(CoopenvError, match=r"not armed: svea7: .* m from svea1, 5 m is the least"):
+            env.reset(seed=0, options={"arm": True})
+    finally:
+        env.close()
+
+
+def test_a_car_that_somebody_has_stopped_is_released_on_purpose(lab: Any, tmp_path: Path) -> None:
+    _, hub, _ = lab
+    env = env_of(cars(write_fleet(tmp_path, OVERTAKING.replace("fakes = true", "")), hub))
+    try:
+        env.reset(options={"arm": True, "release": True})
+        drive(env, 5)
+        hub.connect().publish(topic_of("svea1", Role.STOP), encode(make("std_msgs/msg/Bool", data=True)))
+        drive(env, 60)
+        assert not env.agents
+        for _ in range(2):
+            with pytest.raises(CoopenvError, match=r"not armed: svea1: somebody has stopped it.*--release"):
+                env.reset(options={"arm": True})
+        env.reset(options={"arm": True, "release": True})
+        infos = drive(env, 5)
+        assert infos["vehicle_2"]["car"]["gate"] in ("armed", "timed_out")
     finally:
         env.close()
 
