@@ -89,7 +89,7 @@ def told(error: BaseException) -> str:
         text = str(error)
     except Exception as another:
         text = f"says nothing, but raises {type(another).__name__}"
-    return f"{type(error).__name__}: {text}"
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 def listed(names: Sequence[str], most: int = 12) -> str:

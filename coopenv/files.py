@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from coopenv.errors import OutputError
-from coopenv.interrupts import before_a_hard_end, held, note
+from coopenv.interrupts import NOTHING, before_a_hard_end, held, note
 from coopenv.staging import PART, abandoned, copy_owner, heal, new_part, put_in_place, sync
 
 PROBE_BYTES = 1 << 16  # written before the work begins, to find a disk that is full already
@@ -182,7 +182,7 @@ def _staging(path: str | Path, check: Callable[[str | Path, Path], None]) -> Ite
         for left in abandoned(place, PART):
             shutil.rmtree(left, ignore_errors=True)
     if place.parent not in _under_way:
-        note(f"kept: {path} of an earlier run" if os.path.lexists(place) else "nothing written")
+        note(f"kept: {path} of an earlier run" if os.path.lexists(place) else NOTHING)
     part = None
     try:
         with writing(path):

@@ -19,7 +19,9 @@ HIDDEN_CURSOR_BACK = "\x1b[?25h"
 
 _received = 0
 _holds: list[None] = []
-_state = "nothing written"
+NOTHING = "nothing written"
+_state = NOTHING
+_kept: list[Callable[[], str]] = []
 _ended = threading.Event()
 _last_steps: list[Callable[[], None]] = []
 
@@ -64,6 +66,11 @@ def note(state: str) -> None:
     _state = state
 
 
+def also_kept(words: Callable[[], str]) -> None:
+    """Let what is told after an interruption end with what was kept beside the results; empty: nothing was."""
+    _kept.append(words)
+
+
 def before_a_hard_end(step: Callable[[], None]) -> None:
     """Let a step be done, in another thread, before a command is ended that does not end by itself."""
     _last_steps.append(step)
@@ -74,7 +81,7 @@ def tell() -> int:
     _ended.set()
     if sys.stderr is not None:
         with suppress(OSError):
-            print(f"interrupted; {_state}", file=sys.stderr, flush=True)
+            print(_summary(), file=sys.stderr, flush=True)
     return 128 + (_received or signal.SIGINT)
 
 
@@ -99,6 +106,12 @@ def end_with_parent() -> None:
             os._exit(1)
 
         threading.Thread(target=wait_and_end, daemon=True).start()
+
+
+def _summary() -> str:
+    kept = [text for words in _kept if (text := words())]
+    results = [] if kept and _state == NOTHING else [_state]
+    return f"interrupted; {'; '.join([*results, *kept])}"
 
 
 def _handle(number: int, _frame: object) -> None:
@@ -127,5 +140,5 @@ def _watch(signals: socket.socket) -> None:
             step()
         shown = HIDDEN_CURSOR_BACK if os.isatty(2) else ""
         with suppress(OSError):
-            os.write(2, f"{shown}interrupted; {_state}\n".encode())
+            os.write(2, f"{shown}{_summary()}\n".encode())
     os._exit(128 + number)

@@ -155,6 +155,9 @@ class Conversing(Protocol):
 class Repeating(Protocol):
     """A backend whose episodes have been before: what a reset draws is what was drawn then."""
 
+    stopped: str
+    """Why the vehicles were stopped in the episode that has been replayed; empty: it is not over, or they were not."""
+
     @property
     def drawn(self) -> tuple[int, int]:
         """Key of the random draws, and number of the episode, of the episode that has begun last."""

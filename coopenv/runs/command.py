@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
+from coopenv.backends.base import Repeating
 from coopenv.errors import CoopenvError
 from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import analyse_observability
@@ -48,7 +49,7 @@ def execute(
         CoopenvError: an argument is not valid, or the results cannot be written.
     """
     scenario = run.scenario
-    if run.policy_name != "zero" and not scenario.driven:
+    if run.policy_name not in ("zero", "recorded") and not scenario.driven:
         log.print("note: all motion here is prescribed, the policy has no effect", soft_wrap=True)
     steady = steady_start(steady_from, scenario.horizon, run.ticks_planned / scenario.rates.camera)
     with replacing_folder(out, result_names()) as folder:
@@ -90,12 +91,18 @@ def _simulate(run: Rollout, film: Film | None, log: Console, describe: Callable[
 
         view = TopView(run.scenario)
     stride = frame_stride(run.scenario)
-    with Progress(log, "simulating", run.ticks_planned) as progress:
+    with Progress(log, _doing(run), run.ticks_planned) as progress:
         for tick in run.play():
             if tick % stride == 0:
                 if film is not None and view is not None:
                     film.add(view.draw(run.engine))
                 progress.update(tick, describe() if describe is not None else None)
+
+
+def _doing(run: Rollout) -> str:
+    """Return what a run does to its ticks: the backend says where they come from."""
+    abilities = run.engine.backend.capabilities
+    return "replaying" if abilities.recorded else "driving" if abilities.real_time else "simulating"
 
 
 def report(run: Rollout, result: Mapping[str, Any], folder: Path, out: Console) -> None:
@@ -110,7 +117,10 @@ def report(run: Rollout, result: Mapping[str, Any], folder: Path, out: Console) 
     explained = legend(result["steady_from_s"], result["simulated_time_s"])
     for line in (*explained, *remarks(result["vehicles"])):
         out.print(line)
-    out.print(f"Outcome: {result['outcome']}. Simulated at {result['real_time_factor']:.3g} times real time.")
+    done = {"replaying": "Replayed", "driving": "Driven", "simulating": "Simulated"}[_doing(run)]
+    out.print(f"Outcome: {result['outcome']}. {done} at {result['real_time_factor']:.3g} times real time.")
+    if isinstance(run.engine.backend, Repeating) and run.engine.backend.stopped:
+        out.print(f"Stopped: {run.engine.backend.stopped}", soft_wrap=True, markup=False)
     out.print(f"Files in {folder}:", soft_wrap=True)
     names = ", ".join(path.name for path in result["files"])
     out.print(fill(names, out.width, initial_indent="  ", subsequent_indent="  "))

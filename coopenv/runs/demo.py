@@ -15,6 +15,7 @@ from coopenv.backends.svea.opening import open_svea
 from coopenv.errors import CoopenvError, listed, suggest
 from coopenv.fake.fleet import fakes
 from coopenv.files import replacing_file, writing
+from coopenv.interrupts import also_kept
 from coopenv.runs.command import execute, report
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.links import links_line, links_report
@@ -109,7 +110,9 @@ def run_demo(demo: Demo, port: int | None, log: Console, out: Console) -> None:
         environment = None if demo.deployment else demo.environment
         backend = open_svea(fleet, environment, demo.overrides, record=tape, connect=router)
         stack.callback(backend.close)
-        _drive(demo, backend, kept, driven, log, out)
+        whole = _drive_or_keep(demo, backend, kept, driven, log, out)
+    if not whole:
+        raise KeyboardInterrupt
     backends = {"fakes": driven}
     if demo.beside and driven:
         backends["simulation"] = _simulate(demo, backend.scenario, len(driven), log)
@@ -120,6 +123,21 @@ def run_demo(demo: Demo, port: int | None, log: Console, out: Console) -> None:
         out.print("Hidden: frames in which a static landmark is not seen.")
     out.print(kept.line(), soft_wrap=True)
     out.print(f"The drive, bit for bit: coopenv run {demo.drive} --steady-from {STEADY_FROM:g}", soft_wrap=True)
+
+
+def _drive_or_keep(demo: Demo, backend: Svea, kept: Punctuality, driven: Episodes, log: Console, out: Console) -> bool:
+    """Drive; return whether nobody has interrupted it.
+
+    Of one that was interrupted what has been driven takes its place, unless an earlier drive stands there.
+    """
+    try:
+        _drive(demo, backend, kept, driven, log, out)
+    except KeyboardInterrupt:
+        if demo.drive.exists() or backend.tape is None or not backend.tape.begun:
+            raise
+        also_kept(lambda: f"the drive up to here: coopenv run {demo.drive}" if demo.drive.exists() else "")
+        return False
+    return True
 
 
 def _drive(demo: Demo, backend: Svea, kept: Punctuality, driven: Episodes, log: Console, out: Console) -> None:

@@ -1,5 +1,7 @@
 """What a run on cars says of its links: what came, what was refused, and how well time was kept."""
 
+from pathlib import Path
+
 from rich.console import Console
 from rich.table import Table
 
@@ -15,6 +17,13 @@ def links_line(backend: Svea) -> str:
         parts.append(f"{notes['name']} {notes['gate']}" + (f", {refused} refused" if refused else ""))
     late = f"; {backend.link.missed} deadlines missed" if backend.link.missed else ""
     return "; ".join(parts) + late
+
+
+def kept_drive(path: Path | None, backend: Svea) -> str:
+    """Return what is told of a drive's record when the drive is interrupted; empty where there is nothing to replay."""
+    if path is None or backend.tape is None or not backend.tape.begun:
+        return ""
+    return f"kept: {path}, the drive up to here: coopenv run {path}"
 
 
 def links_report(backend: Svea, out: Console) -> None:

@@ -54,6 +54,8 @@ class Rollout:
         self.scenario, self.seed = self.engine.backend.scenario, seed
         self.policy = load_policy(policy, scenario, seed) if isinstance(policy, str) else policy
         self.policy_name = policy if isinstance(policy, str) else getattr(policy, "__name__", "custom")
+        if self.engine.backend.capabilities.recorded:  # whoever drove then
+            self.policy_name = "recorded"
         self.ticks_planned = scenario.horizon_ticks
         if steps is not None:
             self.ticks_planned = min(self.ticks_planned, steps * scenario.ticks_per_decision)

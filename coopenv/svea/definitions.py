@@ -54,6 +54,9 @@ float64[16] covariance
 TICK = "coopenv_msgs/msg/Tick"
 """Type of the marks in a file of a drive."""
 
+STOPPED = "coopenv_msgs/msg/Stopped"
+"""Type of the message that tells there why the watchdog stopped the cars."""
+
 ROS_2 = {
     **CAMERA,
     "mavros_msgs/msg/ManualControl": """
@@ -112,6 +115,11 @@ std_msgs/Header header
 int64 index  # 0: an episode begins
 uint64 key  # of its random draws
 uint32 episode
+""",
+    STOPPED: """
+std_msgs/Header header
+string reason
+string car  # whose fault it was; empty: nobody's
 """,
     "coopenv_msgs/msg/Arm": """
 std_msgs/Header header

@@ -63,6 +63,7 @@ TOPICS = {
 PREFIX = "fleet"
 MOTION_CAPTURE = "qualisys"
 TICK_TOPIC = "coopenv/tick"  # in files only
+STOPPED_TOPIC = "coopenv/stopped"  # likewise: why the watchdog stopped the cars
 RESET_TOPIC = "fleet/coopenv/reset"  # std_msgs/msg/Int64, a seed: fakes go to their start
 
 

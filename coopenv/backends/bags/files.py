@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+from coopenv.backends.mcap.peek import CUT_OFF, MENDED, REPAIR, is_cut_off
 from coopenv.errors import CoopenvError, DataError, DataWarning, told
 from coopenv.svea import codec
 
 SUFFIXES = (".bag", ".db3", ".mcap")
 METADATA = "metadata.yaml"
 
-REPAIRS = {".bag": "rosbag reindex", ".mcap": "mcap recover"}
+REPAIRS = {".bag": "rosbag reindex", ".mcap": REPAIR}
 """By suffix, the tool that mends a file whose recording was cut off."""
 
 
@@ -45,6 +46,8 @@ class BagFile:
             raise DataError(f"{path}: a folder without {METADATA}, which a bag of ROS 2 has")
         if path.is_file() and path.suffix not in SUFFIXES:
             raise DataError(f"{path}: no bag, expected a folder or one of {', '.join(SUFFIXES)}")
+        if path.suffix == ".mcap" and is_cut_off(path):
+            raise DataError(f"{path}: {CUT_OFF}; {MENDED}")
         self._stack = ExitStack()
         from rosbags.highlevel import AnyReader
 

@@ -14,9 +14,8 @@ from lz4.frame import LZ4FrameDecompressor
 from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Message, MessageIndex, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
+from coopenv.backends.mcap.peek import CUT_OFF, MAGIC, MENDED
 from coopenv.errors import DataError, check_memory
-
-MAGIC = b"\x89MCAP0\r\n"
 
 MAX_CHUNK_BYTES = 16 * 2**20  # unpacked; writers make chunks of about 1 MiB
 MAX_EXPANSION = 50
@@ -26,16 +25,22 @@ MAX_EXPANSION = 50
 class Container:
     """An MCAP file, read from begin to end; the index behind its data says nothing that its records do not."""
 
-    def __init__(self, path: Path) -> None:
-        """Read a file. Raises DataError: it is no MCAP file, or cut off; other errors are the library's."""
+    def __init__(self, path: Path, forgiving: bool = False) -> None:
+        """Read a file; if `forgiving`, of one that is cut off what is whole.
+
+        Raises:
+            DataError: it is no MCAP file, or cut off; other errors are the library's.
+        """
         check_memory(path.stat().st_size, f"{path}:")
         data = path.read_bytes()
         if not data.startswith(MAGIC):
             raise DataError(f"{path}: not an MCAP file (it does not begin as one)")
-        if len(data) < 2 * len(MAGIC) or not data.endswith(MAGIC):
-            raise DataError(f"{path}: cut off, the end of the MCAP file is missing")
+        self.cut_off = len(data) < 2 * len(MAGIC) or not data.endswith(MAGIC)
+        """Whether the end is missing."""
+        if self.cut_off and not forgiving:
+            raise DataError(f"{path}: {CUT_OFF}; {MENDED}")
         records = StreamReader(BytesIO(data), emit_chunks=True, record_size_limit=len(data)).records
-        section = takewhile(lambda record: not isinstance(record, DataEnd), records)
+        section = takewhile(lambda record: not isinstance(record, DataEnd), self._whole(records))
         self._records = [record for record in section if not isinstance(record, MessageIndex)]
         self._size = len(data)
 
@@ -51,7 +56,7 @@ class Container:
         """
         schemas: dict[int, Schema] = {}
         channels: dict[int, Channel] = {}
-        for record in self._unpacked():
+        for record in self._whole(self._unpacked()):
             if isinstance(record, Schema):
                 schemas[record.id] = record
             elif isinstance(record, Channel):
@@ -61,6 +66,14 @@ class Container:
                     raise ValueError(f"a message's channel {record.channel_id} is not described")
                 channel = channels[record.channel_id]
                 yield channel, schemas.get(channel.schema_id), record
+
+    def _whole(self, records: Iterator[McapRecord]) -> Iterator[McapRecord]:
+        """Yield records up to where a file is cut off; there anything can be wrong with them."""
+        try:
+            yield from records
+        except Exception:
+            if not self.cut_off:
+                raise
 
     def _unpacked(self) -> Iterator[McapRecord]:
         """Yield the records inside and outside of chunks."""

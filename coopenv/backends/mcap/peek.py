@@ -7,6 +7,21 @@ MAGIC = b"\x89MCAP0\r\n"
 METADATA, ATTACHMENT, HEADER = 0x0C, 0x09, 0x01
 MOST_RECORDS = 16
 
+CUT_OFF = "cut off, the end of the MCAP file is missing"
+REPAIR = "mcap recover"
+"""The tool that mends such a file."""
+MENDED = f"`{REPAIR}` mends it"
+
+
+def is_cut_off(path: Path) -> bool:
+    """Return whether a file begins as an MCAP file and does not end as one."""
+    with path.open("rb") as stream:
+        if stream.read(len(MAGIC)) != MAGIC:
+            return False
+        size = stream.seek(0, 2)
+        stream.seek(max(0, size - len(MAGIC)))
+        return size < 2 * len(MAGIC) or stream.read() != MAGIC
+
 
 def metadata_names(path: str | Path) -> frozenset[str] | None:
     """Return the names of the metadata that stand before a file's data; None: it cannot be read or is no MCAP file."""

@@ -22,7 +22,7 @@ from coopenv.backends.svea.status import StatusBoard
 from coopenv.backends.svea.tape import Tape
 from coopenv.backends.svea.v2x import checked, estimate_message, report_message
 from coopenv.backends.svea.vitals import Vitals
-from coopenv.backends.svea.watchdog import Watchdog
+from coopenv.backends.svea.watchdog import Trip, Watchdog
 from coopenv.errors import CoopenvError
 from coopenv.observers.recording import Sensed
 from coopenv.svea.codec import encode, make
@@ -72,10 +72,11 @@ class Svea:
             transport: how it is reached; closed with the backend.
             signer: signs what is sent (None: nothing is signed).
             verifier: knows the cars' keys (None: signatures do not count).
-            tape: writes down what comes.
+            tape: writes down what ticks are made of, and why the cars were stopped.
         """
         self.deployment, self.binding, self.scenario = deployment, binding, binding.scenario
-        self._transport, self._signer, self._tape = transport, signer, tape
+        self._transport, self._signer = transport, signer
+        self.tape = tape
         names = binding.names
         self._local = {names[i]: i for i in binding.local}
         self.capabilities = Capabilities(
@@ -114,6 +115,7 @@ class Svea:
         )
         transport.watch(presence_of("*"), self._presence)
         self.board.on_override = self.watchdog.set_overridden
+        self.watchdog.on_stop = self._write_down
         self._armed, self._heard_once, self._began, self._index = False, False, 0, 0
         self._key, self._episode = 0, 0
         self._presented = presence_of(deployment.security.identity)
@@ -149,8 +151,8 @@ class Svea:
         self._drain()
         self._began, self._index = self._pacer.start(), 0
         self._key, self._episode = (self._key, self._episode + 1) if seed is None else (seed, 0)
-        if self._tape is not None:
-            self._tape.begin(self._began, self._key % 2**64, self._episode)
+        if self.tape is not None:
+            self.tape.begin(self._began, self._key % 2**64, self._episode)
         return self._counted(self._assembler.begin(self._began))
 
     def _listen(self, arm: bool) -> None:
@@ -212,8 +214,8 @@ class Svea:
             now = self._pacer.wait()
             self._drain()
             self._index += 1
-            if self._tape is not None:
-                self._tape.tick(self._index, now)
+            if self.tape is not None:
+                self.tape.tick(self._index, now)
             yield self._counted(self._assembler.tick(self._index, now))
 
     def _drain(self) -> None:
@@ -224,8 +226,8 @@ class Svea:
         self.vitals.looked = self._pacer.now()
 
     def _take(self, arrival: Arrival) -> None:
-        if self._tape is not None:
-            self._tape.write(arrival.topic, arrival.payload, arrival.received)
+        if self.tape is not None:
+            self.tape.write(arrival.topic, arrival.payload, arrival.received)
         for sample in self.intake.samples(arrival):
             self._assembler.put(sample)
             self.vitals.put(sample)
@@ -288,6 +290,10 @@ class Svea:
         """Return by how much at most that share of the ticks came after their time, s."""
         return self._pacer.late(share)
 
+    def _write_down(self, trip: Trip) -> None:
+        if self.tape is not None:
+            self.tape.stopped(trip.reason, trip.car or "", self._pacer.now())
+
     def stop(self, reason: str) -> None:
         """Bring the cars to a stand at once and end the episode."""
         self._stop(reason)
@@ -301,14 +307,14 @@ class Svea:
         self._armed = False
 
     def close(self) -> None:
-        """Stop, and leave the network."""
+        """Stop, and leave the network. Raises OutputError: what comes and goes could not be written to the end."""
         if not self._closed.acquire(blocking=False):
             return
         self._stop("closed")
         self.watchdog.close()
         try:
-            if self._tape is not None:
-                self._tape.close()
+            if self.tape is not None:
+                self.tape.close()
         finally:
             self._transport.close()
             gc.unfreeze()

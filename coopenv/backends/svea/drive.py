@@ -1,24 +1,27 @@
 """A recorded drive of cars in their place: the same messages, the same ticks."""
 
 import json
+import warnings
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
 from coopenv.backends.mcap.container import Container
+from coopenv.backends.mcap.peek import CUT_OFF, metadata_names
 from coopenv.backends.svea.assembler import Assembler
 from coopenv.backends.svea.binding import Binding, bind
 from coopenv.backends.svea.intake import Intake
 from coopenv.backends.svea.options import wishes_of
 from coopenv.backends.svea.tape import ATTACHMENT, FORMAT, NAME
-from coopenv.errors import CoopenvError, DataError
+from coopenv.errors import CoopenvError, DataError, DataWarning
 from coopenv.scenario.files import override, parse_scenario
 from coopenv.scenario.own_terms import without_own_terms
 from coopenv.svea.codec import decode, stamp_of
-from coopenv.svea.definitions import TICK
+from coopenv.svea.definitions import STOPPED, TICK
 from coopenv.svea.deployment import Deployment, parse_deployment
-from coopenv.svea.topics import TICK_TOPIC
+from coopenv.svea.topics import STOPPED_TOPIC, TICK_TOPIC
 from coopenv.svea.transport.base import Arrival
 
 
@@ -34,15 +37,32 @@ def head_of(deployment: Deployment, binding: Binding, only: str | None) -> bytes
 
 def is_drive(path: str | Path) -> bool:
     """Return whether a file is a recorded drive; False where it cannot be read."""
-    try:
-        metadata, _ = Container(Path(path)).extras()
-    except Exception:  # of whatever kind of file it is
-        return False
-    return NAME in metadata
+    return NAME in (metadata_names(path) or ())
+
+
+@dataclass(frozen=True)
+class Mark:
+    """That a tick was made, at a time in ns; the key of the draws and the number of the episode count at its start."""
+
+    index: int
+    time: int
+    key: int
+    episode: int
+
+
+@dataclass(frozen=True)
+class Stopped:
+    """That the watchdog stopped the cars."""
+
+    reason: str
+    time: int
 
 
 class Drive(TickGenerator):
-    """A drive as a backend: actions change nothing. Every reset goes on to its next episode, and round again."""
+    """A drive as a backend: actions change nothing. Every reset goes on to its next episode, and round again.
+
+    Of one whose end is missing, as the process that wrote it was killed, what is whole is replayed.
+    """
 
     def __init__(self, path: str | Path, overrides: Mapping[str, Any] | None = None) -> None:
         """Open a file that `coopenv svea run --record` has written.
@@ -57,7 +77,7 @@ class Drive(TickGenerator):
         """
         self._where = str(path)
         try:
-            container = Container(Path(path))
+            container = Container(Path(path), forgiving=True)
             metadata, attachments = container.extras()
         except OSError as error:
             raise DataError(f"{path}: cannot be read ({error.strerror or error})") from None
@@ -69,14 +89,16 @@ class Drive(TickGenerator):
             raise DataError(f"{path}: no recorded drive of coopenv (format '{FORMAT}')")
         self._deployment, self.binding = self._read_head(attachments[ATTACHMENT], overrides or {})
         self._messages = list(self._read(container))
-        ends = [n for n, (topic, _, index) in enumerate(self._messages) if topic == TICK_TOPIC and index == 0]
-        if not ends:
-            raise DataError(f"{path}: no episode begins in it")
-        last = [index for topic, _, index in self._messages if topic == TICK_TOPIC]
-        self._episodes, self._next = len(ends), 0
+        indices = [message.index for message in self._messages if isinstance(message, Mark)]
+        if 0 not in indices:
+            raise DataError(f"{path}: {f'{CUT_OFF}, and ' if container.cut_off else ''}no episode begins in it")
+        if container.cut_off:
+            self._warn()
+        self._episodes, self._next = indices.count(0), 0
         self.drawn = (0, 0)
+        self.stopped = ""
         local = self.binding.local if self.binding.remote else None
-        truth, ticks = self._deployment.sensors.truth, max(last) + 1
+        truth, ticks = self._deployment.sensors.truth, max(indices) + 1
         super().__init__(
             self.binding.scenario,
             Capabilities(truth, False, False, ticks, batched=False, recorded=True, estimated=local),
@@ -95,16 +117,28 @@ class Drive(TickGenerator):
         deployment = parse_deployment(given, Path(self._where))
         return deployment, bind(scenario, deployment.cars, deployment.markers, self._where, only)
 
-    def _read(self, container: Container) -> Iterator[tuple[str, Any, int]]:
-        """Yield (topic, arrival or (time, key, episode), index of a tick or -1)."""
+    def _warn(self) -> None:
+        """Say from where on the file is missing."""
+        times = [message.received if isinstance(message, Arrival) else message.time for message in self._messages]
+        seconds = (max(times) - min(times)) * 1e-9
+        warnings.warn(
+            f"{self._where}: {CUT_OFF}: of what came after {seconds:.1f} s nothing is replayed",
+            DataWarning,
+            stacklevel=3,
+        )
+
+    def _read(self, container: Container) -> Iterator[Arrival | Mark | Stopped]:
         try:
             for channel, _, message in container.messages():
                 topic = channel.topic.lstrip("/")
-                if topic != TICK_TOPIC:
-                    yield topic, Arrival(topic, bytes(message.data), message.log_time), -1
-                    continue
-                mark = decode(message.data, TICK)
-                yield topic, (stamp_of(mark), int(mark.key), int(mark.episode)), int(mark.index)
+                if topic == TICK_TOPIC:
+                    mark = decode(message.data, TICK)
+                    yield Mark(int(mark.index), stamp_of(mark), int(mark.key), int(mark.episode))
+                elif topic == STOPPED_TOPIC:
+                    stop = decode(message.data, STOPPED)
+                    yield Stopped(stop.reason, stamp_of(stop))
+                else:
+                    yield Arrival(topic, bytes(message.data), message.log_time)
         except CoopenvError as error:
             raise DataError(f"{self._where}: {error}") from None
         except Exception as error:
@@ -115,20 +149,22 @@ class Drive(TickGenerator):
         wishes_of(options)
         wanted, self._next = self._next, (self._next + 1) % self._episodes
         intake, assembler = Intake(self.binding, self._deployment.sensors), Assembler(self.binding)
-        number = -1
-        for topic, content, index in self._messages:
-            if topic != TICK_TOPIC:
-                for sample in intake.samples(content):
+        number, self.stopped = -1, ""
+        for message in self._messages:
+            if isinstance(message, Arrival):
+                for sample in intake.samples(message):
                     assembler.put(sample)
                 continue
-            now, key, episode = content
-            if index == 0:
+            if isinstance(message, Stopped):
+                self.stopped = message.reason if number == wanted else ""
+                continue
+            if message.index == 0:
                 number += 1
                 if number > wanted:
                     return
-                self.drawn = key, episode
-                tick = assembler.begin(now)
+                self.drawn = message.key, message.episode
+                tick = assembler.begin(message.time)
             else:
-                tick = assembler.tick(index, now)
+                tick = assembler.tick(message.index, message.time)
             if number == wanted:
                 yield tick

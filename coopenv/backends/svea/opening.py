@@ -7,13 +7,15 @@ from typing import Any
 from coopenv.backends.svea.backend import Svea
 from coopenv.backends.svea.binding import Binding, bind
 from coopenv.backends.svea.drive import head_of
-from coopenv.backends.svea.tape import Tape, Taped
+from coopenv.backends.svea.status import ROLES
+from coopenv.backends.svea.tape import Tape
+from coopenv.backends.svea.taped import PRESENCE, Taped
 from coopenv.errors import CoopenvError
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.svea.deployment import Deployment, load_deployment
 from coopenv.svea.keys import check_known, load_signer, load_verifier
 from coopenv.svea.signing import Signer, Verifier
-from coopenv.svea.topics import RESET_TOPIC, TOPICS, topic_of
+from coopenv.svea.topics import RESET_TOPIC, TOPICS, Role, presence_of, topic_of
 from coopenv.svea.transport.base import Transport
 from coopenv.svea.transport.open import open_transport
 
@@ -47,12 +49,15 @@ def open_svea(
     signer, verifier = _keys(deployment, binding, car)
     link = open_transport(deployment) if transport is None else transport
     try:
-        tape = None if record is None else Tape(Path(record), head_of(deployment, binding, car), _types(binding))
+        types = _types(binding, deployment.security.identity)
+        tape = None if record is None else Tape(Path(record), head_of(deployment, binding, car), types)
     except CoopenvError:
         link.close()
         raise
     if tape is not None:
-        link = Taped(link, tape)
+        names = [binding.names[i] for i in binding.local]
+        aside = {topic_of(name, role) for name in names for role in (Role.GATE, *ROLES)}
+        link = Taped(link, tape, aside, {topic_of(name, Role.STOP) for name in names})
     return Svea(deployment, binding, link, signer, verifier, tape)
 
 
@@ -75,8 +80,9 @@ def _keys(deployment: Deployment, binding: Binding, car: str | None) -> tuple[Si
     return load_signer(folder, car or deployment.security.identity), verifier
 
 
-def _types(binding: Binding) -> dict[str, str]:
-    """Return the type of every topic of the cars."""
+def _types(binding: Binding, identity: str) -> dict[str, str]:
+    """Return the type of every topic of the cars, presence included."""
     names = (*binding.cars, *binding.leaders)
     types = {topic_of(name, role): topic.type for name in names for role, topic in TOPICS.items()}
-    return {**types, RESET_TOPIC: "std_msgs/msg/Int64"}
+    present = {presence_of(name): PRESENCE for name in (*names, identity)}
+    return {**types, **present, RESET_TOPIC: "std_msgs/msg/Int64"}

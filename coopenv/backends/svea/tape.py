@@ -2,26 +2,30 @@
 
 The file is a ROS 2 bag that other tools read: every message stands under its own topic and type. What goes beyond that
 is the topic `coopenv/tick` and an attachment that says which fleet and environment it was; with both, a replay makes
-the same ticks again, bit for bit (`coopenv.backends.svea.drive`).
+the same ticks again, bit for bit (`coopenv.backends.svea.drive`). `coopenv/stopped` tells why the watchdog stopped the
+cars.
 """
 
 import queue
 import threading
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from coopenv.errors import CoopenvError, OutputError
 from coopenv.files import writing
 from coopenv.shipped import version
 from coopenv.svea.codec import encode, header, make, ros2
-from coopenv.svea.definitions import TICK
-from coopenv.svea.topics import TICK_TOPIC
-from coopenv.svea.transport.base import Transport
+from coopenv.svea.definitions import STOPPED, TICK
+from coopenv.svea.topics import STOPPED_TOPIC, TICK_TOPIC
 
 FORMAT = "coopenv drive 1"
 NAME = "coopenv-drive"
 ATTACHMENT = "drive.json"
+
+FLUSH = 0.5
+"""s after which at the latest the system has what was written: so much is lost if the process is killed."""
 
 
 class Tape:
@@ -47,16 +51,21 @@ class Tape:
             raise OutputError(f"{path}: the name must end in .mcap")
         if path.exists():
             raise OutputError(f"{path}: exists already")
-        self._types = {**types, TICK_TOPIC: TICK}
+        self._path, self._types = path, {**types, TICK_TOPIC: TICK, STOPPED_TOPIC: STOPPED}
+        self.begun = False
+        """Whether an episode has begun: without one there is nothing to replay."""
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._sequence = 0
+        self._error: OSError | None = None
         with writing(path):
             self._stream = path.open("xb")
-        self._writer = Writer(self._stream)
-        self._writer.start(profile="ros2", library=f"coopenv {version()}")
-        self._writer.add_metadata(NAME, {"format": FORMAT, "version": version()})
-        self._writer.add_attachment(0, 0, ATTACHMENT, "application/json", head)
+            self._writer = Writer(self._stream)
+            self._writer.start(profile="ros2", library=f"coopenv {version()}")
+            self._writer.add_metadata(NAME, {"format": FORMAT, "version": version()})
+            self._writer.add_attachment(0, 0, ATTACHMENT, "application/json", head)
+            self._stream.flush()
+        _stopped("", "", 0)  # the first message of a type takes long, and this one must not
         self._queue: queue.SimpleQueue[tuple[str, bytes, int] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write_all, name="coopenv tape", daemon=True)
         self._thread.start()
@@ -64,6 +73,7 @@ class Tape:
     def begin(self, now: int, key: int, episode: int) -> None:
         """Mark that tick 0 of an episode was made at a time in ns; key and episode fix what was drawn."""
         self._mark(0, now, key, episode)
+        self.begun = True
 
     def tick(self, index: int, now: int) -> None:
         """Mark that a tick was made at a time in ns of what had come before."""
@@ -78,18 +88,52 @@ class Tape:
         if topic in self._types:
             self._queue.put((topic, payload, now))
 
+    def stopped(self, reason: str, car: str, now: int) -> None:
+        """Write why the watchdog stopped the cars at a time in ns, and whose fault it was; that cannot get lost."""
+        self._queue.put((STOPPED_TOPIC, _stopped(reason, car, now), now))
+
     def close(self) -> None:
-        """Write what is left and close the file."""
+        """Write what is left and close the file; one without an episode is removed.
+
+        Raises:
+            OutputError: it could not be written to the end; what stands in it can be replayed.
+        """
         self._queue.put(None)
         self._thread.join()
-        self._writer.finish()
-        self._stream.close()
+        try:
+            with writing(self._path):
+                if self._error is not None:
+                    raise self._error
+                self._writer.finish()
+                self._stream.flush()
+        finally:
+            with suppress(OSError):
+                self._stream.close()
+            if not self.begun:
+                self._path.unlink(missing_ok=True)
 
     def _write_all(self) -> None:
-        while (item := self._queue.get()) is not None:
-            topic, payload, now = item
-            self._sequence += 1
-            self._writer.add_message(self._channel(topic), now, payload, now, self._sequence % 2**32)
+        due = time.monotonic() + FLUSH
+        try:
+            while (item := self._next(due)) is not None:
+                topic, payload, now = item
+                if topic:
+                    self._sequence += 1
+                    self._writer.add_message(self._channel(topic), now, payload, now, self._sequence % 2**32)
+                if topic == STOPPED_TOPIC or time.monotonic() >= due:
+                    self._writer.flush()
+                    due = time.monotonic() + FLUSH
+        except OSError as error:  # the disk is full: nothing more is written, but nor does the memory fill
+            self._error = error
+            while self._queue.get() is not None:
+                pass
+
+    def _next(self, until: float) -> tuple[str, bytes, int] | None:
+        """Return what is to be written next; nothing, without a topic, where nothing comes until then."""
+        try:
+            return self._queue.get(timeout=max(0.0, until - time.monotonic()))
+        except queue.Empty:
+            return "", b"", 0
 
     def _channel(self, topic: str) -> int:
         if topic not in self._channels:
@@ -101,18 +145,5 @@ class Tape:
         return self._channels[topic]
 
 
-class Taped:
-    """A transport whose outgoing messages are written to a tape as well."""
-
-    def __init__(self, transport: Transport, tape: Tape) -> None:
-        """Wrap a transport."""
-        self._transport, self._tape = transport, tape
-        self.subscribe, self.announce = transport.subscribe, transport.announce
-        self.watch, self.close = transport.watch, transport.close
-
-    def publish(
-        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
-    ) -> None:
-        """Send, see `Transport`, and write down."""
-        self._transport.publish(topic, payload, attachment, urgent=urgent, reliable=reliable)
-        self._tape.write(topic, payload, time.time_ns())
+def _stopped(reason: str, car: str, now: int) -> bytes:
+    return encode(make(STOPPED, header=header(now), reason=reason, car=car))

@@ -60,6 +60,7 @@ class Watchdog:
         self._lock = threading.Lock()
         self._armed, self._closed = False, threading.Event()
         self.trip: Trip | None = None
+        self.on_stop: Callable[[Trip], None] = lambda trip: None
         self._beat: float | None = None  # of the last decision; None: there has been none
         self._missed = 0
         self._present: dict[str, bool] = {}
@@ -101,9 +102,13 @@ class Watchdog:
         with self._lock:
             if not self._armed:
                 return
-            self._armed, self.trip = False, Trip(reason, car, time.monotonic())
-        self._gates.stop()
-        self._gates.end()
+            self._armed = False
+            self.trip = trip = Trip(reason, car, time.monotonic())
+        try:
+            self.on_stop(trip)  # takes microseconds, and comes before another episode can begin
+        finally:
+            self._gates.stop()
+            self._gates.end()
 
     def close(self) -> None:
         """End the thread."""

@@ -25,7 +25,9 @@ def run(
     seed: options.Seed = 0,
     steps: Annotated[int | None, typer.Option(min=1, help="Decisions to run (default: up to the horizon).")] = None,
     connect: options.Connect = None,
-    record: Annotated[Path | None, typer.Option(help="MCAP file for all that comes and goes.")] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="MCAP file for every message that comes or goes; coopenv run replays it.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the results (default: out/DEPLOYMENT).")] = None,
     overrides: options.Overrides = None,
     steady_from: options.SteadyFrom = None,
@@ -37,13 +39,15 @@ def run(
     Without --arm no command is sent: run it beside the car that somebody else drives.
     """
     from coopenv.backends.svea.opening import open_svea
+    from coopenv.interrupts import also_kept
     from coopenv.runs.command import execute, report
-    from coopenv.runs.links import links_line, links_report
+    from coopenv.runs.links import kept_drive, links_line, links_report
     from coopenv.runs.rollouts import Rollout
 
     changes, log = options.parse_overrides(overrides), options.console(stderr=True)
     with options.warned():
         backend = open_svea(config, None, changes, car, record, connect=connect)
+    also_kept(partial(kept_drive, record, backend))
     try:
         wishes = {"arm": arm, "release": release}
         rollout = Rollout(backend.scenario, seed, steps, policy=policy, backend=backend, options=wishes)

@@ -9,7 +9,8 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
-from coopenv.backends.svea.tape import ATTACHMENT, NAME, Tape, Taped
+from coopenv.backends.svea.tape import ATTACHMENT, NAME, Tape
+from coopenv.backends.svea.taped import Taped
 from coopenv.errors import OutputError
 from coopenv.svea.codec import encode, header, make
 from coopenv.svea.definitions import TICK
@@ -71,6 +72,7 @@ def test_what_goes_out_is_on_tape_as_well(tmp_path: Path) -> None:
     hub, heard = Hub(), []
     hub.connect().subscribe(WHEEL, heard.append)
     tape = Tape(tmp_path / "drive.mcap", b"{}", TYPES)
+    tape.begin(1, 0, 0)
     Taped(hub.connect(), tape).publish(WHEEL, encode(empty(TYPES[WHEEL])), b"signature")
     tape.close()
     assert [arrival.attachment for arrival in heard] == [b"signature"]
