@@ -139,12 +139,14 @@ def _windows_about_anchor(scene: Scene, window: float) -> tuple[np.ndarray, np.n
 
 def _information_rate(scene: Scene, anchor: np.ndarray) -> np.ndarray:
     """Return C*^T C* (K, N, 6, 6) in map axes, about one point (N, 3) per vehicle."""
-    offset = scene.target_position[:, None] - scene.position[:, :, None]  # (K, N, T, 3)
+    known = np.isfinite(scene.target_position).all(axis=-1)  # (K, T)
+    place = np.where(known[..., None], scene.target_position, 0.0)
+    offset = place[:, None] - scene.position[:, :, None]  # (K, N, T, 3)
     distance = np.linalg.norm(offset, axis=-1, keepdims=True)
     bearing = offset / np.where(distance > 0, distance, 1.0)
-    seen = scene.visible & (distance[..., 0] > 0)
+    seen = scene.visible & known[:, None] & (distance[..., 0] > 0)
     projection = (np.eye(3) - bearing[..., :, None] * bearing[..., None, :]) * seen[..., None, None]
-    lever = skew(scene.target_position[:, None] - anchor[:, None])  # (K, N, T, 3, 3)
+    lever = skew(place[:, None] - anchor[:, None])  # (K, N, T, 3, 3)
     cross = lever @ projection  # = (-Pi S)^T Pi
     rate = np.empty((*scene.position.shape[:2], 6, 6))
     rate[..., :3, :3] = -(cross @ lever).sum(axis=2)

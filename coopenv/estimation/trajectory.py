@@ -1,5 +1,6 @@
 """The record of one run: what was true, what was estimated, and what was in view."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Self
@@ -45,6 +46,16 @@ class Trajectory:
             return self
         constant = ("terms", "vehicles", "targets", "target_moving")
         return replace(self, **{f.name: getattr(self, f.name)[known] for f in fields(self) if f.name not in constant})
+
+    def of_vehicles(self, indices: Sequence[int]) -> Self:
+        """Return the record of some vehicles alone; the others stay among the targets."""
+        if [*indices] == [*range(len(self.vehicles))]:
+            return self
+        of_all = ("t", "target_position", "terms", "targets", "target_moving")
+        chosen = {
+            f.name: getattr(self, f.name)[:, [*indices]] for f in fields(self) if f.name not in (*of_all, "vehicles")
+        }
+        return replace(self, vehicles=self.vehicles[[*indices]], **chosen)
 
     def save(self, path: Path) -> None:
         """Write every array into a compressed `.npz` under its field name.

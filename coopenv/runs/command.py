@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 
 from coopenv.backends.base import Repeating
-from coopenv.errors import CoopenvError
+from coopenv.errors import CoopenvError, listed
 from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import analyse_observability
 from coopenv.files import replace_text, replacing_folder
@@ -58,7 +58,7 @@ def execute(
         film = open_film(folder, scenario.rates.camera / frame_stride(scenario)) if video else None
         _simulate(run, film, log, describe)
         trajectory = run.trajectory()
-        judged, endings = trajectory.where_truth_is_known(), run.endings()
+        judged, endings = trajectory.of_vehicles(run.vehicles).where_truth_is_known(), run.endings()
         if len(judged.t) < 2:
             raise CoopenvError(f"{name}: no true poses are known, so there are no errors to show")
         observability = analyse_observability(judged)
@@ -91,7 +91,8 @@ def _simulate(run: Rollout, film: Film | None, log: Console, describe: Callable[
 
         view = TopView(run.scenario)
     stride = frame_stride(run.scenario)
-    with Progress(log, _doing(run), run.ticks_planned) as progress:
+    rate = run.scenario.rates.camera if run.engine.backend.capabilities.real_time else None
+    with Progress(log, _doing(run), run.ticks_planned, rate) as progress:
         for tick in run.play():
             if tick % stride == 0:
                 if film is not None and view is not None:
@@ -107,9 +108,13 @@ def _doing(run: Rollout) -> str:
 
 def report(run: Rollout, result: Mapping[str, Any], folder: Path, out: Console) -> None:
     """Print what `execute` returned for people."""
+    able, pace = run.engine.backend.capabilities, f"{result['real_time_factor']:.3g} times real time"
     source = f"seed {run.seed}, noise {'on' if run.scenario.noise.enabled else 'off'}"
-    if run.engine.backend.capabilities.recorded:
-        source = "recorded"
+    done = f"Simulated at {pace}"
+    if able.recorded:
+        source, done = "recorded", f"Replayed at {pace}"
+    elif able.real_time:
+        source, done = f"in real time, seed {run.seed}", f"It took {result['simulated_time_s']:.4g} s of real time"
     out.print(f"{run.scenario.title}: {source}, {result['dtype']} on {result['device']}", soft_wrap=True)
     out.print()
     out.print(metrics_table(result["vehicles"]))
@@ -117,8 +122,9 @@ def report(run: Rollout, result: Mapping[str, Any], folder: Path, out: Console) 
     explained = legend(result["steady_from_s"], result["simulated_time_s"])
     for line in (*explained, *remarks(result["vehicles"])):
         out.print(line)
-    done = {"replaying": "Replayed", "driving": "Driven", "simulating": "Simulated"}[_doing(run)]
-    out.print(f"Outcome: {result['outcome']}. {done} at {result['real_time_factor']:.3g} times real time.")
+    if others := [name for i, name in enumerate(run.scenario.vehicle_names) if i not in run.vehicles]:
+        out.print(f"{listed(others)}: heard by radio, not estimated here", soft_wrap=True)
+    out.print(f"Outcome: {result['outcome']}. {done}.")
     if isinstance(run.engine.backend, Repeating) and run.engine.backend.stopped:
         out.print(f"Stopped: {run.engine.backend.stopped}", soft_wrap=True, markup=False)
     out.print(f"Files in {folder}:", soft_wrap=True)

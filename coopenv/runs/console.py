@@ -17,7 +17,8 @@ from coopenv.world.launch import start_warp
 T = TypeVar("T")
 
 LINE_PERIOD = 10.0  # s between lines of progress where there is no terminal
-HINT_FROM = 20.0  # s of work left after the first piece of it, from which on there is a line at once
+ENOUGH = 1.0  # s of work from which on its pace can be told
+HINT_FROM = 20.0  # s of work left as soon as its pace is known, from which on there is a line at once
 COMPILE_NOTICE_AFTER = 1.5  # s between looks for what is being compiled; less need not be told
 
 
@@ -30,9 +31,17 @@ class Progress:
         progress.update(30)
     """
 
-    def __init__(self, log: Console, description: str, total: float | None = None) -> None:
-        """Describe the work; `total` is the value of `completed` at the end, None where it is not known."""
+    def __init__(self, log: Console, description: str, total: float | None = None, rate: float | None = None) -> None:
+        """Describe the work.
+
+        Args:
+            log: where it is told.
+            description: what is done.
+            total: the value of `completed` at the end; None where it is not known.
+            rate: how much is completed in a second where that is known, as in real time (None: as it turns out).
+        """
         self._log, self._description, self._total, self._completed = log, description, total, 0.0
+        self._rate, self._hinted = rate, False
         self._over = threading.Event()
         columns = SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
         self._bar = Bar(*columns, console=log, transient=True)
@@ -53,12 +62,15 @@ class Progress:
             self._bar.stop()
 
     def update(self, completed: float, description: str | None = None) -> None:
-        """Say how much is done, and what is being done now."""
-        first = self._completed == 0.0
+        """Say how much is done, and what is being done now; time counts from a first word that nothing is done yet."""
+        if completed == 0.0 and self._completed == 0.0:
+            self._begin = monotonic()
         self._completed, self._description = completed, description or self._description
         self._bar.update(self._task, completed=completed, total=self._total, description=self._description)
-        if first and self._left() > HINT_FROM and not self._log.is_terminal:
-            self._log.print(self.line(), soft_wrap=True)
+        if not self._hinted and not isnan(left := self._left()):
+            self._hinted = True
+            if left > HINT_FROM and not self._log.is_terminal:
+                self._log.print(self.line(), soft_wrap=True)
 
     def advance(self, description: str | None = None) -> None:
         """Say that one more unit is done."""
@@ -75,15 +87,22 @@ class Progress:
     def line(self) -> str:
         """Return how far the work is, e.g. `simulating: 40 % after 20 s, about 30 s left`."""
         elapsed, left = monotonic() - self._begin, self._left()
-        if isnan(left):
+        share = self._completed / self._total if self._total else 0.0
+        if share == 0.0:
             return f"{self._description}: {elapsed:.0f} s"
-        share = self._completed / (self._total or nan)
+        if isnan(left):
+            return f"{self._description}: {100 * share:.0f} % after {elapsed:.0f} s"
         return f"{self._description}: {100 * share:.0f} % after {elapsed:.0f} s, about {left:.0f} s left"
 
     def _left(self) -> float:
-        """Return the time that the rest will take at the pace so far, s; NaN where that is not known."""
+        """Return the time that the rest will take at the pace so far, s; NaN where that is not known yet."""
         share = self._completed / self._total if self._total else 0.0
-        return (monotonic() - self._begin) * (1.0 - share) / share if 0.0 < share <= 1.0 else nan
+        elapsed = monotonic() - self._begin
+        if not 0.0 < share <= 1.0:
+            return nan
+        if self._rate is not None:
+            return ((self._total or nan) - self._completed) / self._rate
+        return elapsed * (1.0 - share) / share if elapsed >= ENOUGH else nan
 
     def _write_lines(self) -> None:
         while not self._over.wait(LINE_PERIOD):

@@ -25,7 +25,7 @@ def play(
         seeds: one per world.
         ticks: after the start; fewer where the backend has no more.
         policy: drives the first world; None: action zero.
-        to_the_end: go on when all vehicles of the first world have ended.
+        to_the_end: go on when all vehicles of the first world that are estimated here have ended.
         options: for a backend that takes some at a reset.
 
     Raises:
@@ -34,13 +34,13 @@ def play(
     with engine.stopping():
         engine.reset([world_keys(seed)[0] for seed in seeds], options=options)
         engine.set_actions(np.zeros_like(engine.view("actions")))
-        width = engine.view("actions").shape[-1]
+        width, here = engine.view("actions").shape[-1], [*estimated_here(engine)]
         if policy is not None:
             restart(policy, np.ones(engine.world.model.vehicles, dtype=bool))
         yield 0
         for tick in range(ticks):
             if tick % engine.world.model.ticks_per_decision == 0:
-                if not to_the_end and engine.view("ended")[0].all():
+                if not to_the_end and engine.view("ended")[0, here].all():
                     return
                 if policy is not None:
                     engine.set_actions(decide(policy, engine.view("observation")[0].copy(), width)[None])
@@ -48,6 +48,12 @@ def play(
             if engine.view("exhausted")[0]:
                 return
             yield tick + 1
+
+
+def estimated_here(engine: Engine) -> tuple[int, ...]:
+    """Return which vehicles are estimated here, not elsewhere and heard by radio."""
+    here = engine.backend.capabilities.estimated
+    return tuple(range(engine.world.model.vehicles)) if here is None else here
 
 
 class Views:

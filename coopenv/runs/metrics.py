@@ -63,7 +63,8 @@ def outcome_line(run: Rollout) -> str:
     parts = [f"{count} {word}" for word, count in counts.items() if count]
     time = run.ticks_recorded / run.scenario.rates.camera
     if Outcome.UNDER_WAY.words not in outcomes:
-        end = f"all vehicles had ended by {max(ending.time for ending in run.endings()):.4g} s"
+        own = "" if len(outcomes) == len(run.scenario.vehicles) else " estimated here"
+        end = f"all vehicles{own} had ended by {max(ending.time for ending in run.endings()):.4g} s"
     elif run.ticks_recorded >= run.scenario.horizon_ticks:
         end = f"horizon reached at {time:g} s"
     elif run.ticks_recorded < run.ticks_planned:

@@ -13,7 +13,7 @@ from coopenv.errors import CoopenvError
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.policies import Policy, load_policy
-from coopenv.runs.episode import Views, play
+from coopenv.runs.episode import Views, estimated_here, play
 from coopenv.scenario import Scenario
 
 RECORDED = (
@@ -64,6 +64,11 @@ class Rollout:
         self._views = Views(self.engine, RECORDED)
 
     @property
+    def vehicles(self) -> tuple[int, ...]:
+        """The vehicles that are estimated here, which tables and figures of errors are about."""
+        return estimated_here(self.engine)
+
+    @property
     def ticks_recorded(self) -> int:
         """Camera ticks since t = 0 that have been recorded."""
         return max(0, self._views.taken - 1)
@@ -71,7 +76,8 @@ class Rollout:
     def play(self) -> Iterator[int]:
         """Start the episode and yield the number of each camera tick, from 0, once it is recorded.
 
-        The run ends at the horizon, after `steps` decisions, or with the decision in which the last vehicle ended.
+        The run ends at the horizon, after `steps` decisions, or with the decision in which the last vehicle that is
+        estimated here ended.
         `wall_time` (s) counts what is spent in here, not what the caller does between two ticks.
         """
         start = perf_counter()
@@ -112,8 +118,8 @@ class Rollout:
         )
 
     def endings(self) -> list[Ending]:
-        """Return how each vehicle's run has ended so far."""
-        ended = self._recorded("ended")
+        """Return how the run of each vehicle that is estimated here has ended so far."""
+        ended = self._recorded("ended")[:, [*self.vehicles]]
         first = np.where(ended.any(axis=0), np.argmax(ended != 0, axis=0), len(ended) - 1)
         words, times = outcome_words(self.scenario), (first / self.scenario.rates.camera).tolist()
         return [Ending(words[outcome], time) for outcome, time in zip(ended[-1].tolist(), times, strict=True)]

@@ -25,7 +25,7 @@ class Episodes:
 
     def add(self, run: Rollout) -> None:
         """Take an episode that is over."""
-        trajectory = run.trajectory().where_truth_is_known()
+        trajectory = run.trajectory().of_vehicles(run.vehicles).where_truth_is_known()
         ends = [ending.time for ending in run.endings()]
         static = np.array([k for k in range(len(run.scenario.landmarks)) if not trajectory.target_moving[k]])
         rows = summarise(trajectory, self._steady_from, ends)

@@ -47,7 +47,7 @@ def save_figures(
     draw = {
         "errors": lambda: error_figure(trajectory, ends),
         "trajectories_2d": lambda: trajectory_figure_2d(trajectory, ends, scenario),
-        "trajectories_3d": lambda: trajectory_figure_3d(trajectory, ends),
+        "trajectories_3d": lambda: trajectory_figure_3d(trajectory, ends, scenario),
         "topology": lambda: topology_figure(trajectory, ends),
         "consistency": lambda: consistency_figure(trajectory, ends, steady_from),
         "observability": lambda: observability_figure(seen, ends),

@@ -15,7 +15,7 @@ from coopenv.scenario import Scenario
 from coopenv.viz import style
 from coopenv.viz.clipping import clipped
 from coopenv.viz.labels import place_names
-from coopenv.viz.style import DARK_BLUE, INK, NORMAL, vehicle_colour, vehicle_label
+from coopenv.viz.style import DARK_BLUE, GREY, INK, NORMAL, vehicle_colour, vehicle_label
 from coopenv.viz.topview_ground import ASPHALT, ROOF, WALL, draw_site
 
 _DOTTED = (0, (1, 1.6))
@@ -82,7 +82,8 @@ def trajectory_figure_2d(
     """Draw the paths in plan, axes equal, in metres, over the roads and buildings of a scenario.
 
     The frame follows the truth. An estimate that starts outside enters from the edge, where an open triangle
-    marks it. The paths of a vehicle stop at its end (s).
+    marks it. The paths of a vehicle stop at its end (s). Of a scenario's vehicles that the record is not about, only
+    what is true is shown.
     """
     low, high = _scene(trajectory)
     width, depth = high[:2] - low[:2]
@@ -97,22 +98,31 @@ def trajectory_figure_2d(
     if scenario is not None:
         draw_site(ax, scenario)
     drawing = _Drawing(ax, low, high, dimensions=2)
-    _draw_paths(drawing, trajectory, ends)
+    _draw_paths(drawing, trajectory, ends, _elsewhere(trajectory, scenario))
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.set_aspect("equal", adjustable="datalim")
     drawing.write_names()
-    _legend(figure, trajectory, (1 - (_LEGEND - 0.1) / w, 1 - 0.2 / h), drawing.outside, scenario)
+    _legend(
+        figure,
+        trajectory,
+        (1 - (_LEGEND - 0.1) / w, 1 - 0.2 / h),
+        drawing.outside,
+        _elsewhere(trajectory, scenario),
+        scenario,
+    )
     return figure
 
 
-def trajectory_figure_3d(trajectory: Trajectory, ends: Sequence[float] | None = None) -> Figure:
+def trajectory_figure_3d(
+    trajectory: Trajectory, ends: Sequence[float] | None = None, scenario: Scenario | None = None
+) -> Figure:
     """Draw the paths in space, one scale on all axes, in metres; frame and ends as in plan."""
     low, high = _scene(trajectory)
     figure = style.new_figure(9.5, 5.8)
     ax: Any = figure.add_axes((-0.01, -0.12, 0.85, 1.24), projection="3d")
     ax.view_init(elev=32, azim=-58)
     drawing = _Drawing(ax, low, high, dimensions=3)
-    _draw_paths(drawing, trajectory, ends)
+    _draw_paths(drawing, trajectory, ends, _elsewhere(trajectory, scenario))
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     steep = float((high - low)[2] / np.max((high - low)[:2]))
     ax.set_box_aspect(high - low, zoom=float(np.clip(1.2 - 0.5 * steep, 0.7, 1.0)))
@@ -124,7 +134,7 @@ def trajectory_figure_3d(trajectory: Trajectory, ends: Sequence[float] | None = 
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
         axis.pane.set_facecolor("#F7F7F7")
     drawing.write_names()
-    _legend(figure, trajectory, (0.84, 0.93), drawing.outside)
+    _legend(figure, trajectory, (0.84, 0.93), drawing.outside, _elsewhere(trajectory, scenario))
     return figure
 
 
@@ -154,11 +164,13 @@ def _scene(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-def _draw_paths(drawing: _Drawing, trajectory: Trajectory, ends: Sequence[float] | None) -> None:
+def _draw_paths(
+    drawing: _Drawing, trajectory: Trajectory, ends: Sequence[float] | None, elsewhere: Sequence[str]
+) -> None:
     """Draw landmarks, estimates, and the truth on top."""
     low, high = drawing.low, drawing.high
     used = slice(drawing.dimensions)
-    _draw_landmarks(drawing, trajectory)
+    _draw_landmarks(drawing, trajectory, elsewhere)
     for vehicle, ticks in enumerate(live_ticks(trajectory.t, len(trajectory.vehicles), ends)):
         keep = style.thinned(ticks)
         colour = vehicle_colour(vehicle)
@@ -178,18 +190,22 @@ def _draw_paths(drawing: _Drawing, trajectory: Trajectory, ends: Sequence[float]
         drawing.name(truth[0], vehicle_label(trajectory.vehicles[vehicle]), INK)
 
 
-def _draw_landmarks(drawing: _Drawing, trajectory: Trajectory) -> None:
+def _draw_landmarks(drawing: _Drawing, trajectory: Trajectory, elsewhere: Sequence[str]) -> None:
     keep = style.thinned(len(trajectory.t))
     labels = style.target_labels(trajectory)
     for target, moving in _landmarks(trajectory):
         path = trajectory.target_position[keep, target]
+        path = path[np.isfinite(path).all(axis=-1)]
+        colour, dash = (GREY, _DOTTED) if trajectory.targets[target] in elsewhere else (DARK_BLUE, _DASHED)
+        if not len(path):
+            continue
         if moving:
-            drawing.line(path, color=DARK_BLUE, linewidth=1.1, linestyle=_DASHED)
-            drawing.mark(path[0], "^", DARK_BLUE)
-            drawing.mark(path[-1], "x", DARK_BLUE)
+            drawing.line(path, color=colour, linewidth=1.1, linestyle=dash)
+            drawing.mark(path[0], "^", colour)
+            drawing.mark(path[-1], "x", colour)
         else:
-            drawing.mark(path[0], "o", DARK_BLUE)
-        drawing.name(path[0], labels[target], DARK_BLUE)
+            drawing.mark(path[0], "o", colour)
+        drawing.name(path[0], labels[target], colour)
 
 
 def _landmarks(trajectory: Trajectory) -> list[tuple[int, bool]]:
@@ -199,13 +215,23 @@ def _landmarks(trajectory: Trajectory) -> list[tuple[int, bool]]:
     return [(i, moves) for i, (name, moves) in enumerate(zip(names, moving, strict=True)) if name not in vehicles]
 
 
+def _elsewhere(trajectory: Trajectory, scenario: Scenario | None) -> list[str]:
+    """Return the names of vehicles that the record is not about: they are estimated elsewhere."""
+    return [] if scenario is None else [n for n in scenario.vehicle_names if n not in trajectory.vehicles]
+
+
 def _marker(marker: str, edge: str, face: str) -> dict[str, Any]:
     look = {"marker": marker, "markeredgecolor": edge, "markerfacecolor": face}
     return {"linestyle": "none", "markersize": 6.5, "markeredgewidth": 1.1, **look}
 
 
 def _legend(
-    figure: Figure, trajectory: Trajectory, place: tuple[float, float], outside: bool, scenario: Scenario | None = None
+    figure: Figure,
+    trajectory: Trajectory,
+    place: tuple[float, float],
+    outside: bool,
+    elsewhere: Sequence[str],
+    scenario: Scenario | None = None,
 ) -> None:
     truth = {"color": INK, "linewidth": 1.1, "linestyle": _DOTTED}
     looks: dict[str, dict[str, Any]] = {
@@ -213,14 +239,17 @@ def _legend(
         for i, name in enumerate(trajectory.vehicles)
     }
     looks |= {"truth": truth, "estimate": {"color": INK, "linewidth": 1.6, "alpha": 0.8}}
-    looks |= {"start": _marker("^", INK, INK), "end": _marker("x", INK, INK)}
-    motions = {moving for _, moving in _landmarks(trajectory)}
+    looks |= {"true start": _marker("^", INK, GREY), "first estimate": _marker("^", GREY, GREY)}
+    looks |= {"end": _marker("x", INK, INK)}
+    if elsewhere:
+        looks["heard by radio (truth)"] = {"color": GREY, "linewidth": 1.1, "linestyle": _DOTTED}
+    motions = {moving for i, moving in _landmarks(trajectory) if trajectory.targets[i] not in elsewhere}
     if False in motions:
         looks["landmark"] = _marker("o", DARK_BLUE, DARK_BLUE)
     if True in motions:
         looks["moving landmark"] = {"color": DARK_BLUE, "linewidth": 1.1, "linestyle": _DASHED}
     if outside:
-        looks["starts outside"] = _marker("^", INK, "white")
+        looks["first estimate outside"] = _marker("^", INK, "white")
     handles: list[Line2D | Patch] = [Line2D([], [], label=label, **look) for label, look in looks.items()]
     if scenario is not None and scenario.roads:
         handles.append(Patch(facecolor=ASPHALT, edgecolor="none", label="road"))

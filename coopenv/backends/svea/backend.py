@@ -274,7 +274,7 @@ class Svea:
             "stopped": "" if trip is None else trip.reason,
             "stopped_by": "" if trip is None else trip.car or "",
             "gate": "unknown" if gate is None else gate.state,
-            "gate_rejections": {} if gate is None else dict(gate.rejections),
+            "gate_rejections": {} if gate is None else self.gates.refused(name),
             "rejections": dict(self.link.refused),
             "missed_deadlines": self.link.missed,
             "lateness": self._pacer.lateness[-1] if self._pacer.lateness else 0.0,

@@ -53,6 +53,7 @@ class Gates:
         self._transport, self._limits, self._signer, self._verifier = transport, limits, signer, verifier
         self._lock = threading.Lock()
         self._states = {car: GateState() for car in cars}
+        self._before: dict[str, dict[str, int]] = {}
         self._cars = {topic_of(car, Role.GATE): car for car in cars}
         self._stamps = dict.fromkeys(cars, 0)
         self._stopping = False
@@ -70,6 +71,16 @@ class Gates:
         """What each gate has said last."""
         with self._lock:
             return dict(self._states)
+
+    def refused(self, car: str) -> dict[str, int]:
+        """Return what a gate has refused since it was armed for this session, or since it was first heard, by reason.
+
+        It counts since it was started itself.
+        """
+        with self._lock:
+            counts, before = self._states[car].rejections, self._before.get(car, {})
+        since = {reason: count - before.get(reason, 0) for reason, count in counts.items()}
+        return dict(counts) if any(count < 0 for count in since.values()) else since  # the gate was started anew
 
     def _hear(self, arrival: Arrival) -> None:
         car, v = self._cars[arrival.topic], self._verifier
@@ -97,6 +108,7 @@ class Gates:
             self._stamps[car], self._states[car] = stamp, state
             if m.state == "stopped" and not self._stopping:
                 self.stopped_by_others.add(car)
+            self._before.setdefault(car, counts)
 
     def begin(self) -> None:
         """Arm all gates for a new session.
@@ -123,6 +135,7 @@ class Gates:
             time.sleep(5 * POLL)
         with self._lock:
             self.stopped_by_others.clear()
+            self._before = {car: state.rejections for car, state in self._states.items()}
 
     def _fresh_states(self) -> dict[str, GateState]:
         """Return what each gate says now, not what it said before the last stop. Raises CoopenvError: one is silent."""
