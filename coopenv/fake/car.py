@@ -78,7 +78,7 @@ class Fake:
         self._others = Neighbours(self.room, binding, name, transport)
         self._acts: dict[str, Act] = {}
         self._link: Link | None = None
-        self._build(binding, transport)
+        self._build(binding, transport, deployment.sensors.odometry)
         self.begin(seed)
         self._warm_up()
         transport.subscribe(RESET_TOPIC, self._hear_reset)
@@ -98,15 +98,15 @@ class Fake:
         for fault in faults:
             self._faults.add(fault, clock.steady())
 
-    def _build(self, binding: Binding, transport: Transport) -> None:
-        """Put sensors and wheels on the car."""
+    def _build(self, binding: Binding, transport: Transport, odometry: str) -> None:
+        """Put sensors and wheels on the car; the wheels tell a turn rate only where there is no other one."""
         whose = (self.name, self.room, self._wire, self._stamp, transport)
         self._voice = Voice(*whose)
         if self._drives:
             vehicle, scenario = self.room.vehicle, self.room.scenario
             carriers = {target: marker for marker, target in binding.targets.items()}
             self._pixy = Pixy(self.room, calibration_of(scenario.cameras[vehicle]), carriers, self._faults)
-            self._sensors = Sensors(self.room)
+            self._sensors = Sensors(self.room, differential=odometry == "wheel")
             self._wheels = Actuators(scenario.limits[vehicle].latency)
             voice = DriverVoice(*whose, pixy=self._pixy, sensors=self._sensors, rng=lambda: self._rng)
             voice.before_frame = self._others.place

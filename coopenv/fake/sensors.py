@@ -16,8 +16,9 @@ WHEEL_RATE, IMU_RATE, FILTER_RATE = 50.0, 100.0, 20.0
 class Sensors:
     """The odometry of one car. Lasting errors are those that the room has drawn."""
 
-    def __init__(self, room: Room) -> None:
-        """Put them on the car of a room."""
+    def __init__(self, room: Room, *, differential: bool = True) -> None:
+        """Put them on the car of a room; `differential`: the wheels tell a turn rate, else 0."""
+        self._differential = differential
         self._room, self._noise = room, room.scenario.noises[room.vehicle]
         self.wheel_std = deviation(self._noise.velocity, self._noise, WHEEL_RATE)
         """m/s, of a sample."""
@@ -41,7 +42,8 @@ class Sensors:
         scale = (1.0 + self._room.view("odometry_scale")[0, self._room.vehicle]) * (1.0 + slip[0])
         self._dead_reckon(now)
         self.speed = float(velocity[0] * scale * math.cos(slip[1]) + rng.normal() * self._factor * self.wheel_std)
-        return self.speed, float(turn[2] * scale + rng.normal() * self._factor * self.wheel_turn_std)
+        turned = float(turn[2] * scale + rng.normal() * self._factor * self.wheel_turn_std)
+        return self.speed, turned if self._differential else 0.0
 
     def gyro(self, now: int, rng: np.random.Generator) -> Array:
         """Return the turn rates about the body's axes, (3,) rad/s."""

@@ -10,7 +10,7 @@ from coopenv.fake.car import Fake
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.svea.actuation import Drive, to_manual
 from coopenv.svea.codec import decode, encode, make
-from coopenv.svea.deployment import Car, Deployment
+from coopenv.svea.deployment import Car, Deployment, Sensors
 from coopenv.svea.gate.codec import write_manual
 from coopenv.svea.gate.terms import Clock
 from coopenv.svea.topics import RESET_TOPIC, TOPICS, Role, topic_of
@@ -29,12 +29,18 @@ class Stage:
     """Fakes of an environment, commanded over the network."""
 
     def __init__(
-        self, environment: str, cars: tuple[Car, ...], overrides: dict[str, Any] | None = None, **options: Any
+        self,
+        environment: str,
+        cars: tuple[Car, ...],
+        overrides: dict[str, Any] | None = None,
+        sensors: Sensors | None = None,
+        **options: Any,
     ) -> None:
         self.now, self.wall, self.died = 10**12, 1_700_000_000 * 10**9, list[str]()
         self.complaints: list[str] = []
         self.scenario: Scenario = load_scenario(environment, overrides or {})
-        self.fleet = Deployment(environment=environment, cars=cars, markers=MARKERS, fakes=True)
+        sensors = sensors or Sensors()
+        self.fleet = Deployment(environment=environment, cars=cars, markers=MARKERS, fakes=True, sensors=sensors)
         self.hub, self._said = Hub(), defaultdict[str, list[Arrival]](list)
         self.network = self.hub.connect()
         self.network.subscribe("**", lambda arrival: self._said[arrival.topic].append(arrival))

@@ -10,7 +10,7 @@ from coopenv.scenario.sensing import Camera
 from coopenv.svea.codec import decode, stamp_of
 from coopenv.svea.deployment import Sensors
 from coopenv.svea.reading import read
-from coopenv.svea.samples import Calibration, Sample
+from coopenv.svea.samples import Calibration, Sample, Twist
 from coopenv.svea.topics import TOPICS, Role, topic_of
 from coopenv.svea.transport.base import Arrival
 
@@ -93,6 +93,8 @@ class Intake:
         except CoopenvError:
             self.rejected[car][role.value] += 1
             return
+        if isinstance(value, Twist) and role is Role.WHEEL and self._sensors.odometry == "wheel+imu":
+            value = Twist(value.linear, None)  # the IMU's turn rate alone counts
         if car in self.offsets and role is not Role.TRUTH:
             self.offsets[car].put(stamp, arrival.received)
         yield Sample(car, role, stamp, arrival.received, value)
