@@ -18,7 +18,7 @@ from coopenv.files import replacing_file, writing
 from coopenv.interrupts import also_kept
 from coopenv.runs.command import execute, report
 from coopenv.runs.console import Progress, compile_notice
-from coopenv.runs.links import links_line, links_report
+from coopenv.runs.links import STEADY_FROM, links_line, links_report
 from coopenv.runs.rollouts import Rollout
 from coopenv.runs.side_by_side import Episodes, side_by_side
 from coopenv.scenario import Scenario
@@ -26,9 +26,6 @@ from coopenv.shipped import data_directory
 
 FLEETS = {"svea_overtaking": "overtaking.toml", "svea_crossing": "crossing.toml"}
 """Deployment files of the experiments, in `examples/fleet`."""
-
-STEADY_FROM = 2.0
-"""s: cars know their places by then."""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,10 @@ from rich.console import Console
 from rich.table import Table
 
 from coopenv.backends.svea.backend import Svea
+from coopenv.errors import CoopenvError, listed
+
+STEADY_FROM = 2.0
+"""s: cars know their places by then."""
 
 
 def links_line(backend: Svea) -> str:
@@ -49,3 +53,11 @@ def links_report(backend: Svea, out: Console) -> None:
     trip = backend.watchdog.trip
     if trip is not None:
         out.print(f"Stopped: {trip.reason}", soft_wrap=True)
+
+
+def silence(backend: Svea) -> CoopenvError | None:
+    """Return what is wrong where no car has said anything, None if one has."""
+    if backend.health.received:
+        return None
+    names, where = listed(list(backend.binding.cars)), ", ".join(backend.deployment.network.connect)
+    return CoopenvError(f"nothing has come from {names} by {where}: are they on, and are their names fleet/NAME/...?")

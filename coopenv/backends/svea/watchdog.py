@@ -105,9 +105,9 @@ class Watchdog:
             self._armed = False
             self.trip = trip = Trip(reason, car, time.monotonic())
         try:
-            self.on_stop(trip)  # takes microseconds, and comes before another episode can begin
-        finally:
             self._gates.stop()
+            self.on_stop(trip)
+        finally:
             self._gates.end()
 
     def close(self) -> None:

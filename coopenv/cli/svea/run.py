@@ -7,6 +7,10 @@ from typing import Annotated
 import typer
 
 from coopenv.cli import options
+from coopenv.errors import CoopenvError
+
+STOPPED = 3
+"""Status of a run that was stopped, by whom or what ever."""
 
 
 def run(
@@ -30,7 +34,9 @@ def run(
     ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder of the results (default: out/DEPLOYMENT).")] = None,
     overrides: options.Overrides = None,
-    steady_from: options.SteadyFrom = None,
+    steady_from: Annotated[
+        float, typer.Option(min=0.0, help="RMSE and NEES count from this time on, s: cars know their places by then.")
+    ] = 2.0,
     no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
     as_json: options.AsJson = False,
 ) -> None:
@@ -41,7 +47,7 @@ def run(
     from coopenv.backends.svea.opening import open_svea
     from coopenv.interrupts import also_kept
     from coopenv.runs.command import execute, report
-    from coopenv.runs.links import kept_drive, links_line, links_report
+    from coopenv.runs.links import kept_drive, links_line, links_report, silence
     from coopenv.runs.rollouts import Rollout
 
     changes, log = options.parse_overrides(overrides), options.console(stderr=True)
@@ -55,10 +61,14 @@ def run(
         figures = None if no_figures else "png"
         watched = partial(links_line, backend)
         result = execute(config.stem, rollout, folder, log, changes, steady_from, figures, False, watched)
+    except CoopenvError as error:
+        raise silence(backend) or error from None
     finally:
         backend.close()
     if as_json:
         options.print_json(result)
-        return
-    report(rollout, result, folder, options.console())
-    links_report(backend, options.console())
+    else:
+        report(rollout, result, folder, options.console())
+        links_report(backend, options.console())
+    if backend.watchdog.trip is not None:
+        raise typer.Exit(STOPPED)
