@@ -85,13 +85,16 @@ class Drive(TickGenerator):
             raise
         except Exception as error:  # whatever the libraries raise at bytes that make no sense
             raise DataError(f"{path}: damaged MCAP file ({type(error).__name__})") from None
+        nothing = f"{path}: {f'{CUT_OFF}, and ' if container.cut_off else ''}no episode begins in it"
+        if container.cut_off and ATTACHMENT not in attachments:
+            raise DataError(nothing)
         if metadata.get(NAME, {}).get("format") != FORMAT or ATTACHMENT not in attachments:
             raise DataError(f"{path}: no recorded drive of coopenv (format '{FORMAT}')")
         self._deployment, self.binding = self._read_head(attachments[ATTACHMENT], overrides or {})
         self._messages = list(self._read(container))
         indices = [message.index for message in self._messages if isinstance(message, Mark)]
         if 0 not in indices:
-            raise DataError(f"{path}: {f'{CUT_OFF}, and ' if container.cut_off else ''}no episode begins in it")
+            raise DataError(nothing)
         if container.cut_off:
             self._warn()
         self._episodes, self._next = indices.count(0), 0
