@@ -43,7 +43,7 @@ class ScenarioWarning(UserWarning):
 
 
 class DataWarning(UserWarning):
-    """A recorded file is what it claims to be, but says less than it should."""
+    """A recorded or deployment file is what it claims to be, but says less than it should."""
 
 
 def checked_seed(seed: object) -> int:

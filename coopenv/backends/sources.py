@@ -51,7 +51,8 @@ def kind_of(name: str | Path) -> Kind:
 def is_bag(name: str | Path, topics: str | Path | None = None) -> bool:
     """Return whether a name is that of a ROS bag; of MCAP files it is whatever coopenv has not written.
 
-    With the map of its topics given it is one as well if it cannot be read, and if it is a drive of cars: that is both.
+    With the map of its topics given it is one as well if it cannot be read, if it is a folder, and if it is a drive of
+    cars: that is both.
     """
     if str(name).endswith(BAG_SUFFIXES):
         return True
@@ -61,7 +62,7 @@ def is_bag(name: str | Path, topics: str | Path | None = None) -> bool:
             return topics is not None
         return not metadata & OURS
     try:
-        return (Path(name) / "metadata.yaml").is_file()
+        return (Path(name) / "metadata.yaml").is_file() or (topics is not None and Path(name).is_dir())
     except (OSError, ValueError):  # what can be no path
         return False
 

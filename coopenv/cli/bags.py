@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from coopenv.backends.bags.inventory import Row
 
 
+WIDTH = 100
+"""Columns of a table that is not for a terminal."""
+
+
 def import_command(
     bags: Annotated[list[Path], typer.Argument(metavar="BAG...", help="Bags of one drive, such as one per car.")],
     topics: options.TopicMap = None,
@@ -84,7 +88,7 @@ def _print(rows: Sequence[Row], as_json: bool) -> None:
         return
     printed = options.console()
     if not printed.is_terminal:
-        printed.width = max(printed.width, 160)
+        printed.width = max(printed.width, WIDTH)
     printed.print(_table(rows))
 
 
@@ -95,6 +99,8 @@ def _table(rows: Sequence[Row]) -> Table:
     names = ["topic", *(["read as"] if read else []), *([] if read else ["type"])]
     numbers = ["messages", "rate\n[Hz]", *(["used", "longest\ngap [s]", "gaps", "clock\n[ms]"] if read else [])]
     table = number_table(names, numbers)
+    for column in table.columns[: len(names)]:
+        column.no_wrap, column.overflow = False, "fold"
     for row in rows:
         cells = [row.topic, f"{row.car} {row.role}" if row.role else "" if read else row.type]
         cells += [str(row.messages), _shown(row.rate, 1)]

@@ -40,8 +40,7 @@ def open_fake(
         raise CoopenvError(f"{path}: environment: backend '{scenario.backend}' has no fakes; known: simulated")
     binding = bind(scenario, fleet.cars, fleet.markers, Path(path).name, None)
     signer = verifier = None
-    if fleet.security.keys is not None and gate:
-        folder = fleet.folder / fleet.security.keys
+    if gate and (folder := fleet.keys) is not None:
         verifier = load_verifier(folder)
         check_known(verifier, fleet.security.identity, folder)
         signer = load_signer(folder, car)

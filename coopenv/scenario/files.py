@@ -3,6 +3,7 @@
 import json
 import os
 import tomllib
+import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,9 @@ from coopenv.shipped import data_directory, list_envs
 
 DEFAULTS_KEY = "vehicle_defaults"
 """A table of the file whose entries every vehicle takes over unless it says otherwise."""
+
+OVERRIDES = "overrides (--set)"
+"""Where a field stands that an override has made wrong."""
 
 MOST_BYTES = 8 * 2**20  # of a file; 20,000 landmarks take one or two million
 
@@ -75,6 +79,21 @@ def load_scenario(name_or_path: str | Path, overrides: Mapping[str, Any] | None 
         return parse_scenario(apply_vehicle_defaults(raw, path.name), path.name)
     except RecursionError:
         raise ScenarioError(f"{path.name}: {TOO_DEEP}") from None
+    except ScenarioError as error:
+        of_file = f"{path.name}: "
+        if overrides and str(error).startswith(of_file) and _is_sound(path):
+            raise ScenarioError(f"{OVERRIDES}: {str(error).removeprefix(of_file)}") from None
+        raise
+
+
+def _is_sound(path: Path) -> bool:
+    """Return whether a file by itself describes a world."""
+    with warnings.catch_warnings(action="ignore"):
+        try:
+            load_scenario(path)
+        except ScenarioError:
+            return False
+    return True
 
 
 def _read(path: Path) -> dict[str, Any]:

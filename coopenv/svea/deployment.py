@@ -35,7 +35,8 @@ class Car(Part):
     name: Name
     """As in its topics, `fleet/NAME/...`."""
     vehicle: str | None = None
-    """The vehicle of the environment that it is (default: in the order of the file)."""
+    """The vehicle of the environment that it is (default: the first one in the environment's order that no other car
+    names or, further up, has got)."""
     landmark: str | None = None
     """Or the moving landmark that it is: a car whose position is known and which nobody here drives."""
     marker: Marker | None = None
@@ -159,13 +160,29 @@ class Deployment(Part):
     security: Security = Security()
     fakes: bool = False
     """Whether the cars are fakes, which can be put where an episode begins."""
-    folder: Path = Field(default=Path(), exclude=True)
-    """Where the file is; set by `load_deployment`."""
+    file: Path = Field(default=Path(), exclude=True)
+    """Where it stands; set by `load_deployment`."""
 
     @model_validator(mode="after")
     def _nothing_is_used_twice(self) -> Self:
         refuse_repeated(self.cars, self.markers, MARKERS)
         return self
+
+    @property
+    def folder(self) -> Path:
+        """Where the file is."""
+        return self.file.parent
+
+    @property
+    def keys(self) -> Path | None:
+        """Where keys are; None: nothing is signed. Raises DeploymentError: there is nothing of that name."""
+        if self.security.keys is None:
+            return None
+        place = self.folder / self.security.keys
+        if not place.exists():
+            make = f"`coopenv svea keys {self.file}` makes it"
+            raise DeploymentError(f"{self.file.name}: security.keys: there is no folder '{place}'; {make}")
+        return place
 
     @property
     def driven(self) -> tuple[Car, ...]:
@@ -213,4 +230,4 @@ def parse_deployment(raw: dict[str, Any], path: Path) -> Deployment:
         from coopenv.scenario.validation import one_line  # the gate of a car has no need of scenarios
 
         raise DeploymentError(one_line(error, path.name, Deployment)) from None
-    return made.model_copy(update={"folder": path.parent})
+    return made.model_copy(update={"file": path})

@@ -25,6 +25,13 @@ class Binding:
         return tuple(by_vehicle[i] for i in range(len(by_vehicle)))
 
     @property
+    def unmarked(self) -> tuple[str, ...]:
+        """Names of landmarks and vehicles without a marker, which no camera can tell; one vehicle alone needs none."""
+        names = self.scenario.target_names
+        count = len(names) if len(self.cars) > 1 else len(self.scenario.landmarks)
+        return tuple(name for target, name in enumerate(names[:count]) if target not in self.targets.values())
+
+    @property
     def remote(self) -> bool:
         """Whether some vehicles are estimated elsewhere."""
         return len(self.local) < len(self.cars)

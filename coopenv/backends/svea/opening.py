@@ -1,5 +1,6 @@
 """From a deployment file to a backend: environment, network, keys and tape."""
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,9 @@ from coopenv.backends.svea.drive import head_of
 from coopenv.backends.svea.status import ROLES
 from coopenv.backends.svea.tape import Tape
 from coopenv.backends.svea.taped import PRESENCE, Taped
-from coopenv.errors import CoopenvError
+from coopenv.errors import CoopenvError, DataWarning, ScenarioError, listed
 from coopenv.scenario import Scenario, load_scenario
+from coopenv.scenario.files import OVERRIDES, scenario_path
 from coopenv.svea.deployment import Deployment, load_deployment
 from coopenv.svea.keys import check_known, load_signer, load_verifier
 from coopenv.svea.signing import Signer, Verifier
@@ -40,12 +42,17 @@ def open_svea(
         transport: a network that is open already (None: as the file says).
         connect: endpoint in place of the file's.
 
+    A `DataWarning` tells of landmarks and vehicles that no camera can tell.
+
     Raises:
         CoopenvError: one line that names the file and the field, or what cannot be reached.
     """
     deployment = load_deployment(path, connect)
     scenario = scenario_of(deployment, environment, overrides or {})
     binding = bind(scenario, deployment.cars, deployment.markers, Path(path).name, car)
+    if binding.unmarked:
+        remark = f"{Path(path).name}: no markers, so that no camera can tell them: {listed(binding.unmarked)}"
+        warnings.warn(DataWarning(remark), stacklevel=2)
     signer, verifier = _keys(deployment, binding, car)
     link = open_transport(deployment) if transport is None else transport
     try:
@@ -62,18 +69,43 @@ def open_svea(
 
 
 def scenario_of(deployment: Deployment, environment: str | None, overrides: Mapping[str, Any]) -> Scenario:
-    """Return the environment of a deployment."""
-    own = deployment.environment
-    if own.endswith(".toml") and not Path(own).is_absolute():
+    """Return the environment of a deployment.
+
+    Args:
+        deployment: names it, and has overrides of it.
+        environment: name or path in place of its own.
+        overrides: after the deployment's.
+
+    Raises:
+        CoopenvError: there is no such environment, or an override is not valid.
+    """
+    own, file = deployment.environment, deployment.file.name
+    if own.endswith(".toml"):
         own = str(deployment.folder / own)
-    return load_scenario(environment or own, {**deployment.overrides, **overrides})
+    try:
+        scenario_path(own if environment is None else environment)
+    except CoopenvError as error:
+        raise error if environment is not None else CoopenvError(f"{file}: environment: {error}") from None
+    try:
+        return load_scenario(environment or own, {**deployment.overrides, **overrides})
+    except ScenarioError as error:
+        raise _of_the_file(deployment, environment or own) or error from None
+
+
+def _of_the_file(deployment: Deployment, environment: str) -> CoopenvError | None:
+    """Return what is wrong with a deployment's own overrides; None: nothing."""
+    try:
+        load_scenario(environment, deployment.overrides)
+    except ScenarioError as error:
+        if str(error).startswith("override"):
+            return CoopenvError(f"{deployment.file.name}: {str(error).replace(OVERRIDES, 'overrides', 1)}")
+    return None
 
 
 def _keys(deployment: Deployment, binding: Binding, car: str | None) -> tuple[Signer | None, Verifier | None]:
-    given = deployment.security.keys
-    if given is None:
+    folder = deployment.keys
+    if folder is None:
         return None, None
-    folder = given if given.is_absolute() else deployment.folder / given
     verifier = load_verifier(folder)
     for name in binding.cars:
         check_known(verifier, name, folder)

@@ -42,4 +42,5 @@ def demo(
     name = environment if fleet is None else fleet.stem
     changes, folder = options.parse_overrides(overrides), out or Path("out") / name
     chosen = Demo(name, folder, policy, seed, changes, seconds, beside, fleet)
-    run_demo(chosen, port, options.console(stderr=True), options.console())
+    with options.warned():
+        run_demo(chosen, port, options.console(stderr=True), options.console())

@@ -73,6 +73,10 @@ class Settings:
             return None, None
         from coopenv.svea.keys import check_known, load_signer, load_verifier
 
-        verifier = load_verifier(self.keys)
+        own = None if self.fleet is None else self.fleet.security.keys
+        if self.fleet is not None and own is not None and self.keys == self.fleet.folder / own:
+            verifier = load_verifier(self.fleet.keys or self.keys)  # which names the field where there is none
+        else:
+            verifier = load_verifier(self.keys)
         check_known(verifier, self.station, self.keys)
         return load_signer(self.keys, self.car), verifier
