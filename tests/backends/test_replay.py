@@ -92,7 +92,7 @@ def test_a_recorded_simulation_looks_as_it_did(case: str) -> None:
     for _ in range(recording.scenario.horizon_ticks // 6 + 1):
         for field in ("observation", "reward"):
             assert_allclose(second.view(field), first.view(field), atol=1e-6, err_msg=field)
-        for field in ("alive", "terminated", "truncated", "tick", "inbox_tick", "bearing_tick"):
+        for field in ("alive", "terminated", "truncated", "tick", "inbox_tick", "bearing_tick", "sight"):
             assert np.array_equal(first.view(field), second.view(field)), field
         for field in ("estimate_rotation", "estimate_position", "covariance", "nees", "position_error"):
             assert_allclose(second.view(field), first.view(field), rtol=1e-9, atol=1e-12, err_msg=field)

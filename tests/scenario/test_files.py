@@ -224,7 +224,8 @@ def test_wrong_overrides(file: Path, key: str, words: str) -> None:
 
 def test_override_values_are_checked(file: Path) -> None:
     with pytest.raises(
-        ScenarioError, match=r"mine.toml: rates.camera: Input should be greater than or equal to 0.001, got -5"
+        ScenarioError,
+        match=r"overrides \(--set\): rates.camera: Input should be greater than or equal to 0.001, got -5",
     ):
         load_scenario(file, {"rates.camera": -5})
     with pytest.raises(ScenarioError, match="whole multiple of the decision rate"):

@@ -9,7 +9,15 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.observers.recording import Recording, Truth
 from coopenv.scenario.randomness import PARAMETERS
-from coopenv.world.camera import NOT_A_NEIGHBOUR, OUT_OF_VIEW, VISIBLE
+from coopenv.world.camera import (
+    MISSED,
+    NOT_A_NEIGHBOUR,
+    OUT_OF_VIEW,
+    VISIBLE,
+    camera_to_body,
+    marker_position,
+    sight_of,
+)
 from coopenv.world.collision import depart, referee, touches_anything
 from coopenv.world.embedded import Source
 from coopenv.world.parameters import COUNT as PARAMETER_COUNT
@@ -54,6 +62,31 @@ def forget_errors(state: Any, world: int, vehicle: int):
 
 
 @wp.func
+def explain(model: Any, state: Any, world: int, vehicle: int):
+    """Say why targets are not seen, as the simulation does, where the vehicle's pose and their place are known.
+
+    How far to the side a camera sees that is no pinhole nobody has said: what it does not see is out of view.
+    """
+    agent = model.landmarks + vehicle
+    camera = model.camera[vehicle]
+    R = state.rotation[world, agent]
+    origin = state.position[world, agent] + R * camera.position
+    to_camera = wp.transpose(R * camera_to_body(model, state, world, vehicle))
+    for n in range(model.target_count[vehicle]):
+        target = model.targets[vehicle, n]
+        if state.sight[world, vehicle, target] == OUT_OF_VIEW:
+            line = marker_position(model, state, world, target) - origin
+            ray = to_camera * line
+            if wp.isfinite(wp.dot(ray, ray)):
+                sight = sight_of(model, state, world, vehicle, target, origin, line, ray)
+                if sight == VISIBLE:
+                    sight = OUT_OF_VIEW
+                    if camera.pinhole == 1:
+                        sight = MISSED
+                state.sight[world, vehicle, target] = sight
+
+
+@wp.func
 def recall(model: Any, state: Any, record: Any, world: int, tick: int):
     """Write what was sensed at a tick, and the truth that is known."""
     row = row_of(record, tick)
@@ -78,6 +111,8 @@ def recall(model: Any, state: Any, record: Any, world: int, tick: int):
                 state.bearing[world, vehicle, target] = bearing
                 state.bearing_tick[world, vehicle, target] = tick - record.bearing_lag[row, vehicle]
                 state.sight[world, vehicle, target] = VISIBLE
+    for vehicle in range(model.vehicles):  # now that all poses are those of this tick
+        explain(model, state, world, vehicle)
 
 
 @wp.func
