@@ -9,21 +9,17 @@ tick are those of the moment as well; how long ago it was is the tick's `bearing
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.backends.svea.binding import Binding
 from coopenv.backends.svea.frames import Frames
+from coopenv.backends.svea.hearsay import Hearsay
 from coopenv.backends.svea.odometer import Odometer
-from coopenv.backends.svea.place_track import PlaceTrack
 from coopenv.backends.svea.pose_track import PoseTrack
-from coopenv.backends.svea.v2x import message_of
 from coopenv.estimation.arrays import Array
-from coopenv.observers.contract import Received
 from coopenv.observers.recording import Sensed, Truth, is_due, sealed
-from coopenv.scenario.starts import rotation_of
 from coopenv.svea.samples import Detections, Pose, Report, Sample, Twist
 from coopenv.svea.topics import TOPICS, Role
 from coopenv.world.build_sensors import camera_to_body
@@ -31,8 +27,6 @@ from coopenv.world.build_sensors import camera_to_body
 LATE = round((TOPICS[Role.DETECTIONS].max_age or 0.0) * 1e9)
 SILENT = round((TOPICS[Role.ODOMETRY].max_age or 0.0) * 1e9)
 """ns without odometry after which nothing is said to have come from a car."""
-STALE = round((TOPICS[Role.ESTIMATE].max_age or 0.0) * 1e9)
-"""ns after which what another car has said no longer counts."""
 FUTURE = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
 NS = 1e-9
 
@@ -62,18 +56,12 @@ class Assembler:
         scenario = binding.scenario
         self._period = round(1e9 / scenario.rates.camera)
         self._ratio = (scenario.rates.observer or scenario.rates.camera) / scenario.rates.camera
-        self._origin = origin = np.array(scenario.map.origin)
-        places = [np.array(m.position) + rotation_of(m.yaw, None) @ np.array(m.marker) for m in scenario.landmarks]
-        self._landmarks = np.array(places).reshape(-1, 3) - origin
-        self._led = {landmark: PlaceTrack() for landmark in binding.leaders.values()}
         self._to_body = [camera_to_body(camera) for camera in scenario.cameras]
-        self._markers = [np.array(vehicle.marker) for vehicle in scenario.vehicles]
         self._cars = [_Car() for _ in scenario.vehicles]
-        self._heard: dict[int, dict[Role, tuple[int, Pose | Report]]] = {}  # since the last tick
-        self._said: dict[tuple[int, Role], int] = {}  # stamp of a vehicle's last message
         self._begin = 0
         self.refused: Counter[str] = Counter()
         """Samples that were not used, by reason."""
+        self._hearsay = Hearsay(binding, self.refused)
 
     def put(self, sample: Sample) -> None:
         """Take a sample."""
@@ -81,18 +69,13 @@ class Assembler:
         if stamp > sample.received + FUTURE:
             self.refused["stamp in the future"] += 1
         elif sample.car in self.binding.leaders:
-            self._put_leader(self.binding.leaders[sample.car], sample.role, stamp, value)
+            if isinstance(value, Pose) and sample.role in (Role.ESTIMATE, Role.POINT):
+                landmark = self.binding.leaders[sample.car]
+                self._hearsay.put_landmark(landmark, stamp, sample.received - stamp, value)
         elif sample.car not in self.binding.cars:
             self.refused["unknown car"] += 1
         else:
             self._put_vehicle(self.binding.cars[sample.car], sample.role, stamp, value)
-
-    def _put_leader(self, landmark: int, role: Role, stamp: int, value: object) -> None:
-        if role in (Role.ESTIMATE, Role.POINT) and isinstance(value, Pose):
-            marker = np.array(self.binding.scenario.landmarks[landmark].marker)
-            message = message_of(self._on_map(value), marker)
-            if message.position is not None:
-                self._led[landmark].put(stamp, message.position)
 
     def _put_vehicle(self, vehicle: int, role: Role, stamp: int, value: object) -> None:
         car = self._cars[vehicle]
@@ -102,17 +85,22 @@ class Assembler:
             self.refused["detections left out"] += value.dropped
             car.frames.put(stamp, value)
         elif role is Role.TRUTH and isinstance(value, Pose):
-            car.track.put(stamp, self._on_map(value))
+            if not car.track.put(stamp, self._hearsay.on_map(value)):
+                self.refused["motion capture out of order"] += 1
         elif isinstance(value, Pose | Report) and vehicle not in self.binding.local:
-            if stamp <= self._said.get((vehicle, role), 0):  # older, or replayed
-                self.refused["message out of order"] += 1
-                return
-            self._said[vehicle, role] = stamp
-            self._heard.setdefault(vehicle, {})[role] = stamp, self._on_map(value) if isinstance(value, Pose) else value
+            self._hearsay.put_vehicle(vehicle, role, stamp, value)
 
-    def _on_map(self, pose: Pose) -> Pose:
-        """Return a pose in the coordinates of the scenario's file as one on its map."""
-        return replace(pose, position=pose.position - self._origin)
+    def _count(self) -> None:
+        """Count what odometers and queues of frames have left out since the last call."""
+        for car in self._cars:
+            odometer, frames = car.odometer, car.frames
+            counts = {
+                "odometry out of order": odometer.disordered,
+                "frame out of order": frames.disordered,
+                "frame left out": frames.skipped,
+            }
+            odometer.disordered = frames.disordered = frames.skipped = 0
+            self.refused.update({why: count for why, count in counts.items() if count})
 
     def begin(self, now: int) -> Sensed:
         """Return tick 0 at a time in ns; what came before says where the cars are now."""
@@ -120,9 +108,10 @@ class Assembler:
         for car in self._cars:
             while car.frames.take(-1, now) is not None:
                 pass
+            car.frames.skipped = 0  # nobody has asked for frames since the last episode
             car.moment, car.lag, car.exposed = now - self._period, 0, None
             car.odometer.increment(now - self._period, now - self._period)
-        self._heard.clear()
+        self._hearsay.forget()
         return self._sensed(0, now)
 
     def tick(self, index: int, now: int) -> Sensed:
@@ -133,6 +122,10 @@ class Assembler:
         """Return the time in ns for which the present tick of a vehicle holds, on the receiver's clock."""
         moment = self._cars[vehicle].moment
         return self._begin if moment is None else moment
+
+    def _middle(self) -> int:
+        """Return the mean of the moments of the vehicles estimated here: when their frames were exposed."""
+        return sum(self.moment(i) for i in self.binding.local) // len(self.binding.local)
 
     def truth(self, vehicle: int, now: int) -> tuple[Array, Array]:
         """Return the rotation and position of a vehicle by motion capture, NaN where it is not known."""
@@ -161,6 +154,7 @@ class Assembler:
             if frame is not None:
                 late[i] = car.lag > LATE
                 self._see(i, frame, now, bearings[i], visible[i])
+        self._count()
         return Sensed(
             index=index,
             dt=1.0 / self.binding.scenario.rates.camera,
@@ -172,14 +166,14 @@ class Assembler:
             angular_velocity=angular_velocity,
             bearings=bearings,
             visible=visible,
-            landmarks=sealed(self._places()),
+            landmarks=sealed(self._hearsay.places(now, self._middle())),
             odometry_age=odometry_age,
             bearing_age=bearing_age,
             missing=missing,
             late=late,
             truth=truth if np.isfinite(truth.position).any() else None,
             inbox_tick=np.full((N, N), -1, dtype=np.int64) if self.binding.remote else None,
-            messages=self._messages(now),
+            messages=self._hearsay.messages(now),
         )
 
     def _advance(
@@ -202,34 +196,9 @@ class Assembler:
         """Write a frame's bearings into a car's row, (T, 3) and (T,)."""
         for marker, ray in zip(frame.markers, frame.bearings, strict=True):
             target = self.binding.targets.get(marker)
-            if target is None or target == len(self._landmarks) + i:
+            if target is None or target == len(self.binding.scenario.landmarks) + i:
                 self.refused["unknown marker"] += 1
-            elif target in self._led and now - self._led[target].stamp > STALE:
+            elif self._hearsay.is_lost(target, now):
                 self.refused["landmark of unknown position"] += 1
             else:
                 bearings[target], visible[target] = self._to_body[i] @ ray, True
-
-    def _places(self) -> Array:
-        """Return (L, 3) where the landmarks were when the frames of the tick were exposed, the mean of its moments."""
-        places: Array = self._landmarks.copy()
-        when = sum(self.moment(i) for i in self.binding.local) // len(self.binding.local)
-        for landmark, track in self._led.items():
-            places[landmark] = places[landmark] if track.stamp < 0 else track.at(when)
-        return places
-
-    def _messages(self, now: int) -> dict[tuple[int, int], Received]:
-        """Return what has come from vehicles that are estimated elsewhere since the last tick."""
-        found = {}
-        for sender, by_role in self._heard.items():
-            newest = by_role.get(Role.REPORT) or by_role.get(Role.ESTIMATE) or by_role.get(Role.POINT)
-            if newest is None:
-                continue
-            stamp, value = newest
-            if now - stamp > STALE:
-                self.refused["stale message"] += 1
-                continue
-            for receiver in self.binding.local:
-                message = message_of(value, self._markers[sender])
-                found[receiver, sender] = Received(message, max(0, now - stamp) * NS)
-        self._heard.clear()
-        return found

@@ -253,8 +253,8 @@ class Svea:
                 continue
             if self.deployment.safety.judge == "estimate":
                 self.vitals.place(name, each.position + self._origin, moment)
-            self._publish(name, Role.ESTIMATE, estimate_message(each, moment))
-            report = report_message(each, moment)
+            self._publish(name, Role.ESTIMATE, estimate_message(each, moment, self._origin))
+            report = report_message(each, moment, self._origin)
             if report is not None:
                 self._publish(name, Role.REPORT, report)
 

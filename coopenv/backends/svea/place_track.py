@@ -21,10 +21,17 @@ class PlaceTrack:
         """When it was at the last one; -1: it has told none."""
         return self._places[-1][0] if self._places else -1
 
-    def put(self, stamp: int, position: Array) -> None:
-        """Take a position (3,), unless it is older than one before."""
-        if stamp > self.stamp:
-            self._places.append((stamp, position))
+    @property
+    def last(self) -> Array:
+        """(3,) where it has told last to be."""
+        return self._places[-1][1]
+
+    def put(self, stamp: int, position: Array) -> bool:
+        """Take a position (3,); return False where it is older than one before."""
+        if stamp <= self.stamp:
+            return False
+        self._places.append((stamp, position))
+        return True
 
     def at(self, time: int) -> Array:
         """Return the position (3,) at a time: between two on the straight line, and for a while beyond the last one.

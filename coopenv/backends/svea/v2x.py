@@ -32,30 +32,34 @@ def message_of(value: Pose | Report, marker: Array) -> Message:
     return Message(value.position + arm, value.rotation, covariance)
 
 
-def estimate_message(told: Told, stamp: int) -> Any:
-    """Return the PoseWithCovarianceStamped of an estimate; rotations of its covariance are about the map's axes."""
+def estimate_message(told: Told, stamp: int, origin: Array) -> Any:
+    """Return the PoseWithCovarianceStamped of an estimate; rotations of its covariance are about the map's axes.
+
+    `origin` (3,) is that of the map in the coordinates of the scenario's file, which are those on the wire.
+    """
     P = left_covariance(told.rotation.T @ told.position, told.covariance)
     turn = np.zeros((6, 6))
     turn[:3, 3:] = turn[3:, :3] = told.rotation  # (theta, rho) in the body to (position, rotation) in the map
-    covariance = (turn @ P @ turn.T).ravel()
+    pose, covariance = _pose(told.rotation, told.position + origin), (turn @ P @ turn.T).ravel()
     return make(
         "geometry_msgs/msg/PoseWithCovarianceStamped",
         header=header(stamp, "map"),
-        pose=make(
-            "geometry_msgs/msg/PoseWithCovariance", pose=_pose(told.rotation, told.position), covariance=covariance
-        ),
+        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance),
     )
 
 
-def report_message(told: Told, stamp: int) -> Any | None:
-    """Return the RobustReport of a vehicle; None where its observer has no such messages."""
+def report_message(told: Told, stamp: int, origin: Array) -> Any | None:
+    """Return the RobustReport of a vehicle, `origin` as for `estimate_message`; None: its observer has no such ones.
+
+    Its dead reckoning is from where it began, and knows no map.
+    """
     m = told.message
     if m is None or (m.position is not None and not {"odometry", "depends_on"} <= set(m.extra)):
         return None
     valid = m.position is not None and m.rotation is not None and m.covariance is not None
     pose, odometry, covariance, depends_on = _pose(np.eye(3), np.zeros(3)), _pose(np.eye(3), np.zeros(3)), np.eye(6), 0
     if m.position is not None and m.rotation is not None and m.covariance is not None:
-        pose, covariance = _pose(m.rotation, m.position), np.asarray(m.covariance, dtype=np.float64)
+        pose, covariance = _pose(m.rotation, m.position + origin), np.asarray(m.covariance, dtype=np.float64)
         odometry, depends_on = _pose(*from_six(m.extra["odometry"])), int(m.extra["depends_on"][0])
     return make(
         "coopenv_msgs/msg/RobustReport",

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.backends.svea.assembler import LATE, SILENT, STALE, Assembler
+from coopenv.backends.svea.assembler import LATE, SILENT, Assembler
 from coopenv.backends.svea.binding import Binding, bind
+from coopenv.backends.svea.hearsay import STALE
 from coopenv.backends.svea.pose_track import LONGEST_GAP
 from coopenv.errors import CoopenvError
 from coopenv.observers.recording import Sensed
@@ -263,6 +264,66 @@ def test_a_moving_landmark_counts_as_long_as_it_is_heard() -> None:
     assert tick.visible[0, 2]
     np.testing.assert_allclose(tick.landmarks[2], [2.0, 2.0, 0.1])
     assert not look(40).visible.any()
+
+
+def test_what_a_moving_landmark_says_counts_once_and_not_for_long() -> None:
+    fleet = [Car(name="car0"), Car(name="lorry", landmark="C", marker=3)]
+    assembler = Assembler(bind(world(), fleet, {"A": 1, "B": 2}, "lab.toml", None))
+    assembler.begin(START)
+
+    def say(stamp: int, place: float, delay: int = MS) -> None:
+        assembler.put(
+            sample(Role.ESTIMATE, START + stamp, Pose(np.array([place, 2.0, 0.0]), np.eye(3)), "lorry", delay)
+        )
+
+    say(0, 2.0)
+    say(50 * MS, 3.0)
+    say(50 * MS, 9.0)  # again, with another place
+    say(20 * MS, 9.0)
+    assert assembler.refused == {"message out of order": 2}
+    say(60 * MS, 9.0, delay=STALE + MS)
+    assert assembler.refused["stale message"] == 1
+    np.testing.assert_allclose(assembler.tick(1, START + 70 * MS).landmarks[2, 0], 3.0, atol=0.5)
+    lost = assembler.tick(2, START + 50 * MS + STALE + MS)
+    np.testing.assert_allclose(lost.landmarks[2], [3.0, 2.0, 0.0])  # not where it would be if it had gone on
+
+
+def test_what_queues_leave_out_is_counted() -> None:
+    assembler = Assembler(binding())
+    ray = Detections((1,), np.array([[0.0, 0.0, 1.0]]))
+    for k in range(60):  # before anybody asks
+        assembler.put(sample(Role.DETECTIONS, START - (60 - k) * 16 * MS, ray))
+    assembler.begin(START)
+    assert not assembler.refused["frame left out"]
+    for stamp in (10, 5, 20, 30, 40, 50):
+        assembler.put(sample(Role.DETECTIONS, START + stamp * MS, ray))
+    for stamp in (20, 10, 20):
+        assembler.put(sample(Role.IMU, START + stamp * MS, Twist(None, np.ones(3))))
+    for stamp in (20, 10):
+        assembler.put(sample(Role.TRUTH, START + stamp * MS, Pose(np.zeros(3), np.eye(3))))
+    for k in (1, 2):
+        assembler.tick(k, START + (50 + k) * MS)
+    assert {why: count for why, count in assembler.refused.items() if count} == {
+        "frame out of order": 1,
+        "frame left out": 2,
+        "odometry out of order": 2,
+        "motion capture out of order": 1,
+    }
+
+
+@pytest.mark.parametrize(
+    ("topology", "hearing"),
+    [({"acyclic": True}, {1: {0}, 2: {0, 1}}), ({"acyclic": False}, {0: {1, 2}, 1: {0, 2}, 2: {0, 1}})],
+)
+def test_a_vehicle_hears_only_whom_the_environment_lets_it(topology: Any, hearing: dict[int, set[int]]) -> None:
+    for receiver in range(3):
+        assembler = Assembler(binding(3, only=f"car{receiver}", topology={"mode": "sensed", **topology}))
+        assembler.begin(START)
+        for sender in range(3):
+            assembler.put(sample(Role.ESTIMATE, START + MS, Pose(np.zeros(3), np.eye(3)), f"car{sender}"))
+        messages = assembler.tick(1, START + 5 * MS).messages
+        assert set(messages) == {(receiver, sender) for sender in hearing.get(receiver, set())}
+        assert not assembler.refused
 
 
 def test_the_truth_is_unknown_where_motion_capture_has_lost_the_body() -> None:

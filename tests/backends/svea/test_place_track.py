@@ -25,8 +25,8 @@ def test_it_is_on_the_straight_line_and_goes_on_for_a_tenth_of_a_second() -> Non
 def test_what_is_old_or_out_of_order_does_not_count() -> None:
     track = PlaceTrack()
     track.put(START, np.array([1.0, 0.0, 0.0]))
-    track.put(START - 1, np.array([9.0, 0.0, 0.0]))
-    track.put(START, np.array([9.0, 0.0, 0.0]))
+    assert not track.put(START - 1, np.array([9.0, 0.0, 0.0]))
+    assert not track.put(START, np.array([9.0, 0.0, 0.0]))
     assert track.stamp == START and track.at(START)[0] == 1.0
     track.put(START + 200 * MS, np.array([3.0, 0.0, 0.0]))
     assert track.at(START + 250 * MS)[0] == 3.0  # nothing is said of its speed by positions so far apart
