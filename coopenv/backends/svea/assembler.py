@@ -71,7 +71,7 @@ class Assembler:
         elif sample.car in self.binding.leaders:
             if isinstance(value, Pose) and sample.role in (Role.ESTIMATE, Role.POINT):
                 landmark = self.binding.leaders[sample.car]
-                self._hearsay.put_landmark(landmark, stamp, sample.received - stamp, value)
+                self._hearsay.put_landmark(landmark, sample.role, stamp, sample.received - stamp, value)
         elif sample.car not in self.binding.cars:
             self.refused["unknown car"] += 1
         else:

@@ -42,27 +42,32 @@ class Hearsay:
         markers = [*(m.marker for m in scenario.landmarks), *(v.marker for v in scenario.vehicles)]
         self._markers = [np.array(marker) for marker in markers]
         self._heard: dict[int, dict[Role, tuple[int, Pose | Report]]] = {}  # since the last tick
-        self._said: dict[tuple[int, Role], int] = {}  # stamp of a vehicle's last message
+        self._said: dict[tuple[int, Role], int] = {}  # stamp of a target's last message
 
     def on_map(self, told: Placed) -> Placed:
         """Return what holds in the coordinates of the scenario's file as on its map."""
         return told if told.position is None else replace(told, position=told.position - self._origin)
 
-    def put_landmark(self, landmark: int, stamp: int, age: int, pose: Pose) -> None:
+    def put_landmark(self, landmark: int, role: Role, stamp: int, age: int, pose: Pose) -> None:
         """Take what a moving landmark has said of itself; `age` is that with which it came."""
         position = message_of(self.on_map(pose), self._markers[landmark]).position
         if age > STALE:
             self._refused["stale message"] += 1
-        elif position is not None and not self._led[landmark].put(stamp, position):
-            self._refused["message out of order"] += 1
+        elif position is not None and self._is_new(landmark, role, stamp):
+            self._led[landmark].put(stamp, position)  # unless it has said so in another role
 
     def put_vehicle(self, vehicle: int, role: Role, stamp: int, told: Pose | Report) -> None:
         """Take what a vehicle that is estimated elsewhere has said."""
-        if stamp <= self._said.get((vehicle, role), 0):  # older, or replayed
+        if self._is_new(len(self._landmarks) + vehicle, role, stamp):
+            self._heard.setdefault(vehicle, {})[role] = stamp, self.on_map(told)
+
+    def _is_new(self, target: int, role: Role, stamp: int) -> bool:
+        """Return whether a message is newer than the last one of a target; count it where it is older, or replayed."""
+        if stamp <= self._said.get((target, role), 0):
             self._refused["message out of order"] += 1
-            return
-        self._said[vehicle, role] = stamp
-        self._heard.setdefault(vehicle, {})[role] = stamp, self.on_map(told)
+            return False
+        self._said[target, role] = stamp
+        return True
 
     def forget(self) -> None:
         """Forget what vehicles have said."""

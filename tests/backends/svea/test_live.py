@@ -13,6 +13,7 @@ import pytest
 
 import coopenv
 from coopenv.api.parallel_env import CooperativeLocalisationEnv as Env
+from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.svea.backend import Svea
 from coopenv.backends.svea.drive import Drive
 from coopenv.errors import CoopenvError
@@ -177,11 +178,15 @@ def test_one_car_each_hears_the_other(lab: Any) -> None:
     envs = {car: env_of(backend) for car, backend in backends.items()}
     assert [env.possible_agents for env in envs.values()] == [["vehicle_1"], ["vehicle_2"]]
     results: dict[str, Any] = {}
+    mask = observation_layout(envs["svea7"].scenario)["message_mask"]
+    heard: dict[str, list[float]] = {car: [] for car in envs}
 
     def live(car: str) -> None:
         env = envs[car]
         env.reset(seed=3)
-        results[car] = drive(env, 40)
+        for _ in range(40):
+            observations, *_, results[car] = env.step(dict.fromkeys(env.agents, AHEAD))
+            heard[car] += [float(mask.values(row[None]).mean()) for row in observations.values()]
 
     threads = [threading.Thread(target=live, args=(car,)) for car in envs]
     for thread in threads:
@@ -194,6 +199,7 @@ def test_one_car_each_hears_the_other(lab: Any) -> None:
         follower = envs["svea1"].engine
         leader = envs["svea7"].engine
         assert int(follower.view("inbox_tick")[0, 1, 0]) > 50  # f2 has heard f1 until the end
+        assert np.mean(heard["svea1"]) > 0.5 and np.mean(heard["svea7"]) == 0.0  # f1 leads, and hears nobody
         heard, own = (engine.view("estimate_rotation")[0, 0] for engine in (follower, leader))
         np.testing.assert_allclose(heard, own, atol=0.05)
     finally:
