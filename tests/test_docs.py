@@ -22,6 +22,7 @@ from coopenv.scenario import load_scenario
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from coopenv.svea.deployment import Car, Deployment, Safety, Security, Sensors
 from coopenv.svea.network import Network, Tls
+from coopenv.svea.remote import Remote
 from coopenv.svea.topics import TOPICS
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -102,10 +103,17 @@ def test_the_page_on_cars_lists_every_topic_and_field_of_the_deployment() -> Non
         age = row.split(" | ")[4].strip()
         assert age == ("" if topic.max_age is None else f"{topic.max_age:g}")
     parts = {"": Deployment, "cars.": Car, "network.": Network, "network.tls.": Tls}
-    parts |= {"sensors.": Sensors, "safety.": Safety, "security.": Security}
+    parts |= {"sensors.": Sensors, "safety.": Safety, "remote.": Remote, "security.": Security}
     wanted = {f"{prefix}{name}" for prefix, part in parts.items() for name in part.model_fields}
     told = {row.split("`")[1]: row.split("|")[2].strip() for row in rows}
-    assert wanted - told.keys() == {"folder", "network", "sensors", "safety", "security"}  # the last four are sections
+    assert wanted - told.keys() == {
+        "folder",
+        "network",
+        "sensors",
+        "safety",
+        "remote",
+        "security",
+    }  # all but one are sections
     for name, field in Safety.model_fields.items():
         if isinstance(field.default, float):
             assert float(told[f"safety.{name}"]) == pytest.approx(field.default, rel=1e-4)

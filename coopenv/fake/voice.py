@@ -13,8 +13,8 @@ from coopenv.svea.codec import encode
 from coopenv.svea.topics import TOPICS, Role, topic_of
 from coopenv.svea.transport.base import Transport
 
-TRUTH_RATE, LEADER_RATE, STATUS_RATE = 100.0, 60.0, 1.0
-"""Hz: of motion capture, of what a moving landmark says, and of what a car says of itself."""
+TRUTH_RATE, LEADER_RATE, CONDITION_RATE, CAMERA_INFO_RATE = 100.0, 60.0, 5.0, 1.0
+"""Hz: of motion capture, of what a moving landmark says, of what a car says of itself, and of its camera."""
 FULL = 0.9  # share of the battery that is left
 
 Act = Callable[[int, int], None]
@@ -79,7 +79,8 @@ class DriverVoice(Voice):
             "wheel": (WHEEL_RATE, self._wheel),
             "imu": (IMU_RATE, self._imu),
             "odometry": (FILTER_RATE, self._odometry),
-            "status": (STATUS_RATE, self._status),
+            "condition": (CONDITION_RATE, self._condition),
+            "camera_info": (CAMERA_INFO_RATE, self._camera_info),
         }
 
     def _camera(self, due: int, stamp: int) -> None:
@@ -106,8 +107,10 @@ class DriverVoice(Voice):
         frames = (f"{self.name}/odom", f"{self.name}/base_link")
         self.say(Role.ODOMETRY, messages.odometry(stamp, frames, (R, np.array([x, y, 0.0])), twist))
 
-    def _status(self, _due: int, stamp: int) -> None:
+    def _camera_info(self, _due: int, stamp: int) -> None:
         self.say(Role.CAMERA_INFO, messages.camera_info(stamp, self._pixy.calibration))
+
+    def _condition(self, _due: int, stamp: int) -> None:
         self.say(Role.STATE, messages.state(stamp, armed=True))
         self.say(Role.REMOTE, messages.remote(stamp))
         self.say(Role.BATTERY, messages.battery(stamp, FULL))

@@ -6,10 +6,10 @@ import numpy as np
 
 from coopenv.errors import CoopenvError, shown
 from coopenv.svea.numbers import numbers_of
+from coopenv.svea.remote import MOST_CHANNELS
 from coopenv.svea.samples import Calibration, Status
 
-STICKS, NEUTRAL, MOVED = 2, 1500, 100
-"""Channels of the remote control that drive, their pulse at rest and how far from it they count as moved, us."""
+LONGEST_MODE = 64  # characters
 
 
 def calibration_of(message: Any) -> Calibration:
@@ -31,15 +31,13 @@ def calibration_of(message: Any) -> Calibration:
 
 
 def state_of(message: Any) -> Status:
-    """Return whether a car is armed."""
-    return Status(armed=bool(message.armed))
+    """Return whether a car's autopilot is armed and connected, and in which mode."""
+    return Status(armed=bool(message.armed and message.connected), mode=str(message.mode)[:LONGEST_MODE])
 
 
 def remote_of(message: Any) -> Status:
-    """Return whether one of the two sticks of a car's remote control is moved; without a signal, none is."""
-    pulses = [int(pulse) for pulse in message.channels[:STICKS]]
-    signals = [pulse for pulse in pulses if 800 <= pulse <= 2200]
-    return Status(overridden=any(abs(pulse - NEUTRAL) > MOVED for pulse in signals))
+    """Return the pulses of a car's remote control; none with a signal strength of 0, and 255 says: not known."""
+    return Status(pulses=tuple(int(pulse) for pulse in message.channels[:MOST_CHANNELS]) if message.rssi else ())
 
 
 def battery_of(message: Any) -> Status:

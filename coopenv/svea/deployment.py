@@ -12,6 +12,7 @@ from coopenv.errors import CoopenvError, listed, shown, suggest
 from coopenv.svea.fence import Point, is_simple
 from coopenv.svea.limits import HARDEST, USUAL, Limits
 from coopenv.svea.network import Network, Part
+from coopenv.svea.remote import Remote
 
 MARKERS = range(1, 8)
 """Numbers of markers: the Pixy2 tells apart seven colour signatures."""
@@ -118,6 +119,9 @@ class Safety(Part):
     """Decisions in a row that may come late."""
     min_battery: float = Field(default=0.1, ge=0.0, le=1.0)
     """Share of the battery below which cars are not armed."""
+    conditions: bool | None = None
+    """Whether remote control, autopilot and battery have to be heard of before cars are armed, and the remote control
+    while they are (default: only with `zenoh`, as the authors' cars tell nothing of them)."""
     max_clock_offset: Positive = 0.02
     """s between clocks of cars and of this computer, beyond which nothing is armed."""
 
@@ -157,6 +161,7 @@ class Deployment(Part):
     network: Network = Network()
     sensors: Sensors = Sensors()
     safety: Safety = Safety()
+    remote: Remote = Remote()
     security: Security = Security()
     fakes: bool = False
     """Whether the cars are fakes, which can be put where an episode begins."""
@@ -183,6 +188,11 @@ class Deployment(Part):
             make = f"`coopenv svea keys {self.file}` makes it"
             raise DeploymentError(f"{self.file.name}: security.keys: there is no folder '{place}'; {make}")
         return place
+
+    @property
+    def conditions(self) -> bool:
+        """Whether cars have to tell of remote control, autopilot and battery."""
+        return self.network.kind == "zenoh" if self.safety.conditions is None else self.safety.conditions
 
     @property
     def driven(self) -> tuple[Car, ...]:

@@ -61,7 +61,8 @@ class Status:
     """What a car says of itself."""
 
     armed: bool | None = None
-    overridden: bool | None = None  # the remote control drives
+    mode: str | None = None  # of the autopilot
+    pulses: tuple[int, ...] | None = None  # us, of the remote control's channels; empty: it has no signal
     battery: float | None = None  # share that is left
 
 

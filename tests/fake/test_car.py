@@ -127,12 +127,12 @@ def test_sensors_are_asynchronous() -> None:
     stage = Stage("svea_overtaking", OVERTAKING)
     stage.run(5.0)
     rates = {Role.DETECTIONS: 60, Role.BEARINGS: 60, Role.WHEEL: 50, Role.IMU: 100, Role.ODOMETRY: 20, Role.TRUTH: 100}
-    for role, rate in {**rates, Role.STATE: 1, Role.BATTERY: 1, Role.CAMERA_INFO: 1, Role.REMOTE: 1}.items():
+    for role, rate in {**rates, Role.STATE: 5, Role.BATTERY: 5, Role.CAMERA_INFO: 1, Role.REMOTE: 5}.items():
         stamps = np.array([stamp_of(m) for m in stage.arrivals("svea7", role)]) * 1e-9
         assert len(stamps) == pytest.approx(5 * rate, abs=1.01), role
         gaps = np.diff(stamps) * rate
         assert (np.abs(gaps - 1.0) < 0.11).all(), role
-        assert rate == 1 or gaps.std() > 0.01, role
+        assert rate < 20 or gaps.std() > 0.01, role
     assert stage.arrivals("svea7", Role.STATE)[0].armed
     assert not {stamp_of(m) for m in stage.arrivals("svea7", Role.WHEEL)} & {
         stamp_of(m) for m in stage.arrivals("svea7", Role.IMU)

@@ -47,6 +47,18 @@ def test_each_kind_of_network_has_its_usual_place(tmp_path: Path) -> None:
         assert network.connect == (endpoint,)
 
 
+def test_authors_cars_need_not_tell_of_themselves(tmp_path: Path) -> None:
+    for kind, safety, needed in (
+        ("zenoh", "", True),
+        ("nats", "", False),
+        ("ros1", "", False),
+        ("zenoh", "[safety]\nconditions = false", False),
+        ("nats", "[safety]\nconditions = true", True),
+    ):
+        fleet = load_deployment(written(tmp_path, GOOD + f'[network]\nkind = "{kind}"\n{safety}'))
+        assert fleet.conditions is needed
+
+
 BAD = {
     "an unknown key": ('[network]\nconect = ["tcp/a:1"]', "network.conect: unknown key (did you mean 'connect'?)"),
     "an unknown kind": ('[network]\nkind = "mqtt"', "network.kind: Input should be 'zenoh', 'nats' or 'ros1'"),
@@ -75,6 +87,8 @@ BAD = {
     "a name no topic can have": ('[[cars]]\nname = "a/b"', "cars.3.name: String should match"),
     "two things at once": ('[[cars]]\nname = "c"\nvehicle = "v"\nlandmark = "L"', "cars.3: is a vehicle or a landmark"),
     "too fast": ("[safety]\nmax_speed = 2.0", "safety.max_speed: Input should be less than or equal to 1.53, got 2.0"),
+    "a channel of two": ("[remote]\nthrottle = 1", "remote: steering, throttle and mode_switch: two of them are on"),
+    "no such channel": ("[remote]\nsteering = 0", "remote.steering: Input should be greater than or equal to 1"),
     "not a number": ("[safety]\nmax_speed = nan", "safety.max_speed: "),
     "text for a number": ('[safety]\nmax_speed = "fast"', "safety.max_speed: Input should be a valid number"),
     "no TOML": ("[network", "not valid TOML: "),

@@ -254,10 +254,12 @@ def test_status() -> None:
         mode="MANUAL",
         system_status=4,
     )
-    assert read(Role.STATE, state) == Status(armed=True)
-    for pulses, moved in (([1500, 1510, 2000], False), ([1500, 1700], True), ([], False), ([0, 65535], False)):
-        remote = make("mavros_msgs/msg/RCIn", header=head(), rssi=9, channels=np.array(pulses, dtype=np.uint16))
-        assert read(Role.REMOTE, remote) == Status(overridden=moved)
+    assert read(Role.STATE, state) == Status(armed=True, mode="MANUAL")
+    state.connected = False
+    assert read(Role.STATE, state) == Status(armed=False, mode="MANUAL")
+    for rssi, pulses, told in ((9, [1500, 1510], (1500, 1510)), (0, [1500, 1510], ()), (255, [], ()), (255, [0], (0,))):
+        remote = make("mavros_msgs/msg/RCIn", header=head(), rssi=rssi, channels=np.array(pulses, dtype=np.uint16))
+        assert read(Role.REMOTE, remote) == Status(pulses=told)
     assert read(Role.BATTERY, battery(0.5)) == Status(battery=0.5)
     assert read(Role.BATTERY, battery(float("nan"))) == Status()
 

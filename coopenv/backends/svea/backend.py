@@ -95,7 +95,7 @@ class Svea:
         said = {topic_of(name, role): (name, own) for name in heard for role in SPOKEN}
         self.station = Station(transport, self.intake.topics, verifier, said)
         self.gates = Gates(transport, tuple(self._local), deployment.safety.limits, signer, verifier)
-        self.board = StatusBoard(transport, tuple(self._local))
+        self.board = StatusBoard(transport, tuple(self._local), deployment.remote, deployment.conditions)
         rates = self.scenario.rates
         self._pacer = Pacer(1.0 / rates.camera, self.scenario.ticks_per_decision)
         self._assembler = Assembler(binding)
@@ -114,7 +114,7 @@ class Svea:
             1.0 / rates.decision,
         )
         transport.watch(presence_of("*"), self._presence)
-        self.board.on_override = self.watchdog.set_overridden
+        self.watchdog.happened = self.board.happened
         self.watchdog.on_stop = self._write_down
         self._armed, self._heard_once, self._began, self._index = False, False, 0, 0
         self._key, self._episode = 0, 0
@@ -183,6 +183,7 @@ class Svea:
             raise CoopenvError(f"not armed: {found}")
         self._refuse_stopped(release)
         self.watchdog.forget()
+        self.board.begin()
         self.gates.begin()
         self.watchdog.arm()
         self._armed = True

@@ -58,7 +58,11 @@ def _about_itself(fleet: Fleet, car: str) -> Iterator[str]:
             f"{car}: its clock is {abs(offset) * 1e3:.0f} ms {'behind' if offset > 0 else 'ahead of'} this computer's, "
             f"{safety.max_clock_offset * 1e3:.0f} ms are allowed: let chrony or PTP synchronise them"
         )
+    if obstacle := fleet.board.obstacle(car):
+        yield f"{car}: {obstacle}"
     battery = fleet.board.battery(car)
+    if battery is None and fleet.deployment.conditions and safety.min_battery > 0.0:
+        yield f"{car}: its battery does not tell how much is left (safety.min_battery = 0 does without)"
     if battery is not None and battery < safety.min_battery:
         yield f"{car}: its battery is at {100 * battery:.0f} %, {100 * safety.min_battery:.0f} % are needed"
     told, used = fleet.board.calibration(car), fleet.calibrations[car]

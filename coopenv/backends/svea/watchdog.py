@@ -64,7 +64,8 @@ class Watchdog:
         self._beat: float | None = None  # of the last decision; None: there has been none
         self._missed = 0
         self._present: dict[str, bool] = {}
-        self._overridden: dict[str, bool] = {}
+        self.happened: Callable[[str], str] = lambda car: ""
+        """Returns why a car is to be stopped by what it says of itself; empty: for nothing."""
         self._thread = threading.Thread(target=self._watch, name="coopenv watchdog", daemon=True)
         self._thread.start()
 
@@ -92,10 +93,6 @@ class Watchdog:
     def set_present(self, car: str, there: bool) -> None:
         """Say that a car's token has come or gone."""
         self._present[car] = there
-
-    def set_overridden(self, car: str, overridden: bool) -> None:
-        """Say whether somebody drives a car by the remote control."""
-        self._overridden[car] = overridden
 
     def stop(self, reason: str, car: str | None = None) -> None:
         """Stop all cars at once; the first reason stands."""
@@ -168,5 +165,5 @@ class Watchdog:
                 yield Trip(f"{car}: nothing new that could be used on {topic} for {age:.2f} s", car)
         if self._present.get(car) is False:
             yield Trip(f"{car}: is gone", car)
-        if self._overridden.get(car):
-            yield Trip(f"{car}: is driven by remote control", car)
+        if why := self.happened(car):
+            yield Trip(f"{car}: {why}", car)

@@ -298,17 +298,25 @@ def test_a_car_that_somebody_has_stopped_is_released_on_purpose(lab: Any, tmp_pa
         env.close()
 
 
-def test_who_takes_the_remote_control_drives_alone(lab: Any) -> None:
+@pytest.mark.parametrize(
+    ("rssi", "pulses", "why"),
+    [
+        (100, [1500, 1500, 1800, 1500, 1500], "svea1: is driven by remote control"),
+        (100, [1500, 1500, 1500, 1500, 1900], "svea1: the mode switch of its remote control was moved"),
+        (0, [1500] * 8, "svea1: its remote control has no signal"),
+    ],
+)
+def test_who_takes_the_remote_control_drives_alone(lab: Any, rssi: int, pulses: list[int], why: str) -> None:
     path, hub, _ = lab
     env = env_of(cars(path, hub))
     try:
         env.reset(seed=0, options={"arm": True})
         drive(env, 5)
-        channels = np.array([1800, 1500, 1500, 1500], dtype=np.uint16)
-        moved = make("mavros_msgs/msg/RCIn", header=header(time.time_ns()), rssi=100, channels=channels)
+        channels = np.array(pulses, dtype=np.uint16)
+        moved = make("mavros_msgs/msg/RCIn", header=header(time.time_ns()), rssi=rssi, channels=channels)
         hub.connect().publish(topic_of("svea1", Role.REMOTE), encode(moved))
         infos = drive(env, 40)
-        assert not env.agents and infos["vehicle_2"]["car"]["stopped"] == "svea1: is driven by remote control"
+        assert not env.agents and infos["vehicle_2"]["car"]["stopped"] == why
     finally:
         env.close()
 
