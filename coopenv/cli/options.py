@@ -63,6 +63,26 @@ Connect = Annotated[
     str | None,
     typer.Option(help="Endpoint of the network in place of the deployment's network.connect.", show_default=False),
 ]
+GateConnect = Annotated[
+    str | None,
+    typer.Option(
+        help="Router on the car, that of its zenoh-bridge-ros2dds, in place of the deployment's gate.connect "
+        "[default: tcp/127.0.0.1:7447].",
+        show_default=False,
+    ),
+]
+OffBoard = Annotated[
+    bool,
+    typer.Option("--off-board", help="Allow a router that is not on this computer, for trials beside a car."),
+]
+Station = Annotated[
+    str | None,
+    typer.Option(
+        help="Whose commands count [default: the deployment's security.identity, or station]; that is the car itself "
+        "where it is driven by `coopenv svea run --car`.",
+        show_default=False,
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 SteadyFrom = Annotated[
     float | None,

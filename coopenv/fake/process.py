@@ -2,8 +2,8 @@
 
 import threading
 from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from coopenv.backends.svea.binding import bind
 from coopenv.backends.svea.opening import scenario_of
@@ -11,7 +11,7 @@ from coopenv.errors import CoopenvError
 from coopenv.fake.car import REAL, Fake
 from coopenv.fake.faults import Fault
 from coopenv.svea.deployment import load_deployment
-from coopenv.svea.keys import check_known, load_signer, load_verifier
+from coopenv.svea.gate.settings import Settings
 from coopenv.svea.transport.base import Transport
 
 REST = 0.004
@@ -26,12 +26,24 @@ def open_fake(
     seed: int = 0,
     faults: Iterable[Fault] = (),
     gate: bool = True,
+    station: str | None = None,
     complain: Callable[[str], None] = lambda _: None,
 ) -> Fake:
-    """Return a fake of a car of a deployment file; arguments as for `Fake`.
+    """Return a fake of a car of a deployment file; arguments as for `prepare_fake` and `Fake`."""
+    return prepare_fake(path, car, gate, station)(transport, seed=seed, faults=faults, complain=complain)
+
+
+def prepare_fake(path: str | Path, car: str, gate: bool = True, station: str | None = None) -> Callable[..., Fake]:
+    """Return what makes a fake of a network and further arguments of `Fake`: all that can be wrong without a network.
+
+    Args:
+        path: deployment file.
+        car: its name.
+        gate: as for `Fake`.
+        station: whose commands count at its gate (None: those of the file's `security.identity`).
 
     Raises:
-        CoopenvError: the file or its environment is not valid, the car is unknown, or a key is missing.
+        CoopenvError: the file or its environment is not valid, the car is unknown, or a key is missing or another's.
     """
     fleet = load_deployment(path)
     fleet.car(car)
@@ -39,13 +51,11 @@ def open_fake(
     if scenario.backend != "simulated":
         raise CoopenvError(f"{path}: environment: backend '{scenario.backend}' has no fakes; known: simulated")
     binding = bind(scenario, fleet.cars, fleet.markers, Path(path).name, None)
-    signer = verifier = None
-    if gate and (folder := fleet.keys) is not None:
-        verifier = load_verifier(folder)
-        check_known(verifier, fleet.security.identity, folder)
-        signer = load_signer(folder, car)
-    more: dict[str, Any] = {"seed": seed, "faults": faults, "gate": gate, "complain": complain}
-    return Fake(fleet, binding, car, transport, signer=signer, verifier=verifier, **more)
+    given = Settings.of(car, Path(path)).changed({}, station=station)
+    signer, verifier = given.identities() if gate else (None, None)
+    trusting = fleet.security.model_copy(update={"identity": given.station})
+    fleet = fleet.model_copy(update={"security": trusting})
+    return partial(Fake, fleet, binding, car, gate=gate, signer=signer, verifier=verifier)
 
 
 def run(fake: Fake, stop: threading.Event) -> None:

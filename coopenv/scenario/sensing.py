@@ -3,8 +3,9 @@
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
+from coopenv.errors import shown
 from coopenv.scenario.base import (
     Loss,
     NonNegative,
@@ -30,10 +31,20 @@ ROTATION_OF_CAMERA = {"forward": np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0
 """Camera to body: columns are the optical frame's x (right), y (down), z (forward)."""
 
 
+def _known_model(given: object) -> object:
+    """Refuse another model, in words that help on cars as well, whose pixels mean nothing without a calibration."""
+    if given not in ("pinhole", "omnidirectional"):
+        raise ValueError(
+            f"expected 'omnidirectional' or 'pinhole', got {shown(given)}; cars need 'pinhole' with the calibration of "
+            "their camera: image_size, focal_length, principal_point and distortion in [camera] of the environment"
+        )
+    return given
+
+
 class Camera(Part):
     """The camera that every vehicle carries, unless it has its own; optical frame: x right, y down, z forward."""
 
-    model: Literal["pinhole", "omnidirectional"] = "omnidirectional"
+    model: Annotated[Literal["pinhole", "omnidirectional"], BeforeValidator(_known_model)] = "omnidirectional"
     """`omnidirectional` sees in every direction; `pinhole` is bounded by its image. The model, range, distortion
     and quantisation matter only where `topology.mode` is `sensed`; with `fixed` every neighbour is always measured."""
     position: Vector3 = (0.0, 0.0, 0.0)

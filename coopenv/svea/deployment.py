@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from coopenv.errors import CoopenvError, listed, shown, suggest
 from coopenv.svea.fence import Point, is_simple
 from coopenv.svea.limits import HARDEST, USUAL, Limits
-from coopenv.svea.network import Network, Part
+from coopenv.svea.network import WIRES, GateLink, Network, Part, refuse_foreign
 from coopenv.svea.remote import Remote
 
 MARKERS = range(1, 8)
@@ -159,6 +159,7 @@ class Deployment(Part):
     markers: dict[str, Marker] = Field(default={})
     """Numbers of the markers of landmarks, by name."""
     network: Network = Network()
+    gate: GateLink = Field(default=GateLink(), exclude=True)  # matters on the car alone, and to no record of a drive
     sensors: Sensors = Sensors()
     safety: Safety = Safety()
     remote: Remote = Remote()
@@ -172,6 +173,19 @@ class Deployment(Part):
     def _nothing_is_used_twice(self) -> Self:
         refuse_repeated(self.cars, self.markers, MARKERS)
         return self
+
+    @model_validator(mode="after")
+    def _gates_speak_like_the_cars(self) -> Self:
+        try:
+            refuse_foreign(self.network.kind, self.gate_connect)
+        except ValueError as error:
+            raise ValueError(f"gate.{error}") from None
+        return self
+
+    @property
+    def gate_connect(self) -> tuple[str, ...]:
+        """Where the gate of a car connects to: never to what is beyond the radio, unless the file says so."""
+        return self.gate.connect or (WIRES[self.network.kind][0],)
 
     @property
     def folder(self) -> Path:

@@ -78,10 +78,21 @@ def load_signer(path: str | Path, identity: str) -> Signer:
         identity: name of a car or a station.
 
     Raises:
-        KeyFileError: the file is missing, no plain file, of another user, open to others, or no key.
+        KeyFileError: the file is missing, no plain file, of another user, open to others, or no key; or in a folder its
+            `public.toml` has none of the identity, or another one: what it signs would count nowhere.
     """
     path = Path(path)
-    return Signer(identity, _read_private(path / f"{identity}.pem" if path.is_dir() else path))
+    if not path.is_dir():
+        return Signer(identity, _read_private(path))
+    private, public = path / f"{identity}.pem", path / PUBLIC
+    signer, verifier = Signer(identity, _read_private(private)), load_verifier(public)
+    check_known(verifier, identity, public)
+    if verifier.signer(PUBLIC, b"", signer.sign(PUBLIC, b"")) != identity:
+        raise KeyFileError(
+            f"{private}: is not the key of {identity} in {public}; copy both anew from where `coopenv svea keys` made "
+            f"them, or make new ones (--force) and give {PUBLIC} to all"
+        )
+    return signer
 
 
 def load_verifier(path: str | Path) -> Verifier:

@@ -48,6 +48,13 @@ WIRES = {
 """Kinds of networks: where they are if nothing is said, and which protocols they have."""
 
 
+def refuse_foreign(kind: str, endpoints: tuple[str, ...]) -> None:
+    """Refuse endpoints of a protocol that a kind of network does not have, with a ValueError that says which."""
+    for endpoint in endpoints:
+        if address_of(endpoint).protocol not in WIRES[kind][1]:
+            raise ValueError(f"connect: {shown(endpoint)}: {kind} has {listed(WIRES[kind][1])}")
+
+
 class Network(Part):
     """How the cars are reached."""
 
@@ -65,12 +72,18 @@ class Network(Part):
     def _endpoints_fit(self) -> Self:
         if self.kind == "ros1" and len(self.connect) > 1:
             raise ValueError("connect: there is one ROS master, more than one endpoint is given")
+        refuse_foreign(self.kind, self.connect)
         for endpoint in self.connect:
-            protocol, allowed = address_of(endpoint).protocol, WIRES[self.kind][1]
-            if protocol not in allowed:
-                raise ValueError(f"connect: {shown(endpoint)}: {self.kind} has {listed(allowed)}")
-            if protocol in SECURE and self.tls is None:
+            secure = address_of(endpoint).protocol in SECURE
+            if secure and self.tls is None:
                 raise ValueError(f"tls: is missing, {endpoint} needs at least its root_ca")
-            if protocol not in SECURE and self.tls is not None:
+            if not secure and self.tls is not None:
                 raise ValueError(f"connect: {endpoint} would go in the clear; with network.tls it is tls/...")
         return self
+
+
+class GateLink(Part):
+    """Where the gate of a car connects to, whatever `network` says: no radio may stand between it and the wheels."""
+
+    connect: tuple[Endpoint, ...] | None = Field(default=None, min_length=1)
+    """The car's own router, bridge or ROS master, on its loopback (default: at its usual port)."""

@@ -73,6 +73,24 @@ def test_a_gate_that_is_not_there_is_not_well() -> None:
         router.close()
 
 
+def test_health_is_asked_where_the_gate_is_and_not_beyond_the_radio(tmp_path: Path) -> None:
+    endpoint, file = f"tcp/127.0.0.1:{free_port()}", tmp_path / "fleet.toml"
+    text = OVERTAKING.read_text().replace("tcp/127.0.0.1:7447", "tcp/192.0.2.1:7447")
+    file.write_text(f'{text}\n[gate]\nconnect = ["{endpoint}"]\n')
+    router = open_zenoh("router", listen=[endpoint])
+    try:
+        command = ["svea", "health", str(file), "--patience", "0.2", "--car", "svea7"]
+        found = CliRunner().invoke(app, command)
+        assert "svea7: its gate has said nothing" in str(found.exception)  # so it has got there
+    finally:
+        router.close()
+    for there in ("tcp/192.0.2.1:7447", "tcp/lab:7447"):
+        refused = CliRunner().invoke(app, [*command, "--connect", there])
+        assert str(refused.exception).startswith(f"{there}: is not on this computer")
+    tried = CliRunner().invoke(app, [*command, "--connect", "tcp/nowhere.invalid:7447", "--off-board"])
+    assert str(tried.exception).startswith("tcp/nowhere.invalid:7447: no Zenoh there")
+
+
 def test_who_cannot_start_says_why() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -59,6 +59,15 @@ def test_authors_cars_need_not_tell_of_themselves(tmp_path: Path) -> None:
         assert fleet.conditions is needed
 
 
+def test_a_gate_stays_on_its_car_wherever_the_network_is(tmp_path: Path) -> None:
+    away = '[network]\nconnect = ["tcp/192.0.2.1:7447"]\n'
+    assert load_deployment(written(tmp_path, GOOD + away)).gate_connect == ("tcp/127.0.0.1:7447",)
+    told = load_deployment(written(tmp_path, GOOD + away + '[gate]\nconnect = ["tcp/[::1]:1"]'))
+    assert told.gate_connect == ("tcp/[::1]:1",)
+    ros = load_deployment(written(tmp_path, GOOD + '[network]\nkind = "ros1"'))
+    assert ros.gate_connect == ("tcp/127.0.0.1:11311",)
+
+
 BAD = {
     "an unknown key": ('[network]\nconect = ["tcp/a:1"]', "network.conect: unknown key (did you mean 'connect'?)"),
     "an unknown kind": ('[network]\nkind = "mqtt"', "network.kind: Input should be 'zenoh', 'nats' or 'ros1'"),
@@ -68,6 +77,9 @@ BAD = {
     "a port too large": ('[network]\nconnect = ["tcp/a:70000"]', "'tcp/a:70000' is no endpoint"),
     "no endpoints": ("[network]\nconnect = []", "network.connect: List should have at least 1 item"),
     "a wire's protocol": ('[network]\nconnect = ["nats/a:1"]', "network.connect: 'nats/a:1': zenoh has tcp, tls"),
+    "a gate's endpoint": ('[gate]\nconnect = ["there"]', "gate.connect.0: 'there' is no endpoint"),
+    "no gate's endpoint": ("[gate]\nconnect = []", "gate.connect: List should have at least 1 item"),
+    "a gate's wire": ('[gate]\nconnect = ["nats/127.0.0.1:1"]', "gate.connect: 'nats/127.0.0.1:1': zenoh has tcp, tls"),
     "TLS without it": (
         '[network]\nconnect = ["tls/a:1"]',
         "network.tls: is missing, tls/a:1 needs at least its root_ca",

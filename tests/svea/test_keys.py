@@ -33,6 +33,18 @@ def test_keys_sign_and_verify(folder: Path) -> None:
         check_known(verifier, "svea9", folder)
 
 
+def test_a_private_file_of_another_is_refused_by_the_names_of_both_files(folder: Path) -> None:
+    (folder / "svea8.pem").replace(folder / "svea7.pem")
+    with pytest.raises(KeyFileError) as refused:
+        load_signer(folder, "svea7")
+    for part in (str(folder / "svea7.pem"), str(folder / PUBLIC), "coopenv svea keys", "--force"):
+        assert part in str(refused.value)
+    load_signer(folder / "svea7.pem", "svea8")  # a file alone says nothing of whose it is
+    (folder / PUBLIC).write_text("[keys]\n")
+    with pytest.raises(KeyFileError, match=r"public\.toml: no public key of 'station'"):
+        load_signer(folder, "station")
+
+
 def test_nobody_else_can_read_private_files(folder: Path) -> None:
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     for name in NAMES:

@@ -27,22 +27,24 @@ def fake(
     gate: Annotated[
         bool, typer.Option(help="Whether commands come through a gate of its own; else it obeys ManualControl.")
     ] = True,
+    station: options.Station = None,
 ) -> None:
     """Let a fake car drive, see and send until it is interrupted; it says so when it can be seen."""
     from coopenv import interrupts
     from coopenv.fake.faults import parse_fault
-    from coopenv.fake.process import open_fake, run
+    from coopenv.fake.process import prepare_fake, run
     from coopenv.svea.deployment import load_deployment
     from coopenv.svea.transport.open import open_transport
 
     faults = [parse_fault(text) for text in fault or ()]
+    make = prepare_fake(deployment, car, gate, station)
     transport = open_transport(load_deployment(deployment, connect))
 
     def complain(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
 
     try:
-        made = open_fake(deployment, car, transport, seed=seed, faults=faults, gate=gate, complain=complain)
+        made = make(transport, seed=seed, faults=faults, complain=complain)
         gc.freeze()  # what is there stays, and need not be looked through again and again
         interrupts.note(f"{car} is gone")
         print(f"{car}: fake ready", flush=True)

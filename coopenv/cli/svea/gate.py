@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from coopenv.cli import options
+
 Speed = typer.Option(help="Most m/s [default: 0.5].", show_default=False)
 Angle = typer.Option(help="Most rad of steering [default: 0.5236].", show_default=False)
 Acceleration = typer.Option(help="Most m/s^2, either way [default: 1].", show_default=False)
@@ -18,15 +20,14 @@ def gate(
     car: Annotated[str, typer.Option(help="Name of this car, as in its topics: svea7.")],
     deployment: Annotated[
         Path | None,
-        typer.Argument(metavar="[DEPLOYMENT.toml]", help="Deployment with network, keys and limits; options win."),
+        typer.Argument(metavar="[DEPLOYMENT.toml]", help="Deployment with [gate], keys and limits; options win."),
     ] = None,
-    connect: Annotated[
-        str | None, typer.Option(help="Zenoh router, that of this car's zenoh-bridge-ros2dds: tcp/127.0.0.1:7447.")
-    ] = None,
+    connect: options.GateConnect = None,
+    off_board: options.OffBoard = False,
     keys: Annotated[
         Path | None, typer.Option(help="Folder with CAR.pem and public.toml of `coopenv svea keys`.")
     ] = None,
-    station: Annotated[str | None, typer.Option(help="Whose commands count [default: station].")] = None,
+    station: options.Station = None,
     max_speed: Annotated[float | None, Speed] = None,
     max_steering: Annotated[float | None, Angle] = None,
     max_acceleration: Annotated[float | None, Acceleration] = None,
@@ -36,9 +37,10 @@ def gate(
     """Pass on commands that are fresh, signed, in order and inside the limits; else keep the car neutral.
 
     Runs on the car until it is interrupted; the car then gets neutral. It starts disarmed, and the station arms it for
-    a session. Without a valid command for 0.2 s the car gets neutral until there is a newer one. A stop, from anybody,
-    holds until the next arming. Clocks of car and station must agree to 50 ms (chrony). What the gate rejects is
-    counted in its status, fleet/CAR/coopenv/gate.
+    a session. It connects to the car's own router, so that neutral gets to the wheels when the radio is gone. Without a
+    valid command for 0.2 s the car gets neutral until there is a newer one. A stop, from anybody, holds until the next
+    arming. Clocks of car and station must agree to 50 ms (chrony). What the gate rejects is counted in its status,
+    fleet/CAR/coopenv/gate.
 
     Limits beyond 1.53 m/s, 0.5236 rad, 2 m/s^2 and 4 rad/s are refused.
     """
@@ -54,6 +56,7 @@ def gate(
         station=station,
         limits={**bounds, "steering_rate": max_steering_rate, "reverse": reverse},
     )
+    given.check_place(off_board)
     signer, verifier = given.identities()
     if verifier is None:
         print("warning: without --keys whoever reaches the router can drive this car", file=sys.stderr)

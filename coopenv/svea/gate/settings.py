@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from coopenv.errors import CoopenvError, shown
 from coopenv.svea.limits import USUAL, Limits
 from coopenv.svea.signing import LONGEST_IDENTITY, is_identity
+from coopenv.svea.transport.endpoints import SECURE, address_of
 
 if TYPE_CHECKING:
     from coopenv.svea.deployment import Deployment
@@ -43,8 +44,7 @@ class Settings:
 
         read = load_deployment(path)
         keys = None if read.security.keys is None else read.folder / read.security.keys
-        connect, limits = read.network.connect, read.safety.limits
-        return cls(read.car(car).name, connect, limits, keys, read.security.identity, read)
+        return cls(read.car(car).name, read.gate_connect, read.safety.limits, keys, read.security.identity, read)
 
     def changed(self, limits: Mapping[str, Any], **values: Any) -> Settings:
         """Return these settings with others in place of some; None leaves one as it is.
@@ -56,6 +56,19 @@ class Settings:
         rest = {name: value for name, value in values.items() if value is not None}
         return replace(self, limits=bounds.check(), **rest)
 
+    def check_place(self, off_board: bool) -> None:
+        """Refuse a router that is not on the car, where neutral would get lost with the link; `off_board` allows it.
+
+        Raises:
+            CoopenvError: an endpoint is none, or not on this computer.
+        """
+        for endpoint in self.connect:
+            if not address_of(endpoint).loopback and not off_board:
+                raise CoopenvError(
+                    f"{endpoint}: is not on this computer, and when the link to it dies the wheels get no neutral: "
+                    "expected the car's own router, e.g. tcp/127.0.0.1:7447 ([gate] connect, --connect), or --off-board"
+                )
+
     def open(self) -> Transport:
         """Connect to the network; errors as for `coopenv.svea.transport.open.open_transport`."""
         if self.fleet is None:
@@ -64,7 +77,9 @@ class Settings:
             return open_zenoh("client", self.connect)
         from coopenv.svea.transport.open import open_transport
 
-        network = self.fleet.network.model_copy(update={"connect": self.connect})
+        secure = any(address_of(endpoint).protocol in SECURE for endpoint in self.connect)
+        tls = self.fleet.network.tls if secure else None  # on the car itself nothing need be
+        network = self.fleet.network.model_copy(update={"connect": self.connect, "tls": tls})
         return open_transport(self.fleet.model_copy(update={"network": network}))
 
     def identities(self) -> tuple[Signer | None, Verifier | None]:

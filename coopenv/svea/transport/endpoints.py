@@ -1,5 +1,6 @@
 """Addresses on the network as Zenoh writes them, `PROTOCOL/HOST:PORT`, whatever transport they are for."""
 
+import ipaddress
 import re
 import socket
 import ssl
@@ -9,6 +10,7 @@ from coopenv.errors import CoopenvError, listed, shown
 
 PROTOCOLS = ("tcp", "tls", "quic", "udp", "nats")
 SECURE = ("tls", "quic")
+NO_ANSWER = "no answer"
 
 WRITTEN = re.compile(r"([a-z]+)/(\[[0-9A-Fa-f:.]+\]|[^\s/:?#\[\]]+):(\d{1,5})(?:[?#]\S*)?")
 
@@ -25,6 +27,14 @@ class Address:
     def authority(self) -> str:
         """Host and port as URLs have them."""
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+    @property
+    def loopback(self) -> bool:
+        """Whether it is on this computer, whatever its networks: 127.0.0.0/8, ::1 or localhost."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host.lower() == "localhost"
 
 
 def address_of(endpoint: str) -> Address:
@@ -53,7 +63,7 @@ def trouble_at(address: Address, context: ssl.SSLContext | None, timeout: float)
         with socket.create_connection((address.host, address.port), timeout) as plain:
             return _tls_trouble(plain, address.host, context) if address.protocol == "tls" and context else None
     except TimeoutError:
-        return "no answer"
+        return NO_ANSWER
     except OSError as error:
         return error.strerror or str(error)
 

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from coopenv.errors import CoopenvError
 from coopenv.svea.transport.base import Arrival, Callback, LinkError
 from coopenv.svea.transport.certificates import Certificates
-from coopenv.svea.transport.endpoints import SECURE, address_of, trouble_at
+from coopenv.svea.transport.endpoints import NO_ANSWER, SECURE, address_of, trouble_at
 
 LEASE = 1000  # ms after which a process that has frozen no longer counts as present
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
@@ -115,13 +115,20 @@ def open_zenoh(
         return Zenoh(zenoh.open(config), zenoh)
     except zenoh.ZError as error:
         where = ", ".join([*connect, *listen]) or "no endpoints"
-        raise LinkError(f"{where}: no Zenoh there ({_reason(error, connect, tls)})") from None
+        said = _reason(error, connect, tls)
+        if said is None:
+            raise LinkError(f"{where}: does not answer within {timeout:g} s") from None
+        raise LinkError(f"{where}: no Zenoh there ({said})") from None
 
 
-def _reason(error: Exception, connect: Sequence[str], tls: Certificates | None) -> str:
-    """Return why a connection fails where that can be found out, else the first sentence of Zenoh's error."""
+def _reason(error: Exception, connect: Sequence[str], tls: Certificates | None) -> str | None:
+    """Return why a connection fails where that can be found out, else the first sentence of Zenoh's error.
+
+    None: nobody answers, or somebody who takes a connection and says nothing, as a firewall may.
+    """
     context = tls.context() if tls else None
     for endpoint in connect:
         if trouble := trouble_at(address_of(endpoint), context, 1.0):
-            return trouble
-    return str(error).split(" at /")[0].split("\n")[0][:120]
+            return None if trouble == NO_ANSWER else trouble
+    said = str(error).split(" at /")[0].split("\n")[0][:120]
+    return None if connect and "Timeout" in said else said

@@ -62,8 +62,8 @@ def test_a_station_arms_drives_and_stops(station: Station) -> None:
     assert station.status.state == "disarmed"
     begun = time.monotonic()
     time.sleep(0.6)
-    told = station.since(begun)
-    assert 3 <= len(told) <= 15 and set(told) == {NEUTRAL}  # 20 Hz, on a machine that has other things to do
+    told, most = station.since(begun), 20.0 * (time.monotonic() - begun) + 3
+    assert 3 <= len(told) <= most and set(told) == {NEUTRAL}  # 20 Hz, on a machine that has other things to do
     station.arm("a")
     station.drive()
     wait_until(lambda: station.status.state == "timed_out")
@@ -174,7 +174,8 @@ def test_a_deployment_file_tells_it_all(endpoint: str, keys: Path, tmp_path: Pat
     lines = [
         'environment = "none of its business"',
         f'cars = [{{name = "{CAR}"}}]',
-        f'network.connect = ["{endpoint}"]',
+        'network.connect = ["tcp/192.0.2.1:7447"]',  # of the station: the gate does not go there
+        f'gate.connect = ["{endpoint}"]',
     ]
     lines += [f'security = {{keys = "{keys}", identity = "other"}}', "safety.max_speed = 0.2"]
     (tmp_path / "fleet.toml").write_text("\n".join(lines))
@@ -209,6 +210,9 @@ def test_without_keys_it_warns(endpoint: str, tmp_path: Path) -> None:
         (["--car", CAR, "--max-acceleration", "nan"], "limit of acceleration"),
         (["--car", CAR, "--keys", "nowhere"], "nowhere: cannot be read as a file of keys"),
         (["--car", CAR, "--connect", "nonsense"], "'nonsense' is no endpoint"),
+        (["--car", CAR, "--connect", "tcp/10.0.0.1:7447"], "tcp/10.0.0.1:7447: is not on this computer"),
+        (["away.toml", "--car", CAR], "tcp/lab:7447: is not on this computer"),
+        (["mixed.toml", "--car", CAR], "svea7.pem: is not the key of svea7 in keys/public.toml"),
         (["nothing.toml", "--car", CAR], "nothing.toml: cannot be read"),
         (["fleet.toml", "--car", "svea8"], "unknown car 'svea8'"),
         ([], "Missing option '--car'"),
@@ -220,6 +224,10 @@ def test_mistakes_are_told_in_one_line(
     monkeypatch.chdir(tmp_path)
     fleet = f'environment = "x"\ncars = [{{name = "{CAR}"}}]\n'
     Path("fleet.toml").write_text(fleet)
+    Path("away.toml").write_text(fleet + 'gate.connect = ["tcp/lab:7447"]\n')
+    Path("mixed.toml").write_text(fleet + 'security.keys = "keys"\n')
+    make_keys("keys", [CAR, "station"])
+    Path("keys/station.pem").replace(f"keys/{CAR}.pem")
     assert main(["svea", "gate", *options]) == 2
     error = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: without --keys")]
     assert len(error) == 1 and told in error[0]

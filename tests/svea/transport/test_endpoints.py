@@ -18,6 +18,16 @@ def test_endpoints_have_three_parts() -> None:
     assert address_of("tcp/[::1]:7447").authority == "[::1]:7447"
 
 
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "[::1]", "localhost", "LocalHost"])
+def test_what_is_on_this_computer(host: str) -> None:
+    assert address_of(f"tcp/{host}:7447").loopback
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "10.0.0.1", "[::]", "[fe80::1]", "localhost.lab", "127.0.0.1.lab", "car"])
+def test_what_may_be_elsewhere(host: str) -> None:
+    assert not address_of(f"tcp/{host}:7447").loopback
+
+
 @pytest.mark.parametrize(
     "text", ["", "tcp", "tcp/", "tcp/a", "tcp/a:b", "tcp/a:65536", "http/a:1", "tcp/a b:1", "tcp/a:1\n"]
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -115,6 +116,13 @@ def test_a_router_that_is_not_there_is_said_in_time(endpoint: str) -> None:
     with pytest.raises(LinkError, match=rf"^{endpoint}: no Zenoh there \(Connection refused\)$"):
         open_zenoh("client", connect=[endpoint], timeout=0.5)
     assert time.monotonic() - began < 10.0
+
+
+def test_who_does_not_answer_is_said() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # as a firewall may: it takes the connection, and that is it
+        endpoint = f"tcp/127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(LinkError, match=rf"^{endpoint}: does not answer within 0\.5 s$"):
+            open_zenoh("client", connect=[endpoint], timeout=0.5)
 
 
 def test_a_port_that_is_taken_is_said(endpoint: str) -> None:
