@@ -18,6 +18,7 @@ from coopenv.cli import app
 from coopenv.errors import CoopenvError
 from coopenv.fake.process import open_fake, run
 from coopenv.svea.codec import decode, encode, make
+from coopenv.svea.keys import load_signer, load_verifier, make_keys
 from coopenv.svea.limits import Limits
 from coopenv.svea.topics import RESET_TOPIC, TOPICS, Role, presence_of, topic_of
 from coopenv.svea.transport.base import Arrival, Transport
@@ -163,6 +164,27 @@ def test_what_does_not_fit_is_one_line(fleet: Path, options: tuple[str, ...], sa
     result = CliRunner().invoke(app, ["svea", "fake", str(fleet), *options])
     assert isinstance(result.exception, CoopenvError)
     assert said in str(result.exception)
+
+
+def test_a_gate_obeys_whom_it_is_told_to(fleet: Path) -> None:
+    fleet.write_text(fleet.read_text() + '[security]\nkeys = "keys"\n')
+    keys = fleet.parent / "keys"
+    make_keys(keys, ["svea7", "svea8", "station"])
+    hub = Hub()
+    here, verifier = hub.connect(), load_verifier(keys)
+    with threaded(fleet, "svea7", hub, station="svea7"):
+        own, other = (
+            Gates(here, ("svea7",), LIMITS, load_signer(keys, name), verifier) for name in ("svea7", "station")
+        )
+        wait_until(lambda: other.states["svea7"].state == own.states["svea7"].state == "disarmed")
+        with pytest.raises(CoopenvError, match="svea7"):
+            other.begin()
+        assert own.states["svea7"].state == "disarmed"
+        own.begin()
+        assert own.states["svea7"].state == "armed"
+        own.end()
+    with pytest.raises(CoopenvError, match="no public key of 'svea9'"):
+        open_fake(fleet, "svea7", hub.connect(), station="svea9")
 
 
 def test_keys_of_the_gate_are_needed_where_the_deployment_has_some(fleet: Path) -> None:

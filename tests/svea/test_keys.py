@@ -10,6 +10,8 @@ import pytest
 
 from coopenv.cli import main
 from coopenv.svea.keys import PUBLIC, KeyFileError, check_known, load_signer, load_verifier, make_keys
+from coopenv.svea.transport import zenoh
+from tests.helpers.processes import ROOT
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="modes of files")
 NAMES = ("svea7", "svea8", "station")
@@ -131,6 +133,21 @@ def test_what_is_no_public_file_is_refused(folder: Path, text: str) -> None:
     (folder / PUBLIC).write_text(text)
     with pytest.raises(KeyFileError, match=r"public\.toml: (expected|keys\.a: expected)"):
         load_verifier(folder)
+
+
+@pytest.mark.parametrize("command", [["gate", "--car", "svea7"], ["fake", "--car", "svea7"], ["run"]])
+def test_who_has_anothers_key_does_not_even_look_for_the_network(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zenoh, "open_zenoh", lambda *_, **__: pytest.fail("the network is touched"))
+    shipped = ROOT / "examples" / "fleet" / "overtaking.toml"
+    (tmp_path / "fleet.toml").write_text(shipped.read_text() + '[security]\nkeys = "keys"\n')
+    make_keys(tmp_path / "keys", ["svea7", "svea1", "station", "other"])
+    mixed = "station" if command == ["run"] else "svea7"
+    (tmp_path / "keys" / "other.pem").replace(tmp_path / "keys" / f"{mixed}.pem")
+    assert main(["svea", command[0], str(tmp_path / "fleet.toml"), *command[1:]]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{mixed}.pem: is not the key of {mixed} in {tmp_path / 'keys' / PUBLIC}; copy both anew" in line
 
 
 DEPLOYMENT = """
