@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import coopenv
+from coopenv.cli import main
 from coopenv.policies import load_agent
 from coopenv.svea.limits import HARDEST
+from tests.helpers.processes import ROOT
 
 NAMES = ("svea_crossing", "svea_overtaking")
 FROM, WORLDS = 3.0, 16
@@ -60,3 +62,22 @@ def test_the_moving_landmark_hides_landmarks_while_the_car_drives() -> None:
     while_there = [names for names in seen if "ML" in names]
     assert len(while_there) > 20
     assert any(not {"SL2", "SL4"} <= names for names in while_there)
+
+
+@pytest.mark.parametrize("model", ["ideal", "omnidirectional"])
+def test_a_camera_that_cars_cannot_have_is_answered_by_what_they_need(
+    model: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fleet = ROOT / "examples" / "fleet" / "overtaking.toml"
+    assert main(["svea", "run", str(fleet), "--set", f"camera.model={model}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    for word in (
+        "[camera] of the environment",
+        "pinhole",
+        "image_size",
+        "focal_length",
+        "principal_point",
+        "distortion",
+    ):
+        assert word in line
+    assert ("got 'ideal'" in line) == (model == "ideal")

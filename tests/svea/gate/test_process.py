@@ -174,7 +174,8 @@ def test_a_deployment_file_tells_it_all(endpoint: str, keys: Path, tmp_path: Pat
     lines = [
         'environment = "none of its business"',
         f'cars = [{{name = "{CAR}"}}]',
-        'network.connect = ["tcp/192.0.2.1:7447"]',  # of the station: the gate does not go there
+        # Of the station: the gate does not go there, and on its own computer it needs no certificate.
+        'network = {connect = ["tls/192.0.2.1:7447"], tls = {root_ca = "not_on_the_car.pem"}}',
         f'gate.connect = ["{endpoint}"]',
     ]
     lines += [f'security = {{keys = "{keys}", identity = "other"}}', "safety.max_speed = 0.2"]
