@@ -36,7 +36,7 @@ EXPECTED = ("reset", "closed", EPISODE_OVER)
 """Reasons to stop that are no emergency."""
 FIRST_WORD = 3.0  # s that cars have to be heard in at the first reset
 CAMERA_WORD = 1.5  # s in which a camera has to say of itself what it is; some never do
-READY_WORD = 1.0  # s in which all has to be at once as arming wants it
+READY_WORD = 2.0  # s in which all has to be at once as arming wants it; some cars tell of themselves once a second
 SETTLE = 0.5  # s that fakes have to stand where they were put
 
 
