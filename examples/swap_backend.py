@@ -75,6 +75,9 @@ for landmark in scenario.landmarks:
     ways.plot(*landmark.position[:2], "s", color="#222222")
     ways.annotate(landmark.name, landmark.position[:2], (0, 6), textcoords="offset points", ha="center")
 ways.set(xlabel="x [m]", ylabel="y [m]", title="True ways", aspect="equal", xlim=(-1.6, 1.6))
+for name, line in (("simulation", "--"), ("fake cars", "-")):
+    ways.plot([], [], line, color="#222222", label=name)
+ways.legend(*(entries[-2:] for entries in ways.get_legend_handles_labels()))
 errors.set(xlabel="t [s]", ylabel="error of the estimated position [cm]", title="What the cars know of it")
 errors.legend()
 Path("out").mkdir(exist_ok=True)

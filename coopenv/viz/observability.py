@@ -40,7 +40,7 @@ def observability_figure(observability: Observability, ends: Sequence[float] | N
     local.axhline(observability.threshold, color=style.INK, linewidth=0.9, linestyle=(0, (4, 2)), label="threshold")
     style.legend(local, local.get_lines(), "upper left", (1.005, 1.0), fontsize=style.NORMAL)
     _draw_eigenvalues(theorem, cut, [part.min_eigenvalue for part in cut])
-    theorem.set_ylabel("smallest eigenvalue\nabout the map origin", fontsize=style.NORMAL)
+    theorem.set_ylabel("smallest eigenvalue about\nthe origin [rad, m mixed]", fontsize=style.NORMAL)
     _draw_verdict(verdict, cut)
     for ax in (local, theorem):
         style.show_decades(ax)

@@ -38,6 +38,7 @@ NOTE = "#595959"  # of small print; its contrast on white is 7
 TEXT: dict[str, Any] = {"fontsize": NORMAL, "color": INK}
 _LEGEND_MARK, _LEGEND_LETTER = 0.45, 0.06  # inches
 _LEAST_DECADES = 1.05  # on a logarithmic axis
+_LEAST_LABELS = 2  # decades that have one there
 _LARGEST = 1e100  # of a value that is drawn
 
 
@@ -187,14 +188,18 @@ def _columns_width(lengths: Sequence[float], columns: int) -> float:
 
 
 def show_decades(ax: Axes) -> None:
-    """Label a logarithmic ordinate, on which everything has been drawn, at decades only, one at least in sight."""
+    """Label a logarithmic ordinate, on which everything has been drawn, at decades only, two at least in sight."""
     ax.yaxis.set_minor_formatter(NullFormatter())
     low, high = ax.dataLim.intervaly
     if 0 < low <= high < np.inf:
         ax.set_autoscaley_on(False)  # it would complain about a single value
         low, high = np.log10((low, high))
         room = max(0.05 * (high - low), (_LEAST_DECADES - (high - low)) / 2)
-        ax.set_ylim(10 ** (low - room), 10 ** (high + room))
+        bottom, top = low - room, high + room
+        while np.floor(top) - np.ceil(bottom) + 1 < _LEAST_LABELS:
+            below, above = np.ceil(bottom) - 1, np.floor(top) + 1
+            bottom, top = (below, top) if bottom - below < above - top else (bottom, above)
+        ax.set_ylim(10**bottom, 10**top)
 
 
 def time_axis(ax: Axes, t: np.ndarray, *, labelled: bool) -> None:

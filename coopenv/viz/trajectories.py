@@ -242,14 +242,14 @@ def _legend(
     looks |= {"true start": _marker("^", INK, GREY), "first estimate": _marker("^", GREY, GREY)}
     looks |= {"end": _marker("x", INK, INK)}
     if elsewhere:
-        looks["heard by radio (truth)"] = {"color": GREY, "linewidth": 1.1, "linestyle": _DOTTED}
+        looks["heard by radio"] = {"color": GREY, "linewidth": 1.1, "linestyle": _DOTTED}
     motions = {moving for i, moving in _landmarks(trajectory) if trajectory.targets[i] not in elsewhere}
     if False in motions:
         looks["landmark"] = _marker("o", DARK_BLUE, DARK_BLUE)
     if True in motions:
         looks["moving landmark"] = {"color": DARK_BLUE, "linewidth": 1.1, "linestyle": _DASHED}
     if outside:
-        looks["first estimate outside"] = _marker("^", INK, "white")
+        looks["starts outside"] = _marker("^", INK, "white")
     handles: list[Line2D | Patch] = [Line2D([], [], label=label, **look) for label, look in looks.items()]
     if scenario is not None and scenario.roads:
         handles.append(Patch(facecolor=ASPHALT, edgecolor="none", label="road"))

@@ -190,7 +190,7 @@ def test_a_far_initial_estimate_does_not_change_the_frame(
     near_figure, far_figure = draw(run), draw(far)
     for limits in ("get_xlim", "get_ylim"):
         assert getattr(near_figure.axes[0], limits)() == getattr(far_figure.axes[0], limits)()
-    in_legend = ["first estimate outside" in texts(f) for f in (near_figure, far_figure)]
+    in_legend = ["starts outside" in texts(f) for f in (near_figure, far_figure)]
     assert in_legend == [False, True]
 
 
