@@ -77,7 +77,8 @@ for landmark in scenario.landmarks:
 ways.set(xlabel="x [m]", ylabel="y [m]", title="True ways", aspect="equal", xlim=(-1.6, 1.6))
 for name, line in (("simulation", "--"), ("fake cars", "-")):
     ways.plot([], [], line, color="#222222", label=name)
-ways.legend(*(entries[-2:] for entries in ways.get_legend_handles_labels()))
+whose = [entries[-2:] for entries in ways.get_legend_handles_labels()]
+ways.legend(*whose, loc="center", bbox_to_anchor=(0.5, 0.74))  # where nothing else is
 errors.set(xlabel="t [s]", ylabel="error of the estimated position [cm]", title="What the cars know of it")
 errors.legend()
 Path("out").mkdir(exist_ok=True)

@@ -16,10 +16,12 @@ from numpy.testing import assert_allclose
 
 from coopenv import CoopenvError, DataError
 from coopenv.backends.bags import Bag
+from coopenv.backends.bags.inventory import Row
 from coopenv.backends.bags.topic_map import TopicMapError, load_map
 from coopenv.backends.mcap.peek import metadata_names
 from coopenv.backends.sources import Kind, is_bag, kind_of
 from coopenv.cli import main
+from coopenv.cli.bags import _print
 from coopenv.errors import DataWarning
 from coopenv.scenario import load_scenario
 from coopenv.svea.samples import Detections
@@ -154,6 +156,25 @@ def test_a_bag_that_is_not_there(name: str, tmp_path: Path) -> None:
     (tmp_path / "topics.toml").write_text(MAP, encoding="utf-8")
     with pytest.raises(DataError, match=f"no such bag: .*{name}"):
         Bag([tmp_path / name], tmp_path / "topics.toml")
+
+
+def test_a_folder_that_is_no_bag_is_told_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "topics.toml").write_text(MAP, encoding="utf-8")
+    (tmp_path / "empty").mkdir()
+    for command in ("run", "import"):
+        assert main([command, str(tmp_path / "empty"), "--map", str(tmp_path / "topics.toml")]) == 2
+        assert "empty: a folder without metadata.yaml, which a bag of ROS 2 has" in capsys.readouterr().err
+
+
+def test_tables_of_topics_are_folded_and_not_cut(capsys: pytest.CaptureFixture[str]) -> None:
+    name = "/fleet/" + "a_car_with_a_long_name/" * 4 + "mavros/wheel_odometry/velocity"
+    kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
+    for row in (Row(name, kind, 12345, 59.9), Row(name, kind, 12345, 59.9, "a_car", "detections", 12300, 1.2, 3, 0.1)):
+        _print([row], False)
+        lines = capsys.readouterr().out.splitlines()
+        assert max(map(len, lines)) <= 100
+        assert "".join(line[:20] for line in lines[2:]).replace(" ", "").startswith("─" * 20 + name[:20])
+        assert sum(line.count("a_car_with") for line in lines) >= 2 and "…" not in "".join(lines)
 
 
 def test_a_topic_of_which_nothing_is_of_use(tmp_path: Path) -> None:

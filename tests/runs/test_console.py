@@ -37,6 +37,33 @@ def test_lines_where_there_is_no_terminal(text: io.StringIO, monkeypatch: pytest
         wait_for(text, "drawing: 50 % after 20 s, about 20 s left\n")
 
 
+def test_time_left_is_not_told_before_there_is_enough_to_go_by(
+    text: io.StringIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = [100.0]
+    monkeypatch.setattr(module, "monotonic", lambda: clock[0])
+    progress = Progress(Console(file=text), "simulating", total=400)
+    progress.__enter__()
+    clock[0] = 103.0  # until it begins
+    progress.update(0)
+    clock[0] = 103.5
+    progress.update(1)
+    assert progress.line() == "simulating: 0 % after 0 s"
+    clock[0] = 105.0
+    progress.update(20)
+    progress.__exit__()
+    assert "simulating: 5 % after 2 s, about 38 s left\n" in text.getvalue()
+    assert "535" not in text.getvalue() and "199" not in text.getvalue()
+
+
+def test_in_real_time_the_time_left_is_known(text: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "monotonic", lambda: 100.0)
+    with Progress(Console(file=text), "running", total=480, rate=60.0) as progress:
+        progress.update(0)
+        progress.update(3)
+        assert progress.line() == "running: 1 % after 0 s, about 8 s left"
+
+
 def test_tracked_items_are_counted(text: io.StringIO) -> None:
     with Progress(Console(file=text), "episodes") as progress:
         assert list(progress.track(range(5))) == [0, 1, 2, 3, 4]

@@ -171,6 +171,15 @@ def test_topology_bars_are_the_stretches_of_each_sight(run: Trajectory) -> None:
     assert drawn == pytest.approx(run.visible[:, 0].sum() / 60, rel=1e-6)
 
 
+def test_starts_of_truth_and_estimate_are_told_apart(run: Trajectory) -> None:
+    figure = trajectory_figure_2d(run)
+    handles = {str(line.get_label()): line for line in figure.legends[0].get_lines()}
+    true, first = handles["true start"], handles["first estimate"]
+    assert (true.get_markeredgecolor(), first.get_markeredgecolor()) == (style.INK, style.GREY)
+    drawn = {line.get_markeredgecolor() for line in figure.axes[0].lines if line.get_marker() == "^"}
+    assert style.INK in drawn and style.vehicle_colour(0) in drawn
+
+
 def test_topology_shades_occlusion_by_a_moving_body_that_is_itself_unseen(run: Trajectory) -> None:
     sight = np.full_like(run.sight, Sight.NOT_A_NEIGHBOUR)
     sight[:, :, 0] = Sight.VISIBLE
@@ -421,15 +430,17 @@ def test_a_missed_frame_leaves_no_line_in_the_shade(run: Trajectory) -> None:
         assert spans(figure.axes[0], style.SHADE) == [pytest.approx((10, 15), abs=1e-6)]
 
 
-def test_axes_show_a_decade_and_no_labels_between() -> None:
+@pytest.mark.parametrize("values", [(120.0, 180.0), (0.02, 0.1), (3.0, 3.0), (1e-3, 2e5)])
+def test_axes_show_two_decades_and_no_labels_between(values: tuple[float, float]) -> None:
     figure = style.new_figure(3, 2)
     ax = figure.add_subplot()
     ax.set_yscale("log")
-    ax.plot([0, 1], [120.0, 180.0])
+    ax.plot([0, 1], values)
     style.show_decades(ax)
     figure.canvas.draw()
     low, high = ax.get_ylim()
-    assert any(low <= 10.0**k <= high for k in range(5))
+    assert sum(low <= 10.0**k <= high for k in range(-5, 7)) >= 2
+    assert low <= values[0] and values[1] <= high
     assert all(not text.get_text() for text in ax.get_yticklabels(minor=True))
 
 
