@@ -165,7 +165,8 @@ def masks_and_ages(env: Env, agent: str, seen: dict[str, np.ndarray], info: dict
     assert set(np.unique(seen["bearing_mask"])) <= {0.0, 1.0} and set(np.unique(seen["message_mask"])) <= {0.0, 1.0}
     for name in ("bearing_age", "odometry_age", "message_age"):
         assert ((seen[name] >= 0.0) & (seen[name] <= 1.0)).all(), name
-    assert (seen["odometry_age"] < 0.5).all(), agent  # of a second
+    # Whatever is older than a part of a second has been told to be missing: by a computer that was busy, say.
+    assert (seen["odometry_age"] < 0.5).all() or info["missing_ticks"] > 0, agent
     if any(visible):
         assert neighbours
 
