@@ -205,6 +205,7 @@ def test_figures_in_another_format_replace_the_older_ones(tmp_path: Path) -> Non
 
 def test_recording_shows_its_progress(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("coopenv.runs.console.LINE_PERIOD", 0.001)
+    monkeypatch.setattr("coopenv.runs.console.ENOUGH", 0.0)
     assert main(["record", "overtaking", "--set", "horizon=5.0", "--out", "drive.mcap"]) == 0
     lines = capsys.readouterr().err.splitlines()
     assert any(re.fullmatch(r"recording: \d+ % after \d+ s, about \d+ s left", line) for line in lines)
