@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -94,7 +95,13 @@ def test_what_gates_refused_before_does_not_count() -> None:
 
     def say(state: str, session: str, stale: int) -> None:
         counts = {"rejections": ["stale", "session"], "counts": np.array([stale, 3], dtype=np.uint64)}
-        about: dict[str, Any] = {"header": header(1), "session": session, "nonce": "n", "state": state, **counts}
+        about: dict[str, Any] = {
+            "header": header(time.time_ns()),
+            "session": session,
+            "nonce": "n",
+            "state": state,
+            **counts,
+        }
         message = make(TOPICS[Role.GATE].type, **about, accepted=0, last_sequence=0)
         gate.publish(topic_of("svea7", Role.GATE), encode(message))
 
