@@ -2,8 +2,7 @@
 
 import gc
 import threading
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,32 +11,28 @@ import numpy as np
 from coopenv.backends.base import EPISODE_OVER, Capabilities, Command, Health, Told
 from coopenv.backends.svea.assembler import Assembler
 from coopenv.backends.svea.binding import Binding
-from coopenv.backends.svea.checks import Fleet, problems_of
+from coopenv.backends.svea.checks import Fleet
 from coopenv.backends.svea.gates import Gates
 from coopenv.backends.svea.intake import SPOKEN, VELOCITY, Intake
 from coopenv.backends.svea.options import wishes_of
 from coopenv.backends.svea.pacer import Pacer
+from coopenv.backends.svea.start import Start
 from coopenv.backends.svea.station import Station
 from coopenv.backends.svea.status import StatusBoard
 from coopenv.backends.svea.tape import Tape
 from coopenv.backends.svea.v2x import checked, estimate_message, report_message
 from coopenv.backends.svea.vitals import Vitals
 from coopenv.backends.svea.watchdog import Trip, Watchdog
-from coopenv.errors import CoopenvError
 from coopenv.observers.recording import Sensed
-from coopenv.svea.codec import encode, make
+from coopenv.svea.codec import encode
 from coopenv.svea.deployment import Deployment
 from coopenv.svea.signing import Signer, Verifier
-from coopenv.svea.topics import RESET_TOPIC, Role, presence_of, topic_of
+from coopenv.svea.topics import Role, presence_of, topic_of
 from coopenv.svea.transport.base import Arrival, Transport
 from coopenv.svea.warm_up import warm_up
 
 EXPECTED = ("reset", "closed", EPISODE_OVER)
 """Reasons to stop that are no emergency."""
-FIRST_WORD = 3.0  # s that cars have to be heard in at the first reset
-CAMERA_WORD = 1.5  # s in which a camera has to say of itself what it is; some never do
-READY_WORD = 2.0  # s in which all has to be at once as arming wants it; some cars tell of themselves once a second
-SETTLE = 0.5  # s that fakes have to stand where they were put
 
 
 @dataclass
@@ -113,10 +108,13 @@ class Svea:
             self._odometry,
             1.0 / rates.decision,
         )
+        calibrations = {name: self.intake.calibrations[name] for name in self._local}
+        fleet = Fleet(deployment, calibrations, self.station, self.intake, self.board, self.vitals, self._others)
+        self._start = Start(fleet, transport, self.gates, self.watchdog, self._odometry, self._drain)
         transport.watch(presence_of("*"), self._presence)
         self.watchdog.happened = self.board.happened
         self.watchdog.on_stop = self._write_down
-        self._armed, self._heard_once, self._began, self._index = False, False, 0, 0
+        self._armed, self._began, self._index = False, 0, 0
         self._key, self._episode = 0, 0
         self._presented = presence_of(deployment.security.identity)
         transport.announce(self._presented)
@@ -140,63 +138,20 @@ class Svea:
             CoopenvError: an option is not known, or something is not as it has to be before wheels turn.
         """
         self._stop("reset")
-        _tidy_up()
         wishes = wishes_of(options)
-        if self.deployment.fakes:
-            self._place_fakes(0 if seed is None else seed)
+        self._start.prepare(0 if seed is None else seed)
         self.vitals.begin(self._pacer.now())
-        self._listen(wishes.arm)
+        self._start.listen(wishes.arm)
+        self.station.dropped.clear()
         if wishes.arm:
-            self._arm(wishes.release)
+            self._start.arm(wishes.release)
+            self._armed = True
         self._drain()
         self._began, self._index = self._pacer.start(), 0
         self._key, self._episode = (self._key, self._episode + 1) if seed is None else (seed, 0)
         if self.tape is not None:
             self.tape.begin(self._began, self._key % 2**64, self._episode)
         return self._counted(self._assembler.begin(self._began))
-
-    def _listen(self, arm: bool) -> None:
-        """Wait until the cars have been heard, but not for ever: they need not be there as long as nobody drives."""
-        topics = [topic_of(name, role) for name in self._local for role in self._odometry]
-        _wait(lambda: all(self.station.silence(topic) < 1.0 for topic in topics), 0 if self._heard_once else FIRST_WORD)
-        if arm:
-            _wait(lambda: all(self.board.calibration(name) is not None for name in self._local), CAMERA_WORD)
-        self._heard_once = True
-        self._drain()
-        self.station.dropped.clear()
-
-    def _place_fakes(self, seed: int) -> None:
-        signed = (seed + 2**63) % 2**64 - 2**63  # the same 64 bits
-        self._transport.publish(RESET_TOPIC, encode(make("std_msgs/msg/Int64", data=signed)), reliable=True)
-        time.sleep(SETTLE)
-
-    def _arm(self, release: bool) -> None:
-        calibrations = {name: self.intake.calibrations[name] for name in self._local}
-        fleet = Fleet(self.deployment, calibrations, self.station, self.intake, self.board, self.vitals, self._others)
-
-        def problem() -> str | None:
-            self._drain()
-            return next(problems_of(fleet), None)
-
-        _wait(lambda: problem() is None, READY_WORD)
-        if found := problem():
-            raise CoopenvError(f"not armed: {found}")
-        self._refuse_stopped(release)
-        self.watchdog.forget()
-        self.board.begin()
-        self.gates.begin()
-        self.watchdog.arm()
-        self._armed = True
-
-    def _refuse_stopped(self, release: bool) -> None:
-        """Refuse to set cars going again that somebody else has stopped, unless that is asked for."""
-        if self.deployment.fakes or release:
-            return
-        for car in sorted(self.gates.stopped_by_others):
-            raise CoopenvError(
-                f"not armed: {car}: somebody has stopped it; once you know why, release it "
-                '(`coopenv svea run --release`, options={"arm": True, "release": True})'
-            )
 
     def advance(self, command: Command) -> Iterator[Sensed]:
         """Send the commands and yield the ticks of one decision, each when it is due."""
@@ -319,16 +274,3 @@ class Svea:
         finally:
             self._transport.close()
             gc.unfreeze()
-
-
-def _tidy_up() -> None:
-    """Free memory now, and look no more at what is left: a look at everything takes longer than a decision may."""
-    gc.collect()
-    gc.freeze()
-
-
-def _wait(ready: Callable[[], bool], patience: float) -> None:
-    """Wait for something to become true, s at most."""
-    until = time.monotonic() + patience
-    while time.monotonic() < until and not ready():
-        time.sleep(0.02)

@@ -110,8 +110,8 @@ class Gates:
                 self.stopped_by_others.add(car)
             self._before.setdefault(car, counts)
 
-    def begin(self) -> None:
-        """Arm all gates for a new session.
+    def begin(self, release: bool = False) -> None:
+        """Arm all gates for a new session; those that somebody else has stopped only with `release`.
 
         Raises:
             CoopenvError: a gate is not there, does not open, or is stopped meanwhile; all are closed again then.
@@ -119,34 +119,41 @@ class Gates:
         self.session, self._sequence = secrets.token_hex(8), 0
         before = self._fresh_states()
         with self._lock:
-            self._stopping = False
+            stopped = sorted(car for car in self.stopped_by_others if before[car].state == "stopped")
+        if stopped and not release:
+            raise CoopenvError(
+                f"not armed: {stopped[0]}: somebody has stopped it; once you know why, release it "
+                '(`coopenv svea run --release`, options={"arm": True, "release": True})'
+            )
         until = time.monotonic() + PATIENCE
         while closed := [c for c, s in self.states.items() if (s.state, s.session) != ("armed", self.session)]:
             states = self.states
             for car in closed:
                 if states[car].state == "stopped" and states[car].nonce != before[car].nonce:
                     self.end()
+                    self.stopped_by_others.add(car)
                     raise CoopenvError(f"{car}: was stopped while it was being armed")
             if time.monotonic() > until:
                 self.end()
                 raise CoopenvError(f"{closed[0]}: {_why_closed(before[closed[0]], states[closed[0]])}")
             for car in closed:
-                self._arm(car, True)
+                self._arm(car, True, states[car].nonce)  # as looked at: a stop that comes now makes it worthless
             time.sleep(5 * POLL)
         with self._lock:
+            self._stopping = False
             self.stopped_by_others.clear()
             self._before = {car: state.rejections for car, state in self._states.items()}
 
     def _fresh_states(self) -> dict[str, GateState]:
         """Return what each gate says now, not what it said before the last stop. Raises CoopenvError: one is silent."""
-        asked = time.monotonic()
+        asked, known = time.monotonic(), {car: counts.copy() for car, counts in self.dropped.items()}
         while any(state.heard < asked for state in self.states.values()) and time.monotonic() < asked + WORD:
             time.sleep(POLL)
         for car, state in self.states.items():
             if state.age <= OLD:
                 continue
-            if self.dropped[car]:
-                why = ", ".join(f"{reason} {count}" for reason, count in self.dropped[car].items())
+            if dropped := self.dropped[car] - known[car]:
+                why = ", ".join(f"{reason} {count}" for reason, count in dropped.items())
                 raise CoopenvError(f"{car}: what its gate says is not believed ({why}): are keys and clocks the same?")
             topic = topic_of(car, Role.GATE)
             raise CoopenvError(f"{car}: no gate has spoken on {topic}: is `coopenv svea gate` running there?")
@@ -155,11 +162,10 @@ class Gates:
     def end(self) -> None:
         """Close all gates; cars come to a stand."""
         for car in self._states:
-            self._arm(car, False)
+            self._arm(car, False, "")
         self.session = ""
 
-    def _arm(self, car: str, armed: bool) -> None:
-        nonce = self.states[car].nonce
+    def _arm(self, car: str, armed: bool, nonce: str) -> None:
         message = make(
             TOPICS[Role.ARM].type, header=header(time.time_ns()), session=self.session, nonce=nonce, armed=armed
         )

@@ -171,7 +171,9 @@ def test_an_emergency_stop_during_arming_holds(yard: Yard, monkeypatch: pytest.M
 
     arm = yard.gates._arm
     monkeypatch.setattr("coopenv.backends.svea.gates.time", Ticking(during))
-    monkeypatch.setattr(yard.gates, "_arm", lambda car, armed: arm(car, armed) if car == "a" or not armed else None)
+    monkeypatch.setattr(
+        yard.gates, "_arm", lambda car, on, nonce: arm(car, on, nonce) if car == "a" or not on else None
+    )
     with pytest.raises(CoopenvError, match="a: was stopped while it was being armed"):
         yard.gates.begin()
     yard.tell()
@@ -187,7 +189,9 @@ def test_who_has_stopped_a_car_is_known(yard: Yard) -> None:
     yard.stop("b")
     yard.tell()
     assert yard.gates.stopped_by_others == {"b"}
-    yard.gates.begin()
+    with pytest.raises(CoopenvError, match="b: somebody has stopped it"):
+        yard.gates.begin()
+    yard.gates.begin(release=True)
     assert not yard.gates.stopped_by_others and states(yard) == ["armed", "armed"]
 
 
