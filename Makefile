@@ -37,8 +37,9 @@ $(VENV)/.svea: $(VENV)/.base
 svea-demo: $(VENV)/.svea ## two fake cars overtake in real time; table here, figures in out/svea_overtaking, half a minute
 	@$(BIN)/coopenv svea demo --out out/svea_overtaking
 
+# Three workers on two cores: tests of cars wait for their clock most of the time.
 test: lint ## lint, type check and all tests but the slow ones
-	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not nats and not ros1"
+	@$(BIN)/python -m pytest -n 3 --dist loadfile -m "not slow and not nats and not ros1"
 
 test-nats: $(VENV)/.dev ## the tests that need a NATS broker (installs Debian's nats-server, as root)
 	@PATH="$$PATH:/usr/sbin"; command -v nats-server > /dev/null || $(APT) nats-server

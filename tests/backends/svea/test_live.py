@@ -225,7 +225,9 @@ def test_nothing_is_armed_that_should_not_be(lab: Any, tmp_path: Path) -> None:
     refuses(strict, hub, r"not armed: svea1: its clock is \d+ ms ahead of this computer's")
 
 
-def test_nothing_is_armed_where_nobody_is(tmp_path: Path) -> None:
+def test_nothing_is_armed_where_nobody_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for patience in ("FIRST_WORD", "CAMERA_WORD", "READY_WORD"):
+        monkeypatch.setattr(f"coopenv.backends.svea.start.{patience}", 0.1)
     refuses(write_fleet(tmp_path), Hub(), r"not armed: svea7: no odometry on fleet/svea7/mavros/wheel_odometry")
 
 

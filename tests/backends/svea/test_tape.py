@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import sys
 import threading
 from collections import Counter
@@ -181,7 +182,7 @@ except Exception as error:
 def whole(path: Path) -> list[tuple[str, int]]:
     """Return topic and time of the messages that the library finds in a file before it comes upon its end."""
     channels, found = {}, []
-    with path.open("rb") as stream, suppress(EndOfFile):
+    with path.open("rb") as stream, suppress(EndOfFile, struct.error):
         for record in StreamReader(stream, validate_crcs=True).records:
             if isinstance(record, Channel):
                 channels[record.id] = record.topic
