@@ -46,7 +46,7 @@ def group_of(leader: int) -> list[str]:
         try:
             state, _, group = (path / "stat").read_text().rpartition(")")[2].split()[:3]
             if int(group) == leader and int(path.name) != leader and state != "Z":
-                found.append((path / "cmdline").read_text().replace("\0", " "))
+                found.append((path / "cmdline").read_bytes().decode(errors="replace").replace("\0", " "))
         except OSError:  # gone meanwhile
             continue
     return found
@@ -57,7 +57,7 @@ def mentioning(text: str) -> list[str]:
     found = []
     for path in Path("/proc").glob("[0-9]*"):
         try:
-            line = (path / "cmdline").read_text().replace("\0", " ")
+            line = (path / "cmdline").read_bytes().decode(errors="replace").replace("\0", " ")
         except OSError:  # gone meanwhile
             continue
         if text in line:

@@ -36,6 +36,7 @@ def problems_of(fleet: Fleet) -> Iterator[str]:
     """Yield what is not as it has to be, the first that one would look at first."""
     safety, sensors = fleet.deployment.safety, fleet.deployment.sensors
     for car in fleet.calibrations:
+        yield from _its_clock(fleet, car)  # by which all else is judged
         for role in VELOCITY[sensors.odometry]:
             topic = topic_of(car, role)
             if (age := fleet.station.silence(topic)) > safety.odometry_age:
@@ -51,13 +52,17 @@ def problems_of(fleet: Fleet) -> Iterator[str]:
             yield f"{car}: {wrong}"
 
 
-def _about_itself(fleet: Fleet, car: str) -> Iterator[str]:
+def _its_clock(fleet: Fleet, car: str) -> Iterator[str]:
     safety, offset = fleet.deployment.safety, fleet.intake.offsets[car].seconds
     if offset is not None and abs(offset) > safety.max_clock_offset:
         yield (
             f"{car}: its clock is {abs(offset) * 1e3:.0f} ms {'behind' if offset > 0 else 'ahead of'} this computer's, "
             f"{safety.max_clock_offset * 1e3:.0f} ms are allowed: let chrony or PTP synchronise them"
         )
+
+
+def _about_itself(fleet: Fleet, car: str) -> Iterator[str]:
+    safety = fleet.deployment.safety
     if obstacle := fleet.board.obstacle(car):
         yield f"{car}: {obstacle}"
     battery = fleet.board.battery(car)

@@ -98,24 +98,24 @@ def test_bad_messages_leave_it_working(station: Station, keys: Path) -> None:
     station.drive()
 
 
-@pytest.mark.parametrize("duration", [0.3, 2.0])
+@pytest.mark.parametrize("duration", [0.2, 2.0])
 def test_what_comes_while_it_is_frozen_moves_nothing(
     station: Station, gate: subprocess.Popen[str], duration: float
 ) -> None:
     station.arm("a")
     station.drive()
-    gate.send_signal(signal.SIGSTOP)
-    time.sleep(0.2)
-    sent = station.sequence
     frozen = time.monotonic()
+    gate.send_signal(signal.SIGSTOP)
+    time.sleep(0.05)
+    sent = station.sequence
     while time.monotonic() < frozen + duration:
         station.command(0.5)
         time.sleep(0.05)
-    time.sleep(0.3)  # the youngest is older than it may be, too
+    time.sleep(0.2)  # the youngest is older than it may be, too
     resumed = time.monotonic()
     gate.send_signal(signal.SIGCONT)
     wait_until(lambda: len(station.since(resumed)) > 10)
-    if duration + 0.5 < LEASE / 1000:  # after a longer while Zenoh has given the session up, with what was under way
+    if resumed - frozen < 0.6 * LEASE / 1000:  # after a longer while Zenoh has given the session up, with what was under way
         wait_until(lambda: station.count("stale") > 0)
     assert set(station.since(resumed)) == {NEUTRAL}
     assert station.status.state == "timed_out" and station.status.last_sequence <= sent
