@@ -11,6 +11,7 @@ from coopenv.api.engine import Engine
 from coopenv.evaluation import Difference, Episodes, compare_paired, drive, held_out_seeds, score
 from coopenv.policies import load_agent
 from coopenv.scenario import load_scenario
+from tests.helpers.marks import largest_slow
 
 WORLDS = {"open_square": 48, "facade": 48, "behind_truck": 48, "urban_crossing": 48, "large_crossing": 6}
 """How many suffice for intervals that tell the drivers apart."""
@@ -38,7 +39,7 @@ def change_of_time(environment: str, times: int = 2) -> Difference:
     return next(each for each in compare_paired(*of) if each.metric == "travel_time_s")
 
 
-@pytest.mark.parametrize("environment", WORLDS)
+@pytest.mark.parametrize("environment", largest_slow(WORLDS))
 def test_a_lookout_knows_far_better_where_it_is_and_loses_little_time(environment: str) -> None:
     straight, lookout = figures(environment, "route_follower"), figures(environment, "peek")
     assert lookout["e95_m"][0] <= 0.5 * straight["e95_m"][0]
@@ -52,7 +53,7 @@ def test_many_worlds_show_how_little_time_is_lost(environment: str) -> None:
     assert change_of_time(environment, 10).relative <= MOST_TIME
 
 
-@pytest.mark.parametrize("environment", WORLDS)
+@pytest.mark.parametrize("environment", largest_slow(WORLDS))
 def test_errors_depend_on_what_is_sensed(environment: str) -> None:
     sensed = figures(environment, "route_follower")
     ideal, blind = (figures(environment, "route_follower", how, 1) for how in ("ideal", "blind"))

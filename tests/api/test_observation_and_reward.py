@@ -17,6 +17,7 @@ from coopenv.bench.agents.dial import has_dial
 from coopenv.policies.peek import Peek
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import load_scenario
+from tests.helpers.marks import largest_slow
 
 KNOWN = {name: load_scenario(name) for name in coopenv.list_envs()}
 ENVIRONMENTS = [
@@ -94,7 +95,7 @@ def run(name: str, driver: str, weight: float | None = None) -> Run:
     return Run(*joined, total / alive.size, envs.observation_layout)
 
 
-@pytest.mark.parametrize("name", ENVIRONMENTS)
+@pytest.mark.parametrize("name", largest_slow(ENVIRONMENTS))
 def test_scales_give_every_entry_a_deviation_between_a_tenth_and_one(name: str) -> None:
     runs = [run(name, driver) for driver in ("follow", "slow", "look around", "peek")]
     entries = np.concatenate([each.observations for each in runs])
