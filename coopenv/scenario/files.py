@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from coopenv.errors import ScenarioError, UnknownEnvironmentError, shortened, shown, suggest
 from coopenv.scenario.landmarks import with_groups
 from coopenv.scenario.own_terms import located
+from coopenv.scenario.scenes import SCENES, is_scene, scene_text
 from coopenv.scenario.schema import Scenario
 from coopenv.scenario.validation import TOO_DEEP, one_line
 from coopenv.shipped import data_directory, list_envs
@@ -52,7 +53,7 @@ def scenario_path(name_or_path: str | Path) -> Path:
             raise UnknownEnvironmentError(f"no such scenario file: {shortened(str(path), 200)}")
         return path
     if text not in list_envs():
-        known = f"{suggest(text, list_envs())}; known: {', '.join(list_envs())}"
+        known = f"{suggest(text, list_envs())}; known: {', '.join([*list_envs(), *(f'{kind}:N' for kind in SCENES)])}"
         raise UnknownEnvironmentError(f"unknown environment {shown(text)}{known}")
     return data_directory("envs") / f"{text}.toml"
 
@@ -61,18 +62,19 @@ def load_scenario(name_or_path: str | Path, overrides: Mapping[str, Any] | None 
     """Read a scenario and apply dotted overrides such as `{"noise.enabled": False}`.
 
     Args:
-        name_or_path: file stem of `envs/`, or the path of a TOML file.
+        name_or_path: file stem of `envs/`, a scene such as `lane:20`, or the path of a TOML file.
         overrides: dotted key to value; list entries by index or `*` for all (`vehicles.*.goal.radius`).
 
     Raises:
         UnknownEnvironmentError: no such environment.
         ScenarioError: the file or an override does not describe a possible world.
     """
-    path = scenario_path(name_or_path)
+    made = is_scene(str(name_or_path))
+    path = Path(str(name_or_path)) if made else scenario_path(name_or_path)
     if overrides is not None and not isinstance(overrides, Mapping):
         raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
     try:
-        raw = located(_read(path), path.parent)
+        raw = tomllib.loads(scene_text(str(name_or_path))) if made else located(_read(path), path.parent)
         for key, value in (overrides or {}).items():
             override(raw, str(key), value)
         raw = located(raw, Path.cwd())  # those of overrides
@@ -81,16 +83,16 @@ def load_scenario(name_or_path: str | Path, overrides: Mapping[str, Any] | None 
         raise ScenarioError(f"{path.name}: {TOO_DEEP}") from None
     except ScenarioError as error:
         of_file = f"{path.name}: "
-        if overrides and str(error).startswith(of_file) and _is_sound(path):
+        if overrides and str(error).startswith(of_file) and _is_sound(name_or_path):
             raise ScenarioError(f"{OVERRIDES}: {str(error).removeprefix(of_file)}") from None
         raise
 
 
-def _is_sound(path: Path) -> bool:
-    """Return whether a file by itself describes a world."""
+def _is_sound(name_or_path: str | Path) -> bool:
+    """Return whether a file or scene by itself describes a world."""
     with warnings.catch_warnings(action="ignore"):
         try:
-            load_scenario(path)
+            load_scenario(name_or_path)
         except ScenarioError:
             return False
     return True

@@ -1,0 +1,116 @@
+"""What the name of a scene asks for: `lane:20`, `lane:vehicles=20,seen=2`, `random:12,seed=3`."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+from coopenv.errors import UnknownEnvironmentError, listed, shown, suggest
+from coopenv.scenario.scenes import layouts
+from coopenv.scenario.scenes.layouts import Placed
+
+MOST_VEHICLES = 64
+"""Identities fit the 64 bits in which messages of `robust` say on whom they depend."""
+
+
+class Option(NamedTuple):
+    """A whole number that a scene takes."""
+
+    least: int
+    most: int
+    default: int
+
+
+class Scene(NamedTuple):
+    """A kind of scene."""
+
+    about: str
+    build: Callable[..., Sequence[Placed]]
+    """Takes the options by name."""
+    options: Mapping[str, Option]
+
+
+def _vehicles(default: int, least: int = 2) -> Option:
+    return Option(least, MOST_VEHICLES, default)
+
+
+_SEEN = Option(1, 8, 3)
+
+SCENES: Mapping[str, Scene] = {
+    "lane": Scene(
+        "Vehicles one behind the other; each measures those `seen` in front of it, the first ones landmarks.",
+        layouts.lane,
+        {"vehicles": _vehicles(8), "seen": _SEEN},
+    ),
+    "roots": Scene(
+        "Two streets whose first vehicles measure landmarks; the others measure vehicles of both streets.",
+        layouts.roots,
+        {"vehicles": _vehicles(10, 3)},
+    ),
+    "tree": Scene(
+        "A binary tree: each vehicle measures its parent and those above it, filled up with landmarks.",
+        layouts.tree,
+        {"vehicles": _vehicles(15), "seen": _SEEN},
+    ),
+    "random": Scene(
+        "A random acyclic graph: each vehicle measures `seen` landmarks or vehicles before it, drawn by `seed`.",
+        layouts.random_graph,
+        {"vehicles": _vehicles(12), "seen": _SEEN, "seed": Option(0, 2**31 - 1, 0)},
+    ),
+    "ring": Scene(
+        "Vehicles on a circle; each measures those `seen` in front of it, round and round, and landmarks.",
+        layouts.ring,
+        {"vehicles": _vehicles(5, 3), "seen": Option(1, 2, 1)},
+    ),
+}
+"""By name."""
+
+
+class Request(NamedTuple):
+    """A scene with every option."""
+
+    name: str
+    """As it was asked for."""
+    kind: str
+    options: Mapping[str, int]
+
+    @property
+    def vehicles(self) -> Sequence[Placed]:
+        """Its vehicles in order."""
+        return SCENES[self.kind].build(**self.options)
+
+
+def is_scene(text: str) -> bool:
+    """Return whether a text is the name of a scene, be it right or wrong in what follows the colon."""
+    head, colon, rest = text.partition(":")
+    return bool(colon) and head in SCENES and not rest.endswith(".toml") and "/" not in rest
+
+
+def read_request(text: str) -> Request:
+    """Return what a name asks for; what it does not say is as usual.
+
+    Raises:
+        UnknownEnvironmentError: no such scene or option, or a number that is not allowed.
+    """
+    kind, _, rest = text.partition(":")
+    if kind not in SCENES:
+        raise UnknownEnvironmentError(f"unknown scene {shown(kind)}{suggest(kind, SCENES)}; known: {listed([*SCENES])}")
+    known, given = SCENES[kind].options, {}
+    for place, word in enumerate(rest.split(",") if rest.strip() else ()):
+        key, equals, value = (part.strip() for part in word.partition("="))
+        if not equals and place == 0:
+            key, value = "vehicles", key  # lane:20
+        if key not in known:
+            allowed = ", ".join(f"{name} ({o.least}..{o.most})" for name, o in known.items())
+            raise UnknownEnvironmentError(f"scene {kind}: unknown option {shown(key)}; allowed: {allowed}")
+        if key in given:
+            raise UnknownEnvironmentError(f"scene {kind}: {key} is given twice")
+        given[key] = _number(kind, key, value, known[key])
+    return Request(text, kind, {name: given.get(name, option.default) for name, option in known.items()})
+
+
+def _number(kind: str, key: str, text: str, option: Option) -> int:
+    whole = text.isascii() and text.isdigit() and len(text) < 12
+    if not whole or not option.least <= int(text) <= option.most:
+        raise UnknownEnvironmentError(
+            f"scene {kind}: {key} = {shown(text)}, allowed are whole numbers {option.least} to {option.most}"
+        )
+    return int(text)
