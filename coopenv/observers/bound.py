@@ -14,7 +14,7 @@ the orientation, meaningful below about 10 deg, and does not count what "not see
 everybody has all data, whatever was delivered.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +23,9 @@ from scipy.linalg import block_diag
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import skew
 from coopenv.observers.recording import Recording
+
+BLOCK = 10_000_000
+"""Numbers of the matrices over all vehicles that are kept at a time."""
 
 
 @dataclass(frozen=True)
@@ -46,9 +49,8 @@ def cramer_rao(recording: Recording, joint: bool = True) -> Bound:
     poses were known exactly.
     """
     N = len(recording.setups)
-    M, F = information(recording, joint), transitions(recording)
     groups = [range(N)] if joint else [[i] for i in range(N)]
-    return _bound(recording, _covariances(recording, F, M, groups).reshape(recording.ticks, N, 6, 6))
+    return _bound(recording, _covariances(recording, groups, joint).reshape(recording.ticks, N, 6, 6))
 
 
 def cramer_rao_ancestors(recording: Recording) -> Bound:
@@ -58,11 +60,10 @@ def cramer_rao_ancestors(recording: Recording) -> Bound:
     knows no more, whereas the bound over all vehicles also counts what followers could tell their leaders.
     """
     N = len(recording.setups)
-    F = transitions(recording)
     blocks = np.empty((recording.ticks, N, 6, 6))
     families = [ancestors(recording, i) for i in range(N)]
-    for family in set(families):
-        P = _covariances(recording, F, information(recording, observers=family), [family])[:, 0]
+    for family in sorted(set(families)):
+        P = _covariances(recording, [family])[:, 0]
         for i in (i for i in range(N) if families[i] == family):
             blocks[:, i] = P[:, family.index(i)]
     return _bound(recording, blocks)
@@ -79,29 +80,44 @@ def ancestors(recording: Recording, vehicle: int) -> tuple[int, ...]:
     return tuple(sorted(found))
 
 
-def _covariances(recording: Recording, F: Array, M: Array, groups: Sequence[Sequence[int]]) -> Array:
+def _covariances(recording: Recording, groups: Sequence[Sequence[int]], joint: bool = True) -> Array:
     """Return (K, g, n, 6, 6) the bounds of g groups of n vehicles, those of a group estimated together.
 
-    F and M (K, 6N, 6N) are the transitions and the information of all.
+    A group counts what its own vehicles measure; `joint`: their neighbours' poses are unknown.
     """
     part = (6 * np.asarray(groups)[..., None] + np.arange(6)).reshape(len(groups), -1)
-    F, M = (A[:, part[:, :, None], part[:, None, :]] for A in (F, M))
-    F_T = np.swapaxes(F, -1, -2)
     noise = [np.diag(np.concatenate([recording.setups[i].noise.odometry(recording.dt) for i in g])) for g in groups]
     P = np.array([block_diag(*(recording.start_covariance[i] for i in group)) for group in groups])
     own = np.arange(part.shape[1]).reshape(-1, 6)
     rows, columns = own[:, :, None], own[:, None, :]
     blocks = np.empty((recording.ticks, len(groups), len(own), 6, 6))
     blocks[0] = P[:, rows, columns]
-    identity = np.eye(part.shape[1])
-    for k in range(1, recording.ticks):
-        P = F[k] @ P @ F_T[k] + noise
-        if recording.due[k]:
-            # (P^-1 + M)^-1 without the inverse of P, which may be ill-conditioned: P (I + M P)^-1
-            P = np.linalg.solve(identity + P @ M[k], P)
-            P = (P + np.swapaxes(P, -1, -2)) / 2
-        blocks[k] = P[:, rows, columns]
+    identity, used = np.eye(part.shape[1]), sorted({i for group in groups for i in group})
+    for ticks in _stretches(recording):
+        E, M = steps(recording, ticks), information(recording, joint, used, ticks)
+        for k in range(max(1, ticks.start), ticks.stop):
+            P = _moved(P, E[k - ticks.start][np.asarray(groups)]) + noise
+            if recording.due[k]:
+                # (P^-1 + M)^-1 without the inverse of P, which may be ill-conditioned: P (I + M P)^-1
+                told = M[k - ticks.start][part[:, :, None], part[:, None, :]]
+                P = np.linalg.solve(identity + P @ told, P)
+                P = (P + np.swapaxes(P, -1, -2)) / 2
+            blocks[k] = P[:, rows, columns]
     return blocks
+
+
+def _stretches(recording: Recording) -> Iterator[range]:
+    """Yield the ticks in stretches, each of which needs little memory."""
+    most = max(2, BLOCK // (6 * len(recording.setups)) ** 2)
+    for first in range(0, recording.ticks, most):
+        yield range(first, min(first + most, recording.ticks))
+
+
+def _moved(P: Array, E: Array) -> Array:
+    """Return E P E^T of covariances P (g, 6n, 6n), E being block diagonal with blocks (g, n, 6, 6)."""
+    g, n = E.shape[:2]
+    half = (E @ P.reshape(g, n, 6, 6 * n)).reshape(P.shape)
+    return np.asarray((E @ np.swapaxes(half, -1, -2).reshape(g, n, 6, 6 * n)).reshape(P.shape))
 
 
 def _bound(recording: Recording, blocks: Array) -> Bound:
@@ -112,26 +128,38 @@ def _bound(recording: Recording, blocks: Array) -> Bound:
     return Bound(recording.t, np.sqrt(trace), np.degrees(np.sqrt(angle)), blocks)
 
 
-def transitions(recording: Recording) -> Array:
-    """Return F (K, 6N, 6N) of the stacked left errors over the true motion into each tick; F[0] is the identity."""
-    R, p = recording.truth.rotation, recording.truth.position
-    K, N = R.shape[:2]
-    E = np.swapaxes(R[1:], -1, -2) @ R[:-1]
-    step = (np.swapaxes(R[:-1], -1, -2) @ (p[1:] - p[:-1])[..., None])[..., 0]
-    F = np.tile(np.eye(6 * N), (K, 1, 1))
-    for i in range(N):
-        a, b, c = 6 * i, 6 * i + 3, 6 * i + 6
-        F[1:, a:b, a:b] = F[1:, b:c, b:c] = E[:, i]
-        F[1:, b:c, a:b] = -E[:, i] @ skew(step[:, i])
-    return F
+def steps(recording: Recording, ticks: range) -> Array:
+    """Return (k, N, 6, 6) how each vehicle's left error goes on over its true motion into some ticks.
 
-
-def information(recording: Recording, joint: bool = True, observers: Collection[int] | None = None) -> Array:
-    """Return sum of H^T N^-1 H (K, 6N, 6N) over the visible edges at each tick, linearised at the truth.
-
-    `joint`: a neighbour's pose is unknown, too; `observers`: whose measurements count, None: everybody's.
+    Of tick 0 it is the identity.
     """
     R, p = recording.truth.rotation, recording.truth.position
+    into = np.array(ticks)
+    before = np.maximum(into - 1, 0)
+    back = np.swapaxes(R[before], -1, -2)
+    E = np.swapaxes(R[into], -1, -2) @ R[before]
+    made = np.zeros((*E.shape[:2], 6, 6))
+    made[..., :3, :3] = made[..., 3:, 3:] = E
+    made[..., 3:, :3] = -E @ skew((back @ (p[into] - p[before])[..., None])[..., 0])
+    return made
+
+
+def transitions(recording: Recording) -> Array:
+    """Return F (K, 6N, 6N) of the stacked left errors over the true motion into each tick; F[0] is the identity."""
+    return np.array([block_diag(*each) for each in steps(recording, range(recording.ticks))])
+
+
+def information(
+    recording: Recording, joint: bool = True, observers: Collection[int] | None = None, ticks: range | None = None
+) -> Array:
+    """Return sum of H^T N^-1 H (k, 6N, 6N) over the visible edges at each tick, linearised at the truth.
+
+    `joint`: a neighbour's pose is unknown, too; `observers`: whose measurements count, None: everybody's; `ticks`: at
+    which ones, None: at all.
+    """
+    wanted = slice(None) if ticks is None else slice(ticks.start, ticks.stop)
+    R, p, landmarks = recording.truth.rotation[wanted], recording.truth.position[wanted], recording.landmarks[wanted]
+    visible = recording.visible[wanted]
     K, N = R.shape[:2]
     L = recording.landmarks.shape[1]
     M = np.zeros((K, 6 * N, 6 * N))
@@ -144,13 +172,13 @@ def information(recording: Recording, joint: bool = True, observers: Collection[
         for target in setup.targets:
             j = int(target) - L
             marker = recording.setups[j].marker if j >= 0 else np.zeros(3)
-            z = recording.landmarks[:, target] if j < 0 else p[:, j] + R[:, j] @ marker
+            z = landmarks[:, target] if j < 0 else p[:, j] + R[:, j] @ marker
             a = (Rt @ (z - p[:, i])[..., None])[..., 0]
             d = a - setup.lever_arm
             distance = np.maximum(np.linalg.norm(d, axis=-1), 1e-9)
             u = d / distance[:, None]
             across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / distance[:, None, None]
-            weight = recording.visible[:, i, target, None, None] * setup.noise.bearing_information(u)
+            weight = visible[:, i, target, None, None] * setup.noise.bearing_information(u)
             Hi = across @ np.concatenate([skew(a), minus], axis=-1)
             Hi_t = np.swapaxes(Hi, -1, -2) @ weight
             M[:, own, own] += Hi_t @ Hi
