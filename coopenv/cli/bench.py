@@ -65,6 +65,14 @@ def bench_observers(
     basin: Annotated[int, typer.Option(min=0, help="Random initial estimates for maps of the basins.")] = 0,
     overrides: options.Overrides = None,
     steady_from: options.SteadyFrom = None,
+    windows: Annotated[
+        str | None,
+        typer.Option(
+            help="Edges of stretches of the run that are judged one by one, s, with commas between, or `none` "
+            "(default: 5,10,20,35; of recorded robots none).",
+            show_default=False,
+        ),
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the leaderboard and the report.")] = None,
     figures: Annotated[
         str | None, typer.Option("--figures", help="Also write figures as files to the folder: png, pdf or svg.")
@@ -75,14 +83,17 @@ def bench_observers(
     """Compare observers on the same data and with their bound."""
     from coopenv.bench.executors import find_executor
     from coopenv.bench.observers.command import REPORT_FILE, perform, request_of
+    from coopenv.bench.observers.tables import WIDTH
 
     if open_report and out is None:
         raise CoopenvError("--open: the report needs a folder, --out DIR")
     printed, log = options.console(), options.console(stderr=True)
+    if not printed.is_terminal:
+        printed.width = max(printed.width, WIDTH)
     with options.warned():
         changes, numbers = options.parse_overrides(overrides), range(first, first + seeds)
         request = request_of(
-            source, observers, variants, numbers, steady_from, basin, data, changes, overrides or (), topics
+            source, observers, variants, numbers, steady_from, basin, data, changes, overrides or (), topics, windows
         )
         request.plan.source.check()
     perform(request, find_executor(engine, jobs, address), out, figures, printed, log, as_json)

@@ -139,20 +139,28 @@ def _windows_about_anchor(scene: Scene, window: float) -> tuple[np.ndarray, np.n
 
 def _information_rate(scene: Scene, anchor: np.ndarray) -> np.ndarray:
     """Return C*^T C* (K, N, 6, 6) in map axes, about one point (N, 3) per vehicle."""
+    rate = np.empty((*scene.position.shape[:2], 6, 6))
+    for i in range(scene.position.shape[1]):  # one by one: all pairs at once may be gigabytes
+        rate[:, i] = _information_of(scene, i, anchor[i])
+    return rate
+
+
+def _information_of(scene: Scene, i: int, anchor: np.ndarray) -> np.ndarray:
+    """Return C*^T C* (K, 6, 6) of one vehicle in map axes, about a point (3,)."""
     known = np.isfinite(scene.target_position).all(axis=-1)  # (K, T)
     place = np.where(known[..., None], scene.target_position, 0.0)
-    offset = place[:, None] - scene.position[:, :, None]  # (K, N, T, 3)
+    offset = place - scene.position[:, i, None]  # (K, T, 3)
     distance = np.linalg.norm(offset, axis=-1, keepdims=True)
     bearing = offset / np.where(distance > 0, distance, 1.0)
-    seen = scene.visible & known[:, None] & (distance[..., 0] > 0)
+    seen = scene.visible[:, i] & known & (distance[..., 0] > 0)
     projection = (np.eye(3) - bearing[..., :, None] * bearing[..., None, :]) * seen[..., None, None]
-    lever = skew(place[:, None] - anchor[:, None])  # (K, N, T, 3, 3)
+    lever = skew(place - anchor)  # (K, T, 3, 3)
     cross = lever @ projection  # = (-Pi S)^T Pi
-    rate = np.empty((*scene.position.shape[:2], 6, 6))
-    rate[..., :3, :3] = -(cross @ lever).sum(axis=2)
-    rate[..., :3, 3:] = cross.sum(axis=2)
-    rate[..., 3:, :3] = np.swapaxes(rate[..., :3, 3:], -1, -2)
-    rate[..., 3:, 3:] = projection.sum(axis=2)
+    rate = np.empty((len(scene.position), 6, 6))
+    rate[:, :3, :3] = -(cross @ lever).sum(axis=1)
+    rate[:, :3, 3:] = cross.sum(axis=1)
+    rate[:, 3:, :3] = np.swapaxes(rate[:, :3, 3:], -1, -2)
+    rate[:, 3:, 3:] = projection.sum(axis=1)
     return rate
 
 

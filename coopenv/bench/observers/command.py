@@ -23,6 +23,7 @@ from coopenv.runs.console import Progress
 from coopenv.viz import FORMATS
 
 JSON_FILE, CSV_FILE, REPORT_FILE, BASIN_FILE = "leaderboard.json", "leaderboard.csv", "report.html", "basin.csv"
+WINDOWS_FILE = "windows.csv"
 
 
 class Request(NamedTuple):
@@ -48,6 +49,7 @@ def request_of(
     overrides: Mapping[str, Any],
     assignments: Sequence[str],
     topics: Path | None = None,
+    windows: str | None = None,
 ) -> Request:
     """Return the request behind the options of the command line, `overrides` being `assignments` as they are read.
 
@@ -56,7 +58,7 @@ def request_of(
     """
     source = find_source(text, overrides, data, topics)
     given = list(dict.fromkeys(word.strip() for word in observers.split(","))) if observers else None
-    plan = Plan.of(source, given, variants, seeds, steady_from)
+    plan = Plan.of(source, given, variants, seeds, steady_from, windows)
     if basin:
         check_source(source)
     left_out = {} if observers else {name: obstacle(name) for name in observer_names()}
@@ -66,6 +68,7 @@ def request_of(
     words += ["--variants", ",".join(plan.variants), "--seeds", str(len(seeds))]
     words += ["--first", str(seeds[0])] if seeds[0] else []
     words += [] if steady_from is None else ["--steady-from", f"{steady_from:g}"]
+    words += [] if windows is None else ["--windows", windows]
     words += ["--basin", str(basin)] if basin else []
     words += [word for assignment in assignments for word in ("--set", assignment)]
     words += [] if data is None else ["--data", str(data)]
@@ -84,6 +87,7 @@ class Found(NamedTuple):
         """Return what `leaderboard.json` holds."""
         packages, board = versions("coopenv", "numpy", "scipy", "warp-lang"), self.comparison
         content = {"command": command, "versions": packages, "seeds": board.seeds, "rows": board.rows}
+        content["windows"] = board.window_rows
         return dict(jsonable(content | ({"basin": self.basins} if self.basins else {})))
 
 
@@ -106,7 +110,7 @@ def perform(
     wanted = figure_files(request.plan.variants, figures)
     if wanted and out is None:
         raise CoopenvError(f"--figures {figures}: figures need a folder, --out DIR")
-    found, names = None, [JSON_FILE, CSV_FILE, REPORT_FILE, BASIN_FILE]
+    found, names = None, [JSON_FILE, CSV_FILE, WINDOWS_FILE, REPORT_FILE, BASIN_FILE]
     names += [name for form in FORMATS for name in figure_files(tuple(request.plan.source.variants), form)]
     try:
         with nullcontext() if out is None else replacing_folder(out, names) as folder:
@@ -165,6 +169,7 @@ def write_files(found: Found, command: str, out: Path, figures: Mapping[str, tup
     comparison, draws, basins = found
     content = found.document(command)
     texts = {JSON_FILE: json_text(content), CSV_FILE: comparison.to_csv()}
+    texts[WINDOWS_FILE] = csv_text(comparison.window_rows)
     texts |= {BASIN_FILE: csv_text(draws)} if draws else {}
     texts[REPORT_FILE] = report_text(comparison, content, draws, basins)
     for name, text in texts.items():

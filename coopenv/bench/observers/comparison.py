@@ -18,6 +18,7 @@ from coopenv.bench.observers.judge import Task, judge
 from coopenv.bench.observers.leaderboard import Leaderboard
 from coopenv.bench.observers.rows import Row
 from coopenv.bench.observers.sources import Source, find_source, variants_of
+from coopenv.bench.observers.windows import EDGES, WindowRow, checked_edges
 from coopenv.errors import CoopenvError, checked_seed, suggest
 from coopenv.files import replace_text
 from coopenv.observers.contract import Factory
@@ -45,8 +46,8 @@ class Comparison(Leaderboard):
         """
         return tables.error_table(self, self._checked(variant))
 
-    def to_pandas(self) -> DataFrame:
-        """Return the rows with all columns.
+    def to_pandas(self, windows: bool = False) -> DataFrame:
+        """Return the rows with all columns, of whole runs or of every window.
 
         Raises:
             CoopenvError: pandas is not installed.
@@ -55,7 +56,8 @@ class Comparison(Leaderboard):
             from pandas import DataFrame
         except ImportError:
             raise CoopenvError("a table of pandas needs pandas: pip install pandas") from None
-        return DataFrame([asdict(row) for row in self.rows], columns=[f.name for f in fields(Row)])
+        rows, kind = (self.window_rows, WindowRow) if windows else (self.rows, Row)
+        return DataFrame([asdict(row) for row in rows], columns=[f.name for f in fields(kind)])
 
     def to_csv(self, path: str | Path | None = None) -> str:
         """Return the rows with all columns as CSV, and write them where a path is given.
@@ -117,7 +119,7 @@ class Comparison(Leaderboard):
         return drawn
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        return tables.everything(self)
+        return tables.everything(self, options.max_width)
 
     def __str__(self) -> str:
         text = StringIO()
@@ -140,6 +142,7 @@ def compare(
     variants: str | Sequence[str] | None = None,
     overrides: Mapping[str, Any] | None = None,
     steady_from: float | None = None,
+    windows: Sequence[float] | None = None,
     data: str | Path | None = None,
     topics: str | Path | None = None,
     jobs: int = 1,
@@ -155,6 +158,8 @@ def compare(
         variants: names, or "all": faults of an environment, what recorded robots see; None: the usual ones.
         overrides: dotted scenario keys, for example {"noise.enabled": False}.
         steady_from: start of the steady state, s; None: after 70 % of the run.
+        windows: edges of stretches of the run that are judged one by one, s; None: 5, 10, 20 and 35, of recorded
+            robots none.
         data: folder of recorded data sets; None: what COOPENV_DATA says.
         topics: TOML file that says what the topics of a ROS bag are.
         jobs: processes. More than one need a script whose own work stands below `if __name__ == "__main__":`, and
@@ -167,7 +172,7 @@ def compare(
         str(environment), overrides, *(None if path is None else Path(path) for path in (data, topics))
     )
     source.check()
-    plan = Plan.of(source, observers, variants, seeds, steady_from)
+    plan = Plan.of(source, observers, variants, seeds, steady_from, windows)
     with Progress(Console(stderr=True), plan.work, total=1.0) as progress:
         return plan.run(Local(jobs), progress.update)
 
@@ -182,6 +187,8 @@ class Plan:
     seeds: tuple[int, ...]
     steady_from: float | None
     """s; None: the source's own."""
+    edges: tuple[float, ...] = ()
+    """s, of the windows that are judged one by one."""
 
     @classmethod
     def of(
@@ -191,6 +198,7 @@ class Plan:
         variants: str | Sequence[str] | None,
         seeds: int | Iterable[int],
         steady_from: float | None,
+        windows: Sequence[float] | str | None = None,
     ) -> Plan:
         """Return what somebody asks for; arguments and errors as for `compare`."""
         wanted = variants if variants is None or isinstance(variants, str) else ",".join(variants)
@@ -199,7 +207,8 @@ class Plan:
         numbers = tuple(dict.fromkeys(map(checked_seed, given)))
         if not numbers:
             raise CoopenvError("seeds: expected at least one")
-        return cls(source, names, chosen, numbers, steady_from)
+        edges = checked_edges(windows) if windows is not None else () if source.planar else EDGES
+        return cls(source, names, chosen, numbers, steady_from, edges)
 
     @property
     def work(self) -> str:
@@ -218,7 +227,7 @@ class Plan:
         groups = [self.observers] if self.source.seeded else [(name,) for name in self.observers]
         sent = [{name: portable(name) for name in group} for group in groups]
         used = self.seeds if self.source.seeded else (0,)
-        tasks = [Task(self.source, *made, self.steady_from) for made in product(self.variants, used, sent)]
+        tasks = [Task(self.source, *made, self.steady_from, self.edges) for made in product(self.variants, used, sent)]
         judged = executor.map(judge, tasks, lambda done: on_progress(done / len(tasks)))
         order = list(product(self.variants, self.observers))
         samples = sorted(chain(*judged), key=lambda sample: order.index((sample.variant, sample.observer)))

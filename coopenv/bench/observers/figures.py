@@ -14,7 +14,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
 from coopenv.bench.observers.rows import mean_of
-from coopenv.bench.observers.tables import FAILED, short_name
+from coopenv.bench.observers.wording import FAILED, short_name
 from coopenv.estimation.consistency import mean_bounds
 from coopenv.format import number
 from coopenv.viz import style

@@ -2,23 +2,21 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
 
+from coopenv.bench.observers.samples import Sample, Scene, Series
+from coopenv.bench.observers.scene import kept_ticks, scene_of
 from coopenv.bench.observers.sources import Source
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.consistency import diverged, position_std
 from coopenv.estimation.metrics import CONVERGED, SETTLED, SettlingTolerance, fit_exponential_rate, settling_time
-from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.trajectory_error import absolute_error, relative_error
-from coopenv.observers.bound import Bound, cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Factory
 from coopenv.observers.recording import Recording
 from coopenv.observers.runner import Run, run
 
 RELATIVE_DELTA = 1.0  # s between the poses of a pair of the relative trajectory error
-SERIES_TICKS = 250  # instants that are kept for figures
 
 
 @dataclass(frozen=True)
@@ -31,98 +29,19 @@ class Task:
     observers: Mapping[str, str | Factory]
     """By name, as `registry.find` takes them in another process."""
     steady_from: float | None
-
-
-@dataclass(frozen=True)
-class Scene:
-    """What belongs to the record and not to an observer; arrays (N,), NaN where unknown."""
-
-    vehicles: tuple[str, ...]
-    bound_mse: Array  # m^2 in the steady state: joint over all vehicles,
-    bound_ancestors_mse: Array  # joint over a vehicle and its ancestors,
-    bound_single_mse: Array  # and alone with known neighbours
-    gramian: Array  # smallest eigenvalue over the run, as in the theorem: about the map origin, mixed units
-    gramian_local: Array  # the same about the vehicle, without unit
-    steady_from: float  # s
-    t: Array  # (S,) s
-    bound: Array  # (S, N) m, joint
-    paper_noise: bool  # bearings are noisy on the image plane, and so less than the bound assumes off the optical axis
-
-
-class Series(NamedTuple):
-    """What figures show, at `Scene.t`; arrays (S, N)."""
-
-    position_error: Array  # m
-    position_std: Array  # m, NaN where the observer states no covariance
-    nees: Array
-
-
-@dataclass(frozen=True)
-class Sample:
-    """One observer on one record."""
-
-    variant: str
-    observer: str
-    scene: Scene
-    measures: Mapping[str, Array]
-    """Arrays (N,) by name, see `_measures`; none where it failed."""
-    bytes_per_s: Array
-    us_per_update: Array
-    nees_dof: int
-    failure: str
-    series: Series
-
-    def measured(self, name: str, vehicles: int | slice = slice(None)) -> Any:
-        """Return what was measured of some vehicles; NaN where the observer failed, which has diverged."""
-        nothing = np.full(len(self.scene.vehicles), 1.0 if name == "diverged" else np.nan)
-        return self.measures.get(name, nothing)[vehicles]
+    edges: tuple[float, ...] = ()
+    """s, of the windows that are judged one by one."""
 
 
 def judge(task: Task) -> list[Sample]:
     """Make the record and run every observer of a task on it."""
     recording, lie = task.source.recording(task.variant, task.seed)
     steady_from = task.source.steady_from(task.steady_from, recording)
-    scene = scene_of(recording, steady_from)
+    scene = scene_of(recording, steady_from, task.edges)
     return [
         sample_of(task.variant, name, scene, recording, run(factory, recording, lie))
         for name, factory in task.observers.items()
     ]
-
-
-def scene_of(recording: Recording, steady_from: float) -> Scene:
-    """Return the bounds and the observability of a record.
-
-    The noise of recorded robots is not known, and so neither is their bound.
-    """
-    N = len(recording.setups)
-    kept, unknown = _kept(recording), np.full(N, np.nan)
-    known = bool(recording.truth.known.all())
-    bounds: list[Bound] = []
-    if known and not any(setup.planar for setup in recording.setups):
-        bounds = [cramer_rao(recording), cramer_rao_ancestors(recording), cramer_rao(recording, joint=False)]
-    steady = recording.t > steady_from
-    mse = [np.mean(bound.position[steady] ** 2, axis=0) for bound in bounds] or [unknown] * 3
-    gramians = [unknown, unknown]
-    if known:
-        seen = analyse_observability(_Geometry(recording))
-        gramians = [values.min(axis=0, initial=np.inf) for values in (seen.min_eigenvalue, seen.local_eigenvalue)]
-    names = tuple(setup.name for setup in recording.setups)
-    bound = bounds[0].position[kept] if bounds else np.full((len(kept), N), np.nan)
-    paper_noise = any(setup.noise.image_axis is not None for setup in recording.setups)
-    (joint, ancestors, single), (about_map, about_vehicle), t = mse, gramians, recording.t[kept]
-    return Scene(names, joint, ancestors, single, about_map, about_vehicle, steady_from, t, bound, paper_noise)
-
-
-class _Geometry:
-    """A record as `analyse_observability` reads it."""
-
-    def __init__(self, recording: Recording) -> None:
-        self.t, self.visible, truth = recording.t, recording.visible, recording.truth
-        self.position, self.rotation = truth.position, truth.rotation
-        marker = np.array([setup.marker for setup in recording.setups])
-        seen = truth.position + (truth.rotation @ marker[..., None])[..., 0]  # the points of vehicles that cameras see
-        self.target_position = np.concatenate([recording.landmarks, seen], axis=1)
-        self.vehicles = np.array([setup.name for setup in recording.setups])
 
 
 def sample_of(variant: str, observer: str, scene: Scene, recording: Recording, result: Run) -> Sample:
@@ -141,10 +60,13 @@ def _measures(scene: Scene, recording: Recording, result: Run) -> dict[str, Arra
     told = np.where(steady[:, None], result.nis_dof, 0)
     vehicles = range(len(scene.vehicles))
     relative = np.array([_relative(recording, result, i) for i in vehicles]).T
+    windows = [window.ticks(result.t) for window in scene.windows]
     return {
         "position_mse": result.mean(result.position_error**2, steady),
         "orientation_mse": result.mean(result.orientation_error**2, steady),
         "anees": result.mean(result.nees, steady) / result.nees_dof,
+        "window_mse": np.array([result.mean(result.position_error**2, ticks) for ticks in windows]).T,
+        "window_anees": np.array([result.mean(result.nees, ticks) for ticks in windows]).T / result.nees_dof,
         "nis": np.where(told > 0, result.nis, 0.0).sum(axis=0),
         "nis_dof": told.sum(axis=0).astype(float),
         "settle_time": np.array([_settling(result, i, SETTLED) for i in vehicles]),
@@ -185,11 +107,7 @@ def _last(error: Array) -> Array:
     return np.asarray(error[last, np.arange(error.shape[1])])
 
 
-def _kept(recording: Recording) -> np.ndarray:
-    return np.unique(np.linspace(0, recording.ticks - 1, SERIES_TICKS).round().astype(int))
-
-
 def _series(recording: Recording, result: Run) -> Series:
-    kept = _kept(recording)
+    kept = kept_ticks(recording)
     std = position_std(result.covariance[kept], result.coordinates, result.rotation[kept], result.position[kept])
     return Series(result.position_error[kept], std, result.nees[kept])

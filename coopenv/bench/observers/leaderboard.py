@@ -6,8 +6,9 @@ from functools import cached_property
 
 import numpy as np
 
-from coopenv.bench.observers.judge import Sample
 from coopenv.bench.observers.rows import Row, Total, rows_of, totals_of
+from coopenv.bench.observers.samples import Sample, Window
+from coopenv.bench.observers.windows import WindowRow, window_rows
 
 BOUNDS = {"bound_m": "bound (joint)", "bound_ancestors_m": "bound (ancestors)", "bound_single_m": "bound (alone)"}
 """Column to its line in tables."""
@@ -32,6 +33,11 @@ class Leaderboard:
         return rows_of(self.environment, self.samples)
 
     @cached_property
+    def window_rows(self) -> list[WindowRow]:
+        """One per variant, observer, window and vehicle; the last window is the steady state."""
+        return window_rows(self.environment, self.samples)
+
+    @cached_property
     def totals(self) -> dict[tuple[str, str], Total]:
         """Over all vehicles, by variant and observer."""
         return totals_of(self.samples)
@@ -54,6 +60,16 @@ class Leaderboard:
     def rows_in(self, variant: str, observer: str) -> list[Row]:
         """Return the rows of one observer in one variant, a vehicle each."""
         return [row for row in self.rows if (row.variant, row.observer) == (variant, observer)]
+
+    @property
+    def windows(self) -> tuple[Window, ...]:
+        """The stretches of the run that are judged one by one, the steady state last."""
+        return self.samples[0].scene.windows
+
+    def windows_in(self, variant: str, observer: str, window: Window) -> list[WindowRow]:
+        """Return the rows of one observer in one variant and window, a vehicle each."""
+        wanted = (variant, observer, window.name)
+        return [row for row in self.window_rows if (row.variant, row.observer, row.window) == wanted]
 
     def bounds_in(self, variant: str) -> dict[str, list[float]]:
         """Return the bounds that are known of each vehicle in a variant, by column."""

@@ -18,6 +18,7 @@ from coopenv.bench.observers.figures import KINDS
 from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
 from coopenv.bench.observers.rows import Row, mean_of
 from coopenv.bench.observers.tables import failures, honest_line
+from coopenv.bench.observers.windows import spread
 from coopenv.estimation.metrics import CONVERGED
 from coopenv.format import number, with_error
 
@@ -76,9 +77,20 @@ def _variant(board: Leaderboard, name: str) -> dict[str, Any]:
             observer: {"rows": board.rows_in(name, observer), "total": board.totals[name, observer]}
             for observer in board.ranked
         },
+        "windows": {observer: _windows(board, name, observer) for observer in board.ranked},
         "errors": _picture(board, "errors", name),
         "consistency": _picture(board, "consistency", name),
     }
+
+
+def _windows(board: Leaderboard, variant: str, observer: str) -> list[dict[str, Any]]:
+    """Return what the template shows of one observer by window; the steady state alone is no table."""
+    found = [(window, board.windows_in(variant, observer, window)) for window in board.windows]
+    columns = ("ratio_to_bound_ancestors", "anees")
+    return [
+        {"name": window.name, "rows": rows, **{column: spread(rows, column) for column in columns}}
+        for window, rows in (found if len(found) > 1 else ())
+    ]
 
 
 def _extremes(rows: Sequence[Row], column: str) -> str:

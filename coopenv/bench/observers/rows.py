@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from coopenv.bench.observers.faults import NOMINAL
-from coopenv.bench.observers.judge import RELATIVE_DELTA, Sample
+from coopenv.bench.observers.judge import RELATIVE_DELTA
+from coopenv.bench.observers.samples import Sample
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.consistency import DIVERGED_ORIENTATION, DIVERGED_POSITION, LEVEL, Interval, mean_bounds
 from coopenv.estimation.metrics import CONVERGED, SETTLED
@@ -36,6 +37,7 @@ class Row:
     orientation_rmse_se_deg: float = _column("standard error of orientation_rmse_deg over the seeds, deg")
     bound_m: float = _column("posterior Cramér-Rao bound of the position, joint over all vehicles, m")
     anees: float = _column("mean NEES in the steady state divided by its dimension; 1 for an honest covariance")
+    anees_se: float = _column("standard error of anees over the seeds")
     settled_fraction: float = _column(f"share of seeds whose errors stay below {SETTLED.text} to the end")
     settle_time_s: float = _column("median over these seeds of the time from which on they do, s")
     bytes_per_s: float = _column("payload that the vehicle broadcasts, bytes per second")
@@ -186,6 +188,7 @@ def _row(environment: str, i: int, own: Sequence[Sample], nominal: Sequence[Samp
         orientation_rmse_se_deg=orientation.error,
         bound_m=joint,
         anees=float(np.mean(anees)),
+        anees_se=standard_error(anees),
         settled_fraction=float(np.mean(np.isfinite(settle))),
         settle_time_s=_median(settle),
         bytes_per_s=float(np.mean([sample.bytes_per_s[i] for sample in own])),

@@ -1,4 +1,4 @@
-"""The leaderboard as tables that fit a terminal of 80 columns, as CSV and as LaTeX."""
+"""The leaderboard as tables that fit a terminal, as CSV and as LaTeX."""
 
 import csv
 import re
@@ -12,19 +12,22 @@ from coopenv.bench.observers.basin import Draw
 from coopenv.bench.observers.faults import FAULTS, NOMINAL
 from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
 from coopenv.bench.observers.rows import Row, mean_of
+from coopenv.bench.observers.window_tables import window_tables
+from coopenv.bench.observers.windows import WindowRow
+from coopenv.bench.observers.wording import FAILED, short_name
 from coopenv.format import in_parentheses, number, with_error
 from coopenv.jsonable import jsonable
 from coopenv.runs.table import number_table
 
-WIDTH = 80
+WIDTH = 100
 MOST_COLUMNS = 5  # vehicles shown one by one; more are summed up as mean and worst
-FAILED = "failed"
-
-_NAMED = 16  # characters of an observer's name on one line
 
 
-def everything(board: Leaderboard) -> Iterator[Table | str]:
-    """Yield errors, ratios to the bounds and quality of each variant, of faults one only; variants; who failed."""
+def everything(board: Leaderboard, width: int = WIDTH) -> Iterator[Table | str]:
+    """Yield errors, ratios, quality and windows of each variant, of faults one only; then variants, and who failed.
+
+    `width`: characters that fit on a line.
+    """
     variants = list(board.variants)
     for variant in variants[:1] if all(name in FAULTS for name in variants) else variants:
         yield f"\n{board.title}, {variant}"
@@ -38,6 +41,7 @@ def everything(board: Leaderboard) -> Iterator[Table | str]:
         yield quality_table(board, variant)
         if line := honest_line(board.rows):
             yield line
+        yield from window_tables(board, variant, width)
     if len(variants) > 1:
         yield ""
         yield variant_table(board, "mean RMSE [m]", "rmse", variants)
@@ -93,7 +97,8 @@ def quality_table(board: Leaderboard, variant: str) -> Table:
         )
         shares = ("settled_fraction", "converged_fraction", "diverged_fraction")
         cells = [f"{100 * mean_of(own, column):.0f}%" for column in shares]
-        cells += [number(min(anees), 2), number(max(anees), 2)] if anees else ["-", "-"]
+        top = _worst([row for row in own if np.isfinite(row.anees)], "anees") if anees else None
+        cells += [number(min(anees), 2), in_parentheses(top.anees, top.anees_se)] if top else ["-", "-"]
         cells += [number(float(np.mean(nis)), 2) if nis else "-"]
         cells += [f"{mean_of(own, column):.0f}" for column in ("bytes_per_s", "us_per_update")]
         _add(table, name, own, cells)
@@ -120,12 +125,6 @@ def failures(rows: Sequence[Row]) -> list[str]:
     return [f"{observer} ({', '.join(variants)}): failed {why}" for (observer, why), variants in failed.items()]
 
 
-def short_name(name: str) -> str:
-    """Return an observer's name, on two lines if it is long."""
-    cut = name.rfind("_", 0, _NAMED) + 1 if len(name) > _NAMED else 0
-    return f"{name[:cut]}\n{name[cut:]}" if cut else name
-
-
 def _few(board: Leaderboard) -> bool:
     return len(board.samples[0].scene.vehicles) <= MOST_COLUMNS
 
@@ -146,7 +145,7 @@ def _worst(rows: Sequence[Row], column: str = "position_rmse_m") -> Row:
     return max(rows, key=lambda row: getattr(row, column))
 
 
-def csv_text(rows: Sequence[Row] | Sequence[Draw]) -> str:
+def csv_text(rows: Sequence[Row] | Sequence[Draw] | Sequence[WindowRow]) -> str:
     """Return rows as CSV; figures that do not exist are empty."""
     table = [jsonable(row) for row in rows]
     text = StringIO()

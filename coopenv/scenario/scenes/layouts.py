@@ -89,7 +89,8 @@ def tree(vehicles: int, seen: int) -> list[Placed]:
     """Return a binary tree, a level of it on a circle each, whose vehicles go round on small circles of their own."""
     placed = []
     for i in range(1, vehicles + 1):
-        line, level = [], i.bit_length() - 1
+        line: list[int] = []
+        level = i.bit_length() - 1
         while len(line) < min(seen, level):
             line.append((line[-1] if line else i) // 2)
         width = 2**level

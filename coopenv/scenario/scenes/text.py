@@ -89,7 +89,8 @@ def _vehicle(placed: Placed) -> str:
 def _motion(placed: Placed) -> str:
     motion = placed.motion
     if not isinstance(motion, Straight):
-        return f'{{ kind = "constant", linear = [{motion.speed:.6g}, 0.0, 0.0], angular = [0.0, 0.0, {motion.turn:.6g}] }}'
+        twist = f"linear = [{motion.speed:.6g}, 0.0, 0.0], angular = [0.0, 0.0, {motion.turn:.6g}]"
+        return f'{{ kind = "constant", {twist} }}'
     back = tuple(-x for x in motion.velocity)
     legs = [motion.velocity if n % 2 == 0 else back for n in range(round(LONGEST / LEG))]
     rows = ",\n".join(f"  {{ duration = {LEG}, linear = {_vector(leg)} }}" for leg in legs)
