@@ -4,6 +4,9 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path
 
+SCENES = ("lane", "roots", "tree", "random", "ring")
+"""Kinds of scenes that are made to measure, `lane:20`; see `coopenv.scenario.scenes`."""
+
 
 @cache
 def data_directory(kind: str) -> Path:

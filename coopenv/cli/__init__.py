@@ -37,6 +37,7 @@ app = typer.Typer(
 )
 app.command("list")(show.list_command)
 app.command()(show.describe)
+app.command()(show.scene)
 app.command()(show.schema)
 app.command()(run)
 app.command("record")(record_command)

@@ -3,12 +3,12 @@
 from collections.abc import Iterable, Iterator
 from typing import Any, get_args
 
-from coopenv.shipped import list_agents, list_envs
+from coopenv.shipped import SCENES, list_agents, list_envs
 
 
 def environments(incomplete: str) -> list[str]:
     """Return the environments that begin so; the shell completes files itself."""
-    return _matching(list_envs(), incomplete)
+    return _matching([*list_envs(), *(f"{kind}:" for kind in SCENES)], incomplete)
 
 
 def agents(incomplete: str) -> list[str]:

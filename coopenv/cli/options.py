@@ -26,7 +26,8 @@ MOST_WORLDS = 1_000_000
 
 _source = partial(typer.Argument, autocompletion=complete.environments)
 Environment = Annotated[
-    str, _source(metavar="ENV", help="Name of an environment (see `coopenv list`) or path of a TOML file.")
+    str,
+    _source(metavar="ENV", help="Name of an environment (see `coopenv list`), a scene (lane:20) or a TOML file."),
 ]
 _SOURCES = "Environment (name or TOML file), recorded robots (mrclam_1 .. mrclam_9), a log file or a ROS bag."
 Source = Annotated[str, _source(metavar="ENV|DATASET|FILE.mcap|BAG", help=_SOURCES)]

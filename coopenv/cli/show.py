@@ -1,4 +1,4 @@
-"""`coopenv list | describe | schema`: what there is."""
+"""`coopenv list | describe | scene | schema`: what there is."""
 
 import sys
 from enum import StrEnum
@@ -9,13 +9,13 @@ import typer
 
 from coopenv.cli import options
 
-Kind = StrEnum("Kind", "envs observers agents variants")
+Kind = StrEnum("Kind", "envs observers agents variants scenes")
 
 
 def list_command(
     kind: Annotated[Kind, typer.Argument(help="What to list.")] = Kind.envs, as_json: options.AsJson = False
 ) -> None:
-    """List environments, observers, agents or variants."""
+    """List environments, observers, agents, variants or scenes."""
     from coopenv.runs import listing
     from coopenv.shipped import list_envs
 
@@ -25,6 +25,10 @@ def list_command(
         from coopenv.bench.observers.sources import variant_rows
 
         rows = variant_rows()
+    elif kind is Kind.scenes:
+        from coopenv.scenario.scenes import scene_rows
+
+        rows = scene_rows()
     else:
         rows = listing.observer_rows() if kind is Kind.observers else listing.agent_rows()
     if as_json:
@@ -57,6 +61,30 @@ def describe(
         out.print(part)
     if not everything:
         out.print("More: --all (every vehicle, setting and field), --json (all of it as data).")
+
+
+def scene(
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENE",
+            help="Kind of scene and how many vehicles, such as lane:20, lane:8,seen=2 or random:12,seed=3.",
+        ),
+    ],
+    out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None,
+) -> None:
+    """Write a scene that is made to measure as a scenario file, to be kept or changed.
+
+    Scenes stand wherever an environment does: coopenv bench observers lane:20. `coopenv list scenes` lists them.
+    """
+    from coopenv.files import replace_text
+    from coopenv.scenario.scenes import scene_text
+
+    text = scene_text(name)
+    if out is None:
+        sys.stdout.write(text)
+    else:
+        replace_text(out, text)
 
 
 def schema(out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None) -> None:

@@ -1,4 +1,4 @@
-"""`coopenv list`: environments, observers and agents, one line each."""
+"""`coopenv list`: environments, observers, agents and more, one line each."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -17,6 +17,7 @@ COLUMNS = {
     "observers": ("name", "about"),
     "agents": ("name", "kind", "about"),
     "variants": ("name", "of", "about"),
+    "scenes": ("name", "options", "about"),
 }
 """What the tables show of the rows."""
 

@@ -1,5 +1,6 @@
 """The environment that an agent learns in, as it goes with the agent: by its name, or as a copy of the user's file."""
 
+import re
 import tomllib
 from pathlib import Path
 from typing import NamedTuple
@@ -9,6 +10,7 @@ import tomlkit
 from coopenv.policies.loader import AGENT_FILE
 from coopenv.scenario.files import scenario_path
 from coopenv.scenario.own_terms import SECTIONS, located
+from coopenv.scenario.scenes import is_scene, scene_text
 from coopenv.shipped import list_envs
 from coopenv.training.settings import SETTINGS_FILE
 
@@ -28,6 +30,9 @@ def environment_file(environment: str) -> EnvironmentFile:
     """Return an environment, by its name or TOML file, as it goes with an agent. Raises CoopenvError: there is none."""
     if environment in list_envs():
         return EnvironmentFile(environment, environment)
+    if is_scene(environment):
+        name = re.sub(r"[^A-Za-z0-9]+", "_", environment)
+        return EnvironmentFile(environment, f"{name}.toml", scene_text(environment))
     path = scenario_path(environment)
     name = f"{path.stem}.toml"
     if name in (AGENT_FILE, SETTINGS_FILE):  # which stand there

@@ -78,6 +78,15 @@ class Request(NamedTuple):
         return SCENES[self.kind].build(**self.options)
 
 
+def scene_rows() -> list[dict[str, str]]:
+    """Return what `list scenes` says of every kind."""
+    return [
+        {"name": f"{kind}:N", "options": ", ".join(f"{name} {o.least}..{o.most}" for name, o in scene.options.items())}
+        | {"about": scene.about}
+        for kind, scene in SCENES.items()
+    ]
+
+
 def is_scene(text: str) -> bool:
     """Return whether a text is the name of a scene, be it right or wrong in what follows the colon."""
     head, colon, rest = text.partition(":")

@@ -68,7 +68,7 @@ def scene_text(name: str) -> str:
     head = HEAD.format(
         title=f"{request.kind.capitalize()}: {options}",
         about=SCENES[request.kind].about,
-        name=name,
+        name=f"{request.kind}:" + ",".join(f"{key}={value}" for key, value in request.options.items()),
         longest=LONGEST,
         acyclic=str(request.kind != "ring").lower(),
         scale=max(40.0, *(abs(x) for vehicle in placed for x in vehicle.position)),
