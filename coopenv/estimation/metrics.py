@@ -15,6 +15,7 @@ from scipy.ndimage import median_filter
 from scipy.stats import theilslopes
 
 from coopenv.errors import CoopenvError
+from coopenv.estimation.guaranteed_rate import slowest_decay
 from coopenv.estimation.observability import Observability
 from coopenv.estimation.trajectory import Trajectory
 
@@ -264,6 +265,7 @@ def summarise(trajectory: Trajectory, steady_from: float, ends: Sequence[float] 
         t = trajectory.t[:ticks]
         position = trajectory.position_error[:ticks, vehicle]
         orientation = trajectory.orientation_error[:ticks, vehicle]
+        slowest, slowest_from = slowest_decay(t, position)
         fit, mirror = fit_exponential_rate(t, position), bool(mirrored(orientation))
         rows.append(
             {
@@ -280,6 +282,8 @@ def summarise(trajectory: Trajectory, steady_from: float, ends: Sequence[float] 
                 "final_orientation_error_deg": float(orientation[-1]),
                 "rate_per_s": fit.rate,
                 "rate_remark": (_NOT_CONVERGED if fit.remark and mirror else fit.remark) or None,
+                "slowest_rate_per_s": slowest,
+                "slowest_rate_from_s": slowest_from,
                 "mirrored": mirror,
             }
         )

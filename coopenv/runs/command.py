@@ -14,9 +14,9 @@ from coopenv.estimation.observability import analyse_observability
 from coopenv.files import replace_text, replacing_folder
 from coopenv.jsonable import json_text
 from coopenv.runs.console import Progress, compile_notice
-from coopenv.runs.metrics import run_metrics, vehicle_metrics
+from coopenv.runs.metrics import run_metrics, theory_rates, vehicle_metrics
 from coopenv.runs.rollouts import Rollout
-from coopenv.runs.table import legend, metrics_table, remarks
+from coopenv.runs.table import legend, metrics_table, rates, remarks
 from coopenv.runs.video import Film, GifFilm, frame_stride, open_film
 from coopenv.viz import FIGURE_NAMES, FORMATS
 
@@ -62,7 +62,9 @@ def execute(
         if len(judged.t) < 2:
             raise CoopenvError(f"{name}: no true poses are known, so there are no errors to show")
         observability = analyse_observability(judged)
-        metrics = run_metrics(name, overrides, run, vehicle_metrics(judged, observability, endings, steady), steady)
+        rates = theory_rates(run, judged)
+        vehicles = vehicle_metrics(judged, observability, endings, steady, rates)
+        metrics = run_metrics(name, overrides, run, vehicles, steady)
         replace_text(folder / METRICS_FILE, json_text(metrics))
         trajectory.save(folder / TRAJECTORY_FILE)
         paths = [folder / METRICS_FILE, folder / TRAJECTORY_FILE]
@@ -119,6 +121,8 @@ def report(run: Rollout, result: Mapping[str, Any], folder: Path, out: Console) 
     out.print()
     out.print(metrics_table(result["vehicles"]))
     out.print()
+    for part in rates(result["vehicles"]):
+        out.print(part)
     explained = legend(result["steady_from_s"], result["simulated_time_s"])
     for line in (*explained, *remarks(result["vehicles"])):
         out.print(line)

@@ -8,7 +8,7 @@ from rich import box
 from rich.table import Table
 
 from coopenv.estimation.metrics import CONVERGED, SETTLED
-from coopenv.format import column, seconds
+from coopenv.format import column, number, seconds
 
 COLUMNS = (
     ("initial_position_error_m", "start\n[m]", column),
@@ -21,6 +21,21 @@ COLUMNS = (
     ("mean_nees", "mean\nNEES", column),
 )
 """Key of a vehicle's metrics, heading, and how a column of them is written."""
+
+RATE_COLUMNS = (
+    "rate_per_s",
+    "slowest_rate_per_s",
+    "slowest_rate_from_s",
+    "guaranteed_rate_per_s",
+    "guaranteed_rate_at_s",
+    "frozen_rate_window_per_s",
+    "frozen_rate_window_from_s",
+)
+
+VERDICTS = {
+    "not_observable_s": "not observable",
+    "carried_by_odometry_s": f"not observable now, but carried by odometry (within {CONVERGED.text})",
+}
 
 
 def number_table(names: Sequence[str], numbers: Sequence[str], gap: int = 1) -> Table:
@@ -42,6 +57,20 @@ def metrics_table(vehicles: list[dict[str, Any]]) -> Table:
     return table
 
 
+def rates(vehicles: list[dict[str, Any]]) -> Iterator[Table | str]:
+    """Yield the measured rates beside those of the theory and what they mean; nothing where there is no theory."""
+    if all(math.isnan(vehicle["guaranteed_rate_per_s"]) for vehicle in vehicles):
+        return
+    headings = ["fitted\n[1/s]", "slowest 5 s\n[1/s]", "from\n[s]", "guaranteed\n[1/s]", "at\n[s]"]
+    table = number_table(["rate\nvehicle"], [*headings, "frozen, 5 s\n[1/s]", "from\n[s]"])
+    for vehicle in vehicles:
+        figures = [number(vehicle[key], 3) for key in RATE_COLUMNS]
+        table.add_row(vehicle["vehicle"], *figures)
+    yield table
+    yield "Guaranteed: the least of the run, in the norm of P. Frozen: k lambda_min(P M)."
+    yield ""
+
+
 def legend(steady_from: float, end: float) -> Iterator[str]:
     """Yield what the columns mean, for a steady state that starts at a time and a run that ends at one, s."""
     yield f"Settles: stays below {SETTLED.text}. Converges: stays below {CONVERGED.text}."
@@ -57,10 +86,10 @@ def remarks(vehicles: list[dict[str, Any]]) -> Iterator[str]:
         if not math.isnan(vehicle["ended_at_s"]):
             yield f"{vehicle['vehicle']}: {vehicle['outcome']} at {vehicle['ended_at_s']:.2f} s, where its figures end"
     for vehicle in vehicles:
-        gaps = vehicle["observability"]["not_observable_s"]
-        if gaps:
-            times = ", ".join(f"{start:.4g}-{end:.4g}" for start, end in gaps)
-            yield f"{vehicle['vehicle']}: not observable at {times} s"
+        for key, words in VERDICTS.items():
+            if gaps := vehicle["observability"][key]:
+                times = ", ".join(f"{start:.4g}-{end:.4g}" for start, end in gaps)
+                yield f"{vehicle['vehicle']}: {words} at {times} s"
     for vehicle in vehicles:
         if vehicle["mirrored"]:
             angle = f"{vehicle['final_orientation_error_deg']:.4g} deg"
