@@ -83,13 +83,13 @@ def bench_observers(
     """Compare observers on the same data and with their bound."""
     from coopenv.bench.executors import find_executor
     from coopenv.bench.observers.command import REPORT_FILE, perform, request_of
-    from coopenv.bench.observers.tables import WIDTH
+    from coopenv.bench.observers.tables import WIDE
 
     if open_report and out is None:
         raise CoopenvError("--open: the report needs a folder, --out DIR")
     printed, log = options.console(), options.console(stderr=True)
     if not printed.is_terminal:
-        printed.width = max(printed.width, WIDTH)
+        printed.width = max(printed.width, WIDE)
     with options.warned():
         changes, numbers = options.parse_overrides(overrides), range(first, first + seeds)
         request = request_of(

@@ -14,12 +14,13 @@ from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
 from coopenv.bench.observers.rows import Row, mean_of
 from coopenv.bench.observers.window_tables import window_tables
 from coopenv.bench.observers.windows import WindowRow
-from coopenv.bench.observers.wording import FAILED, short_name
+from coopenv.bench.observers.wording import FAILED, compact, short_name
 from coopenv.format import in_parentheses, number, with_error
 from coopenv.jsonable import jsonable
 from coopenv.runs.table import number_table
 
-WIDTH = 100
+WIDTH = 80
+WIDE = 100  # where no terminal says how many characters fit: vehicles are shown one by one
 MOST_COLUMNS = 5  # vehicles shown one by one; more are summed up as mean and worst
 
 
@@ -98,7 +99,7 @@ def quality_table(board: Leaderboard, variant: str) -> Table:
         shares = ("settled_fraction", "converged_fraction", "diverged_fraction")
         cells = [f"{100 * mean_of(own, column):.0f}%" for column in shares]
         top = _worst([row for row in own if np.isfinite(row.anees)], "anees") if anees else None
-        cells += [number(min(anees), 2), in_parentheses(top.anees, top.anees_se)] if top else ["-", "-"]
+        cells += [number(min(anees), 2), compact(top.anees, top.anees_se)] if top else ["-", "-"]
         cells += [number(float(np.mean(nis)), 2) if nis else "-"]
         cells += [f"{mean_of(own, column):.0f}" for column in ("bytes_per_s", "us_per_update")]
         _add(table, name, own, cells)

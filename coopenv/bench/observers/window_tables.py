@@ -6,8 +6,8 @@ from rich.table import Table
 
 from coopenv.bench.observers.leaderboard import Leaderboard
 from coopenv.bench.observers.windows import ERRORS, Spread, WindowRow, spread
-from coopenv.bench.observers.wording import FAILED, short_name
-from coopenv.format import in_parentheses, number
+from coopenv.bench.observers.wording import FAILED, compact, short_name
+from coopenv.format import number
 from coopenv.runs.table import number_table
 
 MOST_OBSERVERS = 4  # of whom every vehicle is shown
@@ -71,11 +71,11 @@ def _told(board: Leaderboard, variant: str, name: str, cells: list[str]) -> list
 
 
 def _cell(row: WindowRow, column: str) -> str:
-    return in_parentheses(getattr(row, column), getattr(row, ERRORS[column]))
+    return compact(getattr(row, column), getattr(row, ERRORS[column]))
 
 
 def _worst(found: Spread) -> str:
-    return in_parentheses(found.worst, found.error)
+    return compact(found.worst, found.error)
 
 
 def _who(found: Spread) -> str:

@@ -62,7 +62,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_json(folder: Path) -> None:
     board = json.loads((folder / "leaderboard.json").read_text())
-    assert set(board) == {"command", "versions", "seeds", "rows", "basin"}
+    assert set(board) == {"command", "versions", "seeds", "rows", "windows", "basin"}
     assert set(board["versions"]) == {"coopenv", "numpy", "scipy", "warp-lang", "python"} and board["seeds"] == [0, 1]
     assert list(board["rows"][0]) == [f.name for f in fields(Row)] and set(board["rows"][0]) >= REQUIRED
     keys = [(row["variant"], row["observer"], row["vehicle"]) for row in board["rows"]]
@@ -233,6 +233,7 @@ def test_an_observer_in_a_file_and_figures_as_files(tmp_path: Path, monkeypatch:
         figures = {path.name for path in Path("board").iterdir()} - {
             "leaderboard.json",
             "leaderboard.csv",
+            "windows.csv",
             "report.html",
         }
         assert figures == {*figure_files(["nominal"], form)} - {f"variants.{form}"}

@@ -1,0 +1,137 @@
+"""Figures by window: worked out here from the runs themselves, told in every file, and in tables that fit."""
+
+from __future__ import annotations
+
+import csv
+import json
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import coopenv
+from coopenv.bench.observers import compare, scene
+from coopenv.bench.observers.samples import Window, windows_of
+from coopenv.bench.observers.windows import EDGES, WindowRow, checked_edges, spread
+from coopenv.cli import main
+from coopenv.errors import CoopenvError
+from coopenv.observers import run
+from coopenv.observers.bound import cramer_rao_ancestors
+from coopenv.observers.recording import Recording
+from coopenv.runs.recorder import record
+
+SHORT = {"horizon": 3.0, "rates.camera": 20.0, "rates.odometry": 20.0}
+EDGE = (0.5, 1.0, 2.0)
+
+
+@pytest.fixture(scope="module")
+def found() -> coopenv.Comparison:
+    return compare(["mekf_covariance"], "lane:4", 3, overrides=SHORT, steady_from=2.5, windows=EDGE)
+
+
+def test_rows_are_what_the_runs_say(found: coopenv.Comparison) -> None:
+    scenario = coopenv.load_scenario("lane:4", SHORT)
+    records = [record(scenario, seed) for seed in (0, 1, 2)]
+    runs, bound = [run("mekf_covariance", made) for made in records], cramer_rao_ancestors(records[0])
+    windows = [*pairwise(EDGE), (2.5, 3.0)]
+    assert [(row.from_s, row.to_s) for row in found.window_rows[::4]] == windows
+    assert [row.window for row in found.window_rows[::4]] == ["0.5-1 s", "1-2 s", "steady"]
+    for n, (start, end) in enumerate(windows):
+        within = (bound.t > start) & (bound.t < end + 1e-9)
+        for i, row in enumerate(found.window_rows[4 * n : 4 * n + 4]):
+            squares = np.array([np.mean(one.position_error[within, i] ** 2) for one in runs])
+            nees = np.array([np.mean(one.nees[within, i]) / 6 for one in runs])
+            rmse, limit = np.sqrt(squares.mean()), np.sqrt(np.mean(bound.position[within, i] ** 2))
+            error = squares.std(ddof=1) / np.sqrt(3) / (2 * rmse)
+            expected = (rmse, error, limit, rmse / limit, error / limit)
+            got = (row.position_rmse_m, row.position_rmse_se_m, row.bound_ancestors_m, row.ratio_to_bound_ancestors)
+            assert_allclose((*got, row.ratio_to_bound_ancestors_se), expected, rtol=1e-9)
+            assert_allclose((row.anees, row.anees_se), (nees.mean(), nees.std(ddof=1) / np.sqrt(3)), rtol=1e-9)
+
+
+def test_the_steady_window_is_the_leaderboard(found: coopenv.Comparison) -> None:
+    for row, steady in zip(found.rows, found.windows_in("nominal", "mekf_covariance", found.windows[-1]), strict=True):
+        assert row.position_rmse_m == steady.position_rmse_m and row.anees == steady.anees
+        assert row.anees_se == steady.anees_se > 0.0
+        assert row.ratio_to_bound_ancestors_se == steady.ratio_to_bound_ancestors_se
+
+
+def test_windows_end_with_the_run() -> None:
+    assert windows_of(EDGES, 20.0, 15.0) == (Window(5.0, 10.0), Window(10.0, 15.0), Window(20.0, 15.0, steady=True))
+    assert windows_of((), 0.0, 5.0) == (Window(0.0, 5.0, steady=True),)
+    assert not Window(1.0, 2.0).ticks(np.array([1.0])).any() and Window(1.0, 2.0).ticks(np.array([2.0])).all()
+
+
+@pytest.mark.parametrize("given", ["5", "5,4", "a,b", "-1,3", "1,inf", "1,1", ",".join(map(str, range(30)))])
+def test_edges_that_are_none_are_told(given: str) -> None:
+    with pytest.raises(CoopenvError, match=r"--windows .*expected 2 to 20 increasing times in s, such as 5,10,20,35"):
+        checked_edges(given)
+
+
+def test_edges() -> None:
+    assert checked_edges("5, 10,20") == checked_edges([5, 10, 20]) == (5.0, 10.0, 20.0)
+    assert checked_edges("none") == checked_edges("") == checked_edges([]) == ()
+
+
+def test_the_worst_anees_is_the_farthest_from_one() -> None:
+    def row(vehicle: str, anees: float, rmse: float) -> WindowRow:
+        return WindowRow("e", "v", "o", vehicle, "w", 0, 1, rmse, 0.1, 1.0, rmse, 0.1, anees, 0.2)
+
+    rows = [row("vehicle_1", 0.1, 3.0), row("vehicle_2", 5.0, 1.0), row("vehicle_3", 1.2, 2.0)]
+    assert spread(rows, "anees") == (1.2, 0.1, 0.2, "vehicle_1")
+    assert spread(rows, "position_rmse_m") == (2.0, 3.0, 0.1, "vehicle_1")
+    assert np.isnan(spread([row("vehicle_1", np.nan, np.nan)], "anees").worst)
+
+
+def test_seeds_share_one_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It depends on what was true and seen, not on the noise: of many vehicles it takes minutes."""
+    calls = []
+
+    def counted(recording: Recording) -> object:
+        calls.append(recording)
+        return cramer_rao_ancestors(recording)
+
+    monkeypatch.setattr(scene, "cramer_rao_ancestors", counted)
+    monkeypatch.setattr(scene, "_kept", type(scene._kept)())
+    compare(["dead_reckoning"], "lane:2", 3, overrides={"horizon": 0.5})
+    assert len(calls) == 1
+    compare(["dead_reckoning"], "lane:2", 2, overrides={"horizon": 0.5, "noise.bearing.scale": 0.01})
+    assert len(calls) == 2
+
+
+def test_the_command_writes_and_prints_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = [
+        "bench",
+        "observers",
+        "lane:12",
+        "--observers",
+        "mekf_covariance",
+        "--seeds",
+        "2",
+        "--windows",
+        "0.2,0.5,2",
+    ]
+    assert main([*words, "--set", "horizon=1.0", "--jobs", "1", "--out", str(tmp_path / "new")]) == 0
+    printed = capsys.readouterr().out
+    assert max(len(line) for line in printed.splitlines() if not line.startswith("Files in")) <= 100
+    told = [line for line in printed.splitlines() if line.startswith("mekf_covariance 0.2-0.5 s")]
+    assert len(told) == 1 and told[0].split()[-1].startswith("f")
+    board = json.loads((tmp_path / "new" / "leaderboard.json").read_text())
+    assert "--windows 0.2,0.5,2" in board["command"]
+    with (tmp_path / "new" / "windows.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert [float(row["anees"]) for row in table] == [row["anees"] for row in board["windows"]]
+    assert [row["window"] for row in table[::12]] == ["0.2-0.5 s", "0.5-1 s", "steady"]
+    page = (tmp_path / "new" / "report.html").read_text()
+    assert "By window" in page and page.count("0.5-1 s") == 1
+
+
+def test_few_vehicles_are_shown_one_by_one(found: coopenv.Comparison) -> None:
+    lines = str(found).splitlines()
+    rows = found.windows_in("nominal", "mekf_covariance", found.windows[0])
+    shown = [line.split() for line in lines if line.startswith("mekf_covariance 0.5-1 s")]
+    assert len(shown) == 2  # ratios and ANEES
+    assert float(shown[0][3].partition("(")[0]) == pytest.approx(rows[0].ratio_to_bound_ancestors, abs=0.06)
+    assert float(shown[1][3].partition("(")[0]) == pytest.approx(rows[0].anees, abs=0.06)
