@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 import coopenv
 from coopenv.errors import CoopenvError, DeviceError
-from coopenv.estimation.metrics import settling_time
+from coopenv.estimation.metrics import CONVERGED, settling_time
 from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.jsonable import json_text
 from coopenv.runs import Rollout, rollout
-from coopenv.runs.metrics import outcome_line, run_metrics, vehicle_metrics
-from coopenv.runs.table import legend, metrics_table, remarks
+from coopenv.runs.metrics import outcome_line, run_metrics, theory_rates, vehicle_metrics
+from coopenv.runs.rollouts import Ending
+from coopenv.runs.table import legend, metrics_table, rates, remarks
 from coopenv.runs.video import GIF_SIZE, GifFilm, frame_stride
 from tests.helpers.four_way import FOUR_WAY
+from tests.helpers.synthetic import make_trajectory
 
 CASES: list[tuple[str, dict[str, Any]]] = [
     *((name, {}) for name in coopenv.list_envs()),
@@ -248,3 +253,40 @@ def test_a_mirrored_estimate_did_not_converge() -> None:
     assert vehicles[0]["rate_remark"] == "did not converge, no rate to fit"
     lines = [line for line in remarks(vehicles) if line.startswith("vehicle_1: ")]
     assert len(lines) == 1 and "mirrored solution" in lines[0]
+
+
+def test_what_odometry_carries_is_told_apart() -> None:
+    """Bearings end at 20 s, when every estimate is within centimetres: odometry keeps it there."""
+    run = make_trajectory()
+    dark = replace(run, visible=run.visible & (run.t < 20.0)[:, None, None])
+    endings = [Ending("under way", 50.0)] * 5
+    rows = vehicle_metrics(dark, analyse_observability(dark), endings, 35.0)
+    for vehicle, row in zip(range(5), rows, strict=True):
+        found = row["observability"]
+        known = CONVERGED.contains(run.position_error[:, vehicle], run.orientation_error[:, vehicle])
+        (start, end) = found["carried_by_odometry_s"][-1]
+        assert end == 50.0 and known[run.t > start].all()
+        for before, after in found["not_observable_s"]:
+            assert not known[(run.t >= before) & (run.t <= after + 1e-9)].all()
+    assert any("carried by odometry (within 0.1 m and 1 deg) at " in line for line in remarks(rows))
+
+
+def test_rates_of_the_theory_are_those_of_the_papers_observer() -> None:
+    _, vehicles = vehicles_of("overtaking", **{"horizon": 12.0, "observer.name": "robust"})
+    assert all(math.isnan(vehicle["guaranteed_rate_per_s"]) for vehicle in vehicles) and list(rates(vehicles)) == []
+    recording = Rollout(coopenv.load_scenario("busy_intersection", {"noise.enabled": False, "horizon": 12.0}))
+    for _ in recording.play():
+        pass
+    run = recording.trajectory()
+    theory = theory_rates(recording, run)
+    assert theory is not None and theory.guaranteed.shape == (721, 5)
+    rows = vehicle_metrics(run, analyse_observability(run), recording.endings(), 8.0, theory)
+    assert 0.5 < rows[0]["guaranteed_rate_per_s"] < min(rows[0]["slowest_rate_per_s"], rows[0]["rate_per_s"])
+    assert 0.0 < rows[4]["guaranteed_rate_per_s"] < 0.05 and math.isnan(rows[4]["slowest_rate_per_s"])  # still off
+    for i, row in enumerate(rows):
+        assert row["guaranteed_rate_per_s"] == theory.guaranteed[:, i].min()
+        assert row["frozen_rate_per_s"] <= row["frozen_rate_window_per_s"]
+    printed = StringIO()
+    for part in rates(rows):
+        Console(file=printed, width=80).print(part)
+    assert "vehicle_5" in printed.getvalue() and "…" not in printed.getvalue()
