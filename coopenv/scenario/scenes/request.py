@@ -36,27 +36,27 @@ _SEEN = Option(1, 8, 3)
 
 SCENES: Mapping[str, Scene] = {
     "lane": Scene(
-        "Vehicles one behind the other; each measures those `seen` in front of it, the first ones landmarks.",
+        "A lane, each measures those in front.",
         layouts.lane,
         {"vehicles": _vehicles(8), "seen": _SEEN},
     ),
     "roots": Scene(
-        "Two streets whose first vehicles measure landmarks; the others measure vehicles of both streets.",
+        "Two streets that measure across.",
         layouts.roots,
         {"vehicles": _vehicles(10, 3)},
     ),
     "tree": Scene(
-        "A binary tree: each vehicle measures its parent and those above it, filled up with landmarks.",
+        "A tree, each measures those above.",
         layouts.tree,
         {"vehicles": _vehicles(15), "seen": _SEEN},
     ),
     "random": Scene(
-        "A random acyclic graph: each vehicle measures `seen` landmarks or vehicles before it, drawn by `seed`.",
+        "A random acyclic graph.",
         layouts.random_graph,
         {"vehicles": _vehicles(12), "seen": _SEEN, "seed": Option(0, 2**31 - 1, 0)},
     ),
     "ring": Scene(
-        "Vehicles on a circle; each measures those `seen` in front of it, round and round, and landmarks.",
+        "A circle, each measures those in front.",
         layouts.ring,
         {"vehicles": _vehicles(5, 3), "seen": Option(1, 2, 1)},
     ),
@@ -81,10 +81,14 @@ class Request(NamedTuple):
 def scene_rows() -> list[dict[str, str]]:
     """Return what `list scenes` says of every kind."""
     return [
-        {"name": f"{kind}:N", "options": ", ".join(f"{name} {o.least}..{o.most}" for name, o in scene.options.items())}
-        | {"about": scene.about}
+        {"name": f"{kind}:N", "options": ", ".join(map(_briefly, scene.options.items())), "about": scene.about}
         for kind, scene in SCENES.items()
     ]
+
+
+def _briefly(option: tuple[str, Option]) -> str:
+    name, (least, most, _) = option
+    return f"{least}..{most} {name}" if most < 1000 else name
 
 
 def is_scene(text: str) -> bool:
