@@ -21,6 +21,7 @@ from coopenv.cli.options import parse_value
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.observers.recording import Truth
 from coopenv.observers.registry import observer_names
+from coopenv.runs import table
 from coopenv.runs.recorder import record
 from coopenv.shipped import list_agents
 
@@ -175,8 +176,11 @@ def test_run_writes_its_files_and_prints_its_table(capsys: pytest.CaptureFixture
     assert (metrics["seed"], metrics["dtype"], metrics["device"]) == (4, "float64", "cpu")
     assert metrics["overrides"] == {"noise.enabled": False}
     assert metrics["steady_from_s"] == 35.0
-    rows = {line.split()[0]: line.split() for line in out.splitlines() if line.startswith("vehicle_")}
-    assert [float(x) for x in rows["vehicle_1"][1:5]] == pytest.approx([11.5, 90.0, 1.32, 2.93], rel=0.01)
+    errors, rates = (line.split() for line in out.splitlines() if line.startswith("vehicle_1 "))
+    assert [float(x) for x in errors[1:5]] == pytest.approx([11.5, 90.0, 1.32, 2.93], rel=0.01)
+    assert [float(x) for x in rates[1:]] == [
+        pytest.approx(metrics["vehicles"][0][key], rel=0.006) for key in table.RATE_COLUMNS
+    ]
     assert "vehicle_5: not observable at 0-" in out
     assert "No steady state: it would begin at 35 s" in out
     assert "stopped after the steps asked for, at 12 s" in out
@@ -230,7 +234,7 @@ def test_a_log_file_runs_and_is_described_like_an_environment(capsys: pytest.Cap
     assert main(["run", "drive.mcap", "--no-figures", "--steady-from", "1"]) == 0
     assert main(["run", "overtaking", "--set", "horizon=2.0", "--no-figures", "--steady-from", "1"]) == 0
     tables = [line for line in capsys.readouterr().out.splitlines() if line.startswith("vehicle_")]
-    assert len(tables) == 4 and tables[:2] == tables[2:]
+    assert len(tables) == 8 and tables[:4] == tables[4:]  # errors and rates
     assert main(["describe", "drive.mcap"]) == 0
     assert "Recorded: every episode is the recording" in capsys.readouterr().out
 
