@@ -199,7 +199,7 @@ class TickWorld(SensingWorld):
                 self.view("inbox_rotation")[0, receiver, sender] = R
                 position = message.position - R @ self.briefing.setups[sender].marker
                 self.view("inbox_position")[0, receiver, sender] = position
-                self.view("inbox_tick")[0, receiver, sender] = sent
+                self.view("inbox_tick")[0, receiver, sender] = self.view("inbox_stamp")[0, receiver, sender] = sent
         self._present = replace(now, messages=accepted)
 
     def _end_tick(self) -> None:

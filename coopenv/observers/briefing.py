@@ -9,9 +9,9 @@ from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Briefing
 from coopenv.scenario import Scenario
+from coopenv.world.faults import UNIFORM_ROTATION
 
 EXACT_START_STD = 1e-3  # rad and m, where a scenario starts its estimates at the truth
-UNIFORM_ROTATION = (math.pi**2 / 3.0 + 2.0) / 3.0  # rad^2 per axis, of a rotation uniform over SO(3)
 
 
 def briefing_of(scenario: Scenario, model: Any) -> Briefing:

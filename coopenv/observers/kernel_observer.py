@@ -76,7 +76,7 @@ class KernelObserver:
         s.rotation[:L], s.rotation[L:] = np.eye(3), np.nan
         for truth in (s.position, s.velocity, s.angular_velocity):
             truth[...] = np.nan
-        for never in (s.inbox_tick, s.outbox_tick, s.bearing_tick):
+        for never in (s.inbox_tick, s.inbox_stamp, s.outbox_tick, s.bearing_tick):
             never[...] = -1
         self._start_covariance[...] = initial_covariance
         self._set_clock(None, self.setup.noise.odometry_period)
@@ -120,7 +120,7 @@ class KernelObserver:
     def _receive(self, messages: Mapping[int, Received], now: int) -> None:
         """Write what the vehicle hears; a message that is malformed, or older than the start, is as none."""
         s = self.state
-        s.inbox_tick[...] = -1
+        s.inbox_tick[...] = s.inbox_stamp[...] = -1
         for target, received in messages.items():
             sender, sent = target - self.setup.landmarks, now - self.units(received.age)
             message, before, sound = self._heard.get(sender, (None, 0, False))
@@ -128,7 +128,7 @@ class KernelObserver:
                 before, sound = sent, sent >= 0 and self._read(sender, received.message, sent)
                 self._heard[sender] = received.message, sent, sound
             if sound:
-                s.inbox_tick[sender] = before
+                s.inbox_tick[sender] = s.inbox_stamp[sender] = before
 
     def _read(self, sender: int, message: Message, sent: int) -> bool:
         """Hand a message to the kernels; return whether it is well-formed."""

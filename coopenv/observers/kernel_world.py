@@ -35,7 +35,7 @@ def model_of(setup: Setup, p: Precision) -> Any:
     model.targets = repeated(wp.array(targets, dtype=wp.int32, device="cpu"), 0, N)
     model.target_count = wp.full(N, len(setup.targets), dtype=wp.int32, device="cpu")
     model.order = model.rank = wp.array(np.arange(N, dtype=np.int32), dtype=wp.int32, device="cpu")
-    model.start.covariance = wp.zeros(N, dtype=mat66d, device="cpu")
+    model.start.covariance = wp.zeros(2 * N, dtype=mat66d, device="cpu")
     camera, noise, known = entry_struct(p, "camera")(), entry_struct(p, "noise")(), setup.noise
     camera.rotation, camera.position = p.mat33(*np.eye(3).ravel()), p.vec3(*setup.lever_arm)
     for name in ("velocity", "angular_velocity", "bearing", "odometry_scale", "odometry_scale_walk"):

@@ -19,6 +19,7 @@ from coopenv.scenario.base import (
     Vector3,
     Word,
 )
+from coopenv.scenario.faults import Faults
 from coopenv.scenario.learning import Dynamics
 from coopenv.scenario.sensing import Camera, Noise
 
@@ -258,16 +259,17 @@ class Vehicle(Part):
     routes: tuple[str, ...] = Field(default=(), max_length=1000)
     """Names of routes, one of which is drawn at each reset: the vehicle starts at its beginning and goes to its end."""
     camera: Camera | None = None
-    """This vehicle's own; what it does not give is as in the scenario's [camera]. Likewise the next two."""
+    """This vehicle's own; what it does not give is as in the scenario's [camera]. Likewise the next three."""
     noise: Noise | None = None
     dynamics: Dynamics | None = None
+    faults: Faults | None = None
 
     @property
     def goal_radius(self) -> float:
         """How near to its goal the vehicle has arrived, m; 0 without a goal."""
         return (self.goal or Goal()).radius if self.goal or self.routes else 0.0
 
-    @field_serializer("camera", "noise", "dynamics")
+    @field_serializer("camera", "noise", "dynamics", "faults")
     def _given(self, part: Part | None) -> dict[str, Any] | None:
         """Leave out what is the scenario's."""
         return None if part is None else part.model_dump(exclude_unset=True)

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from coopenv.scenario.base import Part, Positive, Text, Vector3, overlaid
 from coopenv.scenario.bodies import Landmark, Obstacle, Road, Vehicle
+from coopenv.scenario.faults import Faults
 from coopenv.scenario.highway import Highway
 from coopenv.scenario.landmarks import LandmarkGroup
 from coopenv.scenario.learning import Action, Dynamics, Observation, Reward, Termination
@@ -49,6 +50,7 @@ class ScenarioFields(Part):
     `ideal`: every neighbour is measured in every frame, whatever the field of view, range, misses and what is in
     between; `blind`: nothing is ever measured; `sensed`: as `topology.mode` says."""
     v2x: V2x = V2x()
+    faults: Faults = Faults()
     observer: Observer = Observer()
     dynamics: Dynamics = Dynamics()
     randomisation: Randomisation = Randomisation()
@@ -95,6 +97,21 @@ class ScenarioFields(Part):
     def noises(self) -> list[Noise]:
         """The noise of every vehicle's sensors."""
         return [overlaid(self.noise, vehicle.noise) for vehicle in self.vehicles]
+
+    @property
+    def all_faults(self) -> list[Faults]:
+        """What may go wrong with every vehicle."""
+        return [overlaid(self.faults, vehicle.faults) for vehicle in self.vehicles]
+
+    @property
+    def replay_ticks(self) -> int:
+        """The most ticks that a replayed message may be old beyond what the radio takes, over all vehicles."""
+        lies = [faults.lie for faults in self.all_faults]
+        return max(self.ticks_of_replay(lie.age) if lie.kind == "replay" else 0 for lie in lies)
+
+    def ticks_of_replay(self, age: float) -> int:
+        """Return an age in s as ticks: whole periods of the radio, at least one."""
+        return self.v2x.period * max(1, round(age * self.rates.camera / self.v2x.period))
 
     @property
     def limits(self) -> list[Dynamics]:

@@ -72,11 +72,14 @@ class Camera(Part):
     per vehicle and episode. Observers know `orientation` alone."""
     extrinsics_position_error: NonNegative = 0.0
     """Likewise of where the optical centre is, per axis, m."""
+    focal_length_error: NonNegative = 0.0
+    """Standard deviation of e: the true focal length is (1 + e) times what observers know, so that the coordinates of a
+    bearing on the image plane (at distance 1) are (1 + e) times what they should be; drawn per vehicle and episode."""
 
     @property
     def is_misplaced(self) -> bool:
-        """Whether the true camera is not where observers believe it to be."""
-        return self.extrinsics_error > 0.0 or self.extrinsics_position_error > 0.0
+        """Whether the true camera is not as observers believe it to be."""
+        return any((self.extrinsics_error, self.extrinsics_position_error, self.focal_length_error))
 
 
 class Rates(Part):

@@ -16,6 +16,7 @@ from coopenv.scenario.randomness import FASTEST_PACE
 from coopenv.scenario.starts import agent_starts, rotation_of
 from coopenv.scenario.topology import neighbour_sets, processing_order
 from coopenv.world.build_draws import drawn_of, routes_of
+from coopenv.world.build_faults import fault_entries, fault_switches
 from coopenv.world.build_sensors import camera_entries, noise_entries
 from coopenv.world.model import BLIND, DRIVEN, IDEAL, PRESCRIBED, SENSED, STATIC, entry_struct, model_struct
 from coopenv.world.precision import Precision
@@ -41,6 +42,8 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
     sensors = zip(scenario.cameras, scenario.noises, strict=True)
     model.camera = _structs(p, "camera", [camera_entries(camera, noise) for camera, noise in sensors], device)
     model.noise = _structs(p, "noise", [noise_entries(n, scenario.rates) for n in scenario.noises], device)
+    model.fault = _structs(p, "fault", [fault_entries(f, scenario) for f in scenario.all_faults], device)
+    _fill(model, fault_switches(scenario), device)
     _fill(model.radio, _radio(scenario), device)
     _fill(model.observer, _observer(scenario), device)
     _fill(model.judgement, _judgement(scenario), device)
@@ -187,7 +190,7 @@ def _radio(scenario: Scenario) -> dict[str, Any]:
     v = scenario.v2x
     return {
         **{name: getattr(v, name) for name in ("delay", "period", "loss")},
-        "slots": max(v.delay, 1) + 1,
+        "slots": max(v.delay, 1) + 1 + scenario.replay_ticks,
         "range": math.inf if v.range is None else v.range,
         "staleness": math.inf if v.staleness is None else v.staleness,
     }

@@ -31,6 +31,7 @@ def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
         "miss": c.miss_probability,
         "orientation_std": on * c.extrinsics_error,
         "position_std": on * c.extrinsics_position_error,
+        "focal_std": on * c.focal_length_error,
     }
 
 

@@ -263,6 +263,9 @@ def observe(model: Any, state: Any, world: int, vehicle: int, tick: int):
         turned = turned * exp_so3(state.camera_turn[world, vehicle])
     origin = state.position[world, agent] + R * place
     to_camera = wp.transpose(R * turned)
+    if camera.focal_std > zero:  # the image is wider than a vehicle knows: as seen through the nominal lens
+        wider = zero + place.dtype(1.0) + state.camera_focal[world, vehicle]
+        to_camera = wp.diag(type(place)(wider, wider, place.dtype(1.0))) * to_camera
     random = camera.miss > zero or level > zero
     for n in range(model.target_count[vehicle]):
         target = model.targets[vehicle, n]

@@ -81,7 +81,8 @@ class Embedded:
     """(model, state, memory, world, vehicle, now): take one camera tick `Now`; messages have been delivered."""
     start: Any
     """(model, state, memory, world, vehicle): begin an episode at the initial estimate, which stands in the state, its
-    covariance in `model.start.covariance` (LEFT coordinates); vehicles come leaders first."""
+    covariance is `coopenv.world.faults.start_covariance` (LEFT coordinates); vehicles come leaders first. Called again
+    for a vehicle that starts anew, see `[faults.restart]`."""
     send: Any
     """(model, state, memory, world, vehicle, tick): put on the air what the V2X pose estimate does not carry; called
     at every tick, after `start` as well."""

@@ -1,4 +1,4 @@
-"""Errors that last: of the odometry's scale, the gyro, slipping wheels, and where the camera sits.
+"""Errors that last: of the odometry's scale, the gyro, slipping wheels, where the camera sits, and its lens.
 
 They are truth, drawn once per vehicle and episode (`draw_errors`). Scale and bias then walk, and slips come and go,
 from one camera tick to the next (`drift`). Where all are off, nothing is drawn and nothing is changed.
@@ -13,13 +13,18 @@ from coopenv.world.parameters import EXTRINSICS, GYRO_BIAS, ODOMETRY_SCALE, SLIP
 from coopenv.world.random import (
     ODOMETRY_WALK,
     RESET_CAMERA,
+    RESET_LENS,
     RESET_ODOMETRY,
     SLIP,
+    gaussian_pair,
     random_words,
     signed_uniform,
     six_gaussians,
     uniform,
 )
+
+SHORTEST = wp.constant(-0.9)
+"""Least error of a focal length, relative: a lens stays a lens."""
 
 
 @wp.func
@@ -38,12 +43,18 @@ def draw_errors(model: Any, state: Any, world: int, vehicle: int):
     shift = o
     if camera.orientation_std > o[0] or camera.position_std > o[0]:
         turn, shift = six_gaussians(seed, episode, 0, vehicle, RESET_CAMERA, o)
+    focal = o[0]
+    if camera.focal_std > o[0]:
+        words = random_words(seed, episode, 0, vehicle, RESET_LENS)
+        focal, _ = gaussian_pair(words[0], words[1], o.dtype(1.0))
     factor = state.parameter[world, EXTRINSICS]
     state.odometry_scale[world, vehicle] = noise.odometry_scale * state.parameter[world, ODOMETRY_SCALE] * scale[0]
     state.gyro_bias[world, vehicle] = wp.cw_mul(noise.gyro_bias, bias) * state.parameter[world, GYRO_BIAS]
     state.slip[world, vehicle] = type(state.slip[world, vehicle])()
     state.camera_turn[world, vehicle] = camera.orientation_std * factor * turn
     state.camera_shift[world, vehicle] = camera.position_std * factor * shift
+    least = o.dtype(SHORTEST)
+    state.camera_focal[world, vehicle] = wp.max(camera.focal_std * factor * focal, least)
 
 
 @wp.func

@@ -50,7 +50,7 @@ def model_struct(p: Precision) -> Any:
         orientation_fixed: wp.array(dtype=wp.int32)  # (N,) 0: estimate_rotation multiplies R(0)
         estimate_rotation: wp.array(dtype=mat33)  # (N,)
         orientation_angle: wp.array(dtype=scalar)  # (N,) largest random turn; negative: uniform over SO(3)
-        covariance: wp.array(dtype=mat66d)  # (N,) of the initial estimate, for observers: left error, rad and m
+        covariance: wp.array(dtype=mat66d)  # (2N,) of the initial estimates, for observers, and after restarts; left error
 
     @wp.struct
     class Motion:
@@ -163,6 +163,7 @@ def model_struct(p: Precision) -> Any:
         miss: scalar
         orientation_std: scalar  # rad, per axis, of the error of `rotation`
         position_std: scalar  # m, per axis, of the error of `position`
+        focal_std: scalar  # of the error of `focal_length`, relative
 
     @wp.struct
     class Noise:
@@ -193,6 +194,27 @@ def model_struct(p: Precision) -> Any:
         loss: scalar
         range: scalar  # m
         staleness: wp.float64  # s
+
+    @wp.struct
+    class Fault:
+        """What goes wrong with a vehicle's computer, clock and messages."""
+
+        clock: scalar  # standard deviation, s
+        restart_chance: scalar
+        restart_time: scalar  # s
+        restart_spread: scalar  # s
+        corruption: scalar  # chance
+        corruption_start: scalar  # s
+        corruption_size: scalar  # m
+        corruption_turn: scalar  # rad
+        lie: wp.int32  # see `coopenv.world.faults.KINDS`
+        lie_chance: scalar
+        lie_start: scalar  # s
+        lie_spread: scalar  # s
+        lie_size: scalar  # m, or m/s of a drift
+        lie_replay: wp.int32  # ticks by which messages are old
+        lie_direction: vec3  # of length 1; zero: drawn
+        lie_std: scalar  # claimed, rad and m; 0: honest
 
     @wp.struct
     class Observer:
@@ -254,6 +276,10 @@ def model_struct(p: Precision) -> Any:
         drawn: Drawn
         camera: wp.array(dtype=Camera)  # (N,)
         noise: wp.array(dtype=Noise)  # (N,)
+        fault: wp.array(dtype=Fault)  # (N,)
+        clocks: wp.int32  # 1: some clock is off
+        restarts: wp.int32  # 1: some vehicle may start anew
+        alters: wp.int32  # 1: some message may say something else than its sender believes
         radio: Radio
         observer: Observer
         judgement: Judgement

@@ -34,7 +34,12 @@ RESET_ODOMETRY = wp.constant(wp.uint32(32))
 RESET_CAMERA = wp.constant(wp.uint32(34))
 ODOMETRY_WALK = wp.constant(wp.uint32(36))
 SLIP = wp.constant(wp.uint32(38))
-"""Where six normal numbers are drawn, the next stream gives the second half."""
+RESET_LENS = wp.constant(wp.uint32(40))
+CLOCK = wp.constant(wp.uint32(41))
+RESTART = wp.constant(wp.uint32(42))
+LIE = wp.constant(wp.uint32(43))
+CORRUPTION = wp.constant(wp.uint32(44))
+"""Where six numbers are drawn, the next stream gives the second half."""
 
 
 @wp.func

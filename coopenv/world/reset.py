@@ -11,6 +11,7 @@ from coopenv.world.collision import touches_anything, touches_one_of
 from coopenv.world.command import command_of
 from coopenv.world.draw_route import draw_route, go_straight, start_on_route
 from coopenv.world.dynamics import prescribe
+from coopenv.world.faults import draw_faults
 from coopenv.world.lasting_errors import draw_errors
 from coopenv.world.model import DRIVEN, PRESCRIBED
 from coopenv.world.parameters import INITIAL_ERROR, draw_parameters
@@ -154,6 +155,7 @@ def place_vehicle(model: Any, state: Any, world: int, vehicle: int):
         state.outbox_rotation[world, vehicle, slot] = identity3(o)
     for sender in range(model.vehicles):
         state.inbox_tick[world, vehicle, sender] = -1
+        state.inbox_stamp[world, vehicle, sender] = -1
         state.inbox_position[world, vehicle, sender] = o
         state.inbox_rotation[world, vehicle, sender] = identity3(o)
     for block in range(model.observer.blocks):
@@ -237,6 +239,7 @@ def begin_sensing(model: Any, state: Any, world: int):
     for vehicle in range(model.vehicles):
         believe(model, state, world, vehicle)
         draw_errors(model, state, world, vehicle)
+        draw_faults(model, state, world, vehicle)
         state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
     for place in range(model.vehicles):
         vehicle = model.order[place]

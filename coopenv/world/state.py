@@ -87,6 +87,14 @@ def state_struct(p: Precision) -> Any:
         slip: array("WN", vec2)  # truth: share that the wheels read too much, side slip angle in rad; zero: none
         camera_turn: array("WN", vec3)  # truth: rotation vector of the camera in its frame, beside the nominal one
         camera_shift: array("WN", vec3)  # truth: of the camera in the body frame, beside the nominal place, m
+        camera_focal: array("WN", scalar)  # truth: its focal length is (1 + this) times the nominal one
+
+        clock: array("WN", wp.int32)  # truth: ticks by which a vehicle's clock is ahead
+        restart_tick: array("WN", wp.int32)  # before which its observer starts anew; -1: never
+        lie_tick: array("WN", wp.int32)  # from which on its messages are lies; -1: never
+        lie_vector: array("WN", vec3)  # of its lie, m or m/s, map
+        told_shift: array("WN", vec3)  # added to the position that it broadcasts at this tick, m, map
+        told_turn: array("WN", vec3)  # rotation vector by which the orientation that it broadcasts is turned
 
         odometry_velocity: array("WN", vec3)  # last sample, m/s
         odometry_angular_velocity: array("WN", vec3)  # last sample, rad/s
@@ -104,6 +112,7 @@ def state_struct(p: Precision) -> Any:
         inbox_rotation: array("WNN", mat33)  # per receiver and sender
         inbox_position: array("WNN", vec3)  # map
         inbox_tick: array("WNN", wp.int32)  # tick of sending; -1: never heard
+        inbox_stamp: array("WNN", wp.int32)  # the same as the receiver believes
 
         estimate_rotation: array("WN", mat33)  # Rhat
         estimate_position: array("WN", vec3)  # phat, in the body frame
@@ -122,7 +131,7 @@ def state_struct(p: Precision) -> Any:
     return State
 
 
-LASTING_ERRORS = ("odometry_scale", "gyro_bias", "slip", "camera_turn", "camera_shift")
+LASTING_ERRORS = ("odometry_scale", "gyro_bias", "slip", "camera_turn", "camera_shift", "camera_focal")
 """Fields with the true errors of a vehicle's sensors, see `coopenv.world.lasting_errors`."""
 
 VALID: dict[str, Rule] = {
@@ -159,6 +168,10 @@ VALID: dict[str, Rule] = {
     "outbox_tick": TICK,
     "inbox_rotation": ROTATION,
     "inbox_tick": TICK,
+    "inbox_stamp": TICK,
+    "clock": whole(-(10**8), 10**8),
+    "restart_tick": whole(-1, 2**31 - 1),
+    "lie_tick": whole(-1, 2**31 - 1),
     "estimate_rotation": ROTATION,
     "covariance": COVARIANCE,
     "corrected_tick": whole(0, "tick"),

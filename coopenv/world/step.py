@@ -12,6 +12,7 @@ import warp as wp
 
 from coopenv.world.command import decide
 from coopenv.world.embedded import Embedded, Now, Source, regular_tick
+from coopenv.world.faults import forget_everything
 from coopenv.world.launch import run_seldom
 from coopenv.world.quality import sample_gramian
 from coopenv.world.v2x import broadcast
@@ -87,6 +88,27 @@ def restart_kernel(source: Source, observer: Embedded) -> Kernel:
                 send(model, state, memory, world, vehicle, 0)
 
     return _named(restart, source.name, observer.name, **{**run_seldom(), **observer.options})
+
+
+@cache
+def revive_kernel(observer: Embedded) -> Kernel:
+    """Return the kernel that lets vehicles lose all and start anew; it runs before a decision, where any may."""
+    start = observer.start
+
+    def revive(model: Any, state: Any, memory: Any, hold: wp.array(dtype=wp.int32), ticks: int):
+        """Start the observers anew whose vehicle's restart falls into the next ticks. One thread per world."""
+        world = wp.tid()
+        if hold[world] == 0:
+            tick = state.tick[world]
+            for place in range(model.vehicles):
+                vehicle = model.order[place]
+                begun = state.restart_tick[world, vehicle]
+                if begun > tick and begun <= tick + ticks:
+                    state.restart_tick[world, vehicle] = tick + 1
+                    forget_everything(model, state, world, vehicle)
+                    start(model, state, memory, world, vehicle)
+
+    return _named(revive, observer.name, **{**run_seldom(), **observer.options})
 
 
 def decide_kernel(model: Any, state: Any, actions: wp.array3d(dtype=Any), hold: wp.array(dtype=wp.int32)):

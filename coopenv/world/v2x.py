@@ -4,6 +4,7 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.world.faults import alter, as_told, content_tick, stamp
 from coopenv.world.parameters import V2X_LOSS
 from coopenv.world.random import RADIO, pair, random_words, uniform
 
@@ -16,18 +17,30 @@ def broadcast(model: Any, state: Any, world: int, vehicle: int, tick: int):
     if tick % model.radio.period == 0 and state.present[world, model.landmarks + vehicle] != 0:
         sent = tick
         R = state.estimate_rotation[world, vehicle]
-        state.outbox_rotation[world, vehicle, slot] = R
-        state.outbox_position[world, vehicle, slot] = R * state.estimate_position[world, vehicle]
+        told_R, told = as_told(model, state, world, vehicle, R, R * state.estimate_position[world, vehicle])
+        state.outbox_rotation[world, vehicle, slot] = told_R
+        state.outbox_position[world, vehicle, slot] = told
     state.outbox_tick[world, vehicle, slot] = sent
 
 
 @wp.func
+def put_into_inbox(model: Any, state: Any, world: int, receiver: int, sender: int, sent: int, tick: int):
+    """Let a receiver hear at a tick what a sender put on the air at another one."""
+    slot = content_tick(model, state, world, sender, sent) % model.radio.slots
+    state.inbox_rotation[world, receiver, sender] = state.outbox_rotation[world, sender, slot]
+    state.inbox_position[world, receiver, sender] = state.outbox_position[world, sender, slot]
+    state.inbox_tick[world, receiver, sender] = sent
+    state.inbox_stamp[world, receiver, sender] = stamp(model, state, world, receiver, sender, sent, tick)
+
+
+@wp.func
 def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
-    """Receive what arrives at this tick from the neighbours that may be heard.
+    """Receive what arrives at this tick from the neighbours that may be heard, and decide what the own message says.
 
     With delay 0 a follower hears its leaders' estimates of this very tick; a sender later in the order than
     its receiver (possible only without the acyclic restriction) is heard one tick late.
     """
+    alter(model, state, world, receiver, tick)
     here = state.position[world, model.landmarks + receiver]
     for n in range(model.target_count[receiver]):
         sender = model.targets[receiver, n] - model.landmarks
@@ -48,15 +61,13 @@ def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
                     if uniform(words[0], loss) < loss:
                         heard = int(0)
                 if heard == 1:
-                    state.inbox_rotation[world, receiver, sender] = state.outbox_rotation[world, sender, slot]
-                    state.inbox_position[world, receiver, sender] = state.outbox_position[world, sender, slot]
-                    state.inbox_tick[world, receiver, sender] = due
+                    put_into_inbox(model, state, world, receiver, sender, due, tick)
 
 
 @wp.func
 def fresh(model: Any, state: Any, world: int, receiver: int, sender: int, tick: int) -> bool:
     """Return whether a message has been heard and is not older than the staleness limit."""
-    sent = state.inbox_tick[world, receiver, sender]
+    sent = state.inbox_stamp[world, receiver, sender]
     if sent < 0:
         return False
     return wp.float64(tick - sent) / model.camera_rate <= model.radio.staleness

@@ -11,6 +11,7 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.randomness import PARAMETERS
 from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
+from coopenv.world.faults import UNKNOWN
 from coopenv.world.launch import Launcher, PerWorld, default_threads
 from coopenv.world.model import mat66d
 from coopenv.world.parameters import NOT_SET
@@ -26,6 +27,7 @@ from coopenv.world.step import (
     deliver_kernel,
     finish_kernel,
     restart_kernel,
+    revive_kernel,
     sense_kernel,
 )
 
@@ -89,7 +91,8 @@ class World:
         self.state.difficulty.fill_(self.scenario.difficulty.number)
         N = self.model.vehicles
         covariance = np.zeros((N, 6, 6)) if start_covariance is None else np.ascontiguousarray(start_covariance)
-        self.model.start.covariance = wp.array(covariance, dtype=mat66d, device=self.device)
+        anew = np.concatenate([covariance, np.broadcast_to(UNKNOWN, (N, 6, 6))])
+        self.model.start.covariance = wp.array(anew, dtype=mat66d, device=self.device)
         self.memory = allocate(self.observer.memory, sizes, self.device)
         """What the embedded observer remembers besides the state."""
         self._record = self._build_record()
@@ -148,7 +151,10 @@ class World:
         self._run("restart", kernel, PerWorld(self.memory), self._record, PerWorld(self.mask))
 
     def advance(self, ticks: int) -> None:
-        """Run camera ticks under `self.actions`, stopping each world at its horizon."""
+        """Run camera ticks under `self.actions`, stopping each world at its horizon; of one decision at most."""
+        if self.model.restarts == 1:
+            waiting = [PerWorld(self.memory), PerWorld(self.mask), ticks]
+            self._run(("revive", ticks), revive_kernel(self.observer), *waiting)
         arguments = [PerWorld(self.memory), self._record, PerWorld(self.actions), PerWorld(self.mask), ticks]
         self._run(("advance", ticks), advance_kernel(self.source, self.observer), *arguments)
 

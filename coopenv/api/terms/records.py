@@ -245,7 +245,7 @@ def neighbour_record(model: Any, state: Any, world: int, vehicle: int, sender: i
         p = state.estimate_position[world, vehicle]
         neighbour.position = wp.vec3(Rt * state.inbox_position[world, vehicle, sender] - p)
         neighbour.rotation = wp.mat33(Rt * state.inbox_rotation[world, vehicle, sender])
-        neighbour.age = seconds_since(now, state.inbox_tick[world, vehicle, sender], model.camera_rate)
+        neighbour.age = seconds_since(now, state.inbox_stamp[world, vehicle, sender], model.camera_rate)
     target = model.landmarks + sender
     neighbour.bearing = wp.vec3(body_bearing(model, state, world, vehicle, target))
     neighbour.in_view = state.sight[world, vehicle, target] == VISIBLE

@@ -42,7 +42,7 @@ class ReplayWorld(SensingWorld):
         order = np.array(self._recording.order, dtype=np.int32)
         model.order = wp.array(order, dtype=wp.int32, device=self.device)
         model.rank = wp.array(np.argsort(order).astype(np.int32), dtype=wp.int32, device=self.device)
-        model.radio.slots = max(self._recording.flight, 1) + 1
+        model.radio.slots = max(self._recording.flight, 1) + 1 + self.scenario.replay_ticks
         return model
 
     def _build_record(self) -> Any:

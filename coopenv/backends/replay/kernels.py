@@ -20,13 +20,14 @@ from coopenv.world.camera import (
 )
 from coopenv.world.collision import depart, referee, touches_anything
 from coopenv.world.embedded import Source
+from coopenv.world.faults import alter, draw_faults
 from coopenv.world.parameters import COUNT as PARAMETER_COUNT
 from coopenv.world.parameters import draw_parameters
 from coopenv.world.precision import Precision
 from coopenv.world.presence import draw_presence
 from coopenv.world.records import array, fields
 from coopenv.world.reset import believe, place_agent, place_vehicle
-from coopenv.world.v2x import broadcast, deliver
+from coopenv.world.v2x import broadcast, deliver, put_into_inbox
 
 BY_RADIO = wp.constant(-2)
 """In place of the ticks of sending of messages that a receiver heard: the scenario's radio decides."""
@@ -59,6 +60,7 @@ def forget_errors(state: Any, world: int, vehicle: int):
     state.slip[world, vehicle] = type(state.slip[world, vehicle])(unknown[0], unknown[1])
     state.camera_turn[world, vehicle] = unknown
     state.camera_shift[world, vehicle] = unknown
+    state.camera_focal[world, vehicle] = unknown[0]
 
 
 @wp.func
@@ -122,13 +124,12 @@ def redeliver(model: Any, state: Any, record: Any, world: int, receiver: int, ti
     if record.inbox_tick[row, receiver, receiver] == BY_RADIO:
         deliver(model, state, world, receiver, tick)
         return
+    alter(model, state, world, receiver, tick)
     for sender in range(model.vehicles):
         sent = record.inbox_tick[row, receiver, sender]
         slot = wp.max(sent, 0) % model.radio.slots
         if sent > state.inbox_tick[world, receiver, sender] and state.outbox_tick[world, sender, slot] == sent:
-            state.inbox_rotation[world, receiver, sender] = state.outbox_rotation[world, sender, slot]
-            state.inbox_position[world, receiver, sender] = state.outbox_position[world, sender, slot]
-            state.inbox_tick[world, receiver, sender] = sent
+            put_into_inbox(model, state, world, receiver, sender, sent, tick)
 
 
 @wp.func
@@ -157,6 +158,7 @@ def rewind(model: Any, state: Any, record: Any, world: int):
     for vehicle in range(model.vehicles):
         place_vehicle(model, state, world, vehicle)
         forget_errors(state, world, vehicle)
+        draw_faults(model, state, world, vehicle)
         position = record.true_position[0, vehicle]
         if wp.isfinite(position[0]):
             recall_truth(model, state, record, world, vehicle, 0)

@@ -21,6 +21,7 @@ from coopenv.observers.robust.odometry import begin_errors, increment_noise, pro
 from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
 from coopenv.observers.robust.tracklets import bit_of
 from coopenv.observers.robust.update import resect, set_anchor, update
+from coopenv.world.faults import start_covariance
 
 BELIEVING, SEARCHING, FOUND = 0, 1, 2  # how a vehicle stands to its pose; found in the search at this tick
 
@@ -69,7 +70,7 @@ def make_start(clear_messages: Any, receive: Any) -> Any:
         memory.belief[world, i].others = 1
         begin_errors(model, memory, world, i)
         R = orthonormalise(mat33d(state.estimate_rotation[world, i]))
-        initial = Estimate(Pose(R, R * vec3d(state.estimate_position[world, i])), model.start.covariance[i])
+        initial = Estimate(Pose(R, R * vec3d(state.estimate_position[world, i])), start_covariance(model, state, world, i))
         restart_belief(model, memory, world, i, initial)
         memory.belief[world, i].odometry.R = wp.identity(3, wp.float64)
         set_anchor(memory, world, i, initial.P, 0)

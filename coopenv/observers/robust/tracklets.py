@@ -19,6 +19,7 @@ from coopenv.observers.robust.measurements import is_heard
 from coopenv.observers.robust.memory import Estimate, Pose, Report, mat66d, mat66f, vec3d
 from coopenv.observers.robust.odometry import increment_noise
 from coopenv.world.camera import VISIBLE
+from coopenv.world.faults import as_told, claimed_std, content_tick
 
 LEAST_TIME = constants.NEWS_TIME - constants.SAME_TIME
 
@@ -67,10 +68,22 @@ def clear_messages(model: Any, memory: Any, world: int, i: int):
 
 
 @wp.func
+def told_report(model: Any, state: Any, world: int, i: int, report: Report):
+    """Return a report as a vehicle broadcasts it, which may lie, see `[faults]`."""
+    R, p = as_told(model, state, world, i, report.pose.R, report.pose.p)
+    report.pose = Pose(R, p)
+    std = wp.float32(claimed_std(model, state, world, i, report.tick))
+    if std > wp.float32(0.0):
+        report.P = std * std * wp.identity(6, wp.float32)
+    return report
+
+
+@wp.func
 def send(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Send a report if one is due."""
     if tick % model.radio.period == 0:
-        memory.outbox[world, i, tick % model.radio.slots] = own_report(model, memory, world, i, tick)
+        report = told_report(model, state, world, i, own_report(model, memory, world, i, tick))
+        memory.outbox[world, i, tick % model.radio.slots] = report
 
 
 @wp.func
@@ -79,7 +92,7 @@ def arrived(state: Any, memory: Any, world: int, i: int, sender: int) -> int:
     if sender < 0:  # a landmark
         return -1
     sent = state.inbox_tick[world, i, sender]
-    return wp.where(sent != memory.inbox[world, i, sender].tick, sent, -1)
+    return wp.where(state.inbox_stamp[world, i, sender] != memory.inbox[world, i, sender].tick, sent, -1)
 
 
 @wp.func
@@ -89,7 +102,9 @@ def receive(model: Any, state: Any, memory: Any, world: int, i: int):
         sender = model.targets[i, n] - model.landmarks
         sent = arrived(state, memory, world, i, sender)
         if sent >= 0:
-            memory.inbox[world, i, sender] = memory.outbox[world, sender, sent % model.radio.slots]
+            slot = content_tick(model, state, world, sender, sent) % model.radio.slots
+            memory.inbox[world, i, sender] = memory.outbox[world, sender, slot]
+            memory.inbox[world, i, sender].tick = state.inbox_stamp[world, i, sender]
 
 
 @wp.func

@@ -12,7 +12,16 @@ from coopenv.observers.robust.constants import MAX_TOLD, SAME_TIME, SUPERSEDING_
 from coopenv.observers.robust.joint.matrices import AFTER, entry, factorise
 from coopenv.observers.robust.joint.memory import Contact, Joint, Told
 from coopenv.observers.robust.memory import Pose, mat66d, vec3d
-from coopenv.observers.robust.tracklets import arrived, bit_of, clear_messages, marker_jacobian, own_report, receive
+from coopenv.observers.robust.tracklets import (
+    arrived,
+    bit_of,
+    clear_messages,
+    marker_jacobian,
+    own_report,
+    receive,
+    told_report,
+)
+from coopenv.world.faults import claimed_std, content_tick
 
 MAX_AGE = SUPERSEDING_TIME + SAME_TIME
 
@@ -55,7 +64,8 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
     if tick % model.radio.period != 0:
         return
     slot = tick % model.radio.slots
-    report = own_report(model, memory, world, i, tick)
+    report = told_report(model, state, world, i, own_report(model, memory, world, i, tick))
+    claimed = wp.float64(claimed_std(model, state, world, i, tick))
     joint = Joint()
     others = memory.belief[world, i].others
     members = memory.belief[world, i].members - others + 1  # without the odometry's errors
@@ -71,6 +81,8 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
                     block = J * block
                 if b == 0:
                     block = block * wp.transpose(J)
+                if claimed > wp.float64(0.0) and (a == 0 or b == 0):
+                    block = wp.where(a == b, claimed * claimed, wp.float64(0.0)) * wp.identity(6, wp.float64)
                 memory.matrix[world, AFTER, a, b] = block
         if not factorise(memory, world, AFTER, 6 * count):
             report.valid = 0
@@ -95,11 +107,14 @@ def receive_joint(model: Any, state: Any, memory: Any, world: int, i: int):
         sender = model.targets[i, n] - model.landmarks
         sent = arrived(state, memory, world, i, sender)
         if sent >= 0:
-            slot = sent % model.radio.slots
+            content = content_tick(model, state, world, sender, sent)
+            slot = content % model.radio.slots
+            later = state.inbox_stamp[world, i, sender] - content
             joint = memory.outbox_joint[world, sender, slot]
             memory.inbox_joint[world, i, sender] = joint
             for k in range(joint.others):
                 memory.inbox_told[world, i, sender, k] = memory.outbox_told[world, sender, slot, k]
+                memory.inbox_told[world, i, sender, k].tick = memory.inbox_told[world, i, sender, k].tick + later
             size = 6 * (joint.others + 1)
             for k in range((size * (size + 1)) // 2):
                 memory.inbox_factor[world, i, sender, k] = memory.outbox_factor[world, sender, slot, k]
