@@ -10,6 +10,7 @@ from coopenv.backends.base import SensingWorld
 from coopenv.errors import CoopenvError
 from coopenv.observers.contract import Estimate
 from coopenv.observers.group import Group, ObserverError
+from coopenv.observers.interference import Interference, interference_of
 from coopenv.observers.recording import Sensed
 from coopenv.observers.registry import find
 from coopenv.observers.riccati_coordinates import riccati_covariance
@@ -50,7 +51,7 @@ class PlugIns:
             rotation = np.array(R[w], dtype=float)
             position = (rotation @ np.array(p[w], dtype=float)[..., None])[..., 0]
             try:
-                self.groups[w].start(rotation, position)
+                self.groups[w].start(rotation, position, self._interference(w, 0))
             except ObserverError as failure:
                 raise self._failed(failure) from failure.__cause__
 
@@ -102,9 +103,17 @@ class PlugIns:
         try:
             if vehicle is None:
                 return [answer.estimate for answer in group.update_all(sensed)]
-            return [group.update(vehicle, sensed, self._world.view("inbox_tick")[w, vehicle]).estimate]
+            interference = self._interference(w, sensed.index)
+            if interference is not None and interference.restarts[vehicle]:
+                for heard in ("inbox_tick", "inbox_stamp"):
+                    self._world.view(heard)[w, vehicle] = -1
+            inbox_tick = self._world.view("inbox_tick")[w, vehicle]
+            return [group.update(vehicle, sensed, inbox_tick, interference).estimate]
         except ObserverError as failure:
             raise self._failed(failure) from failure.__cause__
+
+    def _interference(self, w: int, k: int) -> Interference | None:
+        return interference_of(self._world.scenario, self._world.model, self._world.view, w, k)
 
     def _failed(self, failure: ObserverError) -> CoopenvError:
         """Return the error, and remember it for the worlds that were in this tick: it has no end."""

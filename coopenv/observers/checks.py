@@ -18,6 +18,9 @@ MOST_BENT = 1e-6  # by how much entries of R^T R may differ from those of I
 MOST_LOPSIDED = 1e-6  # by how much P and its transpose may differ, relative to P, in Frobenius' norm
 MOST_NEGATIVE = 1e-9  # how far below zero an eigenvalue of P may lie, relative to the largest one
 
+FARTHEST = 1e8  # m, of a plausible position: the earth is smaller
+LEAST_VARIANCE, LARGEST_VARIANCE = 1e-16, 1e12  # rad^2 and m^2, of a plausible covariance
+
 POSITION, ROTATION, COVARIANCE = (3,), (3, 3), (6, 6)
 SENT_COVARIANCES = (ROTATION, COVARIANCE)  # shapes: of the marker's position, or of the whole pose
 
@@ -47,6 +50,28 @@ def check_message(message: Message) -> None:
     for name, value in message.extra.items():
         if np.asarray(value).dtype.kind not in "biufc":
             raise CoopenvError(f"message: extra '{name}' is no array of numbers")
+
+
+def check_received(message: Message, planar: bool = False) -> None:
+    """Refuse what a receiver must not work with, with a CoopenvError: whoever sent it may be broken, or hostile.
+
+    Besides what no message may be: a rotation that is none, a covariance that is not positive definite or of no
+    plausible size, and anything that is not finite. Robots on a plane know their height: theirs may be semidefinite.
+    """
+    check_message(message)
+    if message.position is not None and np.abs(message.position).max() > FARTHEST:
+        raise CoopenvError(f"message: position beyond {FARTHEST:g} m")
+    if message.rotation is not None:
+        _check_rotation(np.asarray(message.rotation, dtype=np.float64))
+    if message.covariance is not None:
+        P = np.asarray(message.covariance, dtype=np.float64)
+        _check_covariance(P)
+        variances = P.diagonal()
+        if variances.max() > LARGEST_VARIANCE or (not planar and (dpotrf(P)[1] or variances.min() < LEAST_VARIANCE)):
+            raise CoopenvError("message: covariance is not positive definite, or not plausible")
+    for name, value in message.extra.items():
+        if not np.isfinite(value).all():
+            raise CoopenvError(f"message: extra '{name}' is not finite")
 
 
 def _are_bounded(values: NDArray[Any], largest: float) -> bool:
@@ -80,11 +105,9 @@ def _check_covariance(P: Array) -> None:
     lopsided = P - P.T
     if np.vdot(lopsided, lopsided) > MOST_LOPSIDED**2 * np.vdot(P, P):
         raise CoopenvError("covariance is not symmetric")
-    if dpotrf(P)[1] == 0 or dpotrf(P + MOST_NEGATIVE * P.diagonal().max() * _IDENTITY)[1] == 0:
+    if dpotrf(P)[1] == 0 or dpotrf(P + MOST_NEGATIVE * P.diagonal().max() * np.eye(len(P)))[1] == 0:
         return  # the second one for those that are singular, as robots' on a plane are
     eigenvalues = np.linalg.eigvalsh(P)
     if eigenvalues[0] < -MOST_NEGATIVE * eigenvalues[-1]:
         raise CoopenvError("covariance is not positive semidefinite")
 
-
-_IDENTITY = np.eye(6)

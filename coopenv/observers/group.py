@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from time import perf_counter
 from typing import Any, NamedTuple, Protocol
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from coopenv.errors import CoopenvError, told
@@ -15,8 +16,10 @@ from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.observers.checks import check_estimate, check_message
 from coopenv.observers.contract import Estimate, Factory, JointObserver, Message, Observer
+from coopenv.observers.interference import Interference
 from coopenv.observers.mailbox import Mailbox
 from coopenv.observers.recording import Briefing, Sensed
+from coopenv.world.faults import UNKNOWN
 
 
 class ObserverError(CoopenvError):
@@ -53,7 +56,7 @@ class Group:
         self.factory, self.briefing, self.tamper = factory, briefing, tamper
         self.joint = bool(getattr(factory, "joint", False))
 
-    def start(self, rotation: Array, position: Array) -> None:
+    def start(self, rotation: Array, position: Array, interference: Interference | None = None) -> None:
         """Build the observers and start them at poses (N, 3, 3) and (N, 3), map frame, m."""
         setups = self.briefing.setups
         self.mail = Mailbox(self.briefing)
@@ -74,19 +77,24 @@ class Group:
                 self.observers[i].reset(poses[i], covariances[i])
                 message = self.observers[i].message()
                 check_message(message)
-                self.mail.post(i, 0, message)
+                self._post(i, 0, message, interference, None)
             except ANYTHING as error:
                 raise self._blamed(error, 0, i) from error
 
-    def update(self, vehicle: int, sensed: Sensed, inbox_tick: ArrayLike) -> Answer:
+    def update(
+        self, vehicle: int, sensed: Sensed, inbox_tick: ArrayLike, interference: Interference | None = None
+    ) -> Answer:
         """Let one vehicle's observer take a tick; vehicles come in the order of the briefing.
 
-        `inbox_tick` is as for `Mailbox.inbox`.
+        `inbox_tick` is as for `Mailbox.inbox`; `interference` is what the world's faults do at this tick.
         """
-        k = sensed.index
+        k, clock = sensed.index, None if interference is None else interference.clock
         try:
+            if interference is not None and interference.restarts[vehicle]:
+                self._restart(vehicle, sensed)
             observer = self.observers[vehicle]
-            tick = sensed.tick(self.briefing.setups[vehicle], self.mail.inbox(k, vehicle, inbox_tick, sensed.messages))
+            heard = self.mail.inbox(k, vehicle, inbox_tick, sensed.messages, clock)
+            tick = sensed.tick(self.briefing.setups[vehicle], heard)
             begin = perf_counter()
             estimate = observer.update(tick)
             message = observer.message() if k % self.briefing.period == 0 else None
@@ -94,12 +102,30 @@ class Group:
             self._check(estimate)
             if message is not None:
                 check_message(message)
-                if self.tamper is not None and self.tamper.applies(vehicle, tick.time):
-                    message = self.tamper.told(observer, message)
-                self.mail.post(vehicle, k, message)
+                self._post(vehicle, k, message, interference, self.tamper)
         except ANYTHING as error:
             raise self._blamed(error, k, vehicle) from error
         return Answer(estimate, elapsed)
+
+    def _restart(self, vehicle: int, sensed: Sensed) -> None:
+        """Let a vehicle's observer lose all and start anew, knowing nothing but that it is about the landmarks."""
+        middle = sensed.landmarks.mean(axis=0) if len(sensed.landmarks) else np.zeros(3)
+        self.observers[vehicle] = self.factory(self.briefing.setups[vehicle])
+        self.observers[vehicle].reset((np.eye(3), middle), UNKNOWN.copy())
+        self.mail.forget(vehicle)
+
+    def _post(
+        self, vehicle: int, k: int, message: Message, interference: Interference | None, tamper: Tamper | None
+    ) -> None:
+        """Send a message, or what the world's faults and whoever tampers with it make of it."""
+        observer, replay, kept = self.observers[vehicle], 0, 0
+        self.mail.expect_as(vehicle, message)
+        if interference is not None:
+            message = interference.told(observer, vehicle, message)
+            replay, kept = int(interference.replay[vehicle]), int(interference.kept[vehicle])
+        if tamper is not None and tamper.applies(vehicle, k * self.briefing.dt):
+            message = tamper.told(observer, message)
+        self.mail.post(vehicle, k, message, replay, kept)
 
     def update_all(self, sensed: Sensed) -> list[Answer]:
         """Let a joint observer take a tick of every vehicle."""

@@ -1,18 +1,34 @@
-"""Messages between the plug-in observers of one world: contents on the host, delivery as the radio decided."""
+"""Messages between the plug-in observers of one world: contents on the host, delivery as the radio decided.
+
+Whoever receives a message checks it: what is none is refused, counted, and as if it had been lost.
+"""
 
 from collections.abc import Mapping
 from operator import index
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
-from coopenv.observers.checks import check_message
+from coopenv.observers.checks import check_message, check_received
 from coopenv.observers.contract import Message, Received
 from coopenv.observers.recording import Briefing, sealed
+
+MOST_CONTENTS = 100_000  # bytes of a message
+
+
+class Heard(NamedTuple):
+    """The last message of a sender that reached a receiver."""
+
+    sent: int
+    """Tick of sending."""
+    message: Message | None
+    """The last one that was sound; None: there was none."""
+    stamp: int
+    """Tick at which that one was sent, as the receiver believes."""
 
 
 class Mailbox:
@@ -20,22 +36,41 @@ class Mailbox:
 
     def __init__(self, briefing: Briefing) -> None:
         self.briefing = briefing
-        self.sent: list[dict[int, Message]] = [{} for _ in briefing.setups]
-        """Per sender: tick of sending to message, of those that may still be under way."""
-        self.heard: list[dict[int, tuple[int, Message]]] = [{} for _ in briefing.setups]
-        """Per receiver: sender to the last message that arrived, with its tick of sending."""
+        self.sent: list[dict[int, Message | None]] = [{} for _ in briefing.setups]
+        """Per sender: tick of sending to message, of those that may still be under way; None: it is no message."""
+        self.said: list[dict[int, Message]] = [{} for _ in briefing.setups]
+        """Per sender that may replay: tick to what it had to say."""
+        self.heard: list[dict[int, Heard]] = [{} for _ in briefing.setups]
+        """Per receiver: sender to what was heard last."""
         self.bytes = np.zeros(len(briefing.setups))
+        self.refused = np.zeros(len(briefing.setups), dtype=np.int64)
+        """Per receiver: messages that were none."""
+        self.forms: dict[int, tuple[int, ...]] = {}
+        """Per vehicle: the shape of the covariances that it sends itself, in which it expects those of others."""
         self._senders = [[int(t) for t in setup.targets if t >= setup.landmarks] for setup in briefing.setups]
         """Per receiver: the targets that are vehicles."""
 
-    def post(self, vehicle: int, k: int, message: Message) -> None:
-        """Send one message; that of the start is heard but not counted."""
-        sent = self.sent[vehicle]
-        sent[k] = _copied(message)
+    def expect_as(self, vehicle: int, message: Message) -> None:
+        """Let a vehicle expect of others covariances of the shape that it has itself."""
+        if message.covariance is not None:
+            self.forms[vehicle] = np.shape(message.covariance)
+
+    def post(self, vehicle: int, k: int, message: Message, replay: int = 0, kept: int = 0) -> None:
+        """Send one message; that of the start is heard but not counted.
+
+        One that is a replay is in truth the one of so many ticks before; for that it is kept for so many.
+        """
+        sent, said = self.sent[vehicle], self.said[vehicle]
+        if kept > 0:
+            said[k] = message
+            message = said.get(max(k - replay, 0), message)
+            while (oldest := next(iter(said))) < k - kept:
+                del said[oldest]
+        sent[k] = self._sound(vehicle, message)
         while (oldest := next(iter(sent))) < k - self.briefing.flight - 1:
             del sent[oldest]
         if k > 0:
-            self.bytes[vehicle] += message.size_bytes
+            self.bytes[vehicle] += _size(message)
 
     def inbox(
         self,
@@ -43,45 +78,97 @@ class Mailbox:
         vehicle: int,
         inbox_tick: ArrayLike,
         arrived: Mapping[tuple[int, int], Received] = MappingProxyType({}),
+        clock: ArrayLike | None = None,
     ) -> dict[int, Received]:
         """Return what a vehicle has heard by tick k, by target, without what is stale.
 
         `inbox_tick` (N,) says when the last message was sent that the radio delivered of each sender, -1: none;
-        `arrived` is what came at this tick from vehicles that are estimated elsewhere, see `Sensed.messages`.
+        `arrived` is what came at this tick from vehicles that are estimated elsewhere, see `Sensed.messages`; `clock`
+        (N,) is by how many ticks vehicles' clocks are ahead.
         """
         b, landmarks, heard = self.briefing, self.briefing.setups[vehicle].landmarks, self.heard[vehicle]
         ticks, received = np.asarray(inbox_tick).tolist(), {}
+        ahead = None if clock is None else np.asarray(clock).tolist()
         for target in self._senders[vehicle]:
             sender = target - landmarks
-            sent = ticks[sender]
+            sent, last = ticks[sender], heard.get(sender)
             if (vehicle, sender) in arrived:
-                heard[sender] = (sent, _copied(arrived[vehicle, sender].message))
-            elif sent in self.sent[sender] and (sender not in heard or heard[sender][0] != sent):
-                heard[sender] = (sent, self.sent[sender][sent])
-            age = (k - sent) * b.dt
-            if sent >= 0 and age <= b.staleness and sender in heard and heard[sender][0] == sent:
-                received[target] = Received(heard[sender][1], age)
+                self._hear(vehicle, sender, sent, self._sound(sender, arrived[vehicle, sender].message), sent)
+            elif sent in self.sent[sender] and (last is None or last.sent != sent):
+                stamp = sent if ahead is None else min(max(sent + ahead[sender] - ahead[vehicle], 0), k)
+                self._hear(vehicle, sender, sent, self.sent[sender][sent], stamp)
+            last = heard.get(sender)
+            if last is not None and last.message is not None and last.sent == sent >= 0:
+                age = (k - last.stamp) * b.dt
+                if age <= b.staleness:
+                    received[target] = Received(last.message, age)
         return received
+
+    def forget(self, vehicle: int) -> None:
+        """Let a vehicle lose what it has heard."""
+        self.heard[vehicle].clear()
+
+    def _hear(self, vehicle: int, sender: int, sent: int, message: Message | None, stamp: int) -> None:
+        """Take a message that has reached a vehicle, or refuse it: then the last one stays."""
+        heard = self.heard[vehicle]
+        if message is not None and self._fits(vehicle, message):
+            heard[sender] = Heard(sent, message, stamp)
+            return
+        self.refused[vehicle] += 1
+        last = heard.get(sender)
+        heard[sender] = Heard(sent, None, stamp) if last is None else last._replace(sent=sent)
+
+    def _fits(self, vehicle: int, message: Message) -> bool:
+        """Return whether a message's covariance, if it has one, is what the receiver expects."""
+        P, form = message.covariance, self.forms.get(vehicle)
+        return P is None or form is None or P.shape == form
+
+    def _sound(self, sender: int, message: Any) -> Message | None:
+        """Return a copy of a message that nobody can change, the sender included; None where it is no message."""
+        try:
+            if _size(message) > MOST_CONTENTS:
+                return None
+            copied = _copied(message)
+            check_received(copied, self.briefing.setups[sender].planar)
+        except (CoopenvError, ValueError, TypeError, ArithmeticError, LookupError, AttributeError):
+            return None
+        return copied
 
     def get_state(self) -> dict[str, Any]:
         """Return what has been sent and heard."""
-        return {"sent": self.sent, "heard": self.heard, "bytes": self.bytes}
+        heard = [{sender: tuple(last) for sender, last in of_receiver.items()} for of_receiver in self.heard]
+        counts = {"bytes": self.bytes, "refused": self.refused}
+        return {"sent": self.sent, "said": self.said, "heard": heard, **counts}
 
     def set_state(self, state: Any) -> None:
         """Take over what `get_state` returned, so that nobody can change it; anything else raises what it raises."""
         senders = range(len(self.briefing.setups))
         sent, heard, count = state["sent"], state["heard"], np.asarray(state["bytes"], np.float64)
-        if not (len(sent) == len(heard) == len(senders) == len(count)) or not np.isfinite(count).all():
+        refused = np.asarray(state["refused"], np.int64)
+        said = [{index(k): _checked(message) or Message() for k, message in own.items()} for own in state["said"]]
+        lengths = {len(sent), len(said), len(heard), len(count), len(refused)}
+        if lengths != {len(senders)} or not np.isfinite(count).all():
             raise CoopenvError("not one mailbox per vehicle")
+        self.said = said
         self.sent = [{index(k): _checked(message) for k, message in of_sender.items()} for of_sender in sent]
         self.heard = [
-            {senders[j]: (index(k), _checked(message)) for j, (k, message) in of_receiver.items()}
-            for of_receiver in heard
+            {senders[j]: Heard(index(k), _checked(message), index(stamp)) for j, (k, message, stamp) in of_one.items()}
+            for of_one in heard
         ]
-        self.bytes = count
+        self.bytes, self.refused = count, refused
 
 
-def _checked(message: Message) -> Message:
+def _size(message: Any) -> int:
+    """Return the bytes of a message; of what is none something."""
+    try:
+        return int(message.size_bytes)
+    except (ValueError, TypeError, AttributeError):
+        return 0
+
+
+def _checked(message: Message | None) -> Message | None:
+    if message is None:
+        return None
     check_message(message)
     for array in (message.position, message.rotation, message.covariance, *message.extra.values()):
         if array is not None:

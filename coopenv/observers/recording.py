@@ -11,6 +11,7 @@ from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Received, Setup, Tick
 
 if TYPE_CHECKING:
+    from coopenv.observers.interference import Interference
     from coopenv.scenario import Scenario
 
 
@@ -139,6 +140,7 @@ class Recording:
     pan: Array | None = None  # (K, N) rad, by which cameras were turned to the left; None: never
     scenario: "Scenario | None" = None  # the world that was recorded; None for recorded robots
     drawn: Drawn | None = None  # None: not simulated
+    interference: "Interference | None" = None  # of the world's faults with messages and observers; None: there is none
 
     @property
     def ticks(self) -> int:

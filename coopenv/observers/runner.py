@@ -42,6 +42,7 @@ class Run:
     nis_dof: NDArray[np.int64]  # (K, N)
     bytes_per_second: Array  # (N,) sent, payload
     microseconds_per_update: Array  # (N,) median, message included; a joint observer's time is shared out
+    refused: NDArray[np.int64]  # (N,) messages that were none, per receiver
     failure: str = ""  # who failed, when and why; empty where nobody did
 
     def position_rmse(self, after: float = 0.0) -> Array:
@@ -69,7 +70,8 @@ class Run:
 def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = None) -> Run:
     """Run an observer, by name or class, for all vehicles on a record.
 
-    An observer that raises or returns something that is not finite ends its run: `Run.failure` says who, when and why.
+    What it receives is checked, and what is no message counts as lost, so that none can end a run. An observer that
+    raises or returns something that is not finite ends its run: `Run.failure` says who, when and why.
 
     Args:
         observer: name or factory.
@@ -85,7 +87,7 @@ def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = N
     R, p, P = (np.full((*shape, *of), np.nan) for of in ((3, 3), (3,), (6, 6)))
     nis, nis_dof, elapsed = np.full(shape, np.nan), np.zeros(shape, np.int64), np.full(shape, np.nan)
     try:
-        group.start(r.start_rotation, r.start_position)
+        group.start(r.start_rotation, r.start_position, None if r.interference is None else r.interference.at(0))
         R[0], p[0] = r.start_rotation, r.start_position
         for k, i, (estimate, seconds) in _play(group, r):
             R[k, i], p[k, i], elapsed[k, i] = estimate.rotation, estimate.position, seconds
@@ -114,6 +116,7 @@ def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = N
         nis_dof=nis_dof,
         bytes_per_second=group.mail.bytes / max(r.dt, (r.ticks - 1) * r.dt),
         microseconds_per_update=np.array([1e6 * float(np.median(c)) if len(c) else np.nan for c in timed]),
+        refused=group.mail.refused,
         failure=failure,
     )
 
@@ -122,12 +125,13 @@ def _play(group: Group, recording: Recording) -> Iterator[tuple[int, int, Answer
     """Run the observers over a record, yielding (tick, vehicle, answer) after each update."""
     for k in range(1, recording.ticks):
         sensed = recording.at(k)
+        faults = None if recording.interference is None else recording.interference.at(k)
         if group.joint:
             for i, answer in enumerate(group.update_all(sensed)):
                 yield k, i, answer
         else:
             for i in recording.order:
-                yield k, i, group.update(i, sensed, recording.inbox_tick[k, i])
+                yield k, i, group.update(i, sensed, recording.inbox_tick[k, i], faults)
 
 
 def _errors(

@@ -7,6 +7,7 @@ import numpy as np
 from coopenv.api.engine import Engine
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import simulation_of
+from coopenv.observers.interference import Interference, interference_of, stacked
 from coopenv.observers.recording import Drawn, Recording, Sensed, Truth, is_due
 from coopenv.policies import Policy, load_policy
 from coopenv.runs.episode import Views, play
@@ -38,6 +39,7 @@ def record(
     engine = Engine(scenario, 1, "float64", backend=backend)
     views = Views(engine, ("rotation", "position", "estimate_rotation", "estimate_position", "inbox_tick"))
     ticks: list[Sensed] = []
+    faults: list[Interference | None] = []
     drawn = None
     for k in play(engine, [seed], scenario.horizon_ticks, driver if scenario.driven else None):
         views.take()
@@ -45,6 +47,7 @@ def record(
             key, episode, parameters = (engine.view(name)[0].tolist() for name in ("seed", "episode", "parameter"))
             drawn = Drawn(key, episode, tuple(parameters))
         ticks.append(engine.world.sensed(0, k))
+        faults.append(interference_of(scenario, engine.world.model, engine.view, 0, k))
         on_progress(k / scenario.horizon_ticks)
     L, briefing = len(scenario.landmarks), engine.world.briefing
     names = SENSED if scenario.action.pan is None else (*SENSED, "pan")
@@ -66,5 +69,6 @@ def record(
         truth=Truth(views["rotation"][:, 0, L:], views["position"][:, 0, L:]),
         scenario=scenario,
         drawn=drawn,
+        interference=stacked(faults),
         **kept,
     )

@@ -188,7 +188,7 @@ def forget_everything(model: Any, state: Any, world: int, vehicle: int):
     state.estimate_position[world, vehicle] = middle
     none = i3 - i3
     state.covariance[world, vehicle] = join6(model.observer.p1 * i3, none, none, model.observer.p2 * i3)
-    state.corrected_tick[world, vehicle] = 0
+    state.corrected_tick[world, vehicle] = state.tick[world]
     state.nis_dof[world, vehicle] = 0
     for sender in range(model.vehicles):
         state.inbox_tick[world, vehicle, sender] = -1
