@@ -25,12 +25,18 @@ def broadcast(model: Any, state: Any, world: int, vehicle: int, tick: int):
 
 @wp.func
 def put_into_inbox(model: Any, state: Any, world: int, receiver: int, sender: int, sent: int, tick: int):
-    """Let a receiver hear at a tick what a sender put on the air at another one."""
+    """Let a receiver hear at a tick what a sender put on the air at another one, unless it has heard something newer.
+
+    By clocks that are off it may seem so.
+    """
+    believed = stamp(model, state, world, receiver, sender, sent, tick)
+    if model.clocks == 1 and believed <= state.inbox_stamp[world, receiver, sender]:
+        return
     slot = content_tick(model, state, world, sender, sent) % model.radio.slots
     state.inbox_rotation[world, receiver, sender] = state.outbox_rotation[world, sender, slot]
     state.inbox_position[world, receiver, sender] = state.outbox_position[world, sender, slot]
     state.inbox_tick[world, receiver, sender] = sent
-    state.inbox_stamp[world, receiver, sender] = stamp(model, state, world, receiver, sender, sent, tick)
+    state.inbox_stamp[world, receiver, sender] = believed
 
 
 @wp.func
