@@ -55,6 +55,19 @@ def bench_observers(
             help="Names of variants with commas between, or `all`: faults of an environment, what recorded robots see."
         ),
     ] = None,
+    faults: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--fault",
+            metavar="NAME=VALUE[@VEHICLE][,OPTION=VALUE]",
+            help="One more variant, with a fault that has parameters (see `coopenv list variants`), e.g. gyro_bias=0.01 or "
+            "lie=drift:0.05@vehicle_2,from=10; several vehicles with : between, several faults with +. Repeatable.",
+        ),
+    ] = None,
+    policy: Annotated[
+        str | None,
+        typer.Option("--policy", help="Agent or policy that drives in the records.", autocompletion=complete.policies),
+    ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 5,
     first: First = 0,
     jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes (default: one per core).")] = None,
@@ -93,7 +106,19 @@ def bench_observers(
     with options.warned():
         changes, numbers = options.parse_overrides(overrides), range(first, first + seeds)
         request = request_of(
-            source, observers, variants, numbers, steady_from, basin, data, changes, overrides or (), topics, windows
+            source,
+            observers,
+            variants,
+            numbers,
+            steady_from,
+            basin,
+            data,
+            changes,
+            overrides or (),
+            topics,
+            faults or (),
+            policy,
+            windows,
         )
         request.plan.source.check()
     perform(request, find_executor(engine, jobs, address), out, figures, printed, log, as_json)

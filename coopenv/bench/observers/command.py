@@ -1,5 +1,6 @@
 """`coopenv bench observers`: from what the user asked for to tables and files."""
 
+import re
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
@@ -49,6 +50,8 @@ def request_of(
     overrides: Mapping[str, Any],
     assignments: Sequence[str],
     topics: Path | None = None,
+    faults: Sequence[str] = (),
+    policy: str | None = None,
     windows: str | None = None,
 ) -> Request:
     """Return the request behind the options of the command line, `overrides` being `assignments` as they are read.
@@ -56,7 +59,7 @@ def request_of(
     Raises:
         CoopenvError: something of it does not exist.
     """
-    source = find_source(text, overrides, data, topics)
+    source = find_source(text, overrides, data, topics, faults, policy)
     given = list(dict.fromkeys(word.strip() for word in observers.split(","))) if observers else None
     plan = Plan.of(source, given, variants, seeds, steady_from, windows)
     if basin:
@@ -65,7 +68,10 @@ def request_of(
     if variants is not None and variants.strip() == ALL:
         left_out |= {name: source.obstacle(name) for name in source.variants}
     words = ["coopenv", "bench", "observers", text, "--observers", ",".join(given or plan.observers)]
-    words += ["--variants", ",".join(plan.variants), "--seeds", str(len(seeds))]
+    added = {variant.name for variant in source.added}
+    words += ["--variants", ",".join(name for name in plan.variants if name not in added), "--seeds", str(len(seeds))]
+    words += [word for name in plan.variants if name in added for word in ("--fault", name)]
+    words += [] if policy is None else ["--policy", policy]
     words += ["--first", str(seeds[0])] if seeds[0] else []
     words += [] if steady_from is None else ["--steady-from", f"{steady_from:g}"]
     words += [] if windows is None else ["--windows", windows]
@@ -156,8 +162,13 @@ def figure_files(variants: Sequence[str], form: str | None) -> dict[str, tuple[s
         return {}
     if form not in FORMATS:
         raise CoopenvError(f"--figures {form}: known are {', '.join(FORMATS)}")
-    drawn = {f"{kind}-{v}.{form}": (kind, v) for v in variants for kind in ("errors", "consistency")}
+    drawn = {f"{kind}-{_as_file(v)}.{form}": (kind, v) for v in variants for kind in ("errors", "consistency")}
     return drawn | {f"{kind}.{form}": (kind, variants[0]) for kind in ("cost", "variants")}
+
+
+def _as_file(variant: str) -> str:
+    """Return a variant's name as part of a file's name on any system."""
+    return re.sub(r"[^A-Za-z0-9._+=-]", "_", variant)
 
 
 def write_files(found: Found, command: str, out: Path, figures: Mapping[str, tuple[str, str]]) -> None:

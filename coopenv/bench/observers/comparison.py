@@ -145,6 +145,8 @@ def compare(
     windows: Sequence[float] | None = None,
     data: str | Path | None = None,
     topics: str | Path | None = None,
+    faults: Sequence[str] = (),
+    policy: str | None = None,
     jobs: int = 1,
 ) -> Comparison:
     """Compare observers on the same records.
@@ -162,15 +164,16 @@ def compare(
             robots none.
         data: folder of recorded data sets; None: what COOPENV_DATA says.
         topics: TOML file that says what the topics of a ROS bag are.
+        faults: further variants with parameters, such as "lie=drift:0.05@vehicle_2,from=10", see docs/observers.md.
+        policy: agent or policy that drives in the records of an environment; None: action zero.
         jobs: processes. More than one need a script whose own work stands below `if __name__ == "__main__":`, and
             classes that a module or file holds.
 
     Raises:
         CoopenvError: an argument is not valid, or names what does not exist.
     """
-    source = find_source(
-        str(environment), overrides, *(None if path is None else Path(path) for path in (data, topics))
-    )
+    paths = (None if path is None else Path(path) for path in (data, topics))
+    source = find_source(str(environment), overrides, *paths, faults, policy)
     source.check()
     plan = Plan.of(source, observers, variants, seeds, steady_from, windows)
     with Progress(Console(stderr=True), plan.work, total=1.0) as progress:

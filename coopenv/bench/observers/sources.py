@@ -6,17 +6,20 @@ A source is small and picklable, so that a worker process makes the record itsel
 import math
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import Kind, is_bag, kind_of, open_backend, open_recording
-from coopenv.bench.observers.faults import FAULTS, NOMINAL, Lie, followers
+from coopenv.bench.observers.fault_knobs import KNOBS
+from coopenv.bench.observers.fault_variants import FaultVariant, check_recorded, overrides_of, variants_with
+from coopenv.bench.observers.faults import FAULTS, NOMINAL, Fault, Lie, followers
 from coopenv.errors import CoopenvError, DataWarning, suggest
 from coopenv.estimation.metrics import STEADY_SHARE, steady_start
 from coopenv.observers.recording import Recording
+from coopenv.policies import load_policy
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.topology import neighbour_sets
@@ -34,12 +37,23 @@ class Source(ABC):
 
     name: str
     """As it stands in the rows."""
-    variants: ClassVar[Mapping[str, str]] = {name: fault.summary for name, fault in FAULTS.items()}
-    """All there are, each with what it is."""
+    added: tuple[FaultVariant, ...] = field(default=(), kw_only=True)
+    """Variants with faults that have parameters."""
+    named: ClassVar[Mapping[str, str]] = {name: fault.summary for name, fault in FAULTS.items()}
+    """The others, each with what it is."""
     usual: ClassVar[tuple[str, ...]] = (NOMINAL,)
     """Those that are run unless others are asked for."""
     seeded: ClassVar[bool] = False
     """Whether another seed gives another record."""
+
+    @property
+    def variants(self) -> dict[str, str]:
+        """All variants there are, each with what it is."""
+        return {**self.named, **{variant.name: variant.summary for variant in self.added}}
+
+    def fault(self, variant: str) -> Fault | FaultVariant:
+        """Return what a variant does."""
+        return {**FAULTS, **{made.name: made for made in self.added}}[variant]
 
     @property
     def planar(self) -> bool:
@@ -79,15 +93,19 @@ class Simulated(Source):
     """A scenario, once per seed, as it is and with faults."""
 
     scenario: Scenario
+    policy: str = "zero"
+    """Who drives the driven vehicles, as for `coopenv.runs.recorder.record`."""
     seeded: ClassVar[bool] = True
 
     def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
         """Return the world of a seed with a fault."""
-        return FAULTS[variant].applied(record(self.scenario, seed), seed)
+        fault = self.fault(variant)
+        own = fault.scenario if isinstance(fault, FaultVariant) else None
+        return fault.applied(record(own or self.scenario, seed, self.policy), seed)
 
     def obstacle(self, variant: str) -> str:
         """Return why no vehicle can lie to another, where that is so."""
-        return _nobody_follows(self.scenario) if FAULTS[variant].lies else ""
+        return _nobody_follows(self.scenario) if self.fault(variant).lies else ""
 
     def steady_from(self, given: float | None, recording: Recording | None = None) -> float:
         """Return when the steady state starts, s."""
@@ -100,12 +118,12 @@ class Robots(Source):
 
     data: Path | None
     """The folder with the data; None: as the environment variable COOPENV_DATA says."""
-    variants: ClassVar[Mapping[str, str]] = {
+    named: ClassVar[Mapping[str, str]] = {
         "landmarks": "no robot sees another",
         "landmarks+robots": "everything that was seen counts",
         "blind": "robots 3 to 5 see no landmark",
     }
-    usual: ClassVar[tuple[str, ...]] = tuple(variants)
+    usual: ClassVar[tuple[str, ...]] = tuple(named)
 
     @property
     def planar(self) -> bool:
@@ -136,13 +154,18 @@ class LogFile(Source):
 
     def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
         """Return the file's record with a fault."""
-        return FAULTS[variant].applied(open_recording(self.path), seed)
+        return self.fault(variant).applied(open_recording(self.path), seed)
 
     def obstacle(self, variant: str) -> str:
         """Return why no vehicle can lie to another, where that is so."""
         recording = open_recording(self.path)
         followed = any(followers(recording, i) for i in recording.order)
-        return NOBODY_FOLLOWS if FAULTS[variant].lies and not followed else ""
+        return NOBODY_FOLLOWS if self.fault(variant).lies and not followed else ""
+
+    def check(self) -> None:
+        """Read the file once."""
+        for variant in self.added:
+            check_recorded(variant, open_recording(self.path))
 
 
 @dataclass(frozen=True)
@@ -158,11 +181,14 @@ class Bags(Source):
         """Return the bag as a record, with a fault."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DataWarning)  # `check` has told
-            return FAULTS[variant].applied(record(self._backend(), seed), seed)
+            recording = record(self._backend(), seed)
+        for made in self.added:
+            check_recorded(made, recording)
+        return self.fault(variant).applied(recording, seed)
 
     def obstacle(self, variant: str) -> str:
         """Return why no vehicle can lie to another, where that is so."""
-        return "" if not FAULTS[variant].lies else _nobody_follows(self._backend().scenario)
+        return "" if not self.fault(variant).lies else _nobody_follows(self._backend().scenario)
 
     def check(self) -> None:
         """Read the bag once."""
@@ -180,7 +206,8 @@ def _nobody_follows(scenario: Scenario) -> str:
 
 def variant_rows() -> list[dict[str, str]]:
     """Return what `list variants` says of every variant."""
-    kinds = {"environments, logs": Source.variants, "recorded robots": Robots.variants}
+    faults = {f"{name}={knob.value}": knob.about for name, knob in KNOBS.items()}
+    kinds = {"environments, logs": Source.named, "recorded robots": Robots.named, "--fault": faults}
     return [{"name": n, "of": of, "about": text} for of, variants in kinds.items() for n, text in variants.items()]
 
 
@@ -189,22 +216,64 @@ def _is_planar(recording: Recording) -> bool:
 
 
 def find_source(
-    text: str, overrides: Mapping[str, Any] | None = None, data: Path | None = None, topics: Path | None = None
+    text: str,
+    overrides: Mapping[str, Any] | None = None,
+    data: Path | None = None,
+    topics: Path | None = None,
+    faults: Sequence[str] = (),
+    policy: str | None = None,
 ) -> Source:
     """Return the source of an environment's name, a scenario file, a sub-dataset's name, a log file or a ROS bag.
+
+    Args:
+        text: which one.
+        overrides: dotted keys of its scenario.
+        data: folder of recorded data sets.
+        topics: what the topics of a ROS bag are.
+        faults: variants with parameters, see `coopenv.bench.observers.fault_grammar`.
+        policy: who drives in a simulated environment; None: action zero.
 
     Raises:
         CoopenvError: there is none of that name, or an option for what is no such source.
     """
-    kind = kind_of(text)
+    kind, added = kind_of(text), variants_with(faults)
+    if kind is Kind.ENVIRONMENT and not is_bag(text, topics) and topics is None and data is None:
+        scenario = load_scenario(text, overrides)
+        worlds = tuple(_with_world(made, text, scenario, overrides or {}) for made in added)
+        return Simulated(Path(text).stem, scenario, _checked_policy(policy, scenario), added=worlds)
+    if policy is not None:
+        raise CoopenvError(f"--policy {policy}: {text} is recorded, nobody can drive in it")
+    if faults and kind is Kind.DATASET:
+        raise CoopenvError(f"--fault {faults[0]}: recorded robots have variants of their own, {', '.join(Robots.named)}")
+    return replace(_recorded(text, kind, overrides, data, topics), added=added)
+
+
+def _with_world(
+    variant: FaultVariant, text: str, scenario: Scenario, overrides: Mapping[str, Any]
+) -> FaultVariant:
+    """Return a variant with the world that has its faults."""
+    keys = overrides_of(variant, scenario)
+    return replace(variant, scenario=load_scenario(text, {**overrides, **keys})) if keys else variant
+
+
+def _checked_policy(policy: str | None, scenario: Scenario) -> str:
+    if policy is None:
+        return "zero"
+    if not scenario.driven:
+        raise CoopenvError(f"--policy {policy}: no vehicle of this environment is driven")
+    load_policy(policy, scenario, 0)
+    return policy
+
+
+def _recorded(
+    text: str, kind: Kind, overrides: Mapping[str, Any] | None, data: Path | None, topics: Path | None
+) -> Source:
     if data is not None and kind is not Kind.DATASET:
         raise CoopenvError(f"--data {data}: {text} is not one of the recorded robots, mrclam_1 .. mrclam_9")
     if is_bag(text, topics):
         return Bags(Path(text).stem, Path(text), topics, dict(overrides or {}))
     if topics is not None:
         raise CoopenvError(f"--map {topics}: is for ROS bags, {text} is none")
-    if kind is Kind.ENVIRONMENT:
-        return Simulated(Path(text).stem, load_scenario(text, overrides))
     if overrides:
         raise CoopenvError(f"--set {next(iter(overrides))}: {text} is recorded, it has no scenario to change")
     if kind is Kind.LOG:
@@ -220,15 +289,23 @@ def variants_of(source: Source, asked: str | None) -> tuple[str, ...]:
     Raises:
         CoopenvError: there is none of that name, or the source cannot have it.
     """
+    added = tuple(variant.name for variant in source.added)
     if asked is None:
-        return source.usual
+        return (*source.usual, *(name for name in added if _can_have(source, name)))
     names = tuple(dict.fromkeys(name.strip() for name in asked.split(",")))
     if names == (ALL,):
         return tuple(name for name in source.variants if not source.obstacle(name))
+    names = tuple(dict.fromkeys((*names, *added)))
     for name in names:
         if name not in source.variants:
             known = ", ".join((*source.variants, ALL))
             raise CoopenvError(f"unknown variant '{name}'{suggest(name, list(source.variants))}; known: {known}")
-        if reason := source.obstacle(name):
-            raise CoopenvError(f"variant '{name}': {reason}")
+        _can_have(source, name)
     return names
+
+
+def _can_have(source: Source, variant: str) -> bool:
+    """Return that a source can have a variant, or raise a CoopenvError."""
+    if reason := source.obstacle(variant):
+        raise CoopenvError(f"variant '{variant}': {reason}")
+    return True
