@@ -12,6 +12,9 @@ is linear in the measurements. Without noise of bearings there is none, and ever
 The edges are those that were realised, so the bound is conditional on them: average it over seeds. It is first order in
 the orientation, meaningful below about 10 deg, and does not count what "not seen" tells. It bounds the problem in which
 everybody has all data, whatever was delivered.
+
+Errors of odometry, cameras and clocks that last, and that observers are told of, are states of it, too: see
+`bound_errors`.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -22,6 +25,7 @@ from scipy.linalg import block_diag
 
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import skew
+from coopenv.observers.bound_errors import ErrorStates, error_states, motion_of_points
 from coopenv.observers.recording import Recording
 
 BLOCK = 10_000_000
@@ -89,18 +93,20 @@ def _covariances(recording: Recording, groups: Sequence[Sequence[int]], joint: b
 
     A group counts what its own vehicles measure; `joint`: their neighbours' poses are unknown.
     """
-    part = (6 * np.asarray(groups)[..., None] + np.arange(6)).reshape(len(groups), -1)
+    errors = error_states(recording)
+    w = 6 + errors.count
+    part = (w * np.asarray(groups)[..., None] + np.arange(w)).reshape(len(groups), -1)
     who, used = np.asarray(groups), sorted({i for group in groups for i in group})
-    Q = np.array([np.diag(setup.noise.odometry(recording.dt)) for setup in recording.setups])
-    P = np.array([block_diag(*(recording.start_covariance[i] for i in group)) for group in groups])
-    own = np.arange(part.shape[1]).reshape(-1, 6)
+    start, Q = _starts(recording, errors), _growths(recording, errors)
+    P = np.array([block_diag(*(start[i] for i in group)) for group in groups])
+    own = np.arange(part.shape[1]).reshape(-1, w)
     rows, columns = own[:, :, None], own[:, None, :]
     blocks = np.empty((recording.ticks, len(groups), len(own), 6, 6))
-    blocks[0] = P[:, rows, columns]
+    blocks[0] = P[:, rows, columns][..., :6, :6]
     identity = np.eye(part.shape[1])
     at_once = 1 if len(own) <= EXACT else max(1, round(COARSE / recording.dt))
-    for ticks in _stretches(recording, at_once):
-        E, M = steps(recording, ticks), information(recording, joint, used, ticks)
+    for ticks in _stretches(recording, at_once, w):
+        E, M = steps(recording, ticks, errors), information(recording, joint, used, ticks, errors)
         M[~recording.due[ticks.start : ticks.stop]] = 0.0
         for first in range(0, len(ticks), at_once):
             last = min(first + at_once, len(ticks))
@@ -115,17 +121,30 @@ def _covariances(recording: Recording, groups: Sequence[Sequence[int]], joint: b
                 P = (P + np.swapaxes(P, -1, -2)) / 2
             P[:, rows, columns] += after * noise[who]
             k, parts = ticks.start + first, np.linspace(0.0, 1.0, last - first + 1)[1:, None, None, None, None]
-            blocks[k : ticks.start + last] = blocks[k - 1] + parts * (P[:, rows, columns] - blocks[k - 1])
+            poses = P[:, rows, columns][..., :6, :6]
+            blocks[k : ticks.start + last] = blocks[k - 1] + parts * (poses - blocks[k - 1])
     return blocks
 
 
+def _starts(recording: Recording, errors: ErrorStates) -> list[Array]:
+    """Return the covariance (w, w) of every vehicle's errors at the start."""
+    pairs = zip(recording.start_covariance, errors.variance, strict=True)
+    return [np.asarray(block_diag(P, np.diag(variance))) for P, variance in pairs]
+
+
+def _growths(recording: Recording, errors: ErrorStates) -> Array:
+    """Return (N, w, w) by what the covariance of every vehicle's errors grows in a tick."""
+    dt, pairs = recording.dt, zip(recording.setups, errors.walk, strict=True)
+    return np.array([np.diag(np.concatenate([setup.noise.odometry(dt), dt * walk])) for setup, walk in pairs])
+
+
 def _together(E: Array, M: Array, Q: Array) -> tuple[Array, Array, Array]:
-    """Return motion, noise (N, 6, 6) and information (6N, 6N) of some ticks as one, over the errors at the last one.
+    """Return motion, noise (N, w, w) and information (wN, wN) of some ticks as one, over the errors at the last one.
 
     All of them measure what that in their middle does: each by itself, carried on without the noise in between, would
     count a parallax that the noise hides.
     """
-    on = np.broadcast_to(np.eye(6), Q.shape)  # from a tick to the last one
+    on = np.broadcast_to(np.eye(Q.shape[-1]), Q.shape)  # from a tick to the last one
     noise, told, middle = np.zeros_like(Q), M[0], len(E) // 2
     for k in reversed(range(len(E))):
         if k == middle:
@@ -135,18 +154,18 @@ def _together(E: Array, M: Array, Q: Array) -> tuple[Array, Array, Array]:
     return on, noise, told
 
 
-def _stretches(recording: Recording, multiple: int) -> Iterator[range]:
+def _stretches(recording: Recording, multiple: int, width: int) -> Iterator[range]:
     """Yield the ticks after the start in stretches, each of which needs little memory, of a multiple of so many."""
-    most = multiple * max(1, BLOCK // (6 * len(recording.setups)) ** 2 // multiple)
+    most = multiple * max(1, BLOCK // (width * len(recording.setups)) ** 2 // multiple)
     for first in range(1, recording.ticks, most):
         yield range(first, min(first + most, recording.ticks))
 
 
 def _moved(P: Array, E: Array) -> Array:
-    """Return E P E^T of covariances P (g, 6n, 6n), E being block diagonal with blocks (g, n, 6, 6)."""
-    g, n = E.shape[:2]
-    half = (E @ P.reshape(g, n, 6, 6 * n)).reshape(P.shape)
-    return np.asarray((E @ np.swapaxes(half, -1, -2).reshape(g, n, 6, 6 * n)).reshape(P.shape))
+    """Return E P E^T of covariances P (g, w n, w n), E being block diagonal with blocks (g, n, w, w)."""
+    g, n, w = E.shape[:3]
+    half = (E @ P.reshape(g, n, w, w * n)).reshape(P.shape)
+    return np.asarray((E @ np.swapaxes(half, -1, -2).reshape(g, n, w, w * n)).reshape(P.shape))
 
 
 def _bound(recording: Recording, blocks: Array) -> Bound:
@@ -157,19 +176,24 @@ def _bound(recording: Recording, blocks: Array) -> Bound:
     return Bound(recording.t, np.sqrt(trace), np.degrees(np.sqrt(angle)), blocks)
 
 
-def steps(recording: Recording, ticks: range) -> Array:
-    """Return (k, N, 6, 6) how each vehicle's left error goes on over its true motion into some ticks.
+def steps(recording: Recording, ticks: range, errors: ErrorStates | None = None) -> Array:
+    """Return (k, N, w, w) how each vehicle's errors go on over its true motion into some ticks.
 
-    Of tick 0 it is the identity.
+    They are the left error of its pose (w = 6), and after it further `errors`. Of tick 0 it is the identity.
     """
     R, p = recording.truth.rotation, recording.truth.position
     into = np.array(ticks)
     before = np.maximum(into - 1, 0)
     back = np.swapaxes(R[before], -1, -2)
     E = np.swapaxes(R[into], -1, -2) @ R[before]
-    made = np.zeros((*E.shape[:2], 6, 6))
-    made[..., :3, :3] = made[..., 3:, 3:] = E
-    made[..., 3:, :3] = -E @ skew((back @ (p[into] - p[before])[..., None])[..., 0])
+    way = (back @ (p[into] - p[before])[..., None])[..., 0]
+    more = 0 if errors is None else errors.count
+    made = np.zeros((*E.shape[:2], 6 + more, 6 + more))
+    made[..., :3, :3] = made[..., 3:6, 3:6] = E
+    made[..., 3:6, :3] = -E @ skew(way)
+    if errors is not None:
+        made[..., 6:, 6:] = np.eye(more)
+        made[..., :6, 6:] = errors.over_step(E, way, recording.dt) * (into > 0)[:, None, None, None]
     return made
 
 
@@ -179,24 +203,29 @@ def transitions(recording: Recording) -> Array:
 
 
 def information(
-    recording: Recording, joint: bool = True, observers: Collection[int] | None = None, ticks: range | None = None
+    recording: Recording,
+    joint: bool = True,
+    observers: Collection[int] | None = None,
+    ticks: range | None = None,
+    errors: ErrorStates | None = None,
 ) -> Array:
-    """Return sum of H^T N^-1 H (k, 6N, 6N) over the visible edges at each tick, linearised at the truth.
+    """Return sum of H^T N^-1 H (k, wN, wN) over the visible edges at each tick, linearised at the truth.
 
     `joint`: a neighbour's pose is unknown, too; `observers`: whose measurements count, None: everybody's; `ticks`: at
-    which ones, None: at all.
+    which ones, None: at all; `errors`: what is unknown beside the poses, for which w = 6.
     """
-    wanted = slice(None) if ticks is None else slice(ticks.start, ticks.stop)
+    ticks = range(recording.ticks) if ticks is None else ticks
+    wanted, w = slice(ticks.start, ticks.stop), 6 + (0 if errors is None else errors.count)
     R, p, landmarks = recording.truth.rotation[wanted], recording.truth.position[wanted], recording.landmarks[wanted]
     visible = recording.visible[wanted]
     K, N = R.shape[:2]
     L = recording.landmarks.shape[1]
-    M = np.zeros((K, 6 * N, 6 * N))
+    M = np.zeros((K, w * N, w * N))
     minus = np.broadcast_to(-np.eye(3), (K, 3, 3))
     for i, setup in enumerate(recording.setups):
         if observers is not None and i not in observers:
             continue
-        own = slice(6 * i, 6 * i + 6)
+        own = slice(w * i, w * i + w)
         Rt = np.swapaxes(R[:, i], -1, -2)
         for target in setup.targets:
             j = int(target) - L
@@ -209,12 +238,21 @@ def information(
             across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / distance[:, None, None]
             weight = visible[:, i, target, None, None] * setup.noise.bearing_information(u)
             Hi = across @ np.concatenate([skew(a), minus], axis=-1)
+            known, moved = j < 0 or not joint, np.zeros((K, 3, 0))
+            if errors is not None:
+                Hi = np.concatenate([Hi, errors.in_bearings(u, across)], axis=-1)
+            if errors is not None and not known:  # a sender tells where it was at a time of its own clock
+                there = recording.truth.position[:, j] + recording.truth.rotation[:, j] @ marker
+                v = motion_of_points(there, recording.dt, np.array(ticks))
+                moved = errors.of_clock((across @ Rt @ v[..., None])[..., 0])
+                Hi[..., 6:] -= moved
             Hi_t = np.swapaxes(Hi, -1, -2) @ weight
             M[:, own, own] += Hi_t @ Hi
-            if j < 0 or not joint:
+            if known:
                 continue
-            other = slice(6 * j, 6 * j + 6)
+            other = slice(w * j, w * j + w)
             Hj = across @ Rt @ R[:, j] @ np.hstack([-skew(marker), np.eye(3)])
+            Hj = np.concatenate([Hj, moved], axis=-1)
             Hj_t = np.swapaxes(Hj, -1, -2) @ weight
             M[:, other, other] += Hj_t @ Hj
             M[:, own, other] += Hi_t @ Hj

@@ -64,6 +64,8 @@ def _noise_of(scenario: Scenario, vehicle: int, camera: Any, noise: Any) -> Sens
         slip=(rate, duration, size, angle),
         camera_orientation=float(camera["orientation_std"]),
         camera_position=float(camera["position_std"]),
+        focal_length=float(camera["focal_std"]),
+        clock_offset=scenario.all_faults[vehicle].clock_offset,
         odometry_period=1.0 / scenario.rates.odometry,
         bearing=bearing,
         image_axis=axis,

@@ -40,6 +40,8 @@ class SensorNoise:
     slip angle in rad."""
     camera_orientation: float = 0.0  # rad per axis, of the camera's mounting
     camera_position: float = 0.0  # m per axis
+    focal_length: float = 0.0  # relative
+    clock_offset: float = 0.0  # s, of the vehicle's clock, by which its messages are dated
 
     def odometry(self, dt: float) -> Array:
         """Return the variances (6,) of (rotation, translation) of the increment over dt.

@@ -43,6 +43,7 @@ def model_of(setup: Setup, p: Precision) -> Any:
     noise.gyro_bias, noise.gyro_bias_walk = p.vec3(*known.gyro_bias), p.vec3(*known.gyro_bias_walk)
     noise.slip_rate, noise.slip_duration, noise.slip_size, noise.slip_angle = known.slip
     camera.orientation_std, camera.position_std = known.camera_orientation, known.camera_position
+    camera.focal_std = known.focal_length
     model.camera, model.noise = _for_everybody(camera, N), _for_everybody(noise, N)
     markers = np.zeros((T, 3))
     markers[L + setup.vehicle] = setup.marker

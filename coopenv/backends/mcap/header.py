@@ -38,6 +38,8 @@ class NoiseHeader(Part):
     slip: tuple[Number, Number, Number, Number] = (0.0, 1.0, 0.0, 0.0)
     camera_orientation: Number = 0.0
     camera_position: Number = 0.0
+    focal_length: Number = 0.0
+    clock_offset: Number = 0.0
 
 
 class GainsHeader(Part):

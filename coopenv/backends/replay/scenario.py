@@ -84,6 +84,7 @@ def _of_robots(recording: Recording, name: str) -> dict[str, Any]:
             "orientation": "body",
             "extrinsics_error": noise.camera_orientation,
             "extrinsics_position_error": noise.camera_position,
+            "focal_length_error": noise.focal_length,
         },
         "rates": {
             "camera": rate,
