@@ -9,7 +9,7 @@ from coopenv.api.engine import Engine
 from coopenv.backends.base import Conversing
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.scenario import Scenario
-from coopenv.world.state import LASTING_ERRORS
+from coopenv.world.state import FAULTS, LASTING_ERRORS
 
 
 def outcome_words(scenario: Scenario) -> tuple[str, ...]:
@@ -26,7 +26,8 @@ class InfoWriter:
         self._targets, self._landmarks = scenario.target_names, len(scenario.landmarks)
         self._outcomes = outcome_words(scenario)
         self._backend = engine.backend if isinstance(engine.backend, Conversing) else None
-        self._lasting = LASTING_ERRORS if scenario.has_lasting_errors else ()
+        lasting = (*LASTING_ERRORS, "camera_focal") if scenario.has_lasting_errors else ()
+        self._lasting = (*lasting, *(FAULTS if any(faults.any for faults in scenario.all_faults) else ()))
         self._tick_length = 1.0 / scenario.rates.camera
 
     def __call__(self, agents: list[str]) -> dict[str, dict[str, Any]]:

@@ -81,7 +81,9 @@ def error_states(recording: Recording) -> ErrorStates:
         if (variance[:, first:last] + walk[:, first:last]).any()
     }
     kept: list[int] = [column for columns in there.values() for column in columns]
-    places = {name: slice(kept.index(columns[0]), kept.index(columns[0]) + len(columns)) for name, columns in there.items()}
+    places = {
+        name: slice(kept.index(columns[0]), kept.index(columns[0]) + len(columns)) for name, columns in there.items()
+    }
     return ErrorStates(places, variance[:, kept], walk[:, kept])
 
 

@@ -110,4 +110,3 @@ def _check_covariance(P: Array) -> None:
     eigenvalues = np.linalg.eigvalsh(P)
     if eigenvalues[0] < -MOST_NEGATIVE * eigenvalues[-1]:
         raise CoopenvError("covariance is not positive semidefinite")
-

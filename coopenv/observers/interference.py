@@ -34,7 +34,9 @@ class Interference:
 
     def at(self, k: int) -> "Interference":
         """Return what happens at tick k."""
-        return replace(self, **{name: getattr(self, name)[k] for name in ("shift", "turn", "std", "replay", "restarts")})
+        return replace(
+            self, **{name: getattr(self, name)[k] for name in ("shift", "turn", "std", "replay", "restarts")}
+        )
 
     def told(self, observer: Any, vehicle: int, message: Message) -> Message:
         """Return the message that a vehicle broadcasts in place of one."""

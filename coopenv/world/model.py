@@ -50,7 +50,9 @@ def model_struct(p: Precision) -> Any:
         orientation_fixed: wp.array(dtype=wp.int32)  # (N,) 0: estimate_rotation multiplies R(0)
         estimate_rotation: wp.array(dtype=mat33)  # (N,)
         orientation_angle: wp.array(dtype=scalar)  # (N,) largest random turn; negative: uniform over SO(3)
-        covariance: wp.array(dtype=mat66d)  # (2N,) of the initial estimates, for observers, and after restarts; left error
+        covariance: wp.array(
+            dtype=mat66d
+        )  # (2N,) of the initial estimates, for observers, and after restarts; left error
 
     @wp.struct
     class Motion:

@@ -131,8 +131,10 @@ def state_struct(p: Precision) -> Any:
     return State
 
 
-LASTING_ERRORS = ("odometry_scale", "gyro_bias", "slip", "camera_turn", "camera_shift", "camera_focal")
-"""Fields with the true errors of a vehicle's sensors, see `coopenv.world.lasting_errors`."""
+LASTING_ERRORS = ("odometry_scale", "gyro_bias", "slip", "camera_turn", "camera_shift")
+"""Fields with the true errors of a vehicle's sensors, see `coopenv.world.lasting_errors`; beside `camera_focal`."""
+FAULTS = ("clock", "restart_tick", "lie_tick")
+"""Fields with what goes wrong with a vehicle's clock, computer and messages, see `coopenv.world.faults`."""
 
 VALID: dict[str, Rule] = {
     "seed": ANYTHING,
@@ -152,7 +154,7 @@ VALID: dict[str, Rule] = {
     "position": NUMBER._replace(of_truth=True),
     "velocity": NUMBER._replace(of_truth=True),
     "angular_velocity": NUMBER._replace(of_truth=True),
-    **dict.fromkeys(LASTING_ERRORS, NUMBER._replace(of_truth=True)),
+    **dict.fromkeys((*LASTING_ERRORS, "camera_focal"), NUMBER._replace(of_truth=True)),
     "steering": numbers(1.6),
     "action": numbers(1.001),
     "pan": numbers(3.15),

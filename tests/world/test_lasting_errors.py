@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
+from coopenv.estimation.outcomes import Sight
 from coopenv.world.state import LASTING_ERRORS
 from tests.helpers.builders import constant, run, same_bits, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES
@@ -26,6 +27,7 @@ ALL = {
     "gyro_bias_walk": 0.002,
     "slip": {"rate": 2.0, "duration": 0.2, "size": 0.5, "angle": 0.3},
 }
+DRAWN = ("odometry_scale", "gyro_bias", "camera_turn", "camera_shift", "camera_focal")
 MISPLACED = {"orientation": "forward", "extrinsics_error": 0.02, "extrinsics_position_error": 0.05}
 
 
@@ -39,9 +41,10 @@ def drawn(noise: dict[str, Any], ticks: int = 0, dtype: str = "float64", **camer
 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_errors_of_an_episode_are_normal_and_of_the_stated_size(dtype: str) -> None:
-    state = drawn({"odometry_scale": 0.03, "gyro_bias": [0.01, 0.0, 0.02]}, 0, dtype, **MISPLACED)
-    columns = np.column_stack([state[name][:, 0].astype(float) for name in LASTING_ERRORS if name != "slip"])
-    sizes = np.array([0.03, 0.01, 0.0, 0.02, *[0.02] * 3, *[0.05] * 3])
+    camera = MISPLACED | {"focal_length_error": 0.04}
+    state = drawn({"odometry_scale": 0.03, "gyro_bias": [0.01, 0.0, 0.02]}, 0, dtype, **camera)
+    columns = np.column_stack([state[name][:, 0].astype(float) for name in DRAWN])
+    sizes = np.array([0.03, 0.01, 0.0, 0.02, *[0.02] * 3, *[0.05] * 3, 0.04])
     assert_allclose(columns.std(axis=0), sizes, rtol=SPREAD)
     normal = columns[:, sizes > 0] / sizes[sizes > 0]
     for column in normal.T:
@@ -118,6 +121,38 @@ def test_camera_looks_from_where_it_truly_is(dtype: str) -> None:
         line = np.einsum("wji,wj->wi", turned, state["position"][:, target] - eye)
         seen = state["bearing"][:, 0, target]
         assert_allclose(seen, line / np.linalg.norm(line, axis=1, keepdims=True), atol=2e-6)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_longer_focal_length_spreads_the_image(dtype: str) -> None:
+    """Pixels are f (1 + e) x, bearings are computed from them with f: the tangents to the optical axis are wider."""
+    state = drawn({}, 20, dtype, focal_length_error=0.1)
+    state = {name: values.astype(float) for name, values in state.items() if values.dtype.kind == "f"}
+    forward = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    for target in range(4):
+        ray = np.einsum(
+            "wji,wj->wi", state["rotation"][:, -1] @ forward, state["position"][:, target] - state["position"][:, -1]
+        )
+        wide, seen = 1.0 + state["camera_focal"][:, 0], state["bearing"][:, 0, target]
+        assert_allclose(seen[:, 0] / seen[:, 2], wide * ray[:, 0] / ray[:, 2], rtol=1e-4)
+        assert_allclose(seen[:, 1] / seen[:, 2], wide * ray[:, 1] / ray[:, 2], rtol=1e-4)
+        assert (np.sign(seen[:, 2]) == np.sign(ray[:, 2])).all()
+
+
+def test_a_pinhole_s_view_is_that_of_its_true_focal_length() -> None:
+    """What is seen of a target falls into the image of (1 + e) f, and back through f."""
+    camera = {"model": "pinhole", "focal_length_error": 0.3, "orientation": "forward"}
+    made = scenario([vehicle(motion=TURNING)], camera=camera, topology={"mode": "sensed"})
+    state = start(made, range(500)).get_state()
+    forward = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    (fx, fy), (cx, cy), (width, height) = made.camera.focal_length, made.camera.principal_point, made.camera.image_size
+    for target in range(4):
+        line = state["position"][:, target] - state["position"][:, -1]
+        x, y, z = np.einsum("wji,wj->iw", state["rotation"][:, -1] @ forward, line)
+        wide = 1.0 + state["camera_focal"][:, 0]
+        u, v = fx * wide * x / np.abs(z) + cx, fy * wide * y / np.abs(z) + cy
+        inside = (z > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+        assert_array_equal(state["sight"][:, 0, target] == Sight.VISIBLE, inside)
 
 
 def test_off_draws_nothing() -> None:

@@ -49,7 +49,9 @@ def _keys(section: str, key: str, options: Mapping[str, str] | None = None) -> C
 def _lie(part: Part) -> dict[str, Any]:
     kind, colon, amount = part.value.partition(":")
     if kind not in LIE_AMOUNTS:
-        raise CoopenvError(f"{part.where}: unknown lie '{kind}'{suggest(kind, LIE_AMOUNTS)}; known: {listed(LIE_AMOUNTS)}")
+        raise CoopenvError(
+            f"{part.where}: unknown lie '{kind}'{suggest(kind, LIE_AMOUNTS)}; known: {listed(LIE_AMOUNTS)}"
+        )
     lie: dict[str, Any] = {"kind": kind, "direction": HORIZONTAL}
     if colon:
         lie[LIE_AMOUNTS[kind]] = number(amount, f"{part.where}: lie")
@@ -139,7 +141,9 @@ def knob_of(part: Part) -> Knob:
     """
     knob = KNOBS.get(part.name)
     if knob is None:
-        raise CoopenvError(f"{part.where}: unknown fault '{part.name}'{suggest(part.name, KNOBS)}; known: {listed(KNOBS)}")
+        raise CoopenvError(
+            f"{part.where}: unknown fault '{part.name}'{suggest(part.name, KNOBS)}; known: {listed(KNOBS)}"
+        )
     for option in part.options:
         if option not in knob.options:
             allowed = listed(knob.options) if knob.options else "none"

@@ -79,7 +79,9 @@ def check_vehicles(part: Part, names: list[str]) -> None:
     """Refuse vehicles that there are not. Raises CoopenvError: one that names those that there are."""
     for name in part.who:
         if name not in names:
-            raise CoopenvError(f"{part.where}: unknown vehicle '{name}'{suggest(name, names)}; there are {listed(names)}")
+            raise CoopenvError(
+                f"{part.where}: unknown vehicle '{name}'{suggest(name, names)}; there are {listed(names)}"
+            )
 
 
 def check_recorded(variant: FaultVariant, recording: Recording) -> None:

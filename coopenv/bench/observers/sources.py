@@ -244,13 +244,13 @@ def find_source(
     if policy is not None:
         raise CoopenvError(f"--policy {policy}: {text} is recorded, nobody can drive in it")
     if faults and kind is Kind.DATASET:
-        raise CoopenvError(f"--fault {faults[0]}: recorded robots have variants of their own, {', '.join(Robots.named)}")
+        raise CoopenvError(
+            f"--fault {faults[0]}: recorded robots have variants of their own, {', '.join(Robots.named)}"
+        )
     return replace(_recorded(text, kind, overrides, data, topics), added=added)
 
 
-def _with_world(
-    variant: FaultVariant, text: str, scenario: Scenario, overrides: Mapping[str, Any]
-) -> FaultVariant:
+def _with_world(variant: FaultVariant, text: str, scenario: Scenario, overrides: Mapping[str, Any]) -> FaultVariant:
     """Return a variant with the world that has its faults."""
     keys = overrides_of(variant, scenario)
     return replace(variant, scenario=load_scenario(text, {**overrides, **keys})) if keys else variant

@@ -70,7 +70,9 @@ def make_start(clear_messages: Any, receive: Any) -> Any:
         memory.belief[world, i].others = 1
         begin_errors(model, memory, world, i)
         R = orthonormalise(mat33d(state.estimate_rotation[world, i]))
-        initial = Estimate(Pose(R, R * vec3d(state.estimate_position[world, i])), start_covariance(model, state, world, i))
+        initial = Estimate(
+            Pose(R, R * vec3d(state.estimate_position[world, i])), start_covariance(model, state, world, i)
+        )
         restart_belief(model, memory, world, i, initial)
         memory.belief[world, i].odometry.R = wp.identity(3, wp.float64)
         set_anchor(memory, world, i, initial.P, 0)

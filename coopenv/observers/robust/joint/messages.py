@@ -84,6 +84,8 @@ def tampered(message: Message) -> Message:
     L = np.zeros((n, n))
     L[np.tril_indices(n)] = message.extra["factor"]
     P = L @ L.T
+    if np.allclose(P[:6, :6], message.covariance, rtol=1e-3, atol=1e-3 * np.diag(message.covariance).min()):
+        return message  # it claims what it believes
     P[:6, 6:], P[6:, :6], P[:6, :6] = 0.0, 0.0, message.covariance
     factor = np.linalg.cholesky(P)[np.tril_indices(n)].astype(np.float32)
     more: dict[str, Any] = {**message.extra, "factor": factor}

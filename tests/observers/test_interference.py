@@ -1,0 +1,277 @@
+"""Observers on the host meet the faults of the world as those in its kernels do; what they receive is checked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from coopenv.errors import CoopenvError
+from coopenv.observers import Message, Recording, run
+from coopenv.observers.checks import check_received
+from coopenv.observers.contract import Tick
+from coopenv.observers.mekf_covariance import MekfCovariance
+from coopenv.runs.recorder import record
+from coopenv.scenario import Scenario, load_scenario
+from coopenv.seeds import world_keys
+from tests.helpers.builders import simulate
+
+OTHER = "vehicles.vehicle_2.faults"
+FAULTS: dict[str, dict[str, Any]] = {
+    "none": {},
+    "jump": {f"{OTHER}.lie": {"kind": "jump", "start": 0.3, "std": 0.1}},
+    "drift": {f"{OTHER}.lie": {"kind": "drift", "start": 0.3, "speed": 1.0}},
+    "replay": {f"{OTHER}.lie": {"kind": "replay", "start": 0.3, "age": 0.2}, "v2x.delay": 2, "v2x.period": 3},
+    "clock": {"faults.clock_offset": 0.1, "v2x.staleness": 0.1},
+    "corruption": {"faults.corruption.probability": 0.3},
+    "restart": {OTHER: {"restart": {"chance": 1.0, "time": 0.42}}},
+    "lens": {"camera.focal_length_error": 0.05},
+}
+
+
+def scene(name: str, **more: Any) -> Scenario:
+    start = {"position_radius": 0.2, "orientation_angle": 0.05}
+    overrides = {"horizon": 1.0, "vehicle_defaults.initial_estimate": start, **FAULTS[name], **more}
+    return load_scenario("busy_intersection_tracking", overrides)
+
+
+@cache
+def recorded(name: str, seed: int = 3) -> Recording:
+    return record(scene(name), seed)
+
+
+def in_kernels(made: Scenario, seed: int) -> np.ndarray:
+    """Return (K, N, 3) the positions that the world's own observers believe in, m."""
+    world = simulate(made, 1)
+    world.reset([world_keys(seed)[0]])
+    world.mask.zero_()
+    positions = []
+    for _ in range(made.horizon_ticks):
+        world.advance(1)
+        R, p = world.view("estimate_rotation")[0], world.view("estimate_position")[0]
+        positions.append(np.einsum("nij,nj->ni", R, p))
+    return np.array(positions)
+
+
+@pytest.mark.parametrize("name", list(FAULTS))
+def test_the_same_observer_meets_the_same_faults_on_the_host(name: str) -> None:
+    """The host's messages, clocks and restarts are code of their own: Python and dictionaries in place of kernels."""
+    found = run("riccati", recorded(name))
+    assert not found.failure
+    assert_allclose(found.position[1:], in_kernels(scene(name), 3), atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("observer", ["robust", "robust_joint"])
+@pytest.mark.parametrize("name", list(FAULTS))
+def test_robust_meets_the_same_faults_on_the_host(name: str, observer: str) -> None:
+    found = run(observer, recorded(name))
+    made = scene(name, **{"observer.name": observer})
+    assert not found.failure
+    assert_allclose(found.position[1:], in_kernels(made, 3), atol=1e-6)
+
+
+class Listens(MekfCovariance):
+    """Keeps what vehicle 3 hears of vehicle 2, and starts."""
+
+    heard: list[tuple[float, Message, float]]
+    started: list[tuple[int, np.ndarray]]
+
+    def __init__(self, setup: Any) -> None:
+        super().__init__(setup)
+        self.me = setup.vehicle
+
+    def reset(self, initial_pose: Any, initial_covariance: np.ndarray) -> None:
+        Listens.started.append((self.me, initial_covariance))
+        super().reset(initial_pose, initial_covariance)
+
+    def update(self, tick: Tick) -> Any:
+        if self.me == 2 and 4 in tick.messages:
+            Listens.heard.append((tick.time, tick.messages[4].message, tick.messages[4].age))
+        return super().update(tick)
+
+
+def listen(made: Recording, tamper: Any = None) -> Any:
+    Listens.heard, Listens.started = [], []
+    return run(Listens, made, tamper)
+
+
+def test_a_lie_states_a_pose_and_a_covariance() -> None:
+    listen(replace(recorded("jump"), interference=None))
+    honest = Listens.heard
+    listen(recorded("jump"))
+    vector = recorded("jump").interference.shift[-1, 1]
+    assert np.linalg.norm(vector) == pytest.approx(5.0)
+    for (time, before, _), (_, after, _) in zip(honest, Listens.heard, strict=True):
+        assert_allclose(after.position - before.position, vector if time >= 0.3 - 1e-9 else 0.0, atol=1e-12)
+        assert_allclose(after.covariance, 0.01 * np.eye(3) if time >= 0.3 - 1e-9 else before.covariance)
+
+
+def test_a_restart_begins_anew_and_nobody_else_does() -> None:
+    listen(recorded("restart"))
+    assert [vehicle for vehicle, _ in Listens.started] == [0, 1, 2, 3, 4, 1]
+    assert Listens.started[-1][1][3, 3] >= 1e4
+
+
+def test_clocks_shift_ages() -> None:
+    made = replace(recorded("clock"), staleness=np.inf)
+    listen(made)
+    clock = made.interference.clock
+    ahead = clock[1] - clock[2]
+    for time, _, age in Listens.heard[30:]:
+        assert age == pytest.approx(max(0.0, -ahead / 60), abs=1e-9) and time > 0.4
+
+
+class Throws:
+    """Lets a vehicle broadcast what somebody draws."""
+
+    def __init__(self, *messages: Any) -> None:
+        self.messages, self.count = messages, 0
+
+    def applies(self, vehicle: int, time: float) -> bool:
+        return vehicle == 1
+
+    def told(self, observer: Any, message: Message) -> Any:
+        self.count += 1
+        return self.messages[self.count % len(self.messages)](message)
+
+
+def with_(**fields: Any) -> Any:
+    return lambda message: replace(message, **fields)
+
+
+LOPSIDED = np.eye(3) + np.triu(np.ones((3, 3)), 1)
+HOSTILE = {
+    "NaN": with_(position=np.full(3, np.nan)),
+    "infinite": with_(position=np.array([np.inf, 0.0, 0.0])),
+    "far": with_(position=np.array([1e30, 0.0, 0.0])),
+    "flat": with_(position=np.zeros((3, 1))),
+    "words": with_(position="here"),
+    "objects": with_(position=np.array([None, 1, 2], dtype=object)),
+    "ragged": with_(covariance=[[1.0], [2.0, 3.0]]),
+    "zero": with_(covariance=np.zeros((3, 3))),
+    "indefinite": with_(covariance=np.diag([1.0, 1.0, -1.0])),
+    "lopsided": with_(covariance=LOPSIDED),
+    "huge": with_(covariance=1e200 * np.eye(3)),
+    "of a pose": with_(covariance=np.eye(6)),
+    "stretched": with_(rotation=2.0 * np.eye(3)),
+    "mirrored": with_(rotation=np.diag([1.0, 1.0, -1.0])),
+    "more": with_(extra={"more": np.array([np.nan])}),
+    "too much": with_(extra={"more": np.zeros(10**6)}),
+    "no message": lambda message: None,
+    "number": lambda message: 7,
+}
+
+
+@pytest.mark.parametrize("name", list(HOSTILE))
+def test_what_is_no_message_is_refused_and_counted(name: str) -> None:
+    """It is as if it had been lost: followers go on with the last one that was sound."""
+    made = recorded("none")
+    found = listen(made, Throws(HOSTILE[name]))
+    assert not found.failure and np.isfinite(found.position).all()
+    followers = [i for i, setup in enumerate(made.setups) if 4 in setup.targets]
+    assert (found.refused[followers] == made.ticks - 1).all()
+    assert found.refused.sum() == (made.ticks - 1) * len(followers)
+
+
+def test_the_last_sound_message_stays_heard() -> None:
+    listen(recorded("none"), Throws(lambda message: message, HOSTILE["NaN"]))
+    ages = [age for _, _, age in Listens.heard]
+    assert {round(60 * age) for age in ages[4:]} == {0, 1}
+    assert len(ages) == recorded("none").ticks - 2  # the first one after the start was none
+
+
+number = st.one_of(
+    st.floats(allow_nan=True, allow_infinity=True),
+    st.floats(-100, 100),
+    st.sampled_from([0.0, 1e-300, 1e-12, 1e8, -1e8, 1e308]),
+)
+
+
+@st.composite
+def messages(draw: Any) -> Any:
+    """Draw a message with some fields altered, one or many entries of each."""
+    changes: dict[str, Any] = {}
+    for field, shape in (("position", (3,)), ("rotation", (3, 3)), ("covariance", (3, 3))):
+        how = draw(st.sampled_from(["keep", "keep", "none", "entry", "all", "definite"]))
+        if how == "none":
+            changes[field] = None
+        elif how == "definite" and field == "covariance":
+            scales = np.array(draw(st.lists(st.floats(-16, 12), min_size=3, max_size=3)))
+            changes[field] = np.diag(10.0**scales)
+        elif how in ("all", "definite"):
+            values = draw(st.lists(number, min_size=int(np.prod(shape)), max_size=int(np.prod(shape))))
+            changes[field] = np.reshape(values, shape)
+        elif how == "entry":
+            changes[field] = (draw(st.integers(0, 100)), draw(number))
+    return changes
+
+
+def altered(changes: dict[str, Any]) -> Any:
+    def told(message: Message) -> Message:
+        fields: dict[str, Any] = {}
+        for name, value in changes.items():
+            own = getattr(message, name)
+            if isinstance(value, tuple):
+                if own is None:
+                    continue
+                fields[name] = np.array(own, dtype=float)
+                fields[name].flat[value[0] % fields[name].size] = value[1]
+            else:
+                fields[name] = value
+        return replace(message, **fields)
+
+    return told
+
+
+@pytest.mark.parametrize(
+    "observer",
+    [
+        "mekf",
+        "mekf_covariance",
+        "left_invariant",
+        "right_invariant",
+        "ukf",
+        "covariance_intersection",
+        "riccati",
+        "p3p",
+    ],
+)
+@settings(max_examples=6, deadline=None, suppress_health_check=list(HealthCheck))
+@given(drawn=st.lists(messages(), min_size=20, max_size=20))
+def test_no_message_ends_a_run(observer: str, drawn: list[dict[str, Any]]) -> None:
+    found = run(observer, recorded("none"), Throws(*map(altered, drawn)))
+    assert not found.failure
+    assert np.isfinite(found.position).all()
+
+
+@given(changes=messages())
+@settings(max_examples=300, deadline=None)
+def test_what_passes_can_be_worked_with(changes: dict[str, Any]) -> None:
+    """By other means than the check's own: determinants, eigenvalues, and orthogonality."""
+    with np.errstate(all="ignore"):
+        made = altered(changes)(Message(np.ones(3), np.eye(3), np.eye(3)))
+        try:
+            check_received(made)
+        except CoopenvError:
+            return
+    if made.position is not None:
+        assert np.isfinite(made.position).all()
+    if made.rotation is not None:
+        assert np.linalg.det(made.rotation) == pytest.approx(1.0, abs=1e-5)
+    if made.covariance is not None:
+        assert np.linalg.eigvalsh(made.covariance)[0] > 0.0
+        assert np.isfinite(np.linalg.inv(made.covariance)).all()
+
+
+def test_robots_on_a_plane_may_know_their_height() -> None:
+    flat = Message(np.ones(3), np.eye(3), np.diag([1.0, 1.0, 0.0]))
+    check_received(flat, planar=True)
+    with pytest.raises(CoopenvError, match="not positive definite"):
+        check_received(flat)

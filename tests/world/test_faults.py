@@ -1,0 +1,224 @@
+"""Faults of clocks, computers and messages: who has them, when and how much, and what others then hear."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from coopenv.scenario import Scenario
+from tests.helpers.builders import constant, estimated_position, run, same_bits, scenario, start, vehicle
+
+WORLDS = 1000
+NEIGHBOURS = (["L1", "L2", "L3"], ["L1", "L2", "vehicle_1"], ["L3", "vehicle_1", "vehicle_2"])
+State = dict[str, np.ndarray]
+
+
+def fleet(own: dict[int, dict[str, Any]], **sections: Any) -> Scenario:
+    """Return three vehicles that drive circles, each of which hears all before it; `own` are faults by vehicle, from 0."""
+    vehicles = [
+        vehicle(
+            (2.0 * i, -1.0, 0.5),
+            motion=constant([0.3, 0.0, 0.0], [0.0, 0.0, 0.2]),
+            initial_estimate={"position_radius": 0.3, "orientation_angle": 0.1},
+            neighbours=names,
+            **({"faults": own[i]} if i in own else {}),
+        )
+        for i, names in enumerate(NEIGHBOURS)
+    ]
+    return scenario(vehicles, **sections)
+
+
+def told(state: State, vehicle: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return what a vehicle put on the air at the state's tick beside its estimate: shift (W, 3), turn (W, 3, 3)."""
+    slot = int(state["tick"][0]) % state["outbox_tick"].shape[-1]
+    shift = state["outbox_position"][:, vehicle, slot] - estimated_position(state)[:, vehicle]
+    back = state["estimate_rotation"][:, vehicle].swapaxes(-1, -2)
+    return shift, back @ state["outbox_rotation"][:, vehicle, slot]
+
+
+def test_a_jump_is_of_its_size_from_its_time_on() -> None:
+    lie = {"kind": "jump", "start": 0.5, "offset": 3.0, "direction": [0.0, 3.0, 4.0]}
+    for state in run(start(fleet({0: {"lie": lie}})), 60):
+        shift, turn = told(state, 0)
+        assert_allclose(shift[0], [0.0, 1.8, 2.4] if state["tick"][0] >= 30 else 0.0, atol=1e-12)
+        assert_allclose(turn[0], np.eye(3), atol=1e-12)
+        assert_allclose(told(state, 1)[0], 0.0, atol=1e-12)
+        assert_allclose(
+            state["inbox_position"][0, 2, 0] - estimated_position(state)[0, 0], shift[0], atol=1e-12
+        )  # all hear the same
+
+
+def test_a_drift_grows_with_time() -> None:
+    lie = {"kind": "drift", "start": 0.2, "speed": 0.3, "direction": [1.0, 0.0, 0.0]}
+    for state in run(start(fleet({1: {"lie": lie}})), 40):
+        expected = 0.3 * max(0.0, state["tick"][0] / 60 - 0.2)
+        assert_allclose(told(state, 1)[0][0], [expected, 0.0, 0.0], atol=1e-12)
+
+
+def test_who_lies_when_and_where_to_is_drawn() -> None:
+    lie = {"kind": "jump", "chance": 0.4, "start": 1.0, "start_spread": 2.0, "offset": 2.0}
+    state = start(fleet({0: {"lie": lie}, 1: {"lie": lie}}), range(WORLDS)).get_state()
+    lies = state["lie_tick"][:, :2] >= 0
+    low, high = stats.binom.ppf([1e-4, 1 - 1e-4], 2 * WORLDS, 0.4)
+    assert low <= lies.sum() <= high and (state["lie_tick"][:, 2] == -1).all()
+    assert abs(np.corrcoef(lies.T)[0, 1]) < 4.5 / np.sqrt(WORLDS)
+    begun = state["lie_tick"][:, :2][lies] / 60
+    assert stats.kstest((begun - 1.0) / 2.0, "uniform").pvalue > 1e-4
+    vectors = state["lie_vector"][:, :2][lies]
+    assert_allclose(np.linalg.norm(vectors, axis=1), 2.0)
+    assert not vectors[:, 2].any()
+    assert stats.kstest(np.arctan2(*vectors[:, :2].T) / (2 * np.pi) + 0.5, "uniform").pvalue > 1e-4
+
+
+def test_those_who_collude_tell_the_same() -> None:
+    lie = {"kind": "collude", "chance": 0.5, "start_spread": 1.0, "offset": 2.0}
+    state = start(fleet({0: {"lie": lie}, 1: {"lie": lie}}), range(100)).get_state()
+    assert_array_equal(state["lie_tick"][:, 0], state["lie_tick"][:, 1])
+    assert_array_equal(state["lie_vector"][:, 0], state["lie_vector"][:, 1])
+    assert len(np.unique(state["lie_vector"][:, 0, 0])) > 20
+
+
+@pytest.mark.parametrize(("delay", "period"), [(0, 1), (3, 1), (2, 4)])
+def test_a_replay_is_an_older_message_as_if_new(delay: int, period: int) -> None:
+    lie = {"kind": "replay", "start": 0.5, "age": 0.2}
+    states = run(start(fleet({0: {"lie": lie}}, v2x={"delay": delay, "period": period})), 80)
+    for tick, state in enumerate(states):
+        sent = (tick - delay) // period * period
+        if sent < 0:
+            continue
+        content = states[max(sent - 12, 0) if sent >= 30 else sent]
+        assert state["inbox_tick"][0, 2, 0] == state["inbox_stamp"][0, 2, 0] == sent
+        assert_allclose(state["inbox_position"][0, 2, 0], estimated_position(content)[0, 0], atol=1e-12)
+        assert_array_equal(state["inbox_rotation"][0, 2, 0], content["estimate_rotation"][0, 0])
+
+
+def test_ages_are_wrong_by_the_difference_of_two_clocks() -> None:
+    made = fleet({}, faults={"clock_offset": 0.1}, v2x={"delay": 2})
+    states = run(start(made, range(200)), 40)
+    clock = states[0]["clock"]
+    assert_array_equal(states[-1]["clock"], clock)
+    assert np.std(clock / 60) == pytest.approx(0.1, rel=4 / np.sqrt(2 * clock.size))
+    heard, tick = states[-1]["inbox_stamp"], 40
+    for receiver, sender in ((1, 0), (2, 0), (2, 1)):
+        ahead = clock[:, sender] - clock[:, receiver]
+        late = np.array([np.clip(k - 2 + ahead, 0, k) for k in range(2, tick + 1)])
+        assert_array_equal(heard[:, receiver, sender], late.max(axis=0))
+
+
+def test_messages_older_than_the_limit_by_the_receiver_s_clock_are_not_used() -> None:
+    made = fleet({}, faults={"clock_offset": 0.1}, v2x={"delay": 2, "staleness": 0.05}, observer={"name": "riccati"})
+    fresh = fleet({}, v2x={"delay": 2, "staleness": 0.05})
+    world, plain = start(made, range(50)), start(fresh, range(50))
+    world.advance(60), plain.advance(60)
+    state, other = world.get_state(), plain.get_state()
+    ahead = state["clock"][:, 0] - state["clock"][:, 1]
+    assert (ahead >= 0).any() and (ahead < -1).any()
+    same = (state["estimate_position"][:, 1] == other["estimate_position"][:, 1]).all(axis=-1)
+    assert same[ahead >= 0].all()  # the pose of a message that counts is the same whatever its date
+    assert not same[ahead < -1].any()  # it seems to be older than 3 ticks
+
+
+def test_corruption_alters_a_share_of_the_messages() -> None:
+    corruption = {"probability": 0.3, "start": 0.25, "size": 4.0, "turn": 0.5}
+    states = run(start(fleet({0: {"corruption": corruption}}), range(40)), 60)
+    shifts, turns = zip(*(told(state, 0) for state in states), strict=True)
+    shift, turn = np.array(shifts), np.array(turns)
+    off = np.abs(shift).max(axis=-1) > 1e-9
+    assert not off[:15].any()
+    low, high = stats.binom.ppf([1e-4, 1 - 1e-4], off[15:].size, 0.3)
+    assert low <= off[15:].sum() <= high
+    for axis in range(3):
+        assert stats.kstest(shift[off][:, axis] / 8.0 + 0.5, "uniform").pvalue > 1e-4
+        vectors = Rotation.from_matrix(turn[off]).as_rotvec()
+        assert stats.kstest(vectors[:, axis] + 0.5, "uniform").pvalue > 1e-4
+    assert_allclose(turn[~off], np.broadcast_to(np.eye(3), turn[~off].shape), atol=1e-12)
+    assert not any(np.abs(told(state, 1)[0]).max() > 1e-9 for state in states)
+
+
+def test_a_restart_loses_all_at_the_next_decision() -> None:
+    """The observer begins in the landmarks' middle with the paper's P(0), and has heard nothing."""
+    made = fleet({1: {"restart": {"chance": 1.0, "time": 0.42}}}, rates={"decision": 10.0}, v2x={"delay": 3})
+    world = start(made)
+    assert world.get_state()["restart_tick"].tolist() == [[-1, 31, -1]]
+    world.advance(30)
+    before = world.get_state()
+    world.advance(1)
+    after = world.get_state()
+    spread = [np.trace(state["covariance"][0, 1]) for state in (before, after)]
+    assert spread[1] > 3 * spread[0]  # 303 less what one frame has told
+    middle = before["position"][0, :4].mean(axis=0)
+    moved = np.linalg.norm(estimated_position(after)[0, 1] - middle)
+    assert moved < np.linalg.norm(estimated_position(before)[0, 1] - middle)
+    assert after["inbox_tick"][0, 1].tolist() == [28, -1, -1]  # again, as the radio delivers at this tick
+
+
+def test_restarts_are_drawn() -> None:
+    restart = {"chance": 0.25, "time": 5.0, "time_spread": 20.0}
+    state = start(fleet({}, faults={"restart": restart}), range(WORLDS)).get_state()
+    begun = state["restart_tick"][state["restart_tick"] >= 0]
+    low, high = stats.binom.ppf([1e-4, 1 - 1e-4], 3 * WORLDS, 0.25)
+    assert low <= len(begun) <= high
+    assert ((begun - 1) % 6 == 0).all()
+    assert stats.kstest(((begun - 1) / 60 - 5.0) / 20.0, "uniform").pvalue > 1e-4
+
+
+def test_others_go_on_as_if_there_were_no_fault() -> None:
+    """Who hears nobody that has one has the same bits, and so has everybody where faults are off."""
+    faults = {
+        "clock_offset": 0.2,
+        "corruption": {"probability": 0.5},
+        "restart": {"chance": 1.0, "time": 0.2},
+        "lie": {"kind": "drift"},
+    }
+    noise = {"velocity": 0.1, "angular_velocity": 0.02, "bearing": {"scale": 0.003}}
+    plain, off, faulty = (
+        run(start(made, [3, 4]), 40)[-1]
+        for made in (
+            fleet({}, noise=noise),
+            fleet({1: {"lie": {"kind": "none", "offset": 9.0}}}, noise=noise),
+            fleet({1: faults}, noise=noise),
+        )
+    )
+    for name in (
+        "estimate_position",
+        "estimate_rotation",
+        "covariance",
+        "bearing",
+        "inbox_position",
+        "odometry_velocity",
+    ):
+        assert same_bits(plain[name], off[name]), name
+        assert same_bits(plain[name][:, 0], faulty[name][:, 0]), name
+    assert not same_bits(plain["estimate_position"][:, 2], faulty["estimate_position"][:, 2])
+    assert (plain["restart_tick"] == -1).all() and (plain["lie_tick"] == -1).all() and not plain["clock"].any()
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_world_has_the_same_faults_alone_and_in_a_batch(dtype: str) -> None:
+    faults = {
+        "clock_offset": 0.1,
+        "restart": {"chance": 0.5, "time_spread": 0.5},
+        "corruption": {"probability": 0.3},
+        "lie": {"kind": "jump", "chance": 0.5, "start_spread": 0.5},
+    }
+    made = fleet({}, faults=faults)
+    many, one = start(made, range(5), dtype), start(made, [3], dtype)
+    for world in (many, one):
+        world.advance(6)
+        world.advance(6)
+    left, right = many.get_state(), one.get_state()
+    for name in ("clock", "restart_tick", "lie_tick", "lie_vector", "told_shift", "inbox_stamp", "estimate_position"):
+        assert same_bits(left[name][3:4], right[name]), name
+
+
+def test_vehicles_have_faults_of_their_own() -> None:
+    made = fleet({1: {"lie": {"kind": "replay", "age": 0.5}}}, faults={"lie": {"offset": 7.0}, "clock_offset": 0.1})
+    own = made.all_faults
+    assert [f.lie.kind for f in own] == ["none", "replay", "none"]
+    assert own[1].lie.offset == 7.0 and own[1].clock_offset == 0.1
+    assert made.replay_ticks == 30
