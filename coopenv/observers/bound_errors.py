@@ -31,7 +31,7 @@ class ErrorStates:
     @property
     def count(self) -> int:
         """How many a vehicle has."""
-        return self.variance.shape[1]
+        return int(self.variance.shape[1])
 
     def over_step(self, turned: Array, step: Array, dt: float) -> Array:
         """Return (..., 6, e) what the pose's left error gets over a tick from the errors, to first order.

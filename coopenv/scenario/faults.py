@@ -25,7 +25,7 @@ class Restart(Part):
 
 
 class Corruption(Part):
-    """Messages whose pose is altered on the way, so that they can still be read. (What cannot is lost: `v2x.loss`.)"""
+    """Messages whose pose is altered on the way, so that they can still be read. What cannot is lost: `v2x.loss`."""
 
     probability: Probability = 0.0
     """Of each message, for all that receive it."""
@@ -71,8 +71,8 @@ class Faults(Part):
     """What goes wrong with a vehicle's computer, clock and messages."""
 
     clock_offset: NonNegative = 0.0
-    """Standard deviation of what the vehicle's clock is off by, s. Messages seem older or newer by the difference of the
-    sender's clock and the receiver's, to whole camera ticks, but never from the future."""
+    """Standard deviation of what the vehicle's clock is off by, s. Messages seem older or newer by the difference of
+    the sender's clock and the receiver's, to whole camera ticks, but never from the future."""
     restart: Restart = Restart()
     corruption: Corruption = Corruption()
     lie: Lie = Lie()

@@ -35,7 +35,7 @@ def told_of(made: Recording, *names: str) -> Recording:
 
 def poses_and_residuals(made: Recording, x: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return the last poses as (N, 6) offsets from the truth, and all bearings, for deviations of what is unknown."""
-    truth, dt, N, L = made.truth, made.dt, len(made.setups), made.landmarks.shape[1]
+    truth, dt, L = made.truth, made.dt, made.landmarks.shape[1]
     R = [truth.rotation[0] @ Rotation.from_rotvec(x["start"][:, :3]).as_matrix()]
     p = [truth.position[0] + np.einsum("nij,nj->ni", truth.rotation[0], x["start"][:, 3:])]
     for k in range(1, made.ticks):
@@ -62,7 +62,6 @@ def poses_and_residuals(made: Recording, x: dict[str, np.ndarray]) -> tuple[np.n
                 seen.append(line / setup.noise.bearing)
     turned = Rotation.from_matrix(truth.rotation[-1].swapaxes(-1, -2) @ R[-1]).as_rotvec()
     moved = np.einsum("nji,nj->ni", truth.rotation[-1], p[-1] - truth.position[-1])
-    assert N == len(turned)
     return np.concatenate([turned, moved], axis=1).ravel(), np.concatenate(seen)
 
 

@@ -19,7 +19,7 @@ State = dict[str, np.ndarray]
 
 
 def fleet(own: dict[int, dict[str, Any]], **sections: Any) -> Scenario:
-    """Return three vehicles that drive circles, each of which hears all before it; `own` are faults by vehicle, from 0."""
+    """Return three vehicles that drive circles, each of which hears all before it; `own`: faults by vehicle."""
     vehicles = [
         vehicle(
             (2.0 * i, -1.0, 0.5),

@@ -172,8 +172,8 @@ def compare(
     Raises:
         CoopenvError: an argument is not valid, or names what does not exist.
     """
-    paths = (None if path is None else Path(path) for path in (data, topics))
-    source = find_source(str(environment), overrides, *paths, faults, policy)
+    folder, bag_map = (None if path is None else Path(path) for path in (data, topics))
+    source = find_source(str(environment), overrides, folder, bag_map, faults, policy)
     source.check()
     plan = Plan.of(source, observers, variants, seeds, steady_from, windows)
     with Progress(Console(stderr=True), plan.work, total=1.0) as progress:

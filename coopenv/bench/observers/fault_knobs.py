@@ -50,7 +50,7 @@ def _lie(part: Part) -> dict[str, Any]:
     kind, colon, amount = part.value.partition(":")
     if kind not in LIE_AMOUNTS:
         raise CoopenvError(
-            f"{part.where}: unknown lie '{kind}'{suggest(kind, LIE_AMOUNTS)}; known: {listed(LIE_AMOUNTS)}"
+            f"{part.where}: unknown lie '{kind}'{suggest(kind, LIE_AMOUNTS)}; known: {listed(list(LIE_AMOUNTS))}"
         )
     lie: dict[str, Any] = {"kind": kind, "direction": HORIZONTAL}
     if colon:
@@ -142,7 +142,7 @@ def knob_of(part: Part) -> Knob:
     knob = KNOBS.get(part.name)
     if knob is None:
         raise CoopenvError(
-            f"{part.where}: unknown fault '{part.name}'{suggest(part.name, KNOBS)}; known: {listed(KNOBS)}"
+            f"{part.where}: unknown fault '{part.name}'{suggest(part.name, KNOBS)}; known: {listed(list(KNOBS))}"
         )
     for option in part.options:
         if option not in knob.options:

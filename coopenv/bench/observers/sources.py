@@ -53,7 +53,7 @@ class Source(ABC):
 
     def fault(self, variant: str) -> Fault | FaultVariant:
         """Return what a variant does."""
-        return {**FAULTS, **{made.name: made for made in self.added}}[variant]
+        return next((made for made in self.added if made.name == variant), None) or FAULTS[variant]
 
     @property
     def planar(self) -> bool:
