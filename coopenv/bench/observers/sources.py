@@ -154,7 +154,11 @@ class LogFile(Source):
 
     def recording(self, variant: str, seed: int) -> tuple[Recording, Lie | None]:
         """Return the file's record with a fault."""
-        return self.fault(variant).applied(open_recording(self.path), seed)
+        recording = open_recording(self.path)
+        if recording.scenario is not None and any(faults.any for faults in recording.scenario.all_faults):
+            again = record(open_backend(self.path, None, {}), seed)  # messages are not recorded: the same is drawn again
+            recording = replace(recording, interference=again.interference)
+        return self.fault(variant).applied(recording, seed)
 
     def obstacle(self, variant: str) -> str:
         """Return why no vehicle can lie to another, where that is so."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from coopenv.backends.mcap.writer import write_recording
 from coopenv.bench.observers import compare
 from coopenv.bench.observers.command import figure_files, request_of
 from coopenv.bench.observers.fault_grammar import parts_of
@@ -18,6 +20,7 @@ from coopenv.bench.observers.faults import with_loss
 from coopenv.bench.observers.sources import Simulated, find_source
 from coopenv.cli import main
 from coopenv.errors import CoopenvError
+from coopenv.observers.interference import Interference
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 
@@ -183,3 +186,19 @@ def test_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert "did you mean 'gyro_bias'" in capsys.readouterr().err
     assert main(["list", "variants"]) == 0
     assert "lie=KIND" in capsys.readouterr().out
+
+
+def test_a_log_has_the_faults_of_its_world(tmp_path: Path) -> None:
+    """A log keeps no messages: what faults make of them is drawn again, the same for every vehicle and tick."""
+    faults = {"corruption": {"probability": 0.3}, "lie": {"kind": "drift", "chance": 0.5}, "clock_offset": 0.1}
+    made = record(load_scenario(ENV, {"horizon": 0.5, "faults": {**faults, "restart": {"chance": 0.5}}}), 5)
+    write_recording(made, tmp_path / "log.mcap")
+    log = find_source(str(tmp_path / "log.mcap"), faults=["v2x_delay=0.1"])
+    found, expected = log.recording("nominal", 0)[0].interference, made.interference
+    assert found is not None and expected is not None
+    for field in fields(Interference):
+        assert_array_equal(getattr(found, field.name), getattr(expected, field.name), err_msg=field.name)
+    assert expected.shift.any() and expected.clock.any() and expected.restarts.any()
+    log.check()
+    with pytest.raises(CoopenvError, match="gyro_bias is a fault of a simulated world"):
+        find_source(str(tmp_path / "log.mcap"), faults=["gyro_bias=0.1"]).check()
