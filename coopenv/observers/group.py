@@ -127,6 +127,12 @@ class Group:
             message = tamper.told(observer, message)
         self.mail.post(vehicle, k, message, replay, kept)
 
+    @property
+    def refused(self) -> Array:
+        """(N,) messages that a vehicle received and that were none, or none that its observer understands."""
+        own = [getattr(observer, "ignored_messages", 0) for observer in self.observers]
+        return self.mail.refused + np.array(own or 0, dtype=np.int64)
+
     def update_all(self, sensed: Sensed) -> list[Answer]:
         """Let a joint observer take a tick of every vehicle."""
         setups = self.briefing.setups

@@ -42,7 +42,7 @@ class Run:
     nis_dof: NDArray[np.int64]  # (K, N)
     bytes_per_second: Array  # (N,) sent, payload
     microseconds_per_update: Array  # (N,) median, message included; a joint observer's time is shared out
-    refused: NDArray[np.int64]  # (N,) messages that were none, per receiver
+    refused: NDArray[np.int64]  # (N,) messages that were none, or not understood, per receiver
     failure: str = ""  # who failed, when and why; empty where nobody did
 
     def position_rmse(self, after: float = 0.0) -> Array:
@@ -116,7 +116,7 @@ def run(observer: str | Factory, recording: Recording, tamper: Tamper | None = N
         nis_dof=nis_dof,
         bytes_per_second=group.mail.bytes / max(r.dt, (r.ticks - 1) * r.dt),
         microseconds_per_update=np.array([1e6 * float(np.median(c)) if len(c) else np.nan for c in timed]),
-        refused=group.mail.refused,
+        refused=group.refused,
         failure=failure,
     )
 
