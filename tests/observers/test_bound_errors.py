@@ -23,7 +23,7 @@ KEYS = {
     "place": ("camera_position", 0.04),
     "clock": ("clock_offset", 0.03),
 }
-TICKS = 4
+TICKS = 3
 
 
 def told_of(made: Recording, *names: str) -> Recording:
