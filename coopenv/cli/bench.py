@@ -60,7 +60,7 @@ def bench_observers(
         typer.Option(
             "--fault",
             metavar="NAME=VALUE[@VEHICLE][,OPTION=VALUE]",
-            help="One more variant, with a fault that has parameters (see `coopenv list variants`), e.g. gyro_bias=0.01 "
+            help="One more variant, with a fault that has parameters (see `coopenv list variants`): gyro_bias=0.01 "
             "or lie=drift:0.05@vehicle_2,from=10; several vehicles with : between, several faults with +. Repeatable.",
         ),
     ] = None,

@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from coopenv.errors import CoopenvError, told
 from coopenv.estimation.arrays import Array
@@ -128,7 +128,7 @@ class Group:
         self.mail.post(vehicle, k, message, replay, kept)
 
     @property
-    def refused(self) -> Array:
+    def refused(self) -> NDArray[np.int64]:
         """(N,) messages that a vehicle received and that were none, or none that its observer understands."""
         own = [getattr(observer, "ignored_messages", 0) for observer in self.observers]
         return self.mail.refused + np.array(own or 0, dtype=np.int64)

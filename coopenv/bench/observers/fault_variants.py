@@ -1,7 +1,7 @@
 """Variants with faults that have parameters: what `--fault` asks for, checked against an environment."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 from coopenv.bench.observers.fault_grammar import Part, parts_of
@@ -9,7 +9,7 @@ from coopenv.bench.observers.fault_knobs import knob_of
 from coopenv.bench.observers.faults import Lie
 from coopenv.errors import CoopenvError, listed, suggest
 from coopenv.observers.recording import Recording
-from coopenv.scenario import Scenario
+from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.topology import neighbour_sets, processing_order
 
 
@@ -55,6 +55,22 @@ def variants_with(faults: Iterable[str]) -> tuple[FaultVariant, ...]:
         if sum(knob_of(part).lie is not None for part in variant.parts) > 1:
             raise CoopenvError(f"--fault {variant.name}: one lying_neighbour at most; `lie=jump` may be of several")
     return made
+
+
+def with_world(variant: FaultVariant, text: str, scenario: Scenario, overrides: Mapping[str, Any]) -> FaultVariant:
+    """Return a variant with the world that has its faults, where any is of the world.
+
+    Args:
+        variant: which one.
+        text: name or file of the environment.
+        scenario: the environment with its overrides.
+        overrides: these.
+
+    Raises:
+        CoopenvError: as for `overrides_of`, or a value is not possible.
+    """
+    keys = overrides_of(variant, scenario)
+    return replace(variant, scenario=load_scenario(text, {**overrides, **keys})) if keys else variant
 
 
 def overrides_of(variant: FaultVariant, scenario: Scenario) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import Kind, is_bag, kind_of, open_backend, open_recording
 from coopenv.bench.observers.fault_knobs import KNOBS
-from coopenv.bench.observers.fault_variants import FaultVariant, check_recorded, overrides_of, variants_with
+from coopenv.bench.observers.fault_variants import FaultVariant, check_recorded, variants_with, with_world
 from coopenv.bench.observers.faults import FAULTS, NOMINAL, Fault, Lie, followers
 from coopenv.errors import CoopenvError, DataWarning, suggest
 from coopenv.estimation.metrics import STEADY_SHARE, steady_start
@@ -156,7 +156,9 @@ class LogFile(Source):
         """Return the file's record with a fault."""
         recording = open_recording(self.path)
         if recording.scenario is not None and any(faults.any for faults in recording.scenario.all_faults):
-            again = record(open_backend(self.path, None, {}), seed)  # messages are not recorded: the same is drawn again
+            again = record(
+                open_backend(self.path, None, {}), seed
+            )  # messages are not recorded: the same is drawn again
             recording = replace(recording, interference=again.interference)
         return self.fault(variant).applied(recording, seed)
 
@@ -243,7 +245,7 @@ def find_source(
     kind, added = kind_of(text), variants_with(faults)
     if kind is Kind.ENVIRONMENT and not is_bag(text, topics) and topics is None and data is None:
         scenario = load_scenario(text, overrides)
-        worlds = tuple(_with_world(made, text, scenario, overrides or {}) for made in added)
+        worlds = tuple(with_world(made, text, scenario, overrides or {}) for made in added)
         return Simulated(Path(text).stem, scenario, _checked_policy(policy, scenario), added=worlds)
     if policy is not None:
         raise CoopenvError(f"--policy {policy}: {text} is recorded, nobody can drive in it")
@@ -252,12 +254,6 @@ def find_source(
             f"--fault {faults[0]}: recorded robots have variants of their own, {', '.join(Robots.named)}"
         )
     return replace(_recorded(text, kind, overrides, data, topics), added=added)
-
-
-def _with_world(variant: FaultVariant, text: str, scenario: Scenario, overrides: Mapping[str, Any]) -> FaultVariant:
-    """Return a variant with the world that has its faults."""
-    keys = overrides_of(variant, scenario)
-    return replace(variant, scenario=load_scenario(text, {**overrides, **keys})) if keys else variant
 
 
 def _checked_policy(policy: str | None, scenario: Scenario) -> str:
