@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
+from coopenv.backends.replay.backend import Replay
 from coopenv.errors import CoopenvError
 from coopenv.observers import Message, Recording, run
 from coopenv.observers.checks import check_received
@@ -275,3 +276,16 @@ def test_robots_on_a_plane_may_know_their_height() -> None:
     check_received(flat, planar=True)
     with pytest.raises(CoopenvError, match="not positive definite"):
         check_received(flat)
+
+
+@pytest.mark.parametrize("name", list(FAULTS))
+def test_a_replay_has_the_faults_of_its_world(name: str) -> None:
+    """They are drawn again from what the recording says of its seed."""
+    world = Replay(recorded(name), "log").world(1, "float64", "cpu", 1)
+    world.reset(None)
+    positions = []
+    for _ in range(recorded(name).ticks - 1):
+        world.advance(1)
+        R, p = world.view("estimate_rotation")[0], world.view("estimate_position")[0]
+        positions.append(np.einsum("nij,nj->ni", R, p))
+    assert_allclose(positions, in_kernels(scene(name), 3), atol=1e-9)
