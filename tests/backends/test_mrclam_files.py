@@ -78,10 +78,12 @@ def test_missing_file(folder):
         ("Robot1_Odometry.dat", 9, f"{ORIGIN + 0.18} 0.1\n", "2 columns, expected 3"),
         ("Robot2_Groundtruth.dat", 7, f"{ORIGIN} 1 2 3 4\n", "5 columns, expected 4"),
         ("Robot2_Groundtruth.dat", 7, f"{ORIGIN} 1 2 x\n", "'x' is not a number"),
-        ("Robot4_Measurement.dat", 6, f"{ORIGIN + 1.04} 118 nan 0.1\n", "not finite"),
+        ("Robot4_Measurement.dat", 6, f"{ORIGIN + 1.04} 118 inf 0.1\n", "not finite"),
         ("Robot4_Measurement.dat", 6, f"{ORIGIN + 1.04} 118 -1 0.1\n", "negative range"),
         ("Robot4_Measurement.dat", 6, f"{ORIGIN + 1.04} 118.5 1 0.1\n", "whole"),
+        ("Robot4_Measurement.dat", 6, "nan 118 1.0 0.1\n", "not finite"),
         ("Robot5_Odometry.dat", 8, f"{ORIGIN - 5} 0.1 0.1\n", "time runs backwards"),
+        ("Robot5_Odometry.dat", 80, f"{ORIGIN + 0.5} 0.1 0.1\n", "rows may be out of order by less than 1 s"),
         ("Barcodes.dat", 6, "1 7\n", "occurs twice"),
         ("Barcodes.dat", 6, "21 7\n", "not in 1..20"),
         ("Landmark_Groundtruth.dat", 5, "5 0 0 0 0\n", "not in 6..20"),
@@ -155,3 +157,25 @@ def test_unknown_barcodes_are_counted_and_left_out(folder):
         after = load_dataset("mrclam_6", folder).robots[3]
     assert after.skipped == 1
     assert len(after.detections) == len(before.detections) - 1
+
+
+def test_rows_a_little_late_are_put_in_order(folder):
+    """As in sub-dataset 9, where the second row of odometry stands .1 s before the first."""
+    before = load_dataset("mrclam_6", folder).robots[1]
+    path = folder / "Robot2_Odometry.dat"
+    lines = path.read_text().splitlines(keepends=True)
+    lines[4], lines[5], lines[60], lines[90] = lines[5], lines[4], lines[90], lines[60]
+    path.write_text("".join(lines))
+    with pytest.warns(DataWarning, match=r"put in order: 31 of Robot2_Odometry.dat$"):
+        after = load_dataset("mrclam_6", folder).robots[1]
+    np.testing.assert_array_equal(after.odometry, before.odometry)
+
+
+def test_rows_whose_values_are_not_known_are_left_out(folder):
+    """The line that is named for another fault is still that of the file."""
+    change(folder / "Robot3_Groundtruth.dat", 40, f"{ORIGIN + 0.70:.3f} NaN NaN NaN\n")
+    with pytest.warns(DataWarning, match=r"rows with NaN left out: 1 of Robot3_Groundtruth.dat$"):
+        robot = load_dataset("mrclam_6", folder).robots[2]
+    assert np.isfinite(robot.truth.position).all() and len(robot.truth.t) == 199
+    change(folder / "Robot3_Groundtruth.dat", 50, f"{ORIGIN + 0.90:.3f} 1 2 inf\n")
+    assert "Robot3_Groundtruth.dat:50: a value is not finite" in message(folder)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coopenv.errors import DataError, suggest
 
@@ -18,6 +19,7 @@ ENVIRONMENT_VARIABLE = "COOPENV_DATA"
 MAX_PAUSE_S = 3600.0  # between two rows; more is a broken time stamp
 MAX_LENGTH_S = 6 * 3600.0
 """Longest time that a sub-dataset may span, whose clocks agree; the longest one takes 40 minutes."""
+MAX_DISORDER_S = 1.0  # by which a row may be late, as some are that were published; more is a broken time stamp
 
 
 def find_folder(name: str, data: str | Path | None = None) -> Path:
@@ -48,8 +50,15 @@ def find_folder(name: str, data: str | Path | None = None) -> Path:
 class Table:
     """A file's rows of finite numbers, which know their lines."""
 
-    def __init__(self, path: Path, columns: int, least: int) -> None:
-        """Read a file that has so many columns, and at least so many rows; a DataError names a line that is not so."""
+    unknown = 0  # rows left out because a value in them is not known
+    late = 0  # rows that stood below a later one
+    _kept: NDArray[np.int64] | None = None  # of each row, which of the file's it is; None: the same
+
+    def __init__(self, path: Path, columns: int, least: int, gaps: bool = False) -> None:
+        """Read a file that has so many columns, and at least so many rows; a DataError names a line that is not so.
+
+        Where `gaps` are allowed, rows are left out that have NaN behind their first column.
+        """
         try:
             self.path, self._text = path, path.read_text(encoding="latin-1")
         except OSError as error:
@@ -65,6 +74,10 @@ class Table:
             self.values = np.empty((0, columns))
         if self.values.shape[1] != columns:
             self._explain(columns)
+        if gaps:
+            known = ~np.isnan(self.values[:, 1:]).any(axis=1)
+            self.unknown = int(np.count_nonzero(~known))
+            self._take(np.flatnonzero(known))
         for row in np.flatnonzero(~np.isfinite(self.values).all(axis=1)).tolist():
             self.refuse(row, "a value is not finite")
         if len(self.values) < least:
@@ -95,7 +108,17 @@ class Table:
 
     def refuse(self, row: int, why: str) -> NoReturn:
         """Blame a row of data, by its line in the file."""
-        raise DataError(f"{self.path}:{self._rows[row][0]}: {why}")
+        number = row if self._kept is None else self._kept[row]
+        raise DataError(f"{self.path}:{self._rows[number][0]}: {why}")
+
+    def sort(self, late: NDArray[np.bool_]) -> None:
+        """Put rows in the order of their first column, and remember how many were late."""
+        self.late = int(np.count_nonzero(late))
+        if self.late:
+            self._take(np.argsort(self.values[:, 0], kind="stable"))
+
+    def _take(self, rows: NDArray[np.int64]) -> None:
+        self.values, self._kept = self.values[rows], rows if self._kept is None else self._kept[rows]
 
     def whole(self, column: int) -> list[int]:
         """Return a column of whole numbers. Raises DataError: a number is not whole."""
@@ -106,12 +129,20 @@ class Table:
 
 
 def timed(path: Path, columns: int, least: int) -> Table:
-    """Return a table whose first column is the time, s, which runs neither backwards nor ahead by hours."""
-    table = Table(path, columns, least)
+    """Return a table whose first column is the time, s, which does not run ahead by hours.
+
+    Rows that stand up to a second too late are put in order, and rows with NaN are left out; the table counts both. A
+    DataError names a row that is later.
+    """
+    table = Table(path, columns, least, gaps=True)
+    t = table.values[:, 0]
+    behind = np.maximum.accumulate(t) - t
+    for row in np.flatnonzero(behind >= MAX_DISORDER_S).tolist():
+        why = f"time runs backwards, {t[row]:.14g} after {t[row - 1]:.14g}"
+        table.refuse(row, f"{why}; rows may be out of order by less than {MAX_DISORDER_S:g} s")
+    table.sort(behind > 0)
     t = table.values[:, 0]
     steps, length = np.diff(t, prepend=t[:1]), t - t[:1]
-    for row in np.flatnonzero(steps < 0).tolist():
-        table.refuse(row, f"time runs backwards, {t[row]:.14g} after {t[row - 1]:.14g}")
     for row in np.flatnonzero(steps > MAX_PAUSE_S).tolist():
         table.refuse(row, f"{steps[row]:g} s after the row above, at most {MAX_PAUSE_S:g}")
     for row in np.flatnonzero(length > MAX_LENGTH_S).tolist():
