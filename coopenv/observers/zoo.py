@@ -30,8 +30,8 @@ ZOO = {
     "ukf": Entry("ukf:Ukf"),
     "factor_graph": Entry("factor_graph:FactorGraph", needs="gtsam"),
     "planar_ekf": Entry("planar.plugin:PlanarEkf", in_space=False),
-    "robust": Entry("robust.kernels:robust", "robust.kernels:ROBUST", kernels_on_a_plane=False),
-    # on a plane it is `robust`: there are no joint messages
+    "planar_robust": Entry("planar.robust:PlanarRobust", in_space=False),
+    "robust": Entry("robust.kernels:robust", "robust.kernels:ROBUST", on_a_plane=False, kernels_on_a_plane=False),
     "robust_joint": Entry(
         "robust.joint.kernels:robust_joint",
         "robust.joint.kernels:ROBUST_JOINT",

@@ -89,7 +89,7 @@ def test_batches_restart_what_is_over() -> None:
 
 def test_robots_on_a_plane_have_theirs_on_the_host(tmp_path: Path) -> None:
     mrclam_files.write(tmp_path, seconds=4.0)
-    env = coopenv.parallel_env("mrclam_6", data=tmp_path, observer="robust", dtype="float64")
+    env = coopenv.parallel_env("mrclam_6", data=tmp_path, observer="planar_robust", dtype="float64")
     assert env.engine.plugins is not None
     env.reset(seed=0)
     while env.agents:

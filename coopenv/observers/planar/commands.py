@@ -8,7 +8,7 @@ from coopenv.estimation.arrays import Array
 
 TURNING_RATE = 1e-6  # rad/s; a smaller command is one to drive straight
 DRIVING_SPEED = 1e-6  # m/s; a smaller command is one to turn on the spot
-TURN, TURNING, PATH, ARC, SLOWING, SWITCHING = range(6)
+TURN, TURNING, PATH, ARC, SLOWING, SWITCHING, TOLD = range(7)
 """What the wheels make of commands: commanded turn times gain, rad; commanded turning times gain, s; commanded path, m;
 commanded turning, s; path times rate of turn, m rad/s; squares of the steps in the commanded rate, rad^2/s^2."""
 
@@ -44,7 +44,7 @@ class CommandHistory:
         self._delay, self._share = np.array(wheels.delay), np.array(wheels.share)
         ticks = int((longest + self._delay.max()) / shortest) + 4
         self._t = np.arange(-ticks, 1) * shortest
-        self._sum = np.zeros((6, ticks + 1))
+        self._sum = np.zeros((7, ticks + 1))
         self._rate = 0.0
 
     def add(self, dt: float, turn: float, path: float) -> None:
@@ -55,17 +55,17 @@ class CommandHistory:
         self._t[:-1] = self._t[1:]
         self._sum[:, :-1] = self._sum[:, 1:]
         self._t[-1] += dt
-        self._sum[:, -1] += gain * turn, gain * turning, path, turning, path * abs(w), (w - self._rate) ** 2
+        self._sum[:, -1] += gain * turn, gain * turning, path, turning, path * abs(w), (w - self._rate) ** 2, turn
         self._rate = w
 
     def response(self, dt: float, lead: float) -> tuple[Array, Array]:
-        """Return what the wheels did in the last dt in s (6,), if commands are early by `lead` in s, and d/dlead."""
+        """Return what the wheels did in the last dt in s (7,), if commands are early by `lead` in s, and d/dlead."""
         now, half = self._t[-1] - lead, dt / 2
         ends = np.array([now - dt - half, now - dt, now - half, now, now + half])
         at = (ends[:, None] - self._delay).ravel()
         k = np.clip(np.searchsorted(self._t, at), 1, len(self._t) - 1)
         share = np.minimum((at - self._t[k - 1]) / (self._t[k] - self._t[k - 1]), 1.0)
         before = self._sum[:, k - 1]
-        sums = (before + share * (self._sum[:, k] - before)).reshape(6, len(ends), -1) @ self._share
+        sums = (before + share * (self._sum[:, k] - before)).reshape(7, len(ends), -1) @ self._share
         earlier, start, middle, end, later = sums.T
         return end - start, -(later - 2 * middle + earlier) / dt

@@ -1,6 +1,6 @@
-"""Observers for planar robots whose odometry is their commands: a textbook filter, and one of our own.
+"""The textbook filter for planar robots whose odometry is their commands, as a plug-in.
 
-Both are planar; in the LEFT coordinates of their covariance only yaw, forward and left count. Roll, pitch and height
+In the LEFT coordinates of its covariance only yaw, forward and left count. Roll, pitch and height
 have a millimetre's and milliradian's variance, independent of the rest.
 """
 
@@ -12,41 +12,12 @@ import numpy as np
 from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.planar.commands import Wheels
-from coopenv.observers.planar.filter import HEADING, PlanarFilter, PlanarPose, Tuning, X, Y
+from coopenv.observers.planar.filter import HEADING, PlanarFilter, PlanarPose, Step, X, Y
+from coopenv.observers.planar.heard import LOWER, place_of, sightings_of
+from coopenv.observers.planar.tuning import TEXTBOOK, Tuning
 
 PLANE = np.ix_((2, 3, 4), (2, 3, 4))  # indices of the LEFT coordinates in the plane: yaw, forward, left
 OUT_OF_PLANE_STD = 1e-3  # rad and m
-LOWER = np.tril_indices(3)
-
-TEXTBOOK = Tuning()
-IROBOT_CREATE = Wheels(
-    delay=(0.0, 0.1, 0.2, 0.4),
-    share=(0.33, 0.42, 0.16, 0.09),
-    arc=((0.15, 1.8), (0.35, 1.3), (0.8, 0.88), (1.6, 0.84), (2.6, 0.8), (3.2, 0.95), (3.8, 1.1), (4.5, 0.975)),
-    spot=1.03,
-    slow=0.065,
-    slow_gain=0.22,
-    centre=0.005,
-)
-"""The iRobot Create of MR.CLAM, measured on sub-dataset 6; all of its robots agree (docs/data.md)."""
-CALIBRATING = Tuning(
-    turn_noise=(0.001, 0.05, 0.1),
-    path_noise=(0.002, 0.2),
-    slide_noise=0.05,
-    bearing_std=0.025,
-    gate=25.0,
-    soft=4.0,
-    mean=(0.936, 1.0, 0.005, 0.004, 1.0, 0.15, 0.0),
-    std=(0.08, 0.03, 0.001, 0.002, 0.3, 0.05, 0.007),
-    walk=(0.0003, 0.0003, 0.0, 0.0001, 0.0003, 0.0005, 0.0),
-    jitter=0.08,
-    wheels=IROBOT_CREATE,
-    fusion="intersection",
-    dependent=0.25,
-    arm_m=1.0,
-    mutual=True,
-)
 
 
 class PlanarEkf:
@@ -73,7 +44,7 @@ class PlanarEkf:
         heading = math.atan2(R[1, 0], R[0, 0])
         turn = _from_body(heading)
         covariance = turn @ initial_covariance[PLANE] @ turn.T
-        self.filter = PlanarFilter(self.tuning, np.array([p[0], p[1], heading]), covariance)
+        self._begin(np.array([p[0], p[1], heading]), covariance)
         self._sightings.clear()
         self._heard.clear()
 
@@ -82,7 +53,7 @@ class PlanarEkf:
         turn = math.atan2(tick.rotation[1, 0], tick.rotation[0, 0])
         chord = math.copysign(math.hypot(tick.translation[0], tick.translation[1]), tick.translation[0])
         arc_over_chord = 1.0 if turn == 0.0 else turn / 2 / math.sin(turn / 2)
-        self.filter.advance(tick.dt, turn, chord * arc_over_chord)
+        self._advance(tick.dt, turn, chord * arc_over_chord)
         if self.tuning.mutual:
             self._take_sightings(tick)
         if tick.valid.any():
@@ -95,8 +66,8 @@ class PlanarEkf:
         The pose that goes with the sightings is the one before they corrected it, so that who was seen does not hear
         its own estimate back.
         """
-        state, covariance = self.filter.state, np.zeros((3, 3))
-        covariance[:2, :2], covariance[2, 2] = self.filter.covariance[:2, :2], OUT_OF_PLANE_STD**2
+        (state, believed), covariance = self._belief(), np.zeros((3, 3))
+        covariance[:2, :2], covariance[2, 2] = believed[:2, :2], OUT_OF_PLANE_STD**2
         extra: dict[str, Any] = {}
         if self.tuning.mutual and self._sightings:
             targets, bearings = zip(*self._sightings, strict=True)
@@ -109,19 +80,39 @@ class PlanarEkf:
         self._sightings.clear()
         return Message(position=np.array([state[X], state[Y], 0.0]), covariance=covariance, extra=extra)
 
+    def _begin(self, pose: Array, covariance: Array) -> None:
+        self.filter = PlanarFilter(self.tuning, pose, covariance)
+
+    def _belief(self) -> tuple[Array, Array]:
+        """Return the state and its covariance, the pose first."""
+        return self.filter.state, self.filter.covariance
+
+    def _tell(self) -> PlanarPose:
+        return self.filter.tell()
+
+    def _advance(self, dt: float, turn: float, path: float) -> Step:
+        return self.filter.advance(dt, turn, path)
+
     def _look(self, tick: Tick) -> None:
         """Correct with what the camera saw, landmarks first."""
         for target, b, position, message in sorted(tick.usable(), key=lambda entry: entry[3] is not None):
             bearing = math.atan2(b[1], b[0])
             if message is None:
-                self.filter.landmark(bearing, float(position[0]), float(position[1]))
-            elif message.covariance is not None:
+                self._see_landmark(tick, target, bearing, float(position[0]), float(position[1]))
+            elif (place := place_of(tick.messages[target])) is not None:
                 if not self._sightings:
-                    self._before = self.filter.tell()
+                    self._before = self._tell()
                 self._sightings.append((target, bearing))
-                covariance = np.zeros((3, 3))  # of a neighbour's heading nothing is needed
-                covariance[:2, :2] = message.covariance[:2, :2]
-                self.filter.robot(bearing, PlanarPose(np.array([position[0], position[1], 0.0]), covariance))
+                self._see_robot(tick, target, bearing, place)
+
+    def _see_landmark(self, tick: Tick, target: int, bearing: float, x: float, y: float) -> None:
+        self.filter.landmark(bearing, x, y)
+
+    def _see_robot(self, tick: Tick, target: int, bearing: float, place: PlanarPose) -> None:
+        self.filter.robot(bearing, place)
+
+    def _be_seen(self, tick: Tick, target: int, bearing: float, by: PlanarPose) -> None:
+        self.filter.seen(bearing, by)
 
     def _take_sightings(self, tick: Tick) -> None:
         """Correct with the bearings under which others saw this robot; each message counts once."""
@@ -130,29 +121,18 @@ class PlanarEkf:
             if "seen" not in extra or sent < self._heard.get(target, -math.inf) + tick.dt / 2:
                 continue
             self._heard[target] = sent
-            pose, covariance = extra["from"][:3].astype(float), np.zeros((3, 3))
-            covariance[LOWER] = extra["from"][3:]
-            covariance += np.tril(covariance, -1).T
-            for bearing in extra["bearing"][extra["seen"] == self._me]:
-                self.filter.seen(float(bearing), PlanarPose(pose, covariance))
+            if (told := sightings_of(extra, self._me)) is not None:
+                for bearing in told[1]:
+                    self._be_seen(tick, target, bearing, told[0])
 
     def _estimate(self) -> Estimate:
-        x, y, heading = self.filter.state[[X, Y, HEADING]]
+        state, believed = self._belief()
+        x, y, heading = state[[X, Y, HEADING]]
         c, s = math.cos(heading), math.sin(heading)
         turn = _from_body(heading)
         covariance = OUT_OF_PLANE_STD**2 * np.eye(6)
-        covariance[PLANE] = turn.T @ self.filter.covariance[:3, :3] @ turn
+        covariance[PLANE] = turn.T @ believed[:3, :3] @ turn
         return Estimate(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([x, y, 0.0]), covariance)
-
-
-class PlanarRobust(PlanarEkf):
-    """Calibrates its odometry online, tells others that it saw them, and fuses by split covariance intersection.
-
-    Messages hold position and covariance (72 bytes), and after a sighting a pose with its covariance in single
-    precision (36 bytes) and 5 bytes for each robot seen.
-    """
-
-    tuning = CALIBRATING
 
 
 def _from_body(heading: float) -> Array:

@@ -1,9 +1,9 @@
 """The observer as the world is handed it, and as a plug-in."""
 
+from coopenv.errors import CoopenvError
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import KernelObserver
-from coopenv.observers.planar.plugin import PlanarRobust
 from coopenv.observers.robust.memory import SIZES, RobustMemory, rules_for
 from coopenv.observers.robust.messages import MESSAGES
 from coopenv.observers.robust.observer import make_estimate, make_start
@@ -27,8 +27,19 @@ ROBUST = Embedded(
 
 
 def robust(setup: Setup) -> Observer:
-    """This project's observer: several hypotheses, gates.
+    """This project's observer for vehicles in space: several hypotheses, gates.
 
-    Where a vehicle moves on a plane and its odometry is its commands, it is a planar one.
+    Raises:
+        CoopenvError: the vehicle moves on a plane and its odometry is its commands.
     """
-    return PlanarRobust(setup) if setup.planar else KernelObserver(ROBUST, setup)
+    return in_space("robust", ROBUST, setup)
+
+
+def in_space(name: str, observer: Embedded, setup: Setup) -> Observer:
+    """Return an observer for a vehicle in space; a CoopenvError names the one for robots on a plane."""
+    if setup.planar:
+        raise CoopenvError(
+            f"observer '{name}' is for vehicles in space; '{setup.name}' is a recorded robot on a plane whose odometry "
+            "is its commands: use 'planar_robust'"
+        )
+    return KernelObserver(observer, setup)

@@ -14,6 +14,7 @@ from coopenv.observers.planar.commands import (
     PATH,
     SLOWING,
     SWITCHING,
+    TOLD,
     TURN,
     TURNING,
     CommandHistory,
@@ -23,15 +24,16 @@ from coopenv.observers.planar.filter import (
     BIAS,
     HEADING,
     LEAD,
+    SHARE,
     STATES,
     TURN_SCALE,
     PlanarFilter,
     PlanarPose,
     X,
     Y,
-    growth,
 )
-from coopenv.observers.planar.plugin import CALIBRATING, IROBOT_CREATE, TEXTBOOK
+from coopenv.observers.planar.intersection import growth
+from coopenv.observers.planar.tuning import CALIBRATING, IROBOT_CREATE, TEXTBOOK
 
 DT = 0.05
 COMMANDS = [(0.07, 0.0), (0.08, 0.4), (0.05, 0.4), (0.0, -0.3), (0.067, 0.01), (0.086, -0.398), (0.086, 0.0)] * 3
@@ -94,8 +96,8 @@ def numeric(function, x, step=1e-6):
 
 
 def test_motion_derivatives_agree_with_differences():
-    tuning = replace(CALIBRATING, walk=(0.0,) * 7, turn_noise=(0, 0, 0), path_noise=(0, 0), slide_noise=0, jitter=0)
-    x = np.array([0.3, -0.2, 0.7, 0.93, 0.97, 0.004, 0.003, 0.9, 0.183, 0.01])
+    tuning = replace(CALIBRATING, walk=(0.0,) * 8, turn_noise=(0, 0, 0), path_noise=(0, 0), slide_noise=0, jitter=0)
+    x = np.array([0.3, -0.2, 0.7, 0.93, 0.97, 0.004, 0.003, 0.9, 0.183, 0.01, 0.8])
 
     def filtered(state, covariance):
         own = PlanarFilter(tuning, np.zeros(3), np.zeros((3, 3)))
@@ -175,8 +177,8 @@ def test_calibrates_scale_lead_and_camera_bias():
     """A robot that turns 0.85 times what it is told, 0.25 s late, with its camera off by 0.015 rad."""
     rng = np.random.default_rng(3)
     scale, lead, bias, noise = 0.85, 0.25, 0.015, 0.02
-    mean = (0.94, 1.0, 0.0, 0.0, 0.0, 0.15, 0.0)
-    std = (0.08, 0.03, 1e-6, 1e-6, 1e-6, 0.08, 0.02)
+    mean = (0.94, 1.0, 0.0, 0.0, 0.0, 0.15, 0.0, 1.0)
+    std = (0.08, 0.03, 1e-6, 1e-6, 1e-6, 0.08, 0.02, 0.0)
     tuning = replace(CALIBRATING, wheels=Wheels(), mean=mean, std=std, bearing_std=noise, jitter=0.0)
     own = PlanarFilter(tuning, np.zeros(3), np.diag([1e-4, 1e-4, 1e-4]))
     posts = [np.array([4 * math.cos(a), 4 * math.sin(a)]) for a in np.arange(6)]

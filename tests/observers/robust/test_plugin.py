@@ -7,10 +7,10 @@ import pytest
 
 from coopenv.bench.observers.basin import random_start
 from coopenv.bench.observers.faults import FAULTS, Lie, changed
+from coopenv.errors import CoopenvError
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.kernel_observer import KernelObserver
-from coopenv.observers.planar.plugin import PlanarRobust
 from coopenv.observers.registry import find
 from tests.helpers.robust_observers import OpenJoint, OpenRobust
 from tests.helpers.robust_scenes import everybody_sees_everybody, noise_free, shifted, small_errors
@@ -166,11 +166,12 @@ def test_silence_keeps_a_follower_going():
     assert np.isfinite(result.position_error).all()
 
 
-def test_planar_vehicles_get_the_planar_observer():
-    setup = replace(small_errors(12.0).setups[0], planar=True)
-    assert isinstance(find("robust")(setup), PlanarRobust)
-    assert isinstance(find("robust")(replace(setup, planar=False)), KernelObserver)
-    assert isinstance(find("robust_joint")(replace(setup, planar=False)), KernelObserver)
+@BOTH
+def test_robots_on_a_plane_are_pointed_to_their_observer(name):
+    setup = small_errors(12.0).setups[0]
+    assert isinstance(find(name)(setup), KernelObserver)
+    with pytest.raises(CoopenvError, match=f"'{name}' is for vehicles in space.* use 'planar_robust'"):
+        find(name)(replace(setup, planar=True))
 
 
 @BOTH

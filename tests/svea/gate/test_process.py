@@ -115,7 +115,9 @@ def test_what_comes_while_it_is_frozen_moves_nothing(
     resumed = time.monotonic()
     gate.send_signal(signal.SIGCONT)
     wait_until(lambda: len(station.since(resumed)) > 10)
-    if resumed - frozen < 0.6 * LEASE / 1000:  # after a longer while Zenoh has given the session up, with what was under way
+    if (
+        resumed - frozen < 0.6 * LEASE / 1000
+    ):  # after a longer while Zenoh has given the session up, with what was under way
         wait_until(lambda: station.count("stale") > 0)
     assert set(station.since(resumed)) == {NEUTRAL}
     assert station.status.state == "timed_out" and station.status.last_sequence <= sent

@@ -2,13 +2,11 @@
 
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.observers.contract import Observer, Setup
-from coopenv.observers.kernel_observer import KernelObserver
-from coopenv.observers.planar.plugin import PlanarRobust
 from coopenv.observers.robust.joint.fusion import fuse_joint_messages
 from coopenv.observers.robust.joint.memory import JOINT_SIZES, JointMemory, joint_rules
 from coopenv.observers.robust.joint.messages import JOINT_MESSAGES
 from coopenv.observers.robust.joint.radio import clear_joint_messages, receive_joint, send_joint
-from coopenv.observers.robust.kernels import OPTIONS
+from coopenv.observers.robust.kernels import OPTIONS, in_space
 from coopenv.observers.robust.observer import make_estimate, make_start
 from coopenv.world.embedded import Embedded
 
@@ -27,8 +25,9 @@ ROBUST_JOINT = Embedded(
 
 
 def robust_joint(setup: Setup) -> Observer:
-    """The robust observer with larger, joint messages.
+    """The robust observer with larger, joint messages, for vehicles in space.
 
-    Planar robots have one with small messages only.
+    Raises:
+        CoopenvError: the vehicle moves on a plane and its odometry is its commands.
     """
-    return PlanarRobust(setup) if setup.planar else KernelObserver(ROBUST_JOINT, setup)
+    return in_space("robust_joint", ROBUST_JOINT, setup)

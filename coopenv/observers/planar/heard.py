@@ -1,0 +1,58 @@
+"""What other robots tell, looked at before it is believed: no message may end a run or outweigh what was measured."""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from coopenv.estimation.arrays import Array
+from coopenv.observers.contract import Received
+from coopenv.observers.planar.filter import PlanarPose
+
+OLDEST_S = 2.0
+SPEED = 0.15  # m/s, by which a robot may have moved since it told where it is
+LEAST_STD = (0.01, 0.002)  # m, rad; nobody knows better
+FARTHEST_M = 1e6
+POSE_NUMBERS = 9  # x, y, heading and the triangle of their covariance
+LOWER = np.tril_indices(3)
+
+
+def place_of(received: Received) -> PlanarPose | None:
+    """Return where a robot is by its own word; None where that is no place or older than 2 s.
+
+    Of a neighbour's heading nothing is needed, so it is 0 and certain.
+    """
+    position, told = received.message.position, received.message.covariance
+    if position is None or told is None or not 0.0 <= received.age <= OLDEST_S:
+        return None
+    p, P = np.asarray(position, dtype=float), np.asarray(told, dtype=float)
+    if p.shape != (3,) or P.ndim != 2 or min(P.shape) < 2 or not _plausible(p[:2], P[:2, :2]):
+        return None
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2] = (P[:2, :2] + P[:2, :2].T) / 2
+    covariance[[0, 1], [0, 1]] += LEAST_STD[0] ** 2 + (SPEED * received.age) ** 2
+    return PlanarPose(np.array([p[0], p[1], 0.0]), covariance)
+
+
+def sightings_of(extra: Mapping[str, Array], me: int) -> tuple[PlanarPose, list[float]] | None:
+    """Return the pose of a robot that tells whom it saw, and the bearings in rad of one; None where they are none."""
+    seen, bearing, told = (np.asarray(extra.get(name, ())) for name in ("seen", "bearing", "from"))
+    if told.shape != (POSE_NUMBERS,) or seen.ndim != 1 or bearing.shape != seen.shape:
+        return None
+    pose, covariance = told[:3].astype(float), np.zeros((3, 3))
+    covariance[LOWER] = told[3:]
+    covariance += np.tril(covariance, -1).T
+    angles = [float(b) for b in bearing[seen == me]]
+    if not _plausible(pose, covariance) or not all(map(math.isfinite, angles)):
+        return None
+    return PlanarPose(pose, covariance + np.diag(np.square([LEAST_STD[0], *LEAST_STD]))), angles
+
+
+def _plausible(where: Array, covariance: Array) -> bool:
+    """Return whether numbers are finite, a place is on this site and a covariance is one."""
+    if not (np.isfinite(where).all() and np.isfinite(covariance).all()) or np.abs(where).max() > FARTHEST_M:
+        return False
+    scale = float(np.abs(covariance).max())
+    if scale > FARTHEST_M**2 or not np.allclose(covariance, covariance.T, atol=1e-3 * scale):
+        return False
+    return bool(np.linalg.eigvalsh(covariance)[0] >= -1e-3 * scale)

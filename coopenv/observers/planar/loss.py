@@ -1,0 +1,36 @@
+"""Whether a robot has lost its way: bearings that do not fit its estimate, over a window."""
+
+from collections import deque
+
+REFUSED = 16.0  # normalised innovation squared (4 standard deviations) of a bearing that does not fit
+WINDOW = 10  # bearings
+MOST_REFUSED = 6  # of them
+LONG_WINDOW = 30
+HIGHEST_MEAN = 5.0  # of the normalised innovation squared over the long window, 1 for an honest filter
+LARGEST = 25.0  # that one bearing counts in it
+SHORTEST_S = 1.0  # that the window must span: one bad frame is no loss
+
+
+class LossTest:
+    """The normalised innovations squared of one robot's last bearings."""
+
+    def __init__(self) -> None:
+        self._last: deque[tuple[float, float]] = deque(maxlen=LONG_WINDOW)
+
+    def clear(self) -> None:
+        """Forget them."""
+        self._last.clear()
+
+    def take(self, time: float, ratio: float) -> None:
+        """Take a bearing's normalised innovation squared at a time in s."""
+        self._last.append((time, min(ratio, LARGEST)))
+
+    @property
+    def lost(self) -> bool:
+        """Whether most of the last bearings do not fit, or all together fit badly."""
+        last = list(self._last)
+        short = last[-WINDOW:]
+        if len(short) == WINDOW and short[-1][0] - short[0][0] >= SHORTEST_S:
+            if sum(ratio > REFUSED for _, ratio in short) >= MOST_REFUSED:
+                return True
+        return len(last) == LONG_WINDOW and sum(ratio for _, ratio in last) > HIGHEST_MEAN * LONG_WINDOW
