@@ -29,7 +29,6 @@ from coopenv.observers.planar.tuning import Tuning
 X, Y, HEADING, TURN_SCALE, SPEED_SCALE, TURN_OFFSET, SPEED_OFFSET, SLOWDOWN, LEAD, BIAS, SHARE = range(11)
 STATES = 11
 MAX_LEAD_S = 0.6
-LARGEST_RATIO = 16.0  # that counts in the evidence: a misread bearing does not decide
 NEAREST_M = 0.1  # nothing is seen from closer than this; bounds the bearing's derivatives
 
 
@@ -60,8 +59,6 @@ class PlanarFilter:
         self._walk = np.square([0.0, 0.0, 0.0, *tuning.walk])
         self._commands: CommandHistory | None = None
         self.level = NoiseLevel(tuning.level_std)
-        self.evidence = 0.0
-        """Logarithm of the likelihood of the last bearing, but for a constant."""
 
     def advance(self, dt: float, turn: float, path: float) -> Step:
         """Move the estimate on by dt in s, over which the commands amount to a turn in rad and a path in m."""
@@ -110,21 +107,21 @@ class PlanarFilter:
 
     def landmark(self, bearing: float, x: float, y: float) -> float:
         """Correct with a bearing in rad to a known point in m; return its normalised innovation squared."""
-        h, direction = self._line(x, y)
-        return self._correct(*self._to(bearing, h, direction), self.tuning.bearing_std**2, self.covariance)
+        h, direction, bent = self._line(x, y, self.covariance[:2, :2])
+        return self._correct(*self._to(bearing, h, direction), self.tuning.bearing_std**2 + bent, self.covariance)
 
     def robot(self, bearing: float, other: PlanarPose) -> float:
         """Correct with a bearing in rad to a robot that tells where it thinks it is; return the same."""
-        h, direction = self._line(*other.pose[:2].tolist())
+        h, direction, bent = self._line(*other.pose[:2].tolist(), self.covariance[:2, :2] + other.covariance[:2, :2])
         theirs = np.array([-h[X], -h[Y], 0.0])
-        return self._fuse(*self._to(bearing, h, direction), theirs, other)
+        return self._fuse(*self._to(bearing, h, direction), bent, theirs, other)
 
     def seen(self, bearing: float, other: PlanarPose) -> float:
         """Correct with the bearing in rad under which another robot, which tells its pose, sees this one; the same."""
-        h, direction = self._line(*other.pose[:2].tolist())
+        h, direction, bent = self._line(*other.pose[:2].tolist(), self.covariance[:2, :2] + other.covariance[:2, :2])
         theirs = np.array([-h[X], -h[Y], -1.0])
         back = direction + math.pi  # from them to us; its derivatives are those of the line from us to them
-        return self._fuse(h, wrapped(bearing - (back - float(other.pose[2]))), theirs, other)
+        return self._fuse(h, wrapped(bearing - (back - float(other.pose[2]))), bent, theirs, other)
 
     def place(self, pose: Array, covariance: Array) -> None:
         """Put it at a pose (3,) with a covariance (3, 3); what is known of the wheels stays."""
@@ -133,6 +130,15 @@ class PlanarFilter:
         self.covariance[:, :3] = 0.0
         self.covariance[:3, :3] = covariance
 
+    def doubt(self) -> None:
+        """Doubt what was found out about the wheels as much as at the start, and keep what is plausible of it."""
+        k = self.tuning
+        mean, std = np.array(k.mean), np.array(k.std)
+        self.state[3:] = np.clip(self.state[3:], mean - 2 * std, mean + 2 * std)
+        self.covariance[3:] = 0.0
+        self.covariance[:, 3:] = 0.0
+        self.covariance[range(3, STATES), range(3, STATES)] = std**2
+
     def tell(self) -> PlanarPose:
         """Return what others need: the heading is the camera's, from which bearings count (bias taken off)."""
         pick = np.zeros((3, STATES))
@@ -140,22 +146,32 @@ class PlanarFilter:
         pick[2, BIAS] = -1.0
         return PlanarPose(pick @ self.state, pick @ self.covariance @ pick.T)
 
-    def _line(self, x: float, y: float) -> tuple[Array, float]:
-        """Return the derivatives and the direction of the line from here to a point."""
+    def _line(self, x: float, y: float, covariance: Array) -> tuple[Array, float, float]:
+        """Return derivatives and direction of the line from here to a point, and the variance that they leave out.
+
+        That is of the second order in the covariance (2, 2) of the line's ends, m^2: where these are as uncertain as the
+        line is long, a bearing says little.
+        """
         dx, dy = x - float(self.state[X]), y - float(self.state[Y])
         square = max(dx * dx + dy * dy, NEAREST_M**2)
         h = np.zeros(STATES)
         h[X], h[Y] = dy / square, -dx / square
-        return h, math.atan2(dy, dx)
+        if not self.tuning.second_order:
+            return h, math.atan2(dy, dx), 0.0
+        (xx, xy), (_, yy) = covariance.tolist()
+        along = (dx * dx * xx + 2 * dx * dy * xy + dy * dy * yy) / square
+        across = (dy * dy * xx - 2 * dx * dy * xy + dx * dx * yy) / square
+        both = (dx * dy * (yy - xx) + (dx * dx - dy * dy) * xy) / square
+        return h, math.atan2(dy, dx), (along * across + both * both) / square**2
 
     def _to(self, bearing: float, h: Array, direction: float) -> tuple[Array, float]:
         """Return derivatives and innovation of a bearing of this robot's camera."""
         h[HEADING], h[BIAS] = -1.0, 1.0
         return h, wrapped(bearing - (direction - float(self.state[HEADING]) + float(self.state[BIAS])))
 
-    def _fuse(self, h: Array, innovation: float, by_theirs: Array, other: PlanarPose) -> float:
+    def _fuse(self, h: Array, innovation: float, bent: float, by_theirs: Array, other: PlanarPose) -> float:
         k = self.tuning
-        theirs, noise = float(by_theirs @ other.covariance @ by_theirs), k.bearing_std**2
+        theirs, noise = float(by_theirs @ other.covariance @ by_theirs), k.bearing_std**2 + bent
         if k.fusion == "plain":
             return self._correct(h, innovation, noise + theirs, self.covariance)
         p, arm = self.covariance, k.arm_m**2
@@ -164,7 +180,6 @@ class PlanarFilter:
         cost = float(p[X, X] + p[Y, Y] + arm * p[HEADING, HEADING])
         ours_by, theirs_by = growth(own, gain, cost, theirs, noise, k.dependent)
         if ours_by == 0.0:  # nothing is gained
-            self.evidence = 0.0
             return innovation**2 / (own + theirs + noise)
         grown = np.where(np.arange(STATES) <= HEADING, math.sqrt(ours_by), 1.0)  # nobody shares a calibration
         return self._correct(h, innovation, noise + theirs * theirs_by, p * np.outer(grown, grown))
@@ -175,7 +190,6 @@ class PlanarFilter:
         spread = float(h @ ph)
         ratio = innovation**2 / (spread + noise)
         self.level.learn(ratio, spread / (spread + noise))
-        self.evidence = -(math.log(spread + noise) + min(ratio, LARGEST_RATIO)) / 2
         if ratio > k.gate:
             return ratio
         if ratio > k.soft:

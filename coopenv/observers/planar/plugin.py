@@ -66,8 +66,8 @@ class PlanarEkf:
         The pose that goes with the sightings is the one before they corrected it, so that who was seen does not hear
         its own estimate back.
         """
-        (state, believed), covariance = self._belief(), np.zeros((3, 3))
-        covariance[:2, :2], covariance[2, 2] = believed[:2, :2], OUT_OF_PLANE_STD**2
+        state, covariance = self.filter.state, np.zeros((3, 3))
+        covariance[:2, :2], covariance[2, 2] = self.filter.covariance[:2, :2], OUT_OF_PLANE_STD**2
         extra: dict[str, Any] = {}
         if self.tuning.mutual and self._sightings:
             targets, bearings = zip(*self._sightings, strict=True)
@@ -83,13 +83,6 @@ class PlanarEkf:
     def _begin(self, pose: Array, covariance: Array) -> None:
         self.filter = PlanarFilter(self.tuning, pose, covariance)
 
-    def _belief(self) -> tuple[Array, Array]:
-        """Return the state and its covariance, the pose first."""
-        return self.filter.state, self.filter.covariance
-
-    def _tell(self) -> PlanarPose:
-        return self.filter.tell()
-
     def _advance(self, dt: float, turn: float, path: float) -> Step:
         return self.filter.advance(dt, turn, path)
 
@@ -101,7 +94,7 @@ class PlanarEkf:
                 self._see_landmark(tick, target, bearing, float(position[0]), float(position[1]))
             elif (place := place_of(tick.messages[target])) is not None:
                 if not self._sightings:
-                    self._before = self._tell()
+                    self._before = self.filter.tell()
                 self._sightings.append((target, bearing))
                 self._see_robot(tick, target, bearing, place)
 
@@ -126,12 +119,11 @@ class PlanarEkf:
                     self._be_seen(tick, target, bearing, told[0])
 
     def _estimate(self) -> Estimate:
-        state, believed = self._belief()
-        x, y, heading = state[[X, Y, HEADING]]
+        x, y, heading = self.filter.state[[X, Y, HEADING]]
         c, s = math.cos(heading), math.sin(heading)
         turn = _from_body(heading)
         covariance = OUT_OF_PLANE_STD**2 * np.eye(6)
-        covariance[PLANE] = turn.T @ believed[:3, :3] @ turn
+        covariance[PLANE] = turn.T @ self.filter.covariance[:3, :3] @ turn
         return Estimate(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), np.array([x, y, 0.0]), covariance)
 
 

@@ -7,7 +7,6 @@ import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.planar.bank import PlanarBank
 from coopenv.observers.planar.filter import BIAS, HEADING, TURN_SCALE, PlanarPose, Step, X, Y
 from coopenv.observers.planar.loss import LossTest
 from coopenv.observers.planar.memory import Memory
@@ -15,12 +14,12 @@ from coopenv.observers.planar.plugin import PlanarEkf
 from coopenv.observers.planar.search import Known, find_pose
 from coopenv.observers.planar.tuning import CALIBRATING, Tuning
 
-CLEAR_STD = (1.5, 0.5)  # m, rad; whoever is less certain cannot correct with single bearings, and collects them
+CLEAR_STD = (8.0, 1.6)  # m, rad; whoever is less certain cannot correct with single bearings, and collects them
 LOST_HEADING_STD = math.pi / math.sqrt(3)  # rad, of a heading that may be any
 LEAST_LOST_STD = 5.0  # m
 SPANS_S = (10.0, 30.0)  # of what is searched: the shortest one that gives an answer counts
 SEARCH_PERIOD_S = 0.4
-ENOUGH = 10  # bearings, with which a search should find something
+ENOUGH = 8  # bearings, which contradict what was known before
 MOST_FAILED = 15  # searches with so many bearings, after which what was known before does not count
 
 
@@ -64,21 +63,15 @@ class PlanarRobust(PlanarEkf):
         return super().message()
 
     def _begin(self, pose: Array, covariance: Array) -> None:
-        self._bank = PlanarBank(self.tuning, pose, covariance)
+        super()._begin(pose, covariance)
         self._test, self._memory = LossTest(), Memory()
         self._next_search, self._failed, self._news = 0.0, 0, False
         self.lost, self._adrift, self._turned, self._from = False, 0.0, 0.0, 0.0
         if self._unclear():
             self._lose()
 
-    def _belief(self) -> tuple[Array, Array]:
-        return self._bank.mixture()
-
-    def _tell(self) -> PlanarPose:
-        return self._bank.tell()
-
     def _advance(self, dt: float, turn: float, path: float) -> Step:
-        step = self._bank.advance(dt, turn, path)
+        step = self.filter.advance(dt, turn, path)
         self._memory.move(step)
         self._news = False
         if self.lost:
@@ -87,67 +80,69 @@ class PlanarRobust(PlanarEkf):
 
     def _drift(self, step: Step) -> None:
         """Widen the pose by what was turned and driven since the loss: errors of scale and heading last."""
-        state, covariance = self._belief()
+        state, covariance = self.filter.state, self.filter.covariance
         before = self._turned
         self._adrift, self._turned = self._adrift + abs(step.driven), before + abs(step.turned)
         by_scale = float(covariance[TURN_SCALE, TURN_SCALE]) * (self._turned**2 - before**2)
         heading = min(float(covariance[HEADING, HEADING]) + by_scale, LOST_HEADING_STD**2)
         variance = self._from + self._adrift**2 * min(heading, 1.0)
-        self._bank.place(state[:3].copy(), np.diag([variance, variance, heading]))
+        self.filter.place(state[:3].copy(), np.diag([variance, variance, heading]))
 
     def _see_landmark(self, tick: Tick, target: int, bearing: float, x: float, y: float) -> None:
         self._remember(tick.time, target, bearing, True, PlanarPose(np.array([x, y, 0.0]), np.zeros((3, 3))))
         if not self.lost:
-            self._test.take(tick.time, self._bank.landmark(bearing, x, y))
+            self._test.take(tick.time, self.filter.landmark(bearing, x, y))
 
     def _see_robot(self, tick: Tick, target: int, bearing: float, place: PlanarPose) -> None:
         self._remember(tick.time, target, bearing, True, place)
         if not self.lost:
-            self._test.take(tick.time, self._bank.robot(bearing, place))
+            self._test.take(tick.time, self.filter.robot(bearing, place))
 
     def _be_seen(self, tick: Tick, target: int, bearing: float, by: PlanarPose) -> None:
         self._remember(tick.time, target, float(by.pose[2]) + bearing + math.pi, False, by)
         if not self.lost:
-            self._test.take(tick.time, self._bank.seen(bearing, by))
+            self._test.take(tick.time, self.filter.seen(bearing, by))
 
     def _remember(self, time: float, target: int, angle: float, own: bool, there: PlanarPose) -> None:
         """Keep a sighting; an angle of one's own camera counts from the heading, its bias taken off."""
         self._news = True
-        angle -= float(self._bank.best.state[BIAS]) if own else 0.0
+        angle -= float(self.filter.state[BIAS]) if own else 0.0
         noise = self.tuning.bearing_std**2 + (0.0 if own else float(there.covariance[2, 2]))
         point = (float(there.pose[0]), float(there.pose[1]))
         variance = float(there.covariance[0, 0] + there.covariance[1, 1]) / 2
         self._memory.see(time, target, angle, own, point, variance, noise)
 
     def _unclear(self) -> bool:
-        variance = np.diag(self._bank.best.covariance)
+        variance = np.diag(self.filter.covariance)
         return bool(variance[X] + variance[Y] > CLEAR_STD[0] ** 2 or variance[HEADING] > CLEAR_STD[1] ** 2)
 
     def _lose(self) -> None:
-        """Stop correcting with single bearings."""
-        covariance = self._belief()[1]
+        """State that the pose is unknown."""
+        covariance = self.filter.covariance
         self.lost, self._adrift, self._turned, self._failed = True, 0.0, 0.0, 0
         self._from = float(covariance[X, X] + covariance[Y, Y])
         self._test.clear()
 
     def _give_up(self) -> None:
-        """State that the pose is unknown; what the wheels were found to be is doubtful, too."""
-        pose = self._belief()[0][:3].copy()
-        self._bank.restart(pose, np.diag(np.square([self._site, self._site, LOST_HEADING_STD])))
+        """State that nothing is known of the pose; what the wheels were found to be is doubtful, too."""
+        self.filter.place(
+            self.filter.state[:3].copy(), np.diag(np.square([self._site, self._site, LOST_HEADING_STD]))
+        )
+        self.filter.doubt()
         self._lose()
 
     def _search(self, now: float) -> None:
         """Look for a pose that agrees with what was seen."""
         self._next_search = now + SEARCH_PERIOD_S
-        state, covariance = self._belief()
+        state, covariance = self.filter.state, self.filter.covariance
         before = Known(state[:3].copy(), np.linalg.inv(covariance[:3, :3]))
         for span in SPANS_S:
             lines = self._memory.lines(now, span, float(covariance[TURN_SCALE, TURN_SCALE]))
-            found = find_pose(lines, before)
+            found, contradicted = find_pose(lines, before)
             if found is not None:
-                self._bank.place(found.pose, np.linalg.inv(found.information + before.information))
+                self.filter.place(found.pose, np.linalg.inv(found.information + before.information))
                 self.lost = False
                 return
-        self._failed += len(lines.angle) >= ENOUGH
+        self._failed += contradicted and len(lines.angle) >= ENOUGH
         if self._failed >= MOST_FAILED:
             self._give_up()  # what was known before is wrong

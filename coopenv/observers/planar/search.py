@@ -21,7 +21,7 @@ AGREES = 9.0  # normalised square of the angle up to which a bearing agrees with
 SHARE = 0.7  # of all bearings that must agree
 MARGIN = 12.0  # by which the cost of any other pose is larger
 APART = (0.5, 0.3)  # m, rad: poses further apart than that are different ones
-CERTAIN = (0.6, 0.25)  # m, rad: standard deviation of a pose that counts
+CERTAIN = (1.0, 0.35)  # m, rad: standard deviation of a pose that counts
 NEAREST_M = 0.3
 GROWTH = 2.0  # of the covariance of what bearings say: those of the same odometry share errors
 
@@ -33,13 +33,17 @@ class Known(NamedTuple):
     information: Array
 
 
-def find_pose(lines: Lines, before: Known) -> Known | None:
-    """Return the pose that the sightings agree on, and what they alone say about it.
+class Answer(NamedTuple):
+    """What a search gives."""
 
-    None where they do not agree with what was known before and with each other, or agree on several poses.
-    """
+    found: Known | None  # the pose, and what the sightings alone say about it; None: unknown, or one of several
+    contradicted: bool = False  # whether no pose fits the sightings and what was known before
+
+
+def find_pose(lines: Lines, before: Known) -> Answer:
+    """Return the pose that the sightings agree on with each other and with what was known before."""
     if len(lines.angle) < FEWEST:
-        return None
+        return Answer(None)
     headings = np.arange(HEADINGS) * (2 * np.pi / HEADINGS) - np.pi
     poses = np.column_stack([_positions(lines, headings, before), headings])
     best = np.argsort(_cost(lines, poses, before))[:REFINED]
@@ -48,16 +52,16 @@ def find_pose(lines: Lines, before: Known) -> Known | None:
     first = int(np.argmin(cost))
     apart = poses - poses[first]
     other = (np.hypot(apart[:, 0], apart[:, 1]) > APART[0]) | (np.abs(_wrapped(apart[:, 2])) > APART[1])
-    if (other & (cost < cost[first] + MARGIN)).any():
-        return None
     agree = _squares(lines, poses[first : first + 1])[0] < AGREES
     if agree.sum() < max(FEWEST, SHARE * len(agree)):
-        return None
+        return Answer(None, contradicted=True)
+    if (other & (cost < cost[first] + MARGIN)).any():
+        return Answer(None)
     said = information[first] / GROWTH
     left = np.linalg.inv(said + before.information)
     if left[0, 0] + left[1, 1] > CERTAIN[0] ** 2 or left[2, 2] > CERTAIN[1] ** 2:
-        return None
-    return Known(poses[first], said)
+        return Answer(None)
+    return Answer(Known(poses[first], said))
 
 
 def _positions(lines: Lines, headings: Array, before: Known) -> Array:

@@ -20,12 +20,11 @@ class Tuning:
     bearing_std: float = 0.03  # rad
     gate: float = 9.0  # normalised innovation squared above which a bearing is dropped
     soft: float = math.inf  # the same above which a bearing's variance grows with it (a heavy tail)
+    second_order: bool = False  # whether a bearing's variance grows with what its linearisation leaves out
     mean: Eight = (1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     """Turn scale, speed scale, turn offset, speed offset, slowdown, lead, bearing bias and wheels' share at the
     start."""
     std: Eight = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the same
-    scales: tuple[tuple[float, float], ...] = ((1.0, 1.0),)
-    """Of turns, from which a bank's filters start in place of the mean, each with its weight."""
     walk: Eight = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the same, per sqrt(s)
     jitter: float = 0.0  # s, by which a step of the commanded rate may take effect sooner or later
     level_std: float = 0.0  # of the logarithm of a factor on all motion noise, learnt from the innovations; 0: fixed
@@ -56,9 +55,9 @@ CALIBRATING = Tuning(
     bearing_std=0.025,
     gate=math.inf,
     soft=4.0,
+    second_order=True,
     mean=(0.936, 1.0, 0.005, 0.004, 1.0, 0.15, 0.0, 1.0),
-    scales=((0.6, 0.15), (0.75, 0.2), (0.936, 0.4), (1.15, 0.15), (1.45, 0.1)),
-    std=(0.09, 0.1, 0.003, 0.004, 0.3, 0.08, 0.01, 0.5),
+    std=(0.25, 0.1, 0.003, 0.004, 0.3, 0.08, 0.01, 0.5),
     walk=(0.0003, 0.0003, 0.0, 0.0001, 0.0003, 0.0005, 0.0, 0.0),
     jitter=0.09,
     level_std=0.7,
