@@ -9,10 +9,11 @@ and the commands w, v, late by the lead and spread by the wheels' response, move
 
     turn = turn scale * (W - turn offset * G),    path = speed scale * V + speed offset * T - slowdown * U
 
-over a tick: W is the integral of w + share (g - 1) w, g the wheels' gain as it was measured on robots of a kind, so that
-a share of 0 is a robot of another kind, and G is that of g over the time in which a turn is commanded, T is that time, V and U are the integrals of v and v |w|. A robot told to drive straight does so. A step of the commanded
-rate takes effect a jitter sooner or later, which leaves an error in the heading. All of this noise is as large as the
-innovations say (`level.py`). With no spread in the last seven numbers and a fixed level it is the textbook filter.
+over a tick: W is the integral of w + share (g - 1) w, g the wheels' gain as it was measured on one kind of robot (a
+share of 0 is another kind), G is that of g over the time in which a turn is commanded, T is that time, V and U are the
+integrals of v and v |w|. A robot told to drive straight does so. A step of the commanded rate takes effect a jitter
+sooner or later, which leaves an error in the heading. All of this noise is as large as the innovations say
+(`level.py`). With no spread in the last eight numbers and a fixed level it is the textbook filter.
 """
 
 import math
@@ -21,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from coopenv.estimation.arrays import Array
+from coopenv.observers.planar.bearing import left_out, wrapped
 from coopenv.observers.planar.commands import ARC, PATH, SLOWING, SWITCHING, TOLD, TURN, TURNING, CommandHistory
 from coopenv.observers.planar.intersection import growth
 from coopenv.observers.planar.level import NoiseLevel
@@ -112,13 +114,13 @@ class PlanarFilter:
 
     def robot(self, bearing: float, other: PlanarPose) -> float:
         """Correct with a bearing in rad to a robot that tells where it thinks it is; return the same."""
-        h, direction, bent = self._line(*other.pose[:2].tolist(), self.covariance[:2, :2] + other.covariance[:2, :2])
+        h, direction, bent = self._line_to(other)
         theirs = np.array([-h[X], -h[Y], 0.0])
         return self._fuse(*self._to(bearing, h, direction), bent, theirs, other)
 
     def seen(self, bearing: float, other: PlanarPose) -> float:
         """Correct with the bearing in rad under which another robot, which tells its pose, sees this one; the same."""
-        h, direction, bent = self._line(*other.pose[:2].tolist(), self.covariance[:2, :2] + other.covariance[:2, :2])
+        h, direction, bent = self._line_to(other)
         theirs = np.array([-h[X], -h[Y], -1.0])
         back = direction + math.pi  # from them to us; its derivatives are those of the line from us to them
         return self._fuse(h, wrapped(bearing - (back - float(other.pose[2]))), bent, theirs, other)
@@ -138,6 +140,7 @@ class PlanarFilter:
         self.covariance[3:] = 0.0
         self.covariance[:, 3:] = 0.0
         self.covariance[range(3, STATES), range(3, STATES)] = std**2
+        self.level = NoiseLevel(k.level_std)
 
     def tell(self) -> PlanarPose:
         """Return what others need: the heading is the camera's, from which bearings count (bias taken off)."""
@@ -147,22 +150,18 @@ class PlanarFilter:
         return PlanarPose(pick @ self.state, pick @ self.covariance @ pick.T)
 
     def _line(self, x: float, y: float, covariance: Array) -> tuple[Array, float, float]:
-        """Return derivatives and direction of the line from here to a point, and the variance that they leave out.
-
-        That is of the second order in the covariance (2, 2) of the line's ends, m^2: where these are as uncertain as the
-        line is long, a bearing says little.
-        """
+        """Return derivatives and direction of the line from here to a point, and the variance that they leave out."""
         dx, dy = x - float(self.state[X]), y - float(self.state[Y])
         square = max(dx * dx + dy * dy, NEAREST_M**2)
         h = np.zeros(STATES)
         h[X], h[Y] = dy / square, -dx / square
         if not self.tuning.second_order:
             return h, math.atan2(dy, dx), 0.0
-        (xx, xy), (_, yy) = covariance.tolist()
-        along = (dx * dx * xx + 2 * dx * dy * xy + dy * dy * yy) / square
-        across = (dy * dy * xx - 2 * dx * dy * xy + dx * dx * yy) / square
-        both = (dx * dy * (yy - xx) + (dx * dx - dy * dy) * xy) / square
-        return h, math.atan2(dy, dx), (along * across + both * both) / square**2
+        return h, math.atan2(dy, dx), left_out(dx, dy, square, covariance)
+
+    def _line_to(self, other: PlanarPose) -> tuple[Array, float, float]:
+        x, y = other.pose[:2].tolist()
+        return self._line(x, y, self.covariance[:2, :2] + other.covariance[:2, :2])
 
     def _to(self, bearing: float, h: Array, direction: float) -> tuple[Array, float]:
         """Return derivatives and innovation of a bearing of this robot's camera."""
@@ -200,8 +199,3 @@ class PlanarFilter:
         p = prior - np.outer(gain, ph)
         self.covariance = (p + p.T) / 2
         return ratio
-
-
-def wrapped(angle: float) -> float:
-    """Return an angle in [-pi, pi)."""
-    return (angle + math.pi) % (2 * math.pi) - math.pi

@@ -13,7 +13,7 @@ import math
 
 MEMORY = 150.0  # bearings, over which what was learnt fades
 LARGEST_RATIO = 9.0
-HIGHEST = math.log(8.0)
+HIGHEST = math.log(4.0)
 
 
 class NoiseLevel:

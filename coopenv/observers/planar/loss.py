@@ -1,5 +1,6 @@
 """Whether a robot has lost its way: bearings that do not fit its estimate, over a window."""
 
+import math
 from collections import deque
 
 REFUSED = 16.0  # normalised innovation squared (4 standard deviations) of a bearing that does not fit
@@ -26,11 +27,17 @@ class LossTest:
         self._last.append((time, min(ratio, LARGEST)))
 
     @property
+    def since(self) -> float:
+        """When the first of the last bearings that do not fit was seen, s."""
+        refused = [time for time, ratio in list(self._last)[-WINDOW:] if ratio > REFUSED]
+        return refused[0] if refused else -math.inf
+
+    @property
     def lost(self) -> bool:
         """Whether most of the last bearings do not fit, or all together fit badly."""
         last = list(self._last)
         short = last[-WINDOW:]
-        if len(short) == WINDOW and short[-1][0] - short[0][0] >= SHORTEST_S:
-            if sum(ratio > REFUSED for _, ratio in short) >= MOST_REFUSED:
-                return True
+        lasting = len(short) == WINDOW and short[-1][0] - short[0][0] >= SHORTEST_S
+        if lasting and sum(ratio > REFUSED for _, ratio in short) >= MOST_REFUSED:
+            return True
         return len(last) == LONG_WINDOW and sum(ratio for _, ratio in last) > HIGHEST_MEAN * LONG_WINDOW

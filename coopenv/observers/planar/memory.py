@@ -23,8 +23,8 @@ class Sighting:
     point: tuple[float, float]  # m, map
     variance: float  # m^2, of the point along an axis
     angle_variance: float  # rad^2
-    trail: tuple[float, float, float, float, float]
-    """Where the odometry was: x m, y m, heading rad; and the sums of its variances, rad^2 and m^2."""
+    trail: tuple[float, ...]
+    """(5,) where the odometry was: x m, y m, heading rad; and the sums of its variances, rad^2 and m^2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +47,10 @@ class Memory:
         self._trail = np.zeros(5)
         self._seen: deque[Sighting] = deque(maxlen=MOST)
 
-    def clear(self) -> None:
-        """Forget all sightings."""
-        self._seen.clear()
+    def forget(self, before: float) -> None:
+        """Forget the sightings before a time in s."""
+        while self._seen and self._seen[0].time < before:
+            self._seen.popleft()
 
     def move(self, step: Step) -> None:
         """Go on by what the odometry says of a tick."""

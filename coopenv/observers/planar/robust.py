@@ -46,10 +46,11 @@ class PlanarRobust(PlanarEkf):
             self._site = max(LEAST_LOST_STD, float(np.ptp(tick.landmarks[:, :2], axis=0).max()) / 2)
         estimate = super().update(tick)
         if not self.lost and self._test.lost:
+            self._memory.forget(self._test.since)  # until then it may have been elsewhere
             self._give_up()
         elif not self.lost and self._unclear():
+            self._memory.forget(math.inf)  # what it saw is in the estimate
             self._lose()
-            self._memory.clear()  # what it saw is in the estimate
         if self.lost and self._news and tick.time >= self._next_search:
             self._search(tick.time)
             estimate = self._estimate()
@@ -125,9 +126,7 @@ class PlanarRobust(PlanarEkf):
 
     def _give_up(self) -> None:
         """State that nothing is known of the pose; what the wheels were found to be is doubtful, too."""
-        self.filter.place(
-            self.filter.state[:3].copy(), np.diag(np.square([self._site, self._site, LOST_HEADING_STD]))
-        )
+        self.filter.place(self.filter.state[:3].copy(), np.diag(np.square([self._site, self._site, LOST_HEADING_STD])))
         self.filter.doubt()
         self._lose()
 
@@ -135,12 +134,14 @@ class PlanarRobust(PlanarEkf):
         """Look for a pose that agrees with what was seen."""
         self._next_search = now + SEARCH_PERIOD_S
         state, covariance = self.filter.state, self.filter.covariance
-        before = Known(state[:3].copy(), np.linalg.inv(covariance[:3, :3]))
+        information: Array = np.asarray(np.linalg.inv(covariance[:3, :3]), dtype=np.float64)
+        before = Known(state[:3].copy(), information)
         for span in SPANS_S:
             lines = self._memory.lines(now, span, float(covariance[TURN_SCALE, TURN_SCALE]))
             found, contradicted = find_pose(lines, before)
             if found is not None:
-                self.filter.place(found.pose, np.linalg.inv(found.information + before.information))
+                left = np.asarray(np.linalg.inv(found.information + information), dtype=np.float64)
+                self.filter.place(found.pose, left)
                 self.lost = False
                 return
         self._failed += contradicted and len(lines.angle) >= ENOUGH

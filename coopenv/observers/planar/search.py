@@ -16,9 +16,10 @@ from coopenv.observers.planar.memory import Lines
 HEADINGS = 72
 ROUNDS = 6  # of reweighting
 REFINED = 6  # of the headings tried
-FEWEST = 4  # bearings that agree
+FEWEST = 6  # bearings that agree
+FEWEST_TARGETS = 3  # of them
 AGREES = 9.0  # normalised square of the angle up to which a bearing agrees with a pose
-SHARE = 0.7  # of all bearings that must agree
+SHARE = 0.75  # of all bearings that must agree
 MARGIN = 12.0  # by which the cost of any other pose is larger
 APART = (0.5, 0.3)  # m, rad: poses further apart than that are different ones
 CERTAIN = (1.0, 0.35)  # m, rad: standard deviation of a pose that counts
@@ -44,8 +45,8 @@ def find_pose(lines: Lines, before: Known) -> Answer:
     """Return the pose that the sightings agree on with each other and with what was known before."""
     if len(lines.angle) < FEWEST:
         return Answer(None)
-    headings = np.arange(HEADINGS) * (2 * np.pi / HEADINGS) - np.pi
-    poses = np.column_stack([_positions(lines, headings, before), headings])
+    headings = np.arange(HEADINGS, dtype=np.float64) * (2 * np.pi / HEADINGS) - np.pi
+    poses: Array = np.column_stack([_positions(lines, headings, before), headings])
     best = np.argsort(_cost(lines, poses, before))[:REFINED]
     poses, information = _refined(lines, poses[best], before)
     cost = _cost(lines, poses, before)
@@ -55,6 +56,8 @@ def find_pose(lines: Lines, before: Known) -> Answer:
     agree = _squares(lines, poses[first : first + 1])[0] < AGREES
     if agree.sum() < max(FEWEST, SHARE * len(agree)):
         return Answer(None, contradicted=True)
+    if len(np.unique(lines.target[agree])) < FEWEST_TARGETS:
+        return Answer(None)
     if (other & (cost < cost[first] + MARGIN)).any():
         return Answer(None)
     said = information[first] / GROWTH

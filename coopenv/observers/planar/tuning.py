@@ -49,15 +49,15 @@ IROBOT_CREATE = Wheels(
 )
 """The iRobot Create of MR.CLAM, measured on sub-dataset 6; all of its robots agree (docs/data.md)."""
 CALIBRATING = Tuning(
-    turn_noise=(0.005, 0.12, 0.1),
-    path_noise=(0.003, 0.25),
+    turn_noise=(0.004, 0.1, 0.1),
+    path_noise=(0.002, 0.22),
     slide_noise=0.05,
     bearing_std=0.025,
     gate=math.inf,
     soft=4.0,
     second_order=True,
     mean=(0.936, 1.0, 0.005, 0.004, 1.0, 0.15, 0.0, 1.0),
-    std=(0.25, 0.1, 0.003, 0.004, 0.3, 0.08, 0.01, 0.5),
+    std=(0.25, 0.04, 0.001, 0.002, 0.3, 0.05, 0.007, 0.3),
     walk=(0.0003, 0.0003, 0.0, 0.0001, 0.0003, 0.0005, 0.0, 0.0),
     jitter=0.09,
     level_std=0.7,

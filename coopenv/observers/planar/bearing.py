@@ -1,0 +1,23 @@
+"""Angles on a plane."""
+
+import math
+
+from coopenv.estimation.arrays import Array
+
+
+def wrapped(angle: float) -> float:
+    """Return an angle in [-pi, pi)."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi
+
+
+def left_out(dx: float, dy: float, square: float, covariance: Array) -> float:
+    """Return the variance of a bearing, rad^2, that its linearisation leaves out.
+
+    That is of the second order in the covariance (2, 2) of the line's ends, m^2: where these are as uncertain as the
+    line is long, a bearing says little. The line is (dx, dy) in m, `square` its length squared.
+    """
+    (xx, xy), (_, yy) = covariance.tolist()
+    along = (dx * dx * xx + 2 * dx * dy * xy + dy * dy * yy) / square
+    across = (dy * dy * xx - 2 * dx * dy * xy + dx * dx * yy) / square
+    both = (dx * dy * (yy - xx) + (dx * dx - dy * dy) * xy) / square
+    return float((along * across + both * both) / square**2)
