@@ -135,8 +135,8 @@ class PlanarFilter:
     def doubt(self) -> None:
         """Doubt what was found out about the wheels as much as at the start, and keep what is plausible of it."""
         k = self.tuning
-        mean, std = np.array(k.mean), np.array(k.std)
-        self.state[3:] = np.clip(self.state[3:], mean - 2 * std, mean + 2 * std)
+        std = np.array(k.std)
+        self.state[3:] = np.clip(self.state[3:], k.mean - 2 * std, k.mean + 2 * std)
         self.covariance[3:] = 0.0
         self.covariance[:, 3:] = 0.0
         self.covariance[range(3, STATES), range(3, STATES)] = std**2
@@ -144,9 +144,8 @@ class PlanarFilter:
 
     def tell(self) -> PlanarPose:
         """Return what others need: the heading is the camera's, from which bearings count (bias taken off)."""
-        pick = np.zeros((3, STATES))
-        pick[0, X] = pick[1, Y] = pick[2, HEADING] = 1.0
-        pick[2, BIAS] = -1.0
+        pick = np.eye(3, STATES)
+        pick[HEADING, BIAS] = -1.0
         return PlanarPose(pick @ self.state, pick @ self.covariance @ pick.T)
 
     def _line(self, x: float, y: float, covariance: Array) -> tuple[Array, float, float]:
@@ -178,8 +177,9 @@ class PlanarFilter:
         own, gain = float(h @ ph), float(ph[X] ** 2 + ph[Y] ** 2 + arm * ph[HEADING] ** 2)
         cost = float(p[X, X] + p[Y, Y] + arm * p[HEADING, HEADING])
         ours_by, theirs_by = growth(own, gain, cost, theirs, noise, k.dependent)
-        if ours_by == 0.0:  # nothing is gained
-            return innovation**2 / (own + theirs + noise)
+        ratio = innovation**2 / (own + theirs + noise)
+        if ours_by == 0.0 or ratio > k.others_gate:  # nothing is gained, or it is a lie
+            return ratio
         grown = np.where(np.arange(STATES) <= HEADING, math.sqrt(ours_by), 1.0)  # nobody shares a calibration
         return self._correct(h, innovation, noise + theirs * theirs_by, p * np.outer(grown, grown))
 

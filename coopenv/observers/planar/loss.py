@@ -9,6 +9,8 @@ MOST_REFUSED = 6  # of them
 LONG_WINDOW = 30
 HIGHEST_MEAN = 5.0  # of the normalised innovation squared over the long window, 1 for an honest filter
 LARGEST = 25.0  # that one bearing counts in it
+FITS = 9.0  # the same up to which a bearing to a landmark shows that the robot is not lost
+TRUST_S = 15.0  # for so long; meanwhile a robot whose bearings do not fit is itself lost, or lies
 SHORTEST_S = 1.0  # that the window must span: one bad frame is no loss
 
 
@@ -17,14 +19,23 @@ class LossTest:
 
     def __init__(self) -> None:
         self._last: deque[tuple[float, float]] = deque(maxlen=LONG_WINDOW)
+        self._sure = -math.inf
 
     def clear(self) -> None:
         """Forget them."""
         self._last.clear()
+        self._sure = -math.inf
 
     def take(self, time: float, ratio: float) -> None:
-        """Take a bearing's normalised innovation squared at a time in s."""
+        """Take the normalised innovation squared of a bearing to a landmark at a time in s."""
+        if ratio <= FITS:
+            self._sure = time
         self._last.append((time, min(ratio, LARGEST)))
+
+    def take_of_robot(self, time: float, ratio: float) -> None:
+        """Take that of a bearing to or from a robot, which counts where no landmark was seen lately."""
+        if time - self._sure > TRUST_S:
+            self._last.append((time, min(ratio, LARGEST)))
 
     @property
     def since(self) -> float:

@@ -97,12 +97,12 @@ class PlanarRobust(PlanarEkf):
     def _see_robot(self, tick: Tick, target: int, bearing: float, place: PlanarPose) -> None:
         self._remember(tick.time, target, bearing, True, place)
         if not self.lost:
-            self._test.take(tick.time, self.filter.robot(bearing, place))
+            self._test.take_of_robot(tick.time, self.filter.robot(bearing, place))
 
     def _be_seen(self, tick: Tick, target: int, bearing: float, by: PlanarPose) -> None:
         self._remember(tick.time, target, float(by.pose[2]) + bearing + math.pi, False, by)
         if not self.lost:
-            self._test.take(tick.time, self.filter.seen(bearing, by))
+            self._test.take_of_robot(tick.time, self.filter.seen(bearing, by))
 
     def _remember(self, time: float, target: int, angle: float, own: bool, there: PlanarPose) -> None:
         """Keep a sighting; an angle of one's own camera counts from the heading, its bias taken off."""

@@ -19,6 +19,7 @@ class Tuning:
     slide_noise: float = 0.0  # m/sqrt(s) sideways per m/s
     bearing_std: float = 0.03  # rad
     gate: float = 9.0  # normalised innovation squared above which a bearing is dropped
+    others_gate: float = math.inf  # the same of a bearing to or from a robot, before the covariances grow
     soft: float = math.inf  # the same above which a bearing's variance grows with it (a heavy tail)
     second_order: bool = False  # whether a bearing's variance grows with what its linearisation leaves out
     mean: Eight = (1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -54,6 +55,7 @@ CALIBRATING = Tuning(
     slide_noise=0.05,
     bearing_std=0.025,
     gate=math.inf,
+    others_gate=36.0,
     soft=4.0,
     second_order=True,
     mean=(0.936, 1.0, 0.005, 0.004, 1.0, 0.15, 0.0, 1.0),
