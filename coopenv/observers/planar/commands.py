@@ -1,6 +1,7 @@
 """What a planar robot was told to do, and what its wheels made of it a moment later."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,6 +35,15 @@ class Wheels:
         curvatures, gains = zip(*self.arc, strict=True)
         more = self.slow_gain if abs(v) < self.slow and curvature > 1.0 else 0.0
         return float(np.interp(curvature, curvatures, gains)) + more
+
+
+class Step(NamedTuple):
+    """What the odometry says of one tick."""
+
+    turned: float  # rad
+    driven: float  # m
+    turn_variance: float  # rad^2, of its noise alone
+    path_variance: float  # m^2
 
 
 class CommandHistory:

@@ -23,7 +23,7 @@ import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.observers.planar.bearing import left_out, wrapped
-from coopenv.observers.planar.commands import ARC, PATH, SLOWING, SWITCHING, TOLD, TURN, TURNING, CommandHistory
+from coopenv.observers.planar.commands import ARC, PATH, SLOWING, SWITCHING, TOLD, TURN, TURNING, CommandHistory, Step
 from coopenv.observers.planar.intersection import growth
 from coopenv.observers.planar.level import NoiseLevel
 from coopenv.observers.planar.tuning import Tuning
@@ -39,15 +39,6 @@ class PlanarPose(NamedTuple):
 
     pose: Array
     covariance: Array
-
-
-class Step(NamedTuple):
-    """What the odometry says of one tick."""
-
-    turned: float  # rad
-    driven: float  # m
-    turn_variance: float  # rad^2, of its noise alone
-    path_variance: float  # m^2
 
 
 class PlanarFilter:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from coopenv.estimation.arrays import Array
-from coopenv.observers.planar.filter import Step
+from coopenv.observers.planar.commands import Step
 
 MOST = 60  # sightings
 LARGEST_ERROR = 0.3  # rad; a sighting whose bearing is less certain by now is of no use

@@ -12,7 +12,8 @@ import numpy as np
 from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.planar.filter import HEADING, PlanarFilter, PlanarPose, Step, X, Y
+from coopenv.observers.planar.commands import Step
+from coopenv.observers.planar.filter import HEADING, PlanarFilter, PlanarPose, X, Y
 from coopenv.observers.planar.heard import LOWER, place_of, sightings_of
 from coopenv.observers.planar.tuning import TEXTBOOK, Tuning
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.planar.filter import BIAS, HEADING, TURN_SCALE, PlanarPose, Step, X, Y
+from coopenv.observers.planar.commands import Step
+from coopenv.observers.planar.filter import BIAS, HEADING, TURN_SCALE, PlanarPose, X, Y
 from coopenv.observers.planar.loss import LossTest
 from coopenv.observers.planar.memory import Memory
 from coopenv.observers.planar.plugin import PlanarEkf
