@@ -12,6 +12,7 @@ from coopenv.bench.observers.basin import Draw
 from coopenv.bench.observers.faults import FAULTS, NOMINAL
 from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
 from coopenv.bench.observers.rows import Row, mean_of
+from coopenv.bench.observers.sources import Robots
 from coopenv.bench.observers.window_tables import window_tables
 from coopenv.bench.observers.windows import WindowRow
 from coopenv.bench.observers.wording import FAILED, compact, short_name
@@ -43,6 +44,8 @@ def everything(board: Leaderboard, width: int = WIDTH) -> Iterator[Table | str]:
         if line := honest_line(board.rows):
             yield line
         yield from window_tables(board, variant, width)
+    if set(variants) <= set(Robots.named):
+        yield f"\n{Robots.friendly}"
     if len(variants) > 1:
         yield ""
         yield variant_table(board, "mean RMSE [m]", "rmse", variants)
