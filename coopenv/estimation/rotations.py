@@ -50,6 +50,26 @@ def exp_so3(w: Array) -> Array:
     )
 
 
+def right_jacobian(w: Array) -> Array:
+    """Return J (3, 3) with Exp(w + d) = Exp(w) Exp(J d) to first order in d."""
+    x, y, z = w.tolist()
+    square = x * x + y * y + z * z
+    if square > 1e-6:
+        angle = math.sqrt(square)
+        b, c = 2.0 * (math.sin(angle / 2.0) / angle) ** 2, (1.0 - math.sin(angle) / angle) / square
+    else:
+        b, c = 0.5 - square / 24.0, 1.0 / 6.0 - square / 120.0
+    cxy, cxz, cyz, bx, by, bz = c * x * y, c * x * z, c * y * z, b * x, b * y, b * z
+    diagonal = 1.0 - c * square
+    return np.array(
+        [
+            [diagonal + c * x * x, cxy + bz, cxz - by],
+            [cxy - bz, diagonal + c * y * y, cyz + bx],
+            [cxz + by, cyz - bx, diagonal + c * z * z],
+        ]
+    )
+
+
 def log_so3(R: Array) -> Array:
     """Return (3,) the rotation vector of R, of length 0..pi rad."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R.tolist()

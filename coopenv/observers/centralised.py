@@ -2,17 +2,25 @@
 
 Source: Roumeliotis and Bekey, Distributed multirobot localization, IEEE Transactions on Robotics and Automation 18(5),
 2002, in its centralised form; errors and Jacobians as in mekf.py. A bearing from i to a point z_j = p_j + R_j m_j of
-vehicle j also has H_j = B Rhat_i^T Rhat_j [-S(m_j), I] / |d|.
+vehicle j also has H_j = B Rhat_i^T Rhat_j [-S(m_j), I] / |d|. Each vehicle has a gate (gate.py); corrections are
+linearised half way, and large ones are iterated to where they lead (correction.py).
 """
 
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array
-from coopenv.estimation.rotations import orthonormalise, skew
+from coopenv.estimation.rotations import exp_so3, lengths, orthonormalise, skew
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.mekf import LeftError, innovation, kalman
+from coopenv.observers.correction import Stacked, settled, turn_of_sight
+from coopenv.observers.gate import Gate
+from coopenv.observers.lines import PLANE, Lines, innovation
+from coopenv.observers.mekf import LeftError
+
+Masks = dict[int, NDArray[np.bool_]]
+"""Of the targets of vehicles that saw any."""
 
 
 class Centralised:
@@ -23,7 +31,9 @@ class Centralised:
 
     joint = True
 
-    def __init__(self, setups: Sequence[Setup]) -> None:
+    def __init__(self, setups: Sequence[Setup], gated: bool = True) -> None:
+        """Take the setups of all; without `gated` every bearing is believed."""
+        self.gated, self.gates = gated, [Gate() for _ in setups]
         self.landmarks = setups[0].landmarks
         self.markers = [setup.marker for setup in setups]
 
@@ -34,6 +44,8 @@ class Centralised:
         for i, covariance in enumerate(initial_covariances):
             self.P[self.block(i), self.block(i)] = covariance
         self.sent = [Message() for _ in self.poses]
+        for gate in self.gates:
+            gate.reset()
 
     @staticmethod
     def block(i: int) -> slice:
@@ -43,14 +55,12 @@ class Centralised:
     def update(self, ticks: Sequence[Tick]) -> list[Estimate]:
         """Predict every vehicle, then correct by all bearings in one update."""
         self.predict(ticks)
-        rows = [self.rows(i, tick) for i, tick in enumerate(ticks) if tick.due and tick.valid.any()]
-        if rows:
-            H, residual, variances = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-            dx, self.P, _ = kalman(self.P, H, np.diag(variances), residual)
-            self.move(dx)
+        seen = {i: tick.valid for i, tick in enumerate(ticks) if tick.due and tick.valid.any()}
+        if seen:
+            self.correct(ticks, seen)
         odometry = [np.concatenate([tick.angular_velocity, tick.velocity]) for tick in ticks]
-        seen = [tick.bearings[tick.valid] for tick in ticks]
-        self.sent = [Message(extra={"odometry": o, "bearings": b}) for o, b in zip(odometry, seen, strict=True)]
+        bearings = [tick.bearings[tick.valid] for tick in ticks]
+        self.sent = [Message(extra={"odometry": o, "bearings": b}) for o, b in zip(odometry, bearings, strict=True)]
         return [
             LeftError(R, p, self.P[self.block(i), self.block(i)].copy()).estimate()
             for i, (R, p) in enumerate(self.poses)
@@ -65,19 +75,46 @@ class Centralised:
         noise = np.concatenate([tick.noise.odometry(tick.dt) for tick in ticks])
         self.P = F.dot(self.P).dot(F.T) + np.diag(noise)
 
-    def rows(self, i: int, tick: Tick) -> tuple[Array, Array, Array]:
-        """Return (H (2m, 6N), residual (2m,), variances (2m,)) of the bearings of vehicle i."""
+    def correct(self, ticks: Sequence[Tick], seen: Masks) -> None:
+        """Correct by the bearings of masks (m,) by vehicle that pass the vehicles' gates, in one update."""
+        before, P = self.poses, self.P
+        lines = {i: self.lines(i, ticks[i], mask) for i, mask in seen.items()}
+        if self.gated:
+            kept = {i: self.gates[i].sifted(ticks[i].time, P, *of) for i, of in lines.items()}
+            lines = {i: (of.only(kept[i]), in_front) for i, (of, in_front) in lines.items()}
+            seen = {i: _within(mask, kept[i]) for i, mask in seen.items()}
+        first = _stacked([of for of, _ in lines.values()])
+        if not len(first[0]):
+            return
+
+        def look(at: Array) -> Stacked:
+            self.poses = moved(before, at)
+            residual, H, N = _stacked([self.lines(i, ticks[i], mask)[0] for i, mask in seen.items()])
+            return residual, H.dot(recentring(at)), N
+
+        distance = min(
+            1.0 / lengths(of.H[:, 0, 6 * i + 3 : 6 * i + 6]).min() for i, (of, _) in lines.items() if len(of.H)
+        )
+        dx, P, _ = settled(P, first, look, lambda dx: turn_of_sight(dx, distance))
+        G = recentring(dx)
+        self.poses, self.P = moved(before, dx), G.dot(P).dot(G.T)
+
+    def lines(self, i: int, tick: Tick, mask: NDArray[np.bool_]) -> tuple[Lines, NDArray[np.bool_]]:
+        """Return the bearings of a mask (m,) of vehicle i, linearised by all errors, and whether they point ahead."""
         R, p = self.poses[i]
-        targets = tick.targets[tick.valid].tolist()
-        z = np.array([self.place(target, tick) for target in targets])
-        residual, J = innovation(R, p, tick.lever_arm, tick.bearings[tick.valid], z)
+        targets = tick.targets[mask].tolist()
+        z = np.array([self.place(target, tick) for target in targets]).reshape(-1, 3)
+        bearings = tick.bearings[mask]
+        residual, J = innovation(R, p, tick.lever_arm, bearings, z)
+        own = LeftError(R, p, self.P)
         H = np.zeros((len(z), 2, len(self.P)))
-        H[:, :, self.block(i)] = J @ LeftError(R, p, self.P).jacobian(z)
+        H[:, :, self.block(i)] = J @ own.jacobian(z)
         for n, target in enumerate(targets):
             if (j := target - self.landmarks) >= 0:
                 G = J[n].dot(R.T).dot(self.poses[j][0])
                 H[n, :, self.block(j)] = np.concatenate([G.dot(skew(-self.markers[j])), G], axis=1)
-        return H.reshape(-1, len(self.P)), residual.ravel(), np.full(2 * len(z), tick.noise.bearing_std**2)
+        N = np.broadcast_to(tick.noise.bearing_std**2 * PLANE, (len(z), 2, 2))
+        return Lines(residual, H, N), (((z - p).dot(R) - tick.lever_arm) * bearings).sum(1) > 0.0
 
     def place(self, target: int, tick: Tick) -> Array:
         """Return (3,) where a target is, or is believed to be, map frame, m."""
@@ -88,12 +125,30 @@ class Centralised:
         marker: Array = p + R.dot(self.markers[target - self.landmarks])
         return marker
 
-    def move(self, dx: Array) -> None:
-        """Move every pose by its part of the error."""
-        for i, (R, p) in enumerate(self.poses):
-            moved = LeftError(R, p, self.P).moved(dx[self.block(i)], self.P)
-            self.poses[i] = moved.R, moved.p
-
     def messages(self) -> list[Message]:
         """Return the raw measurements of this tick: odometry and bearings."""
         return self.sent
+
+
+def moved(poses: Sequence[tuple[Array, Array]], dx: Array) -> list[tuple[Array, Array]]:
+    """Return poses moved by their errors (6N,)."""
+    return [(R.dot(exp_so3(e[:3])), p + R.dot(e[3:])) for (R, p), e in zip(poses, dx.reshape(-1, 6), strict=True)]
+
+
+def recentring(dx: Array) -> Array:
+    """Return (6N, 6N) what `LeftError.recentring` returns, of every pose."""
+    G = np.zeros((len(dx), len(dx)))
+    for n in range(0, len(dx), 6):
+        G[n : n + 6, n : n + 6] = LeftError.recentring(dx[n : n + 6])
+    return G
+
+
+def _within(mask: NDArray[np.bool_], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    result = mask.copy()
+    result[mask] = kept
+    return result
+
+
+def _stacked(lines: Sequence[Lines]) -> Stacked:
+    residual, H, N = (np.concatenate(parts) for parts in zip(*lines, strict=True))
+    return Lines(residual, H, N).stacked()

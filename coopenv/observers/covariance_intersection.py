@@ -1,9 +1,12 @@
-"""Error-state filter that fuses neighbours by split covariance intersection.
+"""Error-state filter that fuses neighbours by covariance intersection with what is told of them.
 
 Source: Julier and Uhlmann, A non-divergent estimation algorithm in the presence of unknown correlations, 1997. For a
 bearing to a neighbour P becomes P / w, and the neighbour's part of the noise H_j P_j H_j^T / (1 - w): the two may be
 correlated in any way. The bearing's own noise is independent and stays whole. w minimises det P+. Consistent, at the
-price of information.
+price of information. With the gain that is best for that bound it is also the discorrelated minimum variance of Zhu and
+Kia, Cooperative localization under limited connectivity, IEEE Transactions on Robotics 35(6), 2019, for vehicles that
+correct themselves alone. It is not split covariance intersection, which is in split_covariance_intersection.py: P and
+P_j count as dependent as a whole.
 """
 
 from math import log
@@ -12,8 +15,9 @@ import numpy as np
 from scipy.optimize import brentq
 
 from coopenv.estimation.arrays import Array
-from coopenv.observers.contract import Message, Tick
-from coopenv.observers.mekf import Mekf, innovation, kalman
+from coopenv.observers.contract import Tick
+from coopenv.observers.lines import PLANE, Lines, Sight, linearised
+from coopenv.observers.mekf import Mekf
 
 LOWEST, HIGHEST = 0.02, 1.0 - 1e-6  # limits of w short of 1, which leaves the measurement out
 
@@ -27,27 +31,22 @@ class CovarianceIntersection(Mekf):
 
     sends_covariance = True
 
-    def correct(self, tick: Tick, b: Array, z: Array, messages: list[Message | None]) -> None:
-        """Correct by bearings b (m, 3) to positions z (m, 3)."""
-        known = np.array([m is None or m.covariance is None for m in messages])
+    def correct(self, tick: Tick, sight: Sight, lines: Lines) -> None:
+        """Correct by bearings, which are linearised at the prediction."""
+        known = np.array([m is None or m.covariance is None for m in sight.messages])
         if known.any():
-            super().correct(tick, b[known], z[known], [None] * int(known.sum()))
+            super().correct(tick, sight.only(known), lines.only(known))
         for n in np.flatnonzero(~known):
-            message = messages[n]
-            if message is not None and message.covariance is not None:
-                self.intersect(tick, b[n : n + 1], z[n : n + 1], message.covariance)
+            self.intersect(tick, sight.only(np.arange(len(known)) == n))
 
-    def intersect(self, tick: Tick, b: Array, z: Array, covariance: Array) -> None:
-        """Fuse one bearing to a neighbour with the covariance (3, 3) of its position."""
-        residual, J = innovation(self.state.R, self.state.p, tick.lever_arm, b, z)
-        H = J[0].dot(self.state.jacobian(z)[0])
-        G = J[0].dot(self.state.R.T)
-        own = tick.noise.bearing_std**2 * np.eye(2)
-        theirs, prior = G.dot(covariance).dot(G.T), H.dot(self.state.P).dot(H.T)
-        w = best_weight(prior, own, theirs)
+    def intersect(self, tick: Tick, one: Sight) -> None:
+        """Fuse one bearing to a neighbour with the covariance of its position."""
+        H, N = linearised(self.state, tick, one)[1:]
+        own = tick.noise.bearing_std**2 * PLANE
+        w = best_weight(H[0].dot(self.state.P).dot(H[0].T), own, N[0] - own)
         if w < 1.0:
-            dx, P, _ = kalman(self.state.P / w, H, own + theirs / (1.0 - w), residual[0])
-            self.state = self.state.moved(dx, P)
+            inflated = one._replace(covariances=one.covariances / (1.0 - w))
+            self.fuse(tick, inflated, linearised(self.state, tick, inflated), self.state.P / w)
 
 
 def best_weight(prior: Array, own: Array, theirs: Array) -> float:

@@ -11,8 +11,10 @@ from typing import ClassVar, Self
 import numpy as np
 
 from coopenv.estimation.arrays import Array
-from coopenv.estimation.rotations import adjoint, exp_se3
+from coopenv.estimation.rotations import adjoint, exp_se3, skew
 from coopenv.observers.mekf import LeftError, Mekf
+
+IDENTITY_6 = np.eye(6)
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,17 @@ class InvariantError(LeftError):
         """Return the state moved by an error dx = xi."""
         turn, shift = exp_se3(np.asarray(dx))
         return type(self)(self.R.dot(turn), self.p + self.R.dot(shift), P)
+
+    @staticmethod
+    def recentring(dx: Array) -> Array:
+        """Return the right Jacobian of SE(3) at dx, up to the fourth order."""
+        A = np.zeros((6, 6))
+        A[:3, :3] = A[3:, 3:] = skew(dx[:3])
+        A[3:, :3] = skew(dx[3:])
+        G = IDENTITY_6 - A / 5.0
+        for n in (4.0, 3.0, 2.0):
+            G = IDENTITY_6 - A.dot(G) / n
+        return G
 
 
 class LeftInvariant(Mekf):

@@ -5,7 +5,7 @@ error); the bearing as a residual in its tangent plane. Errors: R = Rhat Exp(the
 
 Over a tick of odometry (dR, dp), with E = dR^T:  F = [E, 0; -E S(dp), E].
 With a = Rhat^T (z - phat), d = a - c the line from the camera c, and B a tangent basis at d / |d|:
-H = B [S(a), -I] / |d|,  residual B b.
+H = B [S(a), -I] / |d|,  residual B b. Bearings are gated (gate.py) and linearised half way (correction.py).
 """
 
 from dataclasses import dataclass
@@ -13,18 +13,13 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array, solve
+from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
-from coopenv.estimation.rotations import IDENTITY, exp_so3, lengths, orthonormalise, skew, tangent_basis
+from coopenv.estimation.rotations import IDENTITY, exp_so3, lengths, orthonormalise, right_jacobian, skew
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-
-
-def innovation(R: Array, p: Array, lever_arm: Array, bearings: Array, positions: Array) -> tuple[Array, Array]:
-    """Return (residual (m, 2), J (m, 2, 3)): tangent residuals and their derivative by the line d in the body frame."""
-    d = (positions - p).dot(R) - lever_arm
-    distance = np.maximum(lengths(d), 1e-9)[:, None]
-    B = tangent_basis(d / distance)
-    return (B @ bearings[..., None])[..., 0], B / distance[..., None]
+from coopenv.observers.correction import Stacked, settled, turn_of_sight
+from coopenv.observers.gate import Gate
+from coopenv.observers.lines import Lines, Sight, ahead, linearised, sight_of
 
 
 @dataclass(frozen=True)
@@ -67,6 +62,23 @@ class LeftError:
         """Return the state moved by an error dx."""
         return type(self)(self.R.dot(exp_so3(dx[:3])), self.p + self.R.dot(dx[3:]), P)
 
+    @staticmethod
+    def recentring(dx: Array) -> Array:
+        """Return G (6, 6): about the state moved by dx, an error of dx + d about this one is G d to first order."""
+        G = np.zeros((6, 6))
+        G[:3, :3] = right_jacobian(dx[:3])
+        G[3:, 3:] = exp_so3(dx[:3]).T
+        return G
+
+    def in_body(self, dx: Array) -> Array:
+        """Return an error as turn and shift (6,) in body axes, to first order."""
+        return dx
+
+    def corrected(self, dx: Array, P: Array) -> Self:
+        """Return the state moved by an error dx, of which P is the covariance about this state."""
+        G = self.recentring(dx)
+        return self.moved(dx, G.dot(P).dot(G.T))
+
     def point_covariance(self, marker: Array) -> Array:
         """Return the covariance (3, 3) in map axes of a point of the body."""
         J = np.empty((3, 6))
@@ -77,17 +89,6 @@ class LeftError:
     def estimate(self, nis: float | None = None, nis_dof: int = 0) -> Estimate:
         """Return the pose with its covariance, and the normalised innovation squared of its correction."""
         return Estimate(self.R, self.p, self.P, Coordinates.LEFT, nis, nis_dof)
-
-
-def kalman(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array, float]:
-    """Return (dx, P+, r^T S^-1 r) of a Kalman update with measurement covariance N, in Joseph's form."""
-    PHt = P.dot(H.T)
-    solved = solve(H.dot(PHt) + N, np.concatenate([PHt.T, residual[:, None]], axis=1))
-    K = solved[:, :-1].T
-    A = -K.dot(H)
-    A.flat[:: len(P) + 1] += 1.0
-    P = A.dot(P).dot(A.T) + K.dot(N).dot(K.T)
-    return K.dot(residual), (P + P.T) / 2, float(residual.dot(solved[:, -1]))
 
 
 class PoseObserver:
@@ -116,32 +117,55 @@ class Mekf(PoseObserver):
     """
 
     sends_covariance = False
+    to_the_end: ClassVar[bool] = False  # whether every correction is iterated to where it leads
+
+    def __init__(self, setup: Setup, gated: bool = True) -> None:
+        """Take a setup; without `gated` every bearing is believed."""
+        super().__init__(setup)
+        self.gated, self.gate = gated, Gate()
+
+    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
+        """Start at a pose."""
+        super().reset(initial_pose, initial_covariance)
+        self.gate.reset()
 
     def update(self, tick: Tick) -> Estimate:
         """Predict, then correct by every usable bearing."""
         self.state = self.state.predicted(tick)
         self.nis: float | None = None
         self.nis_dof = 0
-        seen = tick.usable() if tick.due else []
-        if seen:
-            b, z = np.array([s[1] for s in seen]), np.array([s[2] for s in seen])
-            self.correct(tick, b, z, [s[3] for s in seen])
+        sight = sight_of(tick, self.sends_covariance) if tick.due else None
+        if sight is not None:
+            self.take(tick, sight)
         return self.state.estimate(self.nis, self.nis_dof)
 
-    def correct(self, tick: Tick, b: Array, z: Array, messages: list[Message | None]) -> None:
-        """Correct by bearings b (m, 3) to positions z (m, 3)."""
-        residual, J = innovation(self.state.R, self.state.p, tick.lever_arm, b, z)
-        H = (J @ self.state.jacobian(z)).reshape(-1, 6)
-        dx, P, self.nis = kalman(self.state.P, H, self.noise(tick, J, messages), residual.ravel())
-        self.state, self.nis_dof = self.state.moved(dx, P), len(H)
+    def take(self, tick: Tick, sight: Sight) -> None:
+        """Correct by what passes the gate."""
+        lines = linearised(self.state, tick, sight)
+        if self.gated:
+            kept = self.gate.sifted(tick.time, self.state.P, lines, ahead(self.state, tick, sight))
+            if not kept.all():
+                sight, lines = sight.only(kept), lines.only(kept)
+        if len(lines.residual):
+            self.correct(tick, sight, lines)
 
-    def noise(self, tick: Tick, J: Array, messages: list[Message | None]) -> Array:
-        """Return (2m, 2m) the covariance of the residuals given one's own pose; J as from `innovation`."""
-        size = 2 * len(messages)
-        N = np.zeros((size, size))
-        N.flat[:: size + 1] = tick.noise.bearing_std**2
-        for n, message in enumerate(messages):
-            if self.sends_covariance and message is not None and message.covariance is not None:
-                G = J[n].dot(self.state.R.T)
-                N[2 * n : 2 * n + 2, 2 * n : 2 * n + 2] += G.dot(message.covariance).dot(G.T)
-        return N
+    def correct(self, tick: Tick, sight: Sight, lines: Lines) -> None:
+        """Correct by bearings, which are linearised at the prediction."""
+        self.nis = self.fuse(tick, sight, lines, self.state.P)
+        self.nis_dof = 2 * len(lines.residual)
+
+    def fuse(self, tick: Tick, sight: Sight, lines: Lines, P: Array) -> float:
+        """Correct a prediction of covariance P by bearings; return their normalised innovation squared."""
+        before = self.state
+
+        def look(at: Array) -> Stacked:
+            moved = before.moved(at, before.P)
+            residual, H, N = linearised(moved, tick, sight).stacked()
+            return residual, H.dot(before.recentring(at)), N
+
+        distance = float(lengths(sight.positions - before.p).min())
+        dx, P, nis = settled(
+            P, lines.stacked(), look, lambda dx: turn_of_sight(before.in_body(dx), distance), self.to_the_end
+        )
+        self.state = before.corrected(dx, P)
+        return nis

@@ -4,6 +4,7 @@ Source: N + H_j P_j H_j^T, as if neighbours' errors were independent of one's ow
 multirobot localization, 2002, keep the cross-correlation that this leaves out). Overconfident down the chain.
 """
 
+from coopenv.observers.contract import Setup
 from coopenv.observers.mekf import Mekf
 
 
@@ -14,3 +15,13 @@ class MekfCovariance(Mekf):
     """
 
     sends_covariance = True
+
+
+class MekfCovarianceUngated(MekfCovariance):
+    """Error-state filter that believes every bearing.
+
+    It is `mekf_covariance` without a gate and without cheirality.
+    """
+
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(setup, gated=False)

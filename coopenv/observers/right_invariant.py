@@ -12,7 +12,7 @@ import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
-from coopenv.estimation.rotations import IDENTITY, exp_so3, orthonormalise, skew
+from coopenv.estimation.rotations import IDENTITY, exp_so3, orthonormalise, right_jacobian, skew
 from coopenv.observers.contract import Estimate, Tick
 from coopenv.observers.mekf import LeftError, Mekf
 
@@ -52,6 +52,18 @@ class RightError(LeftError):
         """Return the state moved by an error dx."""
         turn = exp_so3(dx[:3])
         return type(self)(turn.dot(self.R), turn.dot(self.p) + dx[3:], P)
+
+    @staticmethod
+    def recentring(dx: Array) -> Array:
+        """Return G (6, 6): about the state moved by dx, an error of dx + d about this one is G d to first order."""
+        G = np.eye(6)
+        G[:3, :3] = right_jacobian(-dx[:3])
+        G[3:, :3] = skew(dx[3:]).dot(G[:3, :3])
+        return G
+
+    def in_body(self, dx: Array) -> Array:
+        """Return an error as turn and shift (6,) in body axes, to first order."""
+        return np.concatenate([dx[:3].dot(self.R), (dx[3:] - skew(self.p).dot(dx[:3])).dot(self.R)])
 
     def point_covariance(self, marker: Array) -> Array:
         """Return the covariance (3, 3) in map axes of a point of the body."""

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array, solve
 from coopenv.observers.contract import Estimate, Tick
-from coopenv.observers.mekf import LeftError, PoseObserver, innovation
+from coopenv.observers.lines import Sight, ahead, linearised, normalised, sight_of
+from coopenv.observers.mekf import LeftError, PoseObserver
 from coopenv.observers.robust.p3p import solve_p3p
 
 MOST_TRIPLES = 20
@@ -30,11 +31,8 @@ NARROW_STD = 0.5
 LARGEST_STD = 0.15
 """Largest standard deviation of the position over the distance to the nearest point; beyond it geometry is weak."""
 
-ALL, PLANE = np.eye(6), np.eye(2)
+ALL = np.eye(6)
 ADJUGATE = np.array([[1.0, -1.0], [-1.0, 1.0]])
-EXACT = np.zeros((3, 3))  # covariance of a point that is known, or whose sender states no covariance
-
-Bearings = tuple[Array, Array, Array]  # unit bearings (m, 3), positions (m, 3) and covariances of positions (m, 3, 3)
 
 
 class PerspectivePoints(PoseObserver):
@@ -51,14 +49,12 @@ class PerspectivePoints(PoseObserver):
     def update(self, tick: Tick) -> Estimate:
         """Append the increment, and replace the pose by that of the frame where it has one."""
         self.state = self.state.predicted(tick)
-        seen = tick.usable() if tick.due else []
-        if len(seen) >= 3:
-            covariances = [EXACT if m is None or m.covariance is None else m.covariance for *_, m in seen]
-            data = np.array([s[1] for s in seen]), np.array([s[2] for s in seen]), np.array(covariances)
-            self.take(tick, data)
+        seen = sight_of(tick) if tick.due else None
+        if seen is not None and len(seen.targets) >= 3:
+            self.take(tick, seen)
         return self.state.estimate()
 
-    def take(self, tick: Tick, data: Bearings) -> None:
+    def take(self, tick: Tick, data: Sight) -> None:
         """Take the pose of a frame if there is one to be believed."""
         found = refined(self.state, tick, data)
         if found is None or distance(found, self.state) > POSE_GATE:
@@ -70,33 +66,23 @@ class PerspectivePoints(PoseObserver):
         if found is not None and (distance(found, self.state) < POSE_GATE or self.contradicted > PATIENCE):
             self.state, self.contradicted = found, 0.0
 
-    def chosen(self, tick: Tick, data: Bearings) -> LeftError | None:
+    def chosen(self, tick: Tick, data: Sight) -> LeftError | None:
         """Return of all candidates that which agrees with most bearings, then that nearest to the predicted pose."""
         best, most, nearest = None, 3, inf
-        triples = np.array(list(combinations(range(len(data[0])), 3))[:MOST_TRIPLES])
-        turns, cameras, mask = solve_p3p(data[0][triples], data[1][triples])
+        triples = np.array(list(combinations(range(len(data.bearings)), 3))[:MOST_TRIPLES])
+        turns, cameras, mask = solve_p3p(data.bearings[triples], data.positions[triples])
         for R, camera in zip(turns[mask], cameras[mask], strict=True):
             start = LeftError(R, camera - R @ tick.lever_arm, self.state.P)
             agrees = misfits(start, tick, data) < BEARING_GATE
             if (count := int(agrees.sum())) < most:
                 continue
-            pose = refined(start, tick, (data[0][agrees], data[1][agrees], data[2][agrees]))
+            pose = refined(start, tick, data.only(agrees))
             if pose is not None and (count > most or distance(pose, self.state) < nearest):
                 best, most, nearest = pose, count, distance(pose, self.state)
         return best
 
 
-def linearised(pose: LeftError, tick: Tick, data: Bearings) -> tuple[Array, Array, Array]:
-    """Return residuals (m, 2), their derivative H (m, 2, 6) and their covariance (m, 2, 2) given the pose."""
-    b, z, covariances = data
-    residual, J = innovation(pose.R, pose.p, tick.lever_arm, b, z)
-    G = J.dot(pose.R.T)
-    N = G @ covariances @ G.transpose(0, 2, 1)
-    N += tick.noise.bearing_std**2 * PLANE
-    return residual, J @ pose.jacobian(z), N
-
-
-def misfits(pose: LeftError, tick: Tick, data: Bearings, P: Array | None = None) -> Array:
+def misfits(pose: LeftError, tick: Tick, data: Sight, P: Array | None = None) -> Array:
     """Return (m,) the squared residuals over their variance, infinite for bearings from behind.
 
     With P, the variance is that given a pose with this covariance.
@@ -107,19 +93,7 @@ def misfits(pose: LeftError, tick: Tick, data: Bearings, P: Array | None = None)
     return np.where(ahead(pose, tick, data), normalised(residual, N), inf)
 
 
-def normalised(residual: Array, N: Array) -> Array:
-    """Return (m,) r^T N^-1 r of residuals (m, 2)."""
-    x, y = residual.T
-    a, b, d = N[:, 0, 0], N[:, 0, 1], N[:, 1, 1]
-    return np.asarray((d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b))
-
-
-def ahead(pose: LeftError, tick: Tick, data: Bearings) -> NDArray[np.bool_]:
-    """Return (m,) whether the points are where the bearings point, and not opposite."""
-    return np.asarray((((data[1] - pose.p).dot(pose.R) - tick.lever_arm) * data[0]).sum(1) > 0.0)
-
-
-def refined(start: LeftError, tick: Tick, data: Bearings) -> LeftError | None:
+def refined(start: LeftError, tick: Tick, data: Sight) -> LeftError | None:
     """Return the least-squares pose near a start with its covariance, None where it fails, misfits or is too weak."""
     pose = start
     for _ in range(ITERATIONS):
@@ -132,7 +106,7 @@ def refined(start: LeftError, tick: Tick, data: Bearings) -> LeftError | None:
             return None
         gradient = residual.ravel().dot(weighted)
         step = P.dot(gradient)
-        nearest = sqrt(((data[1] - pose.p) ** 2).sum(1).min())
+        nearest = sqrt(((data.positions - pose.p) ** 2).sum(1).min())
         firm = 0.0 < P[3, 3] + P[4, 4] + P[5, 5] < (LARGEST_STD * nearest) ** 2  # else geometry is too weak
         if not (step[:3].dot(step[:3]) < LONGEST_TURN**2 and firm):  # NaN fails as well
             return None

@@ -12,9 +12,10 @@ import numpy as np
 
 from coopenv.estimation.arrays import Array, cholesky, solve
 from coopenv.estimation.rotations import exp_se3, lengths
-from coopenv.observers.contract import Message, Tick
+from coopenv.observers.contract import Tick
 from coopenv.observers.left_invariant import InvariantError
-from coopenv.observers.mekf import LeftError, Mekf, innovation
+from coopenv.observers.lines import Sight, ahead, dense, innovation, noise, normalised
+from coopenv.observers.mekf import LeftError, Mekf
 
 SPREAD = 6.0  # squared distance of the sigma points from the mean in standard deviations: alpha = 1 in six dimensions
 WEIGHT = 1.0 / (2.0 * SPREAD)  # weight of every sigma point but the mean
@@ -27,22 +28,29 @@ class Ukf(Mekf):
     belief: ClassVar[type[LeftError]] = InvariantError
     sends_covariance = True
 
-    def correct(self, tick: Tick, b: Array, z: Array, messages: list[Message | None]) -> None:
-        """Correct by bearings b (m, 3) to positions z (m, 3)."""
+    def take(self, tick: Tick, sight: Sight) -> None:
+        """Correct by what passes the gate."""
         R, p, P = self.state.R, self.state.p, self.state.P
-        residual, J = innovation(R, p, tick.lever_arm, b, z)
+        residual, J = innovation(R, p, tick.lever_arm, sight.bearings, sight.positions)
         distance = 1.0 / lengths(J[:, 0])
         basis = J * distance[:, None, None]
         xi = sigma_points(P)  # (12, 6)
         turn, shift = exp_se3(xi)
-        d = ((z - p).dot(R) - shift[:, None]) @ turn - tick.lever_arm  # (12, m, 3)
+        d = ((sight.positions - p).dot(R) - shift[:, None]) @ turn - tick.lever_arm  # (12, m, 3)
         bearings = d / np.maximum(np.sqrt((d * d).sum(-1, keepdims=True)), 1e-9)
         y = (basis @ bearings[..., None])[..., 0].reshape(len(xi), -1)  # (12, 2m), 0 for the mean
         mean = WEIGHT * y.sum(0)
         y -= mean
-        S = WEIGHT * y.T.dot(y) + MEAN_WEIGHT * np.outer(mean, mean)
-        S += self.noise(tick, J, messages)
+        S = WEIGHT * y.T.dot(y) + MEAN_WEIGHT * np.outer(mean, mean) + dense(noise(R, J, tick, sight))
         r = residual.ravel() - mean
+        if self.gated:
+            each = np.arange(len(residual))
+            blocks = S.reshape(len(each), 2, len(each), 2)[each, :, each, :]
+            squared = normalised(r.reshape(-1, 2), blocks)
+            kept = self.gate.passed(tick.time, squared, ahead(self.state, tick, sight)).repeat(2)
+            if not kept.any():
+                return
+            S, y, r = S[np.ix_(kept, kept)], y[:, kept], r[kept]
         solved = solve(S, np.concatenate([WEIGHT * y.T.dot(xi), r[:, None]], axis=1))
         gain = solved[:, :-1].T
         P = P - gain.dot(S).dot(gain.T)

@@ -24,6 +24,7 @@ ZOO = {
     "hamel_samson": Entry("hamel_samson:HamelSamson"),
     "mekf": Entry("mekf:Mekf"),
     "mekf_covariance": Entry("mekf_covariance:MekfCovariance"),
+    "mekf_covariance_ungated": Entry("mekf_covariance:MekfCovarianceUngated"),
     "covariance_intersection": Entry("covariance_intersection:CovarianceIntersection"),
     "left_invariant": Entry("left_invariant:LeftInvariant"),
     "right_invariant": Entry("right_invariant:RightInvariant"),

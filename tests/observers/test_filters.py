@@ -12,7 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.observers import Coordinates, Recording, SensorNoise, Tick, run
 from coopenv.observers.covariance_intersection import CovarianceIntersection, best_weight
-from coopenv.observers.mekf import LeftError, innovation, kalman
+from coopenv.observers.correction import kalman
+from coopenv.observers.lines import Sight, innovation
+from coopenv.observers.mekf import LeftError
 from coopenv.observers.right_invariant import RightError, from_left
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
@@ -282,7 +284,7 @@ def test_covariance_intersection_of_one_bearing_is_the_best_of_all_weights() -> 
         N = 1e-4 * np.eye(2) + G @ C @ G.T / (1 - w)
         return -np.linalg.slogdet(w * np.linalg.inv(P) + H.T @ np.linalg.inv(N) @ H)[1]
 
-    fused.intersect(heard, b, z, C)
+    fused.intersect(heard, Sight(b, z, C[None], np.array([3]), (None,)))
     best = min(log_determinant(w) for w in np.linspace(0.001, 0.999, 999))
     assert_allclose(np.linalg.slogdet(fused.state.P)[1], best, atol=0.02)
     assert best < np.linalg.slogdet(P)[1] - 0.05
