@@ -3,7 +3,7 @@
 Source: Roumeliotis and Bekey, Distributed multirobot localization, IEEE Transactions on Robotics and Automation 18(5),
 2002, in its centralised form; errors and Jacobians as in mekf.py. A bearing from i to a point z_j = p_j + R_j m_j of
 vehicle j also has H_j = B Rhat_i^T Rhat_j [-S(m_j), I] / |d|. Each vehicle has a gate (gate.py); corrections are
-linearised half way, and large ones are iterated to where they lead (correction.py).
+linearised half way (correction.py).
 """
 
 from collections.abc import Sequence
@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array
-from coopenv.estimation.rotations import exp_so3, lengths, orthonormalise, skew
+from coopenv.estimation.rotations import exp_so3, orthonormalise, skew
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import Stacked, settled, turn_of_sight
+from coopenv.observers.correction import Stacked, halfway
 from coopenv.observers.gate import Gate
 from coopenv.observers.lines import PLANE, Lines, innovation
 from coopenv.observers.mekf import LeftError
@@ -92,10 +92,7 @@ class Centralised:
             residual, H, N = _stacked([self.lines(i, ticks[i], mask)[0] for i, mask in seen.items()])
             return residual, H.dot(recentring(at)), N
 
-        distance = min(
-            1.0 / lengths(of.H[:, 0, 6 * i + 3 : 6 * i + 6]).min() for i, (of, _) in lines.items() if len(of.H)
-        )
-        dx, P, _ = settled(P, first, look, lambda dx: turn_of_sight(dx, distance))
+        dx, P, _ = halfway(P, first, look)
         G = recentring(dx)
         self.poses, self.P = moved(before, dx), G.dot(P).dot(G.T)
 

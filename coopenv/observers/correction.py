@@ -2,9 +2,11 @@
 
 Linearised at the prediction, gain and innovation depend on the same noise of odometry: ranges between vehicles that
 hardly move against each other drift outwards; linearised at the correction, they drift inwards; half way the drift
-vanishes, as a Stratonovich integral has none (docs/robust.md tells of the experiment). Where a correction is so large
-that half way is no good point at all, it is iterated to where it leads, which is Gauss-Newton: Bell and Cathey, The
-iterated Kalman filter update as a Gauss-Newton method, IEEE Transactions on Automatic Control 38(2), 1993.
+vanishes, as a Stratonovich integral has none (docs/robust.md tells of the experiment).
+
+The other form is iterated to where the correction leads, which is Gauss-Newton: Bell and Cathey, The iterated Kalman
+filter update as a Gauss-Newton method, IEEE Transactions on Automatic Control 38(2), 1993; with a line search as in
+Skoglund, Hendeby and Axehill, Extended Kalman filter modifications based on an optimization view point, FUSION 2015.
 """
 
 from collections.abc import Callable
@@ -13,13 +15,13 @@ import numpy as np
 
 from coopenv.estimation.arrays import Array, solve
 
-FAR = 0.05
-"""rad, by which a correction turns a line of sight and is large; what `robust` has, see robust/constants.py."""
-CLOSE = 1e-4  # rad, by which an iteration to the end may still turn a line of sight
-MOST = 8  # linearisations
+CLOSE = 1e-3  # rad, by which the last step of an iteration may turn a line of sight
+MOST = 8  # steps, and halvings of a step
 
 Stacked = tuple[Array, Array, Array]
 """Residual (k,), its derivative H (k, n) by the error about the prediction, and its covariance N (k, k)."""
+
+Look = Callable[[Array], Stacked]
 
 
 def gain(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array, float]:
@@ -50,31 +52,48 @@ def turn_of_sight(dx: Array, distance: float) -> float:
     return float(max(size[0], size[1] / distance))
 
 
-def settled(
-    P: Array,
-    first: Stacked,
-    look: Callable[[Array], Stacked],
-    bend: Callable[[Array], float],
-    to_the_end: bool = False,
-) -> tuple[Array, Array, float]:
-    """Return (dx, P+, r^T S^-1 r at the prediction) of an update linearised where it ought to be.
+def halfway(P: Array, first: Stacked, look: Look) -> tuple[Array, Array, float]:
+    """Return (dx, P+, r^T S^-1 r at the prediction) of an update linearised half way.
 
     Args:
         P: (n, n) before.
         first: the measurements linearised at the prediction.
         look: returns them linearised at the prediction moved by an error (n,), H still by the error about the
             prediction.
-        bend: returns by how much an error (n,) turns a line of sight, rad.
-        to_the_end: whether to linearise at the correction even where that is near.
     """
     residual, H, N = first
-    K, dx, nis = gain(P, H, N, residual)
-    at = np.zeros_like(dx)
-    for step in range(1, MOST):
-        where = dx if to_the_end or bend(dx) > FAR else 0.5 * dx
-        if step > 1 and bend(where - at) < (CLOSE if to_the_end else FAR):
-            break
-        at = where
-        residual, H, N = look(at)
-        K, dx, _ = gain(P, H, N, residual + H.dot(at))
+    _, dx, nis = gain(P, H, N, residual)
+    at = 0.5 * dx
+    residual, H, N = look(at)
+    K, dx, _ = gain(P, H, N, residual + H.dot(at))
     return dx, joseph(P, K, H, N), nis
+
+
+def iterated(P: Array, first: Stacked, look: Look, bend: Callable[[Array], float]) -> tuple[Array, Array, float]:
+    """Return what `halfway` does of an update iterated to where it leads.
+
+    Steps are halved until the cost x^T P^-1 x + r^T N^-1 r falls. `bend` returns by how much an error (n,) turns a line
+    of sight, rad.
+    """
+
+    def cost(x: Array, residual: Array, N: Array) -> float:
+        return float(x.dot(solve(P, x)) + residual.dot(solve(N, residual)))
+
+    at, (residual, H, N) = np.zeros(len(P)), first
+    K, dx, nis = gain(P, H, N, residual)
+    least = cost(at, residual, N)
+    for _ in range(MOST):
+        step = dx - at
+        for _ in range(MOST):
+            seen = look(at + step)
+            reached = cost(at + step, seen[0], seen[2])
+            if reached <= least:
+                break
+            step = 0.5 * step
+        else:
+            break
+        at, least, (residual, H, N) = at + step, reached, seen
+        K, dx, _ = gain(P, H, N, residual + H.dot(at))
+        if bend(step) < CLOSE:
+            break
+    return at, joseph(P, K, H, N), nis

@@ -19,8 +19,13 @@ PLANE = np.eye(2)
 class Pose(Protocol):
     """A pose with an error about it."""
 
-    R: Array  # (3, 3) body to map
-    p: Array  # (3,) map frame, m
+    @property
+    def R(self) -> Array:  # noqa: N802
+        """(3, 3) body to map."""
+
+    @property
+    def p(self) -> Array:
+        """(3,) map frame, m."""
 
     def jacobian(self, positions: Array) -> Array:
         """Return (m, 3, n) the derivative of the lines to map positions (m, 3) by the error."""
@@ -38,7 +43,7 @@ class Sight(NamedTuple):
     def only(self, kept: NDArray[np.bool_]) -> "Sight":
         """Return those of a mask (m,)."""
         messages = tuple(message for message, keep in zip(self.messages, kept.tolist(), strict=True) if keep)
-        return Sight(*(array[kept] for array in self[:4]), messages)  # type: ignore[arg-type]
+        return Sight(self.bearings[kept], self.positions[kept], self.covariances[kept], self.targets[kept], messages)
 
 
 class Lines(NamedTuple):
@@ -58,7 +63,7 @@ class Lines(NamedTuple):
 
 
 def sight_of(tick: Tick, weighed: bool = True) -> Sight | None:
-    """Return what can be used of a frame, None where there is nothing; `weighed`: with the covariances that are told."""
+    """Return what can be used of a frame, None where there is nothing; `weighed`: with the covariances told."""
     seen = tick.usable()
     if not seen:
         return None
@@ -88,7 +93,7 @@ def linearised(pose: Pose, tick: Tick, sight: Sight) -> Lines:
 def noise(R: Array, J: Array, tick: Tick, sight: Sight) -> Array:
     """Return (m, 2, 2) the covariances of the residuals given one's own pose; J as from `innovation`."""
     G = J.dot(R.T)
-    return G @ sight.covariances @ G.transpose(0, 2, 1) + tick.noise.bearing_std**2 * PLANE
+    return np.asarray(G @ sight.covariances @ G.transpose(0, 2, 1) + tick.noise.bearing_std**2 * PLANE)
 
 
 def ahead(pose: Pose, tick: Tick, sight: Sight) -> NDArray[np.bool_]:

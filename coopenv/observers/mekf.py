@@ -15,9 +15,9 @@ import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
-from coopenv.estimation.rotations import IDENTITY, exp_so3, lengths, orthonormalise, right_jacobian, skew
+from coopenv.estimation.rotations import IDENTITY, exp_so3, orthonormalise, right_jacobian, skew
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import Stacked, settled, turn_of_sight
+from coopenv.observers.correction import Look, Stacked, halfway
 from coopenv.observers.gate import Gate
 from coopenv.observers.lines import Lines, Sight, ahead, linearised, sight_of
 
@@ -70,10 +70,6 @@ class LeftError:
         G[3:, 3:] = exp_so3(dx[:3]).T
         return G
 
-    def in_body(self, dx: Array) -> Array:
-        """Return an error as turn and shift (6,) in body axes, to first order."""
-        return dx
-
     def corrected(self, dx: Array, P: Array) -> Self:
         """Return the state moved by an error dx, of which P is the covariance about this state."""
         G = self.recentring(dx)
@@ -117,7 +113,6 @@ class Mekf(PoseObserver):
     """
 
     sends_covariance = False
-    to_the_end: ClassVar[bool] = False  # whether every correction is iterated to where it leads
 
     def __init__(self, setup: Setup, gated: bool = True) -> None:
         """Take a setup; without `gated` every bearing is believed."""
@@ -163,9 +158,10 @@ class Mekf(PoseObserver):
             residual, H, N = linearised(moved, tick, sight).stacked()
             return residual, H.dot(before.recentring(at)), N
 
-        distance = float(lengths(sight.positions - before.p).min())
-        dx, P, nis = settled(
-            P, lines.stacked(), look, lambda dx: turn_of_sight(before.in_body(dx), distance), self.to_the_end
-        )
+        dx, P, nis = self.settled(P, lines.stacked(), look, sight)
         self.state = before.corrected(dx, P)
         return nis
+
+    def settled(self, P: Array, first: Stacked, look: Look, sight: Sight) -> tuple[Array, Array, float]:
+        """Return what `halfway` does."""
+        return halfway(P, first, look)

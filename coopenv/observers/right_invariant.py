@@ -61,10 +61,6 @@ class RightError(LeftError):
         G[3:, :3] = skew(dx[3:]).dot(G[:3, :3])
         return G
 
-    def in_body(self, dx: Array) -> Array:
-        """Return an error as turn and shift (6,) in body axes, to first order."""
-        return np.concatenate([dx[:3].dot(self.R), (dx[3:] - skew(self.p).dot(dx[:3])).dot(self.R)])
-
     def point_covariance(self, marker: Array) -> Array:
         """Return the covariance (3, 3) in map axes of a point of the body."""
         J = np.concatenate([skew(-self.p - self.R.dot(marker)), IDENTITY], axis=1)

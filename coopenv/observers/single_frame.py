@@ -10,7 +10,6 @@ from itertools import combinations
 from math import inf, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array, solve
 from coopenv.observers.contract import Estimate, Tick

@@ -14,7 +14,7 @@ from coopenv.estimation.arrays import Array, cholesky, solve
 from coopenv.estimation.rotations import exp_se3, lengths
 from coopenv.observers.contract import Tick
 from coopenv.observers.left_invariant import InvariantError
-from coopenv.observers.lines import Sight, ahead, dense, innovation, noise, normalised
+from coopenv.observers.lines import Sight, ahead, dense, innovation, noise
 from coopenv.observers.mekf import LeftError, Mekf
 
 SPREAD = 6.0  # squared distance of the sigma points from the mean in standard deviations: alpha = 1 in six dimensions
@@ -46,8 +46,7 @@ class Ukf(Mekf):
         if self.gated:
             each = np.arange(len(residual))
             blocks = S.reshape(len(each), 2, len(each), 2)[each, :, each, :]
-            squared = normalised(r.reshape(-1, 2), blocks)
-            kept = self.gate.passed(tick.time, squared, ahead(self.state, tick, sight)).repeat(2)
+            kept = self.gate.passed(tick.time, r.reshape(-1, 2), blocks, ahead(self.state, tick, sight)).repeat(2)
             if not kept.any():
                 return
             S, y, r = S[np.ix_(kept, kept)], y[:, kept], r[kept]

@@ -26,6 +26,7 @@ ZOO = {
     "mekf_covariance": Entry("mekf_covariance:MekfCovariance"),
     "mekf_covariance_ungated": Entry("mekf_covariance:MekfCovarianceUngated"),
     "covariance_intersection": Entry("covariance_intersection:CovarianceIntersection"),
+    "iterated_ekf": Entry("iterated_ekf:IteratedEkf"),
     "left_invariant": Entry("left_invariant:LeftInvariant"),
     "right_invariant": Entry("right_invariant:RightInvariant"),
     "ukf": Entry("ukf:Ukf"),

@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers import Coordinates, Recording, SensorNoise, Tick, run
-from coopenv.observers.covariance_intersection import CovarianceIntersection, best_weight
 from coopenv.observers.correction import kalman
+from coopenv.observers.covariance_intersection import CovarianceIntersection, best_weight
 from coopenv.observers.lines import Sight, innovation
 from coopenv.observers.mekf import LeftError
 from coopenv.observers.right_invariant import RightError, from_left
