@@ -52,7 +52,7 @@ def turn_of_sight(dx: Array, distance: float) -> float:
     return float(max(size[0], size[1] / distance))
 
 
-def halfway(P: Array, first: Stacked, look: Look) -> tuple[Array, Array, float]:
+def halfway(P: Array, first: Stacked, look: Look, moved: int | None = None) -> tuple[Array, Array, float]:
     """Return (dx, P+, r^T S^-1 r at the prediction) of an update linearised half way.
 
     Args:
@@ -60,12 +60,15 @@ def halfway(P: Array, first: Stacked, look: Look) -> tuple[Array, Array, float]:
         first: the measurements linearised at the prediction.
         look: returns them linearised at the prediction moved by an error (n,), H still by the error about the
             prediction.
+        moved: how many errors are corrected, None: all. Those behind are considered and not corrected (Schmidt).
     """
     residual, H, N = first
     _, dx, nis = gain(P, H, N, residual)
     at = 0.5 * dx
+    at[moved or len(at) :] = 0.0
     residual, H, N = look(at)
     K, dx, _ = gain(P, H, N, residual + H.dot(at))
+    K[moved or len(at) :] = dx[moved or len(at) :] = 0.0
     return dx, joseph(P, K, H, N), nis
 
 

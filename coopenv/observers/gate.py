@@ -7,11 +7,11 @@ where the bearing points, and not behind (cheirality).
 
 A filter that is sure of a wrong pose would refuse what contradicts it for ever. Trackers hold a track for tentative
 until it has been confirmed by measurements, and give it up when they stay away (Blackman and Popoli, Design and
-analysis of modern tracking systems, 1999, chapter 6). So does this gate. It opens, which means that it takes everything:
-where the prior is so wide that a linearised innovation has no meaning; from there on, as from any doubt, until the share
-of refused bearings, averaged over a second, is below `TENTATIVE_SHARE`; and once that has held for some seconds, only
-above `LOST_SHARE`. Targets mistaken now and then, and one sender of two or more that begins to lie later, never open
-it. One that lies from the start does: no gate could tell that from a wrong start.
+analysis of modern tracking systems, 1999, chapter 6). So does this gate. It opens, which means that it takes
+everything, where the prior is so wide that a linearised innovation has no meaning; from there on, as from any doubt,
+until the share of refused bearings, averaged over a second, is below `TENTATIVE_SHARE`; and once that has held for some
+seconds, only above `LOST_SHARE`. Targets mistaken now and then, and one sender of two or more that begins to lie later,
+never open it. One that lies from the start does: no gate could tell that from a wrong start.
 """
 
 import numpy as np

@@ -70,10 +70,18 @@ def sight_of(tick: Tick, weighed: bool = True) -> Sight | None:
     covariances = np.zeros((len(seen), 3, 3))
     if weighed:
         for n, (*_, message) in enumerate(seen):
-            if message is not None and message.covariance is not None and message.covariance.shape == (3, 3):
-                covariances[n] = message.covariance
+            if message is not None and message.covariance is not None:
+                covariances[n] = point_covariance(message)
     targets, bearings, positions, messages = zip(*seen, strict=True)
     return Sight(np.array(bearings), np.array(positions), covariances, np.array(targets), messages)
+
+
+def point_covariance(message: Message) -> Array:
+    """Return the covariance (3, 3) in map axes of the position that a message tells, from whatever it states."""
+    if message.covariance is None or len(message.covariance) == 3 or message.rotation is None:
+        return np.zeros((3, 3)) if message.covariance is None else message.covariance[:3, :3]
+    R = message.rotation
+    return np.asarray(R.dot(message.covariance[3:, 3:]).dot(R.T))
 
 
 def innovation(R: Array, p: Array, lever_arm: Array, bearings: Array, positions: Array) -> tuple[Array, Array]:

@@ -126,13 +126,17 @@ class Mekf(PoseObserver):
 
     def update(self, tick: Tick) -> Estimate:
         """Predict, then correct by every usable bearing."""
-        self.state = self.state.predicted(tick)
+        self.predict(tick)
         self.nis: float | None = None
         self.nis_dof = 0
         sight = sight_of(tick, self.sends_covariance) if tick.due else None
         if sight is not None:
             self.take(tick, sight)
         return self.state.estimate(self.nis, self.nis_dof)
+
+    def predict(self, tick: Tick) -> None:
+        """Append the increment."""
+        self.state = self.state.predicted(tick)
 
     def take(self, tick: Tick, sight: Sight) -> None:
         """Correct by what passes the gate."""
