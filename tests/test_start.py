@@ -105,7 +105,11 @@ def test_completions() -> None:
     assert complete.agents("route") == ["route_follower"]
     assert complete.agent_lists("mine.py:Mine,route") == ["mine.py:Mine,route_follower"]
     assert complete.policies("") == ["zero", "random", *complete.agents("")]
-    assert complete.observers("riccati,mek") == ["riccati,mekf", "riccati,mekf_covariance"]
+    assert complete.observers("riccati,mek") == [
+        "riccati,mekf",
+        "riccati,mekf_covariance",
+        "riccati,mekf_covariance_ungated",
+    ]
     assert "mekf" not in complete.observers("mekf,me")
     assert complete.override_keys("noise.e") == ["noise.enabled="]
     assert complete.override_keys("vehicles.*.goal") == ["vehicles.*.goal.position=", "vehicles.*.goal.radius="]

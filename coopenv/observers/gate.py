@@ -5,13 +5,12 @@ normalised innovation squared r^T S^-1 r of an honest bearing has a chi-square d
 counts the prior, the sender's covariance where the filter uses one, and the bearing's noise. A target must also be
 where the bearing points, and not behind (cheirality).
 
-A filter that is sure of a wrong pose would refuse what contradicts it for ever. Trackers hold a track for tentative
-until it has been confirmed by measurements, and give it up when they stay away (Blackman and Popoli, Design and
-analysis of modern tracking systems, 1999, chapter 6). So does this gate. It opens, which means that it takes
-everything, where the prior is so wide that a linearised innovation has no meaning; from there on, as from any doubt,
-until the share of refused bearings, averaged over a second, is below `TENTATIVE_SHARE`; and once that has held for some
-seconds, only above `LOST_SHARE`. Targets mistaken now and then, and one sender of two or more that begins to lie later,
-never open it. One that lies from the start does: no gate could tell that from a wrong start.
+A filter that is sure of a wrong pose would refuse what contradicts it for ever. Trackers give up a track when what
+fits it stays away, and hold a new one for tentative until it is confirmed (Blackman and Popoli, Design and analysis of
+modern tracking systems, 1999, chapter 6). So does this gate: it opens, which means that it takes everything, where the
+prior is so wide that a linearised innovation has no meaning, and where most bearings are refused; it closes when few
+would be. Targets mistaken now and then, and one sender of two or more that lies, do not open it; a lie that is told
+while it is open is believed.
 """
 
 import numpy as np
@@ -23,9 +22,9 @@ from coopenv.observers.lines import Lines, normalised
 LARGEST = 13.8155  # 0.999 of a chi-square of 2: -2 log 0.001
 WIDE = 0.5  # rad^2, trace of S: about 30 degrees per axis. Chosen
 AVERAGING = 1.0  # s, over which the share of refused bearings is averaged. Chosen
-TENTATIVE_SHARE, LOST_SHARE = 0.2, 0.6
-"""One of three is enough to doubt a pose that was never confirmed, one of two not to doubt one that was. Chosen."""
-CONFIRMATION = 5.0  # s of few refusals that confirm a pose. Chosen
+LOST_SHARE, FOUND_SHARE = 0.6, 0.1
+"""Averaged shares of refused bearings above which the gate opens, and below which it closes. Chosen: one wrong target
+of two does not open it, and one of three does not let it close."""
 
 
 class Gate:
@@ -37,8 +36,8 @@ class Gate:
     def reset(self) -> None:
         """Begin anew."""
         self.share = 0.0  # of refused bearings, averaged
-        self.confirmed = False
-        self.time = self.doubted = 0.0  # s, of the last frame, and of the last doubt
+        self.is_open = False
+        self.time = 0.0  # s, of the last frame
 
     def passed(self, time: float, residual: Array, S: Array, in_front: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return (m,) which bearings of a frame to take.
@@ -57,11 +56,8 @@ class Gate:
         if (S[:, 0, 0] + S[:, 1, 1]).max() > WIDE:
             self.share = 1.0
         self.time = time
-        is_open = self.share > (LOST_SHARE if self.confirmed else TENTATIVE_SHARE)
-        if is_open:
-            self.doubted = time
-        self.confirmed = not is_open and (self.confirmed or time - self.doubted > CONFIRMATION)
-        return definite if is_open else fits
+        self.is_open = self.share > (FOUND_SHARE if self.is_open else LOST_SHARE)
+        return definite if self.is_open else fits
 
     def sifted(self, time: float, P: Array, lines: Lines, in_front: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return (m,) which lines to take, given the covariance P (n, n) of the error that they are linearised by."""

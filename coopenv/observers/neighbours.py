@@ -5,8 +5,8 @@ rho. C_ij is the covariance of one's own error with it. One's own errors change 
 (bearings); the product of these since the last message, a vehicle's factor, is told, so that a neighbour carries its
 C_ij on by C_ij <- C_ij factor_j^T. Source of this rule: Luft, Schubert, Roumeliotis and Burgard, Recursive
 decentralized localization for multi-robot systems with asynchronous pairwise communication, International Journal of
-Robotics Research 37(10), 2018. It is exact for odometry and landmarks; for bearings to a third vehicle it holds if the two have
-nothing in common but what the first one knows. For messages that were lost the factor that came stands in.
+Robotics Research 37(10), 2018. It is exact for odometry and landmarks; for bearings to a third vehicle it holds if the
+two have nothing in common but what the first one knows. For messages that were lost the factor that came stands in.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from coopenv.observers.mekf import LeftError, Mekf
 IDENTITY = np.eye(6)
 MOST_LOST = 60  # messages in a row for which a factor stands in
 SHRINKING = (0.98, 0.9, 0.7, 0.4, 0.0)
-"""Factors of cross-covariances where no joint distribution has them: senders may lie, and the rule approximates."""
+"""Factors of cross-covariances where no joint distribution has them: a sender may lie, the rule approximates."""
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ class SplitCovarianceIntersection(Mekf):
 
 
 def best_weight(P_d: Array, P_i: Array, H: Array, R_d: Array, R_i: Array) -> float:
-    """Return the w of `WEIGHTS` with the least det P+ = det P_1 det P_2 / det(H P_1 H^T + P_2), 1 if that is no gain."""
+    """Return the w with the least det P+ = det P_1 det P_2 / det(H P_1 H^T + P_2), 1 if there is no gain."""
     w = WEIGHTS[:, None, None]
     P_1, P_2 = P_d / w + P_i, R_d / (1.0 - w) + R_i
     S = H @ P_1 @ H.T + P_2

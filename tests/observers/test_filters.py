@@ -162,7 +162,20 @@ def short() -> Recording:
     return small_record()
 
 
-@pytest.mark.parametrize("name", ["mekf", "mekf_covariance", "right_invariant", "covariance_intersection"])
+LEADERS = [
+    "mekf",
+    "mekf_covariance",
+    "mekf_covariance_ungated",
+    "right_invariant",
+    "covariance_intersection",
+    "split_covariance_intersection",
+    "pairwise",
+    "schmidt_kalman",
+    "iterated_ekf",
+]
+
+
+@pytest.mark.parametrize("name", LEADERS)
 def test_leader_is_at_the_most_probable_trajectory(name: str) -> None:
     R, p, covariance = solve(short(), [0])
     result = run(name, short())

@@ -1,0 +1,91 @@
+"""The update linearised half way, and the iterated one, against the optimum and numerical derivatives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.optimize import minimize
+from scipy.spatial.transform import Rotation
+
+from coopenv.estimation.rotations import right_jacobian
+from coopenv.observers import Coordinates
+from coopenv.observers.correction import halfway, iterated, kalman
+from coopenv.observers.left_invariant import InvariantError
+from coopenv.observers.mekf import LeftError
+from coopenv.observers.right_invariant import RightError
+from tests.observers.test_filters import derivative, pose, spd
+
+
+@pytest.mark.parametrize("angle", [1e-5, 0.3, 2.5])
+def test_right_jacobian_is_the_derivative_of_the_exponential(angle: float) -> None:
+    w = angle * np.array([0.6, -0.48, 0.64])
+    numeric = derivative(lambda d: (Rotation.from_rotvec(w).inv() * Rotation.from_rotvec(w + d)).as_rotvec(), 3, 1e-6)
+    assert_allclose(right_jacobian(w), numeric, atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", [LeftError, RightError])
+def test_recentring_is_the_derivative_of_the_error_that_is_left(kind: type[LeftError]) -> None:
+    start = kind(*pose(4), np.eye(6))
+    dx = np.array([0.3, -0.2, 0.4, 1.0, -0.5, 2.0])
+    moved = start.moved(dx, start.P)
+    coordinates = Coordinates.LEFT if kind is LeftError else Coordinates.RIGHT
+
+    def left(d: np.ndarray) -> np.ndarray:
+        truth = start.moved(dx + d, start.P)
+        return coordinates.error(truth.R, truth.p, moved.R, moved.p)
+
+    assert_allclose(kind.recentring(dx), derivative(left), atol=1e-7)
+
+
+def test_recentring_of_the_invariant_error() -> None:
+    start = InvariantError(*pose(4), np.eye(6))
+    dx = np.array([0.1, -0.2, 0.1, 1.0, -0.5, 2.0])
+    G, d = start.recentring(dx), 1e-6 * np.arange(1.0, 7.0)
+    one, other = start.moved(dx + d, start.P), start.moved(dx, start.P)
+    again = other.moved(G @ d, start.P)
+    assert_allclose(again.p, one.p, atol=1e-9)
+    assert_allclose(again.R, one.R, atol=1e-9)
+    assert np.abs(G - np.eye(6)).max() > 0.1
+
+
+def test_of_a_linear_measurement_both_are_the_kalman_update() -> None:
+    rng = np.random.default_rng(0)
+    P, H, N, r = spd(rng, 6), rng.normal(size=(4, 6)), spd(rng, 4), rng.normal(size=4)
+    look = lambda at: (r - H @ at, H, N)  # noqa: E731
+    dx, after, nis = kalman(P, H, N, r)
+    for found in (halfway(P, look(np.zeros(6)), look), iterated(P, look(np.zeros(6)), look, np.linalg.norm)):
+        assert_allclose(found[0], dx, atol=1e-9)
+        assert_allclose(found[1], after, atol=1e-9)
+        assert_allclose(found[2], nis, rtol=1e-9)
+
+
+def test_errors_that_are_considered_are_not_corrected() -> None:
+    """Schmidt's update: the gain of the rest is zero, and what is left of all is the covariance of that."""
+    rng = np.random.default_rng(1)
+    P, H, N, r = spd(rng, 6), rng.normal(size=(2, 6)), spd(rng, 2), rng.normal(size=2)
+    look = lambda at: (r - H @ at, H, N)  # noqa: E731
+    dx, after, _ = halfway(P, look(np.zeros(6)), look, 4)
+    best, whole, _ = kalman(P, H, N, r)
+    assert_allclose(dx, [*best[:4], 0.0, 0.0], atol=1e-12)
+    assert_allclose(after[:4, :4], whole[:4, :4], atol=1e-12)
+    assert_allclose(after[4:, 4:], P[4:, 4:], atol=1e-12)
+    x, noise = rng.multivariate_normal(np.zeros(6), P, 200_000), rng.multivariate_normal(np.zeros(2), N, 200_000)
+    K = (np.linalg.solve(H @ P @ H.T + N, H @ P).T) * np.array([1, 1, 1, 1, 0, 0])[:, None]
+    assert_allclose(np.cov((x - (x @ H.T + noise) @ K.T).T), after, atol=0.03 * np.abs(after).max())
+
+
+def test_the_iterated_one_ends_at_the_most_probable_state() -> None:
+    """A bearing in the plane to a point nearby, which is far from linear."""
+    P, N, measured = np.diag([1.0, 1.0]), np.array([[1e-3]]), 1.2
+
+    def angle(x: np.ndarray) -> float:
+        return float(np.arctan2(2.0 - x[1], 1.0 - x[0]))
+
+    def look(at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        d = np.array([1.0, 2.0]) - at
+        return np.array([measured - angle(at)]), np.array([[d[1], -d[0]]]) / (d @ d), N
+
+    dx, _, _ = iterated(P, look(np.zeros(2)), look, np.linalg.norm)
+    best = minimize(lambda x: x @ np.linalg.solve(P, x) + (measured - angle(x)) ** 2 / N[0, 0], [0.0, 0.0], tol=1e-12)
+    assert_allclose(dx, best.x, atol=1e-3)
