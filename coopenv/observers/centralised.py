@@ -80,7 +80,10 @@ class Centralised:
         before, P = self.poses, self.P
         lines = {i: self.lines(i, ticks[i], mask) for i, mask in seen.items()}
         if self.gated:
-            kept = {i: self.gates[i].sifted(ticks[i].time, P, *of) for i, of in lines.items()}
+            kept = {
+                i: self.gates[i].passed(ticks[i].time, of.residual, of.spread(P), in_front)
+                for i, (of, in_front) in lines.items()
+            }
             lines = {i: (of.only(kept[i]), in_front) for i, (of, in_front) in lines.items()}
             seen = {i: _within(mask, kept[i]) for i, mask in seen.items()}
         first = _stacked([of for of, _ in lines.values()])

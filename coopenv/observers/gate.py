@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array
-from coopenv.observers.lines import Lines, normalised
+from coopenv.observers.lines import normalised
 
 LARGEST = 13.8155  # 0.999 of a chi-square of 2: -2 log 0.001
 WIDE = 0.5  # rad^2, trace of S: about 30 degrees per axis. Chosen
@@ -58,7 +58,3 @@ class Gate:
         self.time = time
         self.is_open = self.share > (FOUND_SHARE if self.is_open else LOST_SHARE)
         return definite if self.is_open else fits
-
-    def sifted(self, time: float, P: Array, lines: Lines, in_front: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return (m,) which lines to take, given the covariance P (n, n) of the error that they are linearised by."""
-        return self.passed(time, lines.residual, lines.H @ P @ lines.H.transpose(0, 2, 1) + lines.N, in_front)

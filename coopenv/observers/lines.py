@@ -57,6 +57,10 @@ class Lines(NamedTuple):
         """Return those of a mask (m,)."""
         return Lines(self.residual[kept], self.H[kept], self.N[kept])
 
+    def spread(self, P: Array) -> Array:
+        """Return (m, 2, 2) the covariances of the innovations, given that of the error (n, n)."""
+        return np.asarray(self.H @ P @ self.H.transpose(0, 2, 1) + self.N)
+
     def stacked(self) -> tuple[Array, Array, Array]:
         """Return the residual (2m,), H (2m, n) and N (2m, 2m)."""
         return self.residual.ravel(), self.H.reshape(-1, self.H.shape[-1]), dense(self.N)

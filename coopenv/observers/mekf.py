@@ -142,11 +142,16 @@ class Mekf(PoseObserver):
         """Correct by what passes the gate."""
         lines = linearised(self.state, tick, sight)
         if self.gated:
-            kept = self.gate.sifted(tick.time, self.state.P, lines, ahead(self.state, tick, sight))
+            S = self.spread(tick, sight, lines)
+            kept = self.gate.passed(tick.time, lines.residual, S, ahead(self.state, tick, sight))
             if not kept.all():
                 sight, lines = sight.only(kept), lines.only(kept)
         if len(lines.residual):
             self.correct(tick, sight, lines)
+
+    def spread(self, tick: Tick, sight: Sight, lines: Lines) -> Array:
+        """Return (m, 2, 2) the covariances of the innovations."""
+        return lines.spread(self.state.P)
 
     def correct(self, tick: Tick, sight: Sight, lines: Lines) -> None:
         """Correct by bearings, which are linearised at the prediction."""

@@ -18,7 +18,7 @@ from coopenv.estimation.arrays import Array, cholesky, solve
 from coopenv.estimation.rotations import skew
 from coopenv.observers.contract import Message, Setup, Tick
 from coopenv.observers.correction import Stacked, halfway
-from coopenv.observers.lines import Sight, innovation, linearised
+from coopenv.observers.lines import Lines, Sight, innovation, linearised
 from coopenv.observers.mekf import LeftError, Mekf
 
 IDENTITY = np.eye(6)
@@ -84,6 +84,17 @@ class Considering(Mekf):
                 self.hear(target, message)
         super().take(tick, sight)
 
+    def spread(self, tick: Tick, sight: Sight, lines: Lines) -> Array:
+        """Return (m, 2, 2) the covariances of the innovations, with what the two errors have in common."""
+        S = super().spread(tick, sight, lines)
+        J = innovation(self.state.R, self.state.p, tick.lever_arm, sight.bearings, sight.positions)[1]
+        for n, target in enumerate(sight.targets.tolist()):
+            if target in self.neighbours:
+                of = self.neighbours[target]
+                common = lines.H[n].dot(of.cross[:, 3:]).dot(J[n].dot(self.state.R.T).dot(of.R).T)
+                S[n] += common + common.T
+        return S
+
     def hear(self, target: int, message: Message) -> None:
         """Take what a neighbour tells of itself."""
         factor, number = message.extra.get("factor"), message.extra.get("number")
@@ -94,6 +105,9 @@ class Considering(Mekf):
         if of is not None and now != of.number:
             lost = max(1, min(now - of.number, MOST_LOST))
             cross = cross.dot(factor.T if lost == 1 else np.linalg.matrix_power(factor, lost).T)
+        variances = np.maximum(np.outer(self.state.P.diagonal(), message.covariance.diagonal()), 0.0)
+        limit = np.sqrt(variances)  # of any covariance: what is told may be anything
+        cross = np.clip(np.nan_to_num(cross), -limit, limit)
         self.neighbours[target] = Neighbour(now, message.rotation, message.covariance, cross)
 
     def consider(self, tick: Tick, sight: Sight, told: Array | None = None) -> float:

@@ -95,4 +95,4 @@ def test_sigma_points_count_the_curvature_that_a_derivative_misses() -> None:
     for estimate in (unscented, linear):
         e = Coordinates.LEFT.error(truth.R, truth.p, estimate.rotation, estimate.position)
         squared.append(e @ np.linalg.solve(estimate.covariance, e))
-    assert squared[0] < 0.1 * squared[1]
+    assert squared[0] < 0.5 * squared[1]
