@@ -4,6 +4,7 @@ Source: Dellaert and Kaess, Factor graphs for robot perception, Foundations and 
 smoother of GTSAM. Variables are the camera's pose at key frames and the points seen from them. Factors: odometry
 between key frames, points known to lie at a position, and bearings, which are averaged between key frames: of each
 target the mean residual to the predicted bearing, in map axes, added to the bearing predicted at the key frame.
+Bearings are gated one by one before (gate.py).
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ import numpy as np
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import adjoint
 from coopenv.observers.contract import Estimate, Setup, Tick
+from coopenv.observers.gate import Gate
+from coopenv.observers.lines import ahead, linearised, sight_of
 from coopenv.observers.mekf import LeftError, PoseObserver
 
 LAG = 1.0  # s
@@ -40,9 +43,10 @@ class FactorGraph(PoseObserver):
     Between key frames it adds odometry.
     """
 
-    def __init__(self, setup: Setup) -> None:
-        """Remember the camera's place, too."""
+    def __init__(self, setup: Setup, gated: bool = True) -> None:
+        """Remember the camera's place, too; without `gated` every bearing is believed."""
         super().__init__(setup)
+        self.gated, self.gate = gated, Gate()
         self.lever_arm, self.noise = setup.lever_arm, setup.noise
         self.to_camera = adjoint(np.eye(3), -setup.lever_arm)
         self.to_body = adjoint(np.eye(3), setup.lever_arm)
@@ -50,6 +54,7 @@ class FactorGraph(PoseObserver):
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose."""
         super().reset(initial_pose, initial_covariance)
+        self.gate.reset()
         self.time = 0.0
         self.keys = 0
         self.restart()
@@ -96,13 +101,18 @@ class FactorGraph(PoseObserver):
 
     def collect(self, tick: Tick) -> None:
         """Add up what the bearings of a frame miss."""
-        R, p = self.state.R, self.state.p
-        for target, bearing, position, message in tick.usable():
+        sight, R, p = sight_of(tick), self.state.R, self.state.p
+        if sight is None:
+            return
+        if self.gated:
+            lines = linearised(self.state, tick, sight)
+            S, in_front = lines.spread(self.state.P), ahead(self.state, tick, sight)
+            sight = sight.only(self.gate.passed(tick.time, lines.residual, S, in_front))
+        for n, target in enumerate(sight.targets.tolist()):
+            position = sight.positions[n]
             seen = self.residuals.setdefault(target, Residuals())
-            seen.position, seen.covariance = position, np.zeros((3, 3))
-            if message is not None and message.covariance is not None:
-                seen.covariance = message.covariance
-            seen.total = seen.total + R @ (bearing - unit((position - p) @ R - self.lever_arm))
+            seen.position, seen.covariance = position, sight.covariances[n]
+            seen.total = seen.total + R @ (sight.bearings[n] - unit((position - p) @ R - self.lever_arm))
             seen.count += 1
 
     def smooth(self) -> None:
