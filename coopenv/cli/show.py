@@ -22,7 +22,7 @@ def list_command(
     if kind is Kind.envs:
         rows = listing.environment_rows({name: options.load(name, {}) for name in list_envs()})
     elif kind is Kind.variants:
-        from coopenv.bench.observers.sources import variant_rows
+        from coopenv.bench.observers.choice import variant_rows
 
         rows = variant_rows()
     elif kind is Kind.scenes:

@@ -12,8 +12,8 @@ from rich.console import Console
 
 from coopenv.bench.executors import Executor
 from coopenv.bench.observers.basin import Basin, Draw, basin_failures, basin_table, basins_of, check_source, study_basin
+from coopenv.bench.observers.choice import ALL, find_source
 from coopenv.bench.observers.comparison import Comparison, Plan
-from coopenv.bench.observers.sources import ALL, find_source
 from coopenv.bench.observers.tables import csv_text
 from coopenv.errors import CoopenvError
 from coopenv.files import replace_text, replacing_folder

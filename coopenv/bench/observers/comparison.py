@@ -14,10 +14,11 @@ from rich.table import Table
 
 from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables
+from coopenv.bench.observers.choice import find_source, variants_of
 from coopenv.bench.observers.judge import Task, judge
 from coopenv.bench.observers.leaderboard import Leaderboard
 from coopenv.bench.observers.rows import Row
-from coopenv.bench.observers.sources import Source, find_source, variants_of
+from coopenv.bench.observers.sources import Source
 from coopenv.bench.observers.windows import EDGES, WindowRow, checked_edges
 from coopenv.errors import CoopenvError, checked_seed, suggest
 from coopenv.files import replace_text
