@@ -15,6 +15,7 @@ import pytest
 import coopenv
 from coopenv.api.registration import environment_id
 from coopenv.backends.mcap import write_recording
+from coopenv.bench.observers.fault_knobs import KNOBS
 from coopenv.bench.observers.faults import FAULTS
 from coopenv.cli import main
 from coopenv.cli.options import parse_value
@@ -75,7 +76,16 @@ def test_list_of_observers_and_agents(capsys: pytest.CaptureFixture[str]) -> Non
         ("list", coopenv.list_envs()),
         ("list observers", observer_names()),
         ("list agents", list_agents()),
-        ("list variants", [*FAULTS, "landmarks", "landmarks+robots", "blind"]),
+        (
+            "list variants",
+            [
+                *FAULTS,
+                "landmarks",
+                "landmarks+robots",
+                "blind",
+                *(f"{name}={knob.value}" for name, knob in KNOBS.items()),
+            ],
+        ),
     ],
 )
 def test_list_as_json(line: str, names: list[str], capsys: pytest.CaptureFixture[str]) -> None:

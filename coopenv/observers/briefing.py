@@ -9,7 +9,7 @@ from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Briefing
 from coopenv.scenario import Scenario
-from coopenv.world.faults import UNIFORM_ROTATION
+from coopenv.world.fault_kinds import UNIFORM_ROTATION
 
 EXACT_START_STD = 1e-3  # rad and m, where a scenario starts its estimates at the truth
 

@@ -19,7 +19,7 @@ from coopenv.observers.contract import Estimate, Factory, JointObserver, Message
 from coopenv.observers.interference import Interference
 from coopenv.observers.mailbox import Mailbox
 from coopenv.observers.recording import Briefing, Sensed
-from coopenv.world.faults import UNKNOWN
+from coopenv.world.fault_kinds import UNKNOWN
 
 
 class ObserverError(CoopenvError):

@@ -14,7 +14,7 @@ from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import exp_so3
 from coopenv.observers.contract import Message
 from coopenv.scenario import Scenario
-from coopenv.world.faults import REPLAY
+from coopenv.world.fault_kinds import REPLAY
 
 FIELDS = ("told_shift", "told_turn")
 """Of the state, at every tick."""

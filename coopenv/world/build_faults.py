@@ -6,7 +6,7 @@ import numpy as np
 
 from coopenv.scenario import Scenario
 from coopenv.scenario.faults import Faults
-from coopenv.world.faults import KINDS
+from coopenv.world.fault_kinds import KINDS
 
 
 def fault_entries(f: Faults, scenario: Scenario) -> dict[str, Any]:

@@ -4,15 +4,14 @@ Where none is on, nothing is drawn and nothing is changed. A message has two tim
 of what it says (`content_tick`, earlier where its sender replays) and that which its receiver believes (`stamp`).
 """
 
-import math
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from coopenv.estimation.linalg import join6
 from coopenv.estimation.so3 import exp_so3, identity3
 from coopenv.world.camera import marker_position
+from coopenv.world.fault_kinds import COLLUDE, DRIFT, HONEST, JUMP, REPLAY
 from coopenv.world.random import (
     CLOCK,
     CORRUPTION,
@@ -24,20 +23,6 @@ from coopenv.world.random import (
     uniform,
 )
 
-HONEST = wp.constant(0)
-JUMP = wp.constant(1)
-DRIFT = wp.constant(2)
-REPLAY = wp.constant(3)
-COLLUDE = wp.constant(4)
-"""Values of `Model.fault.lie`."""
-
-KINDS = {"none": HONEST, "jump": JUMP, "drift": DRIFT, "replay": REPLAY, "collude": COLLUDE}
-UNIFORM_ROTATION = (math.pi**2 / 3.0 + 2.0) / 3.0
-"""rad^2 per axis, of a rotation uniform over SO(3)."""
-UNKNOWN_POSITION = 100.0
-"""m per axis, standard deviation of where a vehicle is that has lost all, about the landmarks' centre."""
-UNKNOWN = np.diag(np.repeat([UNIFORM_ROTATION, UNKNOWN_POSITION**2], 3))
-"""Covariance of the initial estimate of a vehicle that has started anew, LEFT coordinates."""
 NEVER = wp.constant(-1)
 MOST_CLOCK_TICKS = wp.constant(1.0e8)
 

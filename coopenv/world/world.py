@@ -11,7 +11,7 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.randomness import PARAMETERS
 from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
-from coopenv.world.faults import UNKNOWN
+from coopenv.world.fault_kinds import UNKNOWN
 from coopenv.world.launch import Launcher, PerWorld, default_threads
 from coopenv.world.model import mat66d
 from coopenv.world.parameters import NOT_SET

@@ -36,7 +36,7 @@ def test_no_broker_is_said_in_time() -> None:
     with pytest.raises(LinkError, match=rf"^{endpoint}: no NATS broker there \(Connection refused\)$"):
         open_nats([endpoint], timeout=0.5)
     assert time.monotonic() - began < 10.0
-    assert threading.active_count() == before
+    assert threading.active_count() <= before
 
 
 @pytest.mark.nats
