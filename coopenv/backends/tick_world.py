@@ -158,7 +158,8 @@ class TickWorld(SensingWorld):
         self._row["true_rotation"][...], self._row["true_position"][...] = known.rotation, known.position
         self._row["true_velocity"][...], self._row["true_angular_velocity"][...] = linear[1], angular[1]
         sampled = (now.index * now.dt - np.asarray(now.odometry_age) + 1e-9) * rate
-        self._row["samples"][...] = np.where(sampled >= 0.0, np.floor(np.maximum(sampled, 0.0)) + 1, 0)
+        just_before = ~np.asarray(now.missing) & np.isfinite(np.asarray(now.odometry_age))  # the first tick
+        self._row["samples"][...] = np.where((sampled >= 0.0) | just_before, np.floor(np.maximum(sampled, 0.0)) + 1, 0)
         self._row["bearing_lag"][...] = np.round(np.minimum(np.asarray(now.bearing_age) / now.dt, now.index))
         if now.pan is not None:  # of who is missing it stays
             self._row["pan"][...] = np.where(np.asarray(now.missing), self._row["pan"], now.pan)

@@ -20,6 +20,7 @@ from coopenv.observers.lines import PLANE, Lines, Sight, linearised
 from coopenv.observers.mekf import Mekf
 
 LOWEST, HIGHEST = 0.02, 1.0 - 1e-6  # limits of w short of 1, which leaves the measurement out
+VAGUE = 10.0  # rad^2, of a bearing to a neighbour whose place is so uncertain that it says nothing
 
 
 class CovarianceIntersection(Mekf):
@@ -43,6 +44,8 @@ class CovarianceIntersection(Mekf):
         """Fuse one bearing to a neighbour with the covariance of its position."""
         H, N = linearised(self.state, tick, one)[1:]
         own = tick.noise.bearing_std**2 * PLANE
+        if not np.trace(N[0]) < VAGUE:
+            return
         w = best_weight(H[0].dot(self.state.P).dot(H[0].T), own, N[0] - own)
         if w < 1.0:
             inflated = one._replace(covariances=one.covariances / (1.0 - w))

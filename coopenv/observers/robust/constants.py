@@ -53,6 +53,7 @@ MASK_BITS = 64  # vehicles in a mask; numbers from 64 on share bits with lower o
 MAX_TOLD = 4  # vehicles in a message of `robust_joint`, the sender included: 1.7 kB
 SUPERSEDING_TIME = 1.0  # s, for which a joint message stands for the messages of the vehicles that it holds. Chosen
 
+ROUNDING = 1e-9  # share of its variances by which a covariance may fail to be positive definite
 MIN_VARIANCE = 1e-14  # rad^2 and m^2, below which a message is malformed: nobody knows a pose to 0.1 um
 
 # Search

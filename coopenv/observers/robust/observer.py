@@ -20,7 +20,7 @@ from coopenv.observers.robust.memory import Estimate, Pose, clear, mat33d, vec3d
 from coopenv.observers.robust.odometry import begin_errors, increment_noise, propagate_own, take_odometry, walk_errors
 from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
 from coopenv.observers.robust.tracklets import bit_of
-from coopenv.observers.robust.update import resect, set_anchor, update
+from coopenv.observers.robust.update import is_sound, lose, resect, set_anchor, update
 from coopenv.world.faults import start_covariance
 
 BELIEVING, SEARCHING, FOUND = 0, 1, 2  # how a vehicle stands to its pose; found in the search at this tick
@@ -135,6 +135,8 @@ def make_estimate(receive: Any, fuse_messages: Any) -> Any:
             fuse_messages(model, state, memory, world, i, now.tick)
             if now.due:
                 correct(model, state, memory, world, i, now, standing)
+            if memory.search[world, i].active == 0 and not is_sound(own_estimate(memory, world, i)):
+                lose(model, memory, world, i, now.tick)  # a message that no honest vehicle sends
         write(state, memory, world, i)
         if now.due:
             state.corrected_tick[world, i] = now.tick

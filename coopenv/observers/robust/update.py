@@ -11,8 +11,16 @@ import warp as wp
 
 from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import between, carried, inverse6, is_regular, odometry_noise, with_noise
-from coopenv.observers.robust.belief import apply_error
+from coopenv.observers.robust.algebra import (
+    between,
+    carried,
+    inverse6,
+    inverse_factor,
+    is_regular,
+    odometry_noise,
+    with_noise,
+)
+from coopenv.observers.robust.belief import apply_error, own_estimate
 from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.measurements import innovation_squared
 from coopenv.observers.robust.memory import Anchor, Estimate, Frame, mat66d, vec2d, vec6d
@@ -56,6 +64,27 @@ def set_anchor(memory: Any, world: int, i: int, P: Any, tick: int):
 
 
 @wp.func
+def is_sound(estimate: Estimate):
+    """Return whether an estimate is finite and its covariance positive definite, but for rounding."""
+    P = estimate.P
+    for k in range(6):
+        P[k, k] = P[k, k] * (wp.float64(1.0) + wp.float64(constants.ROUNDING))
+    factor = inverse_factor(P)
+    return wp.isfinite(wp.trace(factor) + wp.length(estimate.pose.p) + wp.trace(estimate.pose.R))
+
+
+@wp.func
+def lose(model: Any, memory: Any, world: int, i: int, tick: int):
+    """Search anew, from where most bearings fitted, carried on by odometry since."""
+    anchor = memory.anchor[world, i]
+    elapsed = wp.float64(tick - anchor.tick) * model.camera_period
+    step = between(anchor.odometry, memory.belief[world, i].odometry)
+    begin_errors(model, memory, world, i)  # what was believed of them may be as wrong
+    noise = odometry_noise(model, i, elapsed) + lasting_noise(memory, world, i, step, elapsed, elapsed)
+    begin_search(memory, world, i, carried(anchor.estimate, step, noise))
+
+
+@wp.func
 def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, frame: Frame):
     """Correct the belief by every bearing of a frame that fits it; search anew when most do not."""
     share, fitting, nis = gate(frame, memory, world, i)
@@ -73,13 +102,8 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
     memory.belief[world, i].missed_share = missed
     memory.belief[world, i].healthy_time = healthy
     if missed > wp.float64(constants.LOST_SHARE):
-        anchor = memory.anchor[world, i]  # where most bearings fitted, carried on by odometry since
-        elapsed = wp.float64(now.tick - anchor.tick) * model.camera_period
-        step = between(anchor.odometry, memory.belief[world, i].odometry)
-        begin_errors(model, memory, world, i)  # what was believed of them may be as wrong
-        noise = odometry_noise(model, i, elapsed) + lasting_noise(memory, world, i, step, elapsed, elapsed)
-        begin_search(memory, world, i, carried(anchor.estimate, step, noise))
-    elif healthy > wp.float64(constants.HEALTHY_TIME):
+        lose(model, memory, world, i, now.tick)
+    elif healthy > wp.float64(constants.HEALTHY_TIME) and is_sound(own_estimate(memory, world, i)):
         noise = vec2d(wp.float64(constants.ANCHOR_ANGLE_VARIANCE), wp.float64(constants.ANCHOR_POSITION_VARIANCE))
         set_anchor(memory, world, i, with_noise(wp.float64(4.0) * memory.P[world, i, 0, 0], noise), now.tick)
 
