@@ -96,9 +96,9 @@ class Considering(Mekf):
         return S
 
     def hear(self, target: int, message: Message) -> None:
-        """Take what a neighbour tells of itself."""
-        factor, number = message.extra.get("factor"), message.extra.get("number")
-        if message.rotation is None or message.covariance is None or factor is None or number is None:
+        """Take what a neighbour tells of itself, if it is what this observer sends."""
+        factor, number = (np.asarray(message.extra.get(name, np.nan)) for name in ("factor", "number"))
+        if message.rotation is None or message.covariance is None or factor.shape != (6, 6) or number.shape != (1,):
             return
         of, now = self.neighbours.get(target), int(number[0])
         cross = np.zeros((6, 6)) if of is None else of.cross

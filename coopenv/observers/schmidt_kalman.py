@@ -45,7 +45,8 @@ class SchmidtKalman(Considering):
 
 def told_of(message: Message, target: int) -> Array:
     """Return the cross-covariance (6, 6) of a sender with a target as it tells it, zero where it tells none."""
-    if "targets" not in message.extra:
+    targets, cross = (np.asarray(message.extra.get(name, ())) for name in ("targets", "cross"))
+    if targets.ndim != 1 or cross.shape != (len(targets), 6, 6):
         return np.zeros((6, 6))
-    found = np.flatnonzero(message.extra["targets"] == target)
-    return message.extra["cross"][found[0]] if len(found) else np.zeros((6, 6))
+    found = np.flatnonzero(targets == target)
+    return np.asarray(cross[found[0]]) if len(found) else np.zeros((6, 6))

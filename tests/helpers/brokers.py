@@ -58,7 +58,7 @@ ROS_PORT = free_port()
 @contextmanager
 def ros_master() -> Iterator[str]:
     """Run a ROS master and yield its endpoint."""
-    pytest.importorskip("rospy")
+    pytest.importorskip("rospy", reason="needs rospy: make test-ros1")
     command = (program("rosmaster"), "--core", "--port", str(ROS_PORT))
     environment = {"ROS_IP": "127.0.0.1", "ROS_MASTER_URI": f"http://127.0.0.1:{ROS_PORT}"}
     with serving(command, ROS_PORT, Path.cwd(), **environment):

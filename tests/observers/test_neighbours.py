@@ -13,6 +13,8 @@ from scipy.spatial.transform import Rotation
 from coopenv.observers import Message, Received, Recording, run
 from coopenv.observers.pairwise import Pairwise
 from coopenv.observers.schmidt_kalman import SchmidtKalman
+from coopenv.runs.recorder import record
+from coopenv.scenario import load_scenario
 from tests.observers.test_filters import derivative
 from tests.oracles.batch import small_record
 
@@ -97,6 +99,30 @@ def test_messages_of_any_content_leave_a_pose(name: str) -> None:
         assert np.isfinite(found.position).all()
         assert np.linalg.eigvalsh(found.covariance).min() > 0.0
     assert np.linalg.norm(found.position - made.truth.position[7, 1]) < 0.05
+
+
+MISSHAPEN = {
+    "factor": np.eye(3),
+    "number": np.array(1.0),
+    "targets": np.array([[3.0]]),
+    "cross": np.zeros((1, 6)),
+}
+
+
+@pytest.mark.parametrize("part", MISSHAPEN)
+@pytest.mark.parametrize("name", FILTERS)
+def test_extras_of_another_shape_end_no_run(name: str, part: str) -> None:
+    class Misshapen:
+        def applies(self, vehicle: int, time: float) -> bool:
+            return vehicle == 1
+
+        def told(self, observer: object, message: Message) -> Message:
+            return replace(message, extra={**message.extra, part: MISSHAPEN[part]})
+
+    made = record(load_scenario("busy_intersection_tracking", {"horizon": 0.5}), 0)
+    found = run(name, made, Misshapen())
+    assert not found.failure
+    assert np.isfinite(found.position).all()
 
 
 def test_lost_messages_are_bridged() -> None:

@@ -24,7 +24,7 @@ from tests.svea.gate.bench import CAR
 from tests.svea.gate.hostile import messages_of_strangers
 from tests.svea.gate.station import Station, end, free_endpoint, start_gate, start_router
 
-pytest.importorskip("zenoh")
+pytest.importorskip("zenoh", reason="needs the extra 'svea'")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals and modes of files")
 
 

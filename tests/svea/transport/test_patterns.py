@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from coopenv.svea.transport.patterns import matcher
 
-zenoh = pytest.importorskip("zenoh")
+zenoh = pytest.importorskip("zenoh", reason="needs the extra 'svea'")
 
 PARTS = st.sampled_from(["fleet", "svea7", "a.b", "*", "**"])
 
