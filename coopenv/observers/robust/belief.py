@@ -9,18 +9,17 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3, cholesky6, symmetric_part
+from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust.algebra import (
     displaced,
     forward,
-    lower_blocks,
     moved,
     propagated,
     recentred,
     recentring,
     with_noise,
 )
-from coopenv.observers.robust.constants import FORGET_TIME, MAX_GROWTH, SAME_TIME
+from coopenv.observers.robust.constants import FORGET_TIME, SAME_TIME
 from coopenv.observers.robust.memory import ERRORS, Estimate, Member, Pose, mat66d
 from coopenv.world.camera import VISIBLE
 
@@ -102,42 +101,6 @@ def subtract_block(memory: Any, world: int, i: int, k: int, j: int, block: Any):
         left = symmetric_part(left)
     memory.P[world, i, k, j] = left
     memory.P[world, i, j, k] = wp.transpose(left)
-
-
-@wp.func
-def cholesky_of(P: Any):
-    """Return the Cholesky factor of a 6x6 matrix in blocks, and the inverses of those on its diagonal."""
-    return cholesky6(block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3))
-
-
-@wp.func
-def fuse_information(memory: Any, world: int, i: int, n: int, information: Any, vector: Any):
-    """Fuse information about a member's error x, whose likelihood has the exponent vector^T x - x^T information x / 2.
-
-    P' = P - P_n M P_n^T with M = information (I + P_nn information)^-1, P_n being the member's columns. With
-    P_nn = L L^T that is information - Y^T Y, Y = C^-1 L^T information, C C^T = I + L^T information L. Information is a
-    difference and may be negative by rounding; where it would make a variance `MAX_GROWTH` times as large it is none.
-    """
-    members = memory.belief[world, i].members
-    L11, L21, L22, _, _ = cholesky_of(memory.P[world, i, n, n])
-    L = lower_blocks(L11, L21, L22)
-    V = wp.transpose(L) * information
-    _, C21, _, I11, I22 = cholesky_of(V * L + wp.identity(6, wp.float64))
-    grown = wp.max(wp.max(wp.get_diag(I11)), wp.max(wp.get_diag(I22)))
-    if not grown * grown < wp.float64(MAX_GROWTH):
-        return
-    inverse = lower_blocks(I11, -(I22 * C21 * I11), I22)
-    Y = inverse * V
-    M = information - wp.transpose(Y) * Y
-    along = vector - wp.transpose(Y) * (inverse * (wp.transpose(L) * vector))
-    for k in range(members):
-        memory.scratch[world, k].column = memory.P[world, i, k, n]
-    for k in range(members):
-        gain = memory.scratch[world, k].column * M
-        for j in range(k + 1):
-            subtract_block(memory, world, i, k, j, gain * wp.transpose(memory.scratch[world, j].column))
-        memory.scratch[world, k].correction = memory.scratch[world, k].column * along
-    apply_corrections(memory, world, i)
 
 
 @wp.func

@@ -7,7 +7,7 @@ MAX_MEMBERS, MAX_MEMBERS_JOINT = 5, 8
 `robust_joint`."""
 MAX_LINEARISATIONS, RELINEARISATION_ANGLE = 8, 0.05
 """Linearisations of one correction; how far it may turn a line of sight to be near, rad. Tuned."""
-BEND_FACTOR = 4.0
+BEND_FACTOR = 20.0
 """Factor of the variance of what a bearing's linearisation leaves out: it does not average out as noise does. Tuned."""
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
 FORGET_TIME = 1.0  # s out of view after which a member may be evicted. Chosen
@@ -46,6 +46,18 @@ NEWS_TIME = 0.2
 """s between messages of a sender of which the news are fused; of those in between its odometry counts. Chosen."""
 DEPENDENT_SHARE = 0.7
 """Share that counts of the information of a sender that depends on others: some may have arrived already. Tuned."""
+STEPS = 127  # of a correlation, as it is sent
+MAX_CORRELATIONS = 2  # in a message, which has 248 bytes then
+LEAST_NEWS = 1e-3
+"""Share of a sender's variance that counts as noise of the step by which it moves at its next message. Chosen."""
+STEP_GATE = 22.5
+"""Gate of the squared size of such a step in standard deviations: chi-square of 6, 0.999."""
+MAX_TOLD_VARIANCE = 0.1**2
+"""m^2 per axis, of a sender that knows its place no better, at which nobody follows it: its steps are no small errors.
+Tuned."""
+RELATIVE_NOISE = 1e-6  # share of a variance, that regressions have as noise
+MAX_CONTRADICTION = 0.1
+"""By how much of its covariance a sender may seem to know itself better than what it tells of others allows. Chosen."""
 MAX_VARIANCE_GROWTH = 1.01
 """Ratio of a variance to the predicted one; beyond it the sender has lost information, and its message has no news."""
 MAX_GROWTH = 2.0  # of a variance by information that is negative by rounding; it is below 1.1 as a rule

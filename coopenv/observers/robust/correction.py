@@ -69,6 +69,20 @@ def set_gain(memory: Any, world: int, i: int, n: int):
 
 
 @wp.func
+def is_free(memory: Any, world: int, i: int, k: int) -> bool:
+    """Return whether bearings correct a member; those of others that are considered are as they say."""
+    return memory.member[world, i, k].considered == 0
+
+
+@wp.func
+def hold_considered(memory: Any, world: int, i: int):
+    """Take back the corrections of the members that are considered."""
+    for k in range(memory.belief[world, i].members):
+        if not is_free(memory, world, i, k):
+            memory.scratch[world, k].correction = vec6d()
+
+
+@wp.func
 def error_left(memory: Any, world: int, k: int):
     """Return where the lines were linearised, less the correction so far."""
     return memory.scratch[world, k].last_correction - memory.scratch[world, k].correction
@@ -94,19 +108,21 @@ def correct_by_lines(memory: Any, world: int, i: int, lines: int):
             for k in range(members):
                 correction = memory.scratch[world, k].correction + weighted * memory.gain[world, n, k]
                 memory.scratch[world, k].correction = correction
+    hold_considered(memory, world, i)
 
 
 @wp.func
 def condense(memory: Any, world: int, i: int, lines: int):
-    """Let the covariance be that after the lines that fit."""
+    """Let the covariance be that after the lines that fit; that of errors that are only considered stays."""
     for k in range(memory.belief[world, i].members):
         for j in range(k + 1):
-            block = mat66d()
-            for n in range(lines):
-                if memory.line[world, n].fits == 1:
-                    K = memory.line[world, n].weight * memory.gain[world, n, k]
-                    block = block + wp.transpose(K) * memory.gain[world, n, j]
-            subtract_block(memory, world, i, k, j, block)
+            if is_free(memory, world, i, k) or is_free(memory, world, i, j):
+                block = mat66d()
+                for n in range(lines):
+                    if memory.line[world, n].fits == 1:
+                        K = memory.line[world, n].weight * memory.gain[world, n, k]
+                        block = block + wp.transpose(K) * memory.gain[world, n, j]
+                subtract_block(memory, world, i, k, j, block)
 
 
 @wp.func

@@ -4,23 +4,24 @@ from coopenv.errors import CoopenvError
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import KernelObserver
-from coopenv.observers.robust.memory import SIZES, RobustMemory, rules_for
-from coopenv.observers.robust.messages import MESSAGES
 from coopenv.observers.robust.observer import make_estimate, make_start
-from coopenv.observers.robust.tracklets import clear_messages, fuse_messages, receive, send
+from coopenv.observers.robust.told.correlations import clear_told, receive_told, send_told
+from coopenv.observers.robust.told.fusion import hear_all
+from coopenv.observers.robust.told.memory import TOLD_SIZES, ToldMemory, told_rules
+from coopenv.observers.robust.told.messages import TOLD_MESSAGES
 from coopenv.world.embedded import Embedded
 
 OPTIONS = {"max_unroll": 1}  # of the Warp module; without it there is long straight code, which takes long to compile
 
 ROBUST = Embedded(
     "robust",
-    make_estimate(receive, fuse_messages),
-    make_start(clear_messages, receive),
-    send,
-    RobustMemory,
-    SIZES,
-    valid=rules_for(SIZES["K"]),
-    messages=MESSAGES,
+    make_estimate(receive_told, hear_all),
+    make_start(clear_told, receive_told),
+    send_told,
+    ToldMemory,
+    TOLD_SIZES,
+    valid=told_rules(),
+    messages=TOLD_MESSAGES,
     coordinates=Coordinates.LEFT,
     options=OPTIONS,
 )

@@ -67,6 +67,7 @@ class Member:
     report: Report  # its last one, at which it stands
     distrusted: wp.int32
     agreement_time: wp.float64  # s for which a distrusted sender has agreed
+    considered: wp.int32  # whether it stands as it says, and bearings do not correct it
 
 
 @wp.struct
@@ -147,6 +148,7 @@ class Scratch:
     """What a correction needs of a member."""
 
     column: mat66d  # a block of the covariance
+    row: mat66d  # another one, as it will be
     correction: vec6d
     last_correction: vec6d  # where the lines were linearised
     recentring: mat66d  # of errors about where they were linearised, then about where the member is put
@@ -154,8 +156,11 @@ class Scratch:
 
 
 @wp.struct
-class RobustMemory:
-    """K members of a belief (the vehicle itself first), H hypotheses; other axes as in `coopenv.world.state`."""
+class CommonMemory:
+    """What `robust` and `robust_joint` have in common.
+
+    K members of a belief (the vehicle itself first), H hypotheses; other axes as in `coopenv.world.state`.
+    """
 
     belief: array("WN", Belief)
     member: array("WNK", Member)
@@ -226,7 +231,7 @@ def rules_for(members: int) -> dict[str, Rule]:
     """Return what a saved memory with so many members may hold, by field, see `coopenv.world.saved_state`."""
     flags = (
         "search.active outbox.valid inbox.valid belief.has_sample member.has_twist member.distrusted "
-        "member.report.valid line.fits"
+        "member.considered member.report.valid line.fits"
     )
     ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick"
     large = "hypothesis.cost hypothesis.prior_distance line.variance line.noise line.weight scratch.column gain"

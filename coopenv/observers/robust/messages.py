@@ -1,4 +1,4 @@
-"""What `robust` sends, as other programs see it: 196 bytes."""
+"""What `robust` and `robust_joint` both send, as other programs see it: 196 bytes."""
 
 from typing import Any
 
@@ -12,7 +12,6 @@ from coopenv.observers.checks import check_estimate
 from coopenv.observers.contract import Estimate, Message
 from coopenv.observers.robust.constants import MIN_VARIANCE
 from coopenv.scenario.base import LARGEST
-from coopenv.world.embedded import Messages
 
 
 def write(observer: Any) -> Message:
@@ -41,7 +40,7 @@ def read(observer: Any, sender: int, message: Message, sent: int) -> None:
     if message.position is None and not message.extra:  # the sender does not know where it is
         return
     check_pose(message)
-    odometry, depends_on = (np.asarray(message.extra[name]) for name in ("odometry", "depends_on"))
+    odometry, depends_on = np.asarray(message.extra["odometry"], np.float64), np.asarray(message.extra["depends_on"])
     if odometry.shape != (6,) or not (np.abs(odometry) <= LARGEST).all():
         raise CoopenvError("message: odometry")
     if depends_on.shape != (1,) or depends_on.dtype != np.uint64:
@@ -58,6 +57,3 @@ def check_pose(message: Message) -> None:
     check_estimate(Estimate(message.rotation, message.position, P))
     if dpotrf(P)[1] != 0 or P.diagonal().min() < MIN_VARIANCE or not (np.abs(message.position) <= LARGEST).all():
         raise CoopenvError("message: covariance or position")
-
-
-MESSAGES = Messages(write, read)

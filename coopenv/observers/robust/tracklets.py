@@ -11,14 +11,10 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import symmetric_part
 from coopenv.estimation.so3 import skew
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.belief import append_member, fuse_information, index_of, make_room, mark_seen, propagate
-from coopenv.observers.robust.measurements import is_heard
-from coopenv.observers.robust.memory import Estimate, Pose, Report, mat66d, mat66f, vec3d
-from coopenv.observers.robust.odometry import increment_noise
-from coopenv.world.camera import VISIBLE
+from coopenv.observers.robust.belief import propagate
+from coopenv.observers.robust.memory import Estimate, Pose, Report, mat66f, vec3d
 from coopenv.world.faults import as_told, claimed_std, content_tick
 
 LEAST_TIME = constants.NEWS_TIME - constants.SAME_TIME
@@ -108,19 +104,6 @@ def receive(model: Any, state: Any, memory: Any, world: int, i: int):
 
 
 @wp.func
-def add_member(model: Any, memory: Any, world: int, i: int, sender: int, tick: int):
-    """Add a sender that is new to the belief, if there is room."""
-    if make_room(model, memory, world, i, tick):
-        n = memory.belief[world, i].members
-        report = memory.inbox[world, i, sender]
-        append_member(memory, world, i, sender, report.pose, mat66d(report.P))
-        memory.member[world, i, n].report = report
-        memory.member[world, i, n].seen_tick = tick
-        depends_on = report.depends_on | bit_of(sender)
-        memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
-
-
-@wp.func
 def propagate_member(model: Any, memory: Any, world: int, i: int, n: int, step: Pose, dt: Any, noise: Any):
     """Carry a member on to its new message by its odometry over dt, and average its twist."""
     averaged = wp.max(algebra.averaging_time(model, i), wp.float64(0.5) * dt)
@@ -175,63 +158,6 @@ def information_share(memory: Any, world: int, i: int, depends_on: wp.uint64):
 
 
 @wp.func
-def fuse_tracklet(memory: Any, world: int, i: int, n: int, report: Report, before: Estimate):
-    """Fuse what a sender has learnt since its last report, which odometry has carried on to `before`."""
-    after = mat66d(report.P)
-    for k in range(6):
-        if after[k, k] > wp.float64(constants.MAX_VARIANCE_GROWTH) * before.P[k, k]:
-            return
-    news = algebra.left_error(before.pose, report.pose)
-    G = algebra.recentring(news)
-    precision = wp.transpose(G) * algebra.inverse6(after) * G  # of the error about `before`, as the rest
-    information = symmetric_part(precision - algebra.inverse6(before.P))
-    offset = algebra.left_error(before.pose, memory.member[world, i, n].pose)
-    vector = precision * news - information * offset
-    A = algebra.recentring(-offset)  # backwards, to second order: of the error about the member
-    information = symmetric_part(wp.transpose(A) * information * A)
-    vector = wp.transpose(A) * vector
-    share = information_share(memory, world, i, report.depends_on)
-    fuse_information(memory, world, i, n, share * information, share * vector)
-    memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | report.depends_on
-
-
-@wp.func
 def is_due(model: Any, before: int, sent: int) -> bool:
     """Return whether a message comes long enough after the last one of the sender that was fused to be so, too."""
     return wp.float64(sent - before) * model.camera_period > wp.float64(LEAST_TIME)
-
-
-@wp.func
-def fuse_message(model: Any, memory: Any, world: int, i: int, n: int, sender: int):
-    """Carry a member to its new report, and fuse what it has learnt since the last one, if that is long ago."""
-    sent = memory.inbox[world, i, sender].tick
-    before = memory.member[world, i, n].report.tick
-    if is_due(model, before, sent):
-        last = memory.member[world, i, n].report
-        report = memory.inbox[world, i, sender]
-        dt = wp.float64(sent - before) * model.camera_period
-        step = algebra.between(last.odometry, report.odometry)
-        noise = increment_noise(model, memory, world, i, step, dt)
-        propagate_member(model, memory, world, i, n, step, dt, noise)
-        carried = algebra.carried(Estimate(last.pose, mat66d(last.P)), step, noise)
-        was_distrusted = memory.member[world, i, n].distrusted
-        memory.member[world, i, n].report = report
-        test_sender(memory, world, i, n, Estimate(report.pose, mat66d(report.P)), dt)
-        if was_distrusted == 0 and memory.member[world, i, n].distrusted == 0:
-            fuse_tracklet(memory, world, i, n, report, carried)
-
-
-@wp.func
-def fuse_messages(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
-    """Fuse the messages of members, and add senders in view to the belief."""
-    mark_seen(model, state, memory, world, i, tick)
-    for n in range(model.target_count[i]):
-        target = model.targets[i, n]
-        sender = target - model.landmarks
-        if sender >= 0:
-            if is_heard(model, state, memory, world, i, sender, tick):
-                member = index_of(memory, world, i, sender)
-                if member > 0:
-                    fuse_message(model, memory, world, i, member, sender)
-                elif state.sight[world, i, target] == VISIBLE:
-                    add_member(model, memory, world, i, sender, tick)

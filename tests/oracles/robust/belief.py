@@ -49,6 +49,8 @@ class Member:
     """(m/s)^2 per axis."""
     seen: float = 0.0
     """s, when it was last in view, or was told of along with one in view."""
+    considered: bool = False
+    """Whether it stands as told, and bearings do not correct it."""
 
     def carried(self, age: float) -> Array:
         """Return (3,) how far it comes in its body frame at the last known twist in a time, m."""
@@ -266,7 +268,11 @@ class Belief:
         PHt = self.P.dot(H.T)
         S = H.dot(PHt)
         S.flat[:: len(S) + 1] += noise
-        return solve_positive(S, PHt.T).T
+        K = solve_positive(S, PHt.T).T
+        for n, member in enumerate(self.members):
+            if member.considered:
+                K[6 * n : 6 * n + 6] = 0.0
+        return K
 
     def condense(self, K: Array, H: Array, noise: Array) -> None:
         """Let the covariance be that after measurements H x + noise with gain K."""

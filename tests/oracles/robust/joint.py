@@ -15,14 +15,22 @@ from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array, cholesky
 from coopenv.estimation.rotations import exp_so3, log_so3
-from coopenv.observers.contract import Message
-from coopenv.observers.robust.constants import MAX_MEMBERS_JOINT, MAX_TOLD, SAME_TIME, SUPERSEDING_TIME
+from coopenv.observers.contract import Message, Tick
+from coopenv.observers.robust.constants import (
+    DEPENDENT_SHARE,
+    MAX_MEMBERS_JOINT,
+    MAX_TOLD,
+    NEWS_TIME,
+    SAME_TIME,
+    SUPERSEDING_TIME,
+)
 from tests.oracles.robust.belief import ERRORS, Member, errors_of
-from tests.oracles.robust.observer import Robust
-from tests.oracles.robust.tracklets import Report, from_message, marker_jacobian, mask_of
+from tests.oracles.robust.common import Common, Contact
+from tests.oracles.robust.eviction import room_for
+from tests.oracles.robust.tracklets import Report, from_message, marker_jacobian, mask_of, tracklet
 
 
-class RobustJoint(Robust):
+class RobustJoint(Common):
     """One vehicle's observer; messages hold a joint belief: 281 bytes alone, 1715 with three others."""
 
     most_members = MAX_MEMBERS_JOINT
@@ -63,6 +71,91 @@ class RobustJoint(Robust):
     def _is_spoken_for(self, report: Report, taken: list[Report]) -> bool:
         """Return whether a report that was taken in says all that this one does."""
         return any(_speaks_for(other, report) for other in taken)
+
+    def _listen(self, tick: Tick) -> None:
+        """Take in the messages of those in view, and of those that are already believed in."""
+        in_view = {target - self.landmarks for target in tick.targets[tick.valid].tolist()}
+        reports = sorted(self._reports(tick), key=lambda report: -len(report.vehicles))
+        self._notice(in_view, reports, tick.time)
+        heard = {report.vehicles[0] for report in reports}
+        taken = [contact.last for sender, contact in self.contacts.items() if sender not in heard]
+        for report in reports:
+            contact = self.contacts.get(report.vehicles[0])
+            if self._is_spoken_for(report, taken):
+                if contact is not None:
+                    contact.last = report
+                continue
+            if contact is not None and contact.last.vehicles == report.vehicles:
+                self._hear(contact, report)
+            elif contact is not None or not in_view.isdisjoint(report.vehicles):
+                self._meet(report, tick.time)
+            if (contact := self.contacts.get(report.vehicles[0])) is not None:
+                taken.append(contact.last)
+        self._forget_contacts()
+
+    def _meet(self, report: Report, time: float) -> None:
+        """Take in a sender that is new, or tells of other vehicles than before, if there is room."""
+        told = set(report.vehicles) - {self.vehicle}
+        forgotten = room_for(self.belief, told, self.most_members, time)
+        if forgotten is None:
+            return
+        self.belief.drop(told | forgotten)
+        numbers = [n for n, v in enumerate(report.vehicles) if v in told]
+        index = errors_of(numbers)
+        odometry = zip(report.odometry_turn, report.odometry_position, strict=True)
+        poses = list(zip(report.vehicles, report.R, report.p, report.time.tolist(), odometry, strict=True))
+        self.belief.add([Member(*poses[n], seen=time) for n in numbers], report.P[np.ix_(index, index)])
+        self.contacts[report.vehicles[0]] = Contact(report)
+        self._forget_contacts()
+        self.depends_on |= report.depends_on | int(mask_of(told))
+
+    def _forget_contacts(self) -> None:
+        """Forget the senders that tell of vehicles which are not members; they may be met again."""
+        members = {member.vehicle for member in self.belief.members}
+        self.contacts = {
+            v: contact for v, contact in self.contacts.items() if members.issuperset(contact.last.vehicles)
+        }
+
+    def _hear(self, contact: Contact, report: Report) -> None:
+        """Carry a sender to its new message, and take in what it has learnt since the last one."""
+        last = contact.last
+        dt = float(report.time[0] - last.time[0])
+        if dt <= NEWS_TIME - SAME_TIME:  # of the same message again, or of one soon after, the odometry counts at most
+            return
+        contact.last = report
+        members = [member.vehicle for member in self.belief.members]
+        places = [members.index(v) for v in report.vehicles]
+        for n, R, p, time in zip(
+            places, report.odometry_turn, report.odometry_position, report.time.tolist(), strict=True
+        ):
+            if n > 0:
+                self.belief.follow(n, R, p, time, self.noise)
+        was_trusted = contact.trusted
+        self._judge(contact, report, dt)
+        learnt = (
+            tracklet(last, report, self.noise, self.belief.errors_covariance)
+            if was_trusted and contact.trusted
+            else None
+        )
+        if learnt is None:
+            return
+        share = self._share(report)
+        information, vector = learnt.about([self.belief.members[n] for n in places])
+        self.belief.inform(errors_of(places), share * information, share * vector)
+        self.depends_on |= report.depends_on
+
+    def _share(self, report: Report) -> float:
+        """Return how much of a sender's news counts.
+
+        All if it depends on nobody, `DEPENDENT_SHARE` if on others. Where senders depend on this vehicle in turn, each
+        of n counts 1 / (n + 1): then what comes back round any loop fades, however dense the graph is.
+        """
+        if not report.depends_on:
+            return 1.0
+        own = int(mask_of({self.vehicle}))
+        if not report.depends_on & own:
+            return DEPENDENT_SHARE
+        return 1.0 / (1.0 + sum(bool(contact.last.depends_on & own) for contact in self.contacts.values()))
 
 
 def _speaks_for(other: Report, report: Report) -> bool:

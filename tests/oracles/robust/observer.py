@@ -1,8 +1,8 @@
 """The observer of this project's own: consistent, hard to mislead, and at home from any start.
 
 One vehicle keeps a joint belief about itself and the vehicles that it hears. Bearings, to landmarks and to vehicles,
-correct that belief; a neighbour's messages add what the neighbour has learnt since its last one (report.py), and no
-more. So nothing that was heard before counts twice, and the neighbour's slowly varying error is no white noise.
+correct it in the vehicle's own pose; the others stand where they say that they are, their errors being considered
+(told.py). So nothing that was heard before counts twice, and a neighbour's slowly varying error is no white noise.
 
 - Start and loss: with no useful prior, or when most bearings contradict the belief, the pose is searched for among all
   P3P solutions (search.py). Meanwhile the vehicle says nothing.
@@ -11,396 +11,161 @@ more. So nothing that was heard before counts twice, and the neighbour's slowly 
   odometry and by bearings, until its messages have agreed for a while.
 - Loss and delay: a sender stands in the belief where its last message put it, and is carried on by its last twist.
 - Many neighbours: where there is no room for one in view, those that have been out of view for longest make room.
-- Rumours: what a neighbour learnt from others may reach this vehicle by more ways than one. A share of it counts.
+- Rumours: senders tell how their errors correlate with those of the vehicles that they hear.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from coopenv.estimation.arrays import Array
-from coopenv.estimation.coordinates import Coordinates
-from coopenv.estimation.rotations import orthonormalise
-from coopenv.observers.contract import Estimate, Message, SensorNoise, Setup, Tick
+from coopenv.observers.contract import Message, Setup, Tick
 from coopenv.observers.robust.constants import (
-    AGREEMENT_DISTANCE,
-    AGREEMENT_TIME,
-    ANCHOR_ANGLE_VARIANCE,
-    ANCHOR_POSITION_VARIANCE,
-    BEARING_GATE,
-    DEPENDENT_SHARE,
-    ERRORS_TIME,
-    HEALTHY_SHARE,
-    HEALTHY_TIME,
-    LOST_SHARE,
-    LOST_TIME,
-    MAX_ACCELERATION,
-    MAX_MEMBERS,
-    MAX_SPEED,
-    MESSAGE_GATE,
-    MIN_ANGULAR_VELOCITY_STD,
-    MIN_VELOCITY_STD,
+    LEAST_NEWS,
+    MAX_CORRELATIONS,
+    MAX_TOLD_VARIANCE,
     NEWS_TIME,
     SAME_TIME,
+    STEP_GATE,
+    STEPS,
 )
-from tests.oracles.robust.belief import Belief, Member, errors_of
+from tests.oracles.robust.belief import ERRORS, Member, recentring
+from tests.oracles.robust.common import Common, Contact
 from tests.oracles.robust.eviction import room_for
-from tests.oracles.robust.matrices import solve_positive
-from tests.oracles.robust.odometry import Lasting, as_noise, trapezoidal
-from tests.oracles.robust.resection import resect
-from tests.oracles.robust.search import Search, Sighting, is_known
-from tests.oracles.robust.sight import View
-from tests.oracles.robust.tracklets import Report, from_message, left_error, mask_of, to_message, tracklet
+from tests.oracles.robust.told import Correlations, factor, is_positive, regress
+from tests.oracles.robust.tracklets import Report, left_error, marker_jacobian, mask_of
 
 
-@dataclass
-class Contact:
-    """What is known of a sender."""
-
-    last: Report
-    trusted: bool = True
-    agreed: float = 0.0
-    """s, for which a distrusted sender has agreed."""
-
-
-@dataclass(frozen=True)
-class Anchor:
-    """Where the vehicle was when its bearings last fitted, or at the start."""
-
-    R: Array  # (3, 3) body to map
-    p: Array  # (3,) map frame, m
-    P: Array  # (6, 6) left error, rad and m
-    odometry: tuple[Array, Array]
-    """(3, 3) and (3,) m: its pose by dead reckoning then."""
-    time: float  # s
-
-
-class Robust:
-    """One vehicle's observer; messages hold pose and covariance (196 bytes)."""
-
-    most_members = MAX_MEMBERS
-    """The vehicle itself and those it keeps in its belief."""
+class Robust(Common):
+    """One vehicle's observer; messages hold pose, covariance and one correlation (248 bytes)."""
 
     def __init__(self, setup: Setup) -> None:
         """Take what the vehicle knows before it starts."""
-        self.vehicle, self.landmarks, self.marker = setup.vehicle, setup.landmarks, setup.marker
-        self.noise = SensorNoise(
-            max(setup.noise.velocity, MIN_VELOCITY_STD),
-            max(setup.noise.angular_velocity, MIN_ANGULAR_VELOCITY_STD),
-            setup.noise.odometry_period,
-            setup.noise.bearing,
-        )
-        self.sample_noise = setup.noise.angular_velocity, setup.noise.velocity
-        self.lasting = Lasting.of(setup.noise)
-        self.variance = self.noise.bearing_std**2
-        self.possible_dependencies = int(
-            mask_of({int(t) - self.landmarks for t in setup.targets if t >= self.landmarks})
-        )
-
-    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
-        """Start at a pose; one that is too uncertain to linearise about is only a hint for the search."""
-        R, p = (np.array(x, float) for x in initial_pose)
-        P = np.array(initial_covariance, float)
-        self.odometry = np.eye(3), np.zeros(3)
-        self.sample: tuple[Array, Array] | None = None  # held at the last tick's end
-        self.contacts: dict[int, Contact] = {}
-        self.depends_on = self.possible_dependencies
-        self.missed = 0.0
-        self.belief = self._alone(R, p, P.copy())
-        self.search = None if is_known(P) else Search(self.vehicle, R, p, P.copy())
-        self.anchor, self.healthy = Anchor(R, p, P, self.odometry, 0.0), 0.0
-
-    def update(self, tick: Tick) -> Estimate:
-        """Take one camera tick."""
-        before, self.sample = self.sample, (tick.angular_velocity, tick.velocity)
-        tick, jumps = trapezoidal(tick, before, self.noise.odometry_period, self.sample_noise)
-        dR, dp = self.belief.corrected(tick.rotation, tick.translation, tick.dt)
-        tick = replace(tick, rotation=dR, translation=dp)
-        self._walk(tick.dt)
-        R, p = self.odometry
-        self.odometry = orthonormalise(R.dot(tick.rotation)), p + R.dot(tick.translation)
-        noise = self.noise.odometry(tick.dt) + jumps
-        self.nis, self.nis_dof = 0.0, 0
-        if self.search is not None:
-            self.search.move(tick, noise + as_noise(self.belief.errors_covariance, dp, tick.dt, ERRORS_TIME))
-            if tick.due:
-                self._search(tick)
-        else:
-            self.belief.move(0, tick.rotation, tick.translation, noise)
-            self.belief.drift(tick.rotation, tick.translation, tick.dt)
-            self.belief.own.time = tick.time
-            self._listen(tick)
-            if tick.due:
-                self._look(tick)
-        belief = self.belief if self.search is None else self.search.best
-        P, coordinates = belief.P[:6, :6].copy(), Coordinates.LEFT
-        return Estimate(belief.own.R, belief.own.p, P, coordinates, self.nis if self.nis_dof else None, self.nis_dof)
-
-    def _alone(self, R: Array, p: Array, P: Array) -> Belief:
-        """Return a belief in the vehicle alone, that knows of its odometry's errors what is declared."""
-        belief = Belief(self.vehicle, R, p, P)
-        if self.lasting.any:
-            belief.begin_errors(self.lasting.start)
-        return belief
-
-    def _walk(self, dt: float) -> None:
-        """Let the odometry's errors have walked."""
-        if self.belief.errors is not None:
-            walk = np.append(self.lasting.bias_walk, self.lasting.scale_walk) * dt
-            self.belief.P[6:10, 6:10] += np.diag(walk)
+        super().__init__(setup)
+        self.correlations = Correlations()
 
     def message(self) -> Message:
-        """Return pose, covariance and odometry, or nothing while the pose is not known."""
-        if self.search is not None or not is_known(self.belief.P[:6, :6]):
-            return Message()
-        return to_message(self.belief, self.marker, self.odometry, self.depends_on)
+        """Return pose, covariance, odometry and the correlations with members."""
+        message = super().message()
+        if message.position is None:
+            return message
+        P, J = self.belief.P, marker_jacobian(self.marker)
+        A = factor(J.dot(P[:6, :6]).dot(J.T))
+        told = self._told_of()
+        correlations = np.zeros((len(told), 6, 6), np.int8)
+        for k, n in enumerate(told):
+            block = slice(6 * n, 6 * n + 6)
+            C = np.linalg.solve(A, np.linalg.solve(factor(P[block, block]), J.dot(P[:6, block]).T).T)
+            correlations[k] = np.clip(np.rint(STEPS * C), -STEPS, STEPS)
+        extra = {
+            "odometry": message.extra["odometry"].astype(np.float32),
+            "told": np.array([self.belief.members[n].vehicle for n in told], np.uint16),
+            "correlations": correlations,
+        }
+        return replace(message, extra={**message.extra, **extra})
 
-    def _search(self, tick: Tick) -> None:
-        """Look for the pose; once only one is possible, go on with the prior, or with what this frame alone says."""
-        assert self.search is not None
-        found = self.search.look(tick, self._sightings(tick), self.variance)
-        if found is None:
-            return
-        if self.search.confirms_prior(found):
-            self._begin(self.search.prior, tick)
-            self.search = None
-            self._look(tick)
-            return
-        self._begin(found, tick)
-        if resect(self.belief, lambda: self._view(tick, True)) and is_known(self.belief.P[:6, :6]):
-            self.search = None
+    def _told_of(self) -> list[int]:
+        """Return which members are told of: those that depend on most others, to whom there are most ways."""
+        members = [n for n, m in enumerate(self.belief.members) if n and m.vehicle != ERRORS and m.considered]
 
-    def _begin(self, pose: Belief, tick: Tick) -> None:
-        """Believe in a pose and in those that are in view."""
-        own = pose.own
-        before, self.belief = self.belief, Belief(self.vehicle, own.R, own.p, pose.P.copy(), tick.time)
-        if before.errors_covariance is not None:
-            self.belief.begin_errors(before.errors_covariance, before)
-        self.contacts, self.depends_on, self.missed = {}, self.possible_dependencies, 0.0
-        self._listen(tick)
+        def order(n: int) -> tuple[int, int]:
+            vehicle = self.belief.members[n].vehicle
+            return self.contacts[vehicle].last.depends_on.bit_count(), vehicle
 
-    def _sightings(self, tick: Tick) -> list[Sighting]:
-        """Return every target in view whose place is known or told by a sender that knows it."""
-        reports = {report.vehicles[0]: report for report in self._reports(tick)}
-        result = []
-        for n in np.flatnonzero(tick.valid):
-            target = int(tick.targets[n])
-            if target < self.landmarks:
-                result.append(Sighting(tick.bearings[n], tick.landmarks[target], 0.0))
-            elif (report := reports.get(target - self.landmarks)) is not None:
-                age = tick.time - report.time[0]
-                variance = float(np.trace(report.P[3:6, 3:6])) / 3.0 + (MAX_SPEED * age) ** 2
-                result.append(Sighting(tick.bearings[n], report.p[0], variance))
-        return result
-
-    def _lose(self, time: float) -> None:
-        """Search anew, from where the vehicle was when most bearings fitted, carried on by its odometry."""
-        anchor, (R, p) = self.anchor, self.odometry
-        prior = Belief(self.vehicle, anchor.R, anchor.p, anchor.P.copy())
-        since = anchor.odometry[0].T
-        dt, dp = time - anchor.time, since.dot(p - anchor.odometry[1])
-        self.belief = self._alone(self.belief.own.R, self.belief.own.p, self.belief.P[:6, :6])
-        noise = self.noise.odometry(dt) + as_noise(self.belief.errors_covariance, dp, dt, dt)
-        prior.move(0, since.dot(R), dp, noise)
-        self.search = Search(self.vehicle, prior.own.R, prior.own.p, prior.P)
-
-    def _report(self, message: Message, sender: int, time: float) -> Report | None:
-        """Return what a message says."""
-        return from_message(message, sender, time)
-
-    def _is_spoken_for(self, report: Report, taken: list[Report]) -> bool:
-        """Return whether a report's news are in those that were taken in."""
-        return False
-
-    def _reports(self, tick: Tick) -> list[Report]:
-        """Return what the messages say that were heard."""
-        heard = tick.messages.items()
-        read = [self._report(m.message, target - self.landmarks, tick.time - m.age) for target, m in heard]
-        return [report for report in read if report is not None]
+        return sorted(members, key=order, reverse=True)[:MAX_CORRELATIONS]
 
     def _listen(self, tick: Tick) -> None:
-        """Take in the messages of those in view, and of those that are already believed in."""
+        """Take in the messages of those in view, and of those that are already believed in; leaders first."""
         in_view = {target - self.landmarks for target in tick.targets[tick.valid].tolist()}
-        reports = sorted(self._reports(tick), key=lambda report: -len(report.vehicles))
+        for target, received in tick.messages.items():
+            self.correlations.hear(target - self.landmarks, received.message)
+        reports = self._reports(tick)
         self._notice(in_view, reports, tick.time)
-        heard = {report.vehicles[0] for report in reports}
-        taken = [contact.last for sender, contact in self.contacts.items() if sender not in heard]
-        for report in reports:
+        for report in sorted(reports, key=lambda report: report.depends_on.bit_count()):
             contact = self.contacts.get(report.vehicles[0])
-            if self._is_spoken_for(report, taken):
-                if contact is not None:
-                    contact.last = report
-                continue
-            if contact is not None and contact.last.vehicles == report.vehicles:
+            if contact is not None:
                 self._hear(contact, report)
-            elif contact is not None or not in_view.isdisjoint(report.vehicles):
+            elif report.vehicles[0] in in_view:
                 self._meet(report, tick.time)
-            if (contact := self.contacts.get(report.vehicles[0])) is not None:
-                taken.append(contact.last)
-        self._forget_contacts()
-
-    def _notice(self, in_view: set[int], reports: list[Report], time: float) -> None:
-        """Remember when members were last in view; all that a member tells of count as in view when one of them is."""
-        noticed = set(in_view)
-        for report in reports:
-            if report.vehicles[0] in self.contacts and not in_view.isdisjoint(report.vehicles):
-                noticed.update(report.vehicles)
-        for member in self.belief.members:
-            if member.vehicle in noticed:
-                member.seen = time
 
     def _meet(self, report: Report, time: float) -> None:
-        """Take in a sender that is new, or tells of other vehicles than before, if there is room."""
-        told = set(report.vehicles) - {self.vehicle}
+        """Take in a sender that is new, if there is room."""
+        told = set(report.vehicles)
         forgotten = room_for(self.belief, told, self.most_members, time)
         if forgotten is None:
             return
         self.belief.drop(told | forgotten)
-        numbers = [n for n, v in enumerate(report.vehicles) if v in told]
-        index = errors_of(numbers)
-        odometry = zip(report.odometry_turn, report.odometry_position, strict=True)
-        poses = list(zip(report.vehicles, report.R, report.p, report.time.tolist(), odometry, strict=True))
-        self.belief.add([Member(*poses[n], seen=time) for n in numbers], report.P[np.ix_(index, index)])
+        odometry = report.odometry_turn[0], report.odometry_position[0]
+        member = Member(report.vehicles[0], report.R[0], report.p[0], float(report.time[0]), odometry, seen=time)
+        member.considered = True
+        self.belief.add([member], report.P)
         self.contacts[report.vehicles[0]] = Contact(report)
-        self._forget_contacts()
+        self.contacts = {v: c for v, c in self.contacts.items() if v not in forgotten}
+        self._relate(len(self.belief.members) - 1, report)
         self.depends_on |= report.depends_on | int(mask_of(told))
 
-    def _forget_contacts(self) -> None:
-        """Forget the senders that tell of vehicles which are not members; they may be met again."""
-        members = {member.vehicle for member in self.belief.members}
-        self.contacts = {
-            v: contact for v, contact in self.contacts.items() if members.issuperset(contact.last.vehicles)
-        }
+    def _relate(self, n: int, report: Report) -> None:
+        """Let the error of a sender that has just been met depend on those of the others as told."""
+        crosses = self.correlations.crosses(self.belief, n, report.P, True)
+        row, _ = regress(self.belief.P, n, report.P, crosses, False)
+        block = slice(6 * n, 6 * n + 6)
+        self.belief.P[block], self.belief.P[:, block] = row, row.T
 
     def _hear(self, contact: Contact, report: Report) -> None:
-        """Carry a sender to its new message, and take in what it has learnt since the last one."""
+        """Put a sender where it says that it is, and let one's own pose follow what it has learnt."""
         last = contact.last
         dt = float(report.time[0] - last.time[0])
         if dt <= NEWS_TIME - SAME_TIME:  # of the same message again, or of one soon after, the odometry counts at most
             return
         contact.last = report
-        members = [member.vehicle for member in self.belief.members]
-        places = [members.index(v) for v in report.vehicles]
-        for n, R, p, time in zip(
-            places, report.odometry_turn, report.odometry_position, report.time.tolist(), strict=True
-        ):
-            if n > 0:
-                self.belief.follow(n, R, p, time, self.noise)
+        belief, n = self.belief, self.belief.place(report.vehicles[0])
+        assert n is not None
+        belief.follow(n, report.odometry_turn[0], report.odometry_position[0], float(report.time[0]), self.noise)
         was_trusted = contact.trusted
         self._judge(contact, report, dt)
-        learnt = (
-            tracklet(last, report, self.noise, self.belief.errors_covariance)
-            if was_trusted and contact.trusted
-            else None
-        )
-        if learnt is None:
+        member = belief.members[n]
+        member.considered = contact.trusted
+        if not contact.trusted:
             return
-        share = self._share(report)
-        information, vector = learnt.about([self.belief.members[n] for n in places])
-        self.belief.inform(errors_of(places), share * information, share * vector)
         self.depends_on |= report.depends_on
+        if was_trusted:
+            self._step(n, report)
+            return
+        block = slice(6 * n, 6 * n + 6)
+        belief.P[block], belief.P[:, block] = 0.0, 0.0
+        belief.P[block, block] = report.P
+        member.R, member.p = report.R[0], report.p[0]
+        self._relate(n, report)
 
-    def _share(self, report: Report) -> float:
-        """Return how much of a sender's news counts.
+    def _step(self, n: int, report: Report) -> None:
+        """Put a trusted sender where it says that it is; the step d there tells of all errors that correlate with it.
 
-        All if it depends on nobody, `DEPENDENT_SHARE` if on others. Where senders depend on this vehicle in turn, each
-        of n counts 1 / (n + 1): then what comes back round any loop fades, however dense the graph is.
+        The sender's error after it is not correlated with it, so that its covariance with other errors is the
+        difference of theirs with the sender's before and after, and its own is N = P- - P+.
         """
-        if not report.depends_on:
-            return 1.0
-        own = int(mask_of({self.vehicle}))
-        if not report.depends_on & own:
-            return DEPENDENT_SHARE
-        return 1.0 / (1.0 + sum(bool(contact.last.depends_on & own) for contact in self.contacts.values()))
-
-    def _judge(self, contact: Contact, report: Report, dt: float) -> None:
-        """Decide whether a sender is believed, from its message and the belief about it."""
-        n = self.belief.place(report.vehicles[0])
-        if n is None:
+        belief, member, after = self.belief, self.belief.members[n], report.P
+        block = slice(6 * n, 6 * n + 6)
+        d = left_error(member.R, member.p, report.R[0], report.p[0])
+        G = recentring(d)
+        belief.P[block] = G.dot(belief.P[block])
+        belief.P[:, block] = belief.P[:, block].dot(G.T)
+        member.R, member.p = report.R[0], report.p[0]
+        d, before = G.dot(d), belief.P[block].copy()
+        crosses = self.correlations.crosses(belief, n, after, False)
+        row, forgiven = regress(belief.P, n, after, crosses, True)
+        D = before - row
+        D[:, block] = -forgiven * after
+        before = before[:, block]
+        belief.P[block], belief.P[:, block] = row, row.T
+        N = before - (1.0 - forgiven) * after + LEAST_NEWS * np.diag(before.diagonal())
+        vague = before[3:, 3:].trace() > 3.0 * MAX_TOLD_VARIANCE
+        if forgiven < 0.0 or vague or not is_positive(N) or d.dot(np.linalg.solve(N, d)) > STEP_GATE:
             return
-        member, block = self.belief.members[n], slice(6 * n, 6 * n + 6)
-        e = left_error(member.R, member.p, report.R[0], report.p[0])
-        agrees = float(e.dot(solve_positive(self.belief.P[block, block] + report.P[:6, :6], e))) < MESSAGE_GATE
-        if contact.trusted:
-            contact.trusted, contact.agreed = agrees, 0.0
-            return
-        near = agrees and e[3:].dot(e[3:]) < AGREEMENT_DISTANCE**2
-        contact.agreed = contact.agreed + dt if near else 0.0
-        contact.trusted = contact.agreed >= AGREEMENT_TIME
-
-    def _look(self, tick: Tick) -> None:
-        """Correct the belief by every bearing that fits it; search anew when most do not."""
-        view = self._view(tick)
-        self.nis, self.nis_dof = float(view.nis[view.fits].sum()), 2 * int(view.fits.sum())
-        if view.fits.any():
-            self.belief.settle(view.sight, view.noise, view.fits, lambda: self._view(tick)[:2])
-        if view.missed is not None:
-            self.missed += (view.missed - self.missed) * min(1.0, tick.dt / LOST_TIME)
-            self.healthy = self.healthy + tick.dt if self.missed < HEALTHY_SHARE else 0.0
-            if self.missed > LOST_SHARE:
-                self._lose(tick.time)
-            elif self.healthy > HEALTHY_TIME:
-                own = self.belief.own
-                self.anchor = Anchor(
-                    own.R,
-                    own.p,
-                    4.0 * self.belief.P[:6, :6]
-                    + np.diag(np.repeat([ANCHOR_ANGLE_VARIANCE, ANCHOR_POSITION_VARIANCE], 3)),
-                    self.odometry,
-                    tick.time,
-                )
-
-    def _view(self, tick: Tick, resecting: bool = False) -> View:
-        """Return the frame's bearings to landmarks and to members of the belief, as measurements."""
-        belief = self.belief
-        heard = {report.vehicles[0]: report for report in self._reports(tick)}
-        known, z, drift, counts, places, points = [], [], [], [], [], []
-        targets = tick.targets.tolist()
-        for n in tick.valid.nonzero()[0].tolist():  # landmarks come first
-            vehicle = targets[n] - self.landmarks
-            if vehicle < 0:
-                z.append(tick.landmarks[targets[n]])
-                drift.append(0.0)
-                counts.append(True)
-            elif (place := belief.place(vehicle)) is not None:
-                member, contact = belief.members[place], self.contacts.get(vehicle)
-                turned, gone, stands, variance = self._gone(member, heard.get(vehicle))
-                age = tick.time - stands
-                unknown = 0.0  # m, how far it may have gone, where nobody has told how fast it goes
-                if age > SAME_TIME and member.v is None:
-                    if not resecting:
-                        continue
-                    unknown = MAX_SPEED * age
-                point = gone + turned.dot(member.carried(age))
-                z.append(member.p + member.R.dot(point))
-                places.append(place)
-                points.append(point)
-                drift.append(variance + unknown**2 + self._drift(age) + member.velocity_variance * max(age, 0.0) ** 2)
-                counts.append(contact is None or contact.trusted)
-            else:
-                continue
-            known.append(n)
-        sight = belief.sight(tick.bearings[known], tick.lever_arm, np.array(z).reshape(-1, 3), places, points)
-        noise = self.variance + np.array(drift) / sight.distance**2 + sight.bend
-        nis = sight.normalised(belief.P, noise)
-        fits = sight.ahead & (nis < BEARING_GATE)
-        judged = [fit for fit, judges in zip(fits.tolist(), counts, strict=True) if judges]
-        return View(sight, noise, nis, fits, judged.count(False) / len(judged) if judged else None)
-
-    def _gone(self, member: Member, report: Report | None) -> tuple[Array, Array, float, float]:
-        """Return the increment (dR, dp) since a member's last news by its odometry, until when, and its variance."""
-        if report is None or member.odometry is None or report.time[0] - member.time < SAME_TIME:
-            return np.eye(3), np.zeros(3), member.time, 0.0
-        R, p = member.odometry
-        dR, dp = R.T.dot(report.odometry_turn[0]), R.T.dot(report.odometry_position[0] - p)
-        dt = float(report.time[0]) - member.time
-        noise = self.noise.odometry(dt) + as_noise(self.belief.errors_covariance, dp, dt, ERRORS_TIME)
-        return dR, dp, float(report.time[0]), float(noise[3])
-
-    def _drift(self, age: float) -> float:
-        """Return the variance per axis, m^2, of where a sender is a time after its last message."""
-        if age <= 0.0:
-            return 0.0
-        return float(self.noise.odometry(age)[3]) + (0.5 * MAX_ACCELERATION * age * age) ** 2
+        free = 12 if belief.errors is not None else 6
+        K = np.linalg.solve(N, D[:, :free]).T
+        belief.P[:free] -= K.dot(D)
+        belief.P[free:, :free] = belief.P[:free, free:].T
+        dx = np.zeros(len(belief.P))
+        dx[:free] = K.dot(d)
+        belief.shift_about(dx)

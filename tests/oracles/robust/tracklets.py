@@ -137,7 +137,7 @@ def from_message(message: Message, sender: int, time: float) -> Report | None:
         return None
     if len(message.covariance) != 6 or "odometry" not in message.extra:
         return None
-    odometry = message.extra["odometry"]
+    odometry = np.asarray(message.extra["odometry"], float)
     return Report(
         vehicles=(sender,),
         time=np.array([time]),

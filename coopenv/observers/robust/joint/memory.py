@@ -9,8 +9,8 @@ from coopenv.observers.robust.memory import (
     ERRORS,
     LARGE,
     SIZES,
+    CommonMemory,
     Pose,
-    RobustMemory,
     are_joint,
     mat66d,
     rules_for,
@@ -51,7 +51,7 @@ class Contact:
 
 
 JointMemory = extended(
-    RobustMemory,
+    CommonMemory,
     "JointMemory",
     """T vehicles that a message tells of, B of them others than its sender.
 

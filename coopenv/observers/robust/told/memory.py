@@ -1,0 +1,50 @@
+"""What every vehicle's observer remembers besides `robust.memory` of what others tell."""
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.observers.robust.constants import MAX_CORRELATIONS, STEPS
+from coopenv.observers.robust.memory import SIZES, CommonMemory, mat66d, mat66f, rules_for
+from coopenv.world.records import array, extended
+from coopenv.world.saved_state import Rule, whole
+
+
+@wp.struct
+class Correlation:
+    """What a sender tells of its error and that of a vehicle that it hears, see correlations.py."""
+
+    vehicle: wp.int32  # -1: none
+    matrix: mat66f  # whole numbers, in steps
+
+
+@wp.struct
+class Known:
+    """The covariance of a sender's new error with that of a member; scratch, see regression.py."""
+
+    member: wp.int32
+    covariance: mat66d
+    coefficient: mat66d
+
+
+ToldMemory = extended(
+    CommonMemory,
+    "ToldMemory",
+    """C correlations in a message.""",
+    outbox_correlation=array("WNSC", Correlation),
+    correlation=array("WNNC", Correlation),  # per receiver and sender
+    known=array("WK", Known),  # scratch
+    factor=array("WKK", mat66d),  # scratch: blocks of a Cholesky factor, on its diagonal their inverses
+)
+TOLD_SIZES = {**SIZES, "C": MAX_CORRELATIONS}
+
+VEHICLE = Rule("a vehicle or -1", lambda values, fields, model: (values >= -1) & (values < model.vehicles))
+WITHIN = Rule("within its steps", lambda values, fields, model: abs(values) <= STEPS)
+
+
+def told_rules() -> dict[str, Rule]:
+    """Return what a saved memory may hold, see `rules_for`."""
+    rules: dict[str, Any] = rules_for(TOLD_SIZES["K"])
+    for box in ("outbox_correlation", "correlation"):
+        rules |= {f"{box}.vehicle": VEHICLE, f"{box}.matrix": WITHIN}
+    return rules | {"known.member": whole(0, TOLD_SIZES["K"] - 1)}

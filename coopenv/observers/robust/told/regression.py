@@ -1,0 +1,147 @@
+"""The covariance of a sender's new error with all that is believed, from what is known of it.
+
+Known is its own covariance P+, that with other members' errors as told, and, where the sender was heard before, that
+with its error then, which is P+, too, because the step from one to the other is not correlated with where it ends.
+The new error is regressed on these: e+ = L x + w, so that with any other error y it is L cov(x, y), and the joint
+covariance stays positive definite, if that of w is. All in blocks of 6x6.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.observers.robust import algebra, constants
+from coopenv.observers.robust.memory import mat66d
+from coopenv.observers.robust.told.correlations import correlation_of, factor
+
+INFLATION = 1.0 + constants.RELATIVE_NOISE
+
+
+@wp.func
+def note_known(memory: Any, world: int, at: int, member: int, covariance: Any):
+    """Note the covariance with a member's error as the next that is known."""
+    memory.known[world, at].member = member
+    memory.known[world, at].covariance = covariance
+
+
+@wp.func
+def gather_known(memory: Any, world: int, i: int, n: int, after: Any, heard: bool) -> int:
+    """Note all that is known of member n's new error, that with its last one first; return how much it is."""
+    count = int(0)
+    if heard:
+        note_known(memory, world, 0, n, after)
+        count = 1
+    A = factor(after)
+    sender = memory.member[world, i, n].vehicle
+    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
+        if k != n:
+            other = memory.member[world, i, k].vehicle
+            known, X = correlation_of(memory, world, i, sender, other, not heard)
+            if known:
+                note_known(memory, world, count, k, A * X * wp.transpose(factor(memory.P[world, i, k, k])))
+                count += 1
+    return count
+
+
+@wp.func
+def inflated(P: Any):
+    """Return a covariance with a little more on its diagonal."""
+    more = mat66d(P)
+    for k in range(6):
+        more[k, k] = P[k, k] * wp.float64(INFLATION)
+    return more
+
+
+@wp.func
+def factorise(memory: Any, world: int, i: int, a: int):
+    """Set row a of the block Cholesky factor of the covariance of what is known; on its diagonal the inverse."""
+    row = memory.known[world, a].member
+    for b in range(a + 1):
+        X = mat66d(memory.P[world, i, row, memory.known[world, b].member])
+        if a == b:
+            X = inflated(X)
+        for c in range(b):
+            X = X - memory.factor[world, a, c] * wp.transpose(memory.factor[world, b, c])
+        if a == b:
+            memory.factor[world, a, a] = algebra.inverse_factor(X)
+        else:
+            memory.factor[world, a, b] = X * wp.transpose(memory.factor[world, b, b])
+
+
+@wp.func
+def solve_known(memory: Any, world: int, i: int, count: int):
+    """Set the coefficients L of what is known."""
+    for a in range(count):
+        factorise(memory, world, i, a)
+        Y = mat66d(memory.known[world, a].covariance)
+        for c in range(a):
+            Y = Y - memory.known[world, c].coefficient * wp.transpose(memory.factor[world, a, c])
+        memory.known[world, a].coefficient = Y * wp.transpose(memory.factor[world, a, a])
+    for back in range(count):
+        a = count - 1 - back
+        Y = mat66d(memory.known[world, a].coefficient)
+        for c in range(a + 1, count):
+            Y = Y - memory.known[world, c].coefficient * memory.factor[world, c, a]
+        memory.known[world, a].coefficient = Y * memory.factor[world, a, a]
+
+
+@wp.func
+def regressed(memory: Any, world: int, i: int, count: int, k: int):
+    """Return the covariance L cov(x, y) with the error y of member k."""
+    block = mat66d()
+    for a in range(count):
+        block = block + memory.known[world, a].coefficient * memory.P[world, i, memory.known[world, a].member, k]
+    return block
+
+
+@wp.func
+def is_positive(P: Any) -> bool:
+    """Return whether a matrix is positive definite, by more than rounding."""
+    X = algebra.inverse_factor(P)
+    for k in range(6):
+        if not X[k, k] * X[k, k] * P[k, k] < wp.float64(1.0 / constants.ROUNDING):
+            return False
+    return wp.min(wp.get_diag(P)) > wp.float64(0.0)
+
+
+@wp.func
+def try_known(memory: Any, world: int, i: int, n: int, after: Any, count: int):
+    """Return what has to be forgiven the sender, as a share of its covariance, so that what is known fits; -1: more.
+
+    Blocks of the new row are left in `scratch.row`.
+    """
+    solve_known(memory, world, i, count)
+    left = mat66d(after)
+    for a in range(count):
+        block = regressed(memory, world, i, count, memory.known[world, a].member)
+        left = left - block * wp.transpose(memory.known[world, a].coefficient)
+    forgiven = wp.float64(-1.0)
+    if is_positive(left):
+        forgiven = wp.float64(0.0)
+    elif is_positive(left + wp.float64(constants.MAX_CONTRADICTION) * after):
+        forgiven = wp.float64(constants.MAX_CONTRADICTION)
+    if forgiven >= wp.float64(0.0):
+        for k in range(memory.belief[world, i].members):
+            memory.scratch[world, k].row = regressed(memory, world, i, count, k)
+        memory.scratch[world, n].row = (wp.float64(1.0) + forgiven) * after
+    return forgiven
+
+
+@wp.func
+def regress(memory: Any, world: int, i: int, n: int, after: Any, heard: bool):
+    """Set `scratch.row` to the covariance of member n's new error with all errors; return what is forgiven the sender.
+
+    That is a share of its covariance. Where more would have to be, less is taken as known; -1: nothing is left.
+    """
+    count = gather_known(memory, world, i, n, after, heard)
+    alone = wp.where(heard, 1, 0)
+    forgiven = wp.float64(-1.0)
+    if count > alone:
+        forgiven = try_known(memory, world, i, n, after, count)
+    if heard and forgiven < wp.float64(0.0):
+        forgiven = try_known(memory, world, i, n, after, 1)
+    if forgiven < wp.float64(0.0):
+        for k in range(memory.belief[world, i].members):
+            memory.scratch[world, k].row = mat66d()
+        memory.scratch[world, n].row = after
+    return forgiven
