@@ -73,22 +73,44 @@ def apply_error(memory: Any, world: int, i: int, n: int, error: Any):
 
 
 @wp.func
+def is_free(memory: Any, world: int, i: int, k: int) -> bool:
+    """Return whether bearings correct a member; those of others that are considered are as they say."""
+    return memory.member[world, i, k].considered == 0
+
+
+@wp.func
+def correct_member(memory: Any, world: int, i: int, k: int):
+    """Move a member by its correction, and set the derivative of errors about where it is then by those before."""
+    correction = memory.scratch[world, k].correction
+    G = wp.identity(6, wp.float64)
+    if k < ERRORS or k >= memory.belief[world, i].others:
+        apply_error(memory, world, i, k, correction)
+        G = recentring(correction)
+    else:
+        memory.member[world, i, k].w = memory.member[world, i, k].w + correction[:3]
+        memory.member[world, i, k].v = memory.member[world, i, k].v + correction[3:]
+    memory.scratch[world, k].recentring = G
+
+
+@wp.func
 def apply_corrections(memory: Any, world: int, i: int):
-    """Move all members by their corrections, and let the covariance be about where they are then."""
+    """Move all members that are free by their corrections, and let the covariance be about where they are then."""
     for k in range(memory.belief[world, i].members):
-        correction = memory.scratch[world, k].correction
-        G = wp.identity(6, wp.float64)
-        if k < ERRORS or k >= memory.belief[world, i].others:
-            apply_error(memory, world, i, k, correction)
-            G = recentring(correction)
-        else:
-            memory.member[world, i, k].w = memory.member[world, i, k].w + correction[:3]
-            memory.member[world, i, k].v = memory.member[world, i, k].v + correction[3:]
-        memory.scratch[world, k].recentring = G
+        free = is_free(memory, world, i, k)
+        if free:
+            correct_member(memory, world, i, k)
         for j in range(k + 1):
-            block = recentred(G, memory.P[world, i, k, j], memory.scratch[world, j].recentring)
-            if k == j:
-                block = symmetric_part(block)
+            block = memory.P[world, i, k, j]
+            if free and is_free(memory, world, i, j):
+                block = recentred(memory.scratch[world, k].recentring, block, memory.scratch[world, j].recentring)
+                if k == j:
+                    block = symmetric_part(block)
+            elif free:
+                block = memory.scratch[world, k].recentring * block
+            elif is_free(memory, world, i, j):
+                block = block * wp.transpose(memory.scratch[world, j].recentring)
+            else:
+                continue
             memory.P[world, i, k, j] = block
             memory.P[world, i, j, k] = wp.transpose(block)
 

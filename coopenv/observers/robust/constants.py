@@ -56,6 +56,9 @@ MAX_TOLD_VARIANCE = 0.1**2
 """m^2 per axis, of a sender that knows its place no better, at which nobody follows it: its steps are no small errors.
 Tuned."""
 RELATIVE_NOISE = 1e-6  # share of a variance, that regressions have as noise
+LEAST_FORGIVEN = 0.03
+"""Share of its covariance that is added to that of a sender which depends on others. What is told of correlations is
+not all there is, so that everybody is a little too sure, and who hears him more so. Tuned."""
 MAX_CONTRADICTION = 0.1
 """By how much of its covariance a sender may seem to know itself better than what it tells of others allows. Chosen."""
 MAX_VARIANCE_GROWTH = 1.01

@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust.algebra import displaced, recentring
-from coopenv.observers.robust.belief import apply_corrections, subtract_block
+from coopenv.observers.robust.belief import apply_corrections, is_free, subtract_block
 from coopenv.observers.robust.constants import MAX_LINEARISATIONS, RELINEARISATION_ANGLE
 from coopenv.observers.robust.measurements import linearise
 from coopenv.observers.robust.memory import Frame, mat66d, vec6d
@@ -66,12 +66,6 @@ def set_gain(memory: Any, world: int, i: int, n: int):
                 memory.gain[world, n, k] = memory.gain[world, n, k] - share * memory.gain[world, m, k]
     S = memory.line[world, n].noise * wp.identity(2, wp.float64) + across_line(memory, world, n, n)
     memory.line[world, n].weight = wp.inverse(S)
-
-
-@wp.func
-def is_free(memory: Any, world: int, i: int, k: int) -> bool:
-    """Return whether bearings correct a member; those of others that are considered are as they say."""
-    return memory.member[world, i, k].considered == 0
 
 
 @wp.func

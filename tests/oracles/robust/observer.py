@@ -22,6 +22,7 @@ import numpy as np
 
 from coopenv.observers.contract import Message, Setup, Tick
 from coopenv.observers.robust.constants import (
+    LEAST_FORGIVEN,
     LEAST_NEWS,
     MAX_CORRELATIONS,
     MAX_TOLD_VARIANCE,
@@ -108,7 +109,7 @@ class Robust(Common):
     def _relate(self, n: int, report: Report) -> None:
         """Let the error of a sender that has just been met depend on those of the others as told."""
         crosses = self.correlations.crosses(self.belief, n, report.P, True)
-        row, _ = regress(self.belief.P, n, report.P, crosses, False)
+        row, _ = regress(self.belief.P, n, report.P, crosses, False, _least(report))
         block = slice(6 * n, 6 * n + 6)
         self.belief.P[block], self.belief.P[:, block] = row, row.T
 
@@ -153,7 +154,7 @@ class Robust(Common):
         member.R, member.p = report.R[0], report.p[0]
         d, before = G.dot(d), belief.P[block].copy()
         crosses = self.correlations.crosses(belief, n, after, False)
-        row, forgiven = regress(belief.P, n, after, crosses, True)
+        row, forgiven = regress(belief.P, n, after, crosses, True, _least(report))
         D = before - row
         D[:, block] = -forgiven * after
         before = before[:, block]
@@ -169,3 +170,8 @@ class Robust(Common):
         dx = np.zeros(len(belief.P))
         dx[:free] = K.dot(d)
         belief.shift_about(dx)
+
+
+def _least(report: Report) -> float:
+    """Return what a sender is forgiven at least."""
+    return LEAST_FORGIVEN if report.depends_on else 0.0

@@ -71,7 +71,9 @@ def _correlation(mine: dict[int, Array], theirs: dict[int, Array], sender: int, 
     return max(shared, key=lambda C: float((C * C).sum())) if shared else None
 
 
-def regress(P: Array, n: int, after: Array, crosses: dict[int, Array], heard: bool) -> tuple[Array, float]:
+def regress(
+    P: Array, n: int, after: Array, crosses: dict[int, Array], heard: bool, least: float
+) -> tuple[Array, float]:
     """Return (6, 6m) the covariance of member n's new error with all errors, and what is forgiven the sender.
 
     Known is its covariance `after`, that with the errors of which `crosses` tells and, where the sender was heard
@@ -89,8 +91,8 @@ def regress(P: Array, n: int, after: Array, crosses: dict[int, Array], heard: bo
         right = np.hstack([after] * heard + list(used.values()))
         L = np.linalg.solve(J + RELATIVE_NOISE * np.diag(J.diagonal()), right.T).T
         left = after - L.dot(J).dot(L.T)
-        for forgiven in (0.0, MAX_CONTRADICTION):
-            if is_positive(left + forgiven * after):
+        for needed, forgiven in ((0.0, least), (MAX_CONTRADICTION, MAX_CONTRADICTION)):
+            if is_positive(left + needed * after):
                 row = L.dot(P[index])
                 row[:, block] = (1.0 + forgiven) * after
                 return row, forgiven

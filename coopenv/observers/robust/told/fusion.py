@@ -12,9 +12,9 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.belief import append_member, apply_error, index_of, make_room, mark_seen
+from coopenv.observers.robust.belief import append_member, apply_corrections, index_of, make_room, mark_seen
 from coopenv.observers.robust.measurements import is_heard
-from coopenv.observers.robust.memory import Estimate, mat66d
+from coopenv.observers.robust.memory import Estimate, mat66d, vec6d
 from coopenv.observers.robust.odometry import increment_noise
 from coopenv.observers.robust.told.correlations import rank
 from coopenv.observers.robust.told.regression import is_positive, regress
@@ -60,23 +60,6 @@ def add_member(model: Any, memory: Any, world: int, i: int, sender: int, tick: i
 
 
 @wp.func
-def correct_own(memory: Any, world: int, i: int, k: int, correction: Any):
-    """Correct the vehicle's own pose, or what it believes of its odometry's errors."""
-    if k == 0:
-        apply_error(memory, world, i, 0, correction)
-        G = algebra.recentring(correction)
-        for j in range(memory.belief[world, i].members):
-            block = G * memory.P[world, i, 0, j]
-            if j == 0:
-                block = block * wp.transpose(G)
-            memory.P[world, i, 0, j] = block
-            memory.P[world, i, j, 0] = wp.transpose(block)
-    else:
-        memory.member[world, i, k].w = memory.member[world, i, k].w + correction[:3]
-        memory.member[world, i, k].v = memory.member[world, i, k].v + correction[3:]
-
-
-@wp.func
 def follow(memory: Any, world: int, i: int, n: int, d: Any, N: Any):
     """Let the vehicle's own pose follow a step d, whose covariances with all errors are in `scratch.column`."""
     members = memory.belief[world, i].members
@@ -89,8 +72,9 @@ def follow(memory: Any, world: int, i: int, n: int, d: Any, N: Any):
             block = memory.P[world, i, k, j] - gain * memory.scratch[world, j].column
             memory.P[world, i, k, j] = block
             memory.P[world, i, j, k] = wp.transpose(block)
-    for k in range(others):
-        correct_own(memory, world, i, k, memory.scratch[world, k].correction)
+    for k in range(others, members):
+        memory.scratch[world, k].correction = vec6d()
+    apply_corrections(memory, world, i)
 
 
 @wp.func
@@ -126,11 +110,9 @@ def step_to(memory: Any, world: int, i: int, n: int):
 
 @wp.func
 def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int):
-    """Take a member's new report, if its last one that was taken is long ago."""
+    """Take a member's new report."""
     sent = memory.inbox[world, i, sender].tick
     before = memory.member[world, i, n].report.tick
-    if not is_due(model, before, sent):
-        return
     last = memory.member[world, i, n].report
     report = memory.inbox[world, i, sender]
     dt = wp.float64(sent - before) * model.camera_period
@@ -150,6 +132,17 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int):
 
 
 @wp.func
+def has_news(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int) -> bool:
+    """Return whether a sender's message counts: that of a member whose last one is long ago, or of one in view."""
+    if not is_heard(model, state, memory, world, i, sender, tick):
+        return False
+    n = index_of(memory, world, i, sender)
+    if n > 0:
+        return is_due(model, memory.member[world, i, n].report.tick, memory.inbox[world, i, sender].tick)
+    return state.sight[world, i, model.landmarks + sender] == VISIBLE
+
+
+@wp.func
 def hear_all(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Take the messages of members, and add senders in view to the belief; leaders come first."""
     mark_seen(model, state, memory, world, i, tick)
@@ -160,7 +153,7 @@ def hear_all(model: Any, state: Any, memory: Any, world: int, i: int, tick: int)
         for n in range(model.target_count[i]):
             sender = model.targets[i, n] - model.landmarks
             if sender >= 0:
-                if is_heard(model, state, memory, world, i, sender, tick):
+                if has_news(model, state, memory, world, i, sender, tick):
                     order = rank(model, sender, memory.inbox[world, i, sender])
                     if order > last and (first < 0 or order < best):
                         first = sender
@@ -171,5 +164,5 @@ def hear_all(model: Any, state: Any, memory: Any, world: int, i: int, tick: int)
         member = index_of(memory, world, i, first)
         if member > 0:
             hear(model, memory, world, i, member, first)
-        elif state.sight[world, i, model.landmarks + first] == VISIBLE:
+        else:
             add_member(model, memory, world, i, first, tick)

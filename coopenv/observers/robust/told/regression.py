@@ -118,6 +118,8 @@ def try_known(memory: Any, world: int, i: int, n: int, after: Any, count: int):
     forgiven = wp.float64(-1.0)
     if is_positive(left):
         forgiven = wp.float64(0.0)
+        if memory.member[world, i, n].report.depends_on != wp.uint64(0):
+            forgiven = wp.float64(constants.LEAST_FORGIVEN)
     elif is_positive(left + wp.float64(constants.MAX_CONTRADICTION) * after):
         forgiven = wp.float64(constants.MAX_CONTRADICTION)
     if forgiven >= wp.float64(0.0):
