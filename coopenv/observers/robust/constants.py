@@ -47,7 +47,7 @@ NEWS_TIME = 0.2
 DEPENDENT_SHARE = 0.7
 """Share that counts of the information of a sender that depends on others: some may have arrived already. Tuned."""
 STEPS = 127  # of a correlation, as it is sent
-MAX_CORRELATIONS = 2  # in a message, which has 248 bytes then
+MAX_CORRELATIONS = 2  # in a message, which has 256 bytes then
 LEAST_NEWS = 1e-3
 """Share of a sender's variance that counts as noise of the step by which it moves at its next message. Chosen."""
 STEP_GATE = 22.5

@@ -51,6 +51,7 @@ class Report:
     P: mat66f  # at the marker
     odometry: Pose  # of the marker, by dead reckoning from the start, in a frame of its own
     depends_on: wp.uint64  # bits of the vehicles whose messages are in it
+    news: wp.int32  # whether it tells of correlations, and counts
 
 
 @wp.struct
@@ -83,6 +84,7 @@ class Belief:
     depends_on: wp.uint64  # bits of vehicles
     missed_share: wp.float64  # mean share of bearings that do not fit
     healthy_time: wp.float64  # s for which it has been low
+    told_interval: wp.int32  # of `NEWS_TIME`, the last with a report that counts, from 1 on
 
 
 @wp.struct
@@ -231,7 +233,7 @@ def rules_for(members: int) -> dict[str, Rule]:
     """Return what a saved memory with so many members may hold, by field, see `coopenv.world.saved_state`."""
     flags = (
         "search.active outbox.valid inbox.valid belief.has_sample member.has_twist member.distrusted "
-        "member.considered member.report.valid line.fits"
+        "member.considered outbox.news inbox.news member.report.news member.report.valid line.fits"
     )
     ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick"
     large = "hypothesis.cost hypothesis.prior_distance line.variance line.noise line.weight scratch.column gain"
@@ -240,7 +242,7 @@ def rules_for(members: int) -> dict[str, Rule]:
         **dict.fromkeys(ticks.split(), TICK),
         **dict.fromkeys(large.split(), LARGE),
         **dict.fromkeys(("belief.odometry.R", "anchor.estimate.pose.R", "anchor.odometry.R"), ROTATION),
-        **dict.fromkeys(("search.attempts", "hypothesis.bearings"), whole(0, 10**9)),
+        **dict.fromkeys(("search.attempts", "hypothesis.bearings", "belief.told_interval"), whole(0, 10**9)),
         "belief.members": whole(1, members),
         "belief.others": whole(1, ERRORS + 1),
         "P": Rule("a covariance", lambda P, fields, model: are_joint(P, fields["observer_belief.members"]), axes=4),

@@ -34,23 +34,33 @@ from coopenv.observers.robust.constants import (
 from tests.oracles.robust.belief import ERRORS, Member, recentring
 from tests.oracles.robust.common import Common, Contact
 from tests.oracles.robust.eviction import room_for
-from tests.oracles.robust.told import Correlations, factor, is_positive, regress
+from tests.oracles.robust.told import Correlations, factor, is_positive, is_same, regress
 from tests.oracles.robust.tracklets import Report, left_error, marker_jacobian, mask_of
 
 
 class Robust(Common):
-    """One vehicle's observer; messages hold pose, covariance and one correlation (248 bytes)."""
+    """One vehicle's observer; messages hold pose and covariance (172 bytes), at times correlations (256 bytes)."""
 
     def __init__(self, setup: Setup) -> None:
         """Take what the vehicle knows before it starts."""
         super().__init__(setup)
         self.correlations = Correlations()
+        self.interval = -1
 
     def message(self) -> Message:
         """Return pose, covariance, odometry and the correlations with members."""
         message = super().message()
         if message.position is None:
             return message
+        extra = {"odometry": message.extra["odometry"].astype(np.float32)}
+        interval = int(np.floor((self.belief.own.time + SAME_TIME) / NEWS_TIME))
+        if interval != self.interval:
+            self.interval = interval
+            extra |= self._correlations()
+        return replace(message, extra={**message.extra, **extra})
+
+    def _correlations(self) -> dict[str, Array]:
+        """Return the correlations with some members, as they travel."""
         P, J = self.belief.P, marker_jacobian(self.marker)
         A = factor(J.dot(P[:6, :6]).dot(J.T))
         told = self._told_of()
@@ -59,12 +69,12 @@ class Robust(Common):
             block = slice(6 * n, 6 * n + 6)
             C = np.linalg.solve(A, np.linalg.solve(factor(P[block, block]), J.dot(P[:6, block]).T).T)
             correlations[k] = np.clip(np.rint(STEPS * C), -STEPS, STEPS)
-        extra = {
-            "odometry": message.extra["odometry"].astype(np.float32),
-            "told": np.array([self.belief.members[n].vehicle for n in told], np.uint16),
+        members = [self.belief.members[n] for n in told]
+        return {
+            "told": np.array([member.vehicle for member in members], np.uint16),
+            "ages": np.array([self.belief.own.time - member.time for member in members], np.float32),
             "correlations": correlations,
         }
-        return replace(message, extra={**message.extra, **extra})
 
     def _told_of(self) -> list[int]:
         """Return which members are told of: those that depend on most others, to whom there are most ways."""
@@ -77,18 +87,36 @@ class Robust(Common):
         return sorted(members, key=order, reverse=True)[:MAX_CORRELATIONS]
 
     def _listen(self, tick: Tick) -> None:
-        """Take in the messages of those in view, and of those that are already believed in; leaders first."""
+        """Take in the messages of members that count, and those of others in view, leaders first."""
         in_view = {target - self.landmarks for target in tick.targets[tick.valid].tolist()}
         for target, received in tick.messages.items():
-            self.correlations.hear(target - self.landmarks, received.message)
-        reports = self._reports(tick)
-        self._notice(in_view, reports, tick.time)
-        for report in sorted(reports, key=lambda report: report.depends_on.bit_count()):
-            contact = self.contacts.get(report.vehicles[0])
-            if contact is not None:
-                self._hear(contact, report)
-            elif report.vehicles[0] in in_view:
+            self.correlations.hear(target - self.landmarks, received.message, tick.time - received.age)
+        reports = {report.vehicles[0]: report for report in self._reports(tick)}
+        self._notice(in_view, list(reports.values()), tick.time)
+        news = {s: r for s, r in reports.items() if "told" in tick.messages[s + self.landmarks].message.extra}
+        pending = {s: r for s, r in news.items() if s in self.contacts and r.time[0] > self.contacts[s].last.time[0]}
+        while pending:
+            s = min(pending, key=lambda s: (self._has_to_wait(s, pending), *_rank(pending[s])))
+            self._hear(self.contacts[s], pending.pop(s))
+        for report in sorted(news.values(), key=_rank):
+            if report.vehicles[0] in in_view and report.vehicles[0] not in self.contacts:
                 self._meet(report, tick.time)
+
+    def _has_to_wait(self, sender: int, pending: dict[int, Report]) -> bool:
+        """Return whether a report has to wait for another one, so that all fit what is told of them.
+
+        It has to where it tells of another member's report that is not taken yet, and where another one's that is not
+        taken tells of the sender's report before.
+        """
+        for other in pending:
+            if other != sender:
+                told, theirs = self.correlations.of(sender, other), self.correlations.of(other, sender)
+                last = self.contacts[other].last.time[0]
+                if told is not None and told.time > last and not is_same(told.time, last):
+                    return True
+                if theirs is not None and is_same(theirs.time, self.contacts[sender].last.time[0]):
+                    return True
+        return False
 
     def _meet(self, report: Report, time: float) -> None:
         """Take in a sender that is new, if there is room."""
@@ -117,8 +145,6 @@ class Robust(Common):
         """Put a sender where it says that it is, and let one's own pose follow what it has learnt."""
         last = contact.last
         dt = float(report.time[0] - last.time[0])
-        if dt <= NEWS_TIME - SAME_TIME:  # of the same message again, or of one soon after, the odometry counts at most
-            return
         contact.last = report
         belief, n = self.belief, self.belief.place(report.vehicles[0])
         assert n is not None
@@ -175,3 +201,8 @@ class Robust(Common):
 def _least(report: Report) -> float:
     """Return what a sender is forgiven at least."""
     return LEAST_FORGIVEN if report.depends_on else 0.0
+
+
+def _rank(report: Report) -> tuple[int, int]:
+    """Return a key that is larger for who depends on more others, and then for later ones."""
+    return report.depends_on.bit_count(), report.vehicles[0]

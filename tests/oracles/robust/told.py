@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from coopenv.estimation.arrays import Array, cholesky
@@ -12,7 +14,7 @@ from coopenv.observers.robust.constants import (
     ROUNDING,
     STEPS,
 )
-from tests.oracles.robust.belief import ERRORS, Belief, errors_of
+from tests.oracles.robust.belief import ERRORS, Belief, Member, errors_of
 
 
 def factor(P: Array) -> Array:
@@ -29,46 +31,64 @@ def is_positive(P: Array) -> bool:
     return bool((L.diagonal() ** 2 > ROUNDING * P.diagonal()).all())
 
 
+class Told(NamedTuple):
+    """What a sender has told of a vehicle."""
+
+    correlation: Array  # (6, 6) factor(P_s)^-1 C factor(P_o)^-T
+    time: float  # s, of the report that it has from that vehicle
+
+
 class Correlations:
-    """What was told last, by sender and by the vehicle that it was told of: factor(P_s)^-1 C factor(P_o)^-T."""
+    """What was told last, by sender and by the vehicle that it was told of."""
 
     def __init__(self) -> None:
         """Start with none."""
-        self.told: dict[int, dict[int, Array]] = {}
+        self.told: dict[int, dict[int, Told]] = {}
 
-    def hear(self, sender: int, message: Message) -> None:
-        """Note what a message tells."""
-        told, matrices = message.extra.get("told", ()), message.extra.get("correlations", ())
-        self.told[sender] = {
-            int(vehicle): np.asarray(C, float) / STEPS for vehicle, C in zip(told, matrices, strict=True)
-        }
+    def hear(self, sender: int, message: Message, time: float) -> None:
+        """Note what a message tells, if it tells of correlations."""
+        if "told" in message.extra:
+            told = zip(*(message.extra[name] for name in ("told", "ages", "correlations")), strict=True)
+            self.told[sender] = {int(v): Told(np.asarray(C, float) / STEPS, time - float(age)) for v, age, C in told}
+
+    def of(self, sender: int, vehicle: int) -> Told | None:
+        """Return what a sender has told of a vehicle."""
+        return self.told.get(sender, {}).get(vehicle)
 
     def crosses(self, belief: Belief, n: int, after: Array, met: bool) -> dict[int, Array]:
-        """Return the covariances (6, 6) of a sender's new error with those of other members, as far as they are told.
-
-        By the sender itself; where the two have just met also by the other; and where neither hears the other, by both
-        about a third one, of those the one that they depend on most.
-        """
-        mine = self.told.get(belief.members[n].vehicle, {})
+        """Return the covariances (6, 6) of a sender's new error with those of other members that are told."""
         A, result = factor(after), {}
         for k, member in enumerate(belief.members):
             if k in (0, n) or member.vehicle == ERRORS:
                 continue
-            theirs = self.told.get(member.vehicle, {})
-            C = _correlation(mine, theirs, belief.members[n].vehicle, member.vehicle, met)
+            C = self._correlation(belief.members[n], member, met)
             if C is not None:
                 result[k] = A.dot(C).dot(factor(belief.P[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]).T)
         return result
 
+    def _correlation(self, one: Member, other: Member, met: bool) -> Array | None:
+        """Return the correlation of the errors of a sender and another one, None if it is not known.
 
-def _correlation(mine: dict[int, Array], theirs: dict[int, Array], sender: int, other: int, met: bool) -> Array | None:
-    """Return the correlation of the errors of a sender and another one, None if it is not known."""
-    if other in mine:
-        return mine[other]
-    if sender in theirs:
-        return theirs[sender].T if met else None
-    shared = [mine[v].dot(theirs[v].T) for v in mine if v in theirs]
-    return max(shared, key=lambda C: float((C * C).sum())) if shared else None
+        By the sender itself; where the two have just met also by the other; and where neither hears the other, by both
+        about a third one, of those the one that they depend on most.
+        """
+        told = self.of(one.vehicle, other.vehicle)
+        if told is not None:
+            return told.correlation if is_same(told.time, other.time) else None
+        told = self.of(other.vehicle, one.vehicle)
+        if told is not None:
+            return told.correlation.T if met and is_same(told.time, one.time) else None
+        shared = []
+        for vehicle, mine in self.told.get(one.vehicle, {}).items():
+            theirs = self.of(other.vehicle, vehicle)
+            if theirs is not None and is_same(mine.time, theirs.time):
+                shared.append(mine.correlation.dot(theirs.correlation.T))
+        return max(shared, key=lambda C: float((C * C).sum())) if shared else None
+
+
+def is_same(time: float, other: float) -> bool:
+    """Return whether two times are that of the same report; they travel in single precision."""
+    return abs(time - other) < 1e-4
 
 
 def regress(

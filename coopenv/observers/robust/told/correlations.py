@@ -86,23 +86,44 @@ def no_correlation():
 
 
 @wp.func
+def has_news(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
+    """Return whether a report at a tick is the first of an interval of `NEWS_TIME`, and note that it is."""
+    time = wp.float64(tick) * model.camera_period + wp.float64(constants.SAME_TIME)
+    interval = int(wp.floor(time / wp.float64(constants.NEWS_TIME))) + 1
+    if interval == memory.belief[world, i].told_interval:
+        return False
+    memory.belief[world, i].told_interval = interval
+    return True
+
+
+@wp.func
+def tell(model: Any, memory: Any, world: int, i: int, slot: int):
+    """Tell of correlations with the members that depend on most others."""
+    memory.outbox[world, i, slot].news = 1
+    n = int(0)
+    for c in range(memory.correlation.shape[3]):
+        told = no_correlation()
+        if c == 0 or n > 0:
+            n = next_told(model, memory, world, i, n)
+            if n > 0:
+                told.vehicle = memory.member[world, i, n].vehicle
+                told.tick = memory.member[world, i, n].report.tick
+                told.matrix = own_correlation(model, memory, world, i, n)
+        memory.outbox_correlation[world, i, slot, c] = told
+
+
+@wp.func
 def send_told(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
-    """Send a report if one is due, and with it correlations with the members that depend on most others."""
+    """Send a report if one is due; the first of an interval counts, and tells of correlations."""
     send(model, state, memory, world, i, tick)
     if tick % model.radio.period == 0:
         slot = tick % model.radio.slots
         odometry = memory.outbox[world, i, slot].odometry
         turn = vec3d(wp.vec3f(algebra.log_so3(odometry.R)))  # in single precision
         memory.outbox[world, i, slot].odometry = Pose(exp_so3(turn), vec3d(wp.vec3f(odometry.p)))
-        n = int(0)
-        for c in range(memory.correlation.shape[3]):
-            told = no_correlation()
-            if memory.outbox[world, i, slot].valid == 1 and (c == 0 or n > 0):
-                n = next_told(model, memory, world, i, n)
-                if n > 0:
-                    told.vehicle = memory.member[world, i, n].vehicle
-                    told.matrix = own_correlation(model, memory, world, i, n)
-            memory.outbox_correlation[world, i, slot, c] = told
+        if memory.outbox[world, i, slot].valid == 1:
+            if has_news(model, memory, world, i, tick):
+                tell(model, memory, world, i, slot)
 
 
 @wp.func
@@ -128,8 +149,9 @@ def receive_told(model: Any, state: Any, memory: Any, world: int, i: int):
         sent = arrived(state, memory, world, i, sender)
         if sent >= 0:
             slot = content_tick(model, state, world, sender, sent) % model.radio.slots
-            for c in range(memory.correlation.shape[3]):
-                memory.correlation[world, i, sender, c] = memory.outbox_correlation[world, sender, slot, c]
+            if memory.outbox[world, sender, slot].news == 1:
+                for c in range(memory.correlation.shape[3]):
+                    memory.correlation[world, i, sender, c] = memory.outbox_correlation[world, sender, slot, c]
     receive(model, state, memory, world, i)
 
 
@@ -149,18 +171,22 @@ def matrix_of(memory: Any, world: int, i: int, sender: int, c: int):
 
 
 @wp.func
-def correlation_of(memory: Any, world: int, i: int, sender: int, other: int, met: bool):
-    """Return (whether it is known, matrix) the correlation of a sender's error with another one's.
+def correlation_of(memory: Any, world: int, i: int, n: int, k: int, met: bool):
+    """Return (whether it is known, matrix) the correlation of the new error of member n with that of member k.
 
-    The sender has told it; or the other one, which counts where they have just met; or, where neither hears the
-    other, both have told of a third one, of several that on which they depend most.
+    Member n has told it; or k, which counts where they have just met; or, where neither hears the other, both have told
+    of a third one, of several that on which they depend most. Only what is told of the same reports counts.
     """
+    sender = memory.member[world, i, n].vehicle
+    other = memory.member[world, i, k].vehicle
     c = place_of(memory, world, i, sender, other)
     if c >= 0:
-        return True, matrix_of(memory, world, i, sender, c)
+        same = memory.correlation[world, i, sender, c].tick == memory.member[world, i, k].report.tick
+        return same, matrix_of(memory, world, i, sender, c)
     c = place_of(memory, world, i, other, sender)
     if c >= 0:
-        return met, wp.transpose(matrix_of(memory, world, i, other, c))
+        same = memory.correlation[world, i, other, c].tick == memory.member[world, i, n].report.tick
+        return met and same, wp.transpose(matrix_of(memory, world, i, other, c))
     most = wp.float64(-1.0)
     shared = mat66d()
     for a in range(memory.correlation.shape[3]):
@@ -168,9 +194,10 @@ def correlation_of(memory: Any, world: int, i: int, sender: int, other: int, met
         if third >= 0:
             b = place_of(memory, world, i, other, third)
             if b >= 0:
-                X = matrix_of(memory, world, i, sender, a) * wp.transpose(matrix_of(memory, world, i, other, b))
-                size = wp.ddot(X, X)
-                if size > most:
-                    most = size
-                    shared = X
+                if memory.correlation[world, i, sender, a].tick == memory.correlation[world, i, other, b].tick:
+                    X = matrix_of(memory, world, i, sender, a) * wp.transpose(matrix_of(memory, world, i, other, b))
+                    size = wp.ddot(X, X)
+                    if size > most:
+                        most = size
+                        shared = X
     return most >= wp.float64(0.0), shared

@@ -16,9 +16,9 @@ from coopenv.observers.robust.belief import append_member, apply_corrections, in
 from coopenv.observers.robust.measurements import is_heard
 from coopenv.observers.robust.memory import Estimate, mat66d, vec6d
 from coopenv.observers.robust.odometry import increment_noise
-from coopenv.observers.robust.told.correlations import rank
+from coopenv.observers.robust.told.correlations import place_of, rank
 from coopenv.observers.robust.told.regression import is_positive, regress
-from coopenv.observers.robust.tracklets import bit_of, is_due, propagate_member, test_sender
+from coopenv.observers.robust.tracklets import bit_of, propagate_member, test_sender
 from coopenv.world.camera import VISIBLE
 
 
@@ -132,37 +132,88 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int):
 
 
 @wp.func
-def has_news(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int) -> bool:
-    """Return whether a sender's message counts: that of a member whose last one is long ago, or of one in view."""
+def is_pending(model: Any, state: Any, memory: Any, world: int, i: int, n: int, tick: int) -> bool:
+    """Return whether a report of member n that counts has been heard and not been taken."""
+    sender = memory.member[world, i, n].vehicle
     if not is_heard(model, state, memory, world, i, sender, tick):
         return False
-    n = index_of(memory, world, i, sender)
-    if n > 0:
-        return is_due(model, memory.member[world, i, n].report.tick, memory.inbox[world, i, sender].tick)
-    return state.sight[world, i, model.landmarks + sender] == VISIBLE
+    report = memory.inbox[world, i, sender].tick
+    return memory.inbox[world, i, sender].news == 1 and report > memory.member[world, i, n].report.tick
+
+
+@wp.func
+def has_to_wait(model: Any, state: Any, memory: Any, world: int, i: int, n: int, tick: int) -> bool:
+    """Return whether a report of member n has to wait for another one, so that all fit what is told of them.
+
+    It has to where it tells of another member's report that is not taken yet, and where another one's that is not taken
+    tells of the report of n before.
+    """
+    sender = memory.member[world, i, n].vehicle
+    before = memory.member[world, i, n].report.tick
+    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
+        if k != n:
+            if is_pending(model, state, memory, world, i, k, tick):
+                other = memory.member[world, i, k].vehicle
+                c = place_of(memory, world, i, sender, other)
+                if c >= 0:
+                    if memory.correlation[world, i, sender, c].tick > memory.member[world, i, k].report.tick:
+                        return True
+                c = place_of(memory, world, i, other, sender)
+                if c >= 0:
+                    if memory.correlation[world, i, other, c].tick == before:
+                        return True
+    return False
+
+
+@wp.func
+def next_member(model: Any, state: Any, memory: Any, world: int, i: int, tick: int) -> int:
+    """Return the member whose report is to be taken next, 0 if there is none: leaders first, but see `has_to_wait`."""
+    found = int(0)
+    best = int(0)
+    waits = bool(True)
+    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
+        if is_pending(model, state, memory, world, i, n, tick):
+            sender = memory.member[world, i, n].vehicle
+            at = rank(model, sender, memory.inbox[world, i, sender])
+            wait = has_to_wait(model, state, memory, world, i, n, tick)
+            if found == 0 or (waits and not wait) or (waits == wait and at < best):
+                found = n
+                best = at
+                waits = wait
+    return found
+
+
+@wp.func
+def next_met(model: Any, state: Any, memory: Any, world: int, i: int, last: int, tick: int) -> int:
+    """Return the rank of the next vehicle in view, by rank, that is no member and has been heard; -1 if none is left.
+
+    The vehicle is the rank modulo the number of vehicles.
+    """
+    best = int(-1)
+    for n in range(model.target_count[i]):
+        target = model.targets[i, n]
+        sender = target - model.landmarks
+        if sender >= 0 and state.sight[world, i, target] == VISIBLE:
+            if is_heard(model, state, memory, world, i, wp.max(sender, 0), tick):
+                if memory.inbox[world, i, sender].news == 1 and index_of(memory, world, i, sender) == 0:
+                    at = rank(model, sender, memory.inbox[world, i, sender])
+                    if at > last and (best < 0 or at < best):
+                        best = at
+    return best
 
 
 @wp.func
 def hear_all(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
-    """Take the messages of members, and add senders in view to the belief; leaders come first."""
+    """Take the reports of members that count, and add senders in view to the belief."""
     mark_seen(model, state, memory, world, i, tick)
-    last = int(-1)
+    for _ in range(memory.belief[world, i].members):
+        n = next_member(model, state, memory, world, i, tick)
+        if n == 0:
+            break
+        hear(model, memory, world, i, n, memory.member[world, i, n].vehicle)
+    at = next_met(model, state, memory, world, i, -1, tick)
     for _ in range(model.target_count[i]):
-        first = int(-1)
-        best = int(0)
-        for n in range(model.target_count[i]):
-            sender = model.targets[i, n] - model.landmarks
-            if sender >= 0:
-                if has_news(model, state, memory, world, i, sender, tick):
-                    order = rank(model, sender, memory.inbox[world, i, sender])
-                    if order > last and (first < 0 or order < best):
-                        first = sender
-                        best = order
-        if first < 0:
-            return
-        last = best
-        member = index_of(memory, world, i, first)
-        if member > 0:
-            hear(model, memory, world, i, member, first)
-        else:
-            add_member(model, memory, world, i, first, tick)
+        if at < 0:
+            break
+        add_member(model, memory, world, i, at % model.vehicles, tick)
+        at = next_met(model, state, memory, world, i, at, tick)

@@ -7,7 +7,7 @@ import warp as wp
 from coopenv.observers.robust.constants import MAX_CORRELATIONS, STEPS
 from coopenv.observers.robust.memory import SIZES, CommonMemory, mat66d, mat66f, rules_for
 from coopenv.world.records import array, extended
-from coopenv.world.saved_state import Rule, whole
+from coopenv.world.saved_state import TICK, Rule, whole
 
 
 @wp.struct
@@ -15,6 +15,7 @@ class Correlation:
     """What a sender tells of its error and that of a vehicle that it hears, see correlations.py."""
 
     vehicle: wp.int32  # -1: none
+    tick: wp.int32  # when the report was sent that the sender has from that vehicle
     matrix: mat66f  # whole numbers, in steps
 
 
@@ -46,5 +47,5 @@ def told_rules() -> dict[str, Rule]:
     """Return what a saved memory may hold, see `rules_for`."""
     rules: dict[str, Any] = rules_for(TOLD_SIZES["K"])
     for box in ("outbox_correlation", "correlation"):
-        rules |= {f"{box}.vehicle": VEHICLE, f"{box}.matrix": WITHIN}
+        rules |= {f"{box}.vehicle": VEHICLE, f"{box}.tick": TICK, f"{box}.matrix": WITHIN}
     return rules | {"known.member": whole(0, TOLD_SIZES["K"] - 1)}

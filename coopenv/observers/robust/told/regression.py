@@ -32,11 +32,9 @@ def gather_known(memory: Any, world: int, i: int, n: int, after: Any, heard: boo
         note_known(memory, world, 0, n, after)
         count = 1
     A = factor(after)
-    sender = memory.member[world, i, n].vehicle
     for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
         if k != n:
-            other = memory.member[world, i, k].vehicle
-            known, X = correlation_of(memory, world, i, sender, other, not heard)
+            known, X = correlation_of(memory, world, i, n, k, not heard)
             if known:
                 note_known(memory, world, count, k, A * X * wp.transpose(factor(memory.P[world, i, k, k])))
                 count += 1
