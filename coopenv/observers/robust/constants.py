@@ -7,8 +7,9 @@ MAX_MEMBERS, MAX_MEMBERS_JOINT = 5, 8
 `robust_joint`."""
 MAX_LINEARISATIONS, RELINEARISATION_ANGLE = 8, 0.05
 """Linearisations of one correction; how far it may turn a line of sight to be near, rad. Tuned."""
-BEND_FACTOR = 20.0
-"""Factor of the variance of what a bearing's linearisation leaves out: it does not average out as noise does. Tuned."""
+BEND_FACTOR, CONSIDERED_BEND_FACTOR = 4.0, 20.0
+"""Factor of the variance of what a bearing's linearisation leaves out, which does not average out as noise does; and
+where the bearing is to a member that is only considered, so that no later bearing repairs it. Tuned."""
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
 FORGET_TIME = 1.0  # s out of view after which a member may be evicted. Chosen
 MAX_ACCELERATION = 1.0  # m/s^2 by which a member may leave its last known twist. Chosen: an ordinary start or stop

@@ -12,7 +12,13 @@ from coopenv.estimation.so3 import exp_so3, skew
 from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust.algebra import between, odometry_noise
 from coopenv.observers.robust.belief import index_of
-from coopenv.observers.robust.constants import BEND_FACTOR, CORRELATION_FACTOR, MAX_ACCELERATION, MAX_SPEED
+from coopenv.observers.robust.constants import (
+    BEND_FACTOR,
+    CONSIDERED_BEND_FACTOR,
+    CORRELATION_FACTOR,
+    MAX_ACCELERATION,
+    MAX_SPEED,
+)
 from coopenv.observers.robust.memory import Frame, mat26d, vec3d
 from coopenv.observers.robust.odometry import increment_noise
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
@@ -159,7 +165,11 @@ def bend_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: An
     V = block3(memory.P[world, i, 0, 0], 3, 3)
     along = wp.dot(u, V * u)
     total = wp.trace(V)
-    if member > 0:  # of V + turn W turn^T - C turn^T - turn C^T
+    factor = wp.float64(BEND_FACTOR)
+    if member > 0:
+        if memory.member[world, i, member].considered == 1:
+            factor = wp.float64(CONSIDERED_BEND_FACTOR)
+        # of V + turn W turn^T - C turn^T - turn C^T
         W = block3(memory.P[world, i, member, member], 3, 3)
         C = block3(memory.P[world, i, 0, member], 3, 3)
         w = wp.transpose(turn) * u
@@ -168,7 +178,7 @@ def bend_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: An
     along = wp.max(along, wp.float64(0.0))
     across = wp.max(total - along, wp.float64(0.0))
     square = distance * distance
-    return wp.float64(BEND_FACTOR) * along * across / (square * square)
+    return factor * along * across / (square * square)
 
 
 @wp.func

@@ -18,6 +18,7 @@ from coopenv.observers.contract import SensorNoise
 from coopenv.observers.mekf import LeftError
 from coopenv.observers.robust.constants import (
     BEND_FACTOR,
+    CONSIDERED_BEND_FACTOR,
     ERRORS_TIME,
     MAX_ACCELERATION,
     MAX_GROWTH,
@@ -216,7 +217,9 @@ class Belief:
                 D[:, 6 * n + 3 : 6 * n + 6] = self.members[n].R
             V, square = D.dot(self.P).dot(D.T), float(d.dot(d))
             along = float(d.dot(V).dot(d)) / square
-            result[k] = BEND_FACTOR * max(along, 0.0) * max(float(np.trace(V)) - along, 0.0) / square**2
+            considered = k in places and self.members[places[k]].considered
+            factor = CONSIDERED_BEND_FACTOR if considered else BEND_FACTOR
+            result[k] = factor * max(along, 0.0) * max(float(np.trace(V)) - along, 0.0) / square**2
         return result
 
     def correct(self, H: Array, noise: Array, residual: Array) -> None:

@@ -20,6 +20,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Message, Setup, Tick
 from coopenv.observers.robust.constants import (
     LEAST_FORGIVEN,
@@ -94,7 +95,8 @@ class Robust(Common):
         reports = {report.vehicles[0]: report for report in self._reports(tick)}
         self._notice(in_view, list(reports.values()), tick.time)
         news = {s: r for s, r in reports.items() if "told" in tick.messages[s + self.landmarks].message.extra}
-        pending = {s: r for s, r in news.items() if s in self.contacts and r.time[0] > self.contacts[s].last.time[0]}
+        last = {sender: float(contact.last.time[0]) + SAME_TIME for sender, contact in self.contacts.items()}
+        pending = {s: r for s, r in news.items() if s in last and r.time[0] > last[s]}
         while pending:
             s = min(pending, key=lambda s: (self._has_to_wait(s, pending), *_rank(pending[s])))
             self._hear(self.contacts[s], pending.pop(s))
