@@ -139,7 +139,7 @@ class Robust(Common):
     def _relate(self, n: int, report: Report) -> None:
         """Let the error of a sender that has just been met depend on those of the others as told."""
         crosses = self.correlations.crosses(self.belief, n, report.P, True)
-        row, _ = regress(self.belief.P, n, report.P, crosses, False, _least(report))
+        row, _ = regress(self.belief.P, n, report.P, crosses, False, self._least(report))
         block = slice(6 * n, 6 * n + 6)
         self.belief.P[block], self.belief.P[:, block] = row, row.T
 
@@ -167,6 +167,18 @@ class Robust(Common):
         member.R, member.p = report.R[0], report.p[0]
         self._relate(n, report)
 
+    def _least(self, report: Report) -> float:
+        """Return the share of its covariance that is added to a sender's: a little if it depends on others.
+
+        Where senders depend on this vehicle in turn, what they tell may be its own words, and all of them count once.
+        """
+        if not report.depends_on:
+            return 0.0
+        own = int(mask_of({self.vehicle}))
+        if not report.depends_on & own:
+            return LEAST_FORGIVEN
+        return float(sum(bool(contact.last.depends_on & own) for contact in self.contacts.values()))
+
     def _step(self, n: int, report: Report) -> None:
         """Put a trusted sender where it says that it is; the step d there tells of all errors that correlate with it.
 
@@ -182,7 +194,7 @@ class Robust(Common):
         member.R, member.p = report.R[0], report.p[0]
         d, before = G.dot(d), belief.P[block].copy()
         crosses = self.correlations.crosses(belief, n, after, False)
-        row, forgiven = regress(belief.P, n, after, crosses, True, _least(report))
+        row, forgiven = regress(belief.P, n, after, crosses, True, self._least(report))
         D = before - row
         D[:, block] = -forgiven * after
         before = before[:, block]
@@ -198,11 +210,6 @@ class Robust(Common):
         dx = np.zeros(len(belief.P))
         dx[:free] = K.dot(d)
         belief.shift_about(dx)
-
-
-def _least(report: Report) -> float:
-    """Return what a sender is forgiven at least."""
-    return LEAST_FORGIVEN if report.depends_on else 0.0
 
 
 def _rank(report: Report) -> tuple[int, int]:

@@ -111,7 +111,7 @@ def regress(
         right = np.hstack([after] * heard + list(used.values()))
         L = np.linalg.solve(J + RELATIVE_NOISE * np.diag(J.diagonal()), right.T).T
         left = after - L.dot(J).dot(L.T)
-        for needed, forgiven in ((0.0, least), (MAX_CONTRADICTION, MAX_CONTRADICTION)):
+        for needed, forgiven in ((0.0, least), (MAX_CONTRADICTION, max(MAX_CONTRADICTION, least))):
             if is_positive(left + needed * after):
                 row = L.dot(P[index])
                 row[:, block] = (1.0 + forgiven) * after

@@ -13,6 +13,7 @@ import warp as wp
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.memory import mat66d
 from coopenv.observers.robust.told.correlations import correlation_of, factor
+from coopenv.observers.robust.tracklets import bit_of
 
 INFLATION = 1.0 + constants.RELATIVE_NOISE
 
@@ -103,6 +104,25 @@ def is_positive(P: Any) -> bool:
 
 
 @wp.func
+def least_forgiven(memory: Any, world: int, i: int, n: int):
+    """Return the share of its covariance that is added to member n's: a little if it depends on others.
+
+    Where senders depend on this vehicle in turn, what they tell may be its own words, and all of them count once.
+    """
+    depends_on = memory.member[world, i, n].report.depends_on
+    if depends_on == wp.uint64(0):
+        return wp.float64(0.0)
+    own = bit_of(i)
+    if (depends_on & own) == wp.uint64(0):
+        return wp.float64(constants.LEAST_FORGIVEN)
+    count = wp.float64(0.0)
+    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
+        if (memory.member[world, i, k].report.depends_on & own) != wp.uint64(0):
+            count += wp.float64(1.0)
+    return count
+
+
+@wp.func
 def try_known(memory: Any, world: int, i: int, n: int, after: Any, count: int):
     """Return what has to be forgiven the sender, as a share of its covariance, so that what is known fits; -1: more.
 
@@ -115,11 +135,9 @@ def try_known(memory: Any, world: int, i: int, n: int, after: Any, count: int):
         left = left - block * wp.transpose(memory.known[world, a].coefficient)
     forgiven = wp.float64(-1.0)
     if is_positive(left):
-        forgiven = wp.float64(0.0)
-        if memory.member[world, i, n].report.depends_on != wp.uint64(0):
-            forgiven = wp.float64(constants.LEAST_FORGIVEN)
+        forgiven = least_forgiven(memory, world, i, n)
     elif is_positive(left + wp.float64(constants.MAX_CONTRADICTION) * after):
-        forgiven = wp.float64(constants.MAX_CONTRADICTION)
+        forgiven = wp.max(wp.float64(constants.MAX_CONTRADICTION), least_forgiven(memory, world, i, n))
     if forgiven >= wp.float64(0.0):
         for k in range(memory.belief[world, i].members):
             memory.scratch[world, k].row = regressed(memory, world, i, count, k)
