@@ -53,7 +53,7 @@ LEAST_NEWS = 1e-3
 """Share of a sender's variance that counts as noise of the step by which it moves at its next message. Chosen."""
 STEP_GATE = 22.5
 """Gate of the squared size of such a step in standard deviations: chi-square of 6, 0.999."""
-MAX_TOLD_VARIANCE = 0.1**2
+MAX_TOLD_VARIANCE = 0.03**2
 """m^2 per axis, of a sender that knows its place no better, at which nobody follows it: its steps are no small errors.
 Tuned."""
 RELATIVE_NOISE = 1e-6  # share of a variance, that regressions have as noise
