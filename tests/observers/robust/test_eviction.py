@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.contract import Received
-from coopenv.observers.robust.constants import FORGET_TIME, NEWS_TIME
+from coopenv.observers.robust.constants import FORGET_TIME
 from tests.helpers.robust_observers import OpenJoint, OpenRobust
 from tests.helpers.robust_scenes import crowd, small_errors
 from tests.oracles.robust.belief import Belief, Member
@@ -62,7 +62,7 @@ def test_those_in_view_are_met_when_others_are_gone(kind, leaders, gone, telling
                 members = set(self.member_numbers)
                 if tick.time < left + FORGET_TIME - tick.dt:
                     full.append(members)
-                elif tick.time > left + FORGET_TIME + NEWS_TIME + tick.dt:  # with the next report that counts
+                elif tick.time > left + FORGET_TIME + tick.dt:
                     late.append(members >= set(range(gone, leaders)) and set(self.told) >= set(range(gone, leaders)))
             return estimate
 
@@ -118,12 +118,7 @@ def test_any_meetings_leave_a_belief_in_order(kind, frames):
             sender.believe([o for o in others if o != v])
             for member in sender.belief.members:
                 member.time = time
-            message = sender.message()
-            if kind is OpenRobust:  # a report that counts, with no correlation
-                none = {"told": np.zeros(0, np.uint16), "ages": np.zeros(0, np.float32)}
-                none["correlations"] = np.zeros((0, 6, 6), np.int8)
-                message = replace(message, extra={**message.extra, **none})
-            messages[L + v] = Received(message, 0.0)
+            messages[L + v] = Received(sender.message(), 0.0)
         valid = np.isin(np.arange(1, VEHICLES), list(in_view))
         observer.update(
             replace(

@@ -100,7 +100,7 @@ class Robust(Common):
         while pending:
             s = min(pending, key=lambda s: (self._has_to_wait(s, pending), *_rank(pending[s])))
             self._hear(self.contacts[s], pending.pop(s))
-        for report in sorted(news.values(), key=_rank):
+        for report in sorted(reports.values(), key=_rank):
             if report.vehicles[0] in in_view and report.vehicles[0] not in self.contacts:
                 self._meet(report, tick.time)
 

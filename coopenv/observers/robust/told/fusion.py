@@ -195,7 +195,7 @@ def next_met(model: Any, state: Any, memory: Any, world: int, i: int, last: int,
         sender = target - model.landmarks
         if sender >= 0 and state.sight[world, i, target] == VISIBLE:
             if is_heard(model, state, memory, world, i, wp.max(sender, 0), tick):
-                if memory.inbox[world, i, sender].news == 1 and index_of(memory, world, i, sender) == 0:
+                if index_of(memory, world, i, sender) == 0:
                     at = rank(model, sender, memory.inbox[world, i, sender])
                     if at > last and (best < 0 or at < best):
                         best = at
