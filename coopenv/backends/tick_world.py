@@ -238,7 +238,14 @@ class TickWorld(SensingWorld):
         if vehicle not in self._parts:
             memory = views_of(self.memory, fields(self.observer.memory), vehicle)
             state = views_of(self.state, state_fields(self.precision), vehicle)
-            self._parts[vehicle] = SimpleNamespace(memory=memory, state=state, setup=self.briefing.setups[vehicle])
+            unit = float(self.model.camera_period)
+            self._parts[vehicle] = SimpleNamespace(
+                memory=memory,
+                state=state,
+                setup=self.briefing.setups[vehicle],
+                unit=unit,
+                units=lambda seconds: round(seconds / unit),
+            )
         return self._parts[vehicle]
 
 

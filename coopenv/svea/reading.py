@@ -115,6 +115,9 @@ def _report(message: Any) -> Report:
     extra: dict[str, Any] = {
         "odometry": np.concatenate([turned, moved]),
         "depends_on": np.array([message.depends_on], dtype=np.uint64),
+        "told": np.zeros(0, np.uint16),  # a report counts; of correlations it has none
+        "ages": np.zeros(0, np.float32),
+        "correlations": np.zeros((0, 6, 6), np.int8),
     }
     return Report(pose.position, pose.rotation, covariance_of(message.covariance, "covariance"), extra)
 
