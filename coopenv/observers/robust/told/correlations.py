@@ -14,7 +14,7 @@ from coopenv.estimation.so3 import exp_so3, skew
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.memory import Pose, Report, mat66d, mat66f, vec3d
 from coopenv.observers.robust.told.memory import Correlation, Known
-from coopenv.observers.robust.tracklets import arrived, clear_messages, receive, send
+from coopenv.observers.robust.tracklets import arrived, clear_messages, marker_jacobian, receive, send
 from coopenv.world.faults import content_tick
 
 
@@ -61,14 +61,13 @@ def next_told(model: Any, memory: Any, world: int, i: int, last: int) -> int:
 
 @wp.func
 def own_correlation(model: Any, memory: Any, world: int, i: int, n: int):
-    """Return the correlation of the vehicle's error at its marker with that of a member."""
+    """Return the correlation, 6x6 in whole steps, of the vehicle's left error at its marker with that of a member."""
     P = memory.P[world, i, 0, 0]
     C = memory.P[world, i, 0, n]
     marker = vec3d(model.scene.marker[model.landmarks + i])
     if wp.length_sq(marker) > wp.float64(0.0):
         P = algebra.sheared(P, -skew(marker))
-        one = wp.identity(3, wp.float64)
-        C = algebra.lower_blocks(one, -skew(marker), one) * C
+        C = marker_jacobian(marker) * C
     X = algebra.inverse_factor(P) * C * wp.transpose(algebra.inverse_factor(memory.P[world, i, n, n]))
     steps = wp.float64(constants.STEPS)
     for k in range(6):
