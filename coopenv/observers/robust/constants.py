@@ -33,6 +33,16 @@ MESSAGE_GATE = 40.0
 """Gate of the squared distance between a message and the belief about its sender: chi-square of 6, 1 - 5e-7."""
 AGREEMENT_TIME, AGREEMENT_DISTANCE = 1.0, 1.0
 """s and m: how long and how closely a distrusted sender must agree before it is trusted again. Chosen."""
+WORD_GATE, DRIFT_GATE, DRIFT_CLEAR = 40.0, 32.0, 9.0
+"""Gate of the squared size of what contradicts a sender's word: chi-square of 3, 1 - 1e-8."""
+SLACK = 0.3
+AGREEMENT_GATE = 16.8
+DRIFT_TIME, SLOW_DRIFT_TIME = 3.0, 30.0
+"""s over which a sender's place is held against its odometry. Chosen."""
+EVIDENCE_TIME = 10.0  # s over which it is held against bearings. Chosen
+LEAST_CERTAINTY = 0.01  # 1/m^2: nobody lies by more than some 10 m unnoticed
+ERROR_FACTOR = 2.0  # by which who has lied may be farther off than it seems. Chosen
+MAX_OFFENCES = 7  # after which a sender is believed again after a minute: 2^(n - 1) s
 LOST_SHARE, LOST_TIME = 0.6, 0.5
 """Share of bearings that contradict the belief, and the time over which it is averaged, s. Chosen: one wrong target of
 two is not enough."""

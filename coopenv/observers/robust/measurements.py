@@ -129,6 +129,7 @@ def set_line_to_target(
         return True
     heard = is_heard(model, state, memory, world, i, sender, tick)
     if purpose == SEARCH:
+        heard = heard and tick >= memory.word[world, i, sender].barred_until
         if heard:
             variance = received_variance(model, memory, world, i, sender, tick)
             set_line(memory, world, n, 0, b, memory.inbox[world, i, sender].pose.p, variance)

@@ -72,6 +72,21 @@ class Member:
 
 
 @wp.struct
+class Word:
+    """What a vehicle makes of what another one says of its place, see trust.py; positions along the axes of the map."""
+
+    offset: vec3d  # 1/m: information on how far it is from where it says
+    certainty: mat33d  # 1/m^2: the matrix of that information
+    drift: vec3d  # m, sum of how far it says to be from where its odometry has led
+    spread: mat33d  # m^2, covariance of that
+    slow_drift: vec3d  # m, the same over a longer time
+    slow_spread: mat33d  # m^2
+    missed_share: wp.float64  # mean share of bearings to it that do not fit
+    offences: wp.int32  # how often it has not been believed
+    barred_until: wp.int32  # the tick from which on it may be believed again
+
+
+@wp.struct
 class Belief:
     """What a vehicle believes, but for the members' poses and covariance."""
 
@@ -152,6 +167,7 @@ class Scratch:
     column: mat66d  # a block of the covariance
     row: mat66d  # another one, as it will be
     correction: vec6d
+    wish: vec6d  # the correction of a member that is considered, which is not carried out
     last_correction: vec6d  # where the lines were linearised
     recentring: mat66d  # of errors about where they were linearised, then about where the member is put
     pose: Pose  # before the correction
@@ -169,6 +185,7 @@ class CommonMemory:
     P: array("WNKK", mat66d)  # blocks of the members' joint covariance
     anchor: array("WN", Anchor)
     search: array("WN", Search)
+    word: array("WNN", Word)  # per receiver and sender
     hypothesis: array("WNH", Hypothesis)
     outbox: array("WNS", Report)
     inbox: array("WNN", Report)  # per receiver and sender
@@ -194,6 +211,8 @@ def clear(model: Any, memory: Any, world: int, i: int):
             memory.P[world, i, n, k] = mat66d()
     for h in range(memory.hypothesis.shape[2]):
         memory.hypothesis[world, i, h] = Hypothesis()
+    for sender in range(model.vehicles):
+        memory.word[world, i, sender] = Word()
     for n in range(model.agents):
         memory.line[world, n] = Line()
         for k in range(members):

@@ -131,6 +131,7 @@ def test_sender(memory: Any, world: int, i: int, n: int, told: Estimate, dt: Any
     distrusted = wp.where(agrees, 0, 1)
     if memory.member[world, i, n].distrusted == 1:
         away = algebra.left_error(believed.pose, told.pose)
+        agrees = algebra.distance_squared(believed, told) < wp.float64(constants.AGREEMENT_GATE)
         if agrees and wp.length(away[3:]) < wp.float64(constants.AGREEMENT_DISTANCE):
             agreed = memory.member[world, i, n].agreement_time + dt
         distrusted = wp.where(agreed >= wp.float64(constants.AGREEMENT_TIME), 0, 1)

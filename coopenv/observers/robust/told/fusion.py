@@ -19,6 +19,7 @@ from coopenv.observers.robust.odometry import increment_noise
 from coopenv.observers.robust.told.correlations import place_of, rank
 from coopenv.observers.robust.told.regression import is_positive, regress
 from coopenv.observers.robust.tracklets import bit_of, propagate_member, test_sender
+from coopenv.observers.robust.trust import distrust, drifted, has_jumped, is_barred, note_step
 from coopenv.world.camera import VISIBLE
 
 
@@ -109,7 +110,7 @@ def step_to(memory: Any, world: int, i: int, n: int):
 
 
 @wp.func
-def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int):
+def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick: int):
     """Take a member's new report."""
     sent = memory.inbox[world, i, sender].tick
     before = memory.member[world, i, n].report.tick
@@ -117,10 +118,23 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int):
     report = memory.inbox[world, i, sender]
     dt = wp.float64(sent - before) * model.camera_period
     step = algebra.between(last.odometry, report.odometry)
-    propagate_member(model, memory, world, i, n, step, dt, increment_noise(model, memory, world, i, step, dt))
+    noise = increment_noise(model, memory, world, i, step, dt)
     was_distrusted = memory.member[world, i, n].distrusted
+    jumped = has_jumped(model, memory, world, i, n, step, dt)
+    propagate_member(model, memory, world, i, n, step, dt, noise)
     memory.member[world, i, n].report = report
+    note_step(memory, world, i, sender, last, report, noise, dt)
     test_sender(memory, world, i, n, Estimate(report.pose, mat66d(report.P)), dt)
+    if was_distrusted == 1:
+        if is_barred(memory, world, i, sender, tick) or drifted(memory, world, i, sender, wp.float64(constants.DRIFT_CLEAR)) > wp.float64(0.0):
+            memory.member[world, i, n].distrusted = 1
+            memory.member[world, i, n].agreement_time = wp.float64(0.0)
+    else:
+        drift = drifted(memory, world, i, sender, wp.float64(constants.DRIFT_GATE))
+        if drift > wp.float64(0.0):
+            distrust(model, memory, world, i, n, tick, wp.float64(constants.ERROR_FACTOR) * drift)
+        elif jumped or memory.member[world, i, n].distrusted == 1:
+            distrust(model, memory, world, i, n, tick, wp.float64(0.0))
     if memory.member[world, i, n].distrusted == 1:
         memory.member[world, i, n].considered = 0
         return
@@ -195,7 +209,7 @@ def next_met(model: Any, state: Any, memory: Any, world: int, i: int, last: int,
         sender = target - model.landmarks
         if sender >= 0 and state.sight[world, i, target] == VISIBLE:
             if is_heard(model, state, memory, world, i, wp.max(sender, 0), tick):
-                if index_of(memory, world, i, sender) == 0:
+                if index_of(memory, world, i, sender) == 0 and not is_barred(memory, world, i, sender, tick):
                     at = rank(model, sender, memory.inbox[world, i, sender])
                     if at > last and (best < 0 or at < best):
                         best = at
@@ -210,7 +224,7 @@ def hear_all(model: Any, state: Any, memory: Any, world: int, i: int, tick: int)
         n = next_member(model, state, memory, world, i, tick)
         if n == 0:
             break
-        hear(model, memory, world, i, n, memory.member[world, i, n].vehicle)
+        hear(model, memory, world, i, n, memory.member[world, i, n].vehicle, tick)
     at = next_met(model, state, memory, world, i, -1, tick)
     for _ in range(model.target_count[i]):
         if at < 0:
