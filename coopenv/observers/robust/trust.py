@@ -19,7 +19,8 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.memory import Estimate, Report, Word, mat33d, mat66d, vec3d
+from coopenv.observers.robust.algebra import with_noise
+from coopenv.observers.robust.memory import Estimate, Report, Word, mat33d, mat66d, vec2d, vec3d
 
 
 @wp.func
@@ -47,17 +48,23 @@ def enlarge(memory: Any, world: int, i: int, n: int, variance: Any):
 
 
 @wp.func
-def distrust(model: Any, memory: Any, world: int, i: int, n: int, tick: int, error: Any):
+def distrust(model: Any, memory: Any, world: int, i: int, n: int, tick: int, error: Any, cause: int):
     """Believe member n no more, which may be off by an error of some metres; every time for longer."""
     sender = memory.member[world, i, n].vehicle
     if error > wp.float64(0.0):
         enlarge(memory, world, i, n, error * error)
+    if error > wp.float64(constants.AGREEMENT_DISTANCE):
+        turn = error * wp.float64(0.1)
+        noise = vec2d(turn * turn, error * error)
+        memory.P[world, i, 0, 0] = with_noise(memory.P[world, i, 0, 0], noise)
     memory.member[world, i, n].distrusted = 1
     memory.member[world, i, n].considered = 0
     memory.member[world, i, n].agreement_time = wp.float64(0.0)
     offences = wp.min(memory.word[world, i, sender].offences + 1, constants.MAX_OFFENCES)
     word = Word()
     word.offences = offences
+    word.causes = memory.word[world, i, sender].causes
+    word.causes[cause] = word.causes[cause] + wp.float64(1.0)
     word.slow_drift = memory.word[world, i, sender].slow_drift
     word.slow_spread = memory.word[world, i, sender].slow_spread
     time = wp.float64(constants.AGREEMENT_TIME) * wp.float64(1 << (offences - 1))
@@ -84,9 +91,18 @@ def has_jumped(model: Any, memory: Any, world: int, i: int, n: int, step: Any, d
     if memory.member[world, i, n].has_twist == 0:
         return False
     q = algebra.odometry_noise(model, i, dt)[1]
-    most = wp.float64(constants.MAX_SMOOTH_ACCELERATION) * dt
-    spread = wp.sqrt(memory.member[world, i, n].velocity_variance + q / (dt * dt))
-    return wp.length(step.p / dt - memory.member[world, i, n].v) > most + wp.float64(6.0) * spread
+    most = wp.float64(0.5 * constants.MAX_SMOOTH_ACCELERATION) * dt * dt
+    spread = wp.sqrt(memory.member[world, i, n].velocity_variance * dt * dt + q)
+    return wp.length(step.p - memory.member[world, i, n].v * dt) > most + wp.float64(4.0) * spread
+
+
+@wp.func
+def certainty_of(memory: Any, world: int, i: int, sender: int):
+    """Return the information on how far a sender is from where it says; at first there is hardly any."""
+    V = memory.word[world, i, sender].certainty
+    if wp.trace(V) == wp.float64(0.0):
+        V = wp.float64(constants.LEAST_CERTAINTY) * wp.identity(3, wp.float64)
+    return V
 
 
 @wp.func
@@ -97,14 +113,27 @@ def note_step(memory: Any, world: int, i: int, sender: int, last: Report, report
     x = report.pose.p - carried.pose.p
     R = carried.pose.R
     N = R * (block3(carried.P, 3, 3) - block3(mat66d(report.P), 3, 3)) * wp.transpose(R)
-    N = wp.float64(0.5) * (N + wp.transpose(N)) + wp.float64(constants.SLACK) * noise[1] * wp.identity(3, wp.float64)
+    N = wp.float64(0.5) * (N + wp.transpose(N))
+    if wp.trace(N) < wp.float64(0.0):
+        N = mat33d()
+    N = N + wp.float64(constants.SLACK) * noise[1] * wp.identity(3, wp.float64)
     share = fading(dt, wp.float64(constants.DRIFT_TIME))
     word = memory.word[world, i, sender]
+    if dt > wp.float64(constants.SILENCE):
+        word.drift = vec3d()
+        word.spread = mat33d()
+        word.slow_drift = vec3d()
+        word.slow_spread = mat33d()
     word.drift = share * word.drift + x
     word.spread = (share * share) * word.spread + N
     share = fading(dt, wp.float64(constants.SLOW_DRIFT_TIME))
     word.slow_drift = share * word.slow_drift + x
     word.slow_spread = (share * share) * word.slow_spread + N
+    V = certainty_of(memory, world, i, sender)
+    covariance = wp.inverse(V)
+    believed = covariance * word.offset - x
+    word.certainty = wp.inverse(covariance + noise[1] * wp.identity(3, wp.float64))
+    word.offset = word.certainty * believed
     memory.word[world, i, sender] = word
 
 
@@ -120,7 +149,7 @@ def drifted(memory: Any, world: int, i: int, sender: int, gate: Any):
 
 
 @wp.func
-def note_evidence(memory: Any, world: int, i: int, n: int, lines: int, dt: Any):
+def note_evidence(memory: Any, world: int, i: int, n: int, lines: int, variance: Any, dt: Any):
     """Add what a frame says of how far member n is from where it says.
 
     Its correction P M^T S^-1 r is not carried out; r has the covariance S.
@@ -135,9 +164,15 @@ def note_evidence(memory: Any, world: int, i: int, n: int, lines: int, dt: Any):
     inverse = R * wp.inverse(block3(memory.P[world, i, n, n], 3, 3))
     sender = memory.member[world, i, n].vehicle
     share = fading(dt, wp.float64(constants.EVIDENCE_TIME))
+    share = wp.float64(1.0)
+    f = wp.float64(1.0)
+    for m in range(lines):
+        if memory.line[world, m].fits == 1:
+            lasting = wp.max(wp.float64(constants.NEWS_TIME) / dt, wp.float64(1.0)) * (memory.line[world, m].noise - variance)
+            f = wp.min(f, variance / (variance + lasting))
     c = memory.scratch[world, n].wish
-    offset = share * memory.word[world, i, sender].offset + inverse * c[3:]
-    certainty = share * memory.word[world, i, sender].certainty + inverse * D * wp.transpose(inverse)
+    offset = share * memory.word[world, i, sender].offset + f * (inverse * c[3:])
+    certainty = share * certainty_of(memory, world, i, sender) + f * inverse * D * wp.transpose(inverse)
     memory.word[world, i, sender].offset = offset
     memory.word[world, i, sender].certainty = certainty
 
@@ -146,50 +181,44 @@ def note_evidence(memory: Any, world: int, i: int, n: int, lines: int, dt: Any):
 def contradiction(memory: Any, world: int, i: int, n: int):
     """Return by how much bearings contradict member n, squared in standard deviations, and by how many metres."""
     sender = memory.member[world, i, n].vehicle
-    one = wp.identity(3, wp.float64)
-    V = memory.word[world, i, sender].certainty + wp.float64(constants.LEAST_CERTAINTY) * one
-    covariance = wp.inverse(V)
+    covariance = wp.inverse(certainty_of(memory, world, i, sender))
     b = covariance * memory.word[world, i, sender].offset
     R = memory.member[world, i, n].pose.R
     P = R * block3(memory.P[world, i, n, n], 3, 3) * wp.transpose(R)
-    return size_squared(b, P + covariance), wp.length(b)
+    likely = wp.inverse(certainty_of(memory, world, i, sender) + wp.identity(3, wp.float64)) * memory.word[world, i, sender].offset
+    return size_squared(b, P + covariance), wp.length(likely)
 
 
 @wp.func
-def test_words(model: Any, memory: Any, world: int, i: int, lines: int, tick: int, dt: Any):
+def test_words(model: Any, memory: Any, world: int, i: int, lines: int, variance: Any, tick: int, dt: Any):
     """Weigh a frame's bearings against what every member says; believe the one no more that they contradict most."""
     worst = int(0)
     most = wp.float64(constants.WORD_GATE)
     error = wp.float64(0.0)
     for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
         if memory.member[world, i, n].considered == 1:
-            note_evidence(memory, world, i, n, lines, dt)
+            note_evidence(memory, world, i, n, lines, variance, dt)
             size, far = contradiction(memory, world, i, n)
             if size > most:
                 worst = n
                 most = size
                 error = far
     if worst > 0:
-        distrust(model, memory, world, i, worst, tick, wp.float64(constants.ERROR_FACTOR) * error)
+        distrust(model, memory, world, i, worst, tick, wp.float64(constants.ERROR_FACTOR) * error, 0)
 
 
 @wp.func
-def note_missed(memory: Any, world: int, i: int, lines: int, weight: Any):
-    """Average which share of the bearings to each member do not fit."""
+def test_missed(model: Any, memory: Any, world: int, i: int, lines: int, weight: Any, healthy: bool, tick: int):
+    """Average which share of the bearings to each member do not fit; believe those no more to which most do not."""
     for m in range(lines):
         n = memory.line[world, m].member
         if n > 0:
             sender = memory.member[world, i, n].vehicle
             share = memory.word[world, i, sender].missed_share
             missed = wp.float64(1 - memory.line[world, m].fits)
-            memory.word[world, i, sender].missed_share = share + (missed - share) * weight
-
-
-@wp.func
-def test_missed(model: Any, memory: Any, world: int, i: int, tick: int):
-    """Believe members no more to which bearings do not fit."""
-    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
-        sender = memory.member[world, i, n].vehicle
-        if memory.member[world, i, n].considered == 1:
-            if memory.word[world, i, sender].missed_share > wp.float64(constants.LOST_SHARE):
-                distrust(model, memory, world, i, n, tick, wp.float64(constants.AGREEMENT_DISTANCE))
+            share = share + (missed - share) * weight
+            memory.word[world, i, sender].missed_share = share
+            if healthy and memory.member[world, i, n].considered == 1 and share > wp.float64(constants.LOST_SHARE):
+                far = wp.length(memory.line[world, m].residual) * memory.line[world, m].distance
+                error = wp.float64(constants.ERROR_FACTOR) * far + wp.float64(constants.AGREEMENT_DISTANCE)
+                distrust(model, memory, world, i, n, tick, error, 1)

@@ -26,7 +26,7 @@ from coopenv.observers.robust.measurements import innovation_squared
 from coopenv.observers.robust.memory import Anchor, Estimate, Frame, mat66d, vec2d, vec6d
 from coopenv.observers.robust.odometry import begin_errors, lasting_noise
 from coopenv.observers.robust.search import begin_search
-from coopenv.observers.robust.trust import note_missed, test_missed, test_words
+from coopenv.observers.robust.trust import test_missed, test_words
 
 
 @wp.func
@@ -93,7 +93,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
     state.nis_dof[world, i] = 2 * fitting
     if fitting > 0:
         iterated_update(frame, memory, world, i)
-        test_words(model, memory, world, i, frame.lines, now.tick, now.period)
+        test_words(model, memory, world, i, frame.lines, frame.variance, now.tick, now.period)
     if share < wp.float64(0.0):
         return
     weight = wp.min(wp.float64(1.0), now.period / wp.float64(constants.LOST_TIME))
@@ -102,9 +102,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
     if missed >= wp.float64(constants.HEALTHY_SHARE):
         healthy = wp.float64(0.0)
     memory.belief[world, i].missed_share = missed
-    note_missed(memory, world, i, frame.lines, weight)
-    if missed < wp.float64(constants.LOST_SHARE):
-        test_missed(model, memory, world, i, now.tick)
+    test_missed(model, memory, world, i, frame.lines, weight, missed < wp.float64(constants.LOST_SHARE), now.tick)
     memory.belief[world, i].healthy_time = healthy
     if missed > wp.float64(constants.LOST_SHARE):
         lose(model, memory, world, i, now.tick)

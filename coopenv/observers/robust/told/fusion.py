@@ -131,10 +131,10 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick:
             memory.member[world, i, n].agreement_time = wp.float64(0.0)
     else:
         drift = drifted(memory, world, i, sender, wp.float64(constants.DRIFT_GATE))
-        if drift > wp.float64(0.0):
-            distrust(model, memory, world, i, n, tick, wp.float64(constants.ERROR_FACTOR) * drift)
-        elif jumped or memory.member[world, i, n].distrusted == 1:
-            distrust(model, memory, world, i, n, tick, wp.float64(0.0))
+        if jumped or memory.member[world, i, n].distrusted == 1:
+            distrust(model, memory, world, i, n, tick, wp.float64(0.0), 3)
+        elif drift > wp.float64(0.0):
+            distrust(model, memory, world, i, n, tick, wp.float64(constants.ERROR_FACTOR) * drift, 2)
     if memory.member[world, i, n].distrusted == 1:
         memory.member[world, i, n].considered = 0
         return
