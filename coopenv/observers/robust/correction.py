@@ -6,7 +6,7 @@ import warp as wp
 
 from coopenv.observers.robust.algebra import displaced, recentring
 from coopenv.observers.robust.belief import apply_corrections, is_free, subtract_block
-from coopenv.observers.robust.constants import MAX_LINEARISATIONS, RELINEARISATION_ANGLE
+from coopenv.observers.robust.constants import BEARING_GATE, MAX_LINEARISATIONS, RELINEARISATION_ANGLE
 from coopenv.observers.robust.measurements import linearise
 from coopenv.observers.robust.memory import Frame, mat66d, vec6d
 
@@ -84,7 +84,7 @@ def error_left(memory: Any, world: int, k: int):
 
 
 @wp.func
-def correct_by_lines(memory: Any, world: int, i: int, lines: int):
+def correct_by_lines(memory: Any, world: int, i: int, lines: int, judging: bool):
     """Find the correction of the poses before by all lines that fit; the covariance stays as it is.
 
     One line after the other, with the residual that those before have left, is the batch update.
@@ -100,9 +100,12 @@ def correct_by_lines(memory: Any, world: int, i: int, lines: int):
             if member > 0:
                 residual = residual + memory.line[world, n].member_jacobian * error_left(memory, world, member)
             weighted = memory.line[world, n].weight * residual
-            for k in range(members):
-                correction = memory.scratch[world, k].correction + weighted * memory.gain[world, n, k]
-                memory.scratch[world, k].correction = correction
+            if judging and member > 0 and wp.dot(weighted, residual) > wp.float64(BEARING_GATE):
+                memory.line[world, n].fits = 0
+            else:
+                for k in range(members):
+                    correction = memory.scratch[world, k].correction + weighted * memory.gain[world, n, k]
+                    memory.scratch[world, k].correction = correction
     hold_considered(memory, world, i)
 
 
@@ -171,12 +174,12 @@ def iterated_update(frame: Frame, memory: Any, world: int, i: int):
     """
     lines = frame.lines
     store_poses(memory, world, i)
-    correct_by_lines(memory, world, i, lines)
+    correct_by_lines(memory, world, i, lines, True)
     share = next_share(memory, world, i, lines, True)
     step = int(1)
     while share > wp.float64(0.0) and step < MAX_LINEARISATIONS:
         linearise_again(frame, memory, world, i, share)
-        correct_by_lines(memory, world, i, lines)
+        correct_by_lines(memory, world, i, lines, False)
         share = next_share(memory, world, i, lines, False)
         step += 1
     for k in range(memory.belief[world, i].members):

@@ -82,6 +82,7 @@ class Word:
     slow_drift: vec3d  # m, the same over a longer time
     slow_spread: mat33d  # m^2
     missed_share: wp.float64  # mean share of bearings to it that do not fit
+    fitted_time: wp.float64  # s for which they have
     offences: wp.int32  # how often it has not been believed
     causes: wp.vec4d
     barred_until: wp.int32  # the tick from which on it may be believed again

@@ -22,6 +22,8 @@ from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.algebra import with_noise
 from coopenv.observers.robust.memory import Estimate, Report, Word, mat33d, mat66d, vec2d, vec3d
 
+GROSS_VARIANCE = constants.AGREEMENT_DISTANCE**2
+
 
 @wp.func
 def is_barred(memory: Any, world: int, i: int, sender: int, tick: int) -> bool:
@@ -48,15 +50,42 @@ def enlarge(memory: Any, world: int, i: int, n: int, variance: Any):
 
 
 @wp.func
+def reopen(memory: Any, world: int, i: int, n: int, variance: Any):
+    """Let all that depends on what member n said be as uncertain as that is now; where that is much, the own pose."""
+    enlarge(memory, world, i, n, variance)
+    if variance > wp.float64(GROSS_VARIANCE):
+        noise = vec2d(wp.float64(0.01) * variance, variance)
+        memory.P[world, i, 0, 0] = with_noise(memory.P[world, i, 0, 0], noise)
+
+
+@wp.func
+def admits(memory: Any, world: int, i: int, n: int, noise: Any, dt: Any) -> bool:
+    """Take note where member n's new report admits that what it said before was wrong; return whether it starts anew.
+
+    It does where it knows less than before, and where it has been silent and is elsewhere.
+    """
+    report = memory.member[world, i, n].report
+    P = mat66d(report.P)
+    before = memory.P[world, i, n, n]
+    spread = before[3, 3] + before[4, 4] + before[5, 5]
+    grown = P[3, 3] + P[4, 4] + P[5, 5] - spread
+    if grown > wp.float64(0.5) * spread:
+        reopen(memory, world, i, n, wp.float64(1.0 / 3.0) * grown)
+    if dt > wp.float64(constants.SILENCE):
+        believed = Estimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
+        if algebra.distance_squared(believed, Estimate(report.pose, P)) > wp.float64(constants.STEP_GATE):
+            x = report.pose.p - memory.member[world, i, n].pose.p
+            reopen(memory, world, i, n, wp.length_sq(x))
+            return True
+    return False
+
+
+@wp.func
 def distrust(model: Any, memory: Any, world: int, i: int, n: int, tick: int, error: Any, cause: int):
     """Believe member n no more, which may be off by an error of some metres; every time for longer."""
     sender = memory.member[world, i, n].vehicle
     if error > wp.float64(0.0):
-        enlarge(memory, world, i, n, error * error)
-    if error > wp.float64(constants.AGREEMENT_DISTANCE):
-        turn = error * wp.float64(0.1)
-        noise = vec2d(turn * turn, error * error)
-        memory.P[world, i, 0, 0] = with_noise(memory.P[world, i, 0, 0], noise)
+        reopen(memory, world, i, n, error * error)
     memory.member[world, i, n].distrusted = 1
     memory.member[world, i, n].considered = 0
     memory.member[world, i, n].agreement_time = wp.float64(0.0)
@@ -114,12 +143,13 @@ def note_step(memory: Any, world: int, i: int, sender: int, last: Report, report
     R = carried.pose.R
     N = R * (block3(carried.P, 3, 3) - block3(mat66d(report.P), 3, 3)) * wp.transpose(R)
     N = wp.float64(0.5) * (N + wp.transpose(N))
+    admits = wp.trace(N) < wp.float64(-0.5) * wp.trace(block3(carried.P, 3, 3))
     if wp.trace(N) < wp.float64(0.0):
         N = mat33d()
     N = N + wp.float64(constants.SLACK) * noise[1] * wp.identity(3, wp.float64)
     share = fading(dt, wp.float64(constants.DRIFT_TIME))
     word = memory.word[world, i, sender]
-    if dt > wp.float64(constants.SILENCE):
+    if admits or dt > wp.float64(constants.SILENCE):
         word.drift = vec3d()
         word.spread = mat33d()
         word.slow_drift = vec3d()
@@ -208,8 +238,9 @@ def test_words(model: Any, memory: Any, world: int, i: int, lines: int, variance
 
 
 @wp.func
-def test_missed(model: Any, memory: Any, world: int, i: int, lines: int, weight: Any, healthy: bool, tick: int):
+def test_missed(model: Any, memory: Any, world: int, i: int, lines: int, dt: Any, healthy: bool, tick: int):
     """Average which share of the bearings to each member do not fit; believe those no more to which most do not."""
+    weight = wp.min(wp.float64(1.0), dt / wp.float64(constants.LOST_TIME))
     for m in range(lines):
         n = memory.line[world, m].member
         if n > 0:
@@ -218,7 +249,10 @@ def test_missed(model: Any, memory: Any, world: int, i: int, lines: int, weight:
             missed = wp.float64(1 - memory.line[world, m].fits)
             share = share + (missed - share) * weight
             memory.word[world, i, sender].missed_share = share
+            memory.word[world, i, sender].fitted_time += (wp.float64(1.0) - missed) * dt
             if healthy and memory.member[world, i, n].considered == 1 and share > wp.float64(constants.LOST_SHARE):
                 far = wp.length(memory.line[world, m].residual) * memory.line[world, m].distance
                 error = wp.float64(constants.ERROR_FACTOR) * far + wp.float64(constants.AGREEMENT_DISTANCE)
+                if memory.word[world, i, sender].fitted_time < wp.float64(constants.LOST_TIME):
+                    error = wp.float64(0.0)
                 distrust(model, memory, world, i, n, tick, error, 1)

@@ -19,7 +19,7 @@ from coopenv.observers.robust.odometry import increment_noise
 from coopenv.observers.robust.told.correlations import place_of, rank
 from coopenv.observers.robust.told.regression import is_positive, regress
 from coopenv.observers.robust.tracklets import bit_of, propagate_member, test_sender
-from coopenv.observers.robust.trust import distrust, drifted, has_jumped, is_barred, note_step
+from coopenv.observers.robust.trust import admits, distrust, drifted, has_jumped, is_barred, note_step
 from coopenv.world.camera import VISIBLE
 
 
@@ -124,11 +124,16 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick:
     propagate_member(model, memory, world, i, n, step, dt, noise)
     memory.member[world, i, n].report = report
     note_step(memory, world, i, sender, last, report, noise, dt)
+    anew = bool(False)
+    if was_distrusted == 0:
+        anew = admits(memory, world, i, n, noise, dt)
     test_sender(memory, world, i, n, Estimate(report.pose, mat66d(report.P)), dt)
     if was_distrusted == 1:
         if is_barred(memory, world, i, sender, tick) or drifted(memory, world, i, sender, wp.float64(constants.DRIFT_CLEAR)) > wp.float64(0.0):
             memory.member[world, i, n].distrusted = 1
             memory.member[world, i, n].agreement_time = wp.float64(0.0)
+    elif anew:
+        memory.member[world, i, n].distrusted = 0
     else:
         drift = drifted(memory, world, i, sender, wp.float64(constants.DRIFT_GATE))
         if jumped or memory.member[world, i, n].distrusted == 1:
@@ -139,7 +144,7 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick:
         memory.member[world, i, n].considered = 0
         return
     memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | report.depends_on
-    if was_distrusted == 1:
+    if was_distrusted == 1 or anew:
         place(memory, world, i, n)
     else:
         step_to(memory, world, i, n)
