@@ -81,11 +81,13 @@ def admits(memory: Any, world: int, i: int, n: int, noise: Any, dt: Any) -> bool
 
 
 @wp.func
-def distrust(model: Any, memory: Any, world: int, i: int, n: int, tick: int, error: Any, cause: int):
+def distrust(model: Any, memory: Any, world: int, i: int, n: int, tick: int, error: Any, far: Any, cause: int):
     """Believe member n no more, which may be off by an error of some metres; every time for longer."""
     sender = memory.member[world, i, n].vehicle
     if error > wp.float64(0.0):
         reopen(memory, world, i, n, error * error)
+    if far > wp.float64(0.0):
+        memory.P[world, i, n, n] = with_noise(memory.P[world, i, n, n], vec2d(wp.float64(0.0), far * far))
     memory.member[world, i, n].distrusted = 1
     memory.member[world, i, n].considered = 0
     memory.member[world, i, n].agreement_time = wp.float64(0.0)
@@ -234,7 +236,7 @@ def test_words(model: Any, memory: Any, world: int, i: int, lines: int, variance
                 most = size
                 error = far
     if worst > 0:
-        distrust(model, memory, world, i, worst, tick, wp.float64(constants.ERROR_FACTOR) * error, 0)
+        distrust(model, memory, world, i, worst, tick, wp.float64(constants.ERROR_FACTOR) * error, error, 0)
 
 
 @wp.func
@@ -255,4 +257,4 @@ def test_missed(model: Any, memory: Any, world: int, i: int, lines: int, dt: Any
                 error = wp.float64(constants.ERROR_FACTOR) * far + wp.float64(constants.AGREEMENT_DISTANCE)
                 if memory.word[world, i, sender].fitted_time < wp.float64(constants.LOST_TIME):
                     error = wp.float64(0.0)
-                distrust(model, memory, world, i, n, tick, error, 1)
+                distrust(model, memory, world, i, n, tick, error, wp.float64(constants.ERROR_FACTOR) * far, 1)

@@ -137,9 +137,9 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick:
     else:
         drift = drifted(memory, world, i, sender, wp.float64(constants.DRIFT_GATE))
         if jumped or memory.member[world, i, n].distrusted == 1:
-            distrust(model, memory, world, i, n, tick, wp.float64(0.0), 3)
+            distrust(model, memory, world, i, n, tick, wp.float64(0.0), wp.float64(0.0), 3)
         elif drift > wp.float64(0.0):
-            distrust(model, memory, world, i, n, tick, wp.float64(constants.ERROR_FACTOR) * drift, 2)
+            distrust(model, memory, world, i, n, tick, wp.float64(constants.ERROR_FACTOR) * drift, drift, 2)
     if memory.member[world, i, n].distrusted == 1:
         memory.member[world, i, n].considered = 0
         return
