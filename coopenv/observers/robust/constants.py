@@ -37,6 +37,7 @@ WORD_GATE, DRIFT_GATE, DRIFT_CLEAR = 40.0, 32.0, 9.0
 """Gate of the squared size of what contradicts a sender's word: chi-square of 3, 1 - 1e-8."""
 SLACK = 0.3
 SILENCE = 0.5
+GROSS_ERROR = 0.5
 AGREEMENT_GATE = 16.8
 DRIFT_TIME, SLOW_DRIFT_TIME = 3.0, 30.0
 """s over which a sender's place is held against its odometry. Chosen."""

@@ -22,7 +22,7 @@ from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.algebra import with_noise
 from coopenv.observers.robust.memory import Estimate, Report, Word, mat33d, mat66d, vec2d, vec3d
 
-GROSS_VARIANCE = constants.AGREEMENT_DISTANCE**2
+GROSS_VARIANCE = constants.GROSS_ERROR**2
 
 
 @wp.func
