@@ -35,6 +35,7 @@ AGREEMENT_TIME, AGREEMENT_DISTANCE = 1.0, 1.0
 """s and m: how long and how closely a distrusted sender must agree before it is trusted again. Chosen."""
 WORD_GATE, DRIFT_GATE, DRIFT_CLEAR = 40.0, 32.0, 9.0
 """Gate of the squared size of what contradicts a sender's word: chi-square of 3, 1 - 1e-8."""
+EVIDENCE_SHARE = 0.5
 SLACK = 0.3
 SILENCE = 0.5
 GROSS_ERROR = 0.5

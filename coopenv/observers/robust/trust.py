@@ -197,11 +197,11 @@ def note_evidence(memory: Any, world: int, i: int, n: int, lines: int, variance:
     sender = memory.member[world, i, n].vehicle
     share = fading(dt, wp.float64(constants.EVIDENCE_TIME))
     share = wp.float64(1.0)
-    f = wp.float64(1.0)
+    f = wp.float64(constants.EVIDENCE_SHARE)
     for m in range(lines):
         if memory.line[world, m].fits == 1:
             lasting = wp.max(wp.float64(constants.NEWS_TIME) / dt, wp.float64(1.0)) * (memory.line[world, m].noise - variance)
-            f = wp.min(f, variance / (variance + lasting))
+            f = wp.min(f, wp.float64(constants.EVIDENCE_SHARE) * variance / (variance + lasting))
     c = memory.scratch[world, n].wish
     offset = share * memory.word[world, i, sender].offset + f * (inverse * c[3:])
     certainty = share * certainty_of(memory, world, i, sender) + f * inverse * D * wp.transpose(inverse)
