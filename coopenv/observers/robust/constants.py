@@ -33,19 +33,23 @@ MESSAGE_GATE = 40.0
 """Gate of the squared distance between a message and the belief about its sender: chi-square of 6, 1 - 5e-7."""
 AGREEMENT_TIME, AGREEMENT_DISTANCE = 1.0, 1.0
 """s and m: how long and how closely a distrusted sender must agree before it is trusted again. Chosen."""
-WORD_GATE, DRIFT_GATE, DRIFT_CLEAR = 40.0, 32.0, 9.0
-"""Gate of the squared size of what contradicts a sender's word: chi-square of 3, 1 - 1e-8."""
-EVIDENCE_SHARE = 0.5
-SLACK = 0.3
-SILENCE = 0.5
-GROSS_ERROR = 0.5
-AGREEMENT_GATE = 16.8
-DRIFT_TIME, SLOW_DRIFT_TIME = 3.0, 30.0
-"""s over which a sender's place is held against its odometry. Chosen."""
-EVIDENCE_TIME = 10.0  # s over which it is held against bearings. Chosen
-LEAST_CERTAINTY = 0.01  # 1/m^2: nobody lies by more than some 10 m unnoticed
+AGREEMENT_GATE = 16.8  # of the squared distance at which a distrusted sender agrees: chi-square of 6, 0.99
+MAX_OFFENCES = 7  # from which on a sender is not believed for a minute: 2^(n - 1) s. Chosen
+SILENCE_TIME = 0.5  # s, after which a sender may be elsewhere: who is lost says nothing. Chosen
+ADMISSION = 0.5  # by how much of its variance a sender must know less than before to admit an error. Chosen
+DRIFT_GATE, DRIFT_CLEAR = 32.0, 9.0
+"""Gate of the squared size of a sender's drift from its odometry, chi-square of 3: 1 - 5e-7; and below which a
+distrusted one is clear of it, 0.97."""
+DRIFT_TIME, SLOW_DRIFT_TIME = 3.0, 30.0  # s over which a sender's place is held against its odometry. Chosen
+SLACK = 0.3  # share of the noise of its odometry by which a sender may be off in what it says of its errors. Tuned
+JUMP_STD = 4.0  # standard deviations beyond what brakes can do by which its odometry jumps
+WORD_GATE = 40.0
+"""Gate of the squared size of how far bearings say that a sender is off: chi-square of 3, 1 - 1e-8."""
+EVIDENCE_SHARE = 0.5  # of a frame's information on that. Tuned: honest senders then have a mean of 3
+LEAST_CERTAINTY = 0.01  # 1/m^2, at first
 ERROR_FACTOR = 2.0  # by which who has lied may be farther off than it seems. Chosen
-MAX_OFFENCES = 7  # after which a sender is believed again after a minute: 2^(n - 1) s
+GROSS_ERROR, GROSS_TURN = 0.5, 0.1
+"""m of which an error of a sender has spoilt linearisations, and rad of the own pose per metre of it. Tuned."""
 LOST_SHARE, LOST_TIME = 0.6, 0.5
 """Share of bearings that contradict the belief, and the time over which it is averaged, s. Chosen: one wrong target of
 two is not enough."""

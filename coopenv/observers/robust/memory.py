@@ -72,19 +72,24 @@ class Member:
 
 
 @wp.struct
+class Drift:
+    """A sum of steps, which forgets, see drift.py."""
+
+    sum: vec3d  # m
+    covariance: mat33d  # m^2
+
+
+@wp.struct
 class Word:
-    """What a vehicle makes of what another one says of its place, see trust.py; positions along the axes of the map."""
+    """What a vehicle makes of what another one says of its place, see trust.py; along the axes of the map."""
 
     offset: vec3d  # 1/m: information on how far it is from where it says
     certainty: mat33d  # 1/m^2: the matrix of that information
-    drift: vec3d  # m, sum of how far it says to be from where its odometry has led
-    spread: mat33d  # m^2, covariance of that
-    slow_drift: vec3d  # m, the same over a longer time
-    slow_spread: mat33d  # m^2
+    drift: Drift  # of where it says to be from where its odometry has led
+    slow_drift: Drift  # the same over a longer time
     missed_share: wp.float64  # mean share of bearings to it that do not fit
     fitted_time: wp.float64  # s for which they have
     offences: wp.int32  # how often it has not been believed
-    causes: wp.vec4d
     barred_until: wp.int32  # the tick from which on it may be believed again
 
 

@@ -23,10 +23,11 @@ from coopenv.observers.robust.algebra import (
 from coopenv.observers.robust.belief import apply_error, own_estimate
 from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.measurements import innovation_squared
+from coopenv.observers.robust.evidence import test_words
 from coopenv.observers.robust.memory import Anchor, Estimate, Frame, mat66d, vec2d, vec6d
 from coopenv.observers.robust.odometry import begin_errors, lasting_noise
 from coopenv.observers.robust.search import begin_search
-from coopenv.observers.robust.trust import test_missed, test_words
+from coopenv.observers.robust.trust import test_missed
 
 
 @wp.func
@@ -93,7 +94,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
     state.nis_dof[world, i] = 2 * fitting
     if fitting > 0:
         iterated_update(frame, memory, world, i)
-        test_words(model, memory, world, i, frame.lines, frame.variance, now.tick, now.period)
+        test_words(model, frame, memory, world, i, now)
     if share < wp.float64(0.0):
         return
     weight = wp.min(wp.float64(1.0), now.period / wp.float64(constants.LOST_TIME))

@@ -13,13 +13,14 @@ import warp as wp
 
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import append_member, apply_corrections, index_of, make_room, mark_seen
+from coopenv.observers.robust.drift import drifted, has_jumped, note_step
 from coopenv.observers.robust.measurements import is_heard
-from coopenv.observers.robust.memory import Estimate, mat66d, vec6d
+from coopenv.observers.robust.memory import mat66d, vec6d
 from coopenv.observers.robust.odometry import increment_noise
 from coopenv.observers.robust.told.correlations import place_of, rank
 from coopenv.observers.robust.told.regression import is_positive, regress
-from coopenv.observers.robust.tracklets import bit_of, propagate_member, test_sender
-from coopenv.observers.robust.trust import admits, distrust, drifted, has_jumped, is_barred, note_step
+from coopenv.observers.robust.tracklets import bit_of, propagate_member
+from coopenv.observers.robust.trust import is_barred, judge
 from coopenv.world.camera import VISIBLE
 
 
@@ -119,32 +120,20 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick:
     dt = wp.float64(sent - before) * model.camera_period
     step = algebra.between(last.odometry, report.odometry)
     noise = increment_noise(model, memory, world, i, step, dt)
-    was_distrusted = memory.member[world, i, n].distrusted
     jumped = has_jumped(model, memory, world, i, n, step, dt)
     propagate_member(model, memory, world, i, n, step, dt, noise)
     memory.member[world, i, n].report = report
     note_step(memory, world, i, sender, last, report, noise, dt)
-    anew = bool(False)
-    if was_distrusted == 0:
-        anew = admits(memory, world, i, n, noise, dt)
-    test_sender(memory, world, i, n, Estimate(report.pose, mat66d(report.P)), dt)
-    if was_distrusted == 1:
-        if is_barred(memory, world, i, sender, tick) or drifted(memory, world, i, sender, wp.float64(constants.DRIFT_CLEAR)) > wp.float64(0.0):
-            memory.member[world, i, n].distrusted = 1
-            memory.member[world, i, n].agreement_time = wp.float64(0.0)
-    elif anew:
-        memory.member[world, i, n].distrusted = 0
-    else:
-        drift = drifted(memory, world, i, sender, wp.float64(constants.DRIFT_GATE))
-        if jumped or memory.member[world, i, n].distrusted == 1:
-            distrust(model, memory, world, i, n, tick, wp.float64(0.0), wp.float64(0.0), 3)
-        elif drift > wp.float64(0.0):
-            distrust(model, memory, world, i, n, tick, wp.float64(constants.ERROR_FACTOR) * drift, drift, 2)
+    gate = wp.float64(constants.DRIFT_GATE)
+    if memory.member[world, i, n].distrusted == 1:
+        gate = wp.float64(constants.DRIFT_CLEAR)
+    drift = drifted(memory, world, i, sender, gate)
+    anew = judge(model, memory, world, i, n, tick, dt, drift, jumped)
     if memory.member[world, i, n].distrusted == 1:
         memory.member[world, i, n].considered = 0
         return
     memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | report.depends_on
-    if was_distrusted == 1 or anew:
+    if anew:
         place(memory, world, i, n)
     else:
         step_to(memory, world, i, n)

@@ -1,0 +1,94 @@
+"""A sender's place against bearings: what all innovations together say of how far it is from where it tells.
+
+The filter knows how an error of a sender would show in every innovation r of covariance S, M = H_0 C P_s^-1 + H_s, what
+has passed into the vehicle's own pose included. So sums of M^T S^-1 M and M^T S^-1 r are information on that error
+(Willsky and Jones, A generalized likelihood ratio approach to the detection and estimation of jumps in linear systems,
+IEEE Transactions on Automatic Control 21(1), 1976). It contradicts the sender where its covariance has no room for it.
+The correction that is not carried out, because the sender is only considered, is P_s M^T S^-1 r.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.estimation.linalg import block3
+from coopenv.observers.robust import constants
+from coopenv.observers.robust.memory import Frame, mat33d
+from coopenv.observers.robust.trust import distrust
+
+
+@wp.func
+def size_squared(x: Any, P: Any):
+    """Return the squared size of a vector in standard deviations; 0 where P is no covariance."""
+    return wp.max(wp.dot(x, wp.inverse(P) * x), wp.float64(0.0))
+
+
+@wp.func
+def certainty_of(memory: Any, world: int, i: int, sender: int):
+    """Return the information on how far a sender is from where it says, 1/m^2; at first there is hardly any."""
+    V = memory.word[world, i, sender].certainty
+    if wp.trace(V) == wp.float64(0.0):
+        V = wp.float64(constants.LEAST_CERTAINTY) * wp.identity(3, wp.float64)
+    return V
+
+
+@wp.func
+def share_of(frame: Frame, memory: Any, world: int, dt: Any):
+    """Return which share of a frame's information counts: noise that is not the camera's lasts for many frames."""
+    frames = wp.max(wp.float64(constants.NEWS_TIME) / dt, wp.float64(1.0))
+    most = frame.variance
+    for m in range(frame.lines):
+        if memory.line[world, m].fits == 1:
+            lasting = frames * (memory.line[world, m].noise - frame.variance)
+            most = wp.max(most, frame.variance + lasting)
+    return wp.float64(constants.EVIDENCE_SHARE) * frame.variance / most
+
+
+@wp.func
+def note_evidence(memory: Any, world: int, i: int, n: int, lines: int, share: Any):
+    """Add what a frame says of how far member n is from where it says, along the axes of the map."""
+    D = mat33d()
+    for m in range(lines):
+        if memory.line[world, m].fits == 1:
+            g = memory.gain[world, m, n]
+            K = memory.line[world, m].weight * g
+            D = D + wp.transpose(K[:, 3:]) * g[:, 3:]
+    R = memory.member[world, i, n].pose.R
+    inverse = R * wp.inverse(block3(memory.P[world, i, n, n], 3, 3))
+    sender = memory.member[world, i, n].vehicle
+    wish = memory.scratch[world, n].wish
+    certainty = certainty_of(memory, world, i, sender) + share * (inverse * D * wp.transpose(inverse))
+    memory.word[world, i, sender].offset = memory.word[world, i, sender].offset + share * (inverse * wish[3:])
+    memory.word[world, i, sender].certainty = certainty
+
+
+@wp.func
+def contradiction(memory: Any, world: int, i: int, n: int):
+    """Return by how much bearings contradict member n, squared in standard deviations, and a likely error in m."""
+    sender = memory.member[world, i, n].vehicle
+    certainty = certainty_of(memory, world, i, sender)
+    offset = memory.word[world, i, sender].offset
+    covariance = wp.inverse(certainty)
+    R = memory.member[world, i, n].pose.R
+    P = R * block3(memory.P[world, i, n, n], 3, 3) * wp.transpose(R)
+    likely = wp.inverse(certainty + wp.identity(3, wp.float64)) * offset  # some metre at most, unless bearings tell
+    return size_squared(covariance * offset, P + covariance), wp.length(likely)
+
+
+@wp.func
+def test_words(model: Any, frame: Frame, memory: Any, world: int, i: int, now: Any):
+    """Weigh a frame's bearings against what every member says; believe the one no more that they contradict most."""
+    worst = int(0)
+    most = wp.float64(constants.WORD_GATE)
+    error = wp.float64(0.0)
+    share = share_of(frame, memory, world, now.period)
+    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
+        if memory.member[world, i, n].considered == 1:
+            note_evidence(memory, world, i, n, frame.lines, share)
+            size, far = contradiction(memory, world, i, n)
+            if size > most:
+                worst = n
+                most = size
+                error = far
+    if worst > 0:
+        distrust(model, memory, world, i, worst, now.tick, error, True)
