@@ -64,12 +64,12 @@ def note_step(memory: Any, world: int, i: int, sender: int, last: Report, report
 
 
 @wp.func
-def drifted(memory: Any, world: int, i: int, sender: int, gate: Any):
-    """Return how far a sender has drifted from its odometry, in m; 0 if by no more than it may."""
+def drifted(memory: Any, world: int, i: int, sender: int, gate: Any, least: Any):
+    """Return how far a sender has drifted from its odometry, in m, if by more than it may and by `least`, else 0."""
     fast = memory.word[world, i, sender].drift
-    if size_squared(fast.sum, fast.covariance) > gate:
+    if size_squared(fast.sum, fast.covariance) > gate and wp.length(fast.sum) > least:
         return wp.length(fast.sum)
     slow = memory.word[world, i, sender].slow_drift
-    if size_squared(slow.sum, slow.covariance) > gate:
+    if size_squared(slow.sum, slow.covariance) > gate and wp.length(slow.sum) > least:
         return wp.length(slow.sum)
     return wp.float64(0.0)

@@ -22,8 +22,8 @@ from coopenv.observers.robust.algebra import (
 )
 from coopenv.observers.robust.belief import apply_error, own_estimate
 from coopenv.observers.robust.correction import iterated_update
-from coopenv.observers.robust.measurements import innovation_squared
 from coopenv.observers.robust.evidence import test_words
+from coopenv.observers.robust.measurements import innovation_squared
 from coopenv.observers.robust.memory import Anchor, Estimate, Frame, mat66d, vec2d, vec6d
 from coopenv.observers.robust.odometry import begin_errors, lasting_noise
 from coopenv.observers.robust.search import begin_search

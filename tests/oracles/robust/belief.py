@@ -17,6 +17,7 @@ from coopenv.estimation.rotations import exp_so3, lengths, log_so3, orthonormali
 from coopenv.observers.contract import SensorNoise
 from coopenv.observers.mekf import LeftError
 from coopenv.observers.robust.constants import (
+    BEARING_GATE,
     BEND_FACTOR,
     CONSIDERED_BEND_FACTOR,
     ERRORS_TIME,
@@ -224,13 +225,13 @@ class Belief:
 
     def correct(self, H: Array, noise: Array, residual: Array) -> None:
         """Take independent measurements residual = H x + noise of variances (m,), in Joseph's form."""
-        K = self.gain(H, noise)
+        K = self._held(self.gain(H, noise))
         self.condense(K, H, noise)
         self.shift_about(K.dot(residual))
 
     def settle(
         self, sight: Sight, noise: Array, fits: NDArray[np.bool_], look: Callable[[], tuple[Sight, Array]]
-    ) -> None:
+    ) -> Array:
         """Correct by bearings, linearised anew half way, or at where they put the poses if that is far.
 
         Source: the iterated extended Kalman filter as Gauss-Newton steps, Bell and Cathey, The iterated Kalman filter
@@ -241,6 +242,10 @@ class Belief:
             noise: (m,) their variances.
             fits: which of them count.
             look: returns sight and noise again, at the poses believed by then.
+
+        Returns:
+            (m,) the variances at last. `fits` is changed where a bearing does not fit the others. `wish` (6n,) is the
+            correction with that of members that are considered, and `wished` its covariance.
         """
         before = [(member.R, member.p) for member in self.members]
         x0 = np.zeros(len(self.P))  # where the lines are linearised
@@ -248,17 +253,46 @@ class Belief:
             if step > 0:
                 self._put(before, x0)
                 sight, noise = look()
+            else:
+                self._judge(sight, noise, fits)
+                if not fits.any():
+                    self.wish, self.wished = np.zeros(len(x0)), np.zeros_like(self.P)
+                    return noise
             H = sight.H[fits].reshape(-1, len(x0)).dot(recentring(x0))
             variances = np.repeat(noise[fits], 2)
-            K = self.gain(H, variances)
-            dx = K.dot(sight.residual[fits].ravel() + H.dot(x0))
+            full = self.gain(H, variances)
+            K = self._held(full)
+            self.wish = full.dot(sight.residual[fits].ravel() + H.dot(x0))
+            dx = self._held(self.wish)
             distance = float(sight.distance[fits].min())
             last, x0 = x0, dx if _bend(dx, distance) >= RELINEARISATION_ANGLE else dx / 2
             if step > 0 and _bend(x0 - last, distance) < RELINEARISATION_ANGLE:
                 break
         self._put(before, np.zeros(len(x0)))
+        self.wished = full.dot(H).dot(self.P)
         self.condense(K, H, variances)
         self.shift_about(dx)
+        return noise
+
+    def _judge(self, sight: Sight, noise: Array, fits: NDArray[np.bool_]) -> None:
+        """Let bearings to members count that fit what those before them, to landmarks first, leave of the belief."""
+        P, x = self.P, np.zeros(len(self.P))
+        for k in np.flatnonzero(fits):
+            H = sight.H[k]
+            S, r = H.dot(P).dot(H.T) + noise[k] * np.eye(2), sight.residual[k] - H.dot(x)
+            if H[:, 6:].any() and r.dot(np.linalg.solve(S, r)) > BEARING_GATE:
+                fits[k] = False
+            else:
+                K = np.linalg.solve(S, H.dot(P)).T
+                x, P = x + K.dot(r), P - K.dot(H).dot(P)
+
+    def _held(self, corrections: Array) -> Array:
+        """Return corrections (6n, ...) without those of members that are considered."""
+        held = corrections.copy()
+        for n, member in enumerate(self.members):
+            if member.considered:
+                held[6 * n : 6 * n + 6] = 0.0
+        return held
 
     def _put(self, poses: list[tuple[Array, Array]], error: Array) -> None:
         """Put the members at poses moved by errors."""
@@ -266,16 +300,18 @@ class Belief:
             member.R, member.p = R, p
         self.shift(error)
 
+    def enlarge(self, n: int, variance: float) -> None:
+        """Let a member's position be uncertain by a variance per axis more, with all that depends on its error."""
+        block = slice(6 * n, 6 * n + 6)
+        A = np.linalg.solve(self.P[block, block], self.P[block]).T[:, 3:]
+        self.P = self.P + variance * A.dot(A.T)
+
     def gain(self, H: Array, noise: Array) -> Array:
         """Return the Kalman gain K (6n, m) of measurements H x + noise of variances (m,)."""
         PHt = self.P.dot(H.T)
         S = H.dot(PHt)
         S.flat[:: len(S) + 1] += noise
-        K = solve_positive(S, PHt.T).T
-        for n, member in enumerate(self.members):
-            if member.considered:
-                K[6 * n : 6 * n + 6] = 0.0
-        return K
+        return solve_positive(S, PHt.T).T
 
     def condense(self, K: Array, H: Array, noise: Array) -> None:
         """Let the covariance be that after measurements H x + noise with gain K."""

@@ -12,6 +12,7 @@ from coopenv.estimation.rotations import orthonormalise
 from coopenv.observers.contract import Estimate, Message, SensorNoise, Setup, Tick
 from coopenv.observers.robust.constants import (
     AGREEMENT_DISTANCE,
+    AGREEMENT_GATE,
     AGREEMENT_TIME,
     ANCHOR_ANGLE_VARIANCE,
     ANCHOR_POSITION_VARIANCE,
@@ -177,6 +178,8 @@ class Common:
             if target < self.landmarks:
                 result.append(Sighting(tick.bearings[n], tick.landmarks[target], 0.0))
             elif (report := reports.get(target - self.landmarks)) is not None:
+                if self._is_barred(target - self.landmarks, tick.time):
+                    continue
                 age = tick.time - report.time[0]
                 variance = float(np.trace(report.P[3:6, 3:6])) / 3.0 + (MAX_SPEED * age) ** 2
                 result.append(Sighting(tick.bearings[n], report.p[0], variance))
@@ -220,11 +223,11 @@ class Common:
             return
         member, block = self.belief.members[n], slice(6 * n, 6 * n + 6)
         e = left_error(member.R, member.p, report.R[0], report.p[0])
-        agrees = float(e.dot(solve_positive(self.belief.P[block, block] + report.P[:6, :6], e))) < MESSAGE_GATE
+        size = float(e.dot(solve_positive(self.belief.P[block, block] + report.P[:6, :6], e)))
         if contact.trusted:
-            contact.trusted, contact.agreed = agrees, 0.0
+            contact.trusted, contact.agreed = size < MESSAGE_GATE, 0.0
             return
-        near = agrees and e[3:].dot(e[3:]) < AGREEMENT_DISTANCE**2
+        near = size < AGREEMENT_GATE and e[3:].dot(e[3:]) < AGREEMENT_DISTANCE**2
         contact.agreed = contact.agreed + dt if near else 0.0
         contact.trusted = contact.agreed >= AGREEMENT_TIME
 
@@ -233,10 +236,12 @@ class Common:
         view = self._view(tick)
         self.nis, self.nis_dof = float(view.nis[view.fits].sum()), 2 * int(view.fits.sum())
         if view.fits.any():
-            self.belief.settle(view.sight, view.noise, view.fits, lambda: self._view(tick)[:2])
+            noise = self.belief.settle(view.sight, view.noise, view.fits, lambda: self._view(tick)[:2])
+            self._weigh(tick, noise[view.fits])
         if view.missed is not None:
             self.missed += (view.missed - self.missed) * min(1.0, tick.dt / LOST_TIME)
             self.healthy = self.healthy + tick.dt if self.missed < HEALTHY_SHARE else 0.0
+            self._count(tick, view, self.missed < LOST_SHARE)
             if self.missed > LOST_SHARE:
                 self._lose(tick.time)
             elif self.healthy > HEALTHY_TIME:
@@ -249,6 +254,16 @@ class Common:
                     self.odometry,
                     tick.time,
                 )
+
+    def _weigh(self, tick: Tick, noise: Array) -> None:
+        """Weigh a frame's bearings, whose noise is (m,), against what others say."""
+
+    def _count(self, tick: Tick, view: View, healthy: bool) -> None:
+        """Count to whom bearings do not fit; `healthy`: most bearings do."""
+
+    def _is_barred(self, sender: int, time: float) -> bool:
+        """Return whether a sender is not to be believed."""
+        return False
 
     def _view(self, tick: Tick, resecting: bool = False) -> View:
         """Return the frame's bearings to landmarks and to members of the belief, as measurements."""

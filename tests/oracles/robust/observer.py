@@ -23,20 +23,32 @@ import numpy as np
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Message, Setup, Tick
 from coopenv.observers.robust.constants import (
+    ADMISSION,
+    DRIFT_CLEAR,
+    DRIFT_GATE,
+    ERROR_FACTOR,
+    GROSS_ERROR,
+    GROSS_TURN,
     LEAST_FORGIVEN,
     LEAST_NEWS,
+    LOST_SHARE,
+    LOST_TIME,
     MAX_CORRELATIONS,
     MAX_TOLD_VARIANCE,
     NEWS_TIME,
     SAME_TIME,
+    SILENCE_TIME,
     STEP_GATE,
     STEPS,
+    WORD_GATE,
 )
 from tests.oracles.robust.belief import ERRORS, Member, recentring
 from tests.oracles.robust.common import Common, Contact
 from tests.oracles.robust.eviction import room_for
+from tests.oracles.robust.sight import View
 from tests.oracles.robust.told import Correlations, factor, is_positive, is_same, regress
 from tests.oracles.robust.tracklets import Report, left_error, marker_jacobian, mask_of
+from tests.oracles.robust.words import Word, has_jumped, least_drift, share_of
 
 
 class Robust(Common):
@@ -47,6 +59,12 @@ class Robust(Common):
         super().__init__(setup)
         self.correlations = Correlations()
         self.interval = -1
+        self.words: dict[int, Word] = {}
+
+    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
+        """Start at a pose, and with no opinion of anybody."""
+        super().reset(initial_pose, initial_covariance)
+        self.words = {}
 
     def message(self) -> Message:
         """Return pose, covariance, odometry and the correlations with members."""
@@ -99,9 +117,10 @@ class Robust(Common):
         pending = {s: r for s, r in news.items() if s in last and r.time[0] > last[s]}
         while pending:
             s = min(pending, key=lambda s: (self._has_to_wait(s, pending), *_rank(pending[s])))
-            self._hear(self.contacts[s], pending.pop(s))
+            self._hear(self.contacts[s], pending.pop(s), tick.time)
         for report in sorted(reports.values(), key=_rank):
-            if report.vehicles[0] in in_view and report.vehicles[0] not in self.contacts:
+            sender = report.vehicles[0]
+            if sender in in_view and sender not in self.contacts and not self._is_barred(sender, tick.time):
                 self._meet(report, tick.time)
 
     def _has_to_wait(self, sender: int, pending: dict[int, Report]) -> bool:
@@ -143,29 +162,117 @@ class Robust(Common):
         block = slice(6 * n, 6 * n + 6)
         self.belief.P[block], self.belief.P[:, block] = row, row.T
 
-    def _hear(self, contact: Contact, report: Report) -> None:
+    def _hear(self, contact: Contact, report: Report, time: float) -> None:
         """Put a sender where it says that it is, and let one's own pose follow what it has learnt."""
-        last = contact.last
-        dt = float(report.time[0] - last.time[0])
+        last, sender = contact.last, report.vehicles[0]
+        dt, step = float(report.time[0] - last.time[0]), report.motion_since(last, 0)[1]
         contact.last = report
-        belief, n = self.belief, self.belief.place(report.vehicles[0])
+        belief, n = self.belief, self.belief.place(sender)
         assert n is not None
+        jumped = has_jumped(belief.members[n], step, dt, self.noise)
         belief.follow(n, report.odometry_turn[0], report.odometry_position[0], float(report.time[0]), self.noise)
-        was_trusted = contact.trusted
-        self._judge(contact, report, dt)
-        member = belief.members[n]
-        member.considered = contact.trusted
+        word = self._word(sender)
+        word.step(last, report, self.noise, belief.errors_covariance)
+        drift = word.drifted(DRIFT_GATE, least_drift(report)) if contact.trusted else word.drifted(DRIFT_CLEAR, 0.0)
+        anew = self._decide(contact, report, time, dt, drift, jumped)
         if not contact.trusted:
             return
         self.depends_on |= report.depends_on
-        if was_trusted:
+        if not anew:
             self._step(n, report)
             return
-        block = slice(6 * n, 6 * n + 6)
+        member, block = belief.members[n], slice(6 * n, 6 * n + 6)
+        member.considered = True
         belief.P[block], belief.P[:, block] = 0.0, 0.0
         belief.P[block, block] = report.P
         member.R, member.p = report.R[0], report.p[0]
         self._relate(n, report)
+
+    def _word(self, sender: int) -> Word:
+        """Return what is thought of a sender's word."""
+        return self.words.setdefault(sender, Word())
+
+    def _is_barred(self, sender: int, time: float) -> bool:
+        return self._word(sender).is_barred(time)
+
+    def _decide(self, contact: Contact, report: Report, time: float, dt: float, drift: float, jumped: bool) -> bool:
+        """Decide whether a sender is believed; return whether it starts anew."""
+        if not contact.trusted:
+            self._judge(contact, report, dt)
+            if self._is_barred(report.vehicles[0], time) or drift > 0.0:
+                contact.trusted, contact.agreed = False, 0.0
+            return contact.trusted
+        if self._admits(report, dt):
+            return True
+        self._judge(contact, report, dt)
+        if jumped or not contact.trusted:
+            self._distrust(contact, time, 0.0, False)
+        elif drift > 0.0:
+            self._distrust(contact, time, drift, True)
+        return False
+
+    def _admits(self, report: Report, dt: float) -> bool:
+        """Take note where a report admits an error; return whether its sender starts anew."""
+        belief, n = self.belief, self.belief.place(report.vehicles[0])
+        assert n is not None
+        block = slice(6 * n, 6 * n + 6)
+        spread = belief.P[block, block][3:, 3:].trace()
+        grown = report.P[3:6, 3:6].trace() - spread
+        if grown > ADMISSION * spread:
+            self._reopen(n, grown / 3.0)
+        member = belief.members[n]
+        e = left_error(member.R, member.p, report.R[0], report.p[0])
+        if dt > SILENCE_TIME and e.dot(np.linalg.solve(belief.P[block, block] + report.P[:6, :6], e)) > STEP_GATE:
+            self._reopen(n, float(e[3:].dot(e[3:])))
+            return True
+        return False
+
+    def _reopen(self, n: int, variance: float) -> None:
+        """Let all that depends on what a member said be uncertain again."""
+        self.belief.enlarge(n, variance)
+        if variance > GROSS_ERROR**2:
+            self.belief.P[:6, :6] += variance * np.diag(np.repeat([GROSS_TURN**2, 1.0], 3))
+
+    def _distrust(self, contact: Contact, time: float, error: float, believed: bool) -> None:
+        """Believe a sender no more, which is off by some metres; `believed`: one's own pose has followed that."""
+        sender = contact.last.vehicles[0]
+        n = self.belief.place(sender)
+        assert n is not None
+        if believed:
+            self._reopen(n, (ERROR_FACTOR * error) ** 2)
+        self.belief.P[6 * n + 3 : 6 * n + 6, 6 * n + 3 : 6 * n + 6] += error**2 * np.eye(3)
+        self.belief.members[n].considered = contact.trusted = False
+        contact.agreed = 0.0
+        self.words[sender] = self._word(sender).offend(time)
+
+    def _weigh(self, tick: Tick, noise: Array) -> None:
+        """Weigh a frame's bearings against what members say; believe the one no more that they contradict most."""
+        worst, most, error = None, WORD_GATE, 0.0
+        share = share_of(self.variance, noise, tick.dt)
+        for n, member in enumerate(self.belief.members):
+            if member.considered:
+                position, word = slice(6 * n + 3, 6 * n + 6), self._word(member.vehicle)
+                P = self.belief.P[position, position]
+                word.weigh(member.R, P, self.belief.wish[position], self.belief.wished[position, position], share)
+                size, far = word.contradiction(member.R, P)
+                if size > most:
+                    worst, most, error = member.vehicle, size, far
+        if worst is not None:
+            self._distrust(self.contacts[worst], tick.time, error, True)
+
+    def _count(self, tick: Tick, view: View, healthy: bool) -> None:
+        """Average which share of the bearings to each member do not fit; believe those no more to which most do not."""
+        for k in range(len(view.fits)):
+            of = np.flatnonzero(view.sight.H[k, :, 6:].any(axis=0))
+            if len(of) == 0:
+                continue
+            member = self.belief.members[1 + int(of[0]) // 6]
+            word, missed = self._word(member.vehicle), float(not view.fits[k])
+            word.missed += (missed - word.missed) * min(1.0, tick.dt / LOST_TIME)
+            word.fitted += (1.0 - missed) * tick.dt
+            if healthy and member.considered and word.missed > LOST_SHARE:
+                far = float(np.linalg.norm(view.sight.residual[k]) * view.sight.distance[k])
+                self._distrust(self.contacts[member.vehicle], tick.time, far, word.fitted > LOST_TIME)
 
     def _least(self, report: Report) -> float:
         """Return the share of its covariance that is added to a sender's: a little if it depends on others.

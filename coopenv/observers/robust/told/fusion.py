@@ -23,6 +23,8 @@ from coopenv.observers.robust.tracklets import bit_of, propagate_member
 from coopenv.observers.robust.trust import is_barred, judge
 from coopenv.world.camera import VISIBLE
 
+THIRD = 1.0 / 3.0
+
 
 @wp.func
 def set_row(memory: Any, world: int, i: int, n: int):
@@ -125,9 +127,13 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick:
     memory.member[world, i, n].report = report
     note_step(memory, world, i, sender, last, report, noise, dt)
     gate = wp.float64(constants.DRIFT_GATE)
+    least = wp.float64(constants.DRIFT_STD) * wp.sqrt(
+        wp.float64(THIRD) * wp.float64(report.P[3, 3] + report.P[4, 4] + report.P[5, 5])
+    )
     if memory.member[world, i, n].distrusted == 1:
         gate = wp.float64(constants.DRIFT_CLEAR)
-    drift = drifted(memory, world, i, sender, gate)
+        least = wp.float64(0.0)
+    drift = drifted(memory, world, i, sender, gate, least)
     anew = judge(model, memory, world, i, n, tick, dt, drift, jumped)
     if memory.member[world, i, n].distrusted == 1:
         memory.member[world, i, n].considered = 0
