@@ -1,4 +1,4 @@
-"""A sender's place against its odometry: it may move away from where that leads as far as it has learnt, and no farther.
+"""A sender's place against its odometry: it may leave where that leads as far as it has learnt, and no farther.
 
 From report to report it moves by its odometry and by what it has learnt, x, whose covariance is N = P- - P+. Sums of x
 over a time have the sum of the covariances. A place that drifts away exceeds that, however small its steps are: a

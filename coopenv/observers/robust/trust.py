@@ -1,9 +1,9 @@
 """Whom a vehicle believes, and what follows when it believes somebody no more.
 
-Tests of a sender's word are in drift.py (its place against its odometry), evidence.py (against bearings, slowly) and here
-(bearings to it that do not fit at all). Who is not believed is tracked by its odometry and by bearings, for a second at
-least, and twice as long every further time. What the vehicle's own pose owes to that sender becomes uncertain again:
-with errors e = C P_s^-1 e_s + w, a larger P_s enlarges all that depends on it.
+Tests of a sender's word are in drift.py (its place against its odometry), in evidence.py (against bearings, slowly) and
+here (bearings to it that do not fit at all). Who is not believed is tracked by its odometry and by bearings, for a
+second at least, and twice as long every further time. What the vehicle's own pose owes to that sender becomes uncertain
+again: with errors e = C P_s^-1 e_s + w, a larger P_s enlarges all that depends on it.
 """
 
 from typing import Any
