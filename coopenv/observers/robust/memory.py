@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.estimation.validity import are_covariances
-from coopenv.observers.robust.constants import MAX_HYPOTHESES, MAX_MEMBERS
+from coopenv.observers.robust.constants import MAX_HYPOTHESES, MAX_MEMBERS, MAX_OFFENCES
 from coopenv.scenario.base import LARGEST
 from coopenv.world.records import array
 from coopenv.world.saved_state import COVARIANCE, FLAG, LEAST_EIGENVALUE, ROTATION, TICK, Rule, numbers, whole
@@ -262,13 +262,18 @@ def rules_for(members: int) -> dict[str, Rule]:
         "member.considered outbox.news inbox.news member.report.news member.report.valid line.fits"
     )
     ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick"
-    large = "hypothesis.cost hypothesis.prior_distance line.variance line.noise line.weight scratch.column gain"
+    large = (
+        "hypothesis.cost hypothesis.prior_distance line.variance line.noise line.weight scratch.column gain "
+        "word.certainty"
+    )
     rules = {
         **dict.fromkeys(flags.split(), FLAG),
         **dict.fromkeys(ticks.split(), TICK),
         **dict.fromkeys(large.split(), LARGE),
         **dict.fromkeys(("belief.odometry.R", "anchor.estimate.pose.R", "anchor.odometry.R"), ROTATION),
         **dict.fromkeys(("search.attempts", "hypothesis.bearings", "belief.told_interval"), whole(0, 10**9)),
+        "word.offences": whole(0, MAX_OFFENCES),
+        "word.barred_until": whole(0, 2**31 - 1),
         "belief.members": whole(1, members),
         "belief.others": whole(1, ERRORS + 1),
         "P": Rule("a covariance", lambda P, fields, model: are_joint(P, fields["observer_belief.members"]), axes=4),

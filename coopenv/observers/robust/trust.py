@@ -126,19 +126,39 @@ def judge(model: Any, memory: Any, world: int, i: int, n: int, tick: int, dt: An
 
 
 @wp.func
-def test_missed(model: Any, memory: Any, world: int, i: int, lines: int, dt: Any, healthy: bool, tick: int):
-    """Average which share of the bearings to each member do not fit; believe those no more to which most do not."""
+def note_missed(memory: Any, world: int, i: int, lines: int, dt: Any) -> bool:
+    """Average which share of the bearings to each member do not fit; return whether those to most targets fit.
+
+    Distrusted members do not count. Where most do not fit it may be the vehicle itself that is lost.
+    """
     weight = wp.min(wp.float64(1.0), dt / wp.float64(constants.LOST_TIME))
+    balance = int(0)
+    for m in range(lines):
+        n = memory.line[world, m].member
+        fits = memory.line[world, m].fits
+        if n > 0:
+            sender = memory.member[world, i, n].vehicle
+            share = memory.word[world, i, sender].missed_share
+            share = share + (wp.float64(1 - fits) - share) * weight
+            memory.word[world, i, sender].missed_share = share
+            memory.word[world, i, sender].fitted_time += wp.float64(fits) * dt
+            fits = wp.where(share < wp.float64(0.5), 1, 0)
+        if n == 0 or memory.member[world, i, n].distrusted == 0:
+            balance += 2 * fits - 1
+    return balance > 0
+
+
+@wp.func
+def test_missed(model: Any, memory: Any, world: int, i: int, lines: int, dt: Any, tick: int):
+    """Believe those members no more to which most bearings do not fit, while those to most targets do."""
+    if not note_missed(memory, world, i, lines, dt):
+        return
     for m in range(lines):
         n = memory.line[world, m].member
         if n > 0:
             sender = memory.member[world, i, n].vehicle
-            missed = wp.float64(1 - memory.line[world, m].fits)
-            share = memory.word[world, i, sender].missed_share
-            share = share + (missed - share) * weight
-            memory.word[world, i, sender].missed_share = share
-            memory.word[world, i, sender].fitted_time += (wp.float64(1.0) - missed) * dt
-            if healthy and memory.member[world, i, n].considered == 1 and share > wp.float64(constants.LOST_SHARE):
+            missed = memory.word[world, i, sender].missed_share > wp.float64(constants.LOST_SHARE)
+            if missed and memory.member[world, i, n].considered == 1:
                 far = wp.length(memory.line[world, m].residual) * memory.line[world, m].distance
                 fitted = memory.word[world, i, sender].fitted_time > wp.float64(constants.LOST_TIME)
                 distrust(model, memory, world, i, n, tick, far, fitted)

@@ -103,7 +103,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
     if missed >= wp.float64(constants.HEALTHY_SHARE):
         healthy = wp.float64(0.0)
     memory.belief[world, i].missed_share = missed
-    test_missed(model, memory, world, i, frame.lines, now.period, missed < wp.float64(constants.LOST_SHARE), now.tick)
+    test_missed(model, memory, world, i, frame.lines, now.period, now.tick)
     memory.belief[world, i].healthy_time = healthy
     if missed > wp.float64(constants.LOST_SHARE):
         lose(model, memory, world, i, now.tick)

@@ -241,7 +241,7 @@ class Common:
         if view.missed is not None:
             self.missed += (view.missed - self.missed) * min(1.0, tick.dt / LOST_TIME)
             self.healthy = self.healthy + tick.dt if self.missed < HEALTHY_SHARE else 0.0
-            self._count(tick, view, self.missed < LOST_SHARE)
+            self._count(tick, view)
             if self.missed > LOST_SHARE:
                 self._lose(tick.time)
             elif self.healthy > HEALTHY_TIME:
@@ -258,8 +258,8 @@ class Common:
     def _weigh(self, tick: Tick, noise: Array) -> None:
         """Weigh a frame's bearings, whose noise is (m,), against what others say."""
 
-    def _count(self, tick: Tick, view: View, healthy: bool) -> None:
-        """Count to whom bearings do not fit; `healthy`: most bearings do."""
+    def _count(self, tick: Tick, view: View) -> None:
+        """Count to whom bearings do not fit."""
 
     def _is_barred(self, sender: int, time: float) -> bool:
         """Return whether a sender is not to be believed."""

@@ -260,19 +260,31 @@ class Robust(Common):
         if worst is not None:
             self._distrust(self.contacts[worst], tick.time, error, True)
 
-    def _count(self, tick: Tick, view: View, healthy: bool) -> None:
-        """Average which share of the bearings to each member do not fit; believe those no more to which most do not."""
-        for k in range(len(view.fits)):
-            of = np.flatnonzero(view.sight.H[k, :, 6:].any(axis=0))
-            if len(of) == 0:
-                continue
-            member = self.belief.members[1 + int(of[0]) // 6]
-            word, missed = self._word(member.vehicle), float(not view.fits[k])
-            word.missed += (missed - word.missed) * min(1.0, tick.dt / LOST_TIME)
-            word.fitted += (1.0 - missed) * tick.dt
-            if healthy and member.considered and word.missed > LOST_SHARE:
+    def _target_of(self, view: View, k: int) -> Member | None:
+        """Return the member that a bearing is to, None if it is to a landmark."""
+        of = np.flatnonzero(view.sight.H[k, :, 6:].any(axis=0))
+        return self.belief.members[1 + int(of[0]) // 6] if len(of) else None
+
+    def _count(self, tick: Tick, view: View) -> None:
+        """Average which share of the bearings to each member do not fit; believe those no more to which most do not.
+
+        Only while those to most targets do: otherwise it may be the vehicle itself that is lost.
+        """
+        of = [self._target_of(view, k) for k in range(len(view.fits))]
+        balance = 0
+        for member, fits in zip(of, view.fits.tolist(), strict=True):
+            good, counts = fits, True
+            if member is not None:
+                word = self._word(member.vehicle)
+                word.missed += (float(not fits) - word.missed) * min(1.0, tick.dt / LOST_TIME)
+                word.fitted += fits * tick.dt
+                good, counts = word.missed < 0.5, self.contacts[member.vehicle].trusted
+            balance += (2 * int(good) - 1) * counts
+        for k, member in enumerate(of if balance > 0 else []):
+            if member is not None and member.considered and self._word(member.vehicle).missed > LOST_SHARE:
                 far = float(np.linalg.norm(view.sight.residual[k]) * view.sight.distance[k])
-                self._distrust(self.contacts[member.vehicle], tick.time, far, word.fitted > LOST_TIME)
+                fitted = self._word(member.vehicle).fitted > LOST_TIME
+                self._distrust(self.contacts[member.vehicle], tick.time, far, fitted)
 
     def _least(self, report: Report) -> float:
         """Return the share of its covariance that is added to a sender's: a little if it depends on others.
