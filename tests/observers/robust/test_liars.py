@@ -1,0 +1,99 @@
+"""Who lies is found out before it costs much: five vehicles of which each sees at least two honest targets besides.
+
+The paper's intersection with more neighbours. Honest errors are compared with those in the same worlds without a lie.
+`pytest -s -m slow tests/observers/robust/test_liars.py` prints the table of docs/robust.md.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coopenv.scenario import Scenario, load_scenario
+from tests.helpers.builders import errors, reset, simulate
+
+SEEN = (
+    ("SL1", "SL2", "SL3"),
+    ("SL1", "SL2", "SL3", "vehicle_1"),
+    ("SL2", "SL3", "vehicle_1", "vehicle_2"),
+    ("SL2", "SL3", "vehicle_1", "vehicle_2", "vehicle_3"),
+    ("SL3", "vehicle_1", "vehicle_2", "vehicle_3", "vehicle_4"),
+)
+LIES: dict[str, tuple[tuple[int, ...], dict[str, Any]]] = {
+    "the first from its first word, 5 m": ((0,), {"kind": "jump"}),
+    "the second from its first word, 5 m": ((1,), {"kind": "jump"}),
+    "the second from 15 s on, 5 m": ((1,), {"kind": "jump", "start": 15.0}),
+    "the second drifts at 5 cm/s from 15 s on": ((1,), {"kind": "drift", "start": 15.0}),
+    "the third drifts at 5 cm/s from 15 s on": ((2,), {"kind": "drift", "start": 15.0}),
+    "the second repeats itself 1 s late from 15 s on": ((1,), {"kind": "replay", "start": 15.0}),
+    "the first two collude from 15 s on, 5 m": ((0, 1), {"kind": "collude", "start": 15.0}),
+}
+
+
+def scene(liars: tuple[int, ...] = (), **lie: Any) -> Scenario:
+    """Return the five vehicles, of which some lie."""
+    made = load_scenario("busy_intersection_tracking", {"observer.name": "robust"})
+    raw = made.model_dump()
+    for vehicle, seen in zip(raw["vehicles"], SEEN, strict=True):
+        vehicle["neighbours"] = seen
+    for n in liars:
+        raw["vehicles"][n]["faults"] = {"lie": lie}
+    return Scenario(**raw)
+
+
+def mean_errors(made: Scenario, seeds: range, seconds: int, start: float) -> np.ndarray:
+    """Return (W, N) the mean position error of each vehicle from `start` on, m."""
+    world = simulate(made, len(seeds))
+    reset(world, seeds)
+    found = []
+    for k in range(2 * seconds):
+        world.advance(30)
+        if (k + 1) / 2 > start:
+            state = {name: world.view(name).copy() for name in ("rotation", "position")}
+            state |= {name: world.view(name).copy() for name in ("estimate_rotation", "estimate_position")}
+            found.append(errors(world, state)[1])
+    return np.mean(found, axis=0)
+
+
+@cache
+def honest(seeds: range, seconds: int, start: float) -> np.ndarray:
+    """Return the errors in worlds without a lie."""
+    return mean_errors(scene(), seeds, seconds, start)
+
+
+def cost(name: str, seeds: range, seconds: int) -> tuple[np.ndarray, float, float]:
+    """Return (N,) by how much larger errors are with a lie than without, NaN for who lies.
+
+    And that of the honest ones' mean error, with its standard error.
+    """
+    liars, lie = LIES[name]
+    start = max(lie.get("start", 0.0), 5.0)
+    without = honest(seeds, seconds, start).mean(axis=0)
+    found = mean_errors(scene(liars, **lie), seeds, seconds, start)
+    found[:, list(liars)] = np.nan
+    mean = np.nanmean(found, axis=1) / without[~np.isnan(found[0])].mean()
+    return found.mean(axis=0) / without, float(mean.mean()), float(mean.std(ddof=1) / np.sqrt(len(mean)))
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_a_lie_costs_little(name: str) -> None:
+    assert cost(name, range(4), 25)[1] < 3.5
+
+
+def test_who_is_honest_is_believed() -> None:
+    world = simulate(scene(), 8)
+    reset(world, range(8))
+    world.advance(60 * 25)
+    assert world.memory.word.numpy()["offences"].sum() <= 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LIES)
+def test_what_lies_cost_in_other_worlds(name: str) -> None:
+    ratio, mean, error = cost(name, range(500, 524), 45)
+    each = " ".join("-" if np.isnan(r) else f"{r:.2f}" for r in ratio)
+    print(f"\n{name}: {mean:.2f}({error:.2f}), each {each}")
+    assert mean < 3.0
