@@ -11,9 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
+from coopenv.observers import run
+from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.builders import errors, reset, simulate
+from tests.oracles.robust.observer import Robust
 
 SEEN = (
     ("SL1", "SL2", "SL3"),
@@ -33,9 +37,9 @@ LIES: dict[str, tuple[tuple[int, ...], dict[str, Any]]] = {
 }
 
 
-def scene(liars: tuple[int, ...] = (), **lie: Any) -> Scenario:
+def scene(liars: tuple[int, ...] = (), horizon: float = 50.0, **lie: Any) -> Scenario:
     """Return the five vehicles, of which some lie."""
-    made = load_scenario("busy_intersection_tracking", {"observer.name": "robust"})
+    made = load_scenario("busy_intersection_tracking", {"observer.name": "robust", "horizon": horizon})
     raw = made.model_dump()
     for vehicle, seen in zip(raw["vehicles"], SEEN, strict=True):
         vehicle["neighbours"] = seen
@@ -88,6 +92,23 @@ def test_who_is_honest_is_believed() -> None:
     reset(world, range(8))
     world.advance(60 * 25)
     assert world.memory.word.numpy()["offences"].sum() <= 1
+
+
+@pytest.mark.parametrize("lie", [{"kind": "jump"}, {"kind": "replay", "start": 2.0}, {"kind": "drift", "speed": 0.2}])
+def test_liars_are_judged_as_in_numpy(lie: dict[str, Any]) -> None:
+    recording = record(scene((1,), 6.0, **lie), 0)
+    judged = []
+
+    class Judge(Robust):
+        def _distrust(self, *arguments: Any) -> None:
+            judged.append(self.vehicle)
+            super()._distrust(*arguments)
+
+    expected, result = run(Judge, recording), run("robust", recording)
+    assert judged
+    assert not result.failure
+    for name in ("position", "rotation", "nees", "nis"):
+        assert_allclose(getattr(result, name), getattr(expected, name), rtol=1e-7, atol=1e-9, err_msg=name)
 
 
 @pytest.mark.slow
