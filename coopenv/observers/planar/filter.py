@@ -52,6 +52,7 @@ class PlanarFilter:
         self._walk = np.square([0.0, 0.0, 0.0, *tuning.walk])
         self._commands: CommandHistory | None = None
         self.level = NoiseLevel(tuning.level_std)
+        self._off = np.zeros(2)  # m, along and across, that an unsure heading has led astray since it was seen
 
     def advance(self, dt: float, turn: float, path: float) -> Step:
         """Move the estimate on by dt in s, over which the commands amount to a turn in rad and a path in m."""
@@ -68,12 +69,14 @@ class PlanarFilter:
         driven = s[SPEED_SCALE] * done[PATH] + s[SPEED_OFFSET] * done[ARC] - s[SLOWDOWN] * done[SLOWING]
         middle = float(s[HEADING] + turned / 2)
         c, sn = math.cos(middle), math.sin(middle)
+        shrunk, astray = self._astray(float(driven))
         turn_row, along = np.zeros(STATES), np.zeros(STATES)
         turn_row[TURN_SCALE], turn_row[TURN_OFFSET] = turning, -s[TURN_SCALE] * done[TURNING]
         turn_row[LEAD], turn_row[SHARE] = s[TURN_SCALE] * turning_late, s[TURN_SCALE] * (done[TURN] - done[TOLD])
         along[SPEED_SCALE], along[SPEED_OFFSET], along[SLOWDOWN] = done[PATH], done[ARC], -done[SLOWING]
         along[LEAD] = s[SPEED_SCALE] * late[PATH] + s[SPEED_OFFSET] * late[ARC] - s[SLOWDOWN] * late[SLOWING]
         across = turn_row * (driven / 2)
+        along, across, driven = shrunk * along, shrunk * across, shrunk * driven
         across[HEADING] = driven
         f = np.eye(STATES)
         f[X] += c * along - sn * across
@@ -86,8 +89,8 @@ class PlanarFilter:
         p.flat[:: STATES + 1] += self._walk * dt
         speed, rate = abs(done[PATH]) / dt, abs(done[TURN]) / dt
         factor = self.level.factor
-        q_path = factor * (k.path_noise[0] + k.path_noise[1] * speed) ** 2 * dt
-        q_side = factor * (k.slide_noise * speed) ** 2 * dt
+        q_path = factor * (k.path_noise[0] + k.path_noise[1] * speed) ** 2 * dt + astray[0]
+        q_side = factor * (k.slide_noise * speed) ** 2 * dt + astray[1]
         q_turn = (k.turn_noise[0] + k.turn_noise[1] * rate + k.turn_noise[2] * speed) ** 2 * dt
         q_turn = factor * (q_turn + k.jitter**2 * float(done[SWITCHING]))
         p[HEADING, HEADING] += q_turn
@@ -97,6 +100,22 @@ class PlanarFilter:
         p[Y, X] = p[X, Y]
         self.covariance = p
         return Step(float(turned), float(driven), q_turn, q_path)
+
+    def _astray(self, driven: float) -> tuple[float, tuple[float, float]]:
+        """Return what a path in m shrinks by, and what its errors along and across add in m^2, by an unsure heading.
+
+        With a normal heading of variance u the mean path is e^(-u/2) as long, its best linear function of the heading
+        leaves (1 - e^-u)^2 / 2 along and (1 - e^-2u) / 2 - u e^-u across, of the path squared. The heading's error
+        lasts, so that these add up as lengths and not as variances.
+        """
+        if not self.tuning.second_order:
+            return 1.0, (0.0, 0.0)
+        u = float(self.covariance[HEADING, HEADING])
+        left = 1 - math.exp(-u)
+        more = np.sqrt([left**2 / 2, max((1 - math.exp(-2 * u)) / 2 - u * (1 - left), 0.0)]) * abs(driven)
+        before, self._off = self._off, self._off + more
+        along, across = (self._off**2 - before**2).tolist()
+        return math.exp(-u / 2), (along, across)
 
     def landmark(self, bearing: float, x: float, y: float) -> float:
         """Correct with a bearing in rad to a known point in m; return its normalised innovation squared."""
@@ -188,5 +207,6 @@ class PlanarFilter:
         self.state += gain * innovation
         self.state[LEAD] = min(max(float(self.state[LEAD]), 0.0), MAX_LEAD_S)
         p = prior - np.outer(gain, ph)
+        self._off *= math.sqrt(max(p[HEADING, HEADING] / prior[HEADING, HEADING], 0.0))
         self.covariance = (p + p.T) / 2
         return ratio
