@@ -17,6 +17,7 @@ sooner or later, which leaves an error in the heading. All of this noise is as l
 """
 
 import math
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +32,7 @@ from coopenv.observers.planar.tuning import Tuning
 X, Y, HEADING, TURN_SCALE, SPEED_SCALE, TURN_OFFSET, SPEED_OFFSET, SLOWDOWN, LEAD, BIAS, SHARE = range(11)
 STATES = 11
 MAX_LEAD_S = 0.6
+MISREAD = 0.02  # share of bearings that may be anything
 NEAREST_M = 0.1  # nothing is seen from closer than this; bounds the bearing's derivatives
 
 
@@ -52,15 +54,32 @@ class PlanarFilter:
         self._walk = np.square([0.0, 0.0, 0.0, *tuning.walk])
         self._commands: CommandHistory | None = None
         self.level = NoiseLevel(tuning.level_std)
+        self.learns = True  # how large the noise is
+        self.evidence = 0.0  # logarithm of the likelihood of the last bearing
         self._off = np.zeros(2)  # m, along and across, that an unsure heading has led astray since it was seen
+
+    def copy(self) -> "PlanarFilter":
+        """Return another one like it, of the same robot: what was commanded, and the level of the noise, are shared."""
+        other = copy(self)
+        other.state, other.covariance, other._off = self.state.copy(), self.covariance.copy(), self._off.copy()
+        return other
 
     def advance(self, dt: float, turn: float, path: float) -> Step:
         """Move the estimate on by dt in s, over which the commands amount to a turn in rad and a path in m."""
-        k = self.tuning
+        self.command(dt, turn, path)
+        return self.move(dt)
+
+    def command(self, dt: float, turn: float, path: float) -> None:
+        """Take what was commanded over the last dt in s."""
         if self._commands is None:
-            self._commands = CommandHistory(k.wheels, MAX_LEAD_S, dt)
+            self._commands = CommandHistory(self.tuning.wheels, MAX_LEAD_S, dt)
         self._commands.add(dt, turn, path)
-        s = self.state
+
+    def move(self, dt: float) -> Step:
+        """Move the estimate on by dt in s, by what was commanded."""
+        k, s = self.tuning, self.state
+        if self._commands is None:
+            return Step(0.0, 0.0, 0.0, 0.0)
         done, late = self._commands.response(dt, float(s[LEAD]))
         turning, turning_late = (
             sums[TOLD] + s[SHARE] * (sums[TURN] - sums[TOLD]) - s[TURN_OFFSET] * sums[TURNING] for sums in (done, late)
@@ -154,9 +173,7 @@ class PlanarFilter:
 
     def tell(self) -> PlanarPose:
         """Return what others need: the heading is the camera's, from which bearings count (bias taken off)."""
-        pick = np.eye(3, STATES)
-        pick[HEADING, BIAS] = -1.0
-        return PlanarPose(pick @ self.state, pick @ self.covariance @ pick.T)
+        return picked(self.state, self.covariance)
 
     def _line(self, x: float, y: float, covariance: Array) -> tuple[Array, float, float]:
         """Return derivatives and direction of the line from here to a point, and the variance that they leave out."""
@@ -188,6 +205,7 @@ class PlanarFilter:
         cost = float(p[X, X] + p[Y, Y] + arm * p[HEADING, HEADING])
         ours_by, theirs_by = growth(own, gain, cost, theirs, noise, k.dependent)
         ratio = innovation**2 / (own + theirs + noise)
+        self._weigh(ratio, own + theirs + noise)
         if ours_by == 0.0 or ratio > k.others_gate:  # nothing is gained, or it is a lie
             return ratio
         grown = np.where(np.arange(STATES) <= HEADING, math.sqrt(ours_by), 1.0)  # nobody shares a calibration
@@ -198,7 +216,9 @@ class PlanarFilter:
         ph = prior @ h
         spread = float(h @ ph)
         ratio = innovation**2 / (spread + noise)
-        self.level.learn(ratio, spread / (spread + noise))
+        self._weigh(ratio, spread + noise)
+        if self.learns:
+            self.level.learn(ratio, spread / (spread + noise))
         if ratio > k.gate:
             return ratio
         if ratio > k.soft:
@@ -210,3 +230,15 @@ class PlanarFilter:
         self._off *= math.sqrt(max(p[HEADING, HEADING] / prior[HEADING, HEADING], 0.0))
         self.covariance = (p + p.T) / 2
         return ratio
+
+    def _weigh(self, ratio: float, variance: float) -> None:
+        """Remember how likely a bearing was; it may be anything once in a while."""
+        fits = math.exp(-ratio / 2) / math.sqrt(2 * math.pi * variance)
+        self.evidence = math.log((1 - MISREAD) * fits + MISREAD / (2 * math.pi))
+
+
+def picked(state: Array, covariance: Array) -> PlanarPose:
+    """Return x, y and the heading from which bearings count (the camera's bias taken off), with their covariance."""
+    pick = np.eye(3, STATES)
+    pick[HEADING, BIAS] = -1.0
+    return PlanarPose(pick @ state, pick @ covariance @ pick.T)

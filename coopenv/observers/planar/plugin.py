@@ -15,6 +15,7 @@ from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.planar.commands import Step
 from coopenv.observers.planar.filter import HEADING, PlanarFilter, PlanarPose, X, Y
 from coopenv.observers.planar.heard import LOWER, place_of, sightings_of
+from coopenv.observers.planar.mixture import Mixture
 from coopenv.observers.planar.tuning import TEXTBOOK, Tuning
 
 PLANE = np.ix_((2, 3, 4), (2, 3, 4))  # indices of the LEFT coordinates in the plane: yaw, forward, left
@@ -82,7 +83,7 @@ class PlanarEkf:
         return Message(position=np.array([state[X], state[Y], 0.0]), covariance=covariance, extra=extra)
 
     def _begin(self, pose: Array, covariance: Array) -> None:
-        self.filter = PlanarFilter(self.tuning, pose, covariance)
+        self.filter: PlanarFilter | Mixture = PlanarFilter(self.tuning, pose, covariance)
 
     def _advance(self, dt: float, turn: float, path: float) -> Step:
         return self.filter.advance(dt, turn, path)

@@ -11,6 +11,7 @@ from coopenv.observers.planar.commands import Step
 from coopenv.observers.planar.filter import BIAS, HEADING, TURN_SCALE, PlanarPose, X, Y
 from coopenv.observers.planar.loss import LossTest
 from coopenv.observers.planar.memory import Memory
+from coopenv.observers.planar.mixture import Mixture
 from coopenv.observers.planar.plugin import PlanarEkf
 from coopenv.observers.planar.search import Known, find_pose
 from coopenv.observers.planar.tuning import CALIBRATING, Tuning
@@ -65,11 +66,11 @@ class PlanarRobust(PlanarEkf):
         return super().message()
 
     def _begin(self, pose: Array, covariance: Array) -> None:
-        super()._begin(pose, covariance)
+        self.filter: Mixture = Mixture(self.tuning, pose, covariance)
         self._test, self._memory = LossTest(), Memory()
         self._next_search, self._failed, self._news = 0.0, 0, False
         self.lost, self._adrift, self._turned, self._from = False, 0.0, 0.0, 0.0
-        if self._unclear():
+        if self._unclear() or self.filter.covariance[HEADING, HEADING] > CLEAR_STD[1] ** 2:
             self._lose()
 
     def _advance(self, dt: float, turn: float, path: float) -> Step:
@@ -78,6 +79,8 @@ class PlanarRobust(PlanarEkf):
         self._news = False
         if self.lost:
             self._drift(step)
+        else:
+            self.filter.split()
         return step
 
     def _drift(self, step: Step) -> None:
@@ -116,7 +119,7 @@ class PlanarRobust(PlanarEkf):
 
     def _unclear(self) -> bool:
         variance = np.diag(self.filter.covariance)
-        return bool(variance[X] + variance[Y] > CLEAR_STD[0] ** 2 or variance[HEADING] > CLEAR_STD[1] ** 2)
+        return bool(variance[X] + variance[Y] > CLEAR_STD[0] ** 2)
 
     def _lose(self) -> None:
         """State that the pose is unknown."""

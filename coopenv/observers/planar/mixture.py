@@ -1,0 +1,158 @@
+"""Several planar filters side by side: what a robot believes whose heading one Gaussian cannot hold.
+
+Bearings and paths are linear in a heading that is known to half a radian, and in none that is not. A filter less sure
+than that is split along its heading into three, each with the wheels that lead there (a Gaussian is nearly the sum of
+three narrower ones; the numbers are those of least squares between the densities). Bearings then decide between them by
+their likelihood; filters that have become unlikely are dropped, and those that have come to say the same are merged:
+Alspach, Sorenson, "Nonlinear Bayesian estimation using Gaussian sum approximations", IEEE Trans. Automatic Control
+17(4), 1972.
+"""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from coopenv.estimation.arrays import Array
+from coopenv.observers.planar.bearing import wrapped
+from coopenv.observers.planar.commands import Step
+from coopenv.observers.planar.filter import HEADING, PlanarFilter, PlanarPose, picked
+from coopenv.observers.planar.tuning import Tuning
+
+WIDEST = 0.5  # rad, of the heading of one filter
+MOST = 15
+PARTS = ((-1.0575, 0.2252), (0.0, 0.5496), (1.0575, 0.2252))  # offset in standard deviations, weight
+NARROWED = 0.6716  # standard deviation of a part
+LEAST_WEIGHT = 1e-4
+SAME = 1.0  # squared distance of two poses, normalised, up to which they are merged
+TEMPERED = 0.3  # power of a robot's likelihood: its errors last over many of its messages
+
+
+class Mixture:
+    """One robot's estimate as a weighted sum of filters, mostly of one; it has the methods of one filter."""
+
+    def __init__(self, tuning: Tuning, pose: Array, covariance: Array) -> None:
+        self.tuning = tuning
+        self.filters = [PlanarFilter(tuning, pose, covariance)]
+        self._weights = np.ones(1)
+
+    @property
+    def state(self) -> Array:
+        """Mean of the state."""
+        return self.filters[0].state if len(self.filters) == 1 else self._moments()[0]
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of the state, with what the filters differ in."""
+        return self.filters[0].covariance if len(self.filters) == 1 else self._moments()[1]
+
+    def advance(self, dt: float, turn: float, path: float) -> Step:
+        """Move all filters on; return the step of the likeliest one."""
+        for one in self.filters:
+            one.level = self.filters[0].level
+        self.filters[0].command(dt, turn, path)
+        steps = [one.move(dt) for one in self.filters]
+        return steps[int(np.argmax(self._weights))]
+
+    def landmark(self, bearing: float, x: float, y: float) -> float:
+        """Correct with a bearing in rad to a known point in m; return its normalised innovation squared."""
+        return self._take(lambda one: one.landmark(bearing, x, y), 1.0)
+
+    def robot(self, bearing: float, other: PlanarPose) -> float:
+        """Correct with a bearing in rad to a robot that tells where it thinks it is; return the same."""
+        return self._take(lambda one: one.robot(bearing, other), TEMPERED)
+
+    def seen(self, bearing: float, other: PlanarPose) -> float:
+        """Correct with the bearing in rad under which another robot, which tells its pose, sees this one; the same."""
+        return self._take(lambda one: one.seen(bearing, other), TEMPERED)
+
+    def place(self, pose: Array, covariance: Array) -> None:
+        """Put it at a pose (3,) with a covariance (3, 3); what is known of the wheels stays."""
+        if len(self.filters) > 1:
+            mean, joint = self._moments()
+            one = self.filters[int(np.argmax(self._weights))]
+            one.state, one.covariance = mean, joint
+            self._keep([one], np.ones(1))
+        self.filters[0].place(pose, covariance)
+
+    def doubt(self) -> None:
+        """Doubt what was found out about the wheels as much as at the start, and keep what is plausible of it."""
+        for one in self.filters:
+            one.doubt()
+
+    def tell(self) -> PlanarPose:
+        """Return what others need."""
+        return self.filters[0].tell() if len(self.filters) == 1 else picked(*self._moments())
+
+    def _take(self, correct: Callable[[PlanarFilter], float], power: float) -> float:
+        if len(self.filters) == 1:
+            return correct(self.filters[0])
+        for one in self.filters:
+            one.learns = False  # the unlikely ones would blame the noise
+        ratios = np.array([correct(one) for one in self.filters])
+        logs = np.log(self._weights) + power * np.array([one.evidence for one in self.filters])
+        likely = self._weights @ np.exp(-(ratios - ratios.min()) / 2)
+        weights = np.exp(logs - logs.max())
+        weights /= weights.sum()
+        kept = np.flatnonzero(weights > LEAST_WEIGHT)
+        self._keep([self.filters[k] for k in kept], weights[kept])
+        self._merge()
+        return float(ratios.min() - 2 * math.log(likely))
+
+    def _keep(self, filters: list[PlanarFilter], weights: Array) -> None:
+        self.filters, self._weights = filters, weights / weights.sum()
+        filters[0].learns = True
+
+    def split(self) -> None:
+        """Split the likeliest filter that is not sure of its heading, if there is one."""
+        wide = [k for k, one in enumerate(self.filters) if one.covariance[HEADING, HEADING] > WIDEST**2]
+        if not wide or len(self.filters) + 2 > MOST:
+            return
+        k = max(wide, key=lambda k: float(self._weights[k]))
+        one, weight = self.filters[k], float(self._weights[k])
+        variance = float(one.covariance[HEADING, HEADING])
+        slope = one.covariance[:, HEADING] / variance
+        narrow = one.covariance - (1 - NARROWED**2) * variance * np.outer(slope, slope)
+        parts = []
+        for offset, _ in PARTS:
+            part = one.copy()
+            part.state = one.state + offset * math.sqrt(variance) * slope
+            part.covariance = narrow.copy()
+            parts.append(part)
+        filters = [other for other in self.filters if other is not one] + parts
+        weights = [*np.delete(self._weights, k).tolist(), *(weight * share for _, share in PARTS)]
+        self._keep(filters, np.array(weights))
+
+    def _merge(self) -> None:
+        """Merge the first two that say the same, narrow enough together."""
+        for i, one in enumerate(self.filters):
+            for j in range(i):
+                off = one.state - self.filters[j].state
+                turns = wrapped(float(off[HEADING])) - float(off[HEADING])
+                off[HEADING] += turns
+                joint = one.covariance[:3, :3] + self.filters[j].covariance[:3, :3]
+                if abs(off[HEADING]) < WIDEST and float(off[:3] @ np.linalg.solve(joint, off[:3])) < SAME:
+                    one.state[HEADING] += turns
+                    self._join(i, j)
+                    return
+
+    def _join(self, i: int, j: int) -> None:
+        pair = [i, j]
+        weights = self._weights[pair] / self._weights[pair].sum()
+        kept = self.filters[pair[int(np.argmax(weights))]]
+        kept.state, kept.covariance = _moments(weights, [self.filters[k] for k in pair])
+        self._weights[j] += self._weights[i]
+        self.filters[j] = kept
+        self._keep([one for k, one in enumerate(self.filters) if k != i], np.delete(self._weights, i))
+
+    def _moments(self) -> tuple[Array, Array]:
+        return _moments(self._weights, self.filters)
+
+
+def _moments(weights: Array, filters: list[PlanarFilter]) -> tuple[Array, Array]:
+    """Return the mean and the covariance of a weighted sum of Gaussians."""
+    states = np.array([one.state for one in filters])
+    mean = weights @ states
+    off = states - mean
+    within = np.tensordot(weights, np.array([one.covariance for one in filters]), 1)
+    return mean, within + (off * weights[:, None]).T @ off
