@@ -1,4 +1,4 @@
-"""Angles on a plane."""
+"""Angles on a plane, and what linear functions of them leave out."""
 
 import math
 
@@ -21,3 +21,14 @@ def left_out(dx: float, dy: float, square: float, covariance: Array) -> float:
     across = (dy * dy * xx - 2 * dx * dy * xy + dx * dx * yy) / square
     both = (dx * dy * (yy - xx) + (dx * dx - dy * dy) * xy) / square
     return float((along * across + both * both) / square**2)
+
+
+def unsure(variance: float) -> tuple[float, float, float]:
+    """Return what a straight path becomes under a normal error of its heading of a variance in rad^2.
+
+    By what its mean shrinks, and the standard deviations along and across it, relative to its length, of what the best
+    linear function of the heading leaves: e^(-u/2), (1 - e^-u) / sqrt 2 and sqrt((1 - e^-2u) / 2 - u e^-u).
+    """
+    left = -math.expm1(-variance)
+    across = -math.expm1(-2 * variance) / 2 - variance * (1 - left)
+    return math.exp(-variance / 2), left / math.sqrt(2), math.sqrt(max(across, 0.0))

@@ -1,140 +1,22 @@
-"""A planar bearing-only extended Kalman filter that calibrates its robot's odometry.
-
-Its state is
-
-    x, y [m], heading [rad], turn scale [-], speed scale [-], turn offset [rad/s], speed offset [m/s],
-    slowdown in turns [s/rad], command lead [s], bearing bias [rad], wheels' share [-]
-
-and the commands w, v, late by the lead and spread by the wheels' response, move it by
-
-    turn = turn scale * (W - turn offset * G),    path = speed scale * V + speed offset * T - slowdown * U
-
-over a tick: W is the integral of w + share (g - 1) w, g the wheels' gain as it was measured on one kind of robot (a
-share of 0 is another kind), G is that of g over the time in which a turn is commanded, T is that time, V and U are the
-integrals of v and v |w|. A robot told to drive straight does so. A step of the commanded rate takes effect a jitter
-sooner or later, which leaves an error in the heading. All of this noise is as large as the innovations say
-(`level.py`). With no spread in the last eight numbers and a fixed level it is the textbook filter.
-"""
+"""A planar bearing-only extended Kalman filter that calibrates its robot's odometry (`motion.py` has its state)."""
 
 import math
-from copy import copy
-from typing import NamedTuple
 
 import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.observers.planar.bearing import left_out, wrapped
-from coopenv.observers.planar.commands import ARC, PATH, SLOWING, SWITCHING, TOLD, TURN, TURNING, CommandHistory, Step
 from coopenv.observers.planar.intersection import growth
 from coopenv.observers.planar.level import NoiseLevel
-from coopenv.observers.planar.tuning import Tuning
+from coopenv.observers.planar.motion import MAX_LEAD_S, PlanarMotion
+from coopenv.observers.planar.state import BIAS, HEADING, LEAD, STATES, PlanarPose, X, Y, picked
 
-X, Y, HEADING, TURN_SCALE, SPEED_SCALE, TURN_OFFSET, SPEED_OFFSET, SLOWDOWN, LEAD, BIAS, SHARE = range(11)
-STATES = 11
-MAX_LEAD_S = 0.6
 MISREAD = 0.02  # share of bearings that may be anything
 NEAREST_M = 0.1  # nothing is seen from closer than this; bounds the bearing's derivatives
 
 
-class PlanarPose(NamedTuple):
-    """What a robot tells another: x m, y m, heading rad (3,), and their covariance (3, 3)."""
-
-    pose: Array
-    covariance: Array
-
-
-class PlanarFilter:
-    """One robot's estimate, which starts at a pose (x m, y m, heading rad) with a covariance (3, 3)."""
-
-    def __init__(self, tuning: Tuning, pose: Array, covariance: Array) -> None:
-        self.tuning = tuning
-        self.state: Array = np.array([*pose, *tuning.mean])
-        self.covariance: Array = np.diag(np.square([0.0, 0.0, 0.0, *tuning.std]))
-        self.covariance[:3, :3] = covariance
-        self._walk = np.square([0.0, 0.0, 0.0, *tuning.walk])
-        self._commands: CommandHistory | None = None
-        self.level = NoiseLevel(tuning.level_std)
-        self.learns = True  # how large the noise is
-        self.evidence = 0.0  # logarithm of the likelihood of the last bearing
-        self._off = np.zeros(2)  # m, along and across, that an unsure heading has led astray since it was seen
-
-    def copy(self) -> "PlanarFilter":
-        """Return another one like it, of the same robot: what was commanded, and the level of the noise, are shared."""
-        other = copy(self)
-        other.state, other.covariance, other._off = self.state.copy(), self.covariance.copy(), self._off.copy()
-        return other
-
-    def advance(self, dt: float, turn: float, path: float) -> Step:
-        """Move the estimate on by dt in s, over which the commands amount to a turn in rad and a path in m."""
-        self.command(dt, turn, path)
-        return self.move(dt)
-
-    def command(self, dt: float, turn: float, path: float) -> None:
-        """Take what was commanded over the last dt in s."""
-        if self._commands is None:
-            self._commands = CommandHistory(self.tuning.wheels, MAX_LEAD_S, dt)
-        self._commands.add(dt, turn, path)
-
-    def move(self, dt: float) -> Step:
-        """Move the estimate on by dt in s, by what was commanded."""
-        k, s = self.tuning, self.state
-        if self._commands is None:
-            return Step(0.0, 0.0, 0.0, 0.0)
-        done, late = self._commands.response(dt, float(s[LEAD]))
-        turning, turning_late = (
-            sums[TOLD] + s[SHARE] * (sums[TURN] - sums[TOLD]) - s[TURN_OFFSET] * sums[TURNING] for sums in (done, late)
-        )
-        turned = s[TURN_SCALE] * turning
-        driven = s[SPEED_SCALE] * done[PATH] + s[SPEED_OFFSET] * done[ARC] - s[SLOWDOWN] * done[SLOWING]
-        middle = float(s[HEADING] + turned / 2)
-        c, sn = math.cos(middle), math.sin(middle)
-        shrunk, astray = self._astray(float(driven))
-        turn_row, along = np.zeros(STATES), np.zeros(STATES)
-        turn_row[TURN_SCALE], turn_row[TURN_OFFSET] = turning, -s[TURN_SCALE] * done[TURNING]
-        turn_row[LEAD], turn_row[SHARE] = s[TURN_SCALE] * turning_late, s[TURN_SCALE] * (done[TURN] - done[TOLD])
-        along[SPEED_SCALE], along[SPEED_OFFSET], along[SLOWDOWN] = done[PATH], done[ARC], -done[SLOWING]
-        along[LEAD] = s[SPEED_SCALE] * late[PATH] + s[SPEED_OFFSET] * late[ARC] - s[SLOWDOWN] * late[SLOWING]
-        across = turn_row * (driven / 2)
-        along, across, driven = shrunk * along, shrunk * across, shrunk * driven
-        across[HEADING] = driven
-        f = np.eye(STATES)
-        f[X] += c * along - sn * across
-        f[Y] += sn * along + c * across
-        f[HEADING] += turn_row
-        s[X] += driven * c
-        s[Y] += driven * sn
-        s[HEADING] += turned
-        p = f @ self.covariance @ f.T
-        p.flat[:: STATES + 1] += self._walk * dt
-        speed, rate = abs(done[PATH]) / dt, abs(done[TURN]) / dt
-        factor = self.level.factor
-        q_path = factor * (k.path_noise[0] + k.path_noise[1] * speed) ** 2 * dt + astray[0]
-        q_side = factor * (k.slide_noise * speed) ** 2 * dt + astray[1]
-        q_turn = (k.turn_noise[0] + k.turn_noise[1] * rate + k.turn_noise[2] * speed) ** 2 * dt
-        q_turn = factor * (q_turn + k.jitter**2 * float(done[SWITCHING]))
-        p[HEADING, HEADING] += q_turn
-        p[X, X] += q_path * c * c + q_side * sn * sn
-        p[Y, Y] += q_path * sn * sn + q_side * c * c
-        p[X, Y] += (q_path - q_side) * c * sn
-        p[Y, X] = p[X, Y]
-        self.covariance = p
-        return Step(float(turned), float(driven), q_turn, q_path)
-
-    def _astray(self, driven: float) -> tuple[float, tuple[float, float]]:
-        """Return what a path in m shrinks by, and what its errors along and across add in m^2, by an unsure heading.
-
-        With a normal heading of variance u the mean path is e^(-u/2) as long, its best linear function of the heading
-        leaves (1 - e^-u)^2 / 2 along and (1 - e^-2u) / 2 - u e^-u across, of the path squared. The heading's error
-        lasts, so that these add up as lengths and not as variances.
-        """
-        if not self.tuning.second_order:
-            return 1.0, (0.0, 0.0)
-        u = float(self.covariance[HEADING, HEADING])
-        left = 1 - math.exp(-u)
-        more = np.sqrt([left**2 / 2, max((1 - math.exp(-2 * u)) / 2 - u * (1 - left), 0.0)]) * abs(driven)
-        before, self._off = self._off, self._off + more
-        along, across = (self._off**2 - before**2).tolist()
-        return math.exp(-u / 2), (along, across)
+class PlanarFilter(PlanarMotion):
+    """One robot's estimate, corrected by bearings."""
 
     def landmark(self, bearing: float, x: float, y: float) -> float:
         """Correct with a bearing in rad to a known point in m; return its normalised innovation squared."""
@@ -227,7 +109,7 @@ class PlanarFilter:
         self.state += gain * innovation
         self.state[LEAD] = min(max(float(self.state[LEAD]), 0.0), MAX_LEAD_S)
         p = prior - np.outer(gain, ph)
-        self._off *= math.sqrt(max(p[HEADING, HEADING] / prior[HEADING, HEADING], 0.0))
+        self._off = self._off * math.sqrt(max(p[HEADING, HEADING] / prior[HEADING, HEADING], 0.0))
         self.covariance = (p + p.T) / 2
         return ratio
 
@@ -235,10 +117,3 @@ class PlanarFilter:
         """Remember how likely a bearing was; it may be anything once in a while."""
         fits = math.exp(-ratio / 2) / math.sqrt(2 * math.pi * variance)
         self.evidence = math.log((1 - MISREAD) * fits + MISREAD / (2 * math.pi))
-
-
-def picked(state: Array, covariance: Array) -> PlanarPose:
-    """Return x, y and the heading from which bearings count (the camera's bias taken off), with their covariance."""
-    pick = np.eye(3, STATES)
-    pick[HEADING, BIAS] = -1.0
-    return PlanarPose(pick @ state, pick @ covariance @ pick.T)

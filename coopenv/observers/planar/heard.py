@@ -7,7 +7,7 @@ import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Received
-from coopenv.observers.planar.filter import PlanarPose
+from coopenv.observers.planar.state import PlanarPose
 
 OLDEST_S = 2.0
 SPEED = 0.15  # m/s, by which a robot may have moved since it told where it is

@@ -6,17 +6,22 @@ three narrower ones; the numbers are those of least squares between the densitie
 their likelihood; filters that have become unlikely are dropped, and those that have come to say the same are merged:
 Alspach, Sorenson, "Nonlinear Bayesian estimation using Gaussian sum approximations", IEEE Trans. Automatic Control
 17(4), 1972.
+
+Another filter stands for the few robots whose odometry drifts even where it says that they drive straight, as that of a
+gyro does, where that of commands does not. It is dropped as soon as it is unlikely.
 """
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.observers.planar.bearing import wrapped
 from coopenv.observers.planar.commands import Step
-from coopenv.observers.planar.filter import HEADING, PlanarFilter, PlanarPose, picked
+from coopenv.observers.planar.filter import PlanarFilter
+from coopenv.observers.planar.state import HEADING, PlanarPose, picked
 from coopenv.observers.planar.tuning import Tuning
 
 WIDEST = 0.5  # rad, of the heading of one filter
@@ -33,8 +38,13 @@ class Mixture:
 
     def __init__(self, tuning: Tuning, pose: Array, covariance: Array) -> None:
         self.tuning = tuning
-        self.filters = [PlanarFilter(tuning, pose, covariance)]
-        self._weights = np.ones(1)
+        kinds = [tuning]
+        share = tuning.drifting[1]
+        if share > 0:
+            kinds.append(replace(tuning, std=(*tuning.std[:-1], tuning.drifting[0])))
+        self.filters = [PlanarFilter(kind, pose, covariance) for kind in kinds]
+        self._weights = np.array([1 - share, share][: len(kinds)])
+        self._share()
 
     @property
     def state(self) -> Array:
@@ -48,9 +58,8 @@ class Mixture:
 
     def advance(self, dt: float, turn: float, path: float) -> Step:
         """Move all filters on; return the step of the likeliest one."""
-        for one in self.filters:
-            one.level = self.filters[0].level
         self.filters[0].command(dt, turn, path)
+        self._share()
         steps = [one.move(dt) for one in self.filters]
         return steps[int(np.argmax(self._weights))]
 
@@ -87,8 +96,6 @@ class Mixture:
     def _take(self, correct: Callable[[PlanarFilter], float], power: float) -> float:
         if len(self.filters) == 1:
             return correct(self.filters[0])
-        for one in self.filters:
-            one.learns = False  # the unlikely ones would blame the noise
         ratios = np.array([correct(one) for one in self.filters])
         logs = np.log(self._weights) + power * np.array([one.evidence for one in self.filters])
         likely = self._weights @ np.exp(-(ratios - ratios.min()) / 2)
@@ -101,7 +108,14 @@ class Mixture:
 
     def _keep(self, filters: list[PlanarFilter], weights: Array) -> None:
         self.filters, self._weights = filters, weights / weights.sum()
-        filters[0].learns = True
+        self._share()
+
+    def _share(self) -> None:
+        """Let all filters have the history and the noise of the likeliest one, which alone learns how large it is."""
+        best = self.filters[int(np.argmax(self._weights))]
+        for one in self.filters:
+            one.learns = one is best
+            one.level, one.history = best.level, self.filters[0].history
 
     def split(self) -> None:
         """Split the likeliest filter that is not sure of its heading, if there is one."""
@@ -127,11 +141,14 @@ class Mixture:
         """Merge the first two that say the same, narrow enough together."""
         for i, one in enumerate(self.filters):
             for j in range(i):
-                off = one.state - self.filters[j].state
+                other = self.filters[j]
+                off = one.state[:3] - other.state[:3]
                 turns = wrapped(float(off[HEADING])) - float(off[HEADING])
                 off[HEADING] += turns
-                joint = one.covariance[:3, :3] + self.filters[j].covariance[:3, :3]
-                if abs(off[HEADING]) < WIDEST and float(off[:3] @ np.linalg.solve(joint, off[:3])) < SAME:
+                if one.tuning is not other.tuning or abs(off[HEADING]) > WIDEST:
+                    continue
+                joint = one.covariance[:3, :3] + other.covariance[:3, :3]
+                if float(off @ np.linalg.solve(joint, off)) < SAME:
                     one.state[HEADING] += turns
                     self._join(i, j)
                     return

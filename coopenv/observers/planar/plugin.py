@@ -13,9 +13,10 @@ from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.planar.commands import Step
-from coopenv.observers.planar.filter import HEADING, PlanarFilter, PlanarPose, X, Y
+from coopenv.observers.planar.filter import PlanarFilter
 from coopenv.observers.planar.heard import LOWER, place_of, sightings_of
 from coopenv.observers.planar.mixture import Mixture
+from coopenv.observers.planar.state import HEADING, PlanarPose, X, Y
 from coopenv.observers.planar.tuning import TEXTBOOK, Tuning
 
 PLANE = np.ix_((2, 3, 4), (2, 3, 4))  # indices of the LEFT coordinates in the plane: yaw, forward, left

@@ -8,12 +8,12 @@ import numpy as np
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.planar.commands import Step
-from coopenv.observers.planar.filter import BIAS, HEADING, TURN_SCALE, PlanarPose, X, Y
 from coopenv.observers.planar.loss import LossTest
 from coopenv.observers.planar.memory import Memory
 from coopenv.observers.planar.mixture import Mixture
 from coopenv.observers.planar.plugin import PlanarEkf
 from coopenv.observers.planar.search import Known, find_pose
+from coopenv.observers.planar.state import BIAS, HEADING, TURN_SCALE, PlanarPose, X, Y
 from coopenv.observers.planar.tuning import CALIBRATING, Tuning
 
 CLEAR_STD = (8.0, 1.6)  # m, rad; whoever is less certain cannot correct with single bearings, and collects them

@@ -20,6 +20,7 @@ FEWEST = 6  # bearings that agree
 FEWEST_TARGETS = 3  # of them
 AGREES = 9.0  # normalised square of the angle up to which a bearing agrees with a pose
 SHARE = 0.75  # of all bearings that must agree
+WORST = 2.0  # mean of those squares of the bearings that agree, 1 where all is as it should be
 MARGIN = 12.0  # by which the cost of any other pose is larger
 APART = (0.5, 0.3)  # m, rad: poses further apart than that are different ones
 CERTAIN = (1.0, 0.35)  # m, rad: standard deviation of a pose that counts
@@ -53,14 +54,16 @@ def find_pose(lines: Lines, before: Known) -> Answer:
     first = int(np.argmin(cost))
     apart = poses - poses[first]
     other = (np.hypot(apart[:, 0], apart[:, 1]) > APART[0]) | (np.abs(_wrapped(apart[:, 2])) > APART[1])
-    agree = _squares(lines, poses[first : first + 1])[0] < AGREES
+    squares = _squares(lines, poses[first : first + 1])[0]
+    agree = squares < AGREES
     if agree.sum() < max(FEWEST, SHARE * len(agree)):
         return Answer(None, contradicted=True)
-    if len(np.unique(lines.target[agree])) < FEWEST_TARGETS:
+    worse = float(squares[agree].mean())  # than noise, which has 1
+    if worse > WORST or len(np.unique(lines.target[agree])) < FEWEST_TARGETS:
         return Answer(None)
     if (other & (cost < cost[first] + MARGIN)).any():
         return Answer(None)
-    said = information[first] / GROWTH
+    said = information[first] / (GROWTH * max(worse, 1.0))
     left = np.linalg.inv(said + before.information)
     if left[0, 0] + left[1, 1] > CERTAIN[0] ** 2 or left[2, 2] > CERTAIN[1] ** 2:
         return Answer(None)

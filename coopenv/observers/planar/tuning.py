@@ -6,7 +6,7 @@ from typing import Literal
 
 from coopenv.observers.planar.commands import Wheels
 
-Eight = tuple[float, float, float, float, float, float, float, float]
+Nine = tuple[float, float, float, float, float, float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,11 +22,13 @@ class Tuning:
     others_gate: float = math.inf  # the same of a bearing to or from a robot, before the covariances grow
     soft: float = math.inf  # the same above which a bearing's variance grows with it (a heavy tail)
     second_order: bool = False  # whether a bearing's variance grows with what its linearisation leaves out
-    mean: Eight = (1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    """Turn scale, speed scale, turn offset, speed offset, slowdown, lead, bearing bias and wheels' share at the
+    mean: Nine = (1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+    """Turn scale, speed scale, turn offset, speed offset, slowdown, lead, bearing bias, wheels' share and drift at the
     start."""
-    std: Eight = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the same
-    walk: Eight = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the same, per sqrt(s)
+    std: Nine = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the same
+    walk: Nine = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the same, per sqrt(s)
+    drifting: tuple[float, float] = (0.0, 0.0)
+    """Standard deviation of the drift, rad/s, of robots that drift, and their share; `std` has that of the others."""
     jitter: float = 0.0  # s, by which a step of the commanded rate may take effect sooner or later
     level_std: float = 0.0  # of the logarithm of a factor on all motion noise, learnt from the innovations; 0: fixed
     wheels: Wheels = field(default_factory=Wheels)
@@ -58,9 +60,10 @@ CALIBRATING = Tuning(
     others_gate=36.0,
     soft=4.0,
     second_order=True,
-    mean=(0.936, 1.0, 0.005, 0.004, 1.0, 0.15, 0.0, 1.0),
-    std=(0.25, 0.04, 0.001, 0.002, 0.3, 0.05, 0.007, 0.3),
-    walk=(0.0003, 0.0003, 0.0, 0.0001, 0.0003, 0.0005, 0.0, 0.0),
+    mean=(0.936, 1.0, 0.005, 0.004, 1.0, 0.15, 0.0, 1.0, 0.0),
+    std=(0.25, 0.04, 0.001, 0.002, 0.3, 0.05, 0.007, 0.3, 0.001),
+    walk=(0.0003, 0.0003, 0.0, 0.0001, 0.0003, 0.0005, 0.0, 0.0, 0.0),
+    drifting=(0.02, 0.02),
     jitter=0.09,
     level_std=0.7,
     wheels=IROBOT_CREATE,
