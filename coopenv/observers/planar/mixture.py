@@ -21,14 +21,15 @@ from coopenv.estimation.arrays import Array
 from coopenv.observers.planar.bearing import wrapped
 from coopenv.observers.planar.commands import Step
 from coopenv.observers.planar.filter import PlanarFilter
-from coopenv.observers.planar.state import HEADING, PlanarPose, picked
+from coopenv.observers.planar.state import HEADING, STATES, PlanarPose, picked
 from coopenv.observers.planar.tuning import Tuning
 
 WIDEST = 0.5  # rad, of the heading of one filter
 MOST = 15
 PARTS = ((-1.0575, 0.2252), (0.0, 0.5496), (1.0575, 0.2252))  # offset in standard deviations, weight
 NARROWED = 0.6716  # standard deviation of a part
-LEAST_WEIGHT = 1e-4
+LEAST_WEIGHT = 1e-3
+LEAST_SHARE = 5e-3  # of a kind of robot; the drifting one with no drift to be seen comes to less
 SAME = 1.0  # squared distance of two poses, normalised, up to which they are merged
 TEMPERED = 0.3  # power of a robot's likelihood: its errors last over many of its messages
 
@@ -58,6 +59,7 @@ class Mixture:
 
     def advance(self, dt: float, turn: float, path: float) -> Step:
         """Move all filters on; return the step of the likeliest one."""
+        self._known = None
         self.filters[0].command(dt, turn, path)
         self._share()
         steps = [one.move(dt) for one in self.filters]
@@ -82,10 +84,12 @@ class Mixture:
             one = self.filters[int(np.argmax(self._weights))]
             one.state, one.covariance = mean, joint
             self._keep([one], np.ones(1))
+        self._known = None
         self.filters[0].place(pose, covariance)
 
     def doubt(self) -> None:
         """Doubt what was found out about the wheels as much as at the start, and keep what is plausible of it."""
+        self._known = None
         for one in self.filters:
             one.doubt()
 
@@ -101,7 +105,9 @@ class Mixture:
         likely = self._weights @ np.exp(-(ratios - ratios.min()) / 2)
         weights = np.exp(logs - logs.max())
         weights /= weights.sum()
-        kept = np.flatnonzero(weights > LEAST_WEIGHT)
+        best = self.filters[int(np.argmax(weights))].tuning
+        least = np.array([LEAST_WEIGHT if one.tuning is best else LEAST_SHARE for one in self.filters])
+        kept = np.flatnonzero(weights > least)
         self._keep([self.filters[k] for k in kept], weights[kept])
         self._merge()
         return float(ratios.min() - 2 * math.log(likely))
@@ -112,6 +118,7 @@ class Mixture:
 
     def _share(self) -> None:
         """Let all filters have the history and the noise of the likeliest one, which alone learns how large it is."""
+        self._known: tuple[Array, Array] | None = None  # mean and covariance, once they were asked for
         best = self.filters[int(np.argmax(self._weights))]
         for one in self.filters:
             one.learns = one is best
@@ -163,13 +170,15 @@ class Mixture:
         self._keep([one for k, one in enumerate(self.filters) if k != i], np.delete(self._weights, i))
 
     def _moments(self) -> tuple[Array, Array]:
-        return _moments(self._weights, self.filters)
+        if self._known is None:
+            self._known = _moments(self._weights, self.filters)
+        return self._known
 
 
 def _moments(weights: Array, filters: list[PlanarFilter]) -> tuple[Array, Array]:
     """Return the mean and the covariance of a weighted sum of Gaussians."""
     states = np.array([one.state for one in filters])
-    mean = weights @ states
+    mean = weights.dot(states)
     off = states - mean
-    within = np.tensordot(weights, np.array([one.covariance for one in filters]), 1)
-    return mean, within + (off * weights[:, None]).T @ off
+    within = weights.dot(np.array([one.covariance.ravel() for one in filters]))
+    return mean, within.reshape(STATES, STATES) + (off.T * weights).dot(off)

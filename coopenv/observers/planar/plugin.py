@@ -16,7 +16,7 @@ from coopenv.observers.planar.commands import Step
 from coopenv.observers.planar.filter import PlanarFilter
 from coopenv.observers.planar.heard import LOWER, place_of, sightings_of
 from coopenv.observers.planar.mixture import Mixture
-from coopenv.observers.planar.state import HEADING, PlanarPose, X, Y
+from coopenv.observers.planar.state import PlanarPose, X, Y
 from coopenv.observers.planar.tuning import TEXTBOOK, Tuning
 
 PLANE = np.ix_((2, 3, 4), (2, 3, 4))  # indices of the LEFT coordinates in the plane: yaw, forward, left
@@ -122,7 +122,7 @@ class PlanarEkf:
                     self._be_seen(tick, target, bearing, told[0])
 
     def _estimate(self) -> Estimate:
-        x, y, heading = self.filter.state[[X, Y, HEADING]]
+        x, y, heading = self.filter.state[:3].tolist()
         c, s = math.cos(heading), math.sin(heading)
         turn = _from_body(heading)
         covariance = OUT_OF_PLANE_STD**2 * np.eye(6)

@@ -20,12 +20,13 @@ FEWEST = 6  # bearings that agree
 FEWEST_TARGETS = 3  # of them
 AGREES = 9.0  # normalised square of the angle up to which a bearing agrees with a pose
 SHARE = 0.75  # of all bearings that must agree
-WORST = 2.0  # mean of those squares of the bearings that agree, 1 where all is as it should be
+WORST = 4.0  # mean of those squares of the bearings that agree, 1 where all is as it should be
 MARGIN = 12.0  # by which the cost of any other pose is larger
 APART = (0.5, 0.3)  # m, rad: poses further apart than that are different ones
 CERTAIN = (1.0, 0.35)  # m, rad: standard deviation of a pose that counts
 NEAREST_M = 0.3
-GROWTH = 2.0  # of the covariance of what bearings say: those of the same odometry share errors
+GROWTH = 2.0  # of the covariance of what bearings say, for a pose to be certain
+SHARED = 2.0  # by which it is larger still, or as much as they fit worse: those of the same odometry share errors
 
 
 class Known(NamedTuple):
@@ -63,11 +64,11 @@ def find_pose(lines: Lines, before: Known) -> Answer:
         return Answer(None)
     if (other & (cost < cost[first] + MARGIN)).any():
         return Answer(None)
-    said = information[first] / (GROWTH * max(worse, 1.0))
+    said = information[first] / GROWTH
     left = np.linalg.inv(said + before.information)
     if left[0, 0] + left[1, 1] > CERTAIN[0] ** 2 or left[2, 2] > CERTAIN[1] ** 2:
         return Answer(None)
-    return Answer(Known(poses[first], said))
+    return Answer(Known(poses[first], said / max(SHARED, worse)))
 
 
 def _positions(lines: Lines, headings: Array, before: Known) -> Array:

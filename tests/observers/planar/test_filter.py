@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from coopenv.observers.planar.bearing import left_out
+from coopenv.observers.planar.bearing import left_out, unsure
 from coopenv.observers.planar.commands import (
     ARC,
     PATH,
@@ -144,6 +144,17 @@ def test_what_a_linearised_bearing_leaves_out_is_as_drawn():
     bearing = np.arctan2(d[1] + e[:, 1], d[0] + e[:, 0]) - math.atan2(d[1], d[0])
     rest = bearing - (e[:, 1] * d[0] - e[:, 0] * d[1]) / square
     assert left_out(*d, square, P / 4) == pytest.approx(np.var(rest), rel=0.25)
+
+
+@pytest.mark.parametrize("std", [0.1, 0.8, 2.0])
+def test_what_an_unsure_heading_makes_of_a_path_is_as_drawn(std):
+    heading = std * np.random.default_rng(2).standard_normal(400_000)
+    shrunk, along, across = unsure(std**2)
+    assert np.cos(heading).mean() == pytest.approx(shrunk, abs=0.005)
+    assert np.cos(heading).std() == pytest.approx(along, abs=0.005)
+    linear = np.polyfit(heading, np.sin(heading), 1)
+    assert linear[0] == pytest.approx(shrunk, abs=0.005)
+    assert np.std(np.sin(heading) - np.polyval(linear, heading)) == pytest.approx(across, abs=0.005)
 
 
 def test_how_much_of_the_wheels_applies_is_learnt():
