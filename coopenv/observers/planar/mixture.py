@@ -45,6 +45,7 @@ class Mixture:
             kinds.append(replace(tuning, std=(*tuning.std[:-1], tuning.drifting[0])))
         self.filters = [PlanarFilter(kind, pose, covariance) for kind in kinds]
         self._weights = np.array([1 - share, share][: len(kinds)])
+        self._known: tuple[Array, Array] | None = None  # mean and covariance, once they were asked for
         self._share()
 
     @property
@@ -118,7 +119,7 @@ class Mixture:
 
     def _share(self) -> None:
         """Let all filters have the history and the noise of the likeliest one, which alone learns how large it is."""
-        self._known: tuple[Array, Array] | None = None  # mean and covariance, once they were asked for
+        self._known = None
         best = self.filters[int(np.argmax(self._weights))]
         for one in self.filters:
             one.learns = one is best
