@@ -16,7 +16,7 @@ from coopenv.estimation.rotations import exp_so3, orthonormalise, skew
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.correction import Stacked, halfway
 from coopenv.observers.gate import Gate
-from coopenv.observers.lines import PLANE, Lines, innovation
+from coopenv.observers.lines import Lines, Sight, linearised
 from coopenv.observers.mekf import LeftError
 
 Masks = dict[int, NDArray[np.bool_]]
@@ -105,16 +105,15 @@ class Centralised:
         targets = tick.targets[mask].tolist()
         z = np.array([self.place(target, tick) for target in targets]).reshape(-1, 3)
         bearings = tick.bearings[mask]
-        residual, J = innovation(R, p, tick.lever_arm, bearings, z)
-        own = LeftError(R, p, self.P)
+        known = Sight(bearings, z, np.zeros((len(z), 3, 3)), np.array(targets), (None,) * len(z))
+        own = linearised(LeftError(R, p, self.P), tick, known)
         H = np.zeros((len(z), 2, len(self.P)))
-        H[:, :, self.block(i)] = J @ own.jacobian(z)
+        H[:, :, self.block(i)] = own.H
         for n, target in enumerate(targets):
             if (j := target - self.landmarks) >= 0:
-                G = J[n].dot(R.T).dot(self.poses[j][0])
+                G = own.G[n].dot(self.poses[j][0])
                 H[n, :, self.block(j)] = np.concatenate([G.dot(skew(-self.markers[j])), G], axis=1)
-        N = np.broadcast_to(tick.noise.bearing_std**2 * PLANE, (len(z), 2, 2))
-        return Lines(residual, H, N), (((z - p).dot(R) - tick.lever_arm) * bearings).sum(1) > 0.0
+        return own._replace(H=H), (((z - p).dot(R) - tick.lever_arm) * bearings).sum(1) > 0.0
 
     def place(self, target: int, tick: Tick) -> Array:
         """Return (3,) where a target is, or is believed to be, map frame, m."""
@@ -150,5 +149,4 @@ def _within(mask: NDArray[np.bool_], kept: NDArray[np.bool_]) -> NDArray[np.bool
 
 
 def _stacked(lines: Sequence[Lines]) -> Stacked:
-    residual, H, N = (np.concatenate(parts) for parts in zip(*lines, strict=True))
-    return Lines(residual, H, N).stacked()
+    return Lines(*(np.concatenate(parts) for parts in zip(*lines, strict=True))).stacked()

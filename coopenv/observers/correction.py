@@ -27,6 +27,15 @@ Look = Callable[[Array], Stacked]
 def gain(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array, float]:
     """Return (K, dx, r^T S^-1 r) of a Kalman update with measurement covariance N."""
     PHt = P.dot(H.T)
+    if len(H) == 2:  # one bearing: in closed form
+        (a, b), (_, d) = (H.dot(PHt) + N).tolist()
+        x, y = residual.tolist()
+        determinant = a * d - b * b
+        if determinant == 0.0:
+            raise np.linalg.LinAlgError("singular matrix")
+        inverse = np.array([[d / determinant, -b / determinant], [-b / determinant, a / determinant]])
+        K = PHt.dot(inverse)
+        return K, K.dot(residual), (d * x * x - 2.0 * b * x * y + a * y * y) / determinant
     solved = solve(H.dot(PHt) + N, np.concatenate([PHt.T, residual[:, None]], axis=1))
     K = solved[:, :-1].T
     return K, K.dot(residual), float(residual.dot(solved[:, -1]))

@@ -42,14 +42,16 @@ class CovarianceIntersection(Mekf):
 
     def intersect(self, tick: Tick, one: Sight) -> None:
         """Fuse one bearing to a neighbour with the covariance of its position."""
-        H, N = linearised(self.state, tick, one)[1:]
+        lines = linearised(self.state, tick, one)
+        H, N = lines.H, lines.N
         own = tick.noise.bearing_std**2 * PLANE
         if not np.trace(N[0]) < VAGUE:
             return
         w = best_weight(H[0].dot(self.state.P).dot(H[0].T), own, N[0] - own)
         if w < 1.0:
             inflated = one._replace(covariances=one.covariances / (1.0 - w))
-            self.fuse(tick, inflated, linearised(self.state, tick, inflated), self.state.P / w)
+            lines = lines._replace(N=lines.weighed(tick.noise.bearing_std, 1.0 / (1.0 - w)))
+            self.fuse(tick, inflated, lines, self.state.P / w)
 
 
 def best_weight(prior: Array, own: Array, theirs: Array) -> float:

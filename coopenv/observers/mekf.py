@@ -29,6 +29,7 @@ class LeftError:
     R: Array
     p: Array  # map frame
     P: Array
+    right: ClassVar[bool] = False
 
     @classmethod
     def start(cls, R: Array, p: Array, P: Array) -> Self:

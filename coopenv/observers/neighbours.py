@@ -18,7 +18,7 @@ from coopenv.estimation.arrays import Array, cholesky, solve
 from coopenv.estimation.rotations import skew
 from coopenv.observers.contract import Message, Setup, Tick
 from coopenv.observers.correction import Stacked, halfway
-from coopenv.observers.lines import Lines, Sight, innovation, linearised
+from coopenv.observers.lines import Lines, Sight, linearised
 from coopenv.observers.mekf import LeftError, Mekf
 
 IDENTITY = np.eye(6)
@@ -87,11 +87,10 @@ class Considering(Mekf):
     def spread(self, tick: Tick, sight: Sight, lines: Lines) -> Array:
         """Return (m, 2, 2) the covariances of the innovations, with what the two errors have in common."""
         S = super().spread(tick, sight, lines)
-        J = innovation(self.state.R, self.state.p, tick.lever_arm, sight.bearings, sight.positions)[1]
         for n, target in enumerate(sight.targets.tolist()):
             if target in self.neighbours:
                 of = self.neighbours[target]
-                common = lines.H[n].dot(of.cross[:, 3:]).dot(J[n].dot(self.state.R.T).dot(of.R).T)
+                common = lines.H[n].dot(of.cross[:, 3:]).dot(lines.G[n].dot(of.R).T)
                 S[n] += common + common.T
         return S
 
@@ -122,15 +121,14 @@ class Considering(Mekf):
 
         def look(at: Array) -> Stacked:
             moved = before.moved(at[:6], P)
-            residual, H, N = linearised(moved, tick, exact).stacked()
+            lines = linearised(moved, tick, exact)
+            residual, H, N = lines.stacked()
             whole = np.zeros((len(residual), len(joint)))
             whole[:, :6] = H.dot(before.recentring(at[:6])) if at.any() else H
-            if seen:
-                J = innovation(moved.R, moved.p, tick.lever_arm, sight.bearings, sight.positions)[1].dot(moved.R.T)
             for n, target in enumerate(sight.targets.tolist()):
                 if target in self.neighbours:
                     k = 6 * seen.index(target) + 9
-                    whole[2 * n : 2 * n + 2, k : k + 3] = J[n].dot(self.neighbours[target].R)
+                    whole[2 * n : 2 * n + 2, k : k + 3] = lines.G[n].dot(self.neighbours[target].R)
             return residual, whole, N
 
         dx, after, nis = halfway(joint, look(np.zeros(len(joint))), look, 6)

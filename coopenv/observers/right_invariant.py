@@ -29,6 +29,8 @@ def from_left(R: Array, p: Array) -> Array:
 class RightError(LeftError):
     """A pose with a covariance over its right error."""
 
+    right: ClassVar[bool] = True
+
     @classmethod
     def start(cls, R: Array, p: Array, P: Array) -> Self:
         """Return the state of a pose with a covariance in LEFT coordinates."""

@@ -86,7 +86,7 @@ def misfits(pose: LeftError, tick: Tick, data: Sight, P: Array | None = None) ->
 
     With P, the variance is that given a pose with this covariance.
     """
-    residual, H, N = linearised(pose, tick, data)
+    residual, H, N, _ = linearised(pose, tick, data)
     if P is not None:
         N = N + H @ P @ H.transpose(0, 2, 1)
     return np.where(ahead(pose, tick, data), normalised(residual, N), inf)
@@ -96,7 +96,7 @@ def refined(start: LeftError, tick: Tick, data: Sight) -> LeftError | None:
     """Return the least-squares pose near a start with its covariance, None where it fails, misfits or is too weak."""
     pose = start
     for _ in range(ITERATIONS):
-        residual, H, N = linearised(pose, tick, data)
+        residual, H, N, _ = linearised(pose, tick, data)
         determinants = N[:, 0, 0] * N[:, 1, 1] - N[:, 0, 1] * N[:, 0, 1]
         weighted = (N[:, ::-1, ::-1] * ADJUGATE / determinants[:, None, None] @ H).reshape(-1, 6)
         try:

@@ -68,7 +68,8 @@ class SplitCovarianceIntersection(Mekf):
                 return 0.0
             P = (P - P_i) / w + P_i
             sight = sight._replace(covariances=sight.covariances / (1.0 - w))
-        residual, H, N = linearised(before, tick, sight).stacked()
+            lines = lines._replace(N=lines.weighed(tick.noise.bearing_std, 1.0 / (1.0 - w)))
+        residual, H, N = lines.stacked()
         _, dx, nis = gain(P, H, N, residual)
         at = 0.5 * dx  # half way, see correction.py
         residual, H, N = linearised(before.moved(at, P), tick, sight).stacked()
