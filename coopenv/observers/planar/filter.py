@@ -76,6 +76,18 @@ class PlanarFilter(PlanarMotion):
         h[HEADING], h[BIAS] = -1.0, 1.0
         return h, wrapped(bearing - (direction - float(self.state[HEADING]) + float(self.state[BIAS])))
 
+    def misfit(self, bearing: float, other: PlanarPose, seen: bool) -> tuple[float, float]:
+        """Return the normalised innovation squared of such a bearing and its variance, rad^2; nothing is corrected."""
+        h, direction, bent = self._line_to(other)
+        theirs = np.array([-h[X], -h[Y], -float(seen)])
+        if seen:
+            innovation = wrapped(bearing - (direction + math.pi - float(other.pose[2])))
+        else:
+            h, innovation = self._to(bearing, h, direction)
+        known = float(theirs @ other.covariance @ theirs) + self.tuning.bearing_std**2 + bent
+        variance = float(h @ self.covariance @ h) + known
+        return innovation**2 / variance, variance
+
     def _fuse(self, h: Array, innovation: float, bent: float, by_theirs: Array, other: PlanarPose) -> float:
         k = self.tuning
         theirs, noise = float(by_theirs @ other.covariance @ by_theirs), k.bearing_std**2 + bent

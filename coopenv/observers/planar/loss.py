@@ -34,8 +34,12 @@ class LossTest:
 
     def take_of_robot(self, time: float, ratio: float) -> None:
         """Take that of a bearing to or from a robot, which counts where no landmark was seen lately."""
-        if time - self._sure > TRUST_S:
+        if not self.sure(time):
             self._last.append((time, min(ratio, LARGEST)))
+
+    def sure(self, time: float) -> bool:
+        """Return whether a landmark showed lately that the robot is not lost."""
+        return time - self._sure <= TRUST_S
 
     @property
     def since(self) -> float:

@@ -78,6 +78,10 @@ class Mixture:
         """Correct with the bearing in rad under which another robot, which tells its pose, sees this one; the same."""
         return self._take(lambda one: one.seen(bearing, other), TEMPERED)
 
+    def misfit(self, bearing: float, other: PlanarPose, seen: bool) -> tuple[float, float]:
+        """Return the normalised innovation squared of a bearing to or from a robot, and its variance, rad^2."""
+        return self.filters[int(np.argmax(self._weights))].misfit(bearing, other, seen)
+
     def place(self, pose: Array, covariance: Array) -> None:
         """Put it at a pose (3,) with a covariance (3, 3); what is known of the wheels stays."""
         if len(self.filters) > 1:

@@ -8,12 +8,14 @@ import numpy as np
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.planar.commands import Step
+from coopenv.observers.planar.heard import place_of
 from coopenv.observers.planar.loss import LossTest
 from coopenv.observers.planar.memory import Memory
 from coopenv.observers.planar.mixture import Mixture
 from coopenv.observers.planar.plugin import PlanarEkf
 from coopenv.observers.planar.search import Known, find_pose
 from coopenv.observers.planar.state import BIAS, HEADING, TURN_SCALE, PlanarPose, X, Y
+from coopenv.observers.planar.trust import Trust
 from coopenv.observers.planar.tuning import CALIBRATING, Tuning
 
 CLEAR_STD = (8.0, 1.6)  # m, rad; whoever is less certain cannot correct with single bearings, and collects them
@@ -46,6 +48,7 @@ class PlanarRobust(PlanarEkf):
         """Take one camera tick."""
         if len(tick.landmarks):
             self._site = max(LEAST_LOST_STD, float(np.ptp(tick.landmarks[:, :2], axis=0).max()) / 2)
+        self._listen(tick)
         estimate = super().update(tick)
         if not self.lost and self._test.lost:
             self._memory.forget(self._test.since)  # until then it may have been elsewhere
@@ -68,6 +71,7 @@ class PlanarRobust(PlanarEkf):
     def _begin(self, pose: Array, covariance: Array) -> None:
         self.filter: Mixture = Mixture(self.tuning, pose, covariance)
         self._test, self._memory = LossTest(), Memory()
+        self._trust: dict[int, Trust] = {}
         self._next_search, self._failed, self._news = 0.0, 0, False
         self.lost, self._adrift, self._turned, self._from = False, 0.0, 0.0, 0.0
         if self._unclear() or self.filter.covariance[HEADING, HEADING] > CLEAR_STD[1] ** 2:
@@ -99,14 +103,29 @@ class PlanarRobust(PlanarEkf):
             self._test.take(tick.time, self.filter.landmark(bearing, x, y))
 
     def _see_robot(self, tick: Tick, target: int, bearing: float, place: PlanarPose) -> None:
-        self._remember(tick.time, target, bearing, True, place)
-        if not self.lost:
-            self._test.take_of_robot(tick.time, self.filter.robot(bearing, place))
+        if self._believes(tick, target, bearing, place, seen=False):
+            self._remember(tick.time, target, bearing, True, place)
+            if not self.lost:
+                self._test.take_of_robot(tick.time, self.filter.robot(bearing, place))
 
     def _be_seen(self, tick: Tick, target: int, bearing: float, by: PlanarPose) -> None:
-        self._remember(tick.time, target, float(by.pose[2]) + bearing + math.pi, False, by)
+        if self._believes(tick, target, bearing, by, seen=True):
+            self._remember(tick.time, target, float(by.pose[2]) + bearing + math.pi, False, by)
+            if not self.lost:
+                self._test.take_of_robot(tick.time, self.filter.seen(bearing, by))
+
+    def _listen(self, tick: Tick) -> None:
+        """Test what others tell of their places."""
+        for target, received in tick.messages.items():
+            if (place := place_of(received)) is not None:
+                self._trust.setdefault(target, Trust()).hear(tick.time - received.age, place)
+
+    def _believes(self, tick: Tick, target: int, bearing: float, place: PlanarPose, seen: bool) -> bool:
+        """Return whether a robot is believed, now that it was seen or saw this one."""
+        trust = self._trust.setdefault(target, Trust())
         if not self.lost:
-            self._test.take_of_robot(tick.time, self.filter.seen(bearing, by))
+            trust.see(*self.filter.misfit(bearing, place, seen), self._test.sure(tick.time))
+        return trust.believed
 
     def _remember(self, time: float, target: int, angle: float, own: bool, there: PlanarPose) -> None:
         """Keep a sighting; an angle of one's own camera counts from the heading, its bias taken off."""
