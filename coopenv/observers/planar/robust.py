@@ -1,6 +1,7 @@
 """This project's observer for planar robots whose odometry is their commands."""
 
 import math
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -67,6 +68,14 @@ class PlanarRobust(PlanarEkf):
             self._sightings.clear()
             return Message()
         return super().message()
+
+    def tampered(self, message: Message) -> Message:
+        """Return a message about another place than this robot's with sightings that agree with it."""
+        if message.position is None or "from" not in message.extra:
+            return message
+        told = np.array(message.extra["from"])
+        told[:2] += (message.position[:2] - self.filter.state[:2]).astype(told.dtype)
+        return replace(message, extra={**message.extra, "from": told})
 
     def _begin(self, pose: Array, covariance: Array) -> None:
         self.filter: Mixture = Mixture(self.tuning, pose, covariance)
