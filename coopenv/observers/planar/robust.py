@@ -51,16 +51,19 @@ class PlanarRobust(PlanarEkf):
             self._site = max(LEAST_LOST_STD, float(np.ptp(tick.landmarks[:, :2], axis=0).max()) / 2)
         self._listen(tick)
         estimate = super().update(tick)
-        if not self.lost and self._test.lost:
+        if self.lost:  # in a later tick than the one that showed it: bearings that misled do not at once say where
+            if not (self._news and tick.time >= self._next_search):
+                return estimate
+            self._search(tick.time)
+        elif self._test.lost:
             self._memory.forget(self._test.since)  # until then it may have been elsewhere
             self._give_up()
-        elif not self.lost and self._unclear():
+        elif self._unclear():
             self._memory.forget(math.inf)  # what it saw is in the estimate
             self._lose()
-        if self.lost and self._news and tick.time >= self._next_search:
-            self._search(tick.time)
-            estimate = self._estimate()
-        return estimate
+        else:
+            return estimate
+        return self._estimate()
 
     def message(self) -> Message:
         """Return nothing while lost."""

@@ -16,16 +16,12 @@ from coopenv.observers.planar.robust import PlanarRobust
 from coopenv.observers.runner import run
 from tests.helpers.barrier_robots import barrier_robots, carried_off
 
-LONG = pytest.mark.slow
 
-
-@pytest.mark.parametrize(
-    ("seed", "seconds", "turn_scale"),
-    [(1, 60.0, 0.6), (1, 60.0, 1.5), *(pytest.param(2, 100.0, scale, marks=LONG) for scale in (0.6, 1.0, 1.5))],
-)
-def test_odometry_that_lies_about_turns(seed, seconds, turn_scale):
+@pytest.mark.parametrize("turn_scale", [0.6, pytest.param(1.0, marks=pytest.mark.slow), 1.5])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_odometry_that_lies_about_turns(seed, turn_scale):
     """The covariance stays honest and nobody is lost, whatever the wheels make of a command."""
-    record = recording_of(barrier_robots(seed, seconds, turn_scale), "landmarks+robots")
+    record = recording_of(barrier_robots(seed, 100.0, turn_scale), "landmarks+robots")
     result = run(PlanarRobust, record)
     assert not result.failure
     assert result.position_rmse().max() < 0.3 and result.position_rmse().mean() < 0.15
@@ -56,18 +52,18 @@ class Watched(PlanarRobust):
         return message
 
 
-@pytest.mark.parametrize("seed", [3, pytest.param(5, marks=LONG)])
+@pytest.mark.parametrize("seed", [1, 3, pytest.param(5, marks=pytest.mark.slow)])
 def test_a_robot_that_is_carried_off_notices_and_finds_itself(seed):
     Watched.all = []
-    record = carried_off(seed, robot=2, at=50.0, seconds=105.0)
+    record = carried_off(seed, robot=2, at=50.0, seconds=120.0)
     result = run(Watched, record)
     lost = np.array(Watched.all[2].lost_at)
-    assert lost.size and 50.0 <= lost[0] < 75.0 and lost[-1] < 80.0
+    assert lost.size and 50.0 <= lost[0] < 75.0 and lost[-1] < 105.0
     assert all(message.position is None and message.size_bytes == 0 for message in Watched.all[2].sent)
     at = np.isin(np.round(result.t, 6), np.round(lost, 6))
     std = np.sqrt(np.diagonal(result.covariance[at, 2], axis1=1, axis2=2))
     assert (std[:, 2] > 1.0).all() and (std[:, 3:5] > 3.0).all()  # it says that it does not know
-    end = result.t > 90.0
+    end = result.t > 112.0
     assert np.sqrt(np.mean(result.position_error[end, 2] ** 2)) < 0.4
     assert not any(Watched.all[n].lost_at for n in (0, 1, 3, 4))
 
@@ -87,14 +83,6 @@ def test_who_starts_without_a_pose_searches():
     assert all(one.lost_at and one.lost_at[-1] < 60.0 for one in Watched.all)
     assert (result.position_error[result.t > 75.0] < 0.8).all()
     assert (result.anees(after=record.dt) < 3).all()
-
-
-@pytest.mark.slow
-def test_who_is_unsure_of_the_heading_waits_for_a_bearing():
-    """A robot that turns 0.6 times what it is told and sees nothing at first is not lost by the first bearings."""
-    result = run(Watched, recording_of(barrier_robots(11, 130.0, 0.6), "blind"))
-    assert (result.anees(after=0.05) < 3).all()
-    assert (result.position_error[result.t > 110.0] < 1.2).all()
 
 
 class Babbling:

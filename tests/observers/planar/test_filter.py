@@ -87,9 +87,10 @@ def numeric(function, x, step=1e-6):
     return np.stack([(function(x + step * e) - function(x - step * e)) / (2 * step) for e in np.eye(len(x))], axis=-1)
 
 
-def test_motion_derivatives_agree_with_differences():
+@pytest.mark.parametrize(("second_order", "size"), [(False, 1.0), (True, 1e-8)])  # which counts where P is large
+def test_motion_derivatives_agree_with_differences(second_order, size):
     tuning = replace(CALIBRATING, walk=(0.0,) * 9, turn_noise=(0, 0, 0), path_noise=(0, 0), slide_noise=0, jitter=0)
-    tuning = replace(tuning, second_order=False)
+    tuning = replace(tuning, second_order=second_order)
     x = np.array([0.3, -0.2, 0.7, 0.93, 0.97, 0.004, 0.003, 0.9, 0.183, 0.01, 0.8, 0.004])
 
     def filtered(state, covariance):
@@ -100,10 +101,10 @@ def test_motion_derivatives_agree_with_differences():
         own.advance(DT, 0.02, 0.004)
         return own
 
-    f = numeric(lambda s: filtered(s, np.eye(STATES)).state, x)
-    f[:3, LEAD] = filtered(x, np.eye(STATES)).covariance[:3, LEAD]  # smoothed over half a tick: see below
+    f = numeric(lambda s: filtered(s, size * np.eye(STATES)).state, x)
+    f[:3, LEAD] = filtered(x, size * np.eye(STATES)).covariance[:3, LEAD] / size  # smoothed over half a tick: see below
     root = np.diag(np.arange(1.0, STATES + 1))
-    np.testing.assert_allclose(filtered(x, root).covariance, f @ root @ f.T, atol=1e-6)
+    np.testing.assert_allclose(filtered(x, size * root).covariance / size, f @ root @ f.T, atol=1e-6)
 
 
 def test_derivative_by_the_lead_is_the_slope_across_a_tick():
