@@ -85,6 +85,21 @@ def test_who_starts_without_a_pose_searches():
     assert (result.anees(after=record.dt) < 3).all()
 
 
+def test_who_is_unsure_of_the_heading_says_so():
+    """A robot that turns 0.6 times what it is told and sees nothing at first is not sure of a wrong place."""
+    result = run(PlanarRobust, recording_of(barrier_robots(11, 45.0, 0.6), "blind"))
+    assert not result.failure and (result.anees(after=0.05) < 3).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_who_is_unsure_of_the_heading_waits_for_a_bearing(seed):
+    """Nor is it lost by the first bearings."""
+    result = run(PlanarRobust, recording_of(barrier_robots(seed, 130.0, 0.6), "blind"))
+    assert not result.failure and (result.anees(after=0.05) < 3).all()
+    assert (result.position_error[result.t > 110.0] < 1.0).all()
+
+
 class Babbling:
     """The first robot broadcasts one of many things that are no message, or nothing."""
 
