@@ -2,7 +2,12 @@
 
 import math
 
+import numpy as np
+
 from coopenv.estimation.arrays import Array
+from coopenv.observers.planar.state import PlanarPose
+
+NEAREST_M = 0.1  # nothing is seen from closer than this; bounds the bearing's derivatives
 
 
 def wrapped(angle: float) -> float:
@@ -32,3 +37,14 @@ def unsure(variance: float) -> tuple[float, float, float]:
     left = -math.expm1(-variance)
     across = -math.expm1(-2 * variance) / 2 - variance * (1 - left)
     return math.exp(-variance / 2), left / math.sqrt(2), math.sqrt(max(across, 0.0))
+
+
+def misfit(bearing: float, by: PlanarPose, to: PlanarPose, bearing_std: float) -> tuple[float, float]:
+    """Return the normalised square of how far a bearing in rad is off between two told poses, and its variance."""
+    dx, dy = (to.pose[:2] - by.pose[:2]).tolist()
+    square = max(dx * dx + dy * dy, NEAREST_M**2)
+    both = by.covariance[:2, :2] + to.covariance[:2, :2]
+    line = np.array([dy / square, -dx / square, -1.0])
+    variance = float(line @ by.covariance @ line + line[:2] @ to.covariance[:2, :2] @ line[:2])
+    variance += bearing_std**2 + left_out(dx, dy, square, both)
+    return wrapped(bearing - (math.atan2(dy, dx) - float(by.pose[2]))) ** 2 / variance, variance

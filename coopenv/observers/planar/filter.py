@@ -5,14 +5,13 @@ import math
 import numpy as np
 
 from coopenv.estimation.arrays import Array
-from coopenv.observers.planar.bearing import left_out, wrapped
+from coopenv.observers.planar.bearing import NEAREST_M, left_out, wrapped
 from coopenv.observers.planar.intersection import growth
 from coopenv.observers.planar.level import NoiseLevel
 from coopenv.observers.planar.motion import MAX_LEAD_S, PlanarMotion
 from coopenv.observers.planar.state import BIAS, HEADING, LEAD, STATES, PlanarPose, X, Y, picked
 
 MISREAD = 0.02  # share of bearings that may be anything
-NEAREST_M = 0.1  # nothing is seen from closer than this; bounds the bearing's derivatives
 
 
 class PlanarFilter(PlanarMotion):

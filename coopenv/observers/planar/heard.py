@@ -1,7 +1,7 @@
 """What other robots tell, looked at before it is believed: no message may end a run or outweigh what was measured."""
 
-import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,18 +34,28 @@ def place_of(received: Received) -> PlanarPose | None:
     return PlanarPose(np.array([p[0], p[1], 0.0]), covariance)
 
 
-def sightings_of(extra: Mapping[str, Array], me: int) -> tuple[PlanarPose, list[float]] | None:
-    """Return the pose of a robot that tells whom it saw, and the bearings in rad of one; None where they are none."""
+class Sightings(NamedTuple):
+    """What a robot tells of whom it saw."""
+
+    by: PlanarPose  # where it was
+    seen: list[tuple[int, float]]  # targets and bearings, rad
+    sure: bool  # whether landmarks showed it lately that it is not lost
+
+
+def sightings_of(extra: Mapping[str, Array]) -> Sightings | None:
+    """Return what a robot tells of whom it saw; None where that makes no sense."""
     seen, bearing, told = (np.asarray(extra.get(name, ())) for name in ("seen", "bearing", "from"))
     if told.shape != (POSE_NUMBERS,) or seen.ndim != 1 or bearing.shape != seen.shape:
         return None
     pose, covariance = told[:3].astype(float), np.zeros((3, 3))
     covariance[LOWER] = told[3:]
     covariance += np.tril(covariance, -1).T
-    angles = [float(b) for b in bearing[seen == me]]
-    if not _plausible(pose, covariance) or not all(map(math.isfinite, angles)):
+    if not _plausible(pose, covariance) or not np.isfinite(bearing.astype(float)).all():
         return None
-    return PlanarPose(pose, covariance + np.diag(np.square([LEAST_STD[0], *LEAST_STD]))), angles
+    by = PlanarPose(pose, covariance + np.diag(np.square([LEAST_STD[0], *LEAST_STD])))
+    sure = np.asarray(extra.get("sure", ()))
+    angles = zip(seen.tolist(), bearing.astype(float).tolist(), strict=True)
+    return Sightings(by, list(angles), sure.shape == (1,) and bool(sure[0]))
 
 
 def _plausible(where: Array, covariance: Array) -> bool:

@@ -14,7 +14,7 @@ from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.planar.commands import Step
 from coopenv.observers.planar.filter import PlanarFilter
-from coopenv.observers.planar.heard import LOWER, place_of, sightings_of
+from coopenv.observers.planar.heard import LOWER, Sightings, place_of, sightings_of
 from coopenv.observers.planar.mixture import Mixture
 from coopenv.observers.planar.state import PlanarPose, X, Y
 from coopenv.observers.planar.tuning import TEXTBOOK, Tuning
@@ -110,6 +110,9 @@ class PlanarEkf:
     def _be_seen(self, tick: Tick, target: int, bearing: float, by: PlanarPose) -> None:
         self.filter.seen(bearing, by)
 
+    def _witness(self, tick: Tick, by: int, told: Sightings) -> None:
+        """Take what a robot tells of all that it saw; of use to who doubts words."""
+
     def _take_sightings(self, tick: Tick) -> None:
         """Correct with the bearings under which others saw this robot; each message counts once."""
         for target, received in tick.messages.items():
@@ -117,9 +120,11 @@ class PlanarEkf:
             if "seen" not in extra or sent < self._heard.get(target, -math.inf) + tick.dt / 2:
                 continue
             self._heard[target] = sent
-            if (told := sightings_of(extra, self._me)) is not None:
-                for bearing in told[1]:
-                    self._be_seen(tick, target, bearing, told[0])
+            if (told := sightings_of(extra)) is not None:
+                self._witness(tick, target, told)
+                for seen, bearing in told.seen:
+                    if seen == self._me:
+                        self._be_seen(tick, target, bearing, told.by)
 
     def _estimate(self) -> Estimate:
         x, y, heading = self.filter.state[:3].tolist()

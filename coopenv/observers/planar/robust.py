@@ -8,15 +8,15 @@ import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
+from coopenv.observers.planar.circle import Circle
 from coopenv.observers.planar.commands import Step
-from coopenv.observers.planar.heard import place_of
+from coopenv.observers.planar.heard import Sightings
 from coopenv.observers.planar.loss import LossTest
 from coopenv.observers.planar.memory import Memory
 from coopenv.observers.planar.mixture import Mixture
 from coopenv.observers.planar.plugin import PlanarEkf
 from coopenv.observers.planar.search import Known, find_pose
 from coopenv.observers.planar.state import BIAS, HEADING, TURN_SCALE, PlanarPose, X, Y
-from coopenv.observers.planar.trust import Trust
 from coopenv.observers.planar.tuning import CALIBRATING, Tuning
 
 CLEAR_STD = (8.0, 1.6)  # m, rad; whoever is less certain cannot correct with single bearings, and collects them
@@ -25,6 +25,7 @@ LEAST_LOST_STD = 5.0  # m
 SPANS_S = (10.0, 30.0)  # of what is searched: the shortest one that gives an answer counts
 SEARCH_PERIOD_S = 0.4
 ENOUGH = 8  # bearings, which contradict what was known before
+SWAYED_STD = (0.5, 0.5, 0.3)  # m, m, rad, by which who has believed a liar may be off
 MOST_FAILED = 15  # searches with so many bearings, after which what was known before does not count
 
 
@@ -49,7 +50,9 @@ class PlanarRobust(PlanarEkf):
         """Take one camera tick."""
         if len(tick.landmarks):
             self._site = max(LEAST_LOST_STD, float(np.ptp(tick.landmarks[:, :2], axis=0).max()) / 2)
-        self._listen(tick)
+        self._now = tick.time
+        self._circle.hear(tick)
+        self._unsettle(tick.time)
         estimate = super().update(tick)
         if self.lost:  # in a later tick than the one that showed it: bearings that misled do not at once say where
             if not (self._news and tick.time >= self._next_search):
@@ -70,7 +73,11 @@ class PlanarRobust(PlanarEkf):
         if self.lost:
             self._sightings.clear()
             return Message()
-        return super().message()
+        message = super().message()
+        if "seen" not in message.extra:
+            return message
+        sure = np.array([self._test.sure(self._now)], np.uint8)
+        return replace(message, extra={**message.extra, "sure": sure})
 
     def tampered(self, message: Message) -> Message:
         """Return a message about another place than this robot's with sightings that agree with it."""
@@ -83,8 +90,8 @@ class PlanarRobust(PlanarEkf):
     def _begin(self, pose: Array, covariance: Array) -> None:
         self.filter: Mixture = Mixture(self.tuning, pose, covariance)
         self._test, self._memory = LossTest(), Memory()
-        self._trust: dict[int, Trust] = {}
-        self._next_search, self._failed, self._news = 0.0, 0, False
+        self._circle = Circle(self.tuning.bearing_std)
+        self._now, self._next_search, self._failed, self._news = 0.0, 0.0, 0, False
         self.lost, self._adrift, self._turned, self._from = False, 0.0, 0.0, 0.0
         if self._unclear() or self.filter.covariance[HEADING, HEADING] > CLEAR_STD[1] ** 2:
             self._lose()
@@ -126,18 +133,21 @@ class PlanarRobust(PlanarEkf):
             if not self.lost:
                 self._test.take_of_robot(tick.time, self.filter.seen(bearing, by))
 
-    def _listen(self, tick: Tick) -> None:
-        """Test what others tell of their places."""
-        for target, received in tick.messages.items():
-            if (place := place_of(received)) is not None:
-                self._trust.setdefault(target, Trust()).hear(tick.time - received.age, place)
-
     def _believes(self, tick: Tick, target: int, bearing: float, place: PlanarPose, seen: bool) -> bool:
         """Return whether a robot is believed, now that it was seen or saw this one."""
-        trust = self._trust.setdefault(target, Trust())
         if not self.lost:
-            trust.see(*self.filter.misfit(bearing, place, seen), self._test.sure(tick.time))
-        return trust.believed
+            self._circle.of(target).see(*self.filter.misfit(bearing, place, seen), self._test.sure(tick.time))
+        return self._circle.believes(target, tick.time)
+
+    def _witness(self, tick: Tick, by: int, told: Sightings) -> None:
+        self._circle.witness(tick, by, told)
+        self._unsettle(tick.time)
+
+    def _unsettle(self, now: float) -> None:
+        """Be less sure of one's own place where others have led it astray."""
+        if self._circle.misled(now) and not self.lost and not self._test.sure(now):
+            state, covariance = self.filter.state, self.filter.covariance
+            self.filter.place(state[:3].copy(), covariance[:3, :3] + np.diag(np.square(SWAYED_STD)))
 
     def _remember(self, time: float, target: int, angle: float, own: bool, there: PlanarPose) -> None:
         """Keep a sighting; an angle of one's own camera counts from the heading, its bias taken off."""
