@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from coopenv.backends.mrclam import recording_of
+from coopenv.backends.mrclam import Dataset, recording_of
+from coopenv.observers.planar.bearing import misfit
 from coopenv.observers.planar.robust import PlanarRobust
 from coopenv.observers.planar.state import PlanarPose
 from coopenv.observers.planar.trust import ENOUGH, Trust
@@ -52,6 +53,56 @@ def test_sightings_that_fit_badly_add_up_and_good_ones_make_up_for_them():
     assert drifting.believed
 
 
+def accuse(everyone: dict[int, Trust], target: int, by: int, times: int = 5) -> None:
+    for _ in range(times):
+        everyone[target].witness(by, 20.0, 1e-3)
+
+
+def test_a_robot_that_sees_landmarks_is_accused_by_two_and_another_by_one():
+    everyone = {n: Trust() for n in range(4)}
+    accuse(everyone, 0, by=1)
+    assert everyone[0].accused(10.0, everyone)  # of whom nothing says that it sees landmarks
+    everyone[0].claim(10.0, True)
+    assert not everyone[0].accused(12.0, everyone) and everyone[0].accused(30.0, everyone)
+    accuse(everyone, 0, by=2)
+    assert everyone[0].accused(12.0, everyone)
+
+
+def test_two_against_two_is_not_decided_and_a_liar_cannot_accuse_two():
+    everyone = {n: Trust() for n in range(4)}
+    for trust in everyone.values():
+        trust.claim(10.0, True)
+    for liar, honest in ((0, 2), (0, 3)):
+        accuse(everyone, honest, by=liar)
+        accuse(everyone, liar, by=honest)
+    assert [everyone[n].accused(12.0, everyone) for n in range(4)] == [True, False, False, False]
+    for liar, honest in ((1, 2), (1, 3)):
+        accuse(everyone, honest, by=liar)
+        accuse(everyone, liar, by=honest)
+    assert not any(trust.accused(12.0, everyone) for trust in everyone.values())
+
+
+def test_what_witnesses_see_again_as_told_is_believed_again():
+    everyone = {0: Trust(), 1: Trust()}
+    accuse(everyone, 0, by=1)
+    everyone[0].doubt()
+    for _ in range(ENOUGH - 1):
+        everyone[0].witness(1, 0.5, 1e-3)
+    assert not everyone[0].believed
+    everyone[0].witness(1, 0.5, 1e-3)
+    assert everyone[0].believed and not everyone[0].accusers()
+
+
+def test_how_far_a_bearing_is_off_is_as_drawn():
+    rng = np.random.default_rng(3)
+    P, Q = np.diag([0.02, 0.01, 0.02]) ** 2 + 1e-5, np.diag([0.05, 0.03, 0.0]) ** 2
+    by, to, std = np.array([1.0, -1.0, 2.0]), np.array([3.0, 2.0, 0.0]), 0.02
+    direction = np.arctan2(3.0, 2.0) - by[2] + std * rng.standard_normal(4000)
+    told = zip(rng.multivariate_normal(by, P, 4000), rng.multivariate_normal(to, Q, 4000), direction, strict=True)
+    squares = [misfit(b, PlanarPose(one, P), PlanarPose(other, Q), std)[0] for one, other, b in told]
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.1)
+
+
 class Lying:
     """The first robot broadcasts places that are off by `jump` m and drift on by `drift` m/s from 15 s on."""
 
@@ -83,6 +134,26 @@ def test_a_liar_costs_the_honest_ones_at_most_twice_their_error(nominal, jump, d
     assert result.position_rmse()[1:].mean() < 1.5 * honest.position_rmse()[1:].mean()
     assert (result.position_rmse()[1:] < 2.0 * honest.position_rmse()[1:]).all()
     assert (result.anees(after=record.dt)[1:] < 3.0).all()
+
+
+def blindfolded(data: Dataset, *subjects: int) -> Dataset:
+    """Return a sub-dataset in which some robots see no landmark."""
+    robots = (
+        replace(one, detections=one.detections[one.detections[:, 1] <= 5]) if one.subject in subjects else one
+        for one in data.robots
+    )
+    return replace(data, robots=tuple(robots))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("jump", "drift"), [(5.0, 0.0), (0.0, 0.05)])
+@pytest.mark.parametrize("seed", [32, 51, 52])
+def test_robots_that_see_no_landmark_judge_by_two_that_do(seed, jump, drift):
+    """Three see landmarks, of whom one lies: there are two honest ways to the truth."""
+    record = recording_of(blindfolded(barrier_robots(seed, 100.0, 0.8), 4, 5), "landmarks+robots")
+    honest, result = run(PlanarRobust, record), run(PlanarRobust, record, Lying(jump, drift))
+    assert not result.failure
+    assert result.position_rmse()[1:].mean() < 2.0 * honest.position_rmse()[1:].mean()
 
 
 @pytest.mark.slow
