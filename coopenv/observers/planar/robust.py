@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -37,7 +37,7 @@ class PlanarRobust(PlanarEkf):
     bearings of the last half minute agree on.
 
     Messages hold position and covariance (72 bytes), and after a sighting a pose with its covariance in single
-    precision (36 bytes) and 5 bytes for each robot seen.
+    precision (36 bytes), whether landmarks were seen lately (1), and 5 bytes for each robot seen.
     """
 
     tuning: ClassVar[Tuning] = CALIBRATING
@@ -76,8 +76,8 @@ class PlanarRobust(PlanarEkf):
         message = super().message()
         if "seen" not in message.extra:
             return message
-        sure = np.array([self._test.sure(self._now)], np.uint8)
-        return replace(message, extra={**message.extra, "sure": sure})
+        extra: dict[str, Any] = {**message.extra, "sure": np.array([self._test.sure(self._now)], np.uint8)}
+        return replace(message, extra=extra)
 
     def tampered(self, message: Message) -> Message:
         """Return a message about another place than this robot's with sightings that agree with it."""
