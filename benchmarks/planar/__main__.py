@@ -16,10 +16,10 @@ from coopenv.backends.mrclam import VARIANTS, Dataset, load_dataset, recording_o
 from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.observers.planar.plugin import PlanarEkf
-from coopenv.observers.planar.robust import PlanarRobust
+from coopenv.observers.planar.robust import LEAST_LOST_STD, PlanarRobust
 from coopenv.observers.recording import Recording
 from coopenv.observers.runner import Run, run
-from tests.helpers.barrier_robots import barrier_robots
+from tests.helpers.barrier_robots import barrier_robots, carried_off
 
 CHANGES: dict[str, Callable[[Dataset, int], Dataset]] = {
     "8.3 Hz, turns .7, hidden": lambda d, s: changed(d, s, odometry(1 / 0.7, rate=8.3), hidden((5, 40), (5, 23))),
@@ -36,6 +36,7 @@ LIES: dict[str, Callable[[list[int]], Drifting | Replaying]] = {
     "3 m at once": lambda who: Drifting(who, 3.0, 0.0, since=0.0),
     "replay 1 s": lambda who: Replaying(who, 10),
 }
+CARRIED = 2  # the robot that is
 LIED_FROM = 15.0  # s, from when on errors count among liars
 WAYS: dict[str, tuple[Callable[[Dataset], Recording], int]] = {
     "all see landmarks, 1 lies": (lambda d: recording_of(d, "landmarks+robots"), 0),
@@ -50,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parser().parse_args(arguments)
     warnings.simplefilter("ignore")
     try:
-        {"changed": changes, "barriers": barriers, "liars": liars}[asked.what](asked)
+        {"changed": changes, "barriers": barriers, "liars": liars, "carried": carried}[asked.what](asked)
     except CoopenvError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -60,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     found = argparse.ArgumentParser(prog="python -m benchmarks.planar", description=__doc__)
-    found.add_argument("what", choices=("changed", "barriers", "liars"))
+    found.add_argument("what", choices=("changed", "barriers", "liars", "carried"))
     found.add_argument(
         "--data", type=Path, metavar="DIR", help="where mrclam_6 is (`changed`; `liars`: else simulated)"
     )
@@ -106,6 +107,19 @@ def liars(asked: argparse.Namespace) -> None:
                     ratio, anees = after / before, _numbers(result.anees(LIED_FROM)[honest], 1)
                     cost = f"times {after.mean() / before.mean():.2f}, worst robot {ratio.max():.2f}"
                     print(f"seed {seed}, {way}, {name}: {before.mean():.3f} m, {cost}, ANEES {anees}", flush=True)
+
+
+def carried(asked: argparse.Namespace) -> None:
+    """Print how a simulated robot that is carried off, unfelt, after 50 s finds out, and itself."""
+    for seed in asked.seeds:
+        recording = carried_off(seed, CARRIED, 50.0, asked.seconds)
+        result = run(PlanarRobust, recording)
+        std = np.sqrt(result.covariance[:, CARRIED, 3, 3] + result.covariance[:, CARRIED, 4, 4])
+        lost = result.t[(result.t >= 50.0) & (std > LEAST_LOST_STD)]
+        what = f"lost from {lost[0]:.1f} to {lost[-1]:.1f} s" if len(lost) else "never lost"
+        wrong = result.t[(result.t >= 50.0) & (result.position_error[:, CARRIED] > 0.5)]
+        print(f"seed {seed}: {what}, over 0.5 m until {wrong[-1] if len(wrong) else 50.0:.1f} s, "
+              f"{_rmse(result, asked.seconds - 20.0)[CARRIED]:.3f} m in the last 20 s", flush=True)  # fmt: skip
 
 
 def _compare(name: str, data: Dataset) -> None:
