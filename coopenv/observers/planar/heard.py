@@ -13,6 +13,7 @@ OLDEST_S = 2.0
 SPEED = 0.15  # m/s, by which a robot may have moved since it told where it is
 LEAST_STD = (0.01, 0.002)  # m, rad; nobody knows better
 FARTHEST_M = 1e6
+MOST_SEEN = 64  # robots, of which one message may tell
 POSE_NUMBERS = 9  # x, y, heading and the triangle of their covariance
 LOWER = np.tril_indices(3)
 
@@ -44,8 +45,10 @@ class Sightings(NamedTuple):
 
 def sightings_of(extra: Mapping[str, Array]) -> Sightings | None:
     """Return what a robot tells of whom it saw; None where that makes no sense."""
-    seen, bearing, told = (np.asarray(extra.get(name, ())) for name in ("seen", "bearing", "from"))
-    if told.shape != (POSE_NUMBERS,) or seen.ndim != 1 or bearing.shape != seen.shape:
+    seen, bearing, told, sure = (np.asarray(extra.get(name, ())) for name in ("seen", "bearing", "from", "sure"))
+    if any(numbers.dtype.kind not in "buif" for numbers in (seen, bearing, told, sure)):
+        return None
+    if told.shape != (POSE_NUMBERS,) or seen.ndim != 1 or bearing.shape != seen.shape or len(seen) > MOST_SEEN:
         return None
     pose, covariance = told[:3].astype(float), np.zeros((3, 3))
     covariance[LOWER] = told[3:]
@@ -53,7 +56,6 @@ def sightings_of(extra: Mapping[str, Array]) -> Sightings | None:
     if not _plausible(pose, covariance) or not np.isfinite(bearing.astype(float)).all():
         return None
     by = PlanarPose(pose, covariance + np.diag(np.square([LEAST_STD[0], *LEAST_STD])))
-    sure = np.asarray(extra.get("sure", ()))
     angles = zip(seen.tolist(), bearing.astype(float).tolist(), strict=True)
     return Sightings(by, list(angles), sure.shape == (1,) and bool(sure[0]))
 
