@@ -20,7 +20,7 @@ def test_sightings_are_read():
     assert told is not None and told.sure and told.seen == [(15, 0.25), (17, -0.5)]
     np.testing.assert_allclose(told.by.pose, [1, 2, 0.5])
     added = np.square([LEAST_STD[0], *LEAST_STD])
-    np.testing.assert_allclose(told.by.covariance, np.diag(added + (0.04, 0.09, 0.01)), rtol=1e-6)
+    np.testing.assert_allclose(told.by.covariance, np.diag(np.add(added, (0.04, 0.09, 0.01))), rtol=1e-6)
 
 
 @pytest.mark.parametrize("sure", [None, np.array([0], np.uint8), np.ones(2, np.uint8), np.array(1, np.uint8)])
