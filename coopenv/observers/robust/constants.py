@@ -45,7 +45,7 @@ DRIFT_TIME, SLOW_DRIFT_TIME = 3.0, 30.0  # s over which a sender's place is held
 SLACK = 0.1  # share of the noise of its odometry by which a sender may be off in what it says of its errors. Tuned
 JUMP_STD = 4.0  # standard deviations beyond what brakes can do by which its odometry jumps
 WORD_GATE = 60.0
-"""Gate of the squared size of how far bearings say that a sender is off: chi-square of 3, 1 - 1e-8."""
+"""Gate of the squared size of how far bearings say that a sender is off, see evidence.py. Tuned: the honest pass."""
 EVIDENCE_SHARE = 0.5  # of a frame's information on that. Tuned: honest senders then have a mean of 3
 LEAST_CERTAINTY = 0.01  # 1/m^2, at first
 ERROR_FACTOR = 2.0  # by which who has lied may be farther off than it seems. Chosen

@@ -149,8 +149,10 @@ def receive_told(model: Any, state: Any, memory: Any, world: int, i: int):
         if sent >= 0:
             slot = content_tick(model, state, world, sender, sent) % model.radio.slots
             if memory.outbox[world, sender, slot].news == 1:
+                later = state.inbox_stamp[world, i, sender] - memory.outbox[world, sender, slot].tick
                 for c in range(memory.correlation.shape[3]):
                     memory.correlation[world, i, sender, c] = memory.outbox_correlation[world, sender, slot, c]
+                    memory.correlation[world, i, sender, c].tick += later  # ages are told, not ticks
     receive(model, state, memory, world, i)
 
 
