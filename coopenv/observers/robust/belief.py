@@ -20,7 +20,7 @@ from coopenv.observers.robust.algebra import (
     with_noise,
 )
 from coopenv.observers.robust.constants import FORGET_TIME, SAME_TIME
-from coopenv.observers.robust.memory import ERRORS, Estimate, Member, Pose, mat66d
+from coopenv.observers.robust.memory import ERRORS, MOUNTING, Estimate, Member, Pose, mat66d
 from coopenv.world.camera import VISIBLE
 
 MAX_UNSEEN_TIME = FORGET_TIME + SAME_TIME
@@ -40,9 +40,10 @@ def begin_belief(memory: Any, world: int, i: int, estimate: Estimate):
     """Believe in the vehicle itself alone, and of its odometry's errors what was believed before."""
     others = memory.belief[world, i].others
     memory.belief[world, i].members = others
-    if others > ERRORS:
-        memory.P[world, i, 0, ERRORS] = mat66d()
-        memory.P[world, i, ERRORS, 0] = mat66d()
+    for k in range(1, others):
+        for j in range(k):
+            memory.P[world, i, j, k] = mat66d()
+            memory.P[world, i, k, j] = mat66d()
     memory.member[world, i, 0].vehicle = i
     memory.member[world, i, 0].pose = estimate.pose
     memory.P[world, i, 0, 0] = estimate.P
@@ -83,7 +84,7 @@ def correct_member(memory: Any, world: int, i: int, k: int):
     """Move a member by its correction, and set the derivative of errors about where it is then by those before."""
     correction = memory.scratch[world, k].correction
     G = wp.identity(6, wp.float64)
-    if k < ERRORS or k >= memory.belief[world, i].others:
+    if k != ERRORS or memory.belief[world, i].others <= ERRORS:
         apply_error(memory, world, i, k, correction)
         G = recentring(correction)
     else:
@@ -185,7 +186,7 @@ def longest_unseen(model: Any, memory: Any, world: int, i: int, tick: int) -> in
 @wp.func
 def most_others(memory: Any) -> int:
     """Return how many other vehicles there is room for in a belief."""
-    return memory.member.shape[2] - 1 - ERRORS
+    return memory.member.shape[2] - 1 - MOUNTING
 
 
 @wp.func

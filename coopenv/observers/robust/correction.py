@@ -35,6 +35,9 @@ def linearise_again(frame: Frame, memory: Any, world: int, i: int, share: Any):
             if member > 0:
                 G = memory.scratch[world, member].recentring
                 memory.line[world, n].member_jacobian = memory.line[world, n].member_jacobian * G
+            if frame.mounting > 0:
+                G = memory.scratch[world, frame.mounting].recentring
+                memory.line[world, n].mounting_jacobian = memory.line[world, n].mounting_jacobian * G
 
 
 @wp.func
@@ -44,6 +47,9 @@ def across_line(memory: Any, world: int, n: int, m: int):
     member = memory.line[world, n].member
     if member > 0:
         S = S + memory.line[world, n].member_jacobian * wp.transpose(memory.gain[world, m, member])
+    mounting = memory.line[world, n].mounting
+    if mounting > 0:
+        S = S + memory.line[world, n].mounting_jacobian * wp.transpose(memory.gain[world, m, mounting])
     return S
 
 
@@ -59,6 +65,11 @@ def set_gain(memory: Any, world: int, i: int, n: int):
         H = memory.line[world, n].member_jacobian
         for k in range(members):
             memory.gain[world, n, k] = memory.gain[world, n, k] + H * memory.P[world, i, member, k]
+    mounting = memory.line[world, n].mounting
+    if mounting > 0:
+        H = memory.line[world, n].mounting_jacobian
+        for k in range(members):
+            memory.gain[world, n, k] = memory.gain[world, n, k] + H * memory.P[world, i, mounting, k]
     for m in range(n):
         if memory.line[world, m].fits == 1:
             share = across_line(memory, world, n, m) * memory.line[world, m].weight
@@ -99,6 +110,9 @@ def correct_by_lines(memory: Any, world: int, i: int, lines: int, judging: bool)
             residual = memory.line[world, n].residual + memory.line[world, n].jacobian * error_left(memory, world, 0)
             if member > 0:
                 residual = residual + memory.line[world, n].member_jacobian * error_left(memory, world, member)
+            mounting = memory.line[world, n].mounting
+            if mounting > 0:
+                residual = residual + memory.line[world, n].mounting_jacobian * error_left(memory, world, mounting)
             weighted = memory.line[world, n].weight * residual
             if judging and member > 0 and wp.dot(weighted, residual) > wp.float64(BEARING_GATE):
                 memory.line[world, n].fits = 0

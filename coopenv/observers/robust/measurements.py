@@ -19,7 +19,8 @@ from coopenv.observers.robust.constants import (
     MAX_ACCELERATION,
     MAX_SPEED,
 )
-from coopenv.observers.robust.memory import Frame, mat26d, vec3d
+from coopenv.observers.robust.memory import MOUNTING, Frame, mat26d, vec3d
+from coopenv.observers.robust.mounting import mounting_noise, mounting_of
 from coopenv.observers.robust.odometry import increment_noise
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.v2x import fresh
@@ -152,7 +153,13 @@ def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
         if state.sight[world, i, target] == VISIBLE:
             if set_line_to_target(model, state, memory, world, i, lines, target, tick, purpose):
                 lines += 1
-    return Frame(lines, vec3d(model.camera[i].position), bearing_variance(model, i))
+    mounting = int(0)
+    variance = bearing_variance(model, i)
+    if purpose == TRACKING:
+        mounting = mounting_of(memory, world, i)
+    else:
+        variance += mounting_noise(memory, world, i)
+    return Frame(lines, mounting, vec3d(model.camera[i].position), variance)
 
 
 @wp.func
@@ -197,6 +204,10 @@ def linearise(frame: Frame, memory: Any, world: int, i: int, n: int):
         turn = wp.transpose(own.R) * theirs.R
     a = wp.transpose(own.R) * (z - own.p)
     d = a - frame.lever
+    if mounting_of(memory, world, i) > 0:
+        mounting = memory.member[world, i, MOUNTING].pose
+        d = d - mounting.p
+        bearing = mounting.R * bearing
     distance = wp.max(wp.length(d), wp.float64(1.0e-9))
     inverse = wp.float64(1.0) / distance
     u = d * inverse
@@ -211,6 +222,12 @@ def linearise(frame: Frame, memory: Any, world: int, i: int, n: int):
         H[:, :3] = -(G * skew(point))
         H[:, 3:] = G
         memory.line[world, n].member_jacobian = H
+    memory.line[world, n].mounting = frame.mounting
+    if frame.mounting > 0:
+        turned = memory.member[world, i, MOUNTING].pose.R
+        H[:, :3] = T * turned * skew(memory.line[world, n].bearing)
+        H[:, 3:] = -(B * turned)
+        memory.line[world, n].mounting_jacobian = H
     memory.line[world, n].residual = T * bearing
     memory.line[world, n].distance = distance
     bend = bend_variance(memory, world, i, member, turn, u, distance)
@@ -231,4 +248,12 @@ def innovation_squared(frame: Frame, memory: Any, world: int, i: int, n: int):
         G = memory.line[world, n].member_jacobian
         cross = (H * memory.P[world, i, 0, member]) * wp.transpose(G)
         S = S + cross + wp.transpose(cross) + (G * memory.P[world, i, member, member]) * wp.transpose(G)
+    if frame.mounting > 0:
+        J = memory.line[world, n].mounting_jacobian
+        cross = H * memory.P[world, i, 0, MOUNTING] * wp.transpose(J)
+        if member > 0:
+            cross = cross + memory.line[world, n].member_jacobian * memory.P[world, i, member, MOUNTING] * wp.transpose(
+                J
+            )
+        S = S + cross + wp.transpose(cross) + (J * memory.P[world, i, MOUNTING, MOUNTING]) * wp.transpose(J)
     return wp.dot(residual, wp.inverse(S) * residual)

@@ -102,7 +102,7 @@ class Belief:
     sample_v: vec3d  # m/s, body: the odometry sample held at the last tick's end
     sample_w: vec3d  # rad/s, body
     members: wp.int32  # how many
-    others: wp.int32  # the first of them that is another vehicle; before it, where it is 2, the odometry's errors
+    others: wp.int32  # the first of them that is another vehicle; before it the odometry's errors and the mounting
     depends_on: wp.uint64  # bits of vehicles
     missed_share: wp.float64  # mean share of bearings that do not fit
     healthy_time: wp.float64  # s for which it has been low
@@ -146,6 +146,7 @@ class Frame:
     """What the bearings of a frame have in common; small, because functions are handed copies of their arguments."""
 
     lines: wp.int32  # how many bearings can be used
+    mounting: wp.int32  # the member that stands for the camera's mounting, 0 if there is none or it counts as noise
     lever: vec3d  # m, of the camera in the body
     variance: wp.float64  # rad^2, of a bearing per tangent axis
 
@@ -155,12 +156,14 @@ class Line:
     """A bearing of the frame as a measurement; scratch, see measurements.py."""
 
     member: wp.int32  # that it is to; 0: to a point in the map
+    mounting: wp.int32  # see `Frame`
     bearing: vec3d  # body frame
     point: vec3d  # m, in the member's body or in the map
     variance: wp.float64  # m^2, of the point per axis
     fits: wp.int32
     jacobian: mat26d  # H of the vehicle's own error
     member_jacobian: mat26d  # H of the member's error
+    mounting_jacobian: mat26d  # H of that of the mounting
     noise: wp.float64  # rad^2 per axis
     distance: wp.float64  # m
     residual: vec2d  # rad
@@ -202,7 +205,8 @@ class CommonMemory:
 
 
 ERRORS = 1  # the member that stands for the odometry's errors, where there is one, see odometry.py
-SIZES = {"K": MAX_MEMBERS + ERRORS, "H": MAX_HYPOTHESES + 1}  # besides the hypotheses of one frame there is the prior
+MOUNTING = 2  # the member that stands for the error of the camera's mounting, where there is one, see mounting.py
+SIZES = {"K": MAX_MEMBERS + MOUNTING, "H": MAX_HYPOTHESES + 1}  # besides the hypotheses of one frame there is the prior
 
 
 @wp.func
@@ -275,11 +279,12 @@ def rules_for(members: int) -> dict[str, Rule]:
         "word.offences": whole(0, MAX_OFFENCES),
         "word.barred_until": whole(0, 2**31 - 1),
         "belief.members": whole(1, members),
-        "belief.others": whole(1, ERRORS + 1),
+        "belief.others": whole(1, MOUNTING + 1),
         "P": Rule("a covariance", lambda P, fields, model: are_joint(P, fields["observer_belief.members"]), axes=4),
         "anchor.estimate.P": COVARIANCE,
         "search.hypotheses": whole(0, MAX_HYPOTHESES),
         "line.member": whole(0, members - 1),
+        "line.mounting": whole(0, MOUNTING),
         **where("belief.members", {"member.pose.R": ROTATION, "member.vehicle": whole(0, "vehicles")}),
         **where("search.active", {"search.prior.pose.R": ROTATION, "search.prior.P": COVARIANCE}),
         **where("search.hypotheses", {"hypothesis.estimate.pose.R": ROTATION, "hypothesis.estimate.P": COVARIANCE}),

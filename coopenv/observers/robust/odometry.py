@@ -22,6 +22,7 @@ from coopenv.observers.robust.constants import (
     SAME_TIME,
 )
 from coopenv.observers.robust.memory import ERRORS, Member, Pose, mat33d, mat66d, vec2d, vec3d
+from coopenv.observers.robust.mounting import begin_mounting, has_mounting_errors
 
 TWELFTH = 1.0 / 12.0
 
@@ -54,7 +55,7 @@ def has_lasting_errors(model: Any, i: int) -> bool:
 @wp.func
 def begin_errors(model: Any, memory: Any, world: int, i: int):
     """Let member 1 stand for the odometry's errors, where there are any, and believe of them what is declared."""
-    if has_lasting_errors(model, i):
+    if has_lasting_errors(model, i) or has_mounting_errors(model, i):
         memory.belief[world, i].others = ERRORS + 1
         errors = Member()
         errors.vehicle = i
@@ -67,6 +68,7 @@ def begin_errors(model: Any, memory: Any, world: int, i: int):
             P[k, k] = wp.max(bias[k], least)
         P[3, 3] = wp.max(scale, least)
         memory.P[world, i, ERRORS, ERRORS] = P
+    begin_mounting(model, memory, world, i)
 
 
 @wp.func

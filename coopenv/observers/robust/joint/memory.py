@@ -6,8 +6,8 @@ import warp as wp
 
 from coopenv.observers.robust.constants import MAX_MEMBERS_JOINT, MAX_TOLD
 from coopenv.observers.robust.memory import (
-    ERRORS,
     LARGE,
+    MOUNTING,
     SIZES,
     CommonMemory,
     Pose,
@@ -76,7 +76,7 @@ JointMemory = extended(
 DIMENSION = 6 * MAX_TOLD
 JOINT_SIZES = {
     **SIZES,
-    "K": MAX_MEMBERS_JOINT + ERRORS,
+    "K": MAX_MEMBERS_JOINT + MOUNTING,
     "T": MAX_TOLD,
     "B": MAX_TOLD - 1,
     "E": MAX_TOLD**2,
