@@ -25,6 +25,9 @@ MAX_SMOOTH_ACCELERATION, MAX_SMOOTH_ANGULAR_ACCELERATION = 10.0, 30.0
 ERRORS_TIME = 1.0
 """s for which an error of a vehicle's odometry that lasts counts as the same where it is taken as noise. Chosen."""
 MIN_MOUNTING_STD = 1e-6  # rad and m, of an error of the mounting that is not declared beside one that is
+MOUNTING_WALK = 0.02
+"""Share of its declared deviation by which the mounting walks in a second: while a car hardly turns, bearings do not
+tell its turn from that of the camera, and linearisations make a filter a little too sure of both. Tuned."""
 MIN_ERROR_STD = 1e-6  # rad/s and a share: of an error that is not declared beside one that is
 
 # Tests

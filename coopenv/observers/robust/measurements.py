@@ -19,8 +19,8 @@ from coopenv.observers.robust.constants import (
     MAX_ACCELERATION,
     MAX_SPEED,
 )
-from coopenv.observers.robust.memory import MOUNTING, Frame, mat26d, vec3d
-from coopenv.observers.robust.mounting import mounting_noise, mounting_of
+from coopenv.observers.robust.memory import Frame, mat26d, vec3d
+from coopenv.observers.robust.mounting import mounting_of, mounting_variances
 from coopenv.observers.robust.odometry import increment_noise
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.v2x import fresh
@@ -158,7 +158,7 @@ def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
     if purpose == TRACKING:
         mounting = mounting_of(memory, world, i)
     else:
-        variance += mounting_noise(memory, world, i)
+        variance += mounting_variances(model, i)[0]
     return Frame(lines, mounting, vec3d(model.camera[i].position), variance)
 
 
@@ -204,8 +204,8 @@ def linearise(frame: Frame, memory: Any, world: int, i: int, n: int):
         turn = wp.transpose(own.R) * theirs.R
     a = wp.transpose(own.R) * (z - own.p)
     d = a - frame.lever
-    if mounting_of(memory, world, i) > 0:
-        mounting = memory.member[world, i, MOUNTING].pose
+    if frame.mounting > 0:
+        mounting = memory.member[world, i, frame.mounting].pose
         d = d - mounting.p
         bearing = mounting.R * bearing
     distance = wp.max(wp.length(d), wp.float64(1.0e-9))
@@ -224,7 +224,7 @@ def linearise(frame: Frame, memory: Any, world: int, i: int, n: int):
         memory.line[world, n].member_jacobian = H
     memory.line[world, n].mounting = frame.mounting
     if frame.mounting > 0:
-        turned = memory.member[world, i, MOUNTING].pose.R
+        turned = memory.member[world, i, frame.mounting].pose.R
         H[:, :3] = T * turned * skew(memory.line[world, n].bearing)
         H[:, 3:] = -(B * turned)
         memory.line[world, n].mounting_jacobian = H
@@ -250,10 +250,10 @@ def innovation_squared(frame: Frame, memory: Any, world: int, i: int, n: int):
         S = S + cross + wp.transpose(cross) + (G * memory.P[world, i, member, member]) * wp.transpose(G)
     if frame.mounting > 0:
         J = memory.line[world, n].mounting_jacobian
-        cross = H * memory.P[world, i, 0, MOUNTING] * wp.transpose(J)
+        rows = H * memory.P[world, i, 0, frame.mounting]
         if member > 0:
-            cross = cross + memory.line[world, n].member_jacobian * memory.P[world, i, member, MOUNTING] * wp.transpose(
-                J
-            )
-        S = S + cross + wp.transpose(cross) + (J * memory.P[world, i, MOUNTING, MOUNTING]) * wp.transpose(J)
+            rows = rows + memory.line[world, n].member_jacobian * memory.P[world, i, member, frame.mounting]
+        cross = rows * wp.transpose(J)
+        own = (J * memory.P[world, i, frame.mounting, frame.mounting]) * wp.transpose(J)
+        S = S + cross + wp.transpose(cross) + own
     return wp.dot(residual, wp.inverse(S) * residual)

@@ -9,7 +9,8 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.observers.robust.constants import MIN_MOUNTING_STD
+from coopenv.observers.robust import constants
+from coopenv.observers.robust.algebra import with_noise
 from coopenv.observers.robust.memory import MOUNTING, Member, vec2d
 
 
@@ -37,7 +38,7 @@ def begin_mounting(model: Any, memory: Any, world: int, i: int):
         mounting.pose.R = wp.identity(3, wp.float64)
         memory.member[world, i, MOUNTING] = mounting
         declared = mounting_variances(model, i)
-        least = wp.float64(MIN_MOUNTING_STD) * wp.float64(MIN_MOUNTING_STD)
+        least = wp.float64(constants.MIN_MOUNTING_STD * constants.MIN_MOUNTING_STD)
         P = wp.identity(6, wp.float64)
         for k in range(3):
             P[k, k] = wp.max(declared[0], least)
@@ -46,15 +47,15 @@ def begin_mounting(model: Any, memory: Any, world: int, i: int):
 
 
 @wp.func
-def mounting_of(memory: Any, world: int, i: int) -> int:
-    """Return the member that stands for the mounting, 0 if there is none."""
-    return wp.where(memory.belief[world, i].others > MOUNTING, MOUNTING, 0)
+def walk_mounting(model: Any, memory: Any, world: int, i: int, dt: Any):
+    """Let the mounting be a little less certain after a time: see `MOUNTING_WALK`."""
+    if mounting_of(memory, world, i) > 0:
+        declared = (wp.float64(constants.MOUNTING_WALK * constants.MOUNTING_WALK) * dt) * mounting_variances(model, i)
+        P = memory.P[world, i, MOUNTING, MOUNTING]
+        memory.P[world, i, MOUNTING, MOUNTING] = with_noise(P, declared)
 
 
 @wp.func
-def mounting_noise(memory: Any, world: int, i: int):
-    """Return the variance of a bearing per axis, rad^2, by what is not known of the mounting, where that is noise."""
-    if mounting_of(memory, world, i) == 0:
-        return wp.float64(0.0)
-    turn = wp.get_diag(memory.P[world, i, MOUNTING, MOUNTING])[:3]
-    return wp.max(turn)
+def mounting_of(memory: Any, world: int, i: int) -> int:
+    """Return the member that stands for the mounting, 0 if there is none."""
+    return wp.where(memory.belief[world, i].others > MOUNTING, MOUNTING, 0)

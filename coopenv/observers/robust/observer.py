@@ -17,6 +17,7 @@ from coopenv.observers.robust.belief import begin_belief, own_estimate
 from coopenv.observers.robust.constants import SAME_PRIOR
 from coopenv.observers.robust.measurements import RESECTION, TRACKING, set_lines
 from coopenv.observers.robust.memory import Estimate, Pose, clear, mat33d, vec3d
+from coopenv.observers.robust.mounting import walk_mounting
 from coopenv.observers.robust.odometry import begin_errors, increment_noise, propagate_own, take_odometry, walk_errors
 from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
 from coopenv.observers.robust.tracklets import bit_of
@@ -121,6 +122,7 @@ def make_estimate(receive: Any, fuse_messages: Any) -> Any:
         receive(model, state, memory, world, i)
         step, jump = take_odometry(model, state, memory, world, i, now.period)
         walk_errors(model, memory, world, i, now.period)
+        walk_mounting(model, memory, world, i, now.period)
         standing = int(BELIEVING)
         if memory.search[world, i].active == 1:
             noise = increment_noise(model, memory, world, i, step, now.period) + jump

@@ -32,6 +32,7 @@ LOSSY = {"v2x.delay": 6, "v2x.loss": 0.3}
 LOST = {"position_radius": 4.0, "orientation_angle": "uniform"}
 LASTING = {"noise.odometry_scale": 0.03, "noise.gyro_bias": (0.0, 0.0, 0.0087)}
 WALKING = {"noise.odometry_scale_walk": 0.003, "noise.gyro_bias_walk": 0.001}
+TURNED = {"camera.extrinsics_error": 0.02, "camera.extrinsics_position_error": 0.02}
 STALE = {"v2x.delay": 3, "v2x.loss": 0.4, "v2x.period": 2, "v2x.staleness": 0.2}
 
 
@@ -74,6 +75,10 @@ CASES: dict[str, Callable[[float], Recording]] = {
     "errors that last": lambda horizon: near(recorded(horizon=horizon, **dotted(LASTING))),
     "errors that last, any start": lambda horizon: random_start(recorded(horizon=horizon, **dotted(LASTING)), 2),
     "errors that walk": lambda horizon: recorded("busy_intersection_tracking", horizon=horizon, **dotted(WALKING)),
+    "a camera that is turned": lambda horizon: recorded(
+        "busy_intersection_tracking", horizon=horizon, **dotted(TURNED)
+    ),
+    "a turned camera, any start": lambda horizon: random_start(recorded(horizon=horizon, **dotted(TURNED)), 2),
     "mirror": lambda horizon: recorded("busy_intersection_mirror", horizon=horizon),
 }
 
@@ -116,6 +121,7 @@ JOINT_CASES = {
     "late radio": CASES["late radio"],
     "eviction": lambda: crowd(6.0, 9, 7),
     "eviction of those told of": lambda: crowd(6.0, 9, 7, True),
+    "a turned camera": lambda: recorded("busy_intersection_tracking", horizon=3.0, **dotted(TURNED)),
     "errors that last": lambda: recorded("busy_intersection_tracking", horizon=3.0, **dotted(LASTING)),
     "a liar": lambda: FAULTS["lying_neighbour"].applied(small_errors(4.0), 0),
 }

@@ -67,6 +67,10 @@ ERRORS = -1
 member."""
 
 
+MOUNTING = -2
+"""In place of a vehicle's number: the turn and the shift of one's own camera, `R` and `p` of the member."""
+
+
 class Belief:
     """Members and their joint covariance (6n, 6n)."""
 
@@ -81,6 +85,23 @@ class Belief:
         if like is not None and like.errors is not None:
             member.v, member.w = like.errors.v, like.errors.w
         self.add([member], P)
+
+    def begin_mounting(self, P: Array, like: Belief | None = None) -> None:
+        """Let member 2 stand for the camera's mounting, of covariance P (6, 6), as another belief has it."""
+        member = Member(MOUNTING, np.eye(3), np.zeros(3))
+        if like is not None and like.mounting is not None:
+            member.R, member.p = like.mounting.R, like.mounting.p
+        self.add([member], P)
+
+    @property
+    def mounting(self) -> Member | None:
+        """The member that stands for the camera's mounting, if there is one."""
+        return self.members[2] if len(self.members) > 2 and self.members[2].vehicle == MOUNTING else None
+
+    @property
+    def others(self) -> int:
+        """Where the members begin that are other vehicles."""
+        return 1 + sum(member.vehicle in (ERRORS, MOUNTING) for member in self.members)
 
     @property
     def errors(self) -> Member | None:
@@ -176,7 +197,13 @@ class Belief:
         member.time, member.odometry = time, (odometry_turn, odometry_position)
 
     def sight(
-        self, bearings: Array, lever_arm: Array, z: Array, places: Sequence[int] = (), points: Sequence[Array] = ()
+        self,
+        bearings: Array,
+        lever_arm: Array,
+        z: Array,
+        places: Sequence[int] = (),
+        points: Sequence[Array] = (),
+        mounted: bool = False,
     ) -> Sight:
         """Return bearings as measurements; the last ones are to members.
 
@@ -186,16 +213,21 @@ class Belief:
             z: (m, 3) where the targets are believed to be, map frame, m.
             places: the members that the last targets belong to.
             points: of these targets in their members' bodies, (3,) m each.
+            mounted: whether the camera's mounting is as believed, not as declared.
         """
         own, m = self.own, len(z)
         a = (z - own.p).dot(own.R)
-        d = a - lever_arm
+        d, said, mounting = a - lever_arm, bearings, self.mounting if mounted else None
+        if mounting is not None:
+            d, bearings = d - mounting.p, said.dot(mounting.R.T)
         distance = np.maximum(lengths(d), 1e-9)
         u = d / distance[:, None]
         T = tangent_basis(u)
         B = T / distance[:, None, None]
         H = np.zeros((m, 2, len(self.P)))
         H[:, :, :3], H[:, :, 3:6] = B @ skew(a), -B
+        if mounting is not None:
+            H[:, :, 12:15], H[:, :, 15:18] = T.dot(mounting.R) @ skew(said), -B.dot(mounting.R)
         for k, n, point in zip(range(m - len(places), m), places, points, strict=True):
             G = B[k].dot(own.R.T).dot(self.members[n].R)
             H[k, :, 6 * n + 3 : 6 * n + 6] = G
@@ -280,7 +312,7 @@ class Belief:
         for k in np.flatnonzero(fits):
             H = sight.H[k]
             S, r = H.dot(P).dot(H.T) + noise[k] * np.eye(2), sight.residual[k] - H.dot(x)
-            if H[:, 6:].any() and r.dot(np.linalg.solve(S, r)) > BEARING_GATE:
+            if H[:, 6 * self.others :].any() and r.dot(np.linalg.solve(S, r)) > BEARING_GATE:
                 fits[k] = False
             else:
                 K = np.linalg.solve(S, H.dot(P)).T

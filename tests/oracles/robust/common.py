@@ -27,7 +27,9 @@ from coopenv.observers.robust.constants import (
     MAX_SPEED,
     MESSAGE_GATE,
     MIN_ANGULAR_VELOCITY_STD,
+    MIN_MOUNTING_STD,
     MIN_VELOCITY_STD,
+    MOUNTING_WALK,
     SAME_TIME,
 )
 from tests.oracles.robust.belief import Belief, Member
@@ -79,6 +81,8 @@ class Common:
         self.sample_noise = setup.noise.angular_velocity, setup.noise.velocity
         self.lasting = Lasting.of(setup.noise)
         self.variance = self.noise.bearing_std**2
+        stds = np.array([setup.noise.camera_orientation, setup.noise.camera_position])
+        self.mounting = np.repeat(stds**2, 3) if stds.any() else np.zeros(6)
         self.possible_dependencies = int(
             mask_of({int(t) - self.landmarks for t in setup.targets if t >= self.landmarks})
         )
@@ -125,8 +129,10 @@ class Common:
     def _alone(self, R: Array, p: Array, P: Array) -> Belief:
         """Return a belief in the vehicle alone, that knows of its odometry's errors what is declared."""
         belief = Belief(self.vehicle, R, p, P)
-        if self.lasting.any:
+        if self.lasting.any or self.mounting.any():
             belief.begin_errors(self.lasting.start)
+        if self.mounting.any():
+            belief.begin_mounting(np.diag(np.maximum(self.mounting, MIN_MOUNTING_STD**2)))
         return belief
 
     def _walk(self, dt: float) -> None:
@@ -134,6 +140,8 @@ class Common:
         if self.belief.errors is not None:
             walk = np.append(self.lasting.bias_walk, self.lasting.scale_walk) * dt
             self.belief.P[6:10, 6:10] += np.diag(walk)
+        if self.belief.mounting is not None:
+            self.belief.P[12:18, 12:18] += MOUNTING_WALK**2 * dt * np.diag(self.mounting)
 
     def message(self) -> Message:
         """Return pose, covariance and odometry, or nothing while the pose is not known."""
@@ -148,7 +156,7 @@ class Common:
     def _search(self, tick: Tick) -> None:
         """Look for the pose; once only one is possible, go on with the prior, or with what this frame alone says."""
         assert self.search is not None
-        found = self.search.look(tick, self._sightings(tick), self.variance)
+        found = self.search.look(tick, self._sightings(tick), self.variance + self.mounting[0])
         if found is None:
             return
         if self.search.confirms_prior(found):
@@ -166,6 +174,8 @@ class Common:
         before, self.belief = self.belief, Belief(self.vehicle, own.R, own.p, pose.P.copy(), tick.time)
         if before.errors_covariance is not None:
             self.belief.begin_errors(before.errors_covariance, before)
+        if before.mounting is not None:
+            self.belief.begin_mounting(before.P[12:18, 12:18], before)
         self.contacts, self.depends_on, self.missed = {}, self.possible_dependencies, 0.0
         self._listen(tick)
 
@@ -295,8 +305,11 @@ class Common:
             else:
                 continue
             known.append(n)
-        sight = belief.sight(tick.bearings[known], tick.lever_arm, np.array(z).reshape(-1, 3), places, points)
-        noise = self.variance + np.array(drift) / sight.distance**2 + sight.bend
+        sight = belief.sight(
+            tick.bearings[known], tick.lever_arm, np.array(z).reshape(-1, 3), places, points, not resecting
+        )
+        variance = self.variance + (self.mounting[0] if resecting else 0.0)
+        noise = variance + np.array(drift) / sight.distance**2 + sight.bend
         nis = sight.normalised(belief.P, noise)
         fits = sight.ahead & (nis < BEARING_GATE)
         judged = [fit for fit, judges in zip(fits.tolist(), counts, strict=True) if judges]

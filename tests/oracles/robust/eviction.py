@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from coopenv.observers.robust.constants import FORGET_TIME, SAME_TIME
-from tests.oracles.robust.belief import ERRORS, Belief
+from tests.oracles.robust.belief import Belief
 
 
 def room_for(belief: Belief, vehicles: set[int], most: int, time: float) -> set[int] | None:
@@ -15,7 +15,7 @@ def room_for(belief: Belief, vehicles: set[int], most: int, time: float) -> set[
         most: how many members a belief may have, the vehicle itself included.
         time: now, s.
     """
-    others = [member for member in belief.members[1:] if member.vehicle != ERRORS]
+    others = belief.members[belief.others :]
     staying = [member for member in others if member.vehicle not in vehicles]
     unseen = [member for member in staying if time - member.seen > FORGET_TIME + SAME_TIME]
     excess = max(0, 1 + len(staying) + len(vehicles) - most)

@@ -24,7 +24,7 @@ from coopenv.observers.robust.constants import (
     SAME_TIME,
     SUPERSEDING_TIME,
 )
-from tests.oracles.robust.belief import ERRORS, Member, errors_of
+from tests.oracles.robust.belief import Member, errors_of
 from tests.oracles.robust.common import Common, Contact
 from tests.oracles.robust.eviction import room_for
 from tests.oracles.robust.tracklets import Report, from_message, marker_jacobian, mask_of, tracklet
@@ -40,7 +40,7 @@ class RobustJoint(Common):
         message = super().message()
         if message.position is None:
             return message
-        places = [n for n, member in enumerate(self.belief.members) if member.vehicle != ERRORS]
+        places = [n for n, member in enumerate(self.belief.members) if member.vehicle >= 0]
         told, index = [self.belief.members[n] for n in places[:MAX_TOLD]], errors_of(places[:MAX_TOLD])
         P = self.belief.P[np.ix_(index, index)]
         if self.marker.any():

@@ -42,7 +42,7 @@ from coopenv.observers.robust.constants import (
     STEPS,
     WORD_GATE,
 )
-from tests.oracles.robust.belief import ERRORS, Member, recentring
+from tests.oracles.robust.belief import Member, recentring
 from tests.oracles.robust.common import Common, Contact
 from tests.oracles.robust.eviction import room_for
 from tests.oracles.robust.sight import View
@@ -97,7 +97,7 @@ class Robust(Common):
 
     def _told_of(self) -> list[int]:
         """Return which members are told of: those that depend on most others, to whom there are most ways."""
-        members = [n for n, m in enumerate(self.belief.members) if n and m.vehicle != ERRORS and m.considered]
+        members = [n for n, m in enumerate(self.belief.members) if n and m.considered]
 
         def order(n: int) -> tuple[int, int]:
             vehicle = self.belief.members[n].vehicle
@@ -262,8 +262,9 @@ class Robust(Common):
 
     def _target_of(self, view: View, k: int) -> Member | None:
         """Return the member that a bearing is to, None if it is to a landmark."""
-        of = np.flatnonzero(view.sight.H[k, :, 6:].any(axis=0))
-        return self.belief.members[1 + int(of[0]) // 6] if len(of) else None
+        others = self.belief.others
+        of = np.flatnonzero(view.sight.H[k, :, 6 * others :].any(axis=0))
+        return self.belief.members[others + int(of[0]) // 6] if len(of) else None
 
     def _count(self, tick: Tick, view: View) -> None:
         """Average which share of the bearings to each member do not fit; believe those no more to which most do not.
@@ -322,7 +323,7 @@ class Robust(Common):
         vague = before[3:, 3:].trace() > 3.0 * MAX_TOLD_VARIANCE
         if forgiven < 0.0 or vague or not is_positive(N) or d.dot(np.linalg.solve(N, d)) > STEP_GATE:
             return
-        free = 12 if belief.errors is not None else 6
+        free = 6 * belief.others
         K = np.linalg.solve(N, D[:, :free]).T
         belief.P[:free] -= K.dot(D)
         belief.P[free:, :free] = belief.P[:free, free:].T

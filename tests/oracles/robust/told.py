@@ -14,7 +14,7 @@ from coopenv.observers.robust.constants import (
     ROUNDING,
     STEPS,
 )
-from tests.oracles.robust.belief import ERRORS, Belief, Member, errors_of
+from tests.oracles.robust.belief import Belief, Member, errors_of
 
 
 def factor(P: Array) -> Array:
@@ -59,7 +59,7 @@ class Correlations:
         """Return the covariances (6, 6) of a sender's new error with those of other members that are told."""
         A, result = factor(after), {}
         for k, member in enumerate(belief.members):
-            if k in (0, n) or member.vehicle == ERRORS:
+            if k in (0, n) or member.vehicle < 0:
                 continue
             C = self._correlation(belief.members[n], member, met)
             if C is not None:

@@ -1,0 +1,80 @@
+"""A camera whose mounting is declared not to be known: robust finds out how it is turned, and is as sure as it may be.
+
+`pytest -s -m slow tests/observers/robust/test_mounting.py` prints the figures of docs/robust.md.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coopenv.observers.robust.memory import MOUNTING
+from coopenv.scenario import load_scenario
+from coopenv.world.world import World
+from tests.helpers.builders import reset, simulate
+from tests.observers.robust.test_driving import nees_of
+
+TURNED = {"camera.extrinsics_error": 0.01745}  # rad per axis: 1 deg
+
+
+def worlds(name: str, seeds: range, **overrides: Any) -> World:
+    made = load_scenario(name, {"observer.name": "robust", **TURNED, **overrides})
+    world = simulate(made, len(seeds))
+    reset(world, seeds)
+    return world
+
+
+def judged(world: World, start: int, end: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return (W, N) the mean NEES/6 and the mean error in m of each vehicle from one second to another."""
+    found = []
+    rate = round(world.scenario.rates.camera)
+    for second in range(end):
+        world.advance(rate)
+        if second >= start:
+            found.append(nees_of(world))
+    nees, error = np.mean(found, axis=0)
+    return nees, error
+
+
+def test_it_is_as_sure_as_it_may_be() -> None:
+    nees, _ = judged(worlds("busy_intersection_tracking", range(16)), 10, 30)
+    assert (nees.mean(axis=0) < 2.5).all()
+
+
+def test_it_finds_out_how_the_camera_is_turned() -> None:
+    """A car that goes straight on tells its heading from the camera's by where its odometry leads."""
+    world = worlds("busy_intersection_tracking", range(16))
+    world.advance(60 * 40)
+    R = world.memory.member.numpy()["pose"]["R"][:, 0, MOUNTING]
+    turn = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1) / 2
+    true = world.view("camera_turn")[:, 0]
+    frame = world.model.camera.numpy()["rotation"][0]
+    error = turn - true @ frame.T
+    P = world.memory.P.numpy()[:, 0, MOUNTING, MOUNTING, :3, :3]
+    sizes = np.einsum("wi,wi->w", error, np.linalg.solve(P, error[..., None])[..., 0])
+    assert sizes.mean() < 9.0  # of three numbers; about 6 was seen, with a standard error of 1.5
+    assert np.sqrt((error**2).mean()) < 0.7 * TURNED["camera.extrinsics_error"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["busy_intersection_tracking", "lane:8", "tree:15"])
+def test_figures_in_other_worlds(name: str) -> None:
+    seeds = range(700, 732)
+    nees, error = judged(worlds(name, seeds), 10, 40)
+    without, good = judged(worlds(name, seeds, **{"camera.extrinsics_error": 0.0}), 10, 40)
+    print(f"\n{name}: ANEES/6 {_text(nees)}, error cm {_cm(error)}; of a true camera {_text(without)}, {_cm(good)}")
+    assert (nees.mean(axis=0) < 2.5).all()
+
+
+def _text(values: np.ndarray) -> str:
+    return " ".join(f"{m:.2f}({s:.2f})" for m, s in zip(values.mean(axis=0), _error(values), strict=True))
+
+
+def _cm(values: np.ndarray) -> str:
+    return " ".join(f"{100 * m:.1f}" for m in values.mean(axis=0))
+
+
+def _error(values: np.ndarray) -> np.ndarray:
+    return np.asarray(values.std(axis=0, ddof=1) / np.sqrt(len(values)))
