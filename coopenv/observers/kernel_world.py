@@ -44,6 +44,9 @@ def model_of(setup: Setup, p: Precision) -> Any:
     noise.slip_rate, noise.slip_duration, noise.slip_size, noise.slip_angle = known.slip
     camera.orientation_std, camera.position_std = known.camera_orientation, known.camera_position
     camera.focal_std = known.focal_length
+    fault = entry_struct(p, "fault")()
+    fault.clock = known.clock_offset
+    model.fault = _for_everybody(fault, N)
     model.camera, model.noise = _for_everybody(camera, N), _for_everybody(noise, N)
     markers = np.zeros((T, 3))
     markers[L + setup.vehicle] = setup.marker

@@ -24,6 +24,8 @@ MAX_SMOOTH_ACCELERATION, MAX_SMOOTH_ANGULAR_ACCELERATION = 10.0, 30.0
 
 ERRORS_TIME = 1.0
 """s for which an error of a vehicle's odometry that lasts counts as the same where it is taken as noise. Chosen."""
+SHARE_OF_CHANGE, LEAST_CHANGE = 0.2, 0.05
+"""Share and m/s by which a velocity must change to count anew in what clocks that are off cost. Chosen."""
 MIN_MOUNTING_STD = 1e-6  # rad and m, of an error of the mounting that is not declared beside one that is
 MOUNTING_WALK = 0.02
 """Share of its declared deviation by which the mounting walks in a second: while a car hardly turns, bearings do not

@@ -63,6 +63,7 @@ class Member:
     has_twist: wp.int32
     v: vec3d  # m/s, body; of the odometry's errors: (scale, 0, 0)
     w: vec3d  # rad/s, body; of the odometry's errors: the gyro's bias
+    dated_v: vec3d  # m/s, body: by which clocks that are off count, see told/clocks.py
     velocity_variance: wp.float64  # (m/s)^2 per axis, of v
     seen_tick: wp.int32  # when it was last in view
     report: Report  # its last one, at which it stands

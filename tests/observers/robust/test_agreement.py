@@ -79,6 +79,7 @@ CASES: dict[str, Callable[[float], Recording]] = {
         "busy_intersection_tracking", horizon=horizon, **dotted(TURNED)
     ),
     "a turned camera, any start": lambda horizon: random_start(recorded(horizon=horizon, **dotted(TURNED)), 2),
+    "clocks that are off": lambda horizon: near(recorded(horizon=horizon, **dotted({"faults.clock_offset": 0.05}))),
     "mirror": lambda horizon: recorded("busy_intersection_mirror", horizon=horizon),
 }
 

@@ -68,23 +68,20 @@ def honest(seeds: range, seconds: int, start: float) -> np.ndarray:
     return mean_errors(scene(), seeds, seconds, start)
 
 
-def cost(name: str, seeds: range, seconds: int) -> tuple[np.ndarray, float, float]:
-    """Return (N,) by how much larger errors are with a lie than without, NaN for who lies.
-
-    And that of the honest ones' mean error, with its standard error.
-    """
+def costs(name: str, seeds: range, seconds: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return (N,) by how much larger errors are with a lie than without, NaN for who lies; (W,) that of their mean."""
     liars, lie = LIES[name]
     start = max(lie.get("start", 0.0), 5.0)
     without = honest(seeds, seconds, start).mean(axis=0)
     found = mean_errors(scene(liars, **lie), seeds, seconds, start)
     found[:, list(liars)] = np.nan
-    mean = np.nanmean(found, axis=1) / without[~np.isnan(found[0])].mean()
-    return found.mean(axis=0) / without, float(mean.mean()), float(mean.std(ddof=1) / np.sqrt(len(mean)))
+    return found.mean(axis=0) / without, np.nanmean(found, axis=1) / without[~np.isnan(found[0])].mean()
 
 
 @pytest.mark.parametrize("name", LIES)
 def test_a_lie_costs_little(name: str) -> None:
-    assert cost(name, range(4), 25)[1] < 3.5
+    """In most worlds; means over many are the slow test's, where one world may cost as much as all others."""
+    assert np.median(costs(name, range(6), 25)[1]) < 3.0
 
 
 def test_who_is_honest_is_believed() -> None:
@@ -114,7 +111,7 @@ def test_liars_are_judged_as_in_numpy(lie: dict[str, Any]) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LIES)
 def test_what_lies_cost_in_other_worlds(name: str) -> None:
-    ratio, mean, error = cost(name, range(500, 524), 45)
+    ratio, means = costs(name, range(500, 524), 45)
     each = " ".join("-" if np.isnan(r) else f"{r:.2f}" for r in ratio)
-    print(f"\n{name}: {mean:.2f}({error:.2f}), each {each}")
-    assert mean < 3.0
+    print(f"\n{name}: {means.mean():.2f}({means.std(ddof=1) / np.sqrt(len(means)):.2f}), each {each}")
+    assert means.mean() < 3.0

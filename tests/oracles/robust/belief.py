@@ -47,6 +47,8 @@ class Member:
     """(3,) last known velocity in its body, m/s; None before a second message."""
     w: Array | None = None
     """(3,) last known angular velocity in its body, rad/s."""
+    dated: Array | None = None
+    """(3,) m/s: by which clocks that are off count."""
     velocity_variance: float = 0.0
     """(m/s)^2 per axis."""
     seen: float = 0.0

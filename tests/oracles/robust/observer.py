@@ -29,6 +29,7 @@ from coopenv.observers.robust.constants import (
     ERROR_FACTOR,
     GROSS_ERROR,
     GROSS_TURN,
+    LEAST_CHANGE,
     LEAST_FORGIVEN,
     LEAST_NEWS,
     LOST_SHARE,
@@ -37,6 +38,7 @@ from coopenv.observers.robust.constants import (
     MAX_TOLD_VARIANCE,
     NEWS_TIME,
     SAME_TIME,
+    SHARE_OF_CHANGE,
     SILENCE_TIME,
     STEP_GATE,
     STEPS,
@@ -60,6 +62,7 @@ class Robust(Common):
         self.correlations = Correlations()
         self.interval = -1
         self.words: dict[int, Word] = {}
+        self.clock_std = setup.noise.clock_offset
 
     def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
         """Start at a pose, and with no opinion of anybody."""
@@ -171,6 +174,7 @@ class Robust(Common):
         assert n is not None
         jumped = has_jumped(belief.members[n], step, dt, self.noise)
         belief.follow(n, report.odometry_turn[0], report.odometry_position[0], float(report.time[0]), self.noise)
+        steady = not self._changes_speed(n)
         word = self._word(sender)
         word.step(last, report, self.noise, belief.errors_covariance)
         drift = word.drifted(DRIFT_GATE, least_drift(report)) if contact.trusted else word.drifted(DRIFT_CLEAR, 0.0)
@@ -178,8 +182,9 @@ class Robust(Common):
         if not contact.trusted:
             return
         self.depends_on |= report.depends_on
+        report = replace(report, P=report.P + self._by_clocks(belief.members[n]))
         if not anew:
-            self._step(n, report)
+            self._step(n, report, steady)
             return
         member, block = belief.members[n], slice(6 * n, 6 * n + 6)
         member.considered = True
@@ -187,6 +192,25 @@ class Robust(Common):
         belief.P[block, block] = report.P
         member.R, member.p = report.R[0], report.p[0]
         self._relate(n, report)
+
+    def _by_clocks(self, member: Member) -> Array:
+        """Return (6, 6) the covariance of how far a member is off by clocks, along its velocity."""
+        P = np.zeros((6, 6))
+        if member.dated is not None:
+            P[3:, 3:] = 2.0 * self.clock_std**2 * np.outer(member.dated, member.dated)
+        return P
+
+    def _changes_speed(self, n: int) -> bool:
+        """Let clocks count by a member's velocity where that has changed much; return whether it has."""
+        member, block = self.belief.members[n], slice(6 * n, 6 * n + 6)
+        dated = np.zeros(3) if member.dated is None else member.dated
+        assert member.v is not None
+        limit = SHARE_OF_CHANGE * float(np.linalg.norm(dated)) + LEAST_CHANGE
+        if self.clock_std == 0.0 or float(np.linalg.norm(member.v - dated)) <= limit:
+            return False
+        member.dated = member.v
+        self.belief.P[block, block] += self._by_clocks(member)
+        return True
 
     def _word(self, sender: int) -> Word:
         """Return what is thought of a sender's word."""
@@ -299,7 +323,7 @@ class Robust(Common):
             return LEAST_FORGIVEN
         return float(sum(bool(contact.last.depends_on & own) for contact in self.contacts.values()))
 
-    def _step(self, n: int, report: Report) -> None:
+    def _step(self, n: int, report: Report, following: bool) -> None:
         """Put a trusted sender where it says that it is; the step d there tells of all errors that correlate with it.
 
         The sender's error after it is not correlated with it, so that its covariance with other errors is the
@@ -321,7 +345,7 @@ class Robust(Common):
         belief.P[block], belief.P[:, block] = row, row.T
         N = before - (1.0 - forgiven) * after + LEAST_NEWS * np.diag(before.diagonal())
         vague = before[3:, 3:].trace() > 3.0 * MAX_TOLD_VARIANCE
-        if forgiven < 0.0 or vague or not is_positive(N) or d.dot(np.linalg.solve(N, d)) > STEP_GATE:
+        if not following or forgiven < 0.0 or vague or not is_positive(N) or d.dot(np.linalg.solve(N, d)) > STEP_GATE:
             return
         free = 6 * belief.others
         K = np.linalg.solve(N, D[:, :free]).T

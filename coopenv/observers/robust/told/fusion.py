@@ -17,6 +17,7 @@ from coopenv.observers.robust.drift import drifted, has_jumped, note_step
 from coopenv.observers.robust.measurements import is_heard
 from coopenv.observers.robust.memory import mat66d, vec6d
 from coopenv.observers.robust.odometry import increment_noise
+from coopenv.observers.robust.told.clocks import by_clocks, changes_speed
 from coopenv.observers.robust.told.correlations import place_of, rank
 from coopenv.observers.robust.told.regression import is_positive, regress
 from coopenv.observers.robust.tracklets import bit_of, propagate_member
@@ -35,10 +36,10 @@ def set_row(memory: Any, world: int, i: int, n: int):
 
 
 @wp.func
-def place(memory: Any, world: int, i: int, n: int):
+def place(model: Any, memory: Any, world: int, i: int, n: int):
     """Put a member where its report says that it is, whatever was believed of it before."""
     report = memory.member[world, i, n].report
-    after = mat66d(report.P)
+    after = mat66d(report.P) + by_clocks(model, memory, world, i, n)
     memory.member[world, i, n].pose = report.pose
     memory.member[world, i, n].considered = 1
     for k in range(memory.belief[world, i].members):
@@ -58,7 +59,7 @@ def add_member(model: Any, memory: Any, world: int, i: int, sender: int, tick: i
         append_member(memory, world, i, sender, report.pose, mat66d(report.P))
         memory.member[world, i, n].report = report
         memory.member[world, i, n].seen_tick = tick
-        place(memory, world, i, n)
+        place(model, memory, world, i, n)
         depends_on = report.depends_on | bit_of(sender)
         memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
 
@@ -82,10 +83,10 @@ def follow(memory: Any, world: int, i: int, n: int, d: Any, N: Any):
 
 
 @wp.func
-def step_to(memory: Any, world: int, i: int, n: int):
-    """Put a trusted member where its new report says that it is, and follow the step there."""
+def step_to(model: Any, memory: Any, world: int, i: int, n: int, following: bool):
+    """Put a trusted member where its new report says that it is, and follow the step there if that tells anything."""
     report = memory.member[world, i, n].report
-    after = mat66d(report.P)
+    after = mat66d(report.P) + by_clocks(model, memory, world, i, n)
     news = algebra.left_error(memory.member[world, i, n].pose, report.pose)
     G = algebra.recentring(news)
     members = memory.belief[world, i].members
@@ -107,7 +108,12 @@ def step_to(memory: Any, world: int, i: int, n: int):
     for k in range(6):
         N[k, k] = N[k, k] + wp.float64(constants.LEAST_NEWS) * before[k, k]
     variance = before[3, 3] + before[4, 4] + before[5, 5]
-    if forgiven >= wp.float64(0.0) and variance <= wp.float64(3.0 * constants.MAX_TOLD_VARIANCE) and is_positive(N):
+    if (
+        following
+        and forgiven >= wp.float64(0.0)
+        and variance <= wp.float64(3.0 * constants.MAX_TOLD_VARIANCE)
+        and is_positive(N)
+    ):
         if wp.length_sq(algebra.inverse_factor(N) * d) <= wp.float64(constants.STEP_GATE):
             follow(memory, world, i, n, d, N)
 
@@ -124,6 +130,7 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick:
     noise = increment_noise(model, memory, world, i, step, dt)
     jumped = has_jumped(model, memory, world, i, n, step, dt)
     propagate_member(model, memory, world, i, n, step, dt, noise)
+    steady = not changes_speed(model, memory, world, i, n)
     memory.member[world, i, n].report = report
     note_step(memory, world, i, sender, last, report, noise, dt)
     gate = wp.float64(constants.DRIFT_GATE)
@@ -140,9 +147,9 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick:
         return
     memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | report.depends_on
     if anew:
-        place(memory, world, i, n)
+        place(model, memory, world, i, n)
     else:
-        step_to(memory, world, i, n)
+        step_to(model, memory, world, i, n, steady)
 
 
 @wp.func
