@@ -5,17 +5,8 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust.constants import MAX_MEMBERS_JOINT, MAX_TOLD
-from coopenv.observers.robust.memory import (
-    LARGE,
-    MOUNTING,
-    SIZES,
-    CommonMemory,
-    Pose,
-    are_joint,
-    mat66d,
-    rules_for,
-    where,
-)
+from coopenv.observers.robust.memory import MOUNTING, SIZES, CommonMemory, Pose, mat66d
+from coopenv.observers.robust.rules import LARGE, are_joint, rules_for, where
 from coopenv.world.records import array, extended
 from coopenv.world.saved_state import FLAG, ROTATION, TICK, Rule, whole
 

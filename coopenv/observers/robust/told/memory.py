@@ -5,7 +5,8 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust.constants import MAX_CORRELATIONS, STEPS
-from coopenv.observers.robust.memory import SIZES, CommonMemory, mat66d, mat66f, rules_for
+from coopenv.observers.robust.memory import SIZES, CommonMemory, mat66d, mat66f
+from coopenv.observers.robust.rules import rules_for
 from coopenv.world.records import array, extended
 from coopenv.world.saved_state import TICK, Rule, whole
 
