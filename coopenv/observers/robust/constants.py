@@ -43,10 +43,10 @@ AGREEMENT_GATE = 16.8  # of the squared distance at which a distrusted sender ag
 MAX_OFFENCES = 7  # from which on a sender is not believed for a minute: 2^(n - 1) s. Chosen
 SILENCE_TIME = 0.5  # s, after which a sender may be elsewhere: who is lost says nothing. Chosen
 ADMISSION = 0.5  # by how much of its variance a sender must know less than before to admit an error. Chosen
-DRIFT_GATE, DRIFT_CLEAR = 24.0, 9.0
-"""Gate of the squared size of a sender's drift from its odometry, chi-square of 3: 1 - 3e-5; and below which a
+DRIFT_GATE, DRIFT_CLEAR = 28.0, 9.0
+"""Gate of the squared size of a sender's drift from its odometry, chi-square of 3: 1 - 4e-6; and below which a
 distrusted one is clear of it, 0.97."""
-DRIFT_STD = 5.0  # of what it says of itself, by which a sender must have drifted to be believed no more. Chosen
+DRIFT_STD = 6.0  # of what it says of itself, by which a sender must have drifted to be believed no more. Chosen
 DRIFT_TIME, SLOW_DRIFT_TIME = 3.0, 30.0  # s over which a sender's place is held against its odometry. Chosen
 SLACK = 0.1  # share of the noise of its odometry by which a sender may be off in what it says of its errors. Tuned
 JUMP_STD = 4.0  # standard deviations beyond what brakes can do by which its odometry jumps
