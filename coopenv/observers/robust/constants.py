@@ -52,7 +52,7 @@ SLACK = 0.1  # share of the noise of its odometry by which a sender may be off i
 JUMP_STD = 4.0  # standard deviations beyond what brakes can do by which its odometry jumps
 WORD_GATE = 60.0
 """Gate of the squared size of how far bearings say that a sender is off, see evidence.py. Tuned: the honest pass."""
-EVIDENCE_SHARE = 0.5  # of a frame's information on that. Tuned: honest senders then have a mean of 3
+EVIDENCE_SHARE = 0.5  # of a frame's information on that, because innovations are not quite white. Tuned
 LEAST_CERTAINTY = 0.01  # 1/m^2, at first
 ERROR_FACTOR = 2.0  # by which who has lied may be farther off than it seems. Chosen
 GROSS_ERROR, GROSS_TURN = 0.5, 0.1

@@ -84,7 +84,7 @@ def hold_considered(memory: Any, world: int, i: int):
     """Take back the corrections of the members that are considered."""
     for k in range(memory.belief[world, i].members):
         if not is_free(memory, world, i, k):
-            memory.scratch[world, k].wish = memory.scratch[world, k].correction
+            memory.scratch[world, k].full_correction = memory.scratch[world, k].correction
             memory.scratch[world, k].correction = vec6d()
 
 

@@ -11,8 +11,10 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, symmetric_part
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.evidence import certainty_of, size_squared
+from coopenv.observers.robust.evidence import carry_evidence, size_squared
 from coopenv.observers.robust.memory import Drift, Estimate, Report, mat33d, mat66d
+
+THIRD = 1.0 / 3.0
 
 
 @wp.func
@@ -57,10 +59,8 @@ def note_step(memory: Any, world: int, i: int, sender: int, last: Report, report
     N = N + wp.float64(constants.SLACK) * noise[1] * one
     word.drift = summed(word.drift, x, N, dt, wp.float64(constants.DRIFT_TIME))
     word.slow_drift = summed(word.slow_drift, x, N, dt, wp.float64(constants.SLOW_DRIFT_TIME))
-    covariance = wp.inverse(certainty_of(memory, world, i, sender))
-    word.certainty = wp.inverse(covariance + noise[1] * one)
-    word.offset = word.certainty * (covariance * word.offset - x)
     memory.word[world, i, sender] = word
+    carry_evidence(memory, world, i, sender, x, noise[1])
 
 
 @wp.func
@@ -73,3 +73,14 @@ def drifted(memory: Any, world: int, i: int, sender: int, gate: Any, least: Any)
     if size_squared(slow.sum, slow.covariance) > gate and wp.length(slow.sum) > least:
         return wp.length(slow.sum)
     return wp.float64(0.0)
+
+
+@wp.func
+def drift_of(memory: Any, world: int, i: int, n: int):
+    """Return how far member n has drifted from its odometry, in m; 0 if by no more than it may, distrusted by less."""
+    sender = memory.member[world, i, n].vehicle
+    if memory.member[world, i, n].distrusted == 1:
+        return drifted(memory, world, i, sender, wp.float64(constants.DRIFT_CLEAR), wp.float64(0.0))
+    P = memory.member[world, i, n].report.P
+    std = wp.sqrt(wp.float64(THIRD) * wp.float64(P[3, 3] + P[4, 4] + P[5, 5]))
+    return drifted(memory, world, i, sender, wp.float64(constants.DRIFT_GATE), wp.float64(constants.DRIFT_STD) * std)

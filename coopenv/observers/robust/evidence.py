@@ -33,6 +33,16 @@ def certainty_of(memory: Any, world: int, i: int, sender: int):
 
 
 @wp.func
+def carry_evidence(memory: Any, world: int, i: int, sender: int, x: Any, variance: Any):
+    """Let evidence be about where a sender says to be now: x (m) from where odometry of a variance (m^2) has led."""
+    covariance = wp.inverse(certainty_of(memory, world, i, sender))
+    believed = covariance * memory.word[world, i, sender].offset - x
+    certainty = wp.inverse(covariance + variance * wp.identity(3, wp.float64))
+    memory.word[world, i, sender].certainty = certainty
+    memory.word[world, i, sender].offset = certainty * believed
+
+
+@wp.func
 def share_of(frame: Frame, memory: Any, world: int, dt: Any):
     """Return which share of a frame's information counts: noise that is not the camera's lasts for many frames."""
     frames = wp.max(wp.float64(constants.NEWS_TIME) / dt, wp.float64(1.0))
@@ -56,9 +66,10 @@ def note_evidence(memory: Any, world: int, i: int, n: int, lines: int, share: An
     R = memory.member[world, i, n].pose.R
     inverse = R * wp.inverse(block3(memory.P[world, i, n, n], 3, 3))
     sender = memory.member[world, i, n].vehicle
-    wish = memory.scratch[world, n].wish
+    correction = memory.scratch[world, n].full_correction
     certainty = certainty_of(memory, world, i, sender) + share * (inverse * D * wp.transpose(inverse))
-    memory.word[world, i, sender].offset = memory.word[world, i, sender].offset + share * (inverse * wish[3:])
+    offset = memory.word[world, i, sender].offset + share * (inverse * correction[3:])
+    memory.word[world, i, sender].offset = offset
     memory.word[world, i, sender].certainty = certainty
 
 

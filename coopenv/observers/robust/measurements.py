@@ -22,6 +22,7 @@ from coopenv.observers.robust.constants import (
 from coopenv.observers.robust.memory import Frame, mat26d, vec3d
 from coopenv.observers.robust.mounting import mounting_of, mounting_variances
 from coopenv.observers.robust.odometry import increment_noise
+from coopenv.observers.robust.trust import is_barred
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.v2x import fresh
 
@@ -130,7 +131,7 @@ def set_line_to_target(
         return True
     heard = is_heard(model, state, memory, world, i, sender, tick)
     if purpose == SEARCH:
-        heard = heard and tick >= memory.word[world, i, sender].barred_until
+        heard = heard and not is_barred(memory, world, i, sender, tick)
         if heard:
             variance = received_variance(model, memory, world, i, sender, tick)
             set_line(memory, world, n, 0, b, memory.inbox[world, i, sender].pose.p, variance)

@@ -174,7 +174,7 @@ class Scratch:
     column: mat66d  # a block of the covariance
     row: mat66d  # another one, as it will be
     correction: vec6d
-    wish: vec6d  # the correction of a member that is considered, which is not carried out
+    full_correction: vec6d  # the correction of a member that is considered, which is not carried out
     last_correction: vec6d  # where the lines were linearised
     recentring: mat66d  # of errors about where they were linearised, then about where the member is put
     pose: Pose  # before the correction

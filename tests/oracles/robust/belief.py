@@ -278,8 +278,8 @@ class Belief:
             look: returns sight and noise again, at the poses believed by then.
 
         Returns:
-            (m,) the variances at last. `fits` is changed where a bearing does not fit the others. `wish` (6n,) is the
-            correction with that of members that are considered, and `wished` its covariance.
+            (m,) the variances at last. `fits` is changed where a bearing does not fit the others. `full_correction`
+            (6n,) is the correction with that of members that are considered, `full_covariance` its covariance.
         """
         before = [(member.R, member.p) for member in self.members]
         x0 = np.zeros(len(self.P))  # where the lines are linearised
@@ -290,20 +290,20 @@ class Belief:
             else:
                 self._judge(sight, noise, fits)
                 if not fits.any():
-                    self.wish, self.wished = np.zeros(len(x0)), np.zeros_like(self.P)
+                    self.full_correction, self.full_covariance = np.zeros(len(x0)), np.zeros_like(self.P)
                     return noise
             H = sight.H[fits].reshape(-1, len(x0)).dot(recentring(x0))
             variances = np.repeat(noise[fits], 2)
             full = self.gain(H, variances)
             K = self._held(full)
-            self.wish = full.dot(sight.residual[fits].ravel() + H.dot(x0))
-            dx = self._held(self.wish)
+            self.full_correction = full.dot(sight.residual[fits].ravel() + H.dot(x0))
+            dx = self._held(self.full_correction)
             distance = float(sight.distance[fits].min())
             last, x0 = x0, dx if _bend(dx, distance) >= RELINEARISATION_ANGLE else dx / 2
             if step > 0 and _bend(x0 - last, distance) < RELINEARISATION_ANGLE:
                 break
         self._put(before, np.zeros(len(x0)))
-        self.wished = full.dot(H).dot(self.P)
+        self.full_covariance = full.dot(H).dot(self.P)
         self.condense(K, H, variances)
         self.shift_about(dx)
         return noise

@@ -277,7 +277,9 @@ class Robust(Common):
             if member.considered:
                 position, word = slice(6 * n + 3, 6 * n + 6), self._word(member.vehicle)
                 P = self.belief.P[position, position]
-                word.weigh(member.R, P, self.belief.wish[position], self.belief.wished[position, position], share)
+                correction = self.belief.full_correction[position]
+                spread = self.belief.full_covariance[position, position]
+                word.weigh(member.R, P, correction, spread, share)
                 size, far = word.contradiction(member.R, P)
                 if size > most:
                     worst, most, error = member.vehicle, size, far

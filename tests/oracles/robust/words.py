@@ -96,10 +96,10 @@ class Word:
                 return far
         return 0.0
 
-    def weigh(self, R: Array, P: Array, wish: Array, spread: Array, share: float) -> None:
+    def weigh(self, R: Array, P: Array, correction: Array, spread: Array, share: float) -> None:
         """Add a correction (3,) that is not carried out, and its covariance, of a position of covariance P (3, 3)."""
         inverse = R.dot(np.linalg.inv(P))
-        self.offset = self.offset + share * inverse.dot(wish)
+        self.offset = self.offset + share * inverse.dot(correction)
         self.certainty = self.certainty + share * inverse.dot(spread).dot(inverse.T)
 
     def contradiction(self, R: Array, P: Array) -> tuple[float, float]:

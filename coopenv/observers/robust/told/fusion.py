@@ -13,7 +13,7 @@ import warp as wp
 
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import append_member, apply_corrections, index_of, make_room, mark_seen
-from coopenv.observers.robust.drift import drifted, has_jumped, note_step
+from coopenv.observers.robust.drift import drift_of, has_jumped, note_step
 from coopenv.observers.robust.measurements import is_heard
 from coopenv.observers.robust.memory import mat66d, vec6d
 from coopenv.observers.robust.odometry import increment_noise
@@ -23,8 +23,6 @@ from coopenv.observers.robust.told.regression import is_positive, regress
 from coopenv.observers.robust.tracklets import bit_of, propagate_member
 from coopenv.observers.robust.trust import is_barred, judge
 from coopenv.world.camera import VISIBLE
-
-THIRD = 1.0 / 3.0
 
 
 @wp.func
@@ -133,14 +131,7 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick:
     steady = not changes_speed(model, memory, world, i, n)
     memory.member[world, i, n].report = report
     note_step(memory, world, i, sender, last, report, noise, dt)
-    gate = wp.float64(constants.DRIFT_GATE)
-    least = wp.float64(constants.DRIFT_STD) * wp.sqrt(
-        wp.float64(THIRD) * wp.float64(report.P[3, 3] + report.P[4, 4] + report.P[5, 5])
-    )
-    if memory.member[world, i, n].distrusted == 1:
-        gate = wp.float64(constants.DRIFT_CLEAR)
-        least = wp.float64(0.0)
-    drift = drifted(memory, world, i, sender, gate, least)
+    drift = drift_of(memory, world, i, n)
     anew = judge(model, memory, world, i, n, tick, dt, drift, jumped)
     if memory.member[world, i, n].distrusted == 1:
         memory.member[world, i, n].considered = 0
