@@ -7,9 +7,9 @@ MAX_MEMBERS, MAX_MEMBERS_JOINT = 5, 8
 `robust_joint`."""
 MAX_LINEARISATIONS, RELINEARISATION_ANGLE = 8, 0.05
 """Linearisations of one correction; how far it may turn a line of sight to be near, rad. Tuned."""
-BEND_FACTOR, CONSIDERED_BEND_FACTOR = 4.0, 20.0
-"""Factor of the variance of what a bearing's linearisation leaves out, which does not average out as noise does; and
-where the bearing is to a member that is only considered, so that no later bearing repairs it. Tuned."""
+BEND_TIME, CONSIDERED_BEND_TIME = 0.4, 4.0
+"""s for which what a bearing's linearisation leaves out is the same: so many frames count as one; and where the bearing
+is to a member that is only considered, so that no later bearing repairs it. Tuned."""
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
 FORGET_TIME = 1.0  # s out of view after which a member may be evicted. Chosen
 MAX_ACCELERATION = 1.0  # m/s^2 by which a member may leave its last known twist. Chosen: an ordinary start or stop
@@ -77,11 +77,11 @@ LEAST_NEWS = 1e-3
 """Share of a sender's variance that counts as noise of the step by which it moves at its next message. Chosen."""
 STEP_GATE = 22.5
 """Gate of the squared size of such a step in standard deviations: chi-square of 6, 0.999."""
-MAX_TOLD_VARIANCE = 0.03**2
+MAX_TOLD_VARIANCE = 0.035**2
 """m^2 per axis, of a sender that knows its place no better, at which nobody follows it: its steps are no small errors.
 Tuned."""
 RELATIVE_NOISE = 1e-6  # share of a variance, that regressions have as noise
-LEAST_FORGIVEN = 0.03
+LEAST_FORGIVEN = 0.01
 """Share of its covariance that is added to that of a sender which depends on others. What is told of correlations is
 not all there is, so that everybody is a little too sure, and who hears him more so. Tuned."""
 MAX_CONTRADICTION = 0.1

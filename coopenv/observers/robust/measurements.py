@@ -13,8 +13,8 @@ from coopenv.observers.contract import MIN_BEARING_STD
 from coopenv.observers.robust.algebra import between, odometry_noise
 from coopenv.observers.robust.belief import index_of
 from coopenv.observers.robust.constants import (
-    BEND_FACTOR,
-    CONSIDERED_BEND_FACTOR,
+    BEND_TIME,
+    CONSIDERED_BEND_TIME,
     CORRELATION_FACTOR,
     MAX_ACCELERATION,
     MAX_SPEED,
@@ -143,10 +143,11 @@ def set_line_to_target(
 
 
 @wp.func
-def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int, purpose: int):
+def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int, period: Any, purpose: int):
     """Set the lines of sight of the bearings to landmarks and vehicles that can be used, and return their frame.
 
-    In a search vehicles are where they say that they are, otherwise where they are believed to be.
+    In a search vehicles are where they say that they are, otherwise where they are believed to be. `period` is the time
+    since the last frame, s.
     """
     lines = int(0)
     for n in range(model.target_count[i]):
@@ -160,24 +161,24 @@ def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
         mounting = mounting_of(memory, world, i)
     else:
         variance += mounting_variances(model, i)[0]
-    return Frame(lines, mounting, vec3d(model.camera[i].position), variance)
+    return Frame(lines, mounting, vec3d(model.camera[i].position), variance, period)
 
 
 @wp.func
-def bend_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: Any, distance: Any):
+def bend_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: Any, distance: Any, period: Any):
     """Return the variance of what a bearing's linearisation leaves out, rad^2.
 
     With relative position uncertain by s along the line of sight u and by t across, its direction is t / (d + s), and
-    t s / d^2 of that no linear function of them. That error is the same for many ticks, so that it counts more than
-    noise of that size. `turn` is from the member's body to the vehicle's.
+    t s / d^2 of that no linear function of them. That error is the same for a while, so that all frames of that while,
+    which follow one another by `period`, count as one. `turn` is from the member's body to the vehicle's.
     """
     V = block3(memory.P[world, i, 0, 0], 3, 3)
     along = wp.dot(u, V * u)
     total = wp.trace(V)
-    factor = wp.float64(BEND_FACTOR)
+    time = wp.float64(BEND_TIME)
     if member > 0:
         if memory.member[world, i, member].considered == 1:
-            factor = wp.float64(CONSIDERED_BEND_FACTOR)
+            time = wp.float64(CONSIDERED_BEND_TIME)
         # of V + turn W turn^T - C turn^T - turn C^T
         W = block3(memory.P[world, i, member, member], 3, 3)
         C = block3(memory.P[world, i, 0, member], 3, 3)
@@ -187,7 +188,7 @@ def bend_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: An
     along = wp.max(along, wp.float64(0.0))
     across = wp.max(total - along, wp.float64(0.0))
     square = distance * distance
-    return factor * along * across / (square * square)
+    return wp.max(time / period, wp.float64(1.0)) * along * across / (square * square)
 
 
 @wp.func
@@ -231,7 +232,7 @@ def linearise(frame: Frame, memory: Any, world: int, i: int, n: int):
         memory.line[world, n].mounting_jacobian = H
     memory.line[world, n].residual = T * bearing
     memory.line[world, n].distance = distance
-    bend = bend_variance(memory, world, i, member, turn, u, distance)
+    bend = bend_variance(memory, world, i, member, turn, u, distance, frame.period)
     memory.line[world, n].noise = frame.variance + memory.line[world, n].variance * inverse * inverse + bend
     return wp.dot(u, bearing) > wp.float64(0.0)
 

@@ -146,6 +146,7 @@ class Frame:
     mounting: wp.int32  # the member that stands for the camera's mounting, 0 if there is none or it counts as noise
     lever: vec3d  # m, of the camera in the body
     variance: wp.float64  # rad^2, of a bearing per tangent axis
+    period: wp.float64  # s, since the last frame
 
 
 @wp.struct

@@ -103,7 +103,8 @@ def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) ->
 def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, standing: int):
     """Correct the belief by a frame; that of a pose that has just been found, take from this frame alone."""
     purpose = wp.where(standing == BELIEVING, TRACKING, RESECTION)
-    frame = set_lines(model, state, memory, world, i, now.tick, purpose)
+    since = wp.float64(now.tick - state.corrected_tick[world, i]) * model.camera_period
+    frame = set_lines(model, state, memory, world, i, now.tick, wp.max(since, now.period), purpose)
     if standing == BELIEVING:
         memory.search[world, i].active = 0
         update(model, state, memory, world, i, now, frame)

@@ -174,7 +174,7 @@ def begin_hypotheses(frame: Frame, memory: Any, world: int, i: int, period: Any)
 @wp.func
 def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> bool:
     """Take a frame's bearings; return whether one hypothesis alone is left after some frames."""
-    frame = set_lines(model, state, memory, world, i, now.tick, SEARCH)
+    frame = set_lines(model, state, memory, world, i, now.tick, now.period, SEARCH)
     beginning = memory.search[world, i].hypotheses == 0
     lines = wp.vec3i(-1, -1, -1)
     solved = int(0)

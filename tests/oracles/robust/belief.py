@@ -18,8 +18,8 @@ from coopenv.observers.contract import SensorNoise
 from coopenv.observers.mekf import LeftError
 from coopenv.observers.robust.constants import (
     BEARING_GATE,
-    BEND_FACTOR,
-    CONSIDERED_BEND_FACTOR,
+    BEND_TIME,
+    CONSIDERED_BEND_TIME,
     ERRORS_TIME,
     MAX_ACCELERATION,
     MAX_GROWTH,
@@ -206,6 +206,7 @@ class Belief:
         places: Sequence[int] = (),
         points: Sequence[Array] = (),
         mounted: bool = False,
+        period: float = BEND_TIME,
     ) -> Sight:
         """Return bearings as measurements; the last ones are to members.
 
@@ -216,6 +217,7 @@ class Belief:
             places: the members that the last targets belong to.
             points: of these targets in their members' bodies, (3,) m each.
             mounted: whether the camera's mounting is as believed, not as declared.
+            period: s, since the last frame.
         """
         own, m = self.own, len(z)
         a = (z - own.p).dot(own.R)
@@ -235,10 +237,10 @@ class Belief:
             H[k, :, 6 * n + 3 : 6 * n + 6] = G
             if point.any():
                 H[k, :, 6 * n : 6 * n + 3] = G.dot(skew(-point))
-        bend = self._bends(d.dot(own.R.T), dict(zip(range(m - len(places), m), places, strict=True)))
+        bend = self._bends(d.dot(own.R.T), dict(zip(range(m - len(places), m), places, strict=True)), period)
         return Sight(H, (T @ bearings[..., None])[..., 0], (u * bearings).sum(axis=1) > 0.0, distance, bend)
 
-    def _bends(self, lines: Array, places: dict[int, int]) -> Array:
+    def _bends(self, lines: Array, places: dict[int, int], period: float) -> Array:
         """Return (m,) the variance of the part t s / d^2 of lines d (m, 3), map frame, that is not linear in errors.
 
         An error s along a line and t across it. The last lines are to members, by line.
@@ -253,8 +255,8 @@ class Belief:
             V, square = D.dot(self.P).dot(D.T), float(d.dot(d))
             along = float(d.dot(V).dot(d)) / square
             considered = k in places and self.members[places[k]].considered
-            factor = CONSIDERED_BEND_FACTOR if considered else BEND_FACTOR
-            result[k] = factor * max(along, 0.0) * max(float(np.trace(V)) - along, 0.0) / square**2
+            frames = max((CONSIDERED_BEND_TIME if considered else BEND_TIME) / period, 1.0)
+            result[k] = frames * max(along, 0.0) * max(float(np.trace(V)) - along, 0.0) / square**2
         return result
 
     def correct(self, H: Array, noise: Array, residual: Array) -> None:

@@ -95,7 +95,7 @@ class Common:
         self.sample: tuple[Array, Array] | None = None  # held at the last tick's end
         self.contacts: dict[int, Contact] = {}
         self.depends_on = self.possible_dependencies
-        self.missed = 0.0
+        self.missed, self.frame_time = 0.0, 0.0
         self.belief = self._alone(R, p, P.copy())
         self.search = None if is_known(P) else Search(self.vehicle, R, p, P.copy())
         self.anchor, self.healthy = Anchor(R, p, P, self.odometry, 0.0), 0.0
@@ -122,6 +122,8 @@ class Common:
             self._listen(tick)
             if tick.due:
                 self._look(tick)
+        if tick.due:
+            self.frame_time = tick.time
         belief = self.belief if self.search is None else self.search.best
         P, coordinates = belief.P[:6, :6].copy(), Coordinates.LEFT
         return Estimate(belief.own.R, belief.own.p, P, coordinates, self.nis if self.nis_dof else None, self.nis_dof)
@@ -306,7 +308,13 @@ class Common:
                 continue
             known.append(n)
         sight = belief.sight(
-            tick.bearings[known], tick.lever_arm, np.array(z).reshape(-1, 3), places, points, not resecting
+            tick.bearings[known],
+            tick.lever_arm,
+            np.array(z).reshape(-1, 3),
+            places,
+            points,
+            not resecting,
+            max(tick.time - self.frame_time, tick.dt),
         )
         variance = self.variance + (self.mounting[0] if resecting else 0.0)
         noise = variance + np.array(drift) / sight.distance**2 + sight.bend

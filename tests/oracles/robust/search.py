@@ -228,7 +228,7 @@ def _perspectives(three: list[Sighting], variance: float) -> Iterator[tuple[Arra
 def _seen(belief: Belief, tick: Tick, sightings: list[Sighting], variance: float) -> tuple[Sight, Array]:
     """Return sightings as measurements at a pose, and their variances (m,)."""
     b, z = np.array([s.bearing for s in sightings]), np.array([s.z for s in sightings])
-    sight = belief.sight(b, tick.lever_arm, z)
+    sight = belief.sight(b, tick.lever_arm, z, period=tick.dt)
     places = CORRELATION_FACTOR * np.array([s.variance for s in sightings]) / sight.distance**2
     return sight, variance + places + sight.bend
 
