@@ -7,9 +7,9 @@ MAX_MEMBERS, MAX_MEMBERS_JOINT = 5, 8
 `robust_joint`."""
 MAX_LINEARISATIONS, RELINEARISATION_ANGLE = 8, 0.05
 """Linearisations of one correction; how far it may turn a line of sight to be near, rad. Tuned."""
-BEND_TIME, CONSIDERED_BEND_TIME = 0.4, 4.0
-"""s for which what a bearing's linearisation leaves out is the same: so many frames count as one; and where the bearing
-is to a member that is only considered, so that no later bearing repairs it. Tuned."""
+BEND_TIME, MEMBER_BEND_TIME, CONSIDERED_BEND_TIME = 0.4, 1.0, 4.0
+"""s for which what a bearing's linearisation leaves out is the same, so that all frames of that time count as one: to a
+landmark; to a member; and to one that is only considered, so that no later bearing repairs it. Tuned."""
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
 FORGET_TIME = 1.0  # s out of view after which a member may be evicted. Chosen
 MAX_ACCELERATION = 1.0  # m/s^2 by which a member may leave its last known twist. Chosen: an ordinary start or stop

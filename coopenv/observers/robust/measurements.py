@@ -18,6 +18,7 @@ from coopenv.observers.robust.constants import (
     CORRELATION_FACTOR,
     MAX_ACCELERATION,
     MAX_SPEED,
+    MEMBER_BEND_TIME,
 )
 from coopenv.observers.robust.memory import Frame, mat26d, vec3d
 from coopenv.observers.robust.mounting import mounting_of, mounting_variances
@@ -177,6 +178,7 @@ def bend_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: An
     total = wp.trace(V)
     time = wp.float64(BEND_TIME)
     if member > 0:
+        time = wp.float64(MEMBER_BEND_TIME)
         if memory.member[world, i, member].considered == 1:
             time = wp.float64(CONSIDERED_BEND_TIME)
         # of V + turn W turn^T - C turn^T - turn C^T

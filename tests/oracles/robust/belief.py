@@ -24,6 +24,7 @@ from coopenv.observers.robust.constants import (
     MAX_ACCELERATION,
     MAX_GROWTH,
     MAX_LINEARISATIONS,
+    MEMBER_BEND_TIME,
     RELINEARISATION_ANGLE,
     SAME_TIME,
 )
@@ -249,14 +250,14 @@ class Belief:
         for k, d in enumerate(lines):
             D = np.zeros((3, len(self.P)))
             D[:, 3:6] = -self.own.R
+            time = BEND_TIME
             if k in places:
                 n = places[k]
+                time = CONSIDERED_BEND_TIME if self.members[n].considered else MEMBER_BEND_TIME
                 D[:, 6 * n + 3 : 6 * n + 6] = self.members[n].R
             V, square = D.dot(self.P).dot(D.T), float(d.dot(d))
             along = float(d.dot(V).dot(d)) / square
-            considered = k in places and self.members[places[k]].considered
-            frames = max((CONSIDERED_BEND_TIME if considered else BEND_TIME) / period, 1.0)
-            result[k] = frames * max(along, 0.0) * max(float(np.trace(V)) - along, 0.0) / square**2
+            result[k] = max(time / period, 1.0) * max(along, 0.0) * max(float(np.trace(V)) - along, 0.0) / square**2
         return result
 
     def correct(self, H: Array, noise: Array, residual: Array) -> None:
