@@ -7,7 +7,7 @@ MAX_MEMBERS, MAX_MEMBERS_JOINT = 5, 8
 `robust_joint`."""
 MAX_LINEARISATIONS, RELINEARISATION_ANGLE = 8, 0.05
 """Linearisations of one correction; how far it may turn a line of sight to be near, rad. Tuned."""
-BEND_TIME, MEMBER_BEND_TIME, CONSIDERED_BEND_TIME = 0.4, 1.0, 4.0
+BEND_TIME, MEMBER_BEND_TIME, CONSIDERED_BEND_TIME = 0.2, 1.0, 4.0
 """s for which what a bearing's linearisation leaves out is the same, so that all frames of that time count as one: to a
 landmark; to a member; and to one that is only considered, so that no later bearing repairs it. Tuned."""
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
