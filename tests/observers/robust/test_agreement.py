@@ -25,7 +25,7 @@ from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.replays import Played, replayed
 from tests.helpers.robust_scenes import crowd, everybody_sees_everybody, noise_free, small_errors
 from tests.oracles.robust.joint import RobustJoint
-from tests.oracles.robust.observer import Robust
+from tests.oracles.robust.spoken import Spoken
 
 ISOTROPIC = {"noise.bearing.model": "isotropic", "noise.bearing.scale": 0.0029}
 LOSSY = {"v2x.delay": 6, "v2x.loss": 0.3}
@@ -85,7 +85,7 @@ CASES: dict[str, Callable[[float], Recording]] = {
 
 
 def check(recording: Recording, played: Played, tamper: Lie | None = None) -> None:
-    result = run(Robust, recording, tamper)
+    result = run(Spoken, recording, tamper)
     assert not result.failure
     assert_allclose(played.position[1:], result.position[1:], rtol=0, atol=1e-9)
     assert_allclose(played.rotation[1:], result.rotation[1:], rtol=0, atol=1e-9)
@@ -107,7 +107,7 @@ def test_it_does_as_the_one_in_numpy(case: str) -> None:
 @pytest.mark.parametrize("case", ["the paper's start", "any start", "stale radio", "slow corrections", "cyclic"])
 def test_its_plug_in_face_does_so_too(case: str) -> None:
     recording = CASES[case](4.0)
-    expected, result = run(Robust, recording), run("robust", recording)
+    expected, result = run(Spoken, recording), run("robust", recording)
     assert not result.failure
     for name in ("position", "rotation", "nees", "nis"):
         assert_allclose(getattr(result, name), getattr(expected, name), rtol=1e-7, atol=1e-9, err_msg=name)
@@ -189,7 +189,7 @@ def test_the_same_members_make_room(leaders: int, gone: int) -> None:
         count = memory.belief.numpy()["members"][0, leaders]
         members[tick] = memory.member.numpy()["vehicle"][0, leaders, :count].tolist()
 
-    class Noted(Robust):
+    class Noted(Spoken):
         def update(self, tick: Tick) -> Estimate:
             estimate = super().update(tick)
             if self.vehicle == leaders:

@@ -17,7 +17,7 @@ from coopenv.observers import run
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.builders import errors, reset, simulate
-from tests.oracles.robust.observer import Robust
+from tests.oracles.robust.spoken import Spoken
 
 SEEN = (
     ("SL1", "SL2", "SL3"),
@@ -96,7 +96,7 @@ def test_liars_are_judged_as_in_numpy(lie: dict[str, Any]) -> None:
     recording = record(scene((1,), 6.0, **lie), 0)
     judged = []
 
-    class Judge(Robust):
+    class Judge(Spoken):
         def _distrust(self, *arguments: Any) -> None:
             judged.append(self.vehicle)
             super()._distrust(*arguments)
