@@ -1,0 +1,79 @@
+"""How sure `robust` is far down a graph of vehicles that measure each other: as sure as it may be, everywhere.
+
+`pytest -s -m slow tests/observers/robust/test_depth.py` prints the table of docs/robust.md.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from coopenv.scenario import load_scenario
+from tests.helpers.builders import reset, simulate
+from tests.observers.robust.test_driving import nees_of
+
+EDGES = (2, 5, 10, 20, 35, 60)  # s
+DEEP = {
+    "`lane:8`": ("lane:8", {}),
+    "`lane:8`, messages 50 ms late": ("lane:8", {"v2x.delay": 3}),
+    "`lane:8`, 30 % of messages lost": ("lane:8", {"v2x.loss": 0.3}),
+    "`lane:20`": ("lane:20", {}),
+    "`tree:20`": ("tree:20", {}),
+    "`random:16,seed=7`": ("random:16,seed=7", {}),
+    "`random:50,seed=9`": ("random:50,seed=9", {}),
+    "`roots:10`": ("roots:10", {}),
+    "`roots:14`": ("roots:14", {}),
+}
+
+
+def by_window(
+    name: str, overrides: dict[str, float], seeds: range, edges: tuple[int, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (windows, W, N) the mean NEES/6 and (windows, N) the RMS position error, m, between seconds."""
+    made = load_scenario(name, {"observer.name": "robust", "horizon": float(edges[-1]) + 1.0, **overrides})
+    world = simulate(made, len(seeds))
+    reset(world, seeds)
+    half = round(made.rates.camera) // 2
+    world.advance(2 * half * edges[0])
+    nees, errors = [], []
+    for start, end in pairwise(edges):
+        found = []
+        for _ in range(2 * (end - start)):
+            world.advance(half)
+            found.append(nees_of(world))
+        n, e = map(np.array, zip(*found, strict=True))
+        nees.append(n.mean(axis=0))
+        errors.append(np.sqrt((e**2).mean(axis=(0, 1))))
+    return np.array(nees), np.array(errors)
+
+
+@pytest.mark.parametrize("name", ["lane:8", "random:12,seed=4", "tree:9"])
+def test_everybody_is_as_sure_as_it_may_be(name: str) -> None:
+    """Starts of up to 10 degrees and 1 m; the mean over worlds of each vehicle."""
+    anees = by_window(name, {}, range(12), (2, 5, 10, 15))[0].mean(axis=1)
+    assert (anees > 0.3).all() and (anees < 2.0).all(), anees
+
+
+def test_a_vehicle_at_the_end_of_a_lane_finds_its_place() -> None:
+    """The eighth and the twelfth: 0.09 and 0.2 m were seen, 0.15 and 0.9 m with linearisations said to err less."""
+    _, errors = by_window("lane:20", {}, range(6), (10, 15))
+    assert errors[0, 7] < 0.2 and errors[0, 11] < 0.4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("title", DEEP)
+def test_how_sure_it_is_in_other_worlds(title: str) -> None:
+    name, overrides = DEEP[title]
+    anees, errors = by_window(name, overrides, range(700, 716), EDGES)
+    mean = anees.mean(axis=1)
+    worst = mean.argmax(axis=1)
+    spread = anees.std(axis=1, ddof=1) / np.sqrt(anees.shape[1])
+    parts = [
+        f"{mean[k].min():.2f} .. {mean[k, n]:.2f}({spread[k, n]:.2f}) {100 * np.median(errors[k]):.1f} "
+        f"{100 * errors[k].max():.1f}"
+        for k, n in enumerate(worst)
+    ]
+    print(f"\n{title}: ANEES/6 least .. worst, error median and largest, cm: " + " | ".join(parts))
+    assert (mean > 0.3).all() and (mean < 3.0).all()
