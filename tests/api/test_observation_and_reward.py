@@ -70,11 +70,11 @@ def drivers(scenario: Any) -> dict[str, Callable[[np.ndarray], np.ndarray]]:
 
 
 @cache
-def run(name: str, driver: str, weight: float | None = None) -> Run:
-    """Drive all vehicles; with a weight of the price of uncertainty other than the file's."""
+def run(name: str, driver: str, weight: float | None = None, times: int = 1) -> Run:
+    """Drive all vehicles in 24 worlds or `times` as many; with a weight of uncertainty other than the file's."""
     vehicles = len(KNOWN[name].vehicles)
     overrides = {} if weight is None else {"reward.weights.position_uncertainty": weight}
-    worlds = 24 if vehicles <= 4 else 48 // vehicles
+    worlds = times * (24 if vehicles <= 4 else 48 // vehicles)
     envs = coopenv.make_vec(name, num_worlds=worlds, autoreset="disabled", overrides=overrides)
     engine, policy = envs.engine, drivers(envs.scenario)[driver]
     term = engine.reward_terms.index("position_uncertainty")
@@ -115,9 +115,12 @@ def test_scales_give_every_entry_a_deviation_between_a_tenth_and_one(name: str) 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_the_price_of_uncertainty_goes_with_the_true_error(name: str) -> None:
-    """Pearson over the steps in which a vehicle drives on, of all vehicles and worlds under one driver."""
+    """Pearson over the steps in which a vehicle drives on, of all vehicles and worlds under one driver.
+
+    Steps of a world are much alike: of 24 worlds of `behind_truck` it is 0.4 to 0.5, of 192 it is 0.68.
+    """
     for driver in ("follow", "look around"):
-        found = run(name, driver)
+        found = run(name, driver, times=4)
         price, error = -found.uncertainty[found.drives_on], found.position_error[found.drives_on]
         assert np.corrcoef(price, error)[0, 1] >= 0.5, driver
 
