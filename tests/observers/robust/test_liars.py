@@ -36,6 +36,9 @@ LIES: dict[str, tuple[tuple[int, ...], dict[str, Any]]] = {
     "the first two collude from 15 s on, 5 m": ((0, 1), {"kind": "collude", "start": 15.0}),
 }
 
+DEAR = ("the first from its first word, 5 m",)
+"""Lies that cost 25 times as much in one world of these four; means over many are the slow test's."""
+
 
 def scene(liars: tuple[int, ...] = (), horizon: float = 50.0, **lie: Any) -> Scenario:
     """Return the five vehicles, of which some lie."""
@@ -80,8 +83,10 @@ def costs(name: str, seeds: range, seconds: int) -> tuple[np.ndarray, np.ndarray
 
 @pytest.mark.parametrize("name", LIES)
 def test_a_lie_costs_little(name: str) -> None:
-    """In most worlds; means over many are the slow test's, where one world may cost as much as all others."""
-    assert np.median(costs(name, range(6), 25)[1]) < 3.0
+    """In most worlds, and on average, but for `DEAR`."""
+    each = costs(name, range(6), 25)[1]
+    assert np.median(each) < 3.0
+    assert name in DEAR or each[:4].mean() < 3.5
 
 
 def test_who_is_honest_is_believed() -> None:

@@ -44,6 +44,8 @@ class Spoken(Robust):
         assert (said.position is None) == (own.position is None)
         if said.position is not None:
             assert said.extra.keys() == own.extra.keys()
+            for name in ("position", "rotation", "covariance"):
+                compare(name, np.asarray(getattr(said, name), float), np.asarray(getattr(own, name), float))
             for name, value in said.extra.items():
                 compare(name, np.asarray(value), np.asarray(own.extra[name]))
         return said
