@@ -6,7 +6,7 @@ APT := apt-get install --yes --no-install-recommends
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
 .DEFAULT_GOAL := help
-.PHONY: help demo svea-demo test test-nats test-ros1 test-train agents test-all test-matrix lint format bench stages gpu schema pages clean
+.PHONY: help demo svea-demo test test-nats test-ros1 test-train agents test-all test-matrix test-browser docs notebooks lint format bench stages gpu schema pages clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -39,7 +39,7 @@ svea-demo: $(VENV)/.svea ## two fake cars overtake in real time; table here, fig
 
 # Three workers on two cores: tests of cars wait for their clock most of the time.
 test: lint ## lint, type check and all tests but the slow ones
-	@$(BIN)/python -m pytest -n 3 --dist loadfile -m "not slow and not nats and not ros1"
+	@$(BIN)/python -m pytest -n 3 --dist loadfile -m "not slow and not nats and not ros1 and not browser"
 
 test-nats: $(VENV)/.dev ## the tests that need a NATS broker (installs Debian's nats-server, as root)
 	@PATH="$$PATH:/usr/sbin"; command -v nats-server > /dev/null || $(APT) nats-server
@@ -77,6 +77,22 @@ $(VENV)/.uv: $(VENV)/.dev
 
 test-matrix: $(VENV)/.uv ## the tests under other Pythons, versions and processors; CELLS="lowest newest" for some of them
 	@$(BIN)/python -m tests.matrix $(CELLS)
+
+$(VENV)/.docs: $(VENV)/.dev
+	@echo "Installing what the documentation site needs into $(VENV) (once) ..."
+	@$(PIP) --editable '.[docs]'
+	@touch $@
+
+docs: $(VENV)/.docs ## build the documentation site, out/site/index.html; links are checked
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "The site: out/site/index.html"
+
+notebooks: $(VENV)/.docs ## write the tutorials as notebooks to out/notebooks
+	@$(BIN)/python -m sitegen.notebooks out/notebooks
+
+test-browser: $(VENV)/.docs ## the tests that open pages in headless Chromium (installs Debian's chromium, as root)
+	@command -v chromium > /dev/null || $(APT) chromium
+	@$(BIN)/python -m pytest -m browser
 
 lint: $(VENV)/.dev ## ruff and mypy
 	@$(BIN)/ruff check .

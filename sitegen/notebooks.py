@@ -1,0 +1,62 @@
+"""Tutorials as notebooks, from the same Markdown: `python -m sitegen.notebooks out/notebooks` (`make notebooks`)."""
+
+import re
+import sys
+from pathlib import Path, PurePosixPath
+
+import jupytext
+import nbformat
+
+from sitegen.mirror import ROOT, outside_of_fences
+
+TUTORIALS = "docs/tutorials"
+FENCE = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
+LINK = re.compile(r"(?<!!)\[([^\]]+)\]\((?!https?:)[^)]+\)")
+PICTURE = re.compile(r"^!\[([^\]]*)\]\([^)]+\).*$")
+
+
+def is_tutorial(uri: str) -> bool:
+    """Return whether a page of docs/ is a tutorial that runs."""
+    return uri.startswith("tutorials/") and uri.endswith(".md") and uri != "tutorials/index.md"
+
+
+def name_of(uri: str) -> str:
+    """Return the notebook of a tutorial."""
+    return str(PurePosixPath(uri).with_suffix(".ipynb"))
+
+
+def notebook(markdown: str) -> str:
+    """Return the notebook of a tutorial: its programs and commands are cells, files that it shows are written.
+
+    Outputs that the page shows are left out, as the notebook makes its own, and so are links, which lead elsewhere.
+    """
+
+    def cell(match: re.Match[str]) -> str:
+        language, file, code = match.groups()
+        if file:
+            return f"```python\n%%writefile {file}\n{code}```"
+        if language == "bash":
+            return f"```python\n%%bash\n{code}```"
+        return "" if language == "text" else match[0]
+
+    text = outside_of_fences(FENCE.sub(cell, markdown), lambda line: PICTURE.sub(r"*\1*", LINK.sub(r"\1", line)))
+    made = jupytext.reads(text, fmt="md")
+    made.metadata["kernelspec"] = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    for number, part in enumerate(made.cells):
+        part["id"] = f"cell-{number}"
+    return str(nbformat.writes(made)) + "\n"
+
+
+def write(folder: Path) -> list[Path]:
+    """Write the notebooks of all tutorials and return their paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for page in sorted((ROOT / TUTORIALS).glob("*.md")):
+        if is_tutorial(f"tutorials/{page.name}"):
+            written.append(folder / f"{page.stem}.ipynb")
+            written[-1].write_text(notebook(page.read_text(encoding="utf-8")), encoding="utf-8")
+    return written
+
+
+if __name__ == "__main__":
+    print(*write(Path(sys.argv[1] if len(sys.argv) > 1 else "out/notebooks")), sep="\n")

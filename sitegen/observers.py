@@ -1,0 +1,67 @@
+"""A page for each observer: what it is, where it comes from, what it sends, its class."""
+
+import ast
+import re
+from collections.abc import Iterator
+
+from coopenv.observers.zoo import ZOO, Entry
+from coopenv.runs.markdown import bullets, table
+from sitegen.mirror import ROOT, relinked
+
+PACKAGE = "coopenv.observers"
+TABLE = "docs/observers.md"
+HEAD = """# Observers
+
+An observer estimates the pose of one vehicle. [Comparing observers](../../observers.md) says how they are judged,
+[your own observer](../../tutorials/own_observer.md) how to write one.
+
+"""
+
+
+def observers() -> Iterator[tuple[str, str]]:
+    """Yield path and Markdown text of the pages of all observers, and of the one that lists them."""
+    known = _rows()
+    rows = [(f"[`{name}`]({name}_.md)", *known[name]) for name in ZOO]
+    yield "reference/observers/index.md", HEAD + table(("name", "what it is", "sends"), rows) + "\n"
+    for name, entry in ZOO.items():
+        yield f"reference/observers/{name}_.md", _page(name, entry, *known[name])
+
+
+def _rows() -> dict[str, tuple[str, str]]:
+    """Return what the table in docs/observers.md says of every observer: what it is, what it sends."""
+    text = relinked((ROOT / TABLE).read_text(encoding="utf-8"), TABLE, "reference/observers/index.md")
+    found = re.findall(r"^\| `(\w+)` \| (.+) \| (.+) \|$", text.partition("## The zoo")[2], re.MULTILINE)
+    return {name: (about, sends) for name, about, sends in found if name in ZOO}
+
+
+def _page(name: str, entry: Entry, about: str, sends: str) -> str:
+    place, _, item = entry.plugin.partition(":")
+    file = f"coopenv/observers/{place.replace('.', '/')}.py"
+    doc = ast.get_docstring(ast.parse((ROOT / file).read_text(encoding="utf-8"))) or ""
+    facts = [
+        f"Sends: {sends}.",
+        f"Source: `{file}`.",
+        "Runs inside the kernels of a batch, on the CPU and on a GPU."
+        if entry.kernels
+        else "Runs in Python on the host.",
+    ]
+    facts += [] if entry.in_space else ["Only for recorded robots on a plane."]
+    facts += [] if entry.on_a_plane else ["Only for vehicles in space, not for recorded robots on a plane."]
+    facts += [f"Needs `{entry.needs}`: `pip install '.[bench]'`."] if entry.needs else []
+    use = f'import coopenv\n\nenv = coopenv.parallel_env("busy_intersection_tracking", observer="{name}")'
+    shown = [] if name in ("centralised",) or not entry.in_space else ["## In an environment", f"```python\n{use}\n```"]
+    return (
+        "\n\n".join(
+            [
+                f"# {name}",
+                about[0].upper() + about[1:] + ".",
+                bullets(facts),
+                "## Method and source",
+                re.sub(r"([*<])", r"\\\1", doc),
+                *shown,
+                "## Code",
+                f"::: {PACKAGE}.{place}.{item}",
+            ]
+        )
+        + "\n"
+    )

@@ -1,0 +1,56 @@
+"""Pages of the reference that are made from the project when the site is built."""
+
+import subprocess
+import sys
+from collections.abc import Iterator
+
+from coopenv.runs.markdown import table
+from sitegen.mirror import ROOT, examples_page, page_of, relinked
+from sitegen.observers import observers
+
+
+def generated() -> Iterator[tuple[str, str]]:
+    """Yield path and Markdown text of every page."""
+    yield "reference/command_line.md", command_line()
+    yield "reference/observation.md", observation()
+    yield "files/examples.md", examples_page()
+    yield from observers()
+    for file, page in mirrored().items():
+        yield page, relinked((ROOT / file).read_text(encoding="utf-8"), file, page)
+
+
+def mirrored() -> dict[str, str]:
+    """Return which files of the repository are pages as they are, and which."""
+    files = ["CHANGELOG.md", "CONTRIBUTING.md", "agents/README.md"]
+    cards = sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("agents/*/card.md"))
+    return {file: page_of(file) for file in [*files, *cards]}
+
+
+def command_line() -> str:
+    """Return the page of the command line, as typer describes it."""
+    command = [sys.executable, "-m", "typer", "coopenv.cli", "utils", "docs", "--name", "coopenv"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    text = done.stdout.replace("# `coopenv`\n", "# Command line\n", 1)
+    return text.replace("**Usage**:\n\n```console\n$ ", "```console\n$ ")
+
+
+def observation() -> str:
+    """Return the page that says what every entry of an observation and every term of the reward means."""
+    from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
+    from coopenv.shipped import list_envs
+
+    parts = [(ROOT / "sitegen" / "observation.md").read_text(encoding="utf-8").strip()]
+    parts += [", ".join(f"[`{name}`](../environments/{name}.md#observation)" for name in list_envs()) + "."]
+    groups: dict[str, list[tuple[str, ...]]] = {}
+    for name, field in OBSERVATION_FIELDS.built_in.items():
+        planar = "" if field.planar is None else str(len(field.planar))
+        row = (f"`{name}`", field.per, str(field.size), planar, field.unit, str(field.scale), field.meaning)
+        groups.setdefault(field.group, []).append(row)
+    for group, rows in groups.items():
+        parts += [f"## {group}", table(("field", "one per", "entries", "planar", "unit", "scale", "meaning"), rows)]
+    rewards = [
+        (f"`{name}`", term.unit, term.meaning + (" (uses the truth)" if term.privileged else ""))
+        for name, term in REWARD_TERMS.built_in.items()
+    ]
+    parts += ["## Terms of the reward", "`reward.weights.NAME` in a scenario weighs them; each counts per decision."]
+    return "\n\n".join([*parts, table(("term", "unit", "meaning"), rewards)]) + "\n"
