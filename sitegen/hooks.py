@@ -17,6 +17,16 @@ sys.path.insert(0, str(ROOT))  # MkDocs loads this file by its path
 from sitegen import links, mirror, notebooks, pages  # noqa: E402
 
 
+def on_config(config: Any) -> Any:
+    """List the pages of all environments, observers and agents in the navigation, below the page that compares them."""
+    (reference,) = (section["Reference"] for section in config.nav if "Reference" in section)
+    for row in filter(lambda row: isinstance(row, dict), reference):
+        for title, page in row.items():
+            if isinstance(page, str) and page in pages.LISTED:
+                row[title] = [page, *pages.LISTED[page]()]
+    return config
+
+
 def on_files(files: Files, config: Any) -> Files:
     """Add pages that are made from the project, files that others link to, and notebooks."""
     texts = dict(pages.generated())

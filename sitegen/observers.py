@@ -10,6 +10,13 @@ from sitegen.mirror import ROOT, relinked
 
 PACKAGE = "coopenv.observers"
 TABLE = "docs/observers.md"
+MORE = {
+    "riccati": "../../method.md",
+    "robust": "../../robust.md",
+    "robust_joint": "../../robust.md#what-a-message-adds",
+    "planar_robust": "../../data.md#observers",
+}
+"""Where the documents explain an observer."""
 HEAD = """# Observers
 
 An observer estimates the pose of one vehicle. [Comparing observers](../../observers.md) says how they are judged,
@@ -34,10 +41,15 @@ def _rows() -> dict[str, tuple[str, str]]:
     return {name: (about, sends) for name, about, sends in found if name in ZOO}
 
 
+def _docstring(file: str) -> str:
+    return ast.get_docstring(ast.parse((ROOT / file).read_text(encoding="utf-8"))) or ""
+
+
 def _page(name: str, entry: Entry, about: str, sends: str) -> str:
     place, _, item = entry.plugin.partition(":")
     file = f"coopenv/observers/{place.replace('.', '/')}.py"
-    doc = ast.get_docstring(ast.parse((ROOT / file).read_text(encoding="utf-8"))) or ""
+    package = file.rpartition("/")[0] + "/__init__.py"
+    doc = _docstring(package if place.endswith("kernels") else file)
     facts = [
         f"Sends: {sends}.",
         f"Source: `{file}`.",
@@ -58,6 +70,7 @@ def _page(name: str, entry: Entry, about: str, sends: str) -> str:
                 bullets(facts),
                 "## Method and source",
                 re.sub(r"([*<])", r"\\\1", doc),
+                *([f"[More]({MORE[name]})."] if name in MORE else []),
                 *shown,
                 "## Code",
                 f"::: {PACKAGE}.{place}.{item}",

@@ -2,11 +2,20 @@
 
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
+from coopenv.observers.zoo import ZOO
 from coopenv.runs.markdown import table
+from coopenv.shipped import list_agents, list_envs
 from sitegen.mirror import ROOT, examples_page, page_of, relinked
 from sitegen.observers import observers
+
+LISTED: dict[str, Callable[[], list[dict[str, str]]]] = {
+    "environments/README.md": lambda: [{name: f"environments/{name}.md"} for name in list_envs()],
+    "reference/observers/index.md": lambda: [{name: f"reference/observers/{name}_.md"} for name in sorted(ZOO)],
+    "reference/agents/index.md": lambda: [{name: page_of(f"agents/{name}/card.md")} for name in list_agents()],
+}
+"""Pages that the navigation lists below another one."""
 
 
 def generated() -> Iterator[tuple[str, str]]:
@@ -37,7 +46,6 @@ def command_line() -> str:
 def observation() -> str:
     """Return the page that says what every entry of an observation and every term of the reward means."""
     from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
-    from coopenv.shipped import list_envs
 
     parts = [(ROOT / "sitegen" / "observation.md").read_text(encoding="utf-8").strip()]
     parts += [", ".join(f"[`{name}`](../environments/{name}.md#observation)" for name in list_envs()) + "."]

@@ -1,0 +1,115 @@
+"""Every page of the site in Chromium, from disk: nothing fails, nothing is asked of another machine, nothing is cut."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytestmark = pytest.mark.browser
+LOCAL = ("file:", "data:", "blob:")
+SIZES = {"laptop": (1280, 800), "phone": (390, 844)}
+CUT = """() => {
+    const edge = window.innerWidth + 1, found = [];
+    const rolls = part => ['auto', 'scroll'].includes(getComputedStyle(part).overflowX);
+    const scrolls = part => part && (rolls(part) || scrolls(part.parentElement));
+    const wide = document.documentElement.scrollWidth - window.innerWidth;
+    if (wide > 0) found.push(`the page is ${wide} px too wide`);
+    for (const part of document.querySelectorAll('article *')) {
+        const style = getComputedStyle(part), box = part.getBoundingClientRect(), text = part.textContent.trim();
+        if (!text || style.display === 'inline' || !box.width || part.closest('.md-clipboard, .md-code__nav')) continue;
+        const hides = ['hidden', 'clip'].includes(style.overflowX) && part.scrollWidth > part.clientWidth + 1;
+        if (hides || (box.right > edge && !scrolls(part))) found.push(`cut: ${text.slice(0, 60)}`);
+    }
+    return found.slice(0, 3);
+}"""
+"""What of the text a reader cannot get to: wide tables and code scroll in boxes of their own."""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Debian's Chromium, headless."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs the extra 'docs'")
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("needs Debian's chromium")
+    with playwright.sync_playwright() as tools:
+        browser = tools.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_every_page_opens(site: Path, browser: Any, size: str) -> None:
+    width, height = SIZES[size]
+    page = browser.new_page(viewport={"width": width, "height": height})
+    problems: list[str] = []
+    here = ""
+    page.on("console", lambda message: message.type == "error" and problems.append(f"{here}: {message.text}"))
+    page.on("pageerror", lambda error: problems.append(f"{here}: {error}"))
+    page.on("requestfailed", lambda request: problems.append(f"{here}: {request.url} failed"))
+    page.on(
+        "request",
+        lambda request: (
+            request.url.startswith(("file:", "data:", "blob:")) or problems.append(f"{here}: asks {request.url}")
+        ),
+    )
+    pages = [path for path in sorted(site.rglob("*.html")) if path.name != "404.html"]
+    assert len(pages) > 80
+    for path in pages:
+        here = str(path.relative_to(site))
+        page.goto(path.as_uri(), wait_until="load")
+        problems += [f"{here}: {found}" for found in page.evaluate(CUT)]
+        assert page.inner_text("article h1").strip()
+    page.close()
+    assert not problems, "\n".join(problems)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "<p style='width: 2000px'>Far beyond the edge.</p>",
+        "<div style='overflow: hidden; width: 50px; white-space: nowrap'>Cut in the middle.</div>",
+    ],
+)
+def test_text_that_is_cut_is_noticed(browser: Any, text: str) -> None:
+    page = browser.new_page(viewport={"width": 390, "height": 844})
+    page.set_content(f"<article><h1>A page</h1><pre style='overflow: auto'>{'x' * 500}</pre></article>")
+    assert page.evaluate(CUT) == []
+    page.set_content(f"<article><h1>A page</h1>{text}</article>")
+    assert page.evaluate(CUT)
+    page.close()
+
+
+def test_search_works_from_disk(site: Path, browser: Any) -> None:
+    page = browser.new_page(viewport={"width": 1280, "height": 800})
+    page.goto((site / "index.html").as_uri())
+    page.fill("input.md-search__input", "basin")
+    page.wait_for_selector(".md-search-result__item a", timeout=20_000)
+    found = page.eval_on_selector_all(
+        ".md-search-result__item a", "links => links.map(link => link.getAttribute('href'))"
+    )
+    assert any("glossary.html" in link or "observers.html" in link for link in found), found
+    page.close()
+
+
+@pytest.mark.parametrize(
+    ("words", "goal"),
+    [
+        ("plug in your own observer", "tutorials/own_observer.html"),
+        ("train and watch an agent", "tutorials/train.html"),
+        ("open a log or a bag", "tutorials/logs.html"),
+        ("what each observation entry means", "reference/observation.html"),
+    ],
+)
+def test_what_newcomers_look_for_is_a_click_away(site: Path, browser: Any, words: str, goal: str) -> None:
+    for width, height in SIZES.values():
+        page = browser.new_page(viewport={"width": width, "height": height})
+        page.goto((site / "index.html").as_uri())
+        page.locator(f"article a:text-is('{words}')").first.click()
+        page.wait_for_load_state()
+        assert page.url == (site / goal).as_uri()
+        page.close()
