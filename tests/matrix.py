@@ -116,7 +116,16 @@ def run_cell(cell: Cell, tests: list[str], workers: int) -> tuple[bool, str]:
     except MissingError as problem:
         return False, f"not run: {problem}"
     parallel = ("-n", str(workers), "--dist", "loadfile") if cell.parallel and workers > 1 else ("-p", "no:xdist")
-    command = [python, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "not slow and not packaging"]
+    command = [
+        python,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-m",
+        "not slow and not packaging and not browser",
+    ]
     log = FOLDER / f"{cell.name}.log"
     with log.open("w") as file:
         done = subprocess.run([*command, *parallel, *cell.options, *tests], cwd=ROOT, env=environment, stdout=file)

@@ -1,0 +1,71 @@
+"""The tutorials as notebooks: the same programs, and they run."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.helpers import bags
+from tests.helpers.sessions import ROOT
+
+pytest.importorskip("jupytext", reason="needs the extra 'docs'")
+nbformat = pytest.importorskip("nbformat", reason="needs the extra 'docs'")
+
+from sitegen import notebooks  # noqa: E402
+
+NAMES = ("first_steps", "own_observer", "train", "logs", "cars")
+NEEDS = {"train": "stable_baselines3", "logs": "rosbags", "cars": "zenoh"}
+
+
+def cells(text: str) -> list[str]:
+    return [cell.source for cell in nbformat.reads(text, as_version=4).cells if cell.cell_type == "code"]
+
+
+def test_a_page_becomes_cells() -> None:
+    page = (
+        "# Title\n\nSee [there](x.md) and [out](https://mcap.dev).\n\n![A car](car.png)\n\n"
+        '```python title="mine.py"\nx = 1\n```\n\n```bash\nls\n```\n\n```python\nprint(1)\n```\n\n'
+        "```text\n1\n```\n\n```\nshown\n```\n"
+    )
+    text = notebooks.notebook(page)
+    assert cells(text) == ["%%writefile mine.py\nx = 1", "%%bash\nls", "print(1)"]
+    prose = "".join(cell.source for cell in nbformat.reads(text, as_version=4).cells if cell.cell_type == "markdown")
+    assert "See there and [out](https://mcap.dev)" in prose and "*A car*" in prose and "shown" in prose
+    assert json.loads(text)["metadata"]["kernelspec"]["name"] == "python3"
+    assert text == notebooks.notebook(page)
+
+
+def test_every_tutorial_becomes_one(tmp_path: Path) -> None:
+    written = notebooks.write(tmp_path)
+    assert sorted(path.stem for path in written) == sorted(NAMES)
+    for path in written:
+        nbformat.validate(nbformat.read(path, as_version=4))
+        assert len(cells(path.read_text(encoding="utf-8"))) >= 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.train if n == "train" else ()) for n in NAMES])
+def test_notebooks_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nbclient = pytest.importorskip("nbclient", reason="needs the extra 'docs'")
+    pytest.importorskip("ipykernel", reason="needs the extra 'docs'")
+    if name in NEEDS:
+        pytest.importorskip(NEEDS[name])
+    if name == "logs":  # the reader's bag
+        bags.write(tmp_path / "drive", bags.messages(bags.drive()), "ros1")
+    tool = tmp_path / "bin" / "coopenv"
+    tool.parent.mkdir()
+    tool.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m coopenv "$@"\n', encoding="utf-8")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tool.parent}:{os.environ['PATH']}")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    page = ROOT / "docs" / "tutorials" / f"{name}.md"
+    made = nbformat.reads(notebooks.notebook(page.read_text(encoding="utf-8")), as_version=4)
+    client = nbclient.NotebookClient(
+        made, timeout=600, kernel_name="python3", resources={"metadata": {"path": tmp_path}}
+    )
+    client.execute()  # raises where a cell does
+    assert all(cell.execution_count for cell in made.cells if cell.cell_type == "code")
