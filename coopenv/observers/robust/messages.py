@@ -50,7 +50,7 @@ def read(observer: Any, sender: int, message: Message, sent: int) -> None:
 
 
 def check_pose(message: Message) -> None:
-    """Refuse what is no pose with a covariance that can be inverted."""
+    """Refuse a message without a valid pose and a covariance that can be inverted."""
     if message.position is None or message.rotation is None or message.covariance is None:
         raise CoopenvError("message: no pose with a covariance")
     P = np.asarray(message.covariance, dtype=np.float64)
