@@ -1,0 +1,78 @@
+"""Pages made from the project, links into the repository, and the check of links."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from coopenv.observers.zoo import ZOO
+from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
+from coopenv.shipped import list_agents, list_envs
+from sitegen import links, mirror, pages
+from tests.helpers.sessions import ROOT
+
+
+@pytest.fixture(scope="module")
+def made() -> dict[str, str]:
+    return dict(pages.generated())
+
+
+def test_there_is_a_page_of_every_observer_agent_and_environment(made: dict[str, str]) -> None:
+    assert {f"reference/observers/{name}_.md" for name in ZOO} <= made.keys()
+    assert {f"reference/agents/{name}.md" for name in list_agents()} <= made.keys()
+    assert all((ROOT / "docs" / "environments" / f"{name}.md").is_file() for name in list_envs())
+    listed = [next(iter(row.values())) for rows in pages.LISTED.values() for row in rows()]
+    assert len(listed) == len(ZOO) + len(list_agents()) + len(list_envs())
+    assert {page for page in listed if page.startswith("reference/")} <= made.keys()
+
+
+def test_pages_of_observers_say_where_they_come_from(made: dict[str, str]) -> None:
+    for name, entry in ZOO.items():
+        page = made[f"reference/observers/{name}_.md"]
+        place, _, item = entry.plugin.partition(":")
+        assert f"::: coopenv.observers.{place}.{item}" in page and "## Method and source" in page
+        assert ("inside the kernels" in page) == bool(entry.kernels)
+
+
+def test_the_page_on_observations_explains_every_entry(made: dict[str, str]) -> None:
+    page = made["reference/observation.md"]
+    assert all(f"| `{name}` | {field.per} |" in page for name, field in OBSERVATION_FIELDS.built_in.items())
+    assert all(f"| `{name}` | {term.unit} |" in page for name, term in REWARD_TERMS.built_in.items())
+    assert all(f"(../environments/{name}.md#observation)" in page for name in list_envs())
+
+
+def test_the_page_of_the_command_line_has_every_command(made: dict[str, str]) -> None:
+    page = made["reference/command_line.md"]
+    for command in ("run", "bench observers", "svea gate", "import", "train"):
+        assert f"`coopenv {command}`\n" in page
+    assert "--observers" in page
+
+
+def test_links_into_the_repository_become_pages() -> None:
+    text = "[a](../envs/facade.toml) [b](method.md#x) [c](https://mcap.dev) [d](#here)\n"
+    text += "```\n[e](../envs/facade.toml)\n```\n"
+    assert list(mirror.links(text, "docs/page.md")) == ["envs/facade.toml", "docs/method.md"]
+    changed = mirror.relinked(text, "docs/page.md", "page.md")
+    assert changed.splitlines()[0] == "[a](files/envs/facade.toml.md) [b](method.md#x) [c](https://mcap.dev) [d](#here)"
+    assert "[e](../envs/facade.toml)" in changed
+    assert mirror.relinked("[x](peek/card.md)\n", "agents/README.md", "reference/agents/index.md") == "[x](peek.md)\n"
+    with pytest.raises(ValueError, match=r"envs/none\.toml is not in the repository"):
+        mirror.relinked("[x](../envs/none.toml)", "docs/page.md", "page.md")
+
+
+def test_broken_links_and_foreign_files_are_found(tmp_path: Path) -> None:
+    (tmp_path / "a.html").write_text('<h1 id="top">A</h1><a href="b.html#there">b</a><a href="#top">up</a>')
+    (tmp_path / "b.html").write_text(
+        '<p id="there"></p><img src="data:image/png;base64,"><a href="https://mcap.dev">x</a>'
+    )
+    assert list(links.problems(tmp_path)) == []
+    (tmp_path / "b.html").write_text(
+        '<a href="c.html">c</a><script src="https://cdn.example/x.js"></script><link href="//f/x.css">'
+    )
+    assert sorted(links.problems(tmp_path)) == [
+        "a.html: no anchor for b.html#there",
+        "b.html: loads //f/x.css",
+        "b.html: loads https://cdn.example/x.js",
+        "b.html: no file for c.html",
+    ]
