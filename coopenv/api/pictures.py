@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from coopenv.api.engine import Engine
 from coopenv.scenario import Scenario
+from coopenv.viz.scene.frame import Frame
 
 if TYPE_CHECKING:
     from coopenv.viz.topview import TopView
@@ -23,7 +23,7 @@ class Pictures:
 
     def of(self, world: int = 0) -> np.ndarray:
         """Return an (H, W, 3) uint8 picture of a world."""
-        return self.view.draw(SimpleNamespace(view=lambda name: self._engine.view(name)[world : world + 1]))
+        return self.view.paint(Frame.of(self._engine, world))
 
     def show(self) -> None:
         """Draw the first world in a window."""

@@ -122,6 +122,11 @@ def observer_names() -> list[str]:
     return sorted({*ZOO, *_registered, *_installed()})
 
 
+def states_covariance(name: str) -> bool:
+    """Return whether an observer's P is meant as a covariance: of the paper's observer it is a matrix of gains."""
+    return name not in ZOO or ZOO[name].covariance
+
+
 def obstacle(name: str) -> str:
     """Return why a known observer cannot be used here, in one line; empty where it can."""
     if name in ZOO:

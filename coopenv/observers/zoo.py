@@ -14,14 +14,15 @@ class Entry:
     on_a_plane: bool = True
     """Whether it is meant for robots on a plane whose odometry is their commands (`Setup.planar`)."""
     kernels_on_a_plane: bool = True  # whether its kernels are those of the plug-in there
+    covariance: bool = True  # whether its P is meant as a covariance, and is no matrix of gains
 
 
 ZOO = {
     "dead_reckoning": Entry("dead_reckoning:DeadReckoning", "riccati.kernels:DEAD_RECKONING"),
     # on a plane bearings to three points say more than a pose needs
     "p3p": Entry("single_frame:PerspectivePoints", on_a_plane=False),
-    "riccati": Entry("riccati.kernels:riccati", "riccati.kernels:RICCATI"),
-    "hamel_samson": Entry("hamel_samson:HamelSamson"),
+    "riccati": Entry("riccati.kernels:riccati", "riccati.kernels:RICCATI", covariance=False),
+    "hamel_samson": Entry("hamel_samson:HamelSamson", covariance=False),
     "mekf": Entry("mekf:Mekf"),
     "mekf_covariance": Entry("mekf_covariance:MekfCovariance"),
     "mekf_covariance_ungated": Entry("mekf_covariance:MekfCovarianceUngated"),

@@ -5,16 +5,16 @@ from typing import Any
 import numpy as np
 from matplotlib.colors import to_rgba_array
 from matplotlib.patheffects import withStroke
-from scipy.spatial.transform import Rotation
 
-from coopenv.estimation.outcomes import Outcome, Sight
+from coopenv.estimation.outcomes import Outcome
 from coopenv.format import fixed
 from coopenv.scenario import Scenario
-from coopenv.scenario.bodies import Body, Landmark, Vehicle
+from coopenv.scenario.bodies import Body
 from coopenv.viz import topview_geometry as geometry
 from coopenv.viz import topview_ground as ground
+from coopenv.viz.scene.frame import Frame, Shown
+from coopenv.viz.scene.stage import Stage
 from coopenv.viz.style import DARK_BLUE, INK, NORMAL, vehicle_colour
-from coopenv.viz.topview_goals import FIELDS as GOAL_FIELDS
 from coopenv.viz.topview_goals import Goals
 from coopenv.viz.topview_layers import Layers
 from coopenv.viz.window import Window
@@ -22,18 +22,12 @@ from coopenv.viz.window import Window
 _SHORTEST = 28  # px, drawn length of a vehicle
 _POINTER = 13  # px
 _LABEL = 11  # px beside a vehicle
-_REACH = 0.4  # of the picture's side, of a camera that sees farther
 _FILLED = 0.3  # of the picture's side, largest semi-axis of an ellipse that is filled
 _LARGEST = 2.0  # of the picture's side, largest semi-axis of an ellipse that is drawn
 _HALO: dict[str, Any] = {"path_effects": [withStroke(linewidth=2.2, foreground="white")]}
 _FARTHEST = 10.0  # pictures' sides from the middle, of an estimate as drawn
 _BOX = ("rotation", "position", "half")
 _POINT = Body(size=(2e-3, 1e-3, 1e-3))  # stands in for a vehicle without a body, drawn at the least size
-_FIELDS = (
-    *("rotation", "position", "estimate_rotation", "estimate_position", "covariance"),
-    *("sight", "ended", "position_error", "orientation_error", "present", *GOAL_FIELDS),
-    *("traffic_rotation", "traffic_position", "traffic_half", "pan"),
-)
 
 
 class TopView:
@@ -51,7 +45,7 @@ class TopView:
             panel: table and legend beside the map; without them the mean error of those under way stands above it.
         """
         self.scenario, self._panel = scenario, panel
-        self._landmarks = len(scenario.landmarks)
+        self._stage, self._landmarks = Stage(scenario), len(scenario.landmarks)
         self._figure, self._axes = ground.new_ground(scenario)
         self._layers = Layers(self._figure, self._axes)
         (x0, x1), (y0, y1) = self._axes.get_xlim(), self._axes.get_ylim()
@@ -63,22 +57,20 @@ class TopView:
         self._prepare_table()
         self._window = Window(scenario.title)
 
-    def draw(self, engine: Any) -> np.ndarray:
+    def draw(self, engine: Shown) -> np.ndarray:
         """Return an (H, W, 3) uint8 picture of world 0, as wide as the map if that is all."""
-        view = {name: np.asarray(engine.view(name)[0], float) for name in _FIELDS}
-        R, position = view["rotation"], view["position"]
-        R_hat, p_hat = view["estimate_rotation"], view["estimate_position"]
-        estimate = (R_hat @ p_hat[..., None])[..., 0]
-        absent = view["present"] == 0.0
-        position[absent] = estimate[absent[self._landmarks :]] = np.nan
-        sigma = self._place_ellipses(estimate, geometry.position_covariance(R_hat, p_hat, view["covariance"]))
-        self._goals.place(view)
-        self._place_bodies(R, position, R_hat, estimate)
-        there = view["traffic_half"][:, 0] > 0.0
-        self._traffic.set_verts(geometry.box_outlines(*(view[f"traffic_{part}"][there] for part in _BOX)))
-        self._place_sight(R, position, view["sight"], view["pan"])
-        self._place_marks(R, position, view["ended"])
-        self._write(view, sigma, float(engine.view("tick")[0]) / self.scenario.rates.camera)
+        return self.paint(Frame.of(engine))
+
+    def paint(self, frame: Frame) -> np.ndarray:
+        """Return an (H, W, 3) uint8 picture of a frame, as wide as the map if that is all."""
+        sigma = self._place_ellipses(frame.estimate_position, frame.position_covariance)
+        self._goals.place(frame)
+        self._place_bodies(frame)
+        there = frame.traffic_half[:, 0] > 0.0
+        self._traffic.set_verts(geometry.box_outlines(*(getattr(frame, f"traffic_{part}")[there] for part in _BOX)))
+        self._place_sight(frame)
+        self._place_marks(frame)
+        self._write(frame, sigma)
         picture = self._layers.paint()
         return picture if self._panel else picture[:, : ground.MAP_WIDTH].copy()
 
@@ -92,7 +84,6 @@ class TopView:
 
     def _prepare_shapes(self) -> None:
         s = self.scenario
-        agents: list[Landmark | Vehicle] = [*s.landmarks, *s.vehicles]
         shortest = _SHORTEST * self._pixel
         bodies = [vehicle.body or _POINT for vehicle in s.vehicles]
         self._box = np.array([geometry.box_shape(b.size, b.center, shortest) for b in bodies])
@@ -100,11 +91,6 @@ class TopView:
         self._others = [i for i, m in enumerate(s.landmarks) if m.body]
         bodies = [m.body for m in s.landmarks if m.body]
         self._other_box = np.array([geometry.box_shape(b.size, b.center, shortest) for b in bodies]).reshape(-1, 4, 2)
-        self._marker = np.array([agent.marker for agent in agents])
-        cameras, limit = s.cameras, _REACH * self._side
-        self._camera, self._origin = np.array([camera.position for camera in cameras]), np.array(s.map.origin)
-        self._reach = np.array([min(c.range or limit, limit) if c.model == "pinhole" else 0.0 for c in cameras])
-        self._fan = np.array([geometry.camera_fan(camera) for camera in cameras]) if ground.sees_a_part(s) else None
         aside = self._box[:, 2, 1] + _LABEL * self._pixel
         self._label = np.stack([self._box[:, :, 0].mean(axis=1), aside], axis=-1)
 
@@ -166,9 +152,9 @@ class TopView:
         self._ellipses.set_edgecolor(to_rgba_array(self._rgba[drawn], np.where(alpha > 0, 0.8, 0.35)))
         return semi
 
-    def _place_bodies(self, R: np.ndarray, position: np.ndarray, R_hat: np.ndarray, estimate: np.ndarray) -> None:
-        L = self._landmarks
-        place, guess = position[L:, :2], self._drawable(estimate[:, :2])
+    def _place_bodies(self, frame: Frame) -> None:
+        L, R, position, R_hat = self._landmarks, frame.rotation, frame.position, frame.estimate_rotation
+        place, guess = position[L:, :2], self._drawable(frame.estimate_position[:, :2])
         self._truth.set_verts(geometry.outlines(R[L:], place, self._box))
         self._truth_nose.set_verts(geometry.outlines(R[L:], place, self._nose))
         believed = geometry.outlines(R_hat, guess, self._box)
@@ -194,30 +180,25 @@ class TopView:
         if pointing is self._strays:
             pointing.set_facecolor(self._rgba[which])
 
-    def _place_sight(self, R: np.ndarray, position: np.ndarray, sight: np.ndarray, pan: np.ndarray) -> None:
-        L = self._landmarks
-        target = (position + (R @ self._marker[..., None])[..., 0])[:, :2]
-        camera = position[L:] + (R[L:] @ self._camera[..., None])[..., 0]
+    def _place_sight(self, frame: Frame) -> None:
+        L, target, eye = self._landmarks, self._stage.targets(frame)[:, :2], self._stage.eyes(frame)[:, :2]
         for kind, lines in self._sight.items():
-            observer, seen = np.nonzero(sight == kind)
-            lines.set_segments(list(np.stack([camera[observer, :2], target[seen]], axis=1)))
+            observer, seen = np.nonzero(frame.sight == kind)
+            lines.set_segments(list(np.stack([eye[observer], target[seen]], axis=1)))
             if "color" not in ground.SIGHT_LOOKS[kind]:
                 lines.set_color(to_rgba_array(self._rgba[observer], 0.9))
-        if self._fan is not None:
-            turned = Rotation.from_euler("z", pan[:, None]).as_matrix()
-            rays = self._fan @ np.swapaxes(R[L:] @ turned, 1, 2)
-            length = geometry.free_lengths(camera, rays, self._reach, self.scenario.obstacles, self._origin)
-            rim = camera[:, None] + length[..., None] * rays
-            self._wedges.set_verts(np.concatenate([camera[:, None], rim], axis=1)[..., :2])
-        moving = np.array([i for i, m in enumerate(self.scenario.landmarks) if m.motion.kind != "static"], dtype=int)
+        wedges = self._stage.fields_of_view(frame)
+        if wedges is not None:
+            self._wedges.set_verts(wedges[..., :2])
+        moving = np.flatnonzero(self._stage.moving)
         self._still.set_data(*np.delete(target[:L], moving, axis=0).T)
         self._moving.set_data(*target[moving].T)
         for i, name in self._moving_names.items():
             name.set_visible(bool(np.isfinite(target[i]).all()))
             name.xy = (float(target[i, 0]), float(target[i, 1]))
 
-    def _place_marks(self, R: np.ndarray, position: np.ndarray, ended: np.ndarray) -> None:
-        L = self._landmarks
+    def _place_marks(self, frame: Frame) -> None:
+        L, R, position, ended = self._landmarks, frame.rotation, frame.position, frame.ended
         place = geometry.outlines(R[L:], position[L:, :2], self._box.mean(axis=1, keepdims=True))[:, 0]
         self._arrived.set_data(*place[ended == Outcome.ARRIVED].T)
         self._collided.set_data(*place[ended == Outcome.COLLIDED].T)
@@ -225,14 +206,13 @@ class TopView:
         for name, (x, y) in zip(self._names, beside.tolist(), strict=True):
             name.set_position((x, y))
 
-    def _write(self, view: dict[str, np.ndarray], sigma: np.ndarray, time: float) -> None:
-        under_way = view["position_error"][view["ended"] == Outcome.UNDER_WAY]
+    def _write(self, frame: Frame, sigma: np.ndarray) -> None:
+        time = float(frame.tick) / self.scenario.rates.camera
+        errors = frame.position_error[frame.under_way]
         word = "mean error" if len(self.scenario.vehicles) > 1 else "error"
-        error = f"{word} {fixed(under_way.mean(), 2)} m   " if len(under_way) and not self._panel else ""
+        error = f"{word} {fixed(errors.mean(), 2)} m   " if len(errors) and not self._panel else ""
         self._time.set_text(f"{error}t = {time:.2f} s")
-        seen = np.sum(view["sight"] == Sight.VISIBLE, axis=-1)
-        possible = np.sum(view["sight"] != Sight.NOT_A_NEIGHBOUR, axis=-1)
         for i, row in enumerate(self._rows):
-            error, angle = view["position_error"][i], view["orientation_error"][i]
-            mark, sees = ground.vehicle_mark(i), f"{seen[i]}/{possible[i]}"
+            error, angle = frame.position_error[i], frame.orientation_error[i]
+            mark, sees = ground.vehicle_mark(i), f"{frame.sees[i]}/{frame.could_see[i]}"
             row.set_text(f"{mark:<4}{fixed(error, 3):>7}{angle:>7.1f}{fixed(sigma[i], 3):>7}{sees:>6}")

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba_array
 
 from coopenv.scenario import Scenario
+from coopenv.viz.scene.frame import Frame
 from coopenv.viz.style import SMALL, vehicle_colour
 from coopenv.viz.topview_ground import DOTTED, vehicle_mark
 from coopenv.viz.topview_layers import Layers
@@ -14,9 +15,6 @@ from coopenv.viz.topview_layers import Layers
 _CORNERS = 48  # of the polygon that stands for a circle
 _ANGLE = np.linspace(0.0, 2 * np.pi, _CORNERS, endpoint=False)
 _CIRCLE = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=-1)
-
-FIELDS = ("goal", "route", "route_count", "route_drawn")
-"""Fields of the state that are drawn."""
 
 
 class Goals:
@@ -35,14 +33,14 @@ class Goals:
         texts = [axes.text(0, 0, vehicle_mark(i), color=c, **look) for i, c in zip(self._there, colours, strict=True)]
         self._names = [layers.keep(text) for text in texts]
 
-    def place(self, view: dict[str, np.ndarray]) -> None:
-        """Move them to where they are now; `view` has the FIELDS of the state of one world."""
-        center = view["goal"][self._there, :2]
+    def place(self, frame: Frame) -> None:
+        """Move them to where they are now."""
+        center = frame.goal[self._there, :2]
         shapes = center[:, None] + self._radius[self._there, None, None] * _CIRCLE
         self._discs.set_verts(list(shapes))
         self._rims.set_verts(list(shapes))
         for name, (x, y) in zip(self._names, center.tolist(), strict=True):
             name.set_position((x, y))
-        drawn = [i for i in self._there if view["route_drawn"][i] >= 0]
-        self._routes.set_segments([view["route"][i, : int(view["route_count"][i]), :2] for i in drawn])
+        drawn = [i for i in self._there if frame.route_drawn[i] >= 0]
+        self._routes.set_segments([frame.route[i, : int(frame.route_count[i]), :2] for i in drawn])
         self._routes.set_color([vehicle_colour(i) for i in drawn])

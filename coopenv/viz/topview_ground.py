@@ -13,6 +13,7 @@ from matplotlib.text import Annotation
 
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario
+from coopenv.viz.scene.stage import sees_a_part
 from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, legend, new_figure
 from coopenv.viz.topview_geometry import limits, road_corners
 
@@ -130,13 +131,6 @@ def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
     place = pixels(PANEL - 4, TABLE_TOP - ROW * (rows + 1))
     gaps = {"borderaxespad": 0.0, "borderpad": 0.0, "handlelength": 1.9, "labelspacing": 0.42}
     legend(figure, handles, "upper left", place, labelcolor=INK, **gaps)
-
-
-def sees_a_part(scenario: Scenario) -> bool:
-    """Return whether cameras have a field of view that matters."""
-    if scenario.topology.mode != "sensed" or scenario.sensing != "sensed":
-        return False
-    return any(camera.model == "pinhole" for camera in scenario.cameras)
 
 
 def _sight(sight: Sight, label: str) -> Line2D:

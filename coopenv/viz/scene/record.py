@@ -1,0 +1,182 @@
+"""Frames of an episode, kept in one file: `scene.npz`, from which pages and films are made again."""
+
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from pydantic import ValidationError
+
+from coopenv.errors import CoopenvError, DataError
+from coopenv.files import replacing_file
+from coopenv.jsonable import jsonable
+from coopenv.observers.registry import states_covariance
+from coopenv.scenario import Scenario
+from coopenv.scenario.base import Part
+from coopenv.scenario.files import parse_scenario
+from coopenv.scenario.own_terms import without_own_terms
+from coopenv.scenario.validation import one_line
+from coopenv.viz.scene.frame import FIELDS, WHOLE_FIELDS, Frame, Shown
+
+SCENE_FILE = "scene.npz"
+_LARGEST = 2**31  # bytes that a file may unpack to
+_HEADER = "header"
+
+
+class Source(Part):
+    """What a scene is of, for its heading."""
+
+    name: str
+    """Of the environment, the recording or the deployment."""
+    observer: str
+    policy: str = ""
+    """Who drives; empty: nobody."""
+    seed: int | None = None
+    """None: nothing was drawn."""
+    terms: tuple[str, ...] = ()
+    """Names of the reward terms of a frame."""
+    honest: bool = True
+    """Whether the observer's P is meant as a covariance; of the paper's it is a gain matrix."""
+
+    @classmethod
+    def of(cls, name: str, scenario: Scenario, **more: Any) -> Self:
+        """Return what a scene of a scenario is of; `more` are further fields."""
+        observer = scenario.observer.name
+        terms = tuple(scenario.reward.by_name)
+        return cls(name=name, observer=observer, terms=terms, honest=states_covariance(observer), **more)
+
+    @property
+    def words(self) -> str:
+        """Return it in a line, such as "busy_intersection, observer riccati, seed 0"."""
+        parts = [self.name, f"observer {self.observer}"]
+        parts += [f"driven by {self.policy}"] if self.policy else []
+        return ", ".join([*parts, *([f"seed {self.seed}"] if self.seed is not None else [])])
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """K frames of an episode."""
+
+    scenario: Scenario
+    source: Source
+    fields: dict[str, np.ndarray]
+    """By name of a frame's field, (K, ...)."""
+
+    def __len__(self) -> int:
+        """Return K."""
+        return len(self.fields["tick"])
+
+    def frame(self, k: int) -> Frame:
+        """Return frame k."""
+        return Frame(**{name: values[k] for name, values in self.fields.items()})
+
+    @property
+    def time(self) -> np.ndarray:
+        """(K,) s since the start."""
+        return np.asarray(self.fields["tick"] / self.scenario.rates.camera)
+
+    @property
+    def length(self) -> float:
+        """Time from the first to the last frame, s."""
+        return float(self.time[-1] - self.time[0])
+
+    def of(self, frames: np.ndarray) -> "SceneRecord":
+        """Return some of the frames."""
+        return SceneRecord(self.scenario, self.source, {name: values[frames] for name, values in self.fields.items()})
+
+    def save(self, path: Path) -> None:
+        """Write everything in single precision.
+
+        Raises:
+            OutputError: it cannot be written; an older file is untouched.
+        """
+        arrays: dict[str, Any] = {}
+        for name, values in self.fields.items():
+            whole = name in WHOLE_FIELDS
+            small = values.astype(np.int32 if whole else np.float32)
+            same = len(small) > 1 and np.array_equal(
+                small, np.broadcast_to(small[:1], small.shape), equal_nan=not whole
+            )
+            arrays[name] = small[:1] if same else small  # what stands still is kept once
+        scenario = without_own_terms(jsonable(self.scenario))
+        header = {"frames": len(self), "source": self.source.model_dump(), "scenario": scenario}
+        arrays[_HEADER] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+        with replacing_file(path) as new, new.open("wb") as stream:
+            np.savez_compressed(stream, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a file written by `save`.
+
+        Raises:
+            DataError: there is no such file, or it is no scene.
+        """
+        try:
+            with zipfile.ZipFile(path) as archive:
+                if sum(part.file_size for part in archive.infolist()) > _LARGEST:
+                    raise DataError(f"{path}: unpacks to more than {_LARGEST >> 30} GiB")
+            with np.load(path, allow_pickle=False) as data:
+                missing = [name for name in (_HEADER, *FIELDS) if name not in data]
+                if missing:
+                    raise DataError(f"{path}: not a scene, missing: {', '.join(missing)}")
+                header = json.loads(data[_HEADER].tobytes())
+                fields = {name: data[name] for name in FIELDS}
+        except CoopenvError:
+            raise
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            why = getattr(error, "strerror", None) or error
+            raise DataError(f"{path}: not a readable scene ({why})") from None
+        return cls._checked(path, header, fields)
+
+    @classmethod
+    def _checked(cls, path: Path, header: Any, fields: dict[str, np.ndarray]) -> Self:
+        try:
+            count, source = int(header["frames"]), Source.model_validate(header["source"])
+            scenario = parse_scenario(header["scenario"], str(path))
+        except ValidationError as error:
+            raise DataError(one_line(error, str(path), Source)) from None
+        except (KeyError, TypeError, ValueError) as error:
+            if isinstance(error, CoopenvError):
+                raise
+            raise DataError(f"{path}: not a scene: header: {error}") from None
+        shapes, whole = _shapes(scenario, source), {}
+        for name, values in fields.items():
+            kind, to = ("i", np.int64) if name in WHOLE_FIELDS else ("f", np.float64)
+            wanted = shapes.get(name, values.shape[1:])
+            if values.dtype.kind != kind or not values.ndim or len(values) not in (1, count) or count < 1:
+                raise DataError(f"{path}: {name}: {values.dtype} {values.shape} is not of {count} frames")
+            if values.shape[1:] != wanted:
+                raise DataError(f"{path}: {name}: shape {values.shape} does not fit to its scenario, {wanted}")
+            whole[name] = np.broadcast_to(values.astype(to), (count, *values.shape[1:]))
+        return cls(scenario, source, whole)
+
+
+def _shapes(scenario: Scenario, source: Source) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of a frame's fields, but for those of routes and traffic."""
+    n = len(scenario.vehicles)
+    a = n + len(scenario.landmarks)
+    shapes: dict[str, tuple[int, ...]] = {"tick": (), "rotation": (a, 3, 3), "position": (a, 3)}
+    shapes |= {"estimate_rotation": (n, 3, 3), "position_covariance": (n, 3, 3), "estimate_position": (n, 3)}
+    shapes |= dict.fromkeys(("position_error", "orientation_error", "nees", "pan", "ended"), (n,))
+    shapes |= dict.fromkeys(("route_count", "route_drawn"), (n,))
+    return {**shapes, "sight": (n, a), "inbox_tick": (n, n), "terms": (n, len(source.terms)), "goal": (n, 3)}
+
+
+class SceneWriter:
+    """Collects frames while an episode goes on."""
+
+    def __init__(self, scenario: Scenario, source: Source) -> None:
+        """Begin with none."""
+        self.scenario, self.source = scenario, source
+        self._frames: list[Frame] = []
+
+    def add(self, shown: Shown) -> None:
+        """Keep what is there now."""
+        self._frames.append(Frame.of(shown))
+
+    def record(self) -> SceneRecord:
+        """Return what has been kept; `add` must have been called."""
+        stacked = {name: np.stack([getattr(frame, name) for frame in self._frames]) for name in FIELDS}
+        return SceneRecord(self.scenario, self.source, stacked)

@@ -1,0 +1,160 @@
+"""What stands still in a scene, and what follows from it and a frame: fields of view, and who hides whom."""
+
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from coopenv.estimation.outcomes import Sight
+from coopenv.scenario import Scenario
+from coopenv.scenario.bodies import Body, Landmark, Vehicle
+from coopenv.viz import topview_geometry as geometry
+from coopenv.viz.scene.frame import Frame
+
+REACH = 0.4
+"""Of the picture's side: how far a field of view is drawn of a camera that sees farther."""
+_SHORTEST = 0.035  # of the picture's side, drawn length of a vehicle
+_CAR = Body(size=(4.4, 1.9, 1.5), center=(0.0, 0.0, 0.75))  # stands in for a vehicle without a body
+
+
+class Box(NamedTuple):
+    """A box that hides what is behind it."""
+
+    name: str
+    rotation: np.ndarray  # (3, 3) to map
+    center: np.ndarray  # (3,) map, m
+    size: Any  # (3,) m
+
+
+class Stage:
+    """The static side of a scene; lengths in m, everything in the map frame."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Work out what a scenario fixes."""
+        self.scenario = scenario
+        self.landmarks, self.vehicles = len(scenario.landmarks), len(scenario.vehicles)
+        self.origin = np.array(scenario.map.origin, float)
+        low, high = geometry.limits(scenario)
+        self.low, self.high = low, high
+        """(2,) corners of a square in plan around all that is known beforehand."""
+        self.side = float(high[0] - low[0])
+        agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
+        self.marker = np.array([agent.marker for agent in agents], float)
+        """(A, 3) the point that cameras see, body frame."""
+        self.camera = np.array([camera.position for camera in scenario.cameras], float)
+        """(N, 3) optical centres, body frame."""
+        limit = REACH * self.side
+        pinhole = (camera.model == "pinhole" for camera in scenario.cameras)
+        self.reach = np.array(
+            [min(c.range or limit, limit) if p else 0.0 for c, p in zip(scenario.cameras, pinhole, strict=True)]
+        )
+        """(N,) how far fields of view are drawn."""
+        self.moving = np.array([m.motion.kind != "static" for m in scenario.landmarks], dtype=bool)
+        """(L,) which landmarks move."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the targets, landmarks first."""
+        return tuple(self.scenario.target_names)
+
+    def short_name(self, target: int) -> str:
+        """Return f1 for the first vehicle, and a landmark's name; L1 for landmark_1."""
+        if target >= self.landmarks:
+            return f"f{target - self.landmarks + 1}"
+        name = self.names[target]
+        return f"L{name.removeprefix('landmark_')}" if name.startswith("landmark_") else name
+
+    @cached_property
+    def sees_a_part(self) -> bool:
+        """Whether cameras have a field of view that matters."""
+        return sees_a_part(self.scenario)
+
+    @cached_property
+    def bodies(self) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 3) sizes and (N, 3) centres of the vehicles' boxes as drawn: those too small to be seen are enlarged."""
+        found = [vehicle.body for vehicle in self.scenario.vehicles]
+        given = [_CAR if body is None else body for body in found]
+        size, center = np.array([b.size for b in given], float), np.array([b.center for b in given], float)
+        unknown = np.array([body is None for body in found])
+        size[unknown] *= (1.2 * _SHORTEST * self.side / _CAR.size[0]) if unknown.any() else 1.0
+        center[unknown] = 0.0
+        grown = np.maximum(1.0, _SHORTEST * self.side / size[:, :1])
+        return size * grown, center * grown
+
+    @cached_property
+    def _fan(self) -> np.ndarray:
+        """(N, K, 3) unit rays over the width of each camera's image, body frame without pan."""
+        return np.array([geometry.camera_fan(camera) for camera in self.scenario.cameras])
+
+    def eyes(self, frame: Frame) -> np.ndarray:
+        """Return where cameras are, (N, 3)."""
+        return np.asarray(frame.vehicle_position + (frame.vehicle_rotation @ self.camera[..., None])[..., 0])
+
+    def targets(self, frame: Frame) -> np.ndarray:
+        """Return the points that cameras see, (A, 3)."""
+        return np.asarray(frame.position + (frame.rotation @ self.marker[..., None])[..., 0])
+
+    def fields_of_view(self, frame: Frame) -> np.ndarray | None:
+        """Return the fields of view in plan as polygons (N, K + 1, 3), the camera first; None where all see everything.
+
+        Buildings end them.
+        """
+        if not self.sees_a_part:
+            return None
+        eye = self.eyes(frame)
+        turned = Rotation.from_euler("z", frame.pan[:, None]).as_matrix()
+        rays = self._fan @ np.swapaxes(frame.vehicle_rotation @ turned, 1, 2)
+        length = geometry.free_lengths(eye, rays, self.reach, self.scenario.obstacles, self.origin)
+        return np.concatenate([eye[:, None], eye[:, None] + length[..., None] * rays], axis=1)
+
+    def hider(self, frame: Frame, vehicle: int, target: int) -> str | None:
+        """Return the short name of what hides a target from a vehicle's camera; None: nothing that is drawn does."""
+        kind = frame.sight[vehicle, target]
+        start, end = self.eyes(frame)[vehicle], self.targets(frame)[target]
+        if kind == Sight.OCCLUDED_BY_BUILDING:
+            boxes = self.buildings
+        elif kind == Sight.OCCLUDED_BY_BODY:
+            boxes = self._solid(frame, vehicle, target)
+        else:
+            return None
+        hits = [(entry(start, end, box), box.name) for box in boxes]
+        share, name = min(hits, default=(np.inf, ""))
+        return name if np.isfinite(share) else None
+
+    @cached_property
+    def buildings(self) -> list[Box]:
+        """The buildings."""
+        return [
+            Box(o.name, Rotation.from_euler("z", o.yaw).as_matrix(), np.array(o.center) - self.origin, o.size)
+            for o in self.scenario.obstacles
+        ]
+
+    def _solid(self, frame: Frame, vehicle: int, target: int) -> list[Box]:
+        """Return the bodies that may stand between a vehicle and a target."""
+        s = self.scenario
+        agents: list[Landmark | Vehicle] = [*s.landmarks, *s.vehicles]
+        boxes = []
+        for i, agent in enumerate(agents):
+            if agent.body is not None and i not in (target, self.landmarks + vehicle):
+                R = frame.rotation[i]
+                boxes.append(Box(self.short_name(i), R, frame.position[i] + R @ agent.body.center, agent.body.size))
+        there = np.flatnonzero(frame.traffic_half[:, 0] > 0.0)
+        R, center, size = frame.traffic_rotation, frame.traffic_position, 2.0 * frame.traffic_half
+        return boxes + [Box("traffic", R[z], center[z], size[z]) for z in there]
+
+
+def entry(start: np.ndarray, end: np.ndarray, box: Box) -> float:
+    """Return at which share of the way from start to end (3,) a box is entered; infinite where it is not."""
+    half = np.asarray(box.size, float) / 2
+    a, way = box.rotation.T @ (start - box.center), box.rotation.T @ (end - start)
+    way = np.where(np.abs(way) < 1e-12, 1e-12, way)
+    sides = np.sort(np.stack([(-half - a) / way, (half - a) / way]), axis=0)
+    enter, leave = float(sides[0].max()), float(sides[1].min())
+    return max(enter, 0.0) if enter < leave and leave > 0.0 and enter < 1.0 else np.inf
+
+
+def sees_a_part(scenario: Scenario) -> bool:
+    """Return whether cameras have a field of view that matters."""
+    sensed = scenario.topology.mode == "sensed" and scenario.sensing == "sensed"
+    return sensed and any(camera.model == "pinhole" for camera in scenario.cameras)
