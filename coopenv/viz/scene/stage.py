@@ -115,7 +115,7 @@ class Stage:
         if kind == Sight.OCCLUDED_BY_BUILDING:
             boxes = self.buildings
         elif kind == Sight.OCCLUDED_BY_BODY:
-            boxes = self._solid(frame, vehicle, target)
+            boxes = self.solid(frame, (target, self.landmarks + vehicle))
         else:
             return None
         hits = [(entry(start, end, box), box.name) for box in boxes]
@@ -130,13 +130,13 @@ class Stage:
             for o in self.scenario.obstacles
         ]
 
-    def _solid(self, frame: Frame, vehicle: int, target: int) -> list[Box]:
-        """Return the bodies that may stand between a vehicle and a target."""
+    def solid(self, frame: Frame, without: tuple[int, ...] = ()) -> list[Box]:
+        """Return the bodies that move, but for those of some agents."""
         s = self.scenario
         agents: list[Landmark | Vehicle] = [*s.landmarks, *s.vehicles]
         boxes = []
         for i, agent in enumerate(agents):
-            if agent.body is not None and i not in (target, self.landmarks + vehicle):
+            if agent.body is not None and i not in without:
                 R = frame.rotation[i]
                 boxes.append(Box(self.short_name(i), R, frame.position[i] + R @ agent.body.center, agent.body.size))
         there = np.flatnonzero(frame.traffic_half[:, 0] > 0.0)

@@ -1,0 +1,152 @@
+"""Lines of a scene as arrays of segments with colours: of sight, of errors, routes and trails."""
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from coopenv.estimation.outcomes import Sight
+from coopenv.viz.scene import Frame, Stage
+from coopenv.viz.scene.stage import Box
+from coopenv.viz.style import GREY, INK
+from coopenv.viz.web import shapes
+from coopenv.viz.web.look import Look, linear, rgb
+
+Coloured = tuple[np.ndarray, np.ndarray]
+"""Segments (K, 2, 3), m, and their colours (K, 3) uint8."""
+_DOTS, _DASHES = 16, 9  # of a line to a target that was missed, and to an estimate
+_TRAIL, _TRAIL_STEP = 36, 0.2  # points, and s between them
+_GROWTH = 32  # segments by which the arrays grow
+
+
+class Segments:
+    """A node of line segments whose number changes.
+
+    Arrays have room for more, so that they seldom change their shape; what is not used lies in one point.
+    """
+
+    def __init__(self, scene: Any, name: str, thickness: float) -> None:
+        """Begin with none; the thickness is in pixels."""
+        self._scene, self._name, self._thickness = scene, name, thickness
+        self._room = 0
+        self._handle: Any = None
+
+    def show(self, points: np.ndarray, colours: np.ndarray) -> None:
+        """Show segments (K, 2, 3) in colours (K, 3); those with NaN are left out."""
+        good = np.isfinite(points).all(axis=(1, 2))
+        points, colours = points[good], colours[good]
+        if self._handle is not None:
+            self._handle.visible = len(points) > 0
+        if not len(points):
+            return
+        if len(points) > self._room:
+            self._room = -(-len(points) // _GROWTH) * _GROWTH
+        whole = np.tile(points[:1, :1], (self._room, 2, 1)).astype(np.float32)
+        shade = np.tile(linear(colours)[:1, None], (self._room, 2, 1)).astype(np.uint8)
+        whole[: len(points)], shade[: len(points)] = points, linear(colours)[:, None]
+        if self._handle is None or self._handle.points.shape != whole.shape:
+            look: dict[str, Any] = {"thickness": self._thickness, "thickness_units": "screen"}
+            self._handle = self._scene.add_line_segments(self._name, whole, shade, **look)
+        else:
+            self._handle.points, self._handle.colors = whole, shade
+
+
+def joined(*parts: Coloured) -> Coloured:
+    """Return all of them as one."""
+    points = np.concatenate([np.asarray(points, float).reshape(-1, 2, 3) for points, _ in parts])
+    return points, np.concatenate([np.asarray(colours, np.uint8).reshape(-1, 3) for _, colours in parts])
+
+
+def sight_lines(stage: Stage, frame: Frame, colours: np.ndarray, look: Look) -> Coloured:
+    """Return lines of sight: to what is seen; dotted to what was missed; of what is hidden up to what hides it."""
+    eye, target = stage.eyes(frame), stage.targets(frame)
+    chosen = np.ones(stage.vehicles, bool)
+    if look.only is not None:
+        chosen = np.arange(stage.vehicles) == look.only
+
+    def of(kind: Sight) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        observer, seen = np.nonzero((frame.sight == kind) & chosen[:, None])
+        return eye[observer], target[seen], observer
+
+    start, end, observer = of(Sight.VISIBLE)
+    seen = np.stack([start, end], axis=1), colours[observer]
+    start, end, observer = of(Sight.MISSED)
+    missed = _dashed(start, end, colours[observer], _DOTS, 0.35)
+    start, end, _ = of(Sight.OCCLUDED_BY_BUILDING)
+    built = np.stack([start, stopped(start, end, stage.buildings)], axis=1), _one(GREY, len(start))
+    start, end, _ = of(Sight.OCCLUDED_BY_BODY)
+    bodies = stage.solid(frame)
+    bodily = np.stack([start, stopped(start, end, bodies)], axis=1), _one(INK, len(start))
+    return joined(seen, missed, built, bodily)
+
+
+def stopped(start: np.ndarray, end: np.ndarray, boxes: list[Box]) -> np.ndarray:
+    """Return where the ways from start to end (K, 3) enter a box first, not one that they begin in; or the end."""
+    share = np.ones(len(start))
+    for box in boxes:
+        half = np.asarray(box.size, float) / 2
+        a, way = (start - box.center) @ box.rotation, (end - start) @ box.rotation
+        way = np.where(np.abs(way) < 1e-12, 1e-12, way)
+        sides = np.sort(np.stack([(-half - a) / way, (half - a) / way]), axis=0)
+        enter, leave = sides[0].max(axis=-1), sides[1].min(axis=-1)
+        share = np.where((enter < leave) & (enter > 1e-6), np.minimum(share, enter), share)
+    return np.asarray(start + share[:, None] * (end - start))
+
+
+def error_lines(frame: Frame, colours: np.ndarray) -> Coloured:
+    """Return dashed lines from true positions to estimates."""
+    return _dashed(frame.vehicle_position, frame.estimate_position, colours, _DASHES, 0.6)
+
+
+def way_lines(stage: Stage, frame: Frame, colours: np.ndarray, z: float) -> Coloured:
+    """Return the routes that are drawn, and rings about the goals, at a height."""
+    parts: list[Coloured] = [(np.zeros((0, 2, 3)), np.zeros((0, 3)))]
+    for i, vehicle in enumerate(stage.scenario.vehicles):
+        pale = (0.45 * colours[i] + 0.55 * 255.0)[None]
+        points = frame.route[i, : int(frame.route_count[i])].copy()
+        points[:, 2:] = z
+        if frame.route_drawn[i] >= 0 and len(points) > 1:
+            parts.append((np.stack([points[:-1], points[1:]], axis=1), np.repeat(pale, len(points) - 1, axis=0)))
+        if vehicle.goal_radius > 0:
+            ring = shapes.circle(vehicle.goal_radius) + np.array([*frame.goal[i, :2], z])
+            parts.append((ring, np.repeat(colours[i][None], len(ring), axis=0)))
+    return joined(*parts)
+
+
+class Trails:
+    """Where vehicles have been in the last seconds."""
+
+    def __init__(self, vehicles: int) -> None:
+        """Begin with nothing."""
+        self._points: deque[np.ndarray] = deque(maxlen=_TRAIL)
+        self._times: deque[float] = deque(maxlen=_TRAIL)
+        self._vehicles = vehicles
+
+    def lines(self, frame: Frame, time: float, colours: np.ndarray, z: float) -> Coloured:
+        """Add a frame and return the trails (paler where they are older), at a height."""
+        if self._times and not 0.0 <= time - self._times[-1] < 10.0 * _TRAIL_STEP:
+            self._points.clear()
+            self._times.clear()
+        if not self._times or time - self._times[-1] >= _TRAIL_STEP - 1e-9:
+            place = frame.vehicle_position.copy()
+            place[:, 2] += z - place[:, 2]
+            self._points.append(place)
+            self._times.append(time)
+        points = np.array(self._points)
+        if len(points) < 2:
+            return np.zeros((0, 2, 3)), np.zeros((0, 3), np.uint8)
+        segments = np.stack([points[:-1], points[1:]], axis=2)  # (K, N, 2, 3)
+        age = np.linspace(0.85, 0.35, len(segments))[:, None, None]
+        shade = (1.0 - age) * colours + age * 255.0
+        return segments.reshape(-1, 2, 3), shade.reshape(-1, 3).astype(np.uint8)
+
+
+def _dashed(start: np.ndarray, end: np.ndarray, colours: np.ndarray, count: int, share: float) -> Coloured:
+    """Return lines from start to end (K, 3) in so many dashes, which take up a share of them."""
+    at = np.arange(count)[:, None, None] / count
+    dashes = np.stack([start + at * (end - start), start + (at + share / count) * (end - start)], axis=2)
+    return dashes.reshape(-1, 2, 3), np.tile(colours, (count, 1))
+
+
+def _one(colour: str, count: int) -> np.ndarray:
+    return np.tile(np.array(rgb(colour), np.uint8), (count, 1))

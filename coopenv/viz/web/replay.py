@@ -1,0 +1,98 @@
+"""`replay.html`: one page that plays an episode; it opens from disk and asks nobody for anything."""
+
+import re
+from collections.abc import Callable
+from html import escape
+from pathlib import Path
+
+import numpy as np
+
+from coopenv.files import replace_text
+from coopenv.viz.scene import SceneRecord, Stage
+from coopenv.viz.web.extra import viser_module
+from coopenv.viz.web.legend import legend_html
+from coopenv.viz.web.look import Look
+from coopenv.viz.web.picture import FIELD_OF_VIEW, Picture, first_camera, useful_magnification
+
+REPLAY_FILE = "replay.html"
+MOST_FRAMES = 300
+"""Of a page; longer episodes have fewer frames a second."""
+_PHONE = 0.7  # width over height, from which on the camera begins farther away
+_LOOPBACK = "127.0.0.1"
+
+
+def write_replay(record: SceneRecord, path: Path, on_progress: Callable[[float], None] = lambda share: None) -> Path:
+    """Write the page of an episode and return its path.
+
+    Args:
+        record: the episode.
+        path: of the page, which is replaced as a whole.
+        on_progress: called with the share that is done.
+
+    Raises:
+        CoopenvError: the extra `view` is not installed.
+        OutputError: the file cannot be written.
+    """
+    replace_text(path, replay_html(record, on_progress))
+    return path
+
+
+def replay_html(record: SceneRecord, on_progress: Callable[[float], None] = lambda share: None) -> str:
+    """Return the page of an episode; arguments and errors as for `write_replay`."""
+    record = record.of(np.unique(np.linspace(0, len(record) - 1, min(len(record), MOST_FRAMES)).round().astype(int)))
+    stage = Stage(record.scenario)
+    sigma = np.array([record.frame(k).three_sigma for k in range(0, len(record), max(1, len(record) // 20))])
+    look = Look(magnification=useful_magnification(sigma, stage.side) if record.source.honest else 1.0)
+    server = viser_module().ViserServer(host=_LOOPBACK, port=0, verbose=False)
+    try:
+        server.gui.configure_theme(show_logo=False, show_share_button=False)
+        aim(server.initial_camera, stage)
+        picture = Picture(server.scene, stage, record.source, look)
+        picture.show(record.frame(0))
+        recording, time = server.get_scene_serializer(), record.time
+        for k in range(1, len(record)):
+            recording.insert_sleep(float(time[k] - time[k - 1]))
+            picture.show(record.frame(k))
+            on_progress(k / len(record))
+        page = recording.as_html()
+    finally:
+        server.stop()
+    return _dressed(page, record, stage, look)
+
+
+def aim(camera: object, stage: Stage, aspect: float = 1.6) -> None:
+    """Point one of viser's cameras at the whole scene."""
+    position, middle = first_camera(stage, aspect)
+    settings = {"near": 1e-3 * stage.side, "far": 20.0 * stage.side, "fov": FIELD_OF_VIEW}
+    for name, value in {**settings, "position": position, "look_at": middle}.items():
+        setattr(camera, name, value)
+
+
+def _dressed(page: str, record: SceneRecord, stage: Stage, look: Look) -> str:
+    """Return viser's page with the title of the episode and the legend, and a camera for narrow screens."""
+    title = escape(record.scenario.title)
+    far, middle = first_camera(stage, aspect=0.52)
+    places = {"Position": far, "LookAt": middle}
+    query = "&".join(f"initialCamera{name}={','.join(f'{x:.4g}' for x in at)}" for name, at in places.items())
+    head = (
+        f"<script>if(innerWidth<{_PHONE}*innerHeight&&!location.search)"
+        f"try{{history.replaceState(null,'',location.pathname+'?{query}')}}catch(e){{}}</script>"
+        f"<style>{_STYLE}</style>"
+    )
+    overlay = (
+        f'<details id="about" open><summary>{title}</summary><p>{escape(record.source.words)}</p>'
+        f"{legend_html(stage, record.source, look.magnification)}<p>{_KEYS}</p></details>"
+        "<script>if(innerWidth<700)document.getElementById('about').open=false</script>"
+    )
+    page = re.sub(r"<title>.*?</title>", lambda _: f"<title>{title} - coopenv</title>", page, count=1)
+    page = page.replace("</head>", f"{head}</head>", 1)
+    place = page.rindex("</body>")
+    return page[:place] + overlay + page[place:]
+
+
+_KEYS = "Drag to turn, right drag to move, wheel to come nearer. Space: pause."
+_STYLE = """
+#about{position:fixed;top:10px;right:10px;z-index:2;max-width:min(330px,calc(100vw - 40px));padding:8px 12px;
+background:rgba(255,255,255,.92);border:1px solid #ddd;border-radius:6px;font:13px/1.4 system-ui,sans-serif;color:#222}
+#about summary{font-weight:600;cursor:pointer}#about p{margin:4px 0;color:#595959}
+"""
