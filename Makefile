@@ -21,13 +21,18 @@ $(VENV)/.base: $(BIN)/python pyproject.toml constraints.txt
 	@$(PIP) --editable .
 	@touch $@
 
+$(VENV)/.view: $(VENV)/.base
+	@echo "Installing what draws in the browser into $(VENV) (once) ..."
+	@$(PIP) --editable '.[view]'
+	@touch $@
+
 $(VENV)/.dev: $(VENV)/.base
 	@echo "Installing the development tools into $(VENV) (once) ..."
 	@$(PIP) --editable '.[dev]'
 	@touch $@
 
-demo: $(VENV)/.base ## run the paper's busy intersection; table here, figures in out/busy_intersection
-	@$(BIN)/coopenv run busy_intersection --seed 0 --out out/busy_intersection
+demo: $(VENV)/.view ## run the paper's busy intersection; table here, figures and replay.html in out/busy_intersection
+	@$(BIN)/coopenv run busy_intersection --seed 0 --out out/busy_intersection --open
 
 $(VENV)/.svea: $(VENV)/.base
 	@echo "Installing what cars need into $(VENV) (once) ..."

@@ -30,7 +30,7 @@ def evaluate(
     ] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for evaluation.json and the figures.")] = None,
     figures: Annotated[FigureFormat, typer.Option(help="Format of the figures.")] = FigureFormat.png,
-    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
+    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures and no replay.")] = False,
     film: Annotated[
         bool, typer.Option("--film", help="Also write a film of the agents in one of the worlds, side by side.")
     ] = False,

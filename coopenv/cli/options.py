@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import tomllib
 import warnings
@@ -112,6 +113,21 @@ def show(path: Path) -> None:
     """Open a result with the program that the system has for it, or say that there is none."""
     if typer.launch(str(path)) != 0:
         print(f"note: there is no program to open {path}", file=sys.stderr)
+
+
+def show_page(path: Path) -> None:
+    """Open a page in the user's browser; where there is no display nothing happens."""
+    import webbrowser
+
+    if has_display():
+        webbrowser.open(path.resolve().as_uri())
+
+
+def has_display() -> bool:
+    """Return whether a browser would have a screen here."""
+    if sys.platform in ("darwin", "win32"):
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def load(environment: str, overrides: dict[str, Any]) -> Any:

@@ -2,12 +2,18 @@
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from coopenv.cli import options
 from coopenv.errors import CoopenvError, OutputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from coopenv.observers.recording import Recording
+    from coopenv.runs.scenes import Onlooker
 
 FigureFormat = StrEnum("FigureFormat", "png pdf svg")
 
@@ -23,16 +29,19 @@ def run(
     policy: options.PolicyName = "zero",
     steady_from: options.SteadyFrom = None,
     figures: Annotated[FigureFormat, typer.Option(help="Format of the figures.")] = FigureFormat.png,
-    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures.")] = False,
+    no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures and no replay.")] = False,
     video: Annotated[bool, typer.Option("--video", help="Also write a video of the top view.")] = False,
-    open_out: Annotated[bool, typer.Option("--open", help="Show the folder when it is done.")] = False,
+    open_out: Annotated[
+        bool,
+        typer.Option("--open", help="Show the replay in a browser when it is done; the folder where there is none."),
+    ] = False,
     as_json: options.AsJson = False,
     data: options.DataFolder = None,
     variant: options.Variant = None,
     topics: options.TopicMap = None,
 ) -> None:
-    """Run an environment; write metrics, arrays and figures."""
-    from coopenv.runs.command import execute, report
+    """Run an environment; write metrics, arrays, figures and a page that plays the episode."""
+    from coopenv.runs.command import REPLAY_FILE, execute, report
     from coopenv.runs.rollouts import Rollout
 
     changes, name = options.parse_overrides(overrides), Path(environment).stem
@@ -46,7 +55,8 @@ def run(
     else:
         report(rollout, result, folder, options.console())
     if open_out:
-        options.show(folder)
+        page = folder / REPLAY_FILE
+        options.show_page(page) if page in result["files"] else options.show(folder)
 
 
 def refuse_for_recordings(environment: str, seed: int, policy: str) -> None:
@@ -70,42 +80,65 @@ def record_command(
     data: options.DataFolder = None,
     variant: options.Variant = None,
     topics: options.TopicMap = None,
+    no_replay: Annotated[bool, typer.Option("--no-replay", help="Write no page that plays the episode.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
 ) -> None:
-    """Write what vehicles sense to an MCAP file.
+    """Write what vehicles sense to an MCAP file, and beside it a page that plays the episode.
 
     The file holds every tick; Foxglove opens it and coopenv replays it.
     """
     from coopenv.backends.mcap import check_target, write_recording
-    from coopenv.backends.sources import is_bag, is_recorded, open_recording
     from coopenv.runs.console import Progress
-    from coopenv.runs.recorder import record
+    from coopenv.runs.scenes import Onlooker, write_page
 
+    page = out.with_suffix(".html")
     check_target(out)
-    if out.exists() and not force:
-        raise OutputError(f"{out}: exists already; --force replaces it")
+    for path in (out, *([] if no_replay else [page])):
+        if path.exists() and not force:
+            raise OutputError(f"{path}: exists already; --force replaces it")
     changes, log = options.parse_overrides(overrides), options.console(stderr=True)
-    if is_bag(environment, topics):
-        refuse_for_recordings(environment, seed, policy)
-        backend = options.open_source(environment, changes, data, variant, topics)
-        with Progress(log, "recording", total=1.0) as progress:
-            recording = record(backend, seed, policy, progress.update)
-    elif topics is not None:
-        raise CoopenvError(f"--map {topics}: is for ROS bags, {environment} is none")
-    elif is_recorded(environment):
-        refuse_for_recordings(environment, seed, policy)
-        if changes:
-            raise CoopenvError(f"--set: is for a simulation, {environment} is recorded")
-        with options.warned():
-            recording = open_recording(environment, data, variant)
-    else:
-        for option, value in (("--data", data), ("--variant", variant)):
-            if value is not None:
-                raise CoopenvError(f"{option} {value}: is for recorded data, {environment} is simulated")
-        scenario = options.load(environment, changes)
-        with Progress(log, "recording", total=1.0) as progress:
-            recording = record(scenario, seed, policy, progress.update)
+    onlooker = Onlooker(out.name, seed, policy)
+    recording = _recording(environment, seed, policy, changes, (data, variant, topics), onlooker, log)
     with Progress(log, f"writing {out.name}"):
         write_recording(recording, out)
     facts = f"{len(recording.setups)} vehicles, {recording.ticks} ticks, {recording.t[-1]:g} s"
     options.console().print(f"{out}: {facts}", soft_wrap=True)
+    scene = None if no_replay else onlooker.record()
+    if scene is not None and write_page(scene, page, log) is not None:
+        options.console().print(f"{page}: the episode, to watch in a browser", soft_wrap=True)
+
+
+def _recording(
+    environment: str,
+    seed: int,
+    policy: str,
+    changes: dict[str, Any],
+    recorded: tuple[Path | None, str | None, Path | None],
+    onlooker: "Onlooker",
+    log: "Console",
+) -> "Recording":
+    """Return what vehicles sense, simulated or read; `recorded` are data folder, variant and map of topics."""
+    from coopenv.backends.sources import is_bag, is_recorded, open_recording
+    from coopenv.runs.console import Progress
+    from coopenv.runs.recorder import record
+
+    data, variant, topics = recorded
+    if is_bag(environment, topics):
+        refuse_for_recordings(environment, seed, policy)
+        backend = options.open_source(environment, changes, data, variant, topics)
+        with Progress(log, "recording", total=1.0) as progress:
+            return record(backend, seed, policy, progress.update, onlooker.on_tick)
+    if topics is not None:
+        raise CoopenvError(f"--map {topics}: is for ROS bags, {environment} is none")
+    if is_recorded(environment):
+        refuse_for_recordings(environment, seed, policy)
+        if changes:
+            raise CoopenvError(f"--set: is for a simulation, {environment} is recorded")
+        with options.warned():
+            return open_recording(environment, data, variant)
+    for option, value in (("--data", data), ("--variant", variant)):
+        if value is not None:
+            raise CoopenvError(f"{option} {value}: is for recorded data, {environment} is simulated")
+    scenario = options.load(environment, changes)
+    with Progress(log, "recording", total=1.0) as progress:
+        return record(scenario, seed, policy, progress.update, onlooker.on_tick)

@@ -16,17 +16,21 @@ from coopenv.jsonable import json_text
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.metrics import run_metrics, theory_rates, vehicle_metrics
 from coopenv.runs.rollouts import Rollout
+from coopenv.runs.scenes import Keeper, write_page
 from coopenv.runs.table import legend, metrics_table, rates, remarks
 from coopenv.runs.video import Film, GifFilm, frame_stride, open_film
 from coopenv.viz import FIGURE_NAMES, FORMATS
+from coopenv.viz.scene import SceneRecord, Source
+from coopenv.viz.scene.record import SCENE_FILE
 
 METRICS_FILE, TRAJECTORY_FILE, VIDEO_FILES = "metrics.json", "trajectory.npz", ("video.mp4", "video.gif")
+REPLAY_FILE = "replay.html"
 
 
 def result_names() -> list[str]:
     """Return the names of all files that a run can write."""
     figures = [f"{name}.{file_format}" for name in FIGURE_NAMES for file_format in FORMATS]
-    return [METRICS_FILE, TRAJECTORY_FILE, *figures, *VIDEO_FILES]
+    return [METRICS_FILE, TRAJECTORY_FILE, SCENE_FILE, REPLAY_FILE, *figures, *VIDEO_FILES]
 
 
 def execute(
@@ -56,7 +60,7 @@ def execute(
         with compile_notice(log):
             run.engine.load()
         film = open_film(folder, scenario.rates.camera / frame_stride(scenario)) if video else None
-        _simulate(run, film, log, describe)
+        scene = _simulate(name, run, film, log, describe)
         trajectory = run.trajectory()
         judged, endings = trajectory.of_vehicles(run.vehicles).where_truth_is_known(), run.endings()
         if len(judged.t) < 2:
@@ -67,7 +71,8 @@ def execute(
         metrics = run_metrics(name, overrides, run, vehicles, steady)
         replace_text(folder / METRICS_FILE, json_text(metrics))
         trajectory.save(folder / TRAJECTORY_FILE)
-        paths = [folder / METRICS_FILE, folder / TRAJECTORY_FILE]
+        scene.save(folder / SCENE_FILE)
+        paths = [folder / METRICS_FILE, folder / TRAJECTORY_FILE, folder / SCENE_FILE]
         if figures is not None:
             with Progress(log, "drawing figures"):
                 from coopenv.viz.figures import save_figures
@@ -76,6 +81,8 @@ def execute(
                 options: dict[str, Any] = {"scenario": scenario, "steady_from": steady, "file_format": figures}
                 note = f"{name}, {scenario.observer.name}, seed {run.seed}"
                 paths += save_figures(judged, folder, observability, ends=ends, note=note, **options)
+            page = write_page(scene, folder / REPLAY_FILE, log)
+            paths += [] if page is None else [page]
         if film is not None:
             with Progress(log, f"finishing {film.path.name}"):
                 film.close()
@@ -85,21 +92,27 @@ def execute(
     return {**metrics, "files": [out / path.name for path in paths]}
 
 
-def _simulate(run: Rollout, film: Film | None, log: Console, describe: Callable[[], str] | None) -> None:
-    """Play a run to its end."""
+def _simulate(
+    name: str, run: Rollout, film: Film | None, log: Console, describe: Callable[[], str] | None
+) -> SceneRecord:
+    """Play a run to its end and return its scene."""
     view = None
     if film is not None:
         from coopenv.viz.topview import TopView
 
         view = TopView(run.scenario)
-    stride = frame_stride(run.scenario)
+    recorded = run.engine.backend.capabilities.recorded
+    policy = run.policy_name if run.scenario.driven and not recorded else ""
+    source = Source.of(name, run.scenario, seed=None if recorded else run.seed, policy=policy)
+    keeper = Keeper(run.engine, source)
     rate = run.scenario.rates.camera if run.engine.backend.capabilities.real_time else None
     with Progress(log, _doing(run), run.ticks_planned, rate) as progress:
         for tick in run.play():
-            if tick % stride == 0:
+            if (frame := keeper.tick(tick)) is not None:
                 if film is not None and view is not None:
-                    film.add(view.draw(run.engine))
+                    film.add(view.paint(frame))
                 progress.update(tick, describe() if describe is not None else None)
+    return keeper.record()
 
 
 def _doing(run: Rollout) -> str:
@@ -134,3 +147,5 @@ def report(run: Rollout, result: Mapping[str, Any], folder: Path, out: Console) 
     out.print(f"Files in {folder}:", soft_wrap=True)
     names = ", ".join(path.name for path in result["files"])
     out.print(fill(names, out.width, initial_indent="  ", subsequent_indent="  "))
+    if (page := folder / REPLAY_FILE) in result["files"]:
+        out.print(f"To watch it in a browser, open {page}", soft_wrap=True)

@@ -21,6 +21,7 @@ def record(
     seed: int = 0,
     policy: str | Policy = "zero",
     on_progress: Callable[[float], None] = lambda share: None,
+    on_tick: Callable[[Engine, int], None] = lambda engine, tick: None,
 ) -> Recording:
     """Drive a backend in float64 to its horizon, or as long as it has ticks, and keep what is sensed.
 
@@ -29,6 +30,7 @@ def record(
         seed: of the episode.
         policy: of driven vehicles: "zero", "random", the name of an agent, or a function of the observations.
         on_progress: called with the share of the horizon that is done.
+        on_tick: called with the engine and the tick's number after every tick, 0 included.
 
     Raises:
         CoopenvError: unknown policy or observer, or the backend cannot begin.
@@ -48,6 +50,7 @@ def record(
             drawn = Drawn(key, episode, tuple(parameters))
         ticks.append(engine.world.sensed(0, k))
         faults.append(interference_of(scenario, engine.world.model, engine.view, 0, k))
+        on_tick(engine, k)
         on_progress(k / scenario.horizon_ticks)
     L, briefing = len(scenario.landmarks), engine.world.briefing
     names = SENSED if scenario.action.pan is None else (*SENSED, "pan")

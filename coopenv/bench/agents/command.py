@@ -14,6 +14,7 @@ from coopenv.evaluation import METRICS
 from coopenv.files import replace_text, replacing_folder
 from coopenv.jsonable import json_text
 from coopenv.machine import versions
+from coopenv.runs.command import REPLAY_FILE
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.shipped import version
 from coopenv.viz import FORMATS
@@ -104,9 +105,11 @@ def write(
         replace_text(new / JSON_FILE, json_text(document(request, evaluation)))
         if figures is not None:
             from coopenv.bench.agents.figures import save_figures
+            from coopenv.bench.agents.replay import write_replay
 
             with Progress(log, "drawing figures"):
                 save_figures(evaluation, new, figures)
+            write_replay(evaluation, new / REPLAY_FILE, log)
         if film:
             from coopenv.bench.agents.film import write_film
 
@@ -116,7 +119,7 @@ def write(
 
 def result_names() -> list[str]:
     """Return the names of all files that an evaluation can write."""
-    return [JSON_FILE, *(f"{name}.{form}" for name in FIGURES for form in FORMATS), *FILMS]
+    return [JSON_FILE, *(f"{name}.{form}" for name in FIGURES for form in FORMATS), *FILMS, REPLAY_FILE]
 
 
 def report(evaluation: Evaluation, out: Console) -> None:

@@ -172,9 +172,10 @@ class SceneWriter:
         self.scenario, self.source = scenario, source
         self._frames: list[Frame] = []
 
-    def add(self, shown: Shown) -> None:
-        """Keep what is there now."""
+    def add(self, shown: Shown) -> Frame:
+        """Keep what is there now, and return it."""
         self._frames.append(Frame.of(shown))
+        return self._frames[-1]
 
     def record(self) -> SceneRecord:
         """Return what has been kept; `add` must have been called."""

@@ -1,0 +1,175 @@
+"""Scenes of episodes: kept while they run, or read from what a run has left; and the pages that play them."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from coopenv.api.engine import Engine
+from coopenv.backends.base import Backend
+from coopenv.backends.sources import Kind, kind_of, open_backend
+from coopenv.errors import CoopenvError
+from coopenv.policies import Policy, agents_for, find_agent, load_policy
+from coopenv.runs.console import Progress
+from coopenv.runs.episode import play
+from coopenv.runs.video import frame_stride
+from coopenv.scenario import Scenario
+from coopenv.shipped import list_agents
+from coopenv.viz.scene import Frame, SceneRecord, SceneWriter, Source
+from coopenv.viz.scene.record import SCENE_FILE
+
+BASELINE = "route_follower"
+
+
+class Keeper:
+    """Keeps the frames of an episode that pictures are made of, at most `MAX_FPS` a second."""
+
+    def __init__(self, engine: Engine, source: Source) -> None:
+        """Begin with none."""
+        scenario = engine.backend.scenario
+        self._writer, self._stride = SceneWriter(scenario, source), frame_stride(scenario)
+        self.engine = engine
+        self._last = -1
+
+    def tick(self, tick: int) -> Frame | None:
+        """Keep what is there at a tick if it is one that is drawn, and return it; else None."""
+        if tick % self._stride:
+            return None
+        self._last = tick
+        return self._writer.add(self.engine)
+
+    def record(self) -> SceneRecord:
+        """Return what has been kept, and what is there now."""
+        now = int(self.engine.view("tick")[0])
+        if now > self._last:
+            self._writer.add(self.engine)
+            self._last = now
+        return self._writer.record()
+
+
+def scene_of(
+    engine: Engine,
+    source: Source,
+    policy: Policy | None = None,
+    on_progress: Callable[[float], None] = lambda share: None,
+) -> SceneRecord:
+    """Play an episode in the first world of an engine and return its scene.
+
+    Args:
+        engine: any.
+        source: what the scene is of; its seed is the episode's.
+        policy: drives (None: action zero).
+        on_progress: called with the share of the horizon that is done.
+
+    Raises:
+        CoopenvError: the policy fails, or the backend cannot begin.
+    """
+    keeper, ticks = Keeper(engine, source), engine.backend.scenario.horizon_ticks
+    for tick in play(engine, [source.seed or 0], ticks, policy, to_the_end=False):
+        if keeper.tick(tick) is not None:
+            on_progress(tick / ticks)
+    return keeper.record()
+
+
+class Onlooker:
+    """Keeps the scene of an episode that somebody else plays: `on_tick` is to be called at every tick."""
+
+    def __init__(self, name: str, seed: int, policy: str) -> None:
+        """Say what it is of."""
+        self._name, self._seed, self._policy = name, seed, policy
+        self._keeper: Keeper | None = None
+
+    def on_tick(self, engine: Engine, tick: int) -> None:
+        """Look at the engine."""
+        if self._keeper is None:
+            scenario, recorded = engine.backend.scenario, engine.backend.capabilities.recorded
+            policy = self._policy if scenario.driven and not recorded else ""
+            seed = None if recorded else self._seed
+            self._keeper = Keeper(engine, Source.of(self._name, scenario, seed=seed, policy=policy))
+        self._keeper.tick(tick)
+
+    def record(self) -> SceneRecord | None:
+        """Return what has been seen; None: nothing."""
+        return None if self._keeper is None else self._keeper.record()
+
+
+def saved_scene(name: str | Path) -> SceneRecord | None:
+    """Return the scene in the folder of a run, or of a file `*.npz`; None: the name means something else.
+
+    Raises:
+        CoopenvError: the folder is of a run that has kept none, or the file is no scene.
+    """
+    path = Path(name)
+    if path.suffix == ".npz":
+        return SceneRecord.load(path)
+    if (path / SCENE_FILE).is_file():
+        return SceneRecord.load(path / SCENE_FILE)
+    if (path / "trajectory.npz").is_file():
+        raise CoopenvError(f"{path}: has no {SCENE_FILE}: it was written by an earlier coopenv; run it again")
+    return None
+
+
+def driver_of(name: str | None, scenario: Scenario, environment: str, seed: int) -> tuple[Policy | None, str]:
+    """Return who drives, and its name: what is asked for, else the baseline where it can drive, else nobody.
+
+    Raises:
+        CoopenvError: there is no such agent, or it cannot drive here.
+    """
+    if not scenario.driven:
+        return None, ""
+    if name is None:
+        known = Path(environment).stem
+        name = BASELINE if BASELINE in agents_for(known) or _can_drive(BASELINE, scenario) else "zero"
+    return load_policy(name, scenario, seed), Path(name).name
+
+
+def _can_drive(name: str, scenario: Scenario) -> bool:
+    if name not in list_agents():
+        return False
+    try:
+        find_agent(name).policy(scenario)
+    except CoopenvError:
+        return False
+    return True
+
+
+def open_source(
+    name: str,
+    overrides: Mapping[str, Any],
+    observer: str | None = None,
+    data: Path | None = None,
+    variant: str | None = None,
+    topics: Path | None = None,
+) -> Backend:
+    """Return where the ticks of a name come from: an environment, a log file, a bag or a data set.
+
+    Raises:
+        CoopenvError: there is no such thing, or it is of a form that cannot be opened.
+    """
+    changes = dict(overrides)
+    if observer is not None:
+        from coopenv.observers.registry import find, named
+
+        changes["observer.name"] = named(observer)
+        find(changes["observer.name"])  # before anything is read
+    return open_backend(name, None, changes, data, variant, topics=topics)
+
+
+def title_of(name: str) -> str:
+    """Return what a source is called in headings."""
+    path = Path(name)
+    return path.name if kind_of(name) in (Kind.LOG, Kind.BAG) else path.stem
+
+
+def write_page(record: SceneRecord, path: Path, log: Console) -> Path | None:
+    """Write the page that plays a scene, with progress shown; None, and a line, where the extra `view` is missing."""
+    from coopenv.viz.web.extra import has_viser
+
+    if not has_viser():
+        log.print(f"note: no {path.name}: pages in the browser need an extra: pip install '.[view]'", soft_wrap=True)
+        return None
+    from coopenv.viz.web.replay import write_replay
+
+    with Progress(log, f"writing {path.name}", total=1.0) as progress:
+        return write_replay(record, path, progress.update)
