@@ -26,6 +26,7 @@ LIGHT |= {
             "complete",
             "dataset",
             "evaluate",
+            "film",
             "live",
             "options",
             "page",

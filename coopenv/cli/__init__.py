@@ -17,6 +17,7 @@ from coopenv.cli.bags import import_command
 from coopenv.cli.bench import bench
 from coopenv.cli.dataset import dataset
 from coopenv.cli.evaluate import evaluate
+from coopenv.cli.film import film
 from coopenv.cli.live import play, watch
 from coopenv.cli.page import page
 from coopenv.cli.run import record_command, run
@@ -47,6 +48,7 @@ app.command()(train)
 app.command()(evaluate)
 app.command()(watch)
 app.command()(play)
+app.command()(film)
 app.command()(page)
 app.add_typer(bench, name="bench")
 app.add_typer(svea, name="svea")
