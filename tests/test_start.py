@@ -33,6 +33,7 @@ LIGHT |= {
             "run",
             "show",
             "train",
+            "view",
         )
     ),
 }

@@ -23,6 +23,7 @@ from coopenv.cli.page import page
 from coopenv.cli.run import record_command, run
 from coopenv.cli.svea import svea
 from coopenv.cli.train import train
+from coopenv.cli.view import view
 from coopenv.errors import CoopenvError
 from coopenv.shipped import version as installed_version
 
@@ -48,6 +49,7 @@ app.command()(train)
 app.command()(evaluate)
 app.command()(watch)
 app.command()(play)
+app.command()(view)
 app.command()(film)
 app.command()(page)
 app.add_typer(bench, name="bench")

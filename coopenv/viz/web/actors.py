@@ -14,6 +14,7 @@ from coopenv.viz.web.look import Look, linear, rgb
 
 _SHELL = 1.08  # size of an estimate: around the true vehicle, so that both are seen where they agree
 _LARGEST = 0.5  # of the scene's side, largest semi-axis of an ellipsoid that is drawn
+_HONEST, _GAIN = 0.2, 0.08  # opacity of an ellipsoid: of a covariance, of a matrix of gains
 _DOT = 0.008  # of the scene's side, radius of a landmark
 _FAR = 2.0  # scene's sides from its middle: estimates farther away are drawn there
 
@@ -73,8 +74,8 @@ class Actors:
         ghost: dict[str, Any] = {"opacity": 0.32, "flat_shading": True}
         self._ghosts = Batch(scene, f"{ROOT}/estimates/body", shapes.car(), colours, **ghost)
         self._frames = Batch(scene, f"{ROOT}/estimates/edges", shapes.box(), colours, wireframe=True, opacity=0.5)
-        opacity = 0.2 if source.honest else 0.08
-        self._ellipsoids = Batch(scene, f"{ROOT}/ellipsoids", shapes.sphere(), colours, opacity=opacity)
+        self._ellipsoids = Batch(scene, f"{ROOT}/ellipsoids", shapes.sphere(), colours, opacity=_HONEST)
+        self.tell_source(source)
         dark = np.tile(np.array(rgb(DARK_BLUE), np.uint8), (stage.landmarks, 1))
         self._dots = Batch(scene, f"{ROOT}/landmarks/dots", shapes.sphere(6), dark)
         self._poles = Batch(scene, f"{ROOT}/landmarks/poles", shapes.pole(), dark)
@@ -83,6 +84,10 @@ class Actors:
         self._boxes = Batch(scene, *bodies) if self._bodies else None
         self._scene = scene
         self._traffic: Batch | None = None
+
+    def tell_source(self, source: Source) -> None:
+        """Say what is shown: ellipsoids of what is no covariance are paler."""
+        self._ellipsoids.handle.opacity = _HONEST if source.honest else _GAIN
 
     def place(self, frame: Frame, look: Look) -> None:
         """Move everything to where it is in a frame."""

@@ -47,7 +47,8 @@ class Ground:
         """Draw them; `scene` is viser's."""
         self._stage, self.z = stage, height_of(stage)
         self.spacing = spacing_of(stage.side)
-        scene.add_frame(ROOT, show_axes=False)
+        self.root = scene.add_frame(ROOT, show_axes=False)
+        """viser's handle of the node that everything hangs on."""
         _light(scene, stage.side)
         self._floor(scene)
         self._roads(scene)

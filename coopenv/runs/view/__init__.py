@@ -1,0 +1,1 @@
+"""`coopenv view`: an episode, a record or cars, live in the browser."""

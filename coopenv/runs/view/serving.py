@@ -1,0 +1,79 @@
+"""The server of the live view: where it listens, and which vehicle is meant."""
+
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from coopenv.errors import CoopenvError, listed, suggest
+from coopenv.scenario import Scenario
+from coopenv.viz.web.extra import viser_module
+
+PORT, PORTS = 8080, 20
+"""The first port that is tried where none is asked for, and how many."""
+
+
+@contextmanager
+def serving(host: str, port: int | None) -> Iterator[tuple[Any, str]]:
+    """Yield viser's server and its address.
+
+    Args:
+        host: address of this computer.
+        port: the one to listen on (None: the first free one from `PORT` on).
+
+    Raises:
+        CoopenvError: the port is taken, or the address is none of this computer's.
+    """
+    chosen = free_port(host, port)
+    server = viser_module().ViserServer(host=host, port=chosen, verbose=False)
+    try:
+        shown = "127.0.0.1" if host == "0.0.0.0" else f"[{host}]" if ":" in host else host
+        yield server, f"http://{shown}:{server.get_port()}"
+    finally:
+        server.stop()
+
+
+def free_port(host: str, port: int | None) -> int:
+    """Return a port that nobody listens on; arguments and errors as for `serving`."""
+    for candidate in (port,) if port is not None else range(PORT, PORT + PORTS):
+        reason = _obstacle(host, candidate)
+        if not reason:
+            return candidate
+        if port is not None:
+            raise CoopenvError(f"--port {port}: {reason}")
+    raise CoopenvError(f"--port: {PORT} to {PORT + PORTS - 1} are taken; name another one")
+
+
+def _obstacle(host: str, port: int) -> str:
+    """Return why nobody can listen on a port; empty: one can. Raises CoopenvError: there is no such address here."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind(address)
+    except socket.gaierror:
+        raise CoopenvError(f"--host {host}: no such address") from None
+    except PermissionError:
+        return "ports below 1024 are for the administrator; name another one"
+    except OSError as error:
+        if isinstance(error, OSError) and error.errno == 99:  # EADDRNOTAVAIL
+            raise CoopenvError(f"--host {host}: is no address of this computer") from None
+        return "somebody else listens there; name another one"
+    return ""
+
+
+def vehicle_index(scenario: Scenario, name: str | None) -> int | None:
+    """Return the index of a vehicle by its name or by f1, f2, ...; None without a name.
+
+    Raises:
+        CoopenvError: there is no such vehicle.
+    """
+    if name is None:
+        return None
+    names = list(scenario.vehicle_names)
+    short = {f"f{i + 1}": i for i in range(len(names))}
+    if name in short:
+        return short[name]
+    if name not in names:
+        raise CoopenvError(f"--vehicle {name}: no such vehicle{suggest(name, names)}; known: {listed(names)}")
+    return names.index(name)

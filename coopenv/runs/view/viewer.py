@@ -1,0 +1,232 @@
+"""The loop of the live view: frames at their pace, and what the user wishes."""
+
+from collections.abc import Callable
+from time import monotonic, sleep
+from typing import Any
+
+import numpy as np
+
+from coopenv.errors import CoopenvError
+from coopenv.runs.video import MAX_FPS
+from coopenv.runs.view.reels import FAULTS, Reel
+from coopenv.viz.scene import Frame, Stage
+from coopenv.viz.scene.stage import entry
+from coopenv.viz.web.look import Look
+from coopenv.viz.web.panel import NO_FAULT, Panel
+from coopenv.viz.web.picture import Picture, useful_magnification
+from coopenv.viz.web.plots import History
+from coopenv.viz.web.replay import aim
+
+_NAP = 0.05  # s, longest sleep: wishes are not kept waiting longer
+_LAG = 0.5  # s that frames may be late before time is let go
+_FADE_EVERY = 0.25  # s
+_NARROW = 0.7  # width over height of a window, from which on the camera begins farther away
+
+
+class Viewer:
+    """Shows a reel through a server of viser."""
+
+    def __init__(self, server: Any, reel: Reel) -> None:
+        """Draw the first frame.
+
+        Raises:
+            CoopenvError: there is none.
+        """
+        if not reel.more():
+            raise CoopenvError(f"{reel.source.name}: has no frames to show")
+        self._server, self._reel = server, reel
+        self._stage = Stage(reel.scenario)
+        first = reel.frames[0]
+        magnification = useful_magnification(first.three_sigma, self._stage.side) if reel.source.honest else 1.0
+        self._look = Look(magnification=magnification)
+        self._panel = Panel(server.gui, self._stage, reel.source, self._look, reel.abilities(), reel.length)
+        aim(server.initial_camera, self._stage)
+        self._picture = Picture(server.scene, self._stage, reel.source, self._look)
+        self._picture.actors.cars.handle.on_click(
+            lambda event: self._panel.wishes.put(("vehicle", event.instance_index))
+        )
+        server.on_client_connect(self._welcome)
+        self._history = History(reel.scenario.rates.camera)
+        self._k, self._speed, self.playing = 0, 1.0, True
+        self._due = self._shown_at = self._faded_at = -np.inf
+        self._middle = np.array([*(self._stage.low + self._stage.high) / 2, 0.0])
+        self._follow, self._alone = True, False
+        self.shown = 0
+        """How many frames have been sent."""
+        self._remember(first)
+        self._show(monotonic())
+
+    def pick(self, vehicle: int | None) -> None:
+        """Look at a vehicle, or at none."""
+        self._panel.pick(vehicle)
+
+    def run(self, going: Callable[[], bool] = lambda: True) -> None:
+        """Show frames until `going` says no."""
+        self._due = monotonic()
+        while going():
+            changed = self._obey()
+            now = monotonic()
+            moved = self._go_on(now) if self.playing or self._reel.real_time else False
+            if (moved and now - self._shown_at >= 0.9 / MAX_FPS) or changed:
+                self._show(now)
+            self._fade(now)
+            if not self._reel.real_time:
+                sleep(max(0.0, min(_NAP, self._due - monotonic())) if self.playing else _NAP)
+
+    def _go_on(self, now: float) -> bool:
+        """Go to the frame that is due; return whether another one is."""
+        if not self._reel.real_time and now < self._due:
+            return False
+        if now - self._due > _LAG:
+            self._due = now
+        if not self._step():
+            if not self._reel.real_time:
+                self._set_playing(False)
+                self._panel.tell("The episode is over; Restart shows it again.")
+            return False
+        self._due += self._period() / self._speed
+        return True
+
+    def _step(self) -> bool:
+        """Go to the next frame; return False where there is none."""
+        if self._k + 1 == len(self._reel.frames) and not self._reel.more():
+            return False
+        self._k += 1
+        self._remember(self._frame)
+        return True
+
+    @property
+    def _frame(self) -> Frame:
+        return self._reel.frames[self._k]
+
+    def _period(self) -> float:
+        ticks = self._frame.tick - self._reel.frames[self._k - 1].tick
+        return float(ticks) / self._reel.scenario.rates.camera
+
+    def _remember(self, frame: Frame) -> None:
+        self._history.add(frame)
+
+    def _show(self, now: float) -> None:
+        """Send the present frame; who is slow gets the latest one only, since messages replace one another."""
+        picked = self._panel.picked
+        self._look.only = picked if self._alone else None
+        with self._server.atomic():
+            self._picture.show(self._frame)
+            place = np.zeros(3)
+            if picked is not None and self._follow and np.isfinite(self._frame.vehicle_position[picked]).all():
+                place = self._middle - [*self._frame.vehicle_position[picked, :2], 0.0]
+            self._picture.ground.root.position = tuple(np.round(place, 4).tolist())
+        self._panel.show(self._frame, self._history, now)
+        self._shown_at = now
+        self.shown += 1
+
+    def _fade(self, now: float) -> None:
+        """Let buildings be seen through that hide the picked vehicle, or any, from somebody who looks."""
+        if now - self._faded_at < _FADE_EVERY or not self._stage.buildings:
+            return
+        self._faded_at = now
+        picked = self._panel.picked
+        places = self._frame.vehicle_position[[picked]] if picked is not None else self._frame.vehicle_position
+        root = np.array(self._picture.ground.root.position)
+        eyes = [np.array(client.camera.position) - root for client in self._server.get_clients().values()]
+        hidden = {
+            i
+            for i, box in enumerate(self._stage.buildings)
+            if any(np.isfinite(entry(eye, place, box)) for eye in eyes for place in places if np.isfinite(place).all())
+        }
+        self._picture.ground.fade(hidden)
+
+    def _welcome(self, client: Any) -> None:
+        """Let somebody with a narrow window begin farther away."""
+        waiting = client.camera.aspect < _NARROW
+
+        def once(camera: Any) -> None:
+            nonlocal waiting
+            arrived = np.linalg.norm(camera.look_at - self._middle) < 1e-3 * self._stage.side
+            if waiting and arrived:  # the first camera is there, which would come after what is set before
+                waiting = False
+                aim(camera, self._stage, float(camera.aspect))
+
+        client.camera.on_update(once)
+
+    def _obey(self) -> bool:
+        """Do what the user has wished; return whether there was anything."""
+        any_wish = False
+        while not self._panel.wishes.empty():
+            name, value = self._panel.wishes.get()
+            any_wish = True
+            if name.startswith("show "):
+                setattr(self._look, name.removeprefix("show "), value)
+            else:
+                getattr(self, f"_wish_{name}")(value)
+        return any_wish
+
+    def _set_playing(self, playing: bool) -> None:
+        self.playing, self._due = playing, monotonic()
+        self._panel.tell_playing(playing)
+
+    def _wish_play(self, _: object) -> None:
+        self._set_playing(not self.playing)
+        self._panel.tell("")
+
+    def _wish_step(self, _: object) -> None:
+        self._set_playing(False)
+        self._step()
+
+    def _wish_restart(self, _: object) -> None:
+        self._k = 0
+        self._remember(self._frame)
+        self._panel.tell("")
+        self._set_playing(True)
+
+    def _wish_speed(self, speed: float) -> None:
+        self._speed, self._due = speed, monotonic()
+
+    def _wish_seek(self, time: float) -> None:
+        self._set_playing(False)
+        tick = time * self._reel.scenario.rates.camera
+        while self._reel.frames[-1].tick < tick and self._reel.more():
+            pass
+        ticks = np.array([frame.tick for frame in self._reel.frames])
+        self._k = int(np.argmin(np.abs(ticks - tick)))
+        for frame in self._reel.frames[max(0, self._k - 300) : self._k + 1]:
+            self._remember(frame)
+
+    def _wish_vehicle(self, vehicle: int | None) -> None:
+        self._panel.pick(vehicle)
+
+    def _wish_follow(self, follow: bool) -> None:
+        self._follow = follow
+
+    def _wish_alone(self, alone: bool) -> None:
+        self._alone = alone
+
+    def _wish_magnification(self, magnification: float) -> None:
+        self._look.magnification = magnification
+        self._panel.tell_legend()
+
+    def _wish_observer(self, name: str) -> None:
+        self._change(f"Running this episode under {name} up to here", observer=name)
+
+    def _wish_fault(self, name: str) -> None:
+        time = float(self._frame.tick) / self._reel.scenario.rates.camera
+        fault = {} if name == NO_FAULT else FAULTS[name](time, self._panel.picked or 0)
+        self._change("Running this episode again up to here", fault=fault)
+
+    def _change(self, words: str, **changes: Any) -> None:
+        """Run the episode again up to here under changes."""
+        self._panel.tell(f"{words} (kernels that are new here are compiled first) ...")
+        self._server.flush()
+        try:
+            self._reel.change(**changes)
+        except CoopenvError as error:
+            self._panel.tell(f"That cannot be: {error}")
+            return
+        self._k = min(self._k, len(self._reel.frames) - 1)
+        self._history = History(self._reel.scenario.rates.camera)
+        for frame in self._reel.frames[: self._k + 1]:
+            self._remember(frame)
+        self._picture.actors.tell_source(self._reel.source)
+        self._panel.tell_source(self._reel.source)
+        self._panel.tell("")
+        self._due = monotonic()

@@ -1,0 +1,178 @@
+"""What a vehicle's camera sees: its image with the targets where they are projected to, drawn from the true poses."""
+
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from scipy.spatial.transform import Rotation
+
+from coopenv.estimation.outcomes import Sight
+from coopenv.scenario.sensing import ROTATION_OF_CAMERA, Camera
+from coopenv.viz.scene import Frame, Stage
+from coopenv.viz.scene.stage import Box
+from coopenv.viz.style import DARK_BLUE, GREY, INK, vehicle_colour
+from coopenv.viz.topview_ground import GROUND, ROOF, TRAFFIC, WALL
+
+SKY = "#E6EEF5"
+_ALL_AROUND = (360, 120)  # pixels of the image of a camera that sees everything
+_HIGH = 30.0  # deg that such an image reaches up and down
+_SCALE = 2  # of the drawing, which is made smaller at the end
+_NEAR = 0.05  # m before the camera, where boxes are cut
+_EDGES = ((0, 1, 3, 2), (4, 5, 7, 6), (0, 1, 5, 4), (2, 3, 7, 6), (0, 2, 6, 4), (1, 3, 7, 5))
+
+
+def camera_image(stage: Stage, frame: Frame, vehicle: int) -> np.ndarray:
+    """Return the image of a vehicle's camera, (H, W, 3) uint8; a panorama where it sees in every direction.
+
+    Targets that are measured are discs, those that are hidden or missed are rings; what hides them stands beside.
+    """
+    lens = Lens(stage, frame, vehicle)
+    width, height = lens.size
+    image = Image.new("RGB", (_SCALE * width, _SCALE * height), SKY)
+    draw = ImageDraw.Draw(image)
+    if not np.isfinite(frame.vehicle_position[vehicle]).all():
+        draw.text((12, 12), "not there", fill=INK, font=_font(22))
+        return _small(image)
+    _draw_ground(draw, lens)
+    for box, colour, edge in sorted(_boxes(stage, frame, vehicle), key=lambda each: -lens.distance(each[0].center)):
+        _draw_box(draw, lens, box, colour, edge)
+    _draw_targets(draw, stage, frame, vehicle, lens)
+    return _small(image)
+
+
+class Lens:
+    """Projects points of the map to the pixels of one camera, as it is believed to be mounted."""
+
+    def __init__(self, stage: Stage, frame: Frame, vehicle: int) -> None:
+        """Take the camera of a vehicle at a frame."""
+        self._camera: Camera = stage.scenario.cameras[vehicle]
+        self.around = self._camera.model != "pinhole"
+        self.size = _ALL_AROUND if self.around else self._camera.image_size
+        self.eye = stage.eyes(frame)[vehicle]
+        orientation = self._camera.orientation
+        if self.around:
+            mounted = np.eye(3)
+        elif isinstance(orientation, str):
+            mounted = ROTATION_OF_CAMERA[orientation]
+        else:
+            mounted = Rotation.from_quat(orientation, scalar_first=True).as_matrix()
+        turned = Rotation.from_euler("z", float(frame.pan[vehicle])).as_matrix()
+        self._to_map = frame.vehicle_rotation[vehicle] @ turned @ mounted
+
+    def distance(self, point: np.ndarray) -> float:
+        """Return how far a point of the map is, m."""
+        return float(np.linalg.norm(point - self.eye))
+
+    def in_camera(self, points: np.ndarray) -> np.ndarray:
+        """Return points (K, 3) of the map in the camera's frame; z ahead, but of a panorama x ahead and z up."""
+        return np.asarray((points - self.eye) @ self._to_map)
+
+    def pixels(self, points: np.ndarray) -> np.ndarray:
+        """Return pixels (K, 2) of points in the camera's frame; NaN of those behind it."""
+        if self.around:
+            azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+            up = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+            width, height = self.size
+            return np.column_stack([(180.0 - azimuth) * width / 360.0, (_HIGH - up) * height / (2 * _HIGH)])
+        ahead = np.where(points[:, 2] > 0.5 * _NEAR, points[:, 2], np.nan)
+        return self._distorted(points[:, 0] / ahead, points[:, 1] / ahead)
+
+    def _distorted(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        k1, k2, p1, p2, k3 = self._camera.distortion
+        r2 = np.minimum(x * x + y * y, 4.0)  # beyond the image the polynomial means nothing
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        (fx, fy), (cx, cy) = self._camera.focal_length, self._camera.principal_point
+        return np.column_stack([fx * u + cx, fy * v + cy])
+
+
+def _boxes(stage: Stage, frame: Frame, vehicle: int) -> list[tuple[Box, str, str]]:
+    """Return the boxes before a camera with the colours of their faces and edges."""
+    boxes = [(box, ROOF, WALL) for box in stage.buildings]
+    for box in stage.solid(frame, (stage.landmarks + vehicle,)):
+        own = box.name[1:] if box.name.startswith("f") else ""
+        colour = vehicle_colour(int(own) - 1) if own.isdigit() else TRAFFIC if box.name == "traffic" else DARK_BLUE
+        boxes.append((box, colour, "white"))
+    return [each for each in boxes if np.isfinite(each[0].center).all()]
+
+
+def _draw_ground(draw: ImageDraw.ImageDraw, lens: Lens) -> None:
+    """Fill what is below the horizon."""
+    width, height = lens.size
+    if lens.around:
+        draw.rectangle([0, _SCALE * height // 2, _SCALE * width, _SCALE * height], fill=GROUND)
+        return
+    direction = lens.in_camera(lens.eye + np.array([[0.0, 0.0, -1.0]]))[0]
+    if abs(direction[1]) > 0.2:
+        (fx, fy), (cx, cy) = lens._camera.focal_length, lens._camera.principal_point
+        left, right = (
+            cy + fy * -(direction[2] + direction[0] * (u - cx) / fx) / direction[1] for u in (0.0, float(width))
+        )
+        below = 4.0 * height * np.sign(direction[1])
+        corners = [(0.0, left), (width, right), (width, right + below), (0.0, left + below)]
+        draw.polygon([(_SCALE * u, _SCALE * v) for u, v in corners], fill=GROUND)
+
+
+def _draw_box(draw: ImageDraw.ImageDraw, lens: Lens, box: Box, colour: str, edge: str) -> None:
+    signs = np.array([(i >> 2 & 1, i >> 1 & 1, i & 1) for i in range(8)]) - 0.5
+    corners = lens.in_camera(box.center + (signs * np.asarray(box.size, float)) @ box.rotation.T)
+    faces = [corners[list(face)] for face in _EDGES]
+    for face in sorted(faces, key=lambda each: -float(np.linalg.norm(each.mean(axis=0)))):
+        whole = face if lens.around else _before(face)
+        if len(whole) < 3:
+            continue
+        outline = lens.pixels(whole)
+        if lens.around and np.ptp(outline[:, 0]) > lens.size[0] / 2:
+            continue  # it is behind, on both sides of the panorama
+        points = [(float(u), float(v)) for u, v in np.clip(_SCALE * outline, -5000, 5000)]
+        draw.polygon(points, fill=colour, outline=edge)
+
+
+def _before(face: np.ndarray) -> np.ndarray:
+    """Return the part of a polygon (K, 3) that lies before the camera."""
+    kept = []
+    for a, b in zip(face, np.roll(face, -1, axis=0), strict=True):
+        if a[2] > _NEAR:
+            kept.append(a)
+        if (a[2] > _NEAR) != (b[2] > _NEAR):
+            kept.append(a + (_NEAR - a[2]) / (b[2] - a[2]) * (b - a))
+    return np.array(kept).reshape(-1, 3)
+
+
+def _draw_targets(draw: ImageDraw.ImageDraw, stage: Stage, frame: Frame, vehicle: int, lens: Lens) -> None:
+    pixels = lens.pixels(lens.in_camera(stage.targets(frame)))
+    width, height = lens.size
+    radius, colour = 3.5 * _SCALE, vehicle_colour(vehicle)
+    for target in np.flatnonzero(np.isfinite(pixels).all(axis=1)):
+        (u, v), kind = pixels[target], frame.sight[vehicle, target]
+        inside = -4 <= u <= width + 4 and -4 <= v <= height + 4
+        if not inside or kind in (Sight.NOT_A_NEIGHBOUR, Sight.OUT_OF_VIEW):
+            continue
+        x, y = _SCALE * float(u), _SCALE * float(v)
+        around = [x - radius, y - radius, x + radius, y + radius]
+        if kind == Sight.VISIBLE:
+            draw.ellipse(around, fill=colour, outline="white", width=_SCALE)
+        else:
+            ring = {Sight.MISSED: colour, Sight.OCCLUDED_BY_BUILDING: GREY}.get(Sight(kind), INK)
+            draw.ellipse(around, outline=ring, width=_SCALE)
+        hider = stage.hider(frame, vehicle, int(target))
+        words = stage.short_name(int(target)) + (f" behind {hider}" if hider else "")
+        side = "rs" if x > _SCALE * width * 0.7 else "ls"
+        gap = -radius - 3 if side == "rs" else radius + 3
+        look: dict[str, Any] = {
+            "font": _font(11 * _SCALE),
+            "stroke_width": _SCALE,
+            "stroke_fill": "white",
+            "anchor": side,
+        }
+        draw.text((x + gap, y - 2), words, fill=INK if kind == Sight.VISIBLE else "#595959", **look)
+
+
+def _font(size: int) -> ImageFont.ImageFont | ImageFont.FreeTypeFont:
+    return ImageFont.load_default(size)
+
+
+def _small(image: Image.Image) -> np.ndarray:
+    size = image.width // _SCALE, image.height // _SCALE
+    return np.asarray(image.resize(size, Image.Resampling.LANCZOS))

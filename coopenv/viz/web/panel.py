@@ -1,0 +1,216 @@
+"""The panel beside the live scene: what can be switched, and what is told in numbers."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from html import escape
+from queue import SimpleQueue
+from typing import Any
+
+import numpy as np
+
+from coopenv.estimation.outcomes import Sight
+from coopenv.format import fixed
+from coopenv.viz.camera_image import camera_image
+from coopenv.viz.scene import Frame, Source, Stage
+from coopenv.viz.style import vehicle_colour
+from coopenv.viz.web.legend import legend_html
+from coopenv.viz.web.look import Look
+from coopenv.viz.web.plots import History, Plots
+
+SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4", "8")
+MAGNIFICATIONS = ("1", "10", "100")
+_CELL = "padding:2px 5px;text-align:right"
+NOBODY = "nobody"
+NO_FAULT = "none"
+TEXTS_EVERY, PLOTS_EVERY = 0.25, 0.5
+"""s of real time between two tables, and between two images and plots."""
+
+
+@dataclass
+class Abilities:
+    """What a source lets one do."""
+
+    pace: bool = True
+    """Pause, step and speed; not of real cars."""
+    seek: bool = True
+    """Go back to earlier frames."""
+    observers: Sequence[str] = ()
+    """That can be put in place of the one that runs; the first one runs."""
+    faults: Sequence[str] = ()
+    """That can be switched on."""
+
+
+class Panel:
+    """viser's panel; what the user does comes out of `wishes` as (name, value), in the thread that asks."""
+
+    def __init__(self, gui: Any, stage: Stage, source: Source, look: Look, abilities: Abilities, length: float) -> None:
+        """Add everything; `length` is that of the episode, s."""
+        self.wishes: SimpleQueue[tuple[str, Any]] = SimpleQueue()
+        self._stage, self._source, self._look = stage, source, look
+        self._gui, self._abilities = gui, abilities
+        self.picked: int | None = None
+        """Index of the vehicle that is looked at."""
+        self._texts_at = self._plots_at = -np.inf
+        self._drawn = 0.0
+        self._playing: Any = None
+        self._time: Any = None
+        gui.set_panel_label("coopenv")
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(0, 114, 178))
+        self._head = gui.add_markdown("")
+        self._status = gui.add_markdown("", visible=False)
+        self._add_playback(length)
+        names = [stage.short_name(stage.landmarks + i) for i in range(stage.vehicles)]
+        self._vehicles = gui.add_dropdown(
+            "Vehicle", (NOBODY, *names), hint="Its camera, its plots; the view goes along."
+        )
+        self._on(self._vehicles, "vehicle", lambda name: None if name == NOBODY else names.index(name))
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Errors"):
+            self._table = gui.add_html("")
+            self._add_world()
+        with tabs.add_tab("Vehicle"):
+            self._vehicle_words = gui.add_markdown("*Pick a vehicle above, or click on one in the scene.*")
+            self._image = gui.add_image(np.full((2, 3, 3), 255, np.uint8), visible=False)
+            self._plots = Plots(gui, source)
+        with tabs.add_tab("Show"):
+            self._add_switches()
+        self.tell_source(source)
+
+    def _on(self, handle: Any, name: str, value: Callable[[Any], Any] = lambda given: given) -> None:
+        """Let the user's changes of a control become wishes; what the program sets itself does not."""
+
+        def changed(event: Any) -> None:
+            if event.client is not None:
+                self.wishes.put((name, value(event.target.value)))
+
+        handle.on_update(changed)
+
+    def _button(self, name: str, label: str, **look: Any) -> Any:
+        button = self._gui.add_button(label, **look)
+        button.on_click(lambda event: self.wishes.put((name, None)))
+        return button
+
+    def _add_playback(self, length: float) -> None:
+        if not self._abilities.pace:
+            return
+        self._playing = self._button("play", "Pause")
+        group = self._gui.add_button_group("Go", ("Step", "Restart"))
+        group.on_click(lambda event: self.wishes.put((str(event.target.value).lower(), None)))
+        speed = self._gui.add_dropdown("Speed", SPEEDS, initial_value="1", hint="Times real time.")
+        self._on(speed, "speed", float)
+        if self._abilities.seek:
+            self._time = self._gui.add_slider("Time [s]", 0.0, max(0.1, round(length, 2)), 0.01, 0.0)
+            self._on(self._time, "seek", float)
+
+    def _add_world(self) -> None:
+        able = self._abilities
+        if able.observers:
+            hint = "The episode runs again from its start to this moment, under this observer."
+            observer = self._gui.add_dropdown("Observer", tuple(able.observers), able.observers[0], hint=hint)
+            self._on(observer, "observer")
+        if able.faults:
+            hint = "What goes wrong from this moment on."
+            fault = self._gui.add_dropdown("Fault", (NO_FAULT, *able.faults), NO_FAULT, hint=hint)
+            self._on(fault, "fault")
+
+    def _add_switches(self) -> None:
+        gui, look = self._gui, self._look
+        initial = f"{look.magnification:g}"
+        magnified = gui.add_button_group("Ellipsoids x", MAGNIFICATIONS)
+        magnified.value = initial if initial in MAGNIFICATIONS else "1"
+        magnified.on_click(lambda event: self.wishes.put(("magnification", float(event.target.value))))
+        names = {"ellipsoids": "Ellipsoids", "estimates": "Estimates", "sight": "Lines of sight"}
+        names |= {"views": "Fields of view", "messages": "V2X messages", "trails": "Trails", "names": "Names"}
+        for name, label in names.items():
+            self._on(gui.add_checkbox(label, getattr(look, name)), f"show {name}")
+        alone = gui.add_checkbox("Lines of the picked vehicle alone", False)
+        self._on(alone, "alone")
+        self._follow = gui.add_checkbox("Go along with the picked vehicle", True)
+        self._on(self._follow, "follow")
+        self._legend = gui.add_html("")
+
+    def tell_source(self, source: Source) -> None:
+        """Say what is shown."""
+        self._source = source
+        title = self._stage.scenario.title
+        self._head.content = f"**{_plain(title)}**  \n{_plain(source.words)}"
+        self.tell_legend()
+
+    def tell_legend(self) -> None:
+        """Say what the marks mean, now."""
+        legend = legend_html(self._stage, self._source, self._look.magnification)
+        self._legend.content = f'<div style="font-size:12px;padding:4px 14px">{legend}</div>'
+
+    def tell(self, words: str) -> None:
+        """Say what is going on; nothing: it goes on as usual."""
+        self._status.visible = bool(words)
+        self._status.content = f"*{_plain(words)}*" if words else ""
+
+    def tell_playing(self, playing: bool) -> None:
+        """Name the button after what it does."""
+        if self._playing is not None:
+            self._playing.label = "Pause" if playing else "Play"
+
+    def pick(self, vehicle: int | None) -> None:
+        """Look at a vehicle, or at none."""
+        self.picked = vehicle
+        none = vehicle is None
+        self._vehicles.value = NOBODY if vehicle is None else self._stage.short_name(self._stage.landmarks + vehicle)
+        self._image.visible = not none
+        if none:
+            self._vehicle_words.content = "*Pick a vehicle above, or click on one in the scene.*"
+        self._plots_at = -np.inf
+
+    def show(self, frame: Frame, history: History, now: float) -> None:
+        """Tell a frame in numbers, not more often than can be read; `now` is real time, s."""
+        if self._time is not None:
+            self._time.value = round(float(frame.tick) / self._stage.scenario.rates.camera, 2)
+        if now - self._texts_at >= TEXTS_EVERY:
+            self._texts_at = now
+            self._table.content = table_html(self._stage, self._source, frame)
+        if self.picked is not None and now - self._plots_at >= PLOTS_EVERY:
+            self._plots_at = now
+            self._image.image = camera_image(self._stage, frame, self.picked)
+            self._vehicle_words.content = sight_words(self._stage, frame, self.picked)
+            self._plots.show(history, self.picked)
+
+
+def table_html(stage: Stage, source: Source, frame: Frame) -> str:
+    """Return the table of errors as HTML."""
+    sigma = "3σ [m]" if source.honest else "P, gain [m]"
+    heads = ("error [m]", "[deg]", sigma, "sees")
+    cells = "".join(f'<th style="{_CELL}">{name}</th>' for name in heads)
+    rows = []
+    for i in range(stage.vehicles):
+        lengths = fixed(frame.position_error[i], 3), fixed(frame.three_sigma[i], 3)
+        angle, seen = fixed(frame.orientation_error[i], 1), f"{frame.sees[i]}/{frame.could_see[i]}"
+        values = lengths[0], angle, lengths[1], seen
+        numbers = "".join(f'<td style="{_CELL}">{value}</td>' for value in values)
+        mark = f'<td style="color:{vehicle_colour(i)};font-weight:700">{stage.short_name(stage.landmarks + i)}</td>'
+        rows.append(f"<tr>{mark}{numbers}</tr>")
+    style = "width:100%;font:12px/1.3 ui-monospace,monospace;border-collapse:collapse"
+    table = f'<table style="{style}"><tr><th></th>{cells}</tr>{"".join(rows)}</table>'
+    return f'<div style="padding:2px 14px;max-height:260px;overflow:auto">{table}</div>'
+
+
+def sight_words(stage: Stage, frame: Frame, vehicle: int) -> str:
+    """Return what a vehicle's camera sees and does not, in Markdown."""
+
+    def names(kind: Sight) -> list[str]:
+        found = []
+        for target in np.flatnonzero(frame.sight[vehicle] == kind):
+            hider = stage.hider(frame, vehicle, int(target))
+            found.append(stage.short_name(int(target)) + (f" (by {hider})" if hider else ""))
+        return found
+
+    lines = [("sees", names(Sight.VISIBLE))]
+    lines.append(("hidden", [*names(Sight.OCCLUDED_BY_BODY), *names(Sight.OCCLUDED_BY_BUILDING)]))
+    lines.append(("missed", names(Sight.MISSED)))
+    mark = stage.short_name(stage.landmarks + vehicle)
+    said = "; ".join(f"{word} {_plain(', '.join(found))}" for word, found in lines if found)
+    return f"**{mark}** {said or 'sees nothing'}"
+
+
+def _plain(text: str) -> str:
+    """Return a text in which Markdown finds nothing to do."""
+    return "".join(f"\\{c}" if c in r"\`*_{}[]()#+-!|<>" else c for c in escape(text, quote=False))
