@@ -20,6 +20,7 @@ from coopenv.viz.web.replay import aim
 _NAP = 0.05  # s, longest sleep: wishes are not kept waiting longer
 _LAG = 0.5  # s that frames may be late before time is let go
 _FADE_EVERY = 0.25  # s
+_RAISED = 0.7  # of the scene's side, by which it is lifted over the panel at the lower end of a narrow window
 _NARROW = 0.7  # width over height of a window, from which on the camera begins farther away
 
 
@@ -145,7 +146,7 @@ class Viewer:
             arrived = np.linalg.norm(camera.look_at - self._middle) < 1e-3 * self._stage.side
             if waiting and arrived:  # the first camera is there, which would come after what is set before
                 waiting = False
-                aim(camera, self._stage, float(camera.aspect))
+                aim(camera, self._stage, float(camera.aspect), _RAISED)
 
         client.camera.on_update(once)
 

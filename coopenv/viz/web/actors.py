@@ -3,60 +3,20 @@
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from coopenv.viz.scene import Frame, Source, Stage
 from coopenv.viz.style import DARK_BLUE
 from coopenv.viz.topview_ground import TRAFFIC
 from coopenv.viz.web import shapes
+from coopenv.viz.web.copies import Batch, fine, placed
 from coopenv.viz.web.ground import ROOT, Ground
-from coopenv.viz.web.look import Look, linear, rgb
+from coopenv.viz.web.look import Look, rgb
 
 _SHELL = 1.08  # size of an estimate: around the true vehicle, so that both are seen where they agree
 _LARGEST = 0.5  # of the scene's side, largest semi-axis of an ellipsoid that is drawn
 _HONEST, _GAIN = 0.2, 0.08  # opacity of an ellipsoid: of a covariance, of a matrix of gains
 _DOT = 0.008  # of the scene's side, radius of a landmark
 _FAR = 2.0  # scene's sides from its middle: estimates farther away are drawn there
-
-
-class Batch:
-    """Copies of a mesh; those with NaN in their place are not shown."""
-
-    def __init__(self, scene: Any, name: str, mesh: shapes.Mesh, colours: np.ndarray, **look: Any) -> None:
-        """Add them, one per colour (N, 3), to be placed."""
-        count = len(colours)
-        self._handle = scene.add_batched_meshes_simple(
-            name,
-            *mesh,
-            np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
-            np.zeros((count, 3)),
-            batched_scales=np.zeros((count, 3)),
-            batched_colors=linear(colours),
-            lod="off",
-            **{"cast_shadow": False, "receive_shadow": False, **look},
-        )
-
-    @property
-    def handle(self) -> Any:
-        """Viser's handle."""
-        return self._handle
-
-    def place(self, rotation: np.ndarray, position: np.ndarray, scale: np.ndarray, shown: bool = True) -> None:
-        """Put copies at positions (N, 3) with rotations (N, 3, 3) and sizes (N, 3)."""
-        self._handle.visible = shown
-        if not shown:
-            return
-        good = np.isfinite(position).all(axis=1) & np.isfinite(scale).all(axis=1)
-        good &= np.isfinite(rotation).all(axis=(1, 2))
-        turned = Rotation.from_matrix(np.where(good[:, None, None], rotation, np.eye(3)))
-        self._handle.batched_wxyzs = fine(turned.as_quat(canonical=True, scalar_first=True), 2**-12)
-        self._handle.batched_positions = np.where(good[:, None], position, 0.0).astype(np.float32)
-        self._handle.batched_scales = np.where(good[:, None], scale, 0.0).astype(np.float32)
-
-
-def fine(values: np.ndarray, step: float) -> np.ndarray:
-    """Return values in whole steps, in single precision, which a file can be packed better with."""
-    return (np.round(np.asarray(values, float) / step) * step).astype(np.float32)
 
 
 class Actors:
@@ -80,8 +40,8 @@ class Actors:
         self._dots = Batch(scene, f"{ROOT}/landmarks/dots", shapes.sphere(6), dark)
         self._poles = Batch(scene, f"{ROOT}/landmarks/poles", shapes.pole(), dark)
         self._bodies = [i for i, landmark in enumerate(stage.scenario.landmarks) if landmark.body]
-        bodies = f"{ROOT}/landmarks/bodies", shapes.box(), dark[self._bodies]
-        self._boxes = Batch(scene, *bodies) if self._bodies else None
+        self._boxes = Batch(scene, f"{ROOT}/landmarks/bodies", shapes.box(), dark[self._bodies])
+        self._marks = np.zeros((0, 3))
         self._scene = scene
         self._traffic: Batch | None = None
 
@@ -94,10 +54,11 @@ class Actors:
         R, R_hat = frame.vehicle_rotation, frame.estimate_rotation
         at = self._rounded(frame.vehicle_position + (R @ self._center[..., None])[..., 0])
         believed = self._near(frame.estimate_position + (R_hat @ self._center[..., None])[..., 0])
-        self.cars.place(R, at, self._size)
-        self._arrows.place(R, at, self._size)
-        self._ghosts.place(R_hat, believed, _SHELL * self._size, look.estimates)
-        self._frames.place(R_hat, believed, _SHELL * self._size, look.estimates)
+        true, ghosts = placed(R, at, self._size), placed(R_hat, believed, _SHELL * self._size)
+        self.cars.put(true)
+        self._arrows.put(true)
+        self._ghosts.put(ghosts, look.estimates)
+        self._frames.put(ghosts, look.estimates)
         self._place_ellipsoids(frame, look)
         self._place_landmarks(frame)
         self._place_traffic(frame)
@@ -120,21 +81,24 @@ class Actors:
         semi = look.magnification * 3.0 * np.sqrt(np.maximum(variance, 0.0))
         drawn = finite & (variance[:, 0] >= 0.0) & (semi[:, 2] <= _LARGEST * self._stage.side)
         semi = fine(np.where(drawn[:, None], semi, np.nan), self._step / 4)
-        self._ellipsoids.place(axes, self._near(frame.estimate_position), semi, look.ellipsoids)
+        self._ellipsoids.put(placed(axes, self._near(frame.estimate_position), semi), look.ellipsoids)
 
     def _place_landmarks(self, frame: Frame) -> None:
         L, side = self._stage.landmarks, self._stage.side
-        place, upright = self._stage.targets(frame)[:L], np.tile(np.eye(3), (L, 1, 1))
-        self._dots.place(upright, self._rounded(place), np.full((L, 3), _DOT * side))
+        place = self._stage.targets(frame)[:L]
+        if np.array_equal(place, self._marks, equal_nan=True):
+            return
+        self._marks = place
+        self._dots.put(placed(None, self._rounded(place), np.full((L, 3), _DOT * side)))
         foot = np.column_stack([place[:, :2], np.full(L, self._ground.z)])
         thick = np.full((L, 1), 0.2 * _DOT * side)
         height = np.maximum(place[:, 2:] - self._ground.z, 0.0)
-        self._poles.place(upright, self._rounded(foot), np.hstack([thick, thick, height]))
-        if self._boxes is not None:
+        self._poles.put(placed(None, self._rounded(foot), np.hstack([thick, thick, height])))
+        if self._bodies:
             bodies = [body for landmark in self._stage.scenario.landmarks if (body := landmark.body)]
             R = frame.rotation[self._bodies]
             at = frame.position[self._bodies] + (R @ np.array([b.center for b in bodies])[..., None])[..., 0]
-            self._boxes.place(R, self._rounded(at), np.array([b.size for b in bodies]))
+            self._boxes.put(placed(R, self._rounded(at), np.array([b.size for b in bodies])))
 
     def _place_traffic(self, frame: Frame) -> None:
         if not len(frame.traffic_half):
@@ -143,4 +107,4 @@ class Actors:
             grey = np.tile(np.array(rgb(TRAFFIC), np.uint8), (len(frame.traffic_half), 1))
             self._traffic = Batch(self._scene, f"{ROOT}/traffic", shapes.car(), grey, flat_shading=True)
         size = np.where(frame.traffic_half[:, :1] > 0.0, 2.0 * frame.traffic_half, np.nan)
-        self._traffic.place(frame.traffic_rotation, self._rounded(frame.traffic_position), size)
+        self._traffic.put(placed(frame.traffic_rotation, self._rounded(frame.traffic_position), size))

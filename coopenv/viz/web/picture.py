@@ -6,7 +6,8 @@ import numpy as np
 
 from coopenv.viz.scene import Frame, Source, Stage
 from coopenv.viz.web import lines
-from coopenv.viz.web.actors import Actors, fine
+from coopenv.viz.web.actors import Actors
+from coopenv.viz.web.copies import fine
 from coopenv.viz.web.ground import ROOT, Ground
 from coopenv.viz.web.labels import Labels
 from coopenv.viz.web.look import Look, vehicle_colours

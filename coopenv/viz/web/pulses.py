@@ -6,7 +6,7 @@ import numpy as np
 
 from coopenv.viz.scene import Frame, Stage
 from coopenv.viz.web import shapes
-from coopenv.viz.web.actors import Batch, fine
+from coopenv.viz.web.copies import Batch, fine, placed
 from coopenv.viz.web.ground import ROOT
 
 FLIGHT, PAUSE = 0.5, 1.0
@@ -22,15 +22,14 @@ class Pulses:
         n = stage.vehicles
         self._stage = stage
         self._receiver, self._sender = (part.ravel() for part in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
-        self._batch = Batch(scene, f"{ROOT}/messages", shapes.sphere(5), colours[self._sender]) if n > 1 else None
+        self._batch = Batch(scene, f"{ROOT}/messages", shapes.sphere(5), colours[self._sender])
         self._began = np.full(n * n, -np.inf)
         self._last = np.full(n * n, -1)
         self._time = -np.inf
+        self._step = 2.0 ** np.floor(np.log2(stage.side * 1e-4))
 
     def place(self, frame: Frame, time: float, shown: bool) -> None:
         """Let those fly whose message arrived since the last frame, and the others on."""
-        if self._batch is None:
-            return
         arrived = frame.inbox_tick.ravel()
         if time < self._time:
             self._began[:], self._last[:] = -np.inf, arrived
@@ -43,5 +42,4 @@ class Pulses:
         flying = (share >= 0.0) & (share <= 1.0) & (self._sender != self._receiver)
         at = start + np.where(flying, share, 0.0)[:, None] * (end - start)
         size = np.where(flying, _SIZE * self._stage.side, np.nan)[:, None].repeat(3, axis=1)
-        upright = np.tile(np.eye(3), (len(at), 1, 1))
-        self._batch.place(upright, fine(at, 2.0 ** np.floor(np.log2(self._stage.side * 1e-4))), size, shown)
+        self._batch.put(placed(None, fine(at, self._step), size), shown)

@@ -60,9 +60,9 @@ def replay_html(record: SceneRecord, on_progress: Callable[[float], None] = lamb
     return _dressed(page, record, stage, look)
 
 
-def aim(camera: object, stage: Stage, aspect: float = 1.6) -> None:
-    """Point one of viser's cameras at the whole scene."""
-    position, middle = first_camera(stage, aspect)
+def aim(camera: object, stage: Stage, aspect: float = 1.6, raised: float = 0.0) -> None:
+    """Point one of viser's cameras at the whole scene; `raised` lifts it in the picture, in the scene's sides."""
+    position, middle = (at - [0.0, raised * stage.side, 0.0] for at in first_camera(stage, aspect))
     settings = {"near": 1e-3 * stage.side, "far": 20.0 * stage.side, "fov": FIELD_OF_VIEW}
     for name, value in {**settings, "position": position, "look_at": middle}.items():
         setattr(camera, name, value)
