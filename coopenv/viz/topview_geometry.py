@@ -96,7 +96,7 @@ def free_lengths(
     """
     length = np.repeat(np.broadcast_to(np.asarray(reach, float), len(rays))[:, None], rays.shape[1], axis=1)
     for obstacle in obstacles:
-        Rt = Rotation.from_euler("z", -obstacle.yaw).as_matrix()
+        Rt = about_z(-obstacle.yaw)
         start = (origin - (np.array(obstacle.center) - shift)) @ Rt.T
         way = rays @ Rt.T
         way = np.where(np.abs(way) < 1e-9, 1e-9, way)
@@ -106,6 +106,12 @@ def free_lengths(
         hit = (enter < leave) & (leave > 0)
         length = np.where(hit, np.minimum(length, np.maximum(enter, 0.0)), length)
     return length
+
+
+def about_z(angle: float) -> np.ndarray:
+    """Return the rotation (3, 3) about z by an angle, rad."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([(c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)])
 
 
 def _undistorted(edge: float, camera: Camera) -> float:

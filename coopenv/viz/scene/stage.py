@@ -4,7 +4,6 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario
@@ -95,16 +94,16 @@ class Stage:
         """Return the points that cameras see, (A, 3)."""
         return np.asarray(frame.position + (frame.rotation @ self.marker[..., None])[..., 0])
 
-    def fields_of_view(self, frame: Frame) -> np.ndarray | None:
+    def fields_of_view(self, frame: Frame, every: int = 1) -> np.ndarray | None:
         """Return the fields of view in plan as polygons (N, K + 1, 3), the camera first; None where all see everything.
 
-        Buildings end them.
+        Buildings end them. Of the rays along the rim every so many are taken.
         """
         if not self.sees_a_part:
             return None
         eye = self.eyes(frame)
-        turned = Rotation.from_euler("z", frame.pan[:, None]).as_matrix()
-        rays = self._fan @ np.swapaxes(frame.vehicle_rotation @ turned, 1, 2)
+        turned = np.array([geometry.about_z(pan) for pan in frame.pan])
+        rays = self._fan[:, ::every] @ np.swapaxes(frame.vehicle_rotation @ turned, 1, 2)
         length = geometry.free_lengths(eye, rays, self.reach, self.scenario.obstacles, self.origin)
         return np.concatenate([eye[:, None], eye[:, None] + length[..., None] * rays], axis=1)
 
@@ -126,7 +125,7 @@ class Stage:
     def buildings(self) -> list[Box]:
         """The buildings."""
         return [
-            Box(o.name, Rotation.from_euler("z", o.yaw).as_matrix(), np.array(o.center) - self.origin, o.size)
+            Box(o.name, geometry.about_z(o.yaw), np.array(o.center) - self.origin, o.size)
             for o in self.scenario.obstacles
         ]
 

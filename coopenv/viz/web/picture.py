@@ -35,6 +35,7 @@ class Picture:
         self._ways = lines.Segments(scene, f"{ROOT}/ways", 2.0)
         self._trail = lines.Segments(scene, f"{ROOT}/trails", 3.0)
         self._views: list[Any] = []
+        self._drawn_ways: tuple[bytes, ...] = ()
         self._step = 2.0 ** np.floor(np.log2(stage.side * 1e-4))
 
     def show(self, frame: Frame) -> None:
@@ -49,19 +50,22 @@ class Picture:
         sight = lines.sight_lines(self.stage, frame, self._colours, look) if look.sight else none
         self._show(self._sight, sight)
         self._show(self._errors, lines.error_lines(frame, self._colours) if look.estimates else none)
-        self._show(self._ways, lines.way_lines(self.stage, frame, self._colours, self.ground.z))
+        ways = (frame.goal.tobytes(), frame.route_count.tobytes(), frame.route_drawn.tobytes(), frame.route.tobytes())
+        if ways != self._drawn_ways:
+            self._drawn_ways = ways
+            self._show(self._ways, lines.way_lines(self.stage, frame, self._colours, self.ground.z))
         self._show_views(frame)
 
     def _show(self, node: lines.Segments, what: lines.Coloured) -> None:
         node.show(fine(what[0], self._step), what[1])
 
     def _show_views(self, frame: Frame) -> None:
-        views = self.stage.fields_of_view(frame) if self.look.views else None
+        views = self.stage.fields_of_view(frame, _VIEW_RAYS) if self.look.views else None
         if views is None:
             for view in self._views:
                 view.visible = False
             return
-        corners = fine(np.concatenate([views[:, :1], views[:, 1::_VIEW_RAYS]], axis=1), self._step)
+        corners = fine(views, self._step)
         if not self._views:
             n = np.arange(1, corners.shape[1] - 1)
             faces = np.stack([np.zeros_like(n), n + 1, n], axis=-1)
