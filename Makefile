@@ -95,8 +95,8 @@ docs: $(VENV)/.docs ## build the documentation site, out/site/index.html; links 
 notebooks: $(VENV)/.docs ## write the tutorials as notebooks to out/notebooks
 	@$(BIN)/python -m sitegen.notebooks out/notebooks
 
-test-browser: $(VENV)/.docs ## the tests that open pages in headless Chromium (installs Debian's chromium, as root)
-	@command -v chromium > /dev/null || $(APT) chromium
+test-browser: $(VENV)/.docs $(VENV)/.view ## the tests that open pages in headless Chromium (installs Debian's chromium, as root)
+	@command -v chromium > /dev/null || $(APT) chromium fonts-dejavu-core
 	@$(BIN)/python -m pytest -m browser
 
 lint: $(VENV)/.dev ## ruff and mypy

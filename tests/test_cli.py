@@ -26,6 +26,7 @@ from coopenv.runs import table
 from coopenv.runs.recorder import record
 from coopenv.shipped import list_agents
 
+FILES = {"metrics.json", "trajectory.npz", "scene.npz"}
 FIGURES = {
     "errors.png",
     "trajectories_2d.png",
@@ -179,7 +180,7 @@ def test_run_writes_its_files_and_prints_its_table(capsys: pytest.CaptureFixture
     assert main(["run", "busy_intersection", "--seed", "4", "--steps", "120", "--set", "noise.enabled=false"]) == 0
     out = capsys.readouterr().out
     folder = tmp_path / "out" / "busy_intersection"
-    assert {path.name for path in folder.iterdir()} == FIGURES | {"metrics.json", "trajectory.npz"}
+    assert {path.name for path in folder.iterdir()} == FIGURES | FILES | {"replay.html"}
     assert all((folder / name).stat().st_size > 10_000 for name in FIGURES)
     assert len(Trajectory.load(folder / "trajectory.npz").t) == 721
     metrics = json.loads((folder / "metrics.json").read_text())
@@ -203,9 +204,9 @@ def test_run_as_json_prints_nothing_else(capsys: pytest.CaptureFixture[str], tmp
     captured = capsys.readouterr()
     printed = json.loads(captured.out)
     assert "the policy has no effect" in captured.err
-    assert printed["files"] == ["out/overtaking/metrics.json", "out/overtaking/trajectory.npz"]
+    assert printed["files"] == [f"out/overtaking/{name}" for name in ("metrics.json", "trajectory.npz", "scene.npz")]
     folder = tmp_path / "out" / "overtaking"
-    assert sorted(path.name for path in folder.iterdir()) == ["metrics.json", "trajectory.npz"]
+    assert {path.name for path in folder.iterdir()} == FILES
     assert json.loads((folder / "metrics.json").read_text()) == {k: v for k, v in printed.items() if k != "files"}
 
 
@@ -213,7 +214,7 @@ def test_figures_in_another_format_replace_the_older_ones(tmp_path: Path) -> Non
     for option in ("--figures=png", "--figures=svg"):
         assert main(["run", "overtaking", "--steps", "5", "--out", "here", option]) == 0
     names = {name.replace(".png", ".svg") for name in FIGURES}
-    assert {path.name for path in (tmp_path / "here").iterdir()} == names | {"metrics.json", "trajectory.npz"}
+    assert {path.name for path in (tmp_path / "here").iterdir()} == names | FILES | {"replay.html"}
     assert "<svg" in (tmp_path / "here" / "errors.svg").read_text()
 
 
@@ -265,7 +266,7 @@ def test_a_log_file_is_judged_where_the_truth_is_known(capsys: pytest.CaptureFix
     assert not Path("out/blind").exists()
 
 
-@pytest.mark.parametrize("name", ["metrics.json", "trajectory.npz", *sorted(FIGURES), "video.gif"])
+@pytest.mark.parametrize("name", [*sorted(FILES), "replay.html", *sorted(FIGURES), "video.gif"])
 def test_results_that_cannot_be_written_are_found_before_the_run(
     name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -288,7 +289,7 @@ def test_lost_observers_have_tables_and_figures(options: list[str], capsys: pyte
     assert main(["run", *options, "--out", "lost"]) == 0
     out = capsys.readouterr().out
     assert sum(line.startswith("vehicle_") and "never" in line for line in out.splitlines()) >= 2
-    assert {path.name for path in Path("lost").iterdir()} == FIGURES | {"metrics.json", "trajectory.npz"}
+    assert {path.name for path in Path("lost").iterdir()} == FIGURES | FILES | {"replay.html"}
     assert "NaN" not in Path("lost/metrics.json").read_text()
 
 

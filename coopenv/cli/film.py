@@ -59,7 +59,7 @@ def film(
     from coopenv.runs.video import film_at
 
     rate, log = fps or (20.0 if out.suffix == ".mp4" else 10.0), options.console(stderr=True)
-    film_at(out, rate, width)
+    film_at(out, rate)
     check_file(out)
     record = scene(source, agent, observer, seed, options.parse_overrides(overrides), (data, variant, topics), log)
     pictures = write_film(record, out, log, rate, speed, width, not map_only)

@@ -32,14 +32,14 @@ def write_film(
         CoopenvError: unknown format, or it needs an extra.
         OutputError: the file cannot be written.
     """
-    film_at(path, fps, width)  # before anything is drawn
+    film_at(path, fps)  # before anything is drawn
     chosen = frames_at(record.time, fps, speed)
     with (
         replacing_file(path) as new,
         closing(TopView(record.scenario, panel=panel)) as view,
         Progress(log, f"filming {path.name}", len(chosen)) as progress,
     ):
-        film = film_at(new, fps, width)
+        film = film_at(new, fps)
         for k in chosen:
             film.add(_within(view.paint(record.frame(int(k))), width))
             progress.advance()

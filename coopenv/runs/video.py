@@ -107,12 +107,13 @@ class WebpFilm(GifFilm):
 
 
 Film = Mp4Film | GifFilm
+_ANY_SIZE = 100_000  # px
 SUFFIXES = (".mp4", ".gif", ".webp")
 """Formats of films."""
 
 
-def film_at(path: Path, fps: float, size: int) -> Film:
-    """Return a film in the format that a path names, of pictures at most `size` pixels wide.
+def film_at(path: Path, fps: float) -> Film:
+    """Return a film in the format that a path names; pictures keep their size.
 
     Raises:
         OutputError: no such format.
@@ -124,7 +125,7 @@ def film_at(path: Path, fps: float, size: int) -> Film:
         if find_spec("imageio_ffmpeg") is None:
             raise CoopenvError(f"{path}: MP4 needs an extra: pip install '.[video]'; GIF and WebP do not")
         return Mp4Film(path, fps)
-    return (WebpFilm if path.suffix == ".webp" else GifFilm)(path, fps, size)
+    return (WebpFilm if path.suffix == ".webp" else GifFilm)(path, fps, _ANY_SIZE)
 
 
 def open_film(folder: Path, fps: float) -> Film:

@@ -106,11 +106,13 @@ class Panel:
         able = self._abilities
         if able.observers:
             hint = "The episode runs again from its start to this moment, under this observer."
-            observer = self._gui.add_dropdown("Observer", tuple(able.observers), able.observers[0], hint=hint)
+            observer = self._gui.add_dropdown(
+                "Observer", tuple(able.observers), initial_value=able.observers[0], hint=hint
+            )
             self._on(observer, "observer")
         if able.faults:
             hint = "What goes wrong from this moment on."
-            fault = self._gui.add_dropdown("Fault", (NO_FAULT, *able.faults), NO_FAULT, hint=hint)
+            fault = self._gui.add_dropdown("Fault", (NO_FAULT, *able.faults), initial_value=NO_FAULT, hint=hint)
             self._on(fault, "fault")
 
     def _add_switches(self) -> None:

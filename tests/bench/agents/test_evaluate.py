@@ -40,6 +40,7 @@ def test_tables_and_files(capsys: pytest.CaptureFixture[str], monkeypatch: pytes
     assert max(map(len, out.splitlines())) <= 100 and "…" not in out
     assert "3 held-out worlds, block 0" in out and "against route_follower" in out
     files = {"evaluation.json", "video.gif", "error_along_the_way.png", "time_against_error.png", "looking.png"}
+    files.add("replay.html")
     assert {path.name for path in Path("eval").iterdir()} == files
     found = json.loads(Path("eval/evaluation.json").read_text())
     keys = {"agent", "kind", "environment", "metric", "mean", "ci_low", "ci_high", "n"}

@@ -1,0 +1,115 @@
+"""`coopenv view | film` and the pages of other commands: what they write, and what they say of bad input."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from coopenv.cli import main
+from coopenv.cli.options import has_display
+from tests.helpers.processes import COOPENV, start
+
+pytest.importorskip("viser", reason="needs the extra view")
+SHORT = ("overtaking", "--set", "horizon=1.0")
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_run_can_be_watched_and_filmed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", *SHORT, "--out", "there", "--policy", "zero"]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.endswith("To watch it in a browser, open there/replay.html\n")
+    assert main(["film", "there", "--out", "film.webp", "--fps", "4"]) == 0
+    assert capsys.readouterr().out.startswith("film.webp: 5 pictures, 1.25 s")
+    Path("there/scene.npz").unlink()
+    assert main(["film", "there", "--out", "film.webp"]) == 2
+    assert "has no scene.npz: it was written by an earlier coopenv" in capsys.readouterr().err
+
+
+def test_a_recording_has_its_page(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["record", *SHORT, "--out", "drive.mcap"]) == 0
+    assert capsys.readouterr().out.endswith("drive.html: the episode, to watch in a browser\n")
+    Path("drive.mcap").unlink()
+    assert main(["record", *SHORT, "--out", "drive.mcap"]) == 2
+    assert "drive.html: exists already; --force replaces it" in capsys.readouterr().err
+    assert main(["record", *SHORT, "--out", "drive.mcap", "--no-replay"]) == 0
+    assert main(["film", "drive.mcap", "--observer", "mekf", "--out", "film.gif", "--fps", "2"]) == 0
+
+
+def test_without_the_extra_runs_say_what_is_missing(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["run", *SHORT, "--out", "there"]) == 0
+    captured = capsys.readouterr()
+    assert "note: no replay.html: pages in the browser need an extra: pip install '.[view]'" in captured.err
+    assert "To watch it" not in captured.out and not Path("there/replay.html").exists()
+    assert main(["view", "overtaking"]) == 2
+    assert capsys.readouterr().err == "error: pictures in the browser need an extra: pip install '.[view]'\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["view", "nowhere"], "unknown environment 'nowhere'"),
+        (["view", "overtaking", "--vehicle", "f7"], "--vehicle f7: no such vehicle"),
+        (["view", "overtaking", "--observer", "robost"], "unknown observer 'robost' (did you mean 'robust'?)"),
+        (["view", "urban_crossing", "--agent", "peak"], "unknown policy 'peak'"),
+        (["view", "svea"], "--deployment: needed by coopenv view svea"),
+        (["view", "svea", "--deployment", "none.toml"], "none.toml"),
+        (["view", "overtaking", "--deployment", "x.toml"], "--deployment x.toml: is for coopenv view svea"),
+        (["view", "no.mcap"], "no.mcap"),
+        (["view", "no.bag"], "no.bag"),
+        (["view", "scene.npz"], "scene.npz: not a readable scene"),
+        (["view", "others.mcap"], "others.mcap"),
+        (["view", "drive.mcap", "--agent", "peek"], "--agent: is for a simulation, drive.mcap is recorded"),
+        (["view", "overtaking", "--host", "192.0.2.7"], "--host 192.0.2.7: is no address of this computer"),
+        (["film", "overtaking", "--out", "film.avi"], "film.avi: unknown format of a film"),
+        (["film", "overtaking", "--out", "none/film.gif"], "folder none does not exist"),
+    ],
+)
+def test_bad_input_is_one_line(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("others.mcap").write_bytes(b"\x89MCAP0\r\nnothing")
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("error: ") and captured.err.count("\n") == 1
+    assert message in captured.err
+
+
+def test_without_a_display_no_browser_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr("webbrowser.open", lambda url: pytest.fail(f"opened {url}"))
+    assert not has_display()
+    assert main(["run", *SHORT, "--out", "there", "--open"]) == 0
+    monkeypatch.setenv("DISPLAY", ":0")
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    assert main(["run", *SHORT, "--out", "there", "--open"]) == 0
+    assert opened == [(Path.cwd() / "there" / "replay.html").as_uri()]
+
+
+def test_the_view_serves_on_loopback_until_it_is_ended(folder: Path) -> None:
+    process = start((*COOPENV, "view", *SHORT, "--no-browser"), folder)
+    assert process.stdout is not None
+    url = process.stdout.readline().split()[0]
+    assert url.startswith("http://127.0.0.1:")
+    with urllib.request.urlopen(url, timeout=20) as answer:
+        assert b"<html" in answer.read(2000)
+    second = start((*COOPENV, "view", *SHORT, "--port", url.rpartition(":")[2]), folder)
+    out, errors = second.communicate(timeout=60)
+    assert (second.returncode, out) == (2, "") and "somebody else listens there" in errors
+    os.kill(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 130 and "Traceback" not in errors

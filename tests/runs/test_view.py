@@ -1,0 +1,178 @@
+"""The live view without a browser: reels, the loop's answers to wishes, and the server's port."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+import coopenv
+from coopenv.api.engine import Engine
+from coopenv.errors import CoopenvError
+from coopenv.runs.scenes import driver_of, open_source, scene_of
+from coopenv.runs.view.reels import FAULTS, EngineReel, Reel, SavedReel
+from coopenv.runs.view.serving import free_port, serving, vehicle_index
+from coopenv.runs.view.viewer import Viewer
+from coopenv.viz.scene import Source
+
+pytest.importorskip("viser", reason="needs the extra view")
+
+
+def reel_of(name: str, **overrides: Any) -> EngineReel:
+    changes = {"horizon": 4.0, **overrides}
+    opened = lambda more: open_source(name, {**changes, **more})  # noqa: E731
+    return EngineReel(opened, name, 3, lambda scenario: driver_of(None, scenario, name, 3))
+
+
+def run_to(reel: Reel, frames: int) -> None:
+    while len(reel.frames) < frames:
+        assert reel.more()
+
+
+def test_another_observer_sees_the_same_episode() -> None:
+    reel = reel_of("busy_intersection")
+    run_to(reel, 20)
+    before = reel.frames
+    reel.change(observer="dead_reckoning")
+    assert reel.source.observer == "dead_reckoning" and reel.source.honest
+    assert [frame.tick for frame in reel.frames] == [frame.tick for frame in before]
+    for old, new in zip(before, reel.frames, strict=True):
+        np.testing.assert_array_equal(old.position, new.position)
+    assert (before[-1].estimate_position != reel.frames[-1].estimate_position).any()
+    reel.close()
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_begins_now(fault: str) -> None:
+    reel = reel_of("busy_intersection", **{"observer.name": "robust", "noise.enabled": False})
+    run_to(reel, 20)
+    now = float(reel.frames[-1].tick) / reel.scenario.rates.camera
+    before = reel.frames
+    reel.change(fault=FAULTS[fault](now, 1))
+    assert len(reel.frames) == 20
+    if "whole episode" not in fault:
+        for old, new in zip(before[:-1], reel.frames[:-1], strict=True):
+            np.testing.assert_array_equal(old.estimate_position, new.estimate_position)
+    run_to(reel, 40)
+    wrong = reel.frames[-1]
+    reel.change(fault={})
+    run_to(reel, 40)
+    if "detections" not in fault:  # here every neighbour is always measured
+        assert (wrong.estimate_position != reel.frames[-1].estimate_position).any()
+    reel.close()
+
+
+def test_what_cannot_be_changed_stays() -> None:
+    reel = reel_of("busy_intersection")
+    run_to(reel, 5)
+    before = reel.frames
+    with pytest.raises(CoopenvError, match="unknown observer"):
+        reel.change(observer="nobody")
+    assert reel.frames is before and reel.source.observer == "riccati" and reel.more()
+    reel.close()
+
+
+@pytest.fixture
+def viewer() -> Iterator[Viewer]:
+    reel = reel_of("urban_crossing")
+    with serving("127.0.0.1", None) as (server, url):
+        assert url == f"http://127.0.0.1:{server.get_port()}"
+        yield Viewer(server, reel)
+    reel.close()
+
+
+def turns(count: int) -> Callable[[], bool]:
+    left = iter(range(count))
+    return lambda: next(left, None) is not None
+
+
+def wish(viewer: Viewer, *wishes: tuple[str, Any]) -> None:
+    for each in wishes:
+        viewer._panel.wishes.put(each)
+    viewer.run(turns(1))
+
+
+def test_the_user_goes_through_the_episode(viewer: Viewer) -> None:
+    reel = viewer._reel
+    wish(viewer, ("play", None))
+    assert not viewer.playing
+    wish(viewer, ("seek", 2.0))
+    assert viewer._frame.tick == pytest.approx(2.0 * reel.scenario.rates.camera, abs=2)
+    kept = len(reel.frames)
+    wish(viewer, ("step", None))
+    assert len(reel.frames) == kept + 1
+    wish(viewer, ("seek", 0.5))
+    assert len(reel.frames) == kept + 1  # what has been is kept
+    assert viewer._frame.tick == pytest.approx(0.5 * reel.scenario.rates.camera, abs=2)
+    wish(viewer, ("restart", None), ("play", None))
+    assert viewer._frame.tick == 0 and not viewer.playing
+
+
+def test_the_view_goes_along_with_the_picked_vehicle(viewer: Viewer) -> None:
+    wish(viewer, ("play", None), ("seek", 1.0), ("vehicle", 2))
+    place = viewer._frame.vehicle_position[2, :2] + viewer._picture.ground.root.position[:2]
+    np.testing.assert_allclose(place, viewer._middle[:2], atol=1e-3)
+    wish(viewer, ("follow", False))
+    np.testing.assert_allclose(viewer._picture.ground.root.position, 0.0)
+
+
+def test_switches_change_what_is_shown(viewer: Viewer) -> None:
+    wish(viewer, ("play", None), ("seek", 1.0), ("magnification", 1.0))
+    small = np.array(viewer._picture.actors._ellipsoids.handle.batched_scales)
+    wish(viewer, ("magnification", 10.0), ("show names", False), ("show views", False))
+    large = np.array(viewer._picture.actors._ellipsoids.handle.batched_scales)
+    np.testing.assert_allclose(large[small > 0.05] / small[small > 0.05], 10.0, rtol=0.05)
+    assert not any(label.visible for label in viewer._picture._labels._cars)
+    assert not any(view.visible for view in viewer._picture._views)
+
+
+def test_wrong_wishes_are_answered_and_the_view_goes_on(viewer: Viewer) -> None:
+    wish(viewer, ("play", None), ("observer", "nobody"))
+    assert "That cannot be: unknown observer" in viewer._panel._status.content
+    wish(viewer, ("observer", "dead_reckoning"))
+    assert "observer dead" in viewer._panel._head.content and not viewer._panel._status.visible
+
+
+def test_the_end_is_told(viewer: Viewer) -> None:
+    wish(viewer, ("seek", 100.0), ("play", None))
+    viewer.run(turns(3))
+    assert not viewer.playing and "over" in viewer._panel._status.content
+
+
+def test_a_kept_scene_is_shown_and_cannot_be_changed() -> None:
+    scenario = coopenv.load_scenario("overtaking", {"horizon": 1.0})
+    record = scene_of(Engine(scenario), Source.of("overtaking", scenario, seed=0))
+    reel = SavedReel(record)
+    with serving("127.0.0.1", None) as (server, _):
+        shown = Viewer(server, reel)
+        wish(shown, ("seek", 1.0))
+        assert shown._frame.tick == record.fields["tick"][-1]
+    assert not reel.more()
+    with pytest.raises(CoopenvError, match="nothing can be changed"):
+        reel.change(observer="robust")
+
+
+def test_a_port_that_is_taken_is_told() -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(CoopenvError, match=f"--port {port}: somebody else listens there"):
+            free_port("127.0.0.1", port)
+    assert free_port("127.0.0.1", port) == port
+    with pytest.raises(CoopenvError, match=r"--host 192\.0\.2\.1: is no address of this computer"):
+        free_port("192.0.2.1", port)
+    with pytest.raises(CoopenvError, match="--host no such host: no such address"):
+        free_port("no such host", port)
+
+
+def test_vehicles_are_found_by_either_name() -> None:
+    scenario = coopenv.load_scenario("overtaking")
+    found = partial(vehicle_index, scenario)
+    assert [found(name) for name in (None, "f2", "vehicle_1")] == [None, 1, 0]
+    with pytest.raises(CoopenvError, match="--vehicle f9: no such vehicle"):
+        found("f9")

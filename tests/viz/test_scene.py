@@ -1,0 +1,180 @@
+"""Scenes as plain data: they say what the engine says, files keep them, and hidden lines meet what hides them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import coopenv
+from coopenv.api.engine import Engine
+from coopenv.errors import CoopenvError, DataError
+from coopenv.estimation.outcomes import Sight
+from coopenv.policies import decide, load_policy
+from coopenv.runs.scenes import scene_of
+from coopenv.viz.camera_image import Lens, camera_image
+from coopenv.viz.scene import Frame, SceneRecord, Source, Stage
+from coopenv.viz.scene.stage import entry
+from coopenv.viz.topview import TopView
+from coopenv.viz.web.lines import stopped
+
+ALONG = np.array([40.0, 0.0, 0.0])
+
+
+def played(name: str, overrides: dict[str, Any], decisions: int, seed: int = 1) -> Engine:
+    engine = Engine(coopenv.load_scenario(name, overrides), dtype="float64")
+    engine.reset([seed])
+    for _ in range(decisions):
+        engine.step()
+    return engine
+
+
+@pytest.fixture(scope="module")
+def urban() -> SceneRecord:
+    scenario = coopenv.load_scenario("urban_crossing", {"horizon": 3.0})
+    return scene_of(Engine(scenario), Source.of("urban_crossing", scenario, seed=1, policy="zero"))
+
+
+def test_a_frame_is_what_the_engine_says() -> None:
+    engine = played("urban_crossing", {}, 12)
+    frame = Frame.of(engine)
+    there = engine.view("present")[0] == 1
+    np.testing.assert_array_equal(frame.position[there], engine.view("position")[0][there])
+    assert np.isnan(frame.position[~there]).all()
+    expected = (engine.view("estimate_rotation")[0] @ engine.view("estimate_position")[0][..., None])[..., 0]
+    own = there[frame.landmarks :]
+    np.testing.assert_array_equal(frame.estimate_position[own], expected[own])
+    error = np.linalg.norm(frame.vehicle_position - frame.estimate_position, axis=-1)
+    np.testing.assert_allclose(error[own], frame.position_error[own], rtol=1e-9)
+    before = frame.position.copy()
+    engine.step()
+    np.testing.assert_array_equal(frame.position, before)  # a copy
+    variance = np.trace(frame.position_covariance[own], axis1=1, axis2=2)
+    assert (frame.three_sigma[own] <= 3.0 * np.sqrt(variance) * (1 + 1e-9)).all()
+
+
+def test_a_scene_comes_back_from_its_file(urban: SceneRecord, tmp_path: Path) -> None:
+    urban.save(tmp_path / "scene.npz")
+    again = SceneRecord.load(tmp_path / "scene.npz")
+    assert (again.source, len(again), again.scenario.title) == (urban.source, len(urban), urban.scenario.title)
+    assert again.source.words == "urban_crossing, observer riccati, driven by zero, seed 1" or again.source.honest
+    for name, values in urban.fields.items():
+        np.testing.assert_allclose(again.fields[name], values, rtol=1e-6, atol=1e-30, err_msg=name)
+    np.testing.assert_array_equal(again.time, urban.time)
+    with np.load(tmp_path / "scene.npz") as kept:
+        assert len(kept["goal"]) == 1 and len(kept["rotation"]) == len(urban)  # what stands still is kept once
+    first, second = (TopView(record.scenario).paint(record.frame(3)) for record in (urban, again))
+    assert np.mean(np.any(first != second, axis=-1)) < 0.01
+
+
+def edited(path: Path, to: Path, **changes: Any) -> Path:
+    with np.load(path) as kept:
+        arrays = {name: kept[name] for name in kept.files}
+    header = json.loads(arrays["header"].tobytes())
+    for name, value in changes.items():
+        if name in header:
+            arrays["header"] = np.frombuffer(json.dumps({**header, name: value}).encode(), np.uint8)
+        elif value is None:
+            del arrays[name]
+        else:
+            arrays[name] = value
+    np.savez(to, **arrays)
+    return to
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sight": None}, "not a scene, missing: sight"),
+        ({"rotation": np.zeros((31, 2, 3, 3), np.float32)}, "rotation: shape"),
+        ({"ended": np.zeros((1, 4), np.float32)}, "ended: float32"),
+        ({"nees": np.zeros((7, 4), np.float32)}, "nees: float32 (7, 4) is not of"),
+        ({"frames": "many"}, "not a scene: header"),
+        ({"source": {"name": "x"}}, "observer"),
+        ({"scenario": {"title": 3}}, "edited.npz"),
+        ({"pan": np.array([["a"]])}, "pan: <U1"),
+    ],
+)
+def test_a_file_that_is_no_scene_is_refused(
+    urban: SceneRecord, tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
+    urban.save(tmp_path / "scene.npz")
+    with pytest.raises(CoopenvError) as error:
+        SceneRecord.load(edited(tmp_path / "scene.npz", tmp_path / "edited.npz", **changes))
+    assert message in str(error.value) and "\n" not in str(error.value)
+    assert "edited.npz" in str(error.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK no archive", b"x" * 1000])
+def test_a_file_of_something_else_is_refused(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "scene.npz"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match="not a readable scene"):
+        SceneRecord.load(path)
+    with pytest.raises(DataError, match="No such file"):
+        SceneRecord.load(tmp_path / "none.npz")
+
+
+@pytest.mark.parametrize("name", ["behind_truck", "large_crossing", "urban_crossing"])
+def test_who_is_hidden_is_hidden_by_somebody(name: str) -> None:
+    """The kernels decide what is hidden; the scene finds what stands between, by another computation."""
+    wall = {"obstacles": [{"name": "wall", "center": [0.0, 0.0, 1.0], "size": [3.0, 0.4, 2.0], "yaw": 0.7}]}
+    changes = {"noise.enabled": False, "horizon": 12.0, **(wall if name == "urban_crossing" else {})}
+    scenario = coopenv.load_scenario(name, changes)
+    engine, policy = Engine(scenario, dtype="float64"), load_policy("route_follower", scenario, 0)
+    record = scene_of(engine, Source.of(name, scenario, seed=3), policy)
+    stage, hidden = Stage(scenario), 0
+    for k in range(0, len(record), 3):
+        frame = record.frame(k)
+        eye, target = stage.eyes(frame), stage.targets(frame)
+        for i, j in np.argwhere(np.isin(frame.sight, (Sight.OCCLUDED_BY_BUILDING, Sight.OCCLUDED_BY_BODY))):
+            hidden += 1
+            assert stage.hider(frame, i, j), f"{stage.short_name(j)} from f{i + 1}"
+        for i, j in np.argwhere(frame.sight == Sight.VISIBLE):
+            assert stage.hider(frame, i, j) is None
+            boxes = [*stage.buildings, *stage.solid(frame, (int(j), stage.landmarks + int(i)))]
+            assert not any(np.isfinite(entry(eye[i], target[j], box)) for box in boxes)
+    assert hidden
+
+
+def test_lines_end_where_something_stands() -> None:
+    stage = Stage(coopenv.load_scenario("urban_crossing"))
+    (box, *_) = stage.buildings
+    start = box.center + np.array([[-20.0, 0.0, 0.0], [0.0, 0.0, 0.0], [-20.0, 0.0, 30.0]])
+    ends = stopped(start, start + ALONG, [box])
+    np.testing.assert_allclose(ends[0], box.center - [box.size[0] / 2, 0.0, 0.0])
+    np.testing.assert_allclose(ends[1:], start[1:] + ALONG)  # from inside, and over it
+
+
+def test_targets_are_projected_to_where_cameras_measure_them() -> None:
+    """The bearings of the kernels, turned into pixels by the pinhole formula."""
+    engine = played("open_square", {"noise.enabled": False, "sensing": "sensed"}, 0, seed=2)
+    scenario, seen = engine.backend.scenario, 0
+    policy = load_policy("peek", scenario, 0)
+    for _ in range(15):
+        engine.step(decide(policy, engine.view("observation")[0].copy(), engine.view("actions").shape[-1])[None])
+    stage, frame = Stage(scenario), Frame.of(engine)
+    for i, j in np.argwhere(frame.sight == Sight.VISIBLE):
+        lens = Lens(stage, frame, int(i))
+        (pixel,) = lens.pixels(lens.in_camera(stage.targets(frame)[[j]]))
+        assert (pixel >= 0).all() and (pixel <= lens.size).all()
+        right, down, ahead = engine.view("bearing")[0, i, j]
+        camera = scenario.cameras[i]
+        (fx, fy), (cx, cy) = camera.focal_length, camera.principal_point
+        if not any(camera.distortion):
+            np.testing.assert_allclose(pixel, [cx + fx * right / ahead, cy + fy * down / ahead], atol=0.05)
+        seen += 1
+    assert seen
+
+
+@pytest.mark.parametrize("name", coopenv.list_envs())
+def test_every_camera_has_an_image(name: str) -> None:
+    engine = played(name, {}, 3)
+    stage, frame = Stage(engine.backend.scenario), Frame.of(engine)
+    for i in range(stage.vehicles):
+        image = camera_image(stage, frame, i)
+        width, height = Lens(stage, frame, i).size
+        assert image.shape == (height, width, 3) and image.std() > 1.0

@@ -1,0 +1,137 @@
+"""Scenes in the browser: what pages hold, and what lies behind their drawings."""
+
+from __future__ import annotations
+
+import base64
+import re
+import sys
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import coopenv
+from coopenv.api.engine import Engine
+from coopenv.errors import CoopenvError
+from coopenv.runs.scenes import scene_of
+from coopenv.viz.scene import SceneRecord, Source, Stage
+from coopenv.viz.web.copies import placed, quaternions
+from coopenv.viz.web.extra import has_viser, viser_module
+from coopenv.viz.web.ground import spacing_of
+from coopenv.viz.web.legend import GAIN
+from coopenv.viz.web.look import linear
+from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, useful_magnification
+from coopenv.viz.web.replay import write_replay
+
+msgspec = pytest.importorskip("msgspec", reason="needs the extra view")
+zstandard = pytest.importorskip("zstandard", reason="needs the extra view")
+
+
+def scene(name: str, **overrides: Any) -> SceneRecord:
+    scenario = coopenv.load_scenario(name, {"horizon": 4.0, **overrides})
+    return scene_of(Engine(scenario), Source.of(name, scenario, seed=1))
+
+
+def messages(page: str) -> tuple[float, list[tuple[float, dict[str, Any]]]]:
+    """Return the length of the recording in a page, s, and its messages with their times."""
+    found = re.search(r'__VISER_EMBED_DATA__="([^"]+)"', page)
+    assert found
+    packed = base64.b64decode(found[1])
+    inner = zstandard.ZstdDecompressor().decompress(packed[8:], max_output_size=int.from_bytes(packed[:8], "little"))
+    length = int.from_bytes(inner[:8], "little")
+    content = msgspec.msgpack.decode(inner[8 : 8 + length])
+    return content["durationSeconds"], content["messages"]
+
+
+def test_a_page_holds_the_episode(tmp_path: Path) -> None:
+    record = scene("urban_crossing", **{"observer.name": "robust"})
+    shares: list[float] = []
+    path = write_replay(record, tmp_path / "replay.html", shares.append)
+    page = path.read_text(encoding="utf-8")
+    length, told = messages(page)
+    assert length == pytest.approx(record.length)
+    times = [time for time, _ in told]
+    assert times == sorted(times) and len(set(times)) == len(record)
+    moved = {message["name"] for time, message in told if time > 0 and message["type"] == "SceneNodeUpdateMessage"}
+    assert {"/world/cars/true", "/world/estimates/body", "/world/ellipsoids", "/world/errors"} <= moved
+    assert "urban_crossing, observer robust, seed 1" in page and "Urban crossing - coopenv</title>" in page
+    assert GAIN not in page
+    assert all(a <= b for a, b in pairwise(shares)) and shares[-1] > 0.9
+    assert path.stat().st_size < 1.3e6
+
+
+def test_a_gain_is_not_called_a_covariance(tmp_path: Path) -> None:
+    page = write_replay(scene("overtaking"), tmp_path / "replay.html").read_text(encoding="utf-8")
+    assert GAIN in page and "3σ" not in page.rpartition("__VISER_EMBED_DATA__")[2].partition(";")[2]
+
+
+def test_titles_cannot_bring_code_along(tmp_path: Path) -> None:
+    record = scene("overtaking", title="<script>alert(1)</script> & more")
+    page = write_replay(record, tmp_path / "replay.html").read_text(encoding="utf-8")
+    assert "<script>alert" not in page and "&lt;script&gt;alert(1)&lt;/script&gt; &amp; more" in page
+
+
+@pytest.mark.parametrize("name", coopenv.list_envs())
+def test_every_environment_can_be_drawn(name: str) -> None:
+    from coopenv.viz.web.replay import replay_html
+
+    scenario = coopenv.load_scenario(name, {"horizon": 1.0})
+    length, _ = messages(replay_html(scene_of(Engine(scenario), Source.of(name, scenario, seed=1))))
+    assert length == pytest.approx(1.0, abs=0.21)
+
+
+def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert has_viser()
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert not has_viser()
+    with pytest.raises(CoopenvError, match=r"pip install '\.\[view\]'"):
+        viser_module()
+
+
+def test_quaternions_are_those_of_scipy() -> None:
+    half, diagonal = np.pi * np.eye(3), np.pi * np.array([[0.6, 0.8, 0.0], [0.0, -0.6, 0.8]])
+    random = Rotation.random(500, random_state=1)
+    turns = Rotation.concatenate([random, Rotation.from_rotvec(half), Rotation.from_rotvec(diagonal)])
+    found, expected = quaternions(turns.as_matrix()), turns.as_quat(canonical=True, scalar_first=True)
+    same = np.abs(np.sum(found * expected, axis=-1))
+    np.testing.assert_allclose(same, 1.0, atol=1e-12)
+    assert (found[:, 0] >= 0.0).all()
+
+
+def test_what_is_not_there_has_no_size() -> None:
+    where = placed(None, np.array([[1.0, 2.0, 3.0], [np.nan, 0.0, 0.0]]), np.ones((2, 3)))
+    np.testing.assert_array_equal(where.scales, [[1, 1, 1], [0, 0, 0]])
+    np.testing.assert_array_equal(where.positions, [[1, 2, 3], [0, 0, 0]])
+
+
+def test_colours_are_made_linear() -> None:
+    np.testing.assert_array_equal(linear(np.array([0, 188, 255])), [0, 128, 255])
+
+
+@pytest.mark.parametrize(("side", "spacing"), [(30.0, 2.0), (100.0, 10.0), (99.0, 5.0), (4.0, 0.2), (1.0, 0.1)])
+def test_the_grid_has_even_spacing(side: float, spacing: float) -> None:
+    assert spacing_of(side) == pytest.approx(spacing)
+
+
+@pytest.mark.parametrize("aspect", [1.6, 0.5])
+def test_the_first_camera_has_the_whole_map_in_sight(aspect: float) -> None:
+    stage = Stage(coopenv.load_scenario("urban_crossing"))
+    eye, middle = first_camera(stage, aspect)
+    ahead = (middle - eye) / np.linalg.norm(middle - eye)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, ahead)
+    half = 0.4 * stage.side  # what happens is within the middle of the square
+    for x, y in [(-half, -half), (half, -half), (-half, half), (half, half)]:
+        line = middle + np.array([x, y, 0.0]) - eye
+        depth = line @ ahead
+        assert abs(line @ up) / depth < np.tan(FIELD_OF_VIEW / 2)
+        assert abs(line @ right) / depth < aspect * np.tan(FIELD_OF_VIEW / 2)
+
+
+def test_small_ellipsoids_are_magnified() -> None:
+    assert [useful_magnification(np.array([s, np.nan]), 100.0) for s in (2.0, 0.2, 0.02)] == [1.0, 10.0, 100.0]
+    assert useful_magnification(np.array([np.nan]), 100.0) == 1.0
