@@ -8,6 +8,7 @@ from matplotlib.patheffects import withStroke
 
 from coopenv.estimation.outcomes import Outcome
 from coopenv.format import fixed
+from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Body
 from coopenv.viz import topview_geometry as geometry
@@ -133,7 +134,8 @@ class TopView:
         title = self._figure.text(*place, "", fontsize=NORMAL + 1.5, weight="bold", color=INK, ha=aligned)
         self._time = self._layers.keep(title)
         look: dict[str, Any] = {"fontsize": ground.SMALLER, "family": "monospace"}
-        head = f"{'':4}{'error':>7}{'error':>7}{'3σ':>7}{'sees':>6}\n{'':4}{'[m]':>7}{'[deg]':>7}{'[m]':>7}"
+        sigma = "3σ" if states_covariance(self.scenario.observer.name) else "P"
+        head = f"{'':4}{'error':>7}{'error':>7}{sigma:>7}{'sees':>6}\n{'':4}{'[m]':>7}{'[deg]':>7}{'[m]':>7}"
         self._figure.text(*ground.pixels(ground.PANEL, ground.TABLE_TOP), head, color=INK, va="bottom", **look)
         places = [ground.pixels(ground.PANEL, ground.TABLE_TOP - ground.ROW * (i + 1)) for i in range(shown + 1)]
         rows = [self._figure.text(*places[i], "", color=vehicle_colour(i), **look) for i in range(shown)]

@@ -12,6 +12,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation
 
 from coopenv.estimation.outcomes import Sight
+from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.viz.scene.stage import sees_a_part
 from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, legend, new_figure
@@ -109,11 +110,13 @@ def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
     sensed, end = scenario.topology.mode == "sensed", scenario.termination
     moving = any(landmark.motion.kind != "static" for landmark in scenario.landmarks)
     goals, bodies = (any(getattr(vehicle, part) for vehicle in scenario.vehicles) for part in ("goal_radius", "body"))
+    honest = states_covariance(scenario.observer.name)
+    ellipse = "3σ of the estimate" if honest else "P: a gain, not 3σ"
     marks: list[tuple[object, Artist]] = [
         (True, Patch(facecolor=GREY, edgecolor=INK, linewidth=0.7, label="vehicle, true")),
         (True, Patch(facecolor="white", edgecolor=GREY, linewidth=1.4, label="its estimate")),
         (True, Line2D([], [], color=GREY, linewidth=1.0, linestyle=DOTTED, label="error of the estimate")),
-        (True, Patch(facecolor="#7F7F7F30", edgecolor=GREY, linewidth=0.8, label="3σ of the estimate")),
+        (True, Patch(facecolor="#7F7F7F30", edgecolor=GREY, linewidth=0.8, label=ellipse)),
         (sees_a_part(scenario), Patch(facecolor="#7F7F7F24", edgecolor="none", label="field of view")),
         (True, _sight(Sight.VISIBLE, "sees (its colour)")),
         (sensed and scenario.obstacles, _sight(Sight.OCCLUDED_BY_BUILDING, "hidden by a building")),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -95,8 +96,11 @@ def resembles(tmp_path: Path) -> Callable[[Any, str], None]:
     def compare(page: Any, name: str) -> None:
         taken = tmp_path / f"{name}.png"
         page.screenshot(path=str(taken), timeout=LOADING)
-        approved = APPROVED / f"{name}.png"
-        assert approved.exists(), f"look at {taken} and copy it to {approved} if it is good"
+        approved = APPROVED / f"{name}.webp"
+        if os.environ.get("APPROVE"):
+            with Image.open(taken) as picture:
+                picture.convert("RGB").save(approved, quality=60)
+        assert approved.exists(), f"look at {taken}; APPROVE=1 takes what is shown as {approved.name}"
         difference = float(np.abs(_coarse(taken) - _coarse(approved)).mean())
         assert difference < _DIFFERENT, f"{taken} differs from {approved} by {difference:.3f}"
 
