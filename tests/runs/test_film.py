@@ -39,6 +39,7 @@ def test_a_film_is_the_top_view_in_time(suffix: str, record: SceneRecord, tmp_pa
     with Image.open(path) as film:
         assert film.n_frames == 16 and film.size[0] == 448
         film.seek(15)
+        film.load()
         assert film.info["duration"] == 200
         shown = np.asarray(film.convert("RGB"), float)
     last = TopView(record.scenario, panel=False).paint(record.frame(len(record) - 1))
