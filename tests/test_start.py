@@ -30,6 +30,7 @@ LIGHT |= {
             "live",
             "options",
             "page",
+            "results",
             "run",
             "show",
             "train",

@@ -20,6 +20,7 @@ from coopenv.cli.evaluate import evaluate
 from coopenv.cli.film import film
 from coopenv.cli.live import play, watch
 from coopenv.cli.page import page
+from coopenv.cli.results import export, figures
 from coopenv.cli.run import record_command, run
 from coopenv.cli.svea import svea
 from coopenv.cli.train import train
@@ -42,6 +43,8 @@ app.command()(show.describe)
 app.command()(show.scene)
 app.command()(show.schema)
 app.command()(run)
+app.command()(figures)
+app.command()(export)
 app.command("record")(record_command)
 app.command("import")(import_command)
 app.command()(dataset)

@@ -28,6 +28,8 @@ def import_command(
     out: Annotated[Path | None, typer.Option(help="MCAP file to write, a recording of coopenv.")] = None,
     seed: options.Seed = 0,
     overrides: options.Overrides = None,
+    observer: options.LogObserver = None,
+    scene: options.LogScene = True,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
     as_json: options.AsJson = False,
 ) -> None:
@@ -43,7 +45,11 @@ def import_command(
     from coopenv.backends.sources import open_bags
 
     if out is not None:
+        from coopenv.runs.log import check_scene
+
         _check(out, force)
+        if scene:
+            check_scene(observer)
     with options.warned():
         bag = open_bags(bags, topics, options.parse_overrides(overrides))
     _print(bag.log.rows, as_json)
@@ -52,15 +58,14 @@ def import_command(
     vehicles = len(bag.binding.cars)
     facts = f"{vehicles} vehicle{'s' * (vehicles > 1)}, {ticks} ticks, {seconds:.4g} s"
     if out is not None:
-        from coopenv.backends.mcap import write_recording
         from coopenv.runs.console import Progress
+        from coopenv.runs.log import write_log
         from coopenv.runs.recorder import record
 
         log = options.console(stderr=True)
         with Progress(log, "recording", total=1.0) as progress:
             recording = record(bag, seed, on_progress=progress.update)
-        with Progress(log, f"writing {out.name}"):
-            write_recording(recording, out)
+        write_log(recording, out, log, observer, scene)
     if not as_json:
         options.console().print(f"{out or bag.where}: {facts}", soft_wrap=True)
 

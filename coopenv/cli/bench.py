@@ -90,6 +90,7 @@ def bench_observers(
     figures: Annotated[
         str | None, typer.Option("--figures", help="Also write figures as files to the folder: png, pdf or svg.")
     ] = None,
+    width: options.FigureWidth = None,
     open_report: Annotated[bool, typer.Option("--open", help="Show the report when it is done; needs --out.")] = False,
     as_json: options.AsJson = False,
 ) -> None:
@@ -100,6 +101,8 @@ def bench_observers(
 
     if open_report and out is None:
         raise CoopenvError("--open: the report needs a folder, --out DIR")
+    if width is not None and figures is None:
+        raise CoopenvError(f"--width {width.value}: is for files of figures, --figures pdf")
     printed, log = options.console(), options.console(stderr=True)
     if not printed.is_terminal:
         printed.width = max(printed.width, WIDE)
@@ -121,7 +124,7 @@ def bench_observers(
             windows,
         )
         request.plan.source.check()
-    perform(request, find_executor(engine, jobs, address), out, figures, printed, log, as_json)
+    perform(request, find_executor(engine, jobs, address), out, figures, printed, log, as_json, width and width.value)
     if open_report and out is not None:
         options.show(out / REPORT_FILE)
 

@@ -6,7 +6,6 @@ from typing import Annotated
 import typer
 
 from coopenv.cli import complete, options
-from coopenv.cli.run import FigureFormat
 from coopenv.errors import CoopenvError
 
 
@@ -29,7 +28,8 @@ def evaluate(
         bool, typer.Option("--ideal", help="Also let route_follower drive where everybody sees everything.")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="Folder for evaluation.json and the figures.")] = None,
-    figures: Annotated[FigureFormat, typer.Option(help="Format of the figures.")] = FigureFormat.png,
+    figures: Annotated[options.FigureFormat, typer.Option(help="Format of the figures.")] = options.FigureFormat.png,
+    width: options.FigureWidth = None,
     no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures and no replay.")] = False,
     film: Annotated[
         bool, typer.Option("--film", help="Also write a film of the agents in one of the worlds, side by side.")
@@ -58,7 +58,7 @@ def evaluate(
         result = command.run(request, entrants, log)
     else:
         form = None if no_figures else figures.value
-        result = command.write(out, request, entrants, form, film, force, log)
+        result = command.write(out, request, entrants, form, film, force, log, width and width.value)
     written = cards.write(result, request.command()) if write_card else []
     if as_json:
         options.print_json(command.document(request, result))

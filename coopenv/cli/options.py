@@ -8,6 +8,7 @@ import tomllib
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,6 +26,17 @@ if TYPE_CHECKING:
 MOST_WORLDS = 1_000_000
 """Of a command that drives them all at once."""
 
+FigureFormat = StrEnum("FigureFormat", "png pdf svg")
+FigureColumn = StrEnum("FigureColumn", "ieee1 ieee2 springer1 springer2")
+FigureWidth = Annotated[
+    FigureColumn | None,
+    typer.Option(
+        "--width",
+        help="Draw figures in the width and fonts of a journal's column: IEEE 3.5 or 7.16 in, Springer 84 or 174 mm "
+        "(default: a page).",
+        show_default=False,
+    ),
+]
 _source = partial(typer.Argument, autocompletion=complete.environments)
 Environment = Annotated[
     str,
@@ -84,6 +96,19 @@ Station = Annotated[
         "where it is driven by `coopenv svea run --car`.",
         show_default=False,
     ),
+]
+LogObserver = Annotated[
+    str | None,
+    typer.Option(
+        "--observer",
+        help="Whose estimates are shown: a name, or mine.py:Mine (default: the scenario's own).",
+        autocompletion=complete.observers,
+        show_default=False,
+    ),
+]
+LogScene = Annotated[
+    bool,
+    typer.Option("--scene/--no-scene", help="Also write what Foxglove and Lichtblick show: scene, cameras, estimates."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 SteadyFrom = Annotated[

@@ -1,6 +1,5 @@
 """`coopenv run | record`: simulate an environment, or keep what vehicles sense."""
 
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,8 +14,6 @@ if TYPE_CHECKING:
     from coopenv.observers.recording import Recording
     from coopenv.runs.scenes import Onlooker
 
-FigureFormat = StrEnum("FigureFormat", "png pdf svg")
-
 
 def run(
     environment: options.Source,
@@ -28,7 +25,8 @@ def run(
     dtype: Annotated[str, typer.Option(help="Precision: float32 or float64.")] = "float64",
     policy: options.PolicyName = "zero",
     steady_from: options.SteadyFrom = None,
-    figures: Annotated[FigureFormat, typer.Option(help="Format of the figures.")] = FigureFormat.png,
+    figures: Annotated[options.FigureFormat, typer.Option(help="Format of the figures.")] = options.FigureFormat.png,
+    width: options.FigureWidth = None,
     no_figures: Annotated[bool, typer.Option("--no-figures", help="Draw no figures and no replay.")] = False,
     video: Annotated[bool, typer.Option("--video", help="Also write a video of the top view.")] = False,
     open_out: Annotated[
@@ -49,7 +47,7 @@ def run(
     backend = options.open_source(environment, changes, data, variant, topics)
     rollout = Rollout(backend.scenario, seed, steps, dtype, device, policy, backend)
     folder, form, log = out or Path("out") / name, None if no_figures else figures.value, options.console(stderr=True)
-    result = execute(name, rollout, folder, log, changes, steady_from, form, video)
+    result = execute(name, rollout, folder, log, changes, steady_from, form, video, width=width and width.value)
     if as_json:
         options.print_json(result)
     else:
@@ -80,31 +78,36 @@ def record_command(
     data: options.DataFolder = None,
     variant: options.Variant = None,
     topics: options.TopicMap = None,
+    observer: options.LogObserver = None,
+    scene: options.LogScene = True,
     no_replay: Annotated[bool, typer.Option("--no-replay", help="Write no page that plays the episode.")] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
 ) -> None:
     """Write what vehicles sense to an MCAP file, and beside it a page that plays the episode.
 
-    The file holds every tick; Foxglove opens it and coopenv replays it.
+    The file holds every tick; coopenv replays it, Foxglove and Lichtblick show it with the estimates of an observer.
     """
-    from coopenv.backends.mcap import check_target, write_recording
-    from coopenv.runs.console import Progress
+    from coopenv.backends.mcap import check_target
+    from coopenv.runs.log import check_scene, write_log
     from coopenv.runs.scenes import Onlooker, write_page
 
     page = out.with_suffix(".html")
     check_target(out)
+    if scene:
+        check_scene(observer)
+    elif observer is not None:
+        raise CoopenvError(f"--observer {observer}: is for a scene, --no-scene has none")
     for path in (out, *([] if no_replay else [page])):
         if path.exists() and not force:
             raise OutputError(f"{path}: exists already; --force replaces it")
     changes, log = options.parse_overrides(overrides), options.console(stderr=True)
     onlooker = Onlooker(out.name, seed, policy)
     recording = _recording(environment, seed, policy, changes, (data, variant, topics), onlooker, log)
-    with Progress(log, f"writing {out.name}"):
-        write_recording(recording, out)
+    write_log(recording, out, log, observer, scene)
     facts = f"{len(recording.setups)} vehicles, {recording.ticks} ticks, {recording.t[-1]:g} s"
     options.console().print(f"{out}: {facts}", soft_wrap=True)
-    scene = None if no_replay else onlooker.record()
-    if scene is not None and write_page(scene, page, log) is not None:
+    played = None if no_replay else onlooker.record()
+    if played is not None and write_page(played, page, log) is not None:
         options.console().print(f"{page}: the episode, to watch in a browser", soft_wrap=True)
 
 

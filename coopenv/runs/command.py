@@ -13,6 +13,7 @@ from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import analyse_observability
 from coopenv.files import replace_text, replacing_folder
 from coopenv.jsonable import json_text
+from coopenv.observers.registry import states_covariance
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.metrics import run_metrics, theory_rates, vehicle_metrics
 from coopenv.runs.rollouts import Rollout
@@ -43,11 +44,12 @@ def execute(
     figures: str | None,
     video: bool,
     describe: Callable[[], str] | None = None,
+    width: str | None = None,
 ) -> dict[str, Any]:
     """Run, write to the folder `out`, and return what `run --json` prints: the metrics, and the paths of the files.
 
-    A run that does not reach its end writes nothing. `figures` is their format; None: no figures. `describe` says what
-    is shown beside the bar meanwhile.
+    A run that does not reach its end writes nothing. `figures` is their format; None: no figures. `width` is a column
+    of `coopenv.viz.paper`; None: a page's. `describe` says what is shown beside the bar meanwhile.
 
     Raises:
         CoopenvError: an argument is not valid, or the results cannot be written.
@@ -79,8 +81,8 @@ def execute(
 
                 ends = [ending.time for ending in endings]
                 options: dict[str, Any] = {"scenario": scenario, "steady_from": steady, "file_format": figures}
-                note = f"{name}, {scenario.observer.name}, seed {run.seed}"
-                paths += save_figures(judged, folder, observability, ends=ends, note=note, **options)
+                options |= figure_words(metrics, width)
+                paths += save_figures(judged, folder, observability, ends=ends, **options)
             page = write_page(scene, folder / REPLAY_FILE, log)
             paths += [] if page is None else [page]
         if film is not None:
@@ -90,6 +92,18 @@ def execute(
                 log.print("video: written as GIF; for MP4: pip install '.[video]'", soft_wrap=True)
             paths.append(film.path)
     return {**metrics, "files": [out / path.name for path in paths]}
+
+
+def figure_words(metrics: Mapping[str, Any], width: str | None) -> dict[str, Any]:
+    """Return what `save_figures` is told of a run: its names, and where they are written.
+
+    Figures for a column of a journal have them in the metadata alone.
+    """
+    about = {name: metrics[name] for name in ("environment", "observer", "seed", "policy", "overrides")}
+    note = f"{about['environment']}, {about['observer']}, seed {about['seed']}"
+    told = {"coopenv": metrics["versions"]["coopenv"], **about}
+    gain = not states_covariance(about["observer"])
+    return {"about": told, "gain": gain, "width": width, "note": note if width is None else ""}
 
 
 def _simulate(

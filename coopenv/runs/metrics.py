@@ -139,6 +139,7 @@ def run_metrics(
         "seed": run.seed,
         "overrides": dict(overrides),
         "policy": run.policy_name,
+        "observer": run.scenario.observer.name,
         "dtype": run.engine.world.precision.name,
         "device": run.engine.world.device,
         "versions": {"coopenv": version(), "warp": wp.__version__, "numpy": np.__version__, "python": python_version()},

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from coopenv.estimation.metrics import observability_of
@@ -14,54 +15,65 @@ from coopenv.viz import style
 
 _VERDICTS: dict[bool, dict[str, Any]] = {
     True: {"facecolor": style.GREEN, "edgecolor": "none", "label": "observable"},
-    False: {"facecolor": "white", "edgecolor": style.VERMILION, "hatch": "//////", "label": "not\nobservable"},
+    False: {"facecolor": "white", "edgecolor": style.VERMILION, "hatch": "//////", "label": "not observable"},
 }
 _FLOOR = 1e-8  # smaller eigenvalues are drawn here: they are zero but for rounding
+_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (6, 1.5, 1, 1.5)), (0, (1, 0.8)))
+_FRAME, _NARROW_FRAME, _LANE = 3.6, 2.6, 0.24  # inches
+MEANING = (
+    "Observable: the bearings of a window, together with odometry, determine the pose near the truth. "
+    "It does not promise that an observer gets there from any start."
+)
 
 
-def observability_figure(observability: Observability, ends: Sequence[float] | None = None) -> Figure:
-    """Draw the eigenvalue that the verdict rests on, the theorem's own, and the verdict of every vehicle.
+def observability_figure(
+    observability: Observability, ends: Sequence[float] | None = None, width: float | None = None
+) -> Figure:
+    """Draw the eigenvalue that the verdict rests on, and the verdict of every vehicle.
 
-    Windows that reach beyond a vehicle's end (s) are left out.
+    Windows that reach beyond a vehicle's end (s) are left out. `width` is in inches (None: a page's).
     """
     count = len(observability.vehicles)
     cut = [observability_of(observability, i, np.nan if ends is None else ends[i]) for i in range(count)]
-    strip = 0.3 + 0.24 * count
-    height = 5.6 + strip
-    figure = style.new_figure(9.0, height)
-    edges = {"left": 0.11, "right": 0.875, "bottom": 0.55 / height, "top": 1 - 0.45 / height}
-    grid = figure.add_gridspec(3, 1, height_ratios=(2.5, 1.6, strip), hspace=0.14, **edges)
-    local, theorem, verdict = grid.subplots(squeeze=False)[:, 0]
-    title = f"Observability Gramian, {observability.window:.3g} s windows (values below {_FLOOR:g} drawn there)"
-    place = {"x": 0.11, "y": 1 - 0.12 / height, "ha": "left", "va": "top"}
-    figure.suptitle(title, fontsize=style.NORMAL + 1, color=style.INK, **place)
-    _draw_eigenvalues(local, cut, [part.local_eigenvalue for part in cut])
-    local.set_ylabel("smallest eigenvalue about\nthe vehicle, scaled [-]", fontsize=style.NORMAL)
-    local.axhline(observability.threshold, color=style.INK, linewidth=0.9, linestyle=(0, (4, 2)), label="threshold")
-    style.legend(local, local.get_lines(), "upper left", (1.005, 1.0), fontsize=style.NORMAL)
-    _draw_eigenvalues(theorem, cut, [part.min_eigenvalue for part in cut])
-    theorem.set_ylabel("smallest eigenvalue about\nthe origin [rad, m mixed]", fontsize=style.NORMAL)
-    _draw_verdict(verdict, cut)
-    for ax in (local, theorem):
-        style.show_decades(ax)
-    for ax in (local, theorem, verdict):
+    frame = _NARROW_FRAME if width is not None and width < style.NARROW else _FRAME
+    figure, _ = style.canvas(width, frame + _LANE * count, "")
+    local, verdict = figure.subplots(2, 1, height_ratios=(2.0, max(0.3, _LANE * count)))
+    handles = _draw_eigenvalues(local, cut)
+    low = any((part.local_eigenvalue < _FLOOR).any() for part in cut)
+    style.explain(figure, MEANING + (f" Smaller eigenvalues are drawn at {_FLOOR:g}." if low else ""))
+    local.axhline(observability.threshold, color=style.INK, linewidth=0.9, linestyle=_DASHES[1])
+    handles.append(Line2D([], [], color=style.INK, linewidth=0.9, linestyle=_DASHES[1], label="threshold"))
+    window = f"smallest eigenvalue of the\nGramian over {observability.window:.3g} s, scaled [-]"
+    local.set_ylabel(window, fontsize=style.NORMAL, color=style.INK)
+    style.show_decades(local)
+    occurring = _draw_verdict(verdict, cut)
+    for ax in (local, verdict):
         if len(observability.t):
             span = np.array([observability.t[0], observability.t[-1] + observability.window])
             style.time_axis(ax, span, labelled=ax is verdict)
+    style.legend_above(figure, [*handles, *occurring])
     return figure
 
 
-def _draw_eigenvalues(ax: Axes, cut: list[Observability], eigenvalues: list[np.ndarray]) -> None:
+def _draw_eigenvalues(ax: Axes, cut: list[Observability]) -> list[Line2D | Patch]:
+    """Draw one line per vehicle, of different dashes where they lie upon one another; return what explains them."""
     style.tidy(ax)
     ax.set_yscale("log")
-    for vehicle, (part, values) in enumerate(zip(cut, eigenvalues, strict=True)):
+    drawn: list[Line2D | Patch] = []
+    for vehicle, part in enumerate(cut):
+        name = style.vehicle_label(part.vehicles[0])
+        look: dict[str, Any] = {"linewidth": style.LINE, "color": style.vehicle_colour(vehicle), "label": name}
+        look["linestyle"] = _DASHES[vehicle % len(_DASHES)]
+        drawn.append(Line2D([], [], **look))
         if len(part.t):
-            keep, colour = style.thinned(len(part.t)), style.vehicle_colour(vehicle)
-            drawn, name = np.maximum(values[keep, 0], _FLOOR), style.vehicle_label(part.vehicles[0])
-            ax.plot(part.t[keep], drawn, linewidth=style.LINE, color=colour, label=name)
+            keep = style.thinned(len(part.t))
+            values = part.local_eigenvalue[keep, 0]
+            ax.plot(part.t[keep], np.maximum(values, _FLOOR), **look)
+    return drawn
 
 
-def _draw_verdict(ax: Axes, cut: list[Observability]) -> None:
+def _draw_verdict(ax: Axes, cut: list[Observability]) -> list[Patch]:
+    """Draw the verdict of every vehicle, and return what explains it."""
     style.tidy(ax)
     ax.grid(False, axis="y")
     occurring = set()
@@ -73,5 +85,4 @@ def _draw_verdict(ax: Axes, cut: list[Observability]) -> None:
                 ax.broken_barh(stretches, (vehicle - 0.32, 0.64), linewidth=0.4, **look)
     ax.set_yticks(range(len(cut)), [style.vehicle_label(part.vehicles[0]) for part in cut])
     ax.set_ylim(len(cut) - 0.5, -0.5)
-    handles = [Patch(**look) for observable, look in _VERDICTS.items() if observable in occurring]
-    style.legend(ax, handles, "upper left", (1.005, 1.0), handlelength=1.6)
+    return [Patch(**look) for observable, look in _VERDICTS.items() if observable in occurring]

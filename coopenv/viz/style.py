@@ -1,11 +1,14 @@
 """What the figures share: a palette safe for colour-blind readers, the paper's names, time-axis helpers."""
 
 import re
-from collections.abc import Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -36,6 +39,12 @@ MERGED_GAP = 0.2  # s, longest gap in a shade that is not drawn: a frame or two 
 PAGE = 10.5  # inches, the width of a figure of a comparison unless another one is asked for
 NOTE = "#595959"  # of small print; its contrast on white is 7
 TEXT: dict[str, Any] = {"fontsize": NORMAL, "color": INK}
+BIN = 1 / 12  # inches: samples closer than this are drawn as their median and range
+BAND = 0.22  # opacity of that range
+RANGE = (10, 90)  # percentiles
+LETTER = 0.062  # inches, a letter of small print
+LINE_HEIGHT = 0.17  # inches, of a legend or a note
+NARROW = 5.0  # inches: narrower figures are for one column of a journal
 _LEGEND_MARK, _LEGEND_LETTER = 0.45, 0.06  # inches
 _LEAST_DECADES = 1.05  # on a logarithmic axis
 _LEAST_LABELS = 2  # decades that have one there
@@ -49,8 +58,17 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def save(figure: Figure, path: Path, file_format: str = "", note: str = "") -> Path:
-    """Write a figure in one of `FORMATS` (by default as the path ends), a note in its corner, and return the path.
+def save(
+    figure: Figure, path: Path, file_format: str = "", note: str = "", about: Mapping[str, object] | None = None
+) -> Path:
+    """Write a figure in one of `FORMATS` (by default as the path ends) and return the path.
+
+    Args:
+        figure: is changed by the note.
+        path: an older file is replaced.
+        file_format: one of `FORMATS`.
+        note: in small print below the figure.
+        about: what the file's metadata say of it, for example environment, observer and seed.
 
     Raises:
         CoopenvError: no such format, or the file cannot be written; an older one is untouched.
@@ -59,10 +77,31 @@ def save(figure: Figure, path: Path, file_format: str = "", note: str = "") -> P
     if form not in FORMATS:
         raise CoopenvError(f"{path}: unknown format '{form}' of a figure; known: {', '.join(FORMATS)}")
     stamp = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}[form]  # the same figure is the same file
-    figure.text(0.995, 0.003, note, ha="right", va="bottom", fontsize=SMALL - 1.0, color=NOTE)
-    with replacing_file(path) as new:
-        figure.savefig(new, dpi=DPI, format=form, metadata={stamp: None})
+    words = "; ".join(f"{name}: {value}" for name, value in (about or {}).items()) or note
+    told = {"Title": path.stem, {"png": "Description", "pdf": "Subject", "svg": "Description"}[form]: words}
+    sign(figure, note)
+    with replacing_file(path) as new, rc_context({"svg.hashsalt": "coopenv", "pdf.fonttype": 42}):
+        figure.savefig(new, dpi=DPI, format=form, metadata={stamp: None, **(told if words else {})})
     return path
+
+
+def sign(figure: Figure, note: str) -> None:
+    """Write a note in small print below a figure, and below what is there already."""
+    if note:
+        above = figure.get_supxlabel()
+        words = f"{above}\n{note}" if above else note
+        _grow(figure, note.count("\n") + bool(above))
+        figure.supxlabel(words, x=0.99, ha="right", fontsize=SMALL - 1.0, color=NOTE)
+
+
+def _grow(figure: Figure, lines: int) -> None:
+    """Make room for further lines of small print, so that panels keep their size."""
+    figure.set_figheight(float(figure.get_figheight()) + LINE_HEIGHT * lines)
+
+
+def explain(figure: Figure, text: str) -> None:
+    """Write in small print below a figure what it means, on as many lines as it takes."""
+    sign(figure, fill(text, int(figure.get_figwidth() / LETTER)))
 
 
 def vehicle_colour(index: int) -> str:
@@ -88,6 +127,36 @@ def target_labels(trajectory: Trajectory) -> list[str]:
 def thinned(count: int) -> np.ndarray:
     """Return the indices of at most `MAX_POINTS` of `count` samples, first and last among them."""
     return np.unique(np.linspace(0, count - 1, min(count, MAX_POINTS)).round().astype(int))
+
+
+def summed_up(t: np.ndarray, values: np.ndarray, bins: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return times, and median, 10th and 90th percentile of values (K,), over stretches of equally many samples.
+
+    Where there are fewer than twice as many samples as bins, each sample is one. NaN where no sample is finite.
+    """
+    size = len(t) // max(bins, 1)
+    if size < 2:
+        return t, values, values, values
+    pad = -len(t) % size
+    stretches = [np.append(np.asarray(one, float), np.full(pad, np.nan)).reshape(-1, size) for one in (t, values)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of stretches without any
+        middle = np.nanmean(stretches[0], axis=1)
+        low, median, high = np.nanpercentile(stretches[1], (RANGE[0], 50, RANGE[1]), axis=1)
+    return middle, median, low, high
+
+
+def draw_band(ax: Axes, t: np.ndarray, values: np.ndarray, bins: int, **look: Any) -> None:
+    """Draw a line through medians over the range of the values (K,), so that dense noise leaves other lines visible."""
+    middle, median, least, largest = summed_up(t, values, bins)
+    if median is not values:
+        ax.fill_between(middle, least, largest, color=look.get("color"), alpha=BAND, linewidth=0)
+    ax.plot(middle, median, **look)
+
+
+def bins_of(inches: float) -> int:
+    """Return how many stretches a panel of a width is divided into."""
+    return max(20, int(inches / BIN))
 
 
 def drawable(values: np.ndarray, *, positive: bool = False) -> np.ndarray:
@@ -163,7 +232,7 @@ def canvas(width: float | None, height: float, note: str) -> tuple[Figure, float
         raise CoopenvError(f"width {inches:g}: expected 2 to 50 inches")
     figure = new_figure(inches, height)
     figure.set_layout_engine("constrained", w_pad=0.03, h_pad=0.03, wspace=0.02, hspace=0.02)
-    figure.supxlabel(note, x=0.99, ha="right", fontsize=SMALL - 1.0, color=NOTE)
+    sign(figure, note)
     return figure, inches
 
 
@@ -173,12 +242,19 @@ def fitting(width: float, each: float, most: int) -> int:
 
 
 def legend_above(figure: Figure, handles: Sequence[Artist]) -> None:
-    """Put a legend above the panels."""
-    lengths = [_LEGEND_MARK + _LEGEND_LETTER * len(str(handle.get_label())) for handle in handles]
+    """Put a legend above the panels, in as many columns as fit."""
+    lengths = [_LEGEND_MARK + _LEGEND_LETTER * shown_length(str(handle.get_label())) for handle in handles]
     width = float(figure.get_figwidth())
     columns = next(n for n in range(len(handles), 0, -1) if n == 1 or _columns_width(lengths, n) <= width)
+    _grow(figure, -(-len(handles) // columns) - 1)
     spacing: dict[str, Any] = {"handlelength": 2.2, "columnspacing": 1.6}
-    legend(figure, handles, "outside upper center", ncols=columns, fontsize=SMALL + 0.5, **spacing)
+    place = "upper center" if figure.get_layout_engine() is None else "outside upper center"
+    legend(figure, handles, place, ncols=columns, fontsize=SMALL + 0.5, **spacing)
+
+
+def shown_length(text: str) -> int:
+    """Return how many characters of a text are seen, its formulas counted by their letters."""
+    return len(re.sub(r"[${}_^\\]", "", text))
 
 
 def _columns_width(lengths: Sequence[float], columns: int) -> float:

@@ -23,8 +23,6 @@ from coopenv.viz.window import Window
 _SHORTEST = 28  # px, drawn length of a vehicle
 _POINTER = 13  # px
 _LABEL = 11  # px beside a vehicle
-_FILLED = 0.3  # of the picture's side, largest semi-axis of an ellipse that is filled
-_LARGEST = 2.0  # of the picture's side, largest semi-axis of an ellipse that is drawn
 _HALO: dict[str, Any] = {"path_effects": [withStroke(linewidth=2.2, foreground="white")]}
 _FARTHEST = 10.0  # pictures' sides from the middle, of an estimate as drawn
 _BOX = ("rotation", "position", "half")
@@ -47,6 +45,7 @@ class TopView:
         """
         self.scenario, self._panel = scenario, panel
         self._stage, self._landmarks = Stage(scenario), len(scenario.landmarks)
+        self._gain = not states_covariance(scenario.observer.name)
         self._figure, self._axes = ground.new_ground(scenario)
         self._layers = Layers(self._figure, self._axes)
         (x0, x1), (y0, y1) = self._axes.get_xlim(), self._axes.get_ylim()
@@ -87,13 +86,14 @@ class TopView:
         s = self.scenario
         shortest = _SHORTEST * self._pixel
         bodies = [vehicle.body or _POINT for vehicle in s.vehicles]
-        self._box = np.array([geometry.box_shape(b.size, b.center, shortest) for b in bodies])
-        self._nose = np.array([geometry.nose_shape(box) for box in self._box])
+        boxes = np.array([geometry.box_shape(b.size, b.center, shortest) for b in bodies])
+        noses = np.array([geometry.nose_shape(box) for box in boxes])
+        self._box, self._nose = (geometry.turned(part, geometry.ways(s)) for part in (boxes, noses))
         self._others = [i for i, m in enumerate(s.landmarks) if m.body]
         bodies = [m.body for m in s.landmarks if m.body]
         self._other_box = np.array([geometry.box_shape(b.size, b.center, shortest) for b in bodies]).reshape(-1, 4, 2)
-        aside = self._box[:, 2, 1] + _LABEL * self._pixel
-        self._label = np.stack([self._box[:, :, 0].mean(axis=1), aside], axis=-1)
+        aside = boxes[:, 2, 1] + _LABEL * self._pixel
+        self._label = np.stack([boxes[:, :, 0].mean(axis=1), aside], axis=-1)
 
     def _prepare_artists(self) -> None:
         layers = self._layers
@@ -118,7 +118,7 @@ class TopView:
         self._arrived = layers.points("*", "white", INK, 12)
         self._collided = layers.points("X", INK, "white", 11)
         look = {"fontsize": NORMAL, "weight": "bold", "ha": "center", "va": "center", "clip_on": True, **_HALO}
-        names = [self._axes.text(0, 0, ground.vehicle_mark(i), color=c, **look) for i, c in enumerate(colours)]
+        names = [self._axes.text(0, 0, ground.vehicle_mark(i), color=INK, **look) for i in range(len(colours))]
         self._names = [layers.keep(name) for name in names]
         self._moving_names = {
             i: layers.keep(ground.label_landmark(self._axes, m.name, np.zeros(2)))
@@ -134,11 +134,11 @@ class TopView:
         title = self._figure.text(*place, "", fontsize=NORMAL + 1.5, weight="bold", color=INK, ha=aligned)
         self._time = self._layers.keep(title)
         look: dict[str, Any] = {"fontsize": ground.SMALLER, "family": "monospace"}
-        sigma = "3σ" if states_covariance(self.scenario.observer.name) else "P"
-        head = f"{'':4}{'error':>7}{'error':>7}{sigma:>7}{'sees':>6}\n{'':4}{'[m]':>7}{'[deg]':>7}{'[m]':>7}"
+        head = f"{'':6}{'error':>7}{'error':>7}{'3σ':>7}{'sees':>6}\n{'':6}{'[m]':>7}{'[deg]':>7}{'[m]':>7}"
         self._figure.text(*ground.pixels(ground.PANEL, ground.TABLE_TOP), head, color=INK, va="bottom", **look)
         places = [ground.pixels(ground.PANEL, ground.TABLE_TOP - ground.ROW * (i + 1)) for i in range(shown + 1)]
-        rows = [self._figure.text(*places[i], "", color=vehicle_colour(i), **look) for i in range(shown)]
+        rows = [self._figure.text(*places[i], "", color=INK, **look) for i in range(shown)]
+        ground.draw_swatches(self._figure, places[:shown])
         self._rows = [self._layers.keep(row) for row in rows]
         if count > shown:
             self._figure.text(*places[-1], f"and {count - shown} more", color=INK, **look)
@@ -147,12 +147,12 @@ class TopView:
     def _place_ellipses(self, estimate: np.ndarray, covariance: np.ndarray) -> np.ndarray:
         """Place the 3-sigma ellipses; return their major semi-axes (N,) in m."""
         shapes, semi = geometry.ellipses(self._drawable(estimate[:, :2]), covariance[:, :2, :2])
-        drawn = semi <= _LARGEST * self._side
-        alpha = np.where(semi[drawn] <= _FILLED * self._side, 0.09, 0.0)
+        inside = np.all((estimate[:, :2] >= self._low) & (estimate[:, :2] <= self._high), axis=-1)
+        drawn = inside & (semi <= ground.LARGEST_ELLIPSE * self._side) & (not self._gain)
         self._ellipses.set_verts(list(shapes[drawn]))
-        self._ellipses.set_facecolor(to_rgba_array(self._rgba[drawn], alpha))
-        self._ellipses.set_edgecolor(to_rgba_array(self._rgba[drawn], np.where(alpha > 0, 0.8, 0.35)))
-        return semi
+        self._ellipses.set_facecolor(to_rgba_array(self._rgba[drawn], 0.09))
+        self._ellipses.set_edgecolor(to_rgba_array(self._rgba[drawn], 0.8))
+        return np.where(self._gain, np.nan, semi)
 
     def _place_bodies(self, frame: Frame) -> None:
         L, R, position, R_hat = self._landmarks, frame.rotation, frame.position, frame.estimate_rotation
@@ -217,4 +217,4 @@ class TopView:
         for i, row in enumerate(self._rows):
             error, angle = frame.position_error[i], frame.orientation_error[i]
             mark, sees = ground.vehicle_mark(i), f"{frame.sees[i]}/{frame.could_see[i]}"
-            row.set_text(f"{mark:<4}{fixed(error, 3):>7}{angle:>7.1f}{fixed(sigma[i], 3):>7}{sees:>6}")
+            row.set_text(f"  {mark:<4}{fixed(error, 3):>7}{angle:>7.1f}{fixed(sigma[i], 3):>7}{sees:>6}")

@@ -1,5 +1,6 @@
 """What stands still under the top view: axes, roads, buildings, names of landmarks, and the panel's legend."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -7,16 +8,17 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Polygon
+from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Annotation
 
 from coopenv.estimation.outcomes import Sight
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
+from coopenv.scenario.bodies import Obstacle
 from coopenv.viz.scene.stage import sees_a_part
-from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, legend, new_figure
-from coopenv.viz.topview_geometry import limits, road_corners
+from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, legend, new_figure, vehicle_colour
+from coopenv.viz.topview_geometry import limits, road_corners, ways
 
 WIDTH, HEIGHT = 896, 672  # px; multiples of 16, as video codecs like them
 _LEFT, _BOTTOM, _SIDE = 54, 46, 592  # px, of the square axes
@@ -27,6 +29,8 @@ SMALLER = 6.5  # pt
 ROW = 16  # px
 TABLE_TOP = HEIGHT - 66  # px
 MOST_ROWS = 16
+_SWATCH = 8  # px
+LARGEST_ELLIPSE = 0.3  # of the side of the map, semi-axis of an ellipse that is drawn
 
 GROUND, ASPHALT, WALL, ROOF, TRAFFIC = "#F4F2EC", "#E2E2E2", "#8A8172", "#C9C2B4", "#6E6E6E"
 DASHED, DOTTED = (0, (4, 2.5)), (0, (1, 1.8))
@@ -82,11 +86,16 @@ def draw_site(ax: Axes, scenario: Scenario) -> None:
         line = np.array([road.start, road.end]) - origin
         ax.plot(*line.T, color="white", linewidth=1.2, linestyle=(0, (7, 6)), zorder=0.6)
     for obstacle in scenario.obstacles:
-        half = np.array(obstacle.size)[:2] / 2
-        c, s = np.cos(obstacle.yaw), np.sin(obstacle.yaw)
-        corners = (half * [(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ np.array([[c, s], [-s, c]])
-        corners += np.array(obstacle.center)[:2] - origin
+        corners = footprint(scenario, obstacle)
         ax.add_patch(Polygon(corners, facecolor=ROOF, edgecolor=WALL, linewidth=1.2, hatch="//", zorder=1))
+
+
+def footprint(scenario: Scenario, obstacle: Obstacle) -> np.ndarray:
+    """Return the corners (4, 2) of a building in plan, map frame, m."""
+    half = np.array(obstacle.size)[:2] / 2
+    c, s = np.cos(obstacle.yaw), np.sin(obstacle.yaw)
+    corners = (half * [(-1, -1), (1, -1), (1, 1), (-1, 1)]) @ np.array([[c, s], [-s, c]])
+    return np.asarray(corners + np.array(obstacle.center)[:2] - np.array(scenario.map.origin)[:2])
 
 
 def _name_landmarks(ax: Axes, scenario: Scenario) -> None:
@@ -110,13 +119,14 @@ def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
     sensed, end = scenario.topology.mode == "sensed", scenario.termination
     moving = any(landmark.motion.kind != "static" for landmark in scenario.landmarks)
     goals, bodies = (any(getattr(vehicle, part) for vehicle in scenario.vehicles) for part in ("goal_radius", "body"))
-    honest = states_covariance(scenario.observer.name)
-    ellipse = "3σ of the estimate" if honest else "P: a gain, not 3σ"
     marks: list[tuple[object, Artist]] = [
-        (True, Patch(facecolor=GREY, edgecolor=INK, linewidth=0.7, label="vehicle, true")),
+        (True, Patch(facecolor=GREY, edgecolor=INK, linewidth=0.7, label=_vehicle_words(scenario))),
         (True, Patch(facecolor="white", edgecolor=GREY, linewidth=1.4, label="its estimate")),
         (True, Line2D([], [], color=GREY, linewidth=1.0, linestyle=DOTTED, label="error of the estimate")),
-        (True, Patch(facecolor="#7F7F7F30", edgecolor=GREY, linewidth=0.8, label=ellipse)),
+        (
+            states_covariance(scenario.observer.name),
+            Patch(facecolor="#7F7F7F30", edgecolor=GREY, linewidth=0.8, label=_ellipse_words(scenario)),
+        ),
         (sees_a_part(scenario), Patch(facecolor="#7F7F7F24", edgecolor="none", label="field of view")),
         (True, _sight(Sight.VISIBLE, "sees (its colour)")),
         (sensed and scenario.obstacles, _sight(Sight.OCCLUDED_BY_BUILDING, "hidden by a building")),
@@ -134,6 +144,23 @@ def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
     place = pixels(PANEL - 4, TABLE_TOP - ROW * (rows + 1))
     gaps = {"borderaxespad": 0.0, "borderpad": 0.0, "handlelength": 1.9, "labelspacing": 0.42}
     legend(figure, handles, "upper left", place, labelcolor=INK, **gaps)
+
+
+def _ellipse_words(scenario: Scenario) -> str:
+    low, high = limits(scenario)
+    return f"3σ, where below {LARGEST_ELLIPSE * (high - low)[0]:.2g} m"
+
+
+def _vehicle_words(scenario: Scenario) -> str:
+    return "vehicle, true, and its way" if np.any(ways(scenario)) else "vehicle, true"
+
+
+def draw_swatches(figure: Figure, places: Sequence[tuple[float, float]]) -> None:
+    """Draw squares in the colours of the first vehicles, where the rows of the table begin (figure coordinates)."""
+    side = np.array(pixels(_SWATCH, _SWATCH))
+    for i, (x, y) in enumerate(places):
+        look: dict[str, Any] = {"facecolor": vehicle_colour(i), "edgecolor": INK, "linewidth": 0.5}
+        figure.add_artist(Rectangle((x, y), *side, transform=figure.transFigure, **look))
 
 
 def _sight(sight: Sight, label: str) -> Line2D:

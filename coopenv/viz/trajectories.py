@@ -1,141 +1,128 @@
 """The paths of vehicles and landmarks, in plan and in space: truth dotted, estimate solid."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from mpl_toolkits.mplot3d import proj3d
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-from coopenv.estimation.metrics import live_ticks
+from coopenv.estimation.metrics import SETTLED, live_ticks, settling_times
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.scenario import Scenario
 from coopenv.viz import style
-from coopenv.viz.clipping import clipped
-from coopenv.viz.labels import place_names
-from coopenv.viz.style import DARK_BLUE, GREY, INK, NORMAL, vehicle_colour, vehicle_label
-from coopenv.viz.topview_ground import ASPHALT, ROOF, WALL, draw_site
+from coopenv.viz.drawing import Drawing, marker_look
+from coopenv.viz.style import DARK_BLUE, GREY, INK, NORMAL, NOTE, vehicle_colour, vehicle_label
+from coopenv.viz.topview_ground import ASPHALT, ROOF, WALL, draw_site, footprint
 
 _DOTTED = (0, (1, 1.6))
 _DASHED = (0, (5, 1.5, 1, 1.5))
 _MARGIN_M, _MARGIN_SHARE = 0.5, 0.08  # around the truth
 _DEPTH_SHARE = 0.25  # of the scene's extent: farther above or below, the frame does not follow an estimate
 _TRANSIENT_SHARE = 0.1  # of the record, in which estimates come from anywhere
-_LEGEND = 1.85  # inches
-_NAME = NORMAL + 1  # pt
-
-
-class _Drawing:
-    """Axes with what has been drawn on them, names to be placed at the end."""
-
-    def __init__(self, ax: Any, low: np.ndarray, high: np.ndarray, dimensions: int) -> None:
-        self.ax, self.low, self.high, self.dimensions = ax, low, high, dimensions
-        self.outside = False  # an estimate starts outside the box
-        self._marks: list[np.ndarray] = []
-        self._lines: list[np.ndarray] = []
-        self._names: list[tuple[str, np.ndarray, str]] = []
-
-    def line(self, path: np.ndarray, **look: Any) -> None:
-        """Draw what lies in the box of a path (K, 3)."""
-        used = slice(self.dimensions)
-        shown = clipped(path[:, used], self.low[used], self.high[used])
-        self.ax.plot(*shown.T, **look)
-        self._lines.append(shown)
-
-    def mark(self, point: np.ndarray, marker: str, edge: str, face: str | None = None) -> None:
-        """Mark a point (3,); the face has the colour of the edge unless another one is given."""
-        point = point[: self.dimensions]
-        self.ax.plot(*point[:, None], clip_on=False, zorder=4, **_marker(marker, edge, face or edge))
-        self._marks.append(point)
-
-    def name(self, point: np.ndarray, text: str, colour: str) -> None:
-        """Name a point (3,)."""
-        self._names.append((text, point[: self.dimensions], colour))
-
-    def write_names(self) -> None:
-        """Write the names; the limits of the axes must be final."""
-        self.ax.apply_aspect()
-        if not self._names:
-            return
-        texts, points, colours = zip(*self._names, strict=True)
-        anchors = self._plane(np.array(points))
-        marks, lines = self._plane(np.array(self._marks)), self._plane(np.concatenate(self._lines or [points]))
-        pixels = self.ax.transData.transform
-        offsets = place_names(texts, pixels(anchors), pixels(marks), pixels(lines), _NAME)
-        look: dict[str, Any] = {"fontsize": _NAME, "path_effects": style.HALO, "zorder": 5}
-        for text, anchor, offset, colour in zip(texts, anchors, offsets, colours, strict=True):
-            self.ax.annotate(text, anchor, offset, textcoords="offset points", color=colour, **look)
-
-    def _plane(self, points: np.ndarray) -> np.ndarray:
-        """Return points (K, D) in the coordinates of the plane that is drawn."""
-        if self.dimensions == 2:
-            return points
-        x, y, _ = proj3d.proj_transform(*points.T, self.ax.get_proj())
-        return np.stack([x, y], axis=-1)
+_PAGE, _NARROW_HEIGHT = 7.6, 4.2  # inches, width of the plan on a page and greatest height in a column
+_LEGEND = 0.4  # inches, below the plan
+_MOST_NAMES = 12  # landmarks; of more, names would cover the paths
+_MARKS = 6  # at most, of time along a path
+_EARLY: dict[str, Any] = {"linewidth": 0.7, "alpha": 0.6}
+_STRETCHES = 150  # of a path
+_FAINT: dict[str, Any] = {"linewidth": 0.5, "alpha": 0.3}
+_ESTIMATE: dict[str, Any] = {"linewidth": 1.6, "alpha": 0.85}
+_TRUTH: dict[str, Any] = {"color": INK, "linewidth": 1.1, "linestyle": _DOTTED}
+_STEM: dict[str, Any] = {"color": NOTE, "linewidth": 0.7}
 
 
 def trajectory_figure_2d(
-    trajectory: Trajectory, ends: Sequence[float] | None = None, scenario: Scenario | None = None
+    trajectory: Trajectory,
+    ends: Sequence[float] | None = None,
+    scenario: Scenario | None = None,
+    width: float | None = None,
 ) -> Figure:
     """Draw the paths in plan, axes equal, in metres, over the roads and buildings of a scenario.
 
     The frame follows the truth. An estimate that starts outside enters from the edge, where an open triangle
-    marks it. The paths of a vehicle stop at its end (s). Of a scenario's vehicles that the record is not about, only
-    what is true is shown.
+    marks it; until it has settled its line is thin. Dots on the true paths mark the time. The paths of a vehicle stop
+    at its end (s). Of a scenario's vehicles that the record is not about, only what is true is shown. `width` is in
+    inches (None: a page's).
     """
     low, high = _scene(trajectory)
-    width, depth = high[:2] - low[:2]
-    scale = min(6.6 / width, 6.6 / depth)  # inches per metre
-    drawn = np.maximum((width * scale, depth * scale), 2.4)
+    inches = _PAGE if width is None else width
+    room, most = inches - 0.75, _PAGE if inches > style.NARROW else _NARROW_HEIGHT
+    scale = min(room / (high - low)[0], most / (high - low)[1])  # inches per metre
+    drawn = np.maximum((high - low)[:2] * scale, (room, 0.45 * room))
     middle, half = (low[:2] + high[:2]) / 2, drawn / scale / 2
     low[:2], high[:2] = middle - half, middle + half
-    w, h = float(drawn[0]) + 0.75 + _LEGEND, float(drawn[1]) + 0.75
-    figure = style.new_figure(w, h)
-    ax = figure.add_axes((0.65 / w, 0.55 / h, drawn[0] / w, drawn[1] / h))
+    figure, _ = style.canvas(inches, float(drawn[1]) + 0.6 + _LEGEND, "")
+    ax = figure.add_subplot()
     style.tidy(ax, x_label="x [m]", y_label="y [m]")
     if scenario is not None:
         draw_site(ax, scenario)
-    drawing = _Drawing(ax, low, high, dimensions=2)
-    _draw_paths(drawing, trajectory, ends, _elsewhere(trajectory, scenario))
+    drawing = Drawing(ax, low, high, dimensions=2)
+    elsewhere = _elsewhere(trajectory, scenario)
+    step = _draw_paths(drawing, trajectory, ends, elsewhere)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    ax.set_aspect("equal", adjustable="datalim")
+    ax.set_aspect("equal", adjustable="box")
+    style.legend_above(figure, _handles(trajectory, step, drawing.outside, elsewhere, scenario))
+    figure.draw_without_rendering()  # which arranges the axes, so that names find their places
     drawing.write_names()
-    _legend(
-        figure,
-        trajectory,
-        (1 - (_LEGEND - 0.1) / w, 1 - 0.2 / h),
-        drawing.outside,
-        _elsewhere(trajectory, scenario),
-        scenario,
-    )
     return figure
 
 
 def trajectory_figure_3d(
-    trajectory: Trajectory, ends: Sequence[float] | None = None, scenario: Scenario | None = None
+    trajectory: Trajectory,
+    ends: Sequence[float] | None = None,
+    scenario: Scenario | None = None,
+    width: float | None = None,
 ) -> Figure:
-    """Draw the paths in space, one scale on all axes, in metres; frame and ends as in plan."""
+    """Draw the paths in space, one scale on all axes, in metres; arguments, frame and ends as in plan.
+
+    Stems tell over which point of the floor a start, an end or a landmark is.
+    """
     low, high = _scene(trajectory)
-    figure = style.new_figure(9.5, 5.8)
-    ax: Any = figure.add_axes((-0.01, -0.12, 0.85, 1.24), projection="3d")
-    ax.view_init(elev=32, azim=-58)
-    drawing = _Drawing(ax, low, high, dimensions=3)
-    _draw_paths(drawing, trajectory, ends, _elsewhere(trajectory, scenario))
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     steep = float((high - low)[2] / np.max((high - low)[:2]))
-    ax.set_box_aspect(high - low, zoom=float(np.clip(1.2 - 0.5 * steep, 0.7, 1.0)))
+    inches = style.PAGE if width is None else width
+    figure, _ = style.canvas(inches, inches * float(np.clip(0.52 + 0.4 * steep, 0.52, 0.9)) + _LEGEND, "")
+    figure.set_layout_engine(None)  # which does not know how far labels in space reach
+    ax: Any = figure.add_subplot(projection="3d")
+    ax.view_init(elev=32, azim=-58)
+    drawing = Drawing(ax, low, high, dimensions=3)
+    if scenario is not None:
+        _draw_buildings(ax, scenario, low, high)
+    elsewhere = _elsewhere(trajectory, scenario)
+    step = _draw_paths(drawing, trajectory, ends, elsewhere)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    ax.set_box_aspect(high - low, zoom=float(np.clip((1.45 if inches > style.NARROW else 1.2) - 0.5 * steep, 0.7, 1.4)))
     ax.tick_params(labelsize=style.SMALL, pad=0)
-    ax.locator_params(axis="z", nbins=4)
-    ax.set_xlabel("x [m]", fontsize=NORMAL)
-    ax.set_ylabel("y [m]", fontsize=NORMAL)
-    ax.set_zlabel("z [m]", fontsize=NORMAL, labelpad=-2)
+    for axis, count in zip("xyz", (5, 5, 3), strict=True):
+        ax.locator_params(axis=axis, nbins=count)
+    ax.set_xlabel("x [m]", fontsize=NORMAL, color=INK, labelpad=0)
+    ax.set_ylabel("y [m]", fontsize=NORMAL, color=INK, labelpad=0)
+    ax.zaxis.set_major_formatter("{x:g} m")  # a label of the axis would be cut off at the side
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
         axis.pane.set_facecolor("#F7F7F7")
+    height = float(figure.get_figheight())
+    style.legend_above(figure, _handles(trajectory, step, drawing.outside, elsewhere, None))
+    whole = float(figure.get_figheight())
+    ax.set_position((0.0, 0.1 / whole, 1.0, (height - _LEGEND) / whole))
+    figure.draw_without_rendering()
     drawing.write_names()
-    _legend(figure, trajectory, (0.84, 0.93), drawing.outside, _elsewhere(trajectory, scenario))
     return figure
+
+
+def _draw_buildings(ax: Any, scenario: Scenario, low: np.ndarray, high: np.ndarray) -> None:
+    """Draw the buildings, as far as they are in the box."""
+    for obstacle in scenario.obstacles:
+        corners = np.clip(footprint(scenario, obstacle), low[:2], high[:2])
+        height = np.array(obstacle.center)[2] - scenario.map.origin[2]
+        ends = np.clip(height + np.array([-0.5, 0.5]) * obstacle.size[2], low[2], high[2])
+        rings = [np.column_stack([corners, np.full(len(corners), z)]) for z in ends]
+        around = [*pairwise(zip(*rings, strict=True)), ((rings[0][-1], rings[1][-1]), (rings[0][0], rings[1][0]))]
+        sides = [np.array([a, b, d, c]) for (a, b), (c, d) in around]
+        faces = Poly3DCollection([*sides, rings[1]], facecolor=ROOF, edgecolor=WALL, linewidth=0.6, alpha=0.35)
+        ax.add_collection3d(faces)
 
 
 def _scene(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
@@ -165,32 +152,65 @@ def _scene(trajectory: Trajectory) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _draw_paths(
-    drawing: _Drawing, trajectory: Trajectory, ends: Sequence[float] | None, elsewhere: Sequence[str]
-) -> None:
-    """Draw landmarks, estimates, and the truth on top."""
-    low, high = drawing.low, drawing.high
-    used = slice(drawing.dimensions)
+    drawing: Drawing, trajectory: Trajectory, ends: Sequence[float] | None, elsewhere: Sequence[str]
+) -> float:
+    """Draw landmarks, estimates, and the truth on top; return the time between the marks on it, s."""
     _draw_landmarks(drawing, trajectory, elsewhere)
-    for vehicle, ticks in enumerate(live_ticks(trajectory.t, len(trajectory.vehicles), ends)):
+    live = live_ticks(trajectory.t, len(trajectory.vehicles), ends)
+    settled = np.nan_to_num(settling_times(trajectory, ends, SETTLED), nan=np.inf)
+    for vehicle, ticks in enumerate(live):
         keep = style.thinned(ticks)
-        colour = vehicle_colour(vehicle)
-        estimate = np.asarray(trajectory.position_estimate[keep, vehicle], float)
-        inside = np.all((estimate >= low)[:, used] & (estimate <= high)[:, used], axis=-1)
-        drawing.line(estimate, color=colour, linewidth=1.6, alpha=0.8)
-        if np.isfinite(estimate[0]).all():
-            drawing.outside |= not inside[0]
-            start = np.clip(estimate[0], low, high)
-            drawing.mark(start, "^", colour, None if inside[0] else "white")
-        if inside[-1]:
-            drawing.mark(estimate[-1], "x", colour)
-        truth = trajectory.position[keep, vehicle]
-        drawing.line(truth, color=INK, linewidth=1.1, linestyle=_DOTTED)
-        drawing.mark(truth[0], "^", INK, colour)
-        drawing.mark(truth[-1], "x", INK)
-        drawing.name(truth[0], vehicle_label(trajectory.vehicles[vehicle]), INK)
+        early = trajectory.t[keep] <= settled[vehicle]
+        _draw_estimate(drawing, np.asarray(trajectory.position_estimate[keep, vehicle], float), early, vehicle)
+    step = _round_step(float(trajectory.t[-1] - trajectory.t[0]))
+    for vehicle, ticks in enumerate(live):
+        truth, colour = trajectory.position[:ticks, vehicle], vehicle_colour(vehicle)
+        drawing.line(truth[style.thinned(ticks)], **_TRUTH)
+        whole = np.arange(step, float(trajectory.t[ticks - 1]), step)
+        for k in np.searchsorted(trajectory.t, whole):
+            drawing.mark(truth[min(k, ticks - 1)], ".", INK)
+        for place, mark in ((truth[0], "^"), (truth[-1], "X")):
+            drawing.stem(place, **_STEM)
+            drawing.mark(place, mark, INK, colour)
+        name = vehicle_label(trajectory.vehicles[vehicle])
+        drawing.name(truth[0], name, INK)
+        if np.linalg.norm(truth[-1] - truth[0]) > _MARGIN_SHARE * np.max(drawing.high - drawing.low):
+            drawing.name(truth[-1], name, INK)
+    return step
 
 
-def _draw_landmarks(drawing: _Drawing, trajectory: Trajectory, elsewhere: Sequence[str]) -> None:
+def _draw_estimate(drawing: Drawing, estimate: np.ndarray, early: np.ndarray, vehicle: int) -> None:
+    """Draw an estimate's path (K, 3): thin where it is `early`, then its medians; mark where it begins and ends."""
+    low, high, used, colour = drawing.low, drawing.high, slice(drawing.dimensions), vehicle_colour(vehicle)
+    inside = np.all((estimate >= low)[:, used] & (estimate <= high)[:, used], axis=-1)
+    last = int(early.sum())
+    drawing.line(estimate[: last + 1], color=colour, **_EARLY)
+    rest = estimate[last:]
+    if len(rest):
+        drawing.line(rest, color=colour, **_FAINT)
+        drawing.line(_median_path(rest), color=colour, **_ESTIMATE)
+    if np.isfinite(estimate[0]).all():
+        drawing.outside |= not inside[0]
+        drawing.mark(np.clip(estimate[0], low, high), "^", colour, None if inside[0] else "white")
+    if inside[-1]:
+        drawing.mark(estimate[-1], "x", colour)
+
+
+def _median_path(path: np.ndarray) -> np.ndarray:
+    """Return a path (K, 3) through medians over short stretches, which hides less of the truth than its noise would."""
+    ticks = np.arange(len(path), dtype=float)
+    middle = np.stack([style.summed_up(ticks, column, _STRETCHES)[1] for column in path.T], axis=-1)
+    return np.concatenate([path[:1], middle, path[-1:]])
+
+
+def _round_step(duration: float) -> float:
+    """Return a round time, s, of which a duration has at most `_MARKS`."""
+    least = max(duration, 1e-3) / _MARKS
+    decade = 10.0 ** np.floor(np.log10(least))
+    return float(next(decade * factor for factor in (1, 2, 5, 10) if decade * factor >= least))
+
+
+def _draw_landmarks(drawing: Drawing, trajectory: Trajectory, elsewhere: Sequence[str]) -> None:
     keep = style.thinned(len(trajectory.t))
     labels = style.target_labels(trajectory)
     for target, moving in _landmarks(trajectory):
@@ -205,7 +225,9 @@ def _draw_landmarks(drawing: _Drawing, trajectory: Trajectory, elsewhere: Sequen
             drawing.mark(path[-1], "x", colour)
         else:
             drawing.mark(path[0], "o", colour)
-        drawing.name(path[0], labels[target], colour)
+        drawing.stem(path[0], **_STEM)
+        if len(_landmarks(trajectory)) <= _MOST_NAMES:
+            drawing.name(path[0], labels[target], NOTE if colour == GREY else colour)
 
 
 def _landmarks(trajectory: Trajectory) -> list[tuple[int, bool]]:
@@ -220,39 +242,30 @@ def _elsewhere(trajectory: Trajectory, scenario: Scenario | None) -> list[str]:
     return [] if scenario is None else [n for n in scenario.vehicle_names if n not in trajectory.vehicles]
 
 
-def _marker(marker: str, edge: str, face: str) -> dict[str, Any]:
-    look = {"marker": marker, "markeredgecolor": edge, "markerfacecolor": face}
-    return {"linestyle": "none", "markersize": 6.5, "markeredgewidth": 1.1, **look}
-
-
-def _legend(
-    figure: Figure,
-    trajectory: Trajectory,
-    place: tuple[float, float],
-    outside: bool,
-    elsewhere: Sequence[str],
-    scenario: Scenario | None = None,
-) -> None:
-    truth = {"color": INK, "linewidth": 1.1, "linestyle": _DOTTED}
+def _handles(
+    trajectory: Trajectory, step: float, outside: bool, elsewhere: Sequence[str], scenario: Scenario | None
+) -> list[Line2D | Patch]:
+    """Return what the legend explains."""
     looks: dict[str, dict[str, Any]] = {
         vehicle_label(name): {"color": vehicle_colour(i), "linewidth": 1.6}
         for i, name in enumerate(trajectory.vehicles)
     }
-    looks |= {"truth": truth, "estimate": {"color": INK, "linewidth": 1.6, "alpha": 0.8}}
-    looks |= {"true start": _marker("^", INK, GREY), "first estimate": _marker("^", GREY, GREY)}
-    looks |= {"end": _marker("x", INK, INK)}
+    looks |= {"truth": _TRUTH, "estimate": {"color": INK, **_ESTIMATE}, "before it settles": {"color": INK, **_EARLY}}
+    looks |= {f"every {step:g} s": marker_look(".", INK, INK)}
+    looks |= {"true start": marker_look("^", INK, GREY), "first estimate": marker_look("^", GREY, GREY)}
+    looks |= {"true end": marker_look("X", INK, GREY), "last estimate": marker_look("x", GREY, GREY)}
     if elsewhere:
         looks["heard by radio"] = {"color": GREY, "linewidth": 1.1, "linestyle": _DOTTED}
     motions = {moving for i, moving in _landmarks(trajectory) if trajectory.targets[i] not in elsewhere}
     if False in motions:
-        looks["landmark"] = _marker("o", DARK_BLUE, DARK_BLUE)
+        looks["landmark"] = marker_look("o", DARK_BLUE, DARK_BLUE)
     if True in motions:
         looks["moving landmark"] = {"color": DARK_BLUE, "linewidth": 1.1, "linestyle": _DASHED}
     if outside:
-        looks["starts outside"] = _marker("^", INK, "white")
+        looks["starts outside"] = marker_look("^", INK, "white")
     handles: list[Line2D | Patch] = [Line2D([], [], label=label, **look) for label, look in looks.items()]
     if scenario is not None and scenario.roads:
         handles.append(Patch(facecolor=ASPHALT, edgecolor="none", label="road"))
     if scenario is not None and scenario.obstacles:
         handles.append(Patch(facecolor=ROOF, edgecolor=WALL, hatch="//", label="building"))
-    style.legend(figure, handles, "upper left", place, fontsize=NORMAL, borderaxespad=0.0, handlelength=2.0)
+    return handles

@@ -28,7 +28,7 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.viz import FIGURE_NAMES, consistency, style
 from coopenv.viz.clipping import clipped
-from coopenv.viz.error_figure import error_figure
+from coopenv.viz.error_figure import error_figure, unwrapped
 from coopenv.viz.figures import save_figures
 from coopenv.viz.labels import place_names
 from coopenv.viz.observability import observability_figure
@@ -73,7 +73,7 @@ def test_all_figures_are_written_under_their_stable_names(run: Trajectory, tmp_p
     assert [path.name for path in paths] == NAMES
     for path in paths:
         picture = imread(path)
-        assert picture.shape[1] > 800 and picture.shape[0] > 500
+        assert picture.shape[1] > 800 and picture.shape[0] > 400
         assert picture[..., :3].std() > 0.05  # not blank
 
 
@@ -81,7 +81,8 @@ def test_every_figure_says_what_it_is_of(run: Trajectory, monkeypatch: pytest.Mo
     drawn: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, path, **_: (drawn.append(figure), path.touch()))
     save_figures(run, tmp_path, note="overtaking, robust, seed 3")
-    assert [figure.texts[-1].get_text() for figure in drawn] == len(NAMES) * ["overtaking, robust, seed 3"]
+    assert all(figure.get_supxlabel().endswith("overtaking, robust, seed 3") for figure in drawn)
+    assert len(drawn) == len(NAMES)
 
 
 @pytest.mark.parametrize("ticks", [1, 2, 40])
@@ -134,41 +135,88 @@ def test_global_state_of_matplotlib_is_left_alone() -> None:
 
 def test_error_figure_shows_the_errors_and_marks_settling_and_moving_targets(run: Trajectory) -> None:
     figure = error_figure(run)
-    assert len(figure.axes) == 20  # five vehicles, two columns, linear and logarithmic
-    linear, log = figure.axes[0], figure.axes[1]
-    assert log.get_yscale() == "log"
-    lines = [x for x in linear.lines if x.get_color() in style.AXES_COLOURS and len(xdata(x)) > 1]
+    assert len(figure.axes) == 10  # five vehicles, position and orientation
+    position, orientation = figure.axes[0], figure.axes[1]
+    assert {ax.get_yscale() for ax in figure.axes} == {"symlog"}
+    lines = [x for x in position.lines if x.get_color() in style.AXES_COLOURS and len(xdata(x)) > 1]
     error = run.position[:, 0] - run.position_estimate[:, 0]
     for line, component in zip(lines, error.T, strict=True):
-        np.testing.assert_allclose(ydata(line), np.interp(xdata(line), run.t, component), atol=1e-12)
-        assert xdata(line)[0] == run.t[0] and xdata(line)[-1] == run.t[-1]
-    dots = [x for x in linear.lines if x.get_color() in style.AXES_COLOURS and len(xdata(x)) == 1]
+        near = np.abs(run.t - xdata(line)[:, None]).argmin(axis=1)
+        assert np.abs(ydata(line) - component[near]).max() < 0.3  # the steepest fall within a stretch
+        assert ydata(line)[-1] == pytest.approx(np.median(component[-60:]), abs=0.02)
+    dots = [x for x in position.lines if x.get_color() in style.AXES_COLOURS and len(xdata(x)) == 1]
     assert [ydata(dot)[0] for dot in dots] == pytest.approx(error[0].tolist())
-    assert {dot.get_marker() for dot in dots} == {"o"}
-    yaw = next(line for line in figure.axes[2].lines if line.get_color() == style.AXES_COLOURS[2])
-    assert ydata(yaw)[0] == pytest.approx(90, abs=0.1)  # the synthetic start is a quarter turn about z
-    assert spans(linear, style.SHADE) == [pytest.approx((21, 25), abs=0.05)]  # f1 sees f2
-    settled = [x[0] for x in (xdata(line) for line in log.lines) if len(x) > 1 and x[0] == x[1]]  # upright
+    yaw = [x for x in orientation.lines if x.get_color() == style.AXES_COLOURS[2] and len(xdata(x)) == 1]
+    assert ydata(yaw[0])[0] == pytest.approx(90, abs=0.1)  # the synthetic start is a quarter turn about z
+    assert spans(position, style.SHADE) == [pytest.approx((21, 25), abs=0.05)]  # f1 sees f2
+    settled = [x[0] for x in map(xdata, position.lines) if len(x) == 2 and x[0] == x[1]]  # upright
     assert settled == [pytest.approx(np.log(90) / 1.2, abs=0.5)]
-    assert {"position error\n[m]", "orientation error\n[deg]", "time [s]", "$f_{5}$"} <= texts(figure)
+    assert {"position error [m]", "orientation error [deg]", "time [s]", "$f_{5}$"} <= texts(figure)
+
+
+def test_vehicles_share_an_ordinate_that_is_linear_where_errors_end(run: Trajectory) -> None:
+    for column in (error_figure(run).axes[::2], error_figure(run).axes[1::2]):
+        assert len({ax.get_ylim() for ax in column}) == 1
+        (linear,) = {ax.yaxis.get_transform().linthresh for ax in column}  # type: ignore[attr-defined]
+        assert linear == pytest.approx(0.1, rel=0.01)  # of noise of 0.02
+
+
+def test_dense_noise_is_a_line_of_medians_in_a_band() -> None:
+    t, noise = np.linspace(0, 40, 2401), np.random.default_rng(1).standard_normal(2401)
+    middle, median, low, high = style.summed_up(t, noise, 60)
+    assert len(middle) == pytest.approx(60, abs=2)
+    assert np.abs(median).max() < 1.0 < np.abs(noise).max()
+    assert np.mean(high - low) == pytest.approx(2.56, abs=0.3)  # from the 10th to the 90th percentile
+    assert style.summed_up(t[:50], noise[:50], 60)[1].tolist() == noise[:50].tolist()
+    gone = style.summed_up(t, np.full(2401, np.nan), 60)[1]
+    assert np.isnan(gone).all()
+
+
+def test_angles_do_not_jump_by_whole_turns_and_end_near_zero() -> None:
+    angle = np.linspace(0.0, 540.0, 400)[:, None] * [1.0, -1.0, 0.0] + [0.0, 0.0, 179.0]
+    angle[:, 2] += np.where(np.arange(400) % 2, 2.0, 0.0)
+    wrapped = (angle + 180.0) % 360.0 - 180.0
+    wrapped[100:110] = np.nan
+    smooth = unwrapped(wrapped)
+    assert np.isnan(smooth[100:110]).all()
+    steps = np.abs(np.diff(smooth, axis=0))
+    assert np.nanmax(steps) < 3.0 < 300.0 < np.nanmax(np.abs(np.diff(wrapped, axis=0)))
+    np.testing.assert_allclose(np.nanmax(np.abs((smooth - wrapped + 180.0) % 360.0 - 180.0)), 0.0, atol=1e-9)
+    assert np.all(np.abs(np.nanmedian(smooth[280:], axis=0)) <= 181.0)
+
+
+def test_what_is_so_all_the_time_is_not_shaded(run: Trajectory) -> None:
+    visible = run.visible.copy()
+    visible[:, 0, 4] = True
+    assert spans(error_figure(dataclasses.replace(run, visible=visible)).axes[0], style.SHADE) == []
 
 
 def test_a_run_that_does_not_settle_says_so(run: Trajectory) -> None:
     figure = error_figure(dataclasses.replace(run, position_error=run.position_error + 1.0))
-    assert "not converged" in texts(figure)
-    assert not any(text.startswith("converged at") for text in texts(figure))
+    assert "above to the end" in texts(figure)
+    assert not any(text.startswith("last above 0.1 m") for text in texts(figure))
 
 
 def test_topology_bars_are_the_stretches_of_each_sight(run: Trajectory) -> None:
     figure = topology_figure(run)
-    first, _, third, _, fifth = figure.axes
-    assert [label.get_text() for label in first.get_yticklabels()] == ["SL1", "SL2", "SL3", "$f_{2}$"]
-    assert [label.get_text() for label in fifth.get_yticklabels()] == ["$f_{1}$", "$f_{2}$", "$f_{4}$"]
+    first, _, third, _, _ = figure.axes
+    changing = [label.get_text() for label in first.get_yticklabels()]
+    assert changing == ["SL2", "SL3", "$f_{2}$"]
+    assert any("always visible: SL1" in text.replace("\n", " ") for text in texts(figure))
     assert spans(first, style.GREY) == [pytest.approx((38, 50), abs=0.05)]  # SL3 leaves the view
     hatches = {c.get_hatch(): len(c.get_paths()) for c in third.collections if c.get_hatch()}
     assert len(hatches) == 2  # a building and a body hide, and look different
     drawn = sum(end - start for start, end in spans(first, style.BLUE))
-    assert drawn == pytest.approx(run.visible[:, 0].sum() / 60, rel=1e-6)
+    assert drawn == pytest.approx(run.visible[:, 0][:, [1, 2, 4]].sum() / 60, rel=0.02)
+
+
+def test_a_fixed_topology_is_told_in_words(run: Trajectory) -> None:
+    neighbours = np.any(run.sight != Sight.NOT_A_NEIGHBOUR, axis=0)
+    sight = np.where(neighbours, Sight.VISIBLE, np.zeros_like(run.sight))
+    fixed = topology_figure(dataclasses.replace(run, sight=sight, visible=sight == Sight.VISIBLE))
+    assert not any(ax.collections or ax.lines for ax in fixed.axes)
+    assert not any(ax.axison for ax in fixed.axes)
+    assert float(fixed.get_figheight()) < 0.7 * float(topology_figure(run).get_figheight())
 
 
 def test_starts_of_truth_and_estimate_are_told_apart(run: Trajectory) -> None:
@@ -184,6 +232,7 @@ def test_topology_shades_occlusion_by_a_moving_body_that_is_itself_unseen(run: T
     sight = np.full_like(run.sight, Sight.NOT_A_NEIGHBOUR)
     sight[:, :, 0] = Sight.VISIBLE
     sight[600:900, 0, 0] = Sight.OCCLUDED_BY_BODY
+    sight[600:900, 1, 0] = Sight.OUT_OF_VIEW
     figure = topology_figure(dataclasses.replace(run, sight=sight, visible=sight == Sight.VISIBLE))
     assert spans(figure.axes[0], style.SHADE) == [pytest.approx((10, 15), abs=1e-6)]
     assert spans(figure.axes[1], style.SHADE) == []
@@ -211,10 +260,13 @@ def test_plan_is_to_scale_and_shows_truth_dotted_and_estimate_solid(run: Traject
     metres = np.diff(ax.get_xlim())[0], np.diff(ax.get_ylim())[0]
     assert box.width / metres[0] == pytest.approx(box.height / metres[1], rel=1e-6)
     dotted = [line for line in ax.lines if line.get_color() == style.INK and line.get_linestyle() == "--"]
-    solid = [line for line in ax.lines if len(xdata(line)) > 1 and line.get_linestyle() == "-"]
+    solid = [line for line in ax.lines if len(xdata(line)) > 1 and line.get_linewidth() == 1.6]
     assert len(dotted) == len(solid) == 5
     np.testing.assert_allclose(ydata(dotted[0])[[0, -1]], run.position[[0, -1], 0, 1])
-    np.testing.assert_allclose(ydata(solid[4])[[0, -1]], run.position_estimate[[0, -1], 4, 1])
+    np.testing.assert_allclose(ydata(solid[4])[-1], run.position_estimate[-1, 4, 1])
+    thin = [line for line in ax.lines if len(xdata(line)) > 1 and line.get_linewidth() == 0.7]
+    np.testing.assert_allclose(ydata(thin[4])[0], run.position_estimate[0, 4, 1])
+    np.testing.assert_allclose(ydata(thin[4])[-1], ydata(solid[4])[0])  # one goes on where the other ends
     assert {"SL1", "SL2", "SL3", "x [m]", "y [m]"} <= texts(figure)
 
 
@@ -247,10 +299,10 @@ def test_consistency_shows_the_share_of_ticks_inside_and_the_claimed_deviation(r
     nees[: len(nees) // 4] = 100.0
     figure = consistency.consistency_figure(dataclasses.replace(run, nees=nees), steady_from=0.0)
     assert sum("75 % of ticks inside" in text for text in texts(figure)) == 1  # equal notes, one set member
-    error, claimed = figure.axes[1].lines
+    claimed, error = figure.axes[1].lines
     assert ydata(error)[0] == pytest.approx(run.position_error[0, 0])
     assert ydata(claimed)[0] == pytest.approx(np.sqrt(3) * (6 + 0.02 + 1e-3))
-    degrees = ydata(figure.axes[2].lines[1])[0]
+    degrees = ydata(figure.axes[2].lines[0])[0]
     assert degrees == pytest.approx(np.degrees(np.sqrt(3) * (1 + np.radians(0.02) + 1e-4)))
 
 
@@ -268,19 +320,19 @@ ENDS = [50.0, 20.0, 50.0, 50.0, 50.0]
 
 def test_lines_stop_where_a_vehicle_ends(run: Trajectory) -> None:
     errors = error_figure(run, ENDS)
-    for panel in errors.axes[4:8]:
-        assert max(xdata(x)[-1] for x in panel.lines if len(xdata(x)) > 2) == pytest.approx(20.0)
+    for panel in errors.axes[2:4]:
+        assert max(xdata(x)[-1] for x in panel.lines if len(xdata(x)) > 2) == pytest.approx(20.0, abs=0.5)
         assert spans(panel, style.ENDED) == [pytest.approx((20.0, 50.0))]
-    assert all(spans(panel, style.ENDED) == [] for panel in errors.axes[:4])
+    assert all(spans(panel, style.ENDED) == [] for panel in errors.axes[:2])
     topology = topology_figure(run, ENDS)
     bars = [x for c in topology.axes[1].collections[2:] for p in c.get_paths() for x in np.asarray(p.vertices)[:, 0]]
     assert max(bars) == pytest.approx(20.0, abs=0.02)
     assert spans(topology.axes[1], style.ENDED) == [pytest.approx((20.0, 50.0))]
     seen = run.visible[run.t <= 20.0, 1].sum() / 1201
-    assert f"{seen:.2f} targets in view on average" in texts(topology)
+    assert any(f"{seen:.2f} targets in view on average" in text for text in texts(topology))
     nees = consistency.consistency_figure(run, ENDS).axes[3]
     assert max(xdata(x)[-1] for x in nees.lines if len(xdata(x)) > 2) == pytest.approx(20.0)
-    local, _, verdict = observability_figure(analyse_observability(run), ENDS).axes
+    local, verdict = observability_figure(analyse_observability(run), ENDS).axes
     assert xdata(local.lines[1])[-1] == pytest.approx(19.0)
     assert max(p.vertices[:, 0].max() for c in verdict.collections for p in c.get_paths()) == pytest.approx(50.0)
     plan = trajectory_figure_2d(run, ENDS).axes[0]
@@ -290,43 +342,6 @@ def test_lines_stop_where_a_vehicle_ends(run: Trajectory) -> None:
         assert "ended, parked" in texts(figure)
     for draw in (error_figure, topology_figure, consistency.consistency_figure):
         assert "ended, parked" not in texts(draw(run))
-
-
-def fallen_at_once(run: Trajectory) -> Trajectory:
-    """Return the run with errors of the size of its noise from the first correction on."""
-    rng = np.random.default_rng(5)
-    estimate = run.position + 0.01 * rng.standard_normal(run.position.shape)
-    estimate[0] = run.position_estimate[0]
-    error = np.linalg.norm(run.position - estimate, axis=-1)
-    return dataclasses.replace(run, position_estimate=estimate, position_error=error)
-
-
-def test_a_fall_within_a_tick_does_not_fix_the_axis_but_is_marked(run: Trajectory) -> None:
-    figure = error_figure(fallen_at_once(run))
-    linear, log = figure.axes[0], figure.axes[1]
-    low, high = linear.get_ylim()
-    assert -0.1 < low < 0 < high < 0.1
-    starts = [x for x in linear.lines if len(xdata(x)) == 1]
-    assert [x.get_marker() for x in starts] == ["v", "v", "v"]  # -2, -11 and -2.5 m
-    assert {ydata(x)[0] for x in starts} == {low}
-    x, y, z = (run.position - run.position_estimate)[0, 0]
-    assert f"starts at {x:.3g}, {y:.3g}, {z:.3g} m" in texts(figure)
-    start = [x for x in log.lines if len(xdata(x)) == 1]
-    assert ydata(start[0])[0] == pytest.approx(run.position_error[0, 0])
-    assert not any(text.startswith("starts at") for text in texts(error_figure(run)))
-
-
-def test_the_settling_time_is_not_written_across_its_line(run: Trajectory) -> None:
-    wide = run.position_error + np.where(run.t < 45.0, 0.2, 0.0)[:, None]
-    figure = error_figure(dataclasses.replace(run, position_error=wide))
-    figure.canvas.draw()
-    for ax in figure.axes:
-        notes = [text for text in ax.texts if text.get_text().startswith("converged at 45.0")]
-        for note in notes:
-            line = ax.transData.transform((45.0, 1.0))[0]
-            box = note.get_window_extent()
-            assert not box.x0 <= line <= box.x1
-    assert any(text.startswith("converged at 45.0") for text in texts(figure))
 
 
 def test_space_shows_estimates_below_the_ground(run: Trajectory) -> None:
@@ -339,7 +354,7 @@ def test_space_shows_estimates_below_the_ground(run: Trajectory) -> None:
     )
     ax: Any = trajectory_figure_3d(ground).axes[0]
     assert -1.5 < ax.get_zlim()[0] < -0.4
-    solid = [x.get_data_3d() for x in ax.lines if x.get_linestyle() == "-" and len(x.get_data_3d()[0]) > 1]
+    solid = [x.get_data_3d() for x in ax.lines if x.get_linewidth() == 1.6]
     assert len(solid) == 5
     assert all(np.isfinite(path).all() and path[2].min() == pytest.approx(-0.4) for path in map(np.array, solid))
     above = dataclasses.replace(ground, position_estimate=ground.position + height / 5)
@@ -384,10 +399,10 @@ def test_no_name_covers_the_end_of_a_vehicle(draw: Callable[[Trajectory], Figure
     figure = draw(run)  # SL1 at (-4, 5), the end of f2 at (-2, 6)
     figure.canvas.draw()
     ax = figure.axes[0]
-    ends = [x for x in ax.lines if x.get_marker() == "x"]
+    ends = [x for x in ax.lines if x.get_marker() in ("x", "X")]
     assert len(ends) == 10
     names = [text for text in ax.texts if text.get_text() in ("SL1", "SL2", "SL3", *(f"$f_{{{i}}}$" for i in range(6)))]
-    assert len(names) == 8
+    assert len(names) == 13  # a vehicle at both ends of its path
     for end in ends:
         if draw is trajectory_figure_3d:
             x, y, _ = proj3d.proj_transform(*(v[0] for v in end.get_data_3d()), ax.get_proj())  # type: ignore[attr-defined]
@@ -406,14 +421,16 @@ def test_plan_shows_roads_and_buildings_of_a_scenario(run: Trajectory) -> None:
 
 
 def test_legends_list_only_what_occurs(run: Trajectory) -> None:
-    assert {"missed", "occluded by a building", "out of view", "moving target involved"} <= texts(topology_figure(run))
+    assert {"a frame missed", "occluded by a building", "out of view", "moving target involved"} <= texts(
+        topology_figure(run)
+    )
     sight = np.where(run.sight == Sight.NOT_A_NEIGHBOUR, Sight.NOT_A_NEIGHBOUR, Sight.OUT_OF_VIEW)
     blind = dataclasses.replace(run, sight=sight, visible=np.zeros_like(run.visible))
     shown = texts(topology_figure(blind))
-    assert "out of view" in shown
-    assert not {"visible", "missed", "occluded by a building", "moving target involved"} & shown
+    assert any("never in view" in text for text in shown)
+    assert not {"visible", "a frame missed", "occluded by a building", "moving target involved"} & shown
     assert "moving target detected" not in texts(error_figure(blind))
-    assert "not\nobservable" not in texts(observability_figure(analyse_observability(run, threshold=0.0)))
+    assert "not observable" not in texts(observability_figure(analyse_observability(run, threshold=0.0)))
     without = trajectory_figure_2d(dataclasses.replace(run, target_moving=np.ones(8, bool)))
     assert "landmark" not in texts(without) and "moving landmark" in texts(without)
 
@@ -428,6 +445,8 @@ def test_a_missed_frame_leaves_no_line_in_the_shade(run: Trajectory) -> None:
     missing = dataclasses.replace(run, visible=visible, sight=sight)
     for figure in (error_figure(missing), topology_figure(missing)):
         assert spans(figure.axes[0], style.SHADE) == [pytest.approx((10, 15), abs=1e-6)]
+    bars = spans(topology_figure(missing).axes[0], style.BLUE)
+    assert pytest.approx((10, 15), abs=1e-6) in bars  # a frame missed does not cut a bar
 
 
 @pytest.mark.parametrize("values", [(120.0, 180.0), (0.02, 0.1), (3.0, 3.0), (1e-3, 2e5)])
@@ -453,9 +472,9 @@ def test_what_an_axis_cannot_show_is_left_out() -> None:
 def test_observability_figure_shows_threshold_and_verdict(run: Trajectory) -> None:
     result = analyse_observability(run, threshold=2e-3)
     figure = observability_figure(result)
-    local, _, verdict = figure.axes
-    threshold = [line for line in local.lines if line.get_label() == "threshold"]
-    assert ydata(threshold[0])[0] == 2e-3
+    local, verdict = figure.axes
+    assert ydata(local.lines[-1]).tolist() == [2e-3, 2e-3]
+    assert "threshold" in texts(figure)
     assert local.get_ylim()[0] < 2e-3 < local.get_ylim()[1]
     low = observability_figure(analyse_observability(run, threshold=1e-7)).axes[0].get_ylim()[0]
     assert low < 1e-7

@@ -32,6 +32,7 @@ from coopenv.viz.topview_geometry import (
     limits,
     pointers,
     position_covariance,
+    ways,
 )
 from coopenv.viz.topview_ground import HEIGHT, MAP_WIDTH, PANEL, ROW, TABLE_TOP, WIDTH
 from tests.helpers.builders import scenario
@@ -372,3 +373,31 @@ def test_who_is_absent_is_not_drawn() -> None:
             assert (at(picture, view, x, y)[2] < 150) == present[i]
         seen |= {*zip(range(4), present.tolist(), strict=True)}
     assert len(seen) == 8
+
+
+@pytest.mark.parametrize("name", ["busy_intersection", "overtaking", "urban_crossing"])
+def test_vehicles_point_where_they_go(name: str) -> None:
+    """The drawn front, carried along by the true pose, lies ahead on the way that the vehicle then takes."""
+    engine = Engine(load_scenario(name))
+    engine.reset([0])
+    view = TopView(engine.backend.scenario)
+    L = view._landmarks
+    for _ in range(round(30 * engine.backend.scenario.rates.camera / 10)):
+        before = np.array(engine.view("position")[0, L:, :2])
+        rotation = np.array(engine.view("rotation")[0, L:])
+        engine.step(ticks=10)
+        moved = np.array(engine.view("position")[0, L:, :2]) - before
+        fast = np.linalg.norm(moved, axis=1) > 0.02
+        nose = view._nose.mean(axis=1) - view._box.mean(axis=1)
+        front = np.einsum("nij,nj->ni", rotation[:, :2, :2], nose)
+        ahead = np.sum(front * moved, axis=1) / np.linalg.norm(front, axis=1) / np.linalg.norm(moved, axis=1).clip(1e-9)
+        assert (ahead[fast] > 0.9).all()
+        if fast.all():
+            break
+    assert fast.any() or name == "urban_crossing"  # nobody drives there by itself
+
+
+def test_ways_differ_from_bodies_only_where_the_paper_has_them_so() -> None:
+    turned = ways(load_scenario("busy_intersection"))
+    np.testing.assert_allclose(turned, [np.pi / 2, np.pi / 2, 0, 0, 0], atol=1e-9)
+    assert not ways(load_scenario("urban_crossing")).any()

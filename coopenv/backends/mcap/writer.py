@@ -1,8 +1,9 @@
 """Write a recording as one MCAP file."""
 
 import hashlib
-from collections.abc import Iterator
-from operator import attrgetter
+from collections.abc import Iterator, Sequence
+from heapq import merge
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from coopenv.backends.mcap.messages import (
     codec,
     topic,
 )
+from coopenv.backends.mcap.view import Clock, View, ros_definition
 from coopenv.errors import OutputError
 from coopenv.files import check_file, replacing_file
 from coopenv.observers.recording import Recording
@@ -29,8 +31,14 @@ from coopenv.observers.recording_checks import check_recording
 from coopenv.shipped import version
 
 
-def write_recording(recording: Recording, path: str | Path) -> None:
+def write_recording(recording: Recording, path: str | Path, *, views: Sequence[View] = (), start: float = 0.0) -> None:
     """Write every tick of a recording to a file, which is replaced; `read_recording` gives it back bit for bit.
+
+    Args:
+        recording: what is read back.
+        path: of the file.
+        views: further topics for viewers, such as `coopenv.viz.foxglove.views` makes.
+        start: s since 1970, when tick 0 was; only the stamps tell.
 
     Raises:
         CoopenvError: the extra `log` is not installed.
@@ -40,7 +48,7 @@ def write_recording(recording: Recording, path: str | Path) -> None:
     codec()  # before the file is touched
     check_recording(recording, "recording")
     with replacing_file(path) as new, new.open("wb") as stream:
-        _Log(stream, recording).write()
+        _Log(stream, recording, Clock(recording.dt, start)).write(views)
 
 
 def check_target(path: str | Path) -> None:
@@ -54,10 +62,10 @@ def check_target(path: str | Path) -> None:
 class _Log:
     """One file under way."""
 
-    def __init__(self, stream: Any, recording: Recording) -> None:
+    def __init__(self, stream: Any, recording: Recording, clock: Clock) -> None:
         from mcap.writer import Writer
 
-        self.recording, self.codec = recording, codec()
+        self.recording, self.clock, self.codec = recording, clock, codec()
         self.exact = EXACT if recording.pan is None else EXACT | PAN
         self.types = {name.removeprefix("geometry_msgs/msg/"): kind for name, kind in self.codec.types.items()}
         self.writer = Writer(stream)
@@ -65,25 +73,46 @@ class _Log:
         self.schemas: dict[str, int] = {}
         self.channels: dict[str, int] = {}
 
-    def write(self) -> None:
-        """Write everything."""
+    def write(self, views: Sequence[View]) -> None:
+        """Write everything, tick by tick, as players like it."""
         r = self.recording
         header = header_of(r)
         about = {"format": FORMAT, "version": version(), "sha256": hashlib.sha256(header).hexdigest()}
         self.writer.add_metadata("coopenv", about)
-        self.writer.add_attachment(0, 0, ATTACHMENT, "application/json", header)
-        for i, setup in enumerate(r.setups):  # so that topics are there even if nothing is ever known
+        begun = self.clock.nanoseconds(0)
+        self.writer.add_attachment(begun, begun, ATTACHMENT, "application/json", header)
+        for setup in r.setups:  # so that topics are there even if nothing is ever known
             for name, kind in {**self.exact, **SHOWN}.items():
                 self._channel(topic(setup.name, name), kind)
-            self._write_vehicle(i, setup.name)
         changed = (r.landmarks[1:] != r.landmarks[:-1]).any(axis=(1, 2))
-        for k in [0, *(np.flatnonzero(changed) + 1).tolist()]:
-            poses = self._poses(r.landmarks[k], np.broadcast_to(np.eye(3), (*r.landmarks[k].shape, 3)))
-            self._send(LANDMARKS, LANDMARKS_TYPE, k, "map", poses=list(poses))
+        moved = {0, *(np.flatnonzero(changed) + 1).tolist()}
+        vehicles = [self._ticks_of(i, setup.name) for i, setup in enumerate(r.setups)]
+        shown = merge(*(self._shown(view) for view in views), key=itemgetter(0))
+        following = next(shown, None)
+        for k in range(r.ticks):
+            for ticks in vehicles:
+                next(ticks)
+            if k in moved:
+                poses = self._poses(r.landmarks[k], np.broadcast_to(np.eye(3), (*r.landmarks[k].shape, 3)))
+                self._send(LANDMARKS, LANDMARKS_TYPE, k, "map", poses=list(poses))
+            while following is not None and following[0] <= k:
+                self._add(following[1], k, following[2])
+                following = next(shown, None)
         self.writer.finish()
 
-    def _write_vehicle(self, i: int, name: str) -> None:
+    def _shown(self, view: View) -> Iterator[tuple[int, int, bytes]]:
+        """Register the topic of a view; yield (tick, channel, contents) of its messages."""
+        name, encoding, definition = view.schema, view.schema_encoding, view.definition
+        if name not in self.schemas:
+            self.schemas[name] = self.writer.register_schema(name, encoding, definition)
+        channel = self.writer.register_channel(view.topic, view.encoding, self.schemas[name])
+        return ((k, channel, data) for k, data in view.messages)
+
+    def _ticks_of(self, i: int, name: str) -> Iterator[int]:
+        """Write what one vehicle has sensed, a tick each time that the next one is asked for."""
         r, known = self.recording, np.flatnonzero(self.recording.truth.known[:, i])
+        poses = self._poses(r.truth.position[known, i], r.truth.rotation[known, i])
+        truth = dict(zip(known.tolist(), poses, strict=True))
         columns = {
             field: {part: attrgetter(array)(r)[:, i].reshape(r.ticks, -1) for part, array in CONTENTS[field].items()}
             for field in self.exact
@@ -93,9 +122,9 @@ class _Log:
                 row = {part: column[k] for part, column in parts.items()} or self._bearings(k, i)
                 self._send(topic(name, field), self.exact[field], k, "map" if field == "truth_exact" else name, **row)
             self._show_odometry(k, i, name, shown)
-        truth = self._poses(r.truth.position[known, i], r.truth.rotation[known, i])
-        for k, pose in zip(known.tolist(), truth, strict=True):
-            self._send(topic(name, "truth"), SHOWN["truth"], k, "map", pose=pose)
+            if k in truth:
+                self._send(topic(name, "truth"), SHOWN["truth"], k, "map", pose=truth[k])
+            yield k
 
     def _bearings(self, k: int, i: int) -> dict[str, Any]:
         r = self.recording
@@ -121,17 +150,19 @@ class _Log:
         return (pose(point(*position), orientation(*quaternion)) for position, quaternion in pairs)
 
     def _send(self, name: str, kind: str, k: int, frame: str, **fields: Any) -> None:
-        nanoseconds = round(k * self.recording.dt * 1e9)
-        stamp = self.types["builtin_interfaces/msg/Time"](*divmod(nanoseconds, 10**9))
+        stamp = self.types["builtin_interfaces/msg/Time"](*divmod(self.clock.nanoseconds(k), 10**9))
         header = self.types["std_msgs/msg/Header"](stamp, frame)
         data = bytes(self.codec.serialize_cdr(self.codec.types[kind](header=header, **fields), kind))
-        self.writer.add_message(self._channel(name, kind), nanoseconds, data, nanoseconds, k)
+        self._add(self._channel(name, kind), k, data)
+
+    def _add(self, channel: int, k: int, data: bytes) -> None:
+        nanoseconds = self.clock.nanoseconds(k)
+        self.writer.add_message(channel, nanoseconds, data, nanoseconds, k)
 
     def _channel(self, name: str, kind: str) -> int:
         if name not in self.channels:
             if kind not in self.schemas:
-                text, _ = self.codec.generate_msgdef(kind, ros_version=2)
-                self.schemas[kind] = self.writer.register_schema(kind, "ros2msg", text.encode())
+                self.schemas[kind] = self.writer.register_schema(kind, "ros2msg", ros_definition(kind))
             self.channels[name] = self.writer.register_channel(name, "cdr", self.schemas[kind])
         return self.channels[name]
 

@@ -92,8 +92,11 @@ def write(
     film: bool,
     force: bool,
     log: Console,
+    width: str | None = None,
 ) -> Evaluation:
     """Evaluate and write everything to a folder, which is replaced as a whole.
+
+    `width` is a column of `coopenv.viz.paper` that figures are drawn for; None: a page's.
 
     Raises:
         OutputError: it holds an earlier evaluation and `force` is false, or it cannot be written.
@@ -108,7 +111,7 @@ def write(
             from coopenv.bench.agents.replay import write_replay
 
             with Progress(log, "drawing figures"):
-                save_figures(evaluation, new, figures)
+                save_figures(evaluation, new, figures, width)
             write_replay(evaluation, new / REPLAY_FILE, log)
         if film:
             from coopenv.bench.agents.film import write_film

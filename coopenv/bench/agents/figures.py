@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from coopenv.bench.agents.contest import Evaluation
 from coopenv.evaluation.bootstrap import Quantile, interval, resamples
 from coopenv.evaluation.episodes import Episodes
-from coopenv.viz import style
+from coopenv.viz import paper, style
 from coopenv.viz.style import INK, NORMAL, SMALL
 
 BINS = 24
@@ -22,14 +22,20 @@ _RAREST = 1e-3
 """Share of time that is at the centre of the directions looked in."""
 
 
-def save_figures(evaluation: Evaluation, folder: Path, file_format: str) -> list[Path]:
-    """Write all figures of an evaluation to a folder."""
+def save_figures(evaluation: Evaluation, folder: Path, file_format: str, width: str | None = None) -> list[Path]:
+    """Write all figures of an evaluation to a folder, for a page or a column of `coopenv.viz.paper`."""
+    inches = paper.inches_of(width)
     figures = {
-        "error_along_the_way": error_figure(evaluation),
-        "time_against_error": pareto_figure(evaluation),
-        "looking": looking_figure(evaluation),
+        "error_along_the_way": error_figure(evaluation, inches),
+        "time_against_error": pareto_figure(evaluation, inches),
+        "looking": looking_figure(evaluation, inches),
     }
-    return [style.save(figure, folder / f"{name}.{file_format}") for name, figure in figures.items()]
+    about = {"environment": evaluation.environment, "worlds": evaluation.worlds, "block": evaluation.block}
+    about["agents"] = ", ".join(evaluation.episodes)
+    if width is not None:
+        for figure in figures.values():
+            paper.restyle(figure, width)
+    return [style.save(figure, folder / f"{name}.{file_format}", about=about) for name, figure in figures.items()]
 
 
 def error_figure(evaluation: Evaluation, width: float | None = None) -> Figure:
@@ -87,7 +93,7 @@ def looking_figure(evaluation: Evaluation, width: float | None = None) -> Figure
 
     Radii are logarithms of the shares: most of the time everybody looks ahead, which would hide the rest.
     """
-    columns = min(4, len(evaluation.episodes))
+    columns = min(style.fitting(width or style.PAGE, _PANEL * 0.8, 4), len(evaluation.episodes))
     rows = -(-len(evaluation.episodes) // columns)
     note = _note(evaluation, f"share of time from {100 * _RAREST:g} %, logarithmic; 0: along the way, positive: left")
     figure, _ = style.canvas(width, 0.5 + _PANEL * rows, note)

@@ -24,7 +24,7 @@ from coopenv.runs.console import Progress
 from coopenv.viz import FORMATS
 
 JSON_FILE, CSV_FILE, REPORT_FILE, BASIN_FILE = "leaderboard.json", "leaderboard.csv", "report.html", "basin.csv"
-WINDOWS_FILE = "windows.csv"
+WINDOWS_FILE, LATEX_FILE = "windows.csv", "leaderboard.tex"
 
 
 class Request(NamedTuple):
@@ -105,10 +105,12 @@ def perform(
     printed: Console,
     log: Console,
     as_json: bool = False,
+    width: str | None = None,
 ) -> None:
     """Compare, print the tables (or what `leaderboard.json` holds) and write the files to the folder `out`, if any.
 
-    `figures` is the format of figures as files of their own; None: the report alone has them.
+    `figures` is the format of figures as files of their own; None: the report alone has them. `width` is a column of
+    `coopenv.viz.paper` that they are drawn for; None: a page's.
 
     Raises:
         CoopenvError: something that was asked for does not exist, or cannot be written.
@@ -116,13 +118,13 @@ def perform(
     wanted = figure_files(request.plan.variants, figures)
     if wanted and out is None:
         raise CoopenvError(f"--figures {figures}: figures need a folder, --out DIR")
-    found, names = None, [JSON_FILE, CSV_FILE, WINDOWS_FILE, REPORT_FILE, BASIN_FILE]
+    found, names = None, [JSON_FILE, CSV_FILE, WINDOWS_FILE, LATEX_FILE, REPORT_FILE, BASIN_FILE]
     names += [name for form in FORMATS for name in figure_files(tuple(request.plan.source.variants), form)]
     try:
         with nullcontext() if out is None else replacing_folder(out, names) as folder:
             found = _compare(request, executor, log)
             if folder is not None:
-                write_files(found, request.command, folder, wanted)
+                write_files(found, request.command, folder, wanted, width)
                 names = sorted(path.name for path in folder.iterdir())
     finally:  # hours of work are told even if they cannot be written
         if found is not None and as_json:
@@ -171,21 +173,22 @@ def _as_file(variant: str) -> str:
     return re.sub(r"[^A-Za-z0-9._+=-]", "_", variant)
 
 
-def write_files(found: Found, command: str, out: Path, figures: Mapping[str, tuple[str, str]]) -> None:
+def write_files(
+    found: Found, command: str, out: Path, figures: Mapping[str, tuple[str, str]], width: str | None = None
+) -> None:
     """Write the leaderboard as JSON and CSV, the draws as CSV, the report, and figures by name, kind and variant."""
     from coopenv.bench.observers.figures import KINDS
     from coopenv.bench.observers.report import report_text
-    from coopenv.viz.style import save
 
     comparison, draws, basins = found
     content = found.document(command)
     texts = {JSON_FILE: json_text(content), CSV_FILE: comparison.to_csv()}
     texts[WINDOWS_FILE] = csv_text(comparison.window_rows)
     texts |= {BASIN_FILE: csv_text(draws)} if draws else {}
+    texts[LATEX_FILE] = comparison.to_latex()
     texts[REPORT_FILE] = report_text(comparison, content, draws, basins)
     for name, text in texts.items():
         replace_text(out / name, text)
     for name, (kind, variant) in figures.items():
-        figure = KINDS[kind](comparison, variant, None)
-        if figure is not None:
-            save(figure, out / name)
+        if KINDS[kind](comparison, variant, None) is not None:
+            comparison.figure(kind, variant=variant, width=width, path=out / name)

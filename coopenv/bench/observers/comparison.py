@@ -91,7 +91,7 @@ class Comparison(Leaderboard):
         kind: str = "errors",
         *,
         variant: str | None = None,
-        width: float | None = None,
+        width: str | float | None = None,
         path: str | Path | None = None,
         format: str | None = None,
     ) -> Figure:
@@ -100,7 +100,8 @@ class Comparison(Leaderboard):
         Args:
             kind: "errors" or "consistency" over time, "variants" (a map of errors) or "cost" (error against time).
             variant: of errors, consistency and cost; None: the first one.
-            width: inches, 3.5 for one column of a journal; None: a page's.
+            width: a column of `coopenv.viz.paper.COLUMNS`, whose fonts the figure then has, such as "ieee1", or
+                inches; None: a page's.
             path: file to write.
             format: "png", "pdf" or "svg"; None: as the path ends.
 
@@ -108,16 +109,24 @@ class Comparison(Leaderboard):
             CoopenvError: no such kind or variant, nothing to draw, or the file cannot be written.
         """
         from coopenv.bench.observers.figures import KINDS
+        from coopenv.viz import paper
         from coopenv.viz.style import save
 
         if kind not in KINDS:
             raise CoopenvError(f"unknown figure '{kind}'{suggest(kind, KINDS)}; known: {', '.join(KINDS)}")
-        drawn = KINDS[kind](self, self._checked(variant), width)
+        drawn = KINDS[kind](self, self._checked(variant), paper.inches_of(width))
         if drawn is None:
             raise CoopenvError(f"figure '{kind}': there is nothing to draw")
+        if isinstance(width, str):
+            paper.restyle(drawn, width)
         if path is not None:
-            save(drawn, Path(path), format or "")
+            save(drawn, Path(path), format or "", about=self._about(variant))
         return drawn
+
+    def _about(self, variant: str | None) -> dict[str, object]:
+        """Return what files of figures say of themselves."""
+        told = {"environment": self.environment, "observers": ", ".join(self.observers), "variant": variant or "all"}
+        return {**told, "seeds": ", ".join(map(str, self.seeds))}
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         return tables.everything(self, options.max_width)

@@ -18,6 +18,7 @@ from coopenv.bench.observers.wording import FAILED, short_name
 from coopenv.estimation.consistency import mean_bounds
 from coopenv.format import number
 from coopenv.viz import style
+from coopenv.viz.contrast import contrast
 from coopenv.viz.labels import place_names
 from coopenv.viz.style import BLUE, GREY, INK, NORMAL, SHADE, SMALL, VERMILION, vehicle_colour, vehicle_label
 
@@ -148,9 +149,10 @@ def variant_figure(board: Leaderboard, variant: str, width: float | None = None)
     relative = variants[0] == NOMINAL and inches > _WIDE_CELL * (len(variants) + 2)
     for (y, x), value in np.ndenumerate(table):
         worse = f"  ×{number(value / table[y, 0], 2)}" if x and relative else ""
-        dark = np.isfinite(value) and norm(value) > 0.55
+        behind = image.cmap(norm(value))[:3] if np.isfinite(value) else (1.0, 1.0, 1.0)
+        ink = max(("white", "black"), key=lambda colour: contrast(colour, behind))
         text = f"{number(float(value), 3)}{worse}" if np.isfinite(value) else FAILED
-        ax.text(x, y, text, ha="center", va="center", fontsize=_NAME, color="white" if dark else INK)
+        ax.text(x, y, text, ha="center", va="center", fontsize=_NAME, color=ink)
     ax.set_xticks(range(len(variants)), variants, fontsize=_NAME)
     ax.set_yticks(range(len(names)), names, fontsize=_NAME)
     ax.xaxis.tick_top()

@@ -3,7 +3,7 @@
 import io
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -13,15 +13,18 @@ from matplotlib.figure import Figure
 
 from coopenv.bench.observers.basin import RADIUS, Basin, Draw, basin_failures
 from coopenv.bench.observers.basin_figure import basin_figure
+from coopenv.bench.observers.charts import chart_data, page_file, plotly
 from coopenv.bench.observers.faults import NOMINAL
-from coopenv.bench.observers.figures import KINDS
 from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
-from coopenv.bench.observers.rows import Row, mean_of
+from coopenv.bench.observers.quality import headline, quality
+from coopenv.bench.observers.rows import Row
 from coopenv.bench.observers.tables import failures, honest_line
 from coopenv.bench.observers.windows import spread
 from coopenv.estimation.metrics import CONVERGED
-from coopenv.format import number, with_error
+from coopenv.format import with_error
 
+MOST_BYTES = 1_950_000
+"""Of a report: more than that mails badly and opens slowly on a phone."""
 _COORDINATE = re.compile(r"(?<=[ML ])(-?\d+\.\d\d)\d+(?=[ \n])")
 """A coordinate of a line in SVG, of which hundredths of a point are enough."""
 
@@ -30,13 +33,25 @@ def report_text(
     board: Leaderboard, content: Mapping[str, Any], draws: Sequence[Draw] = (), basins: Sequence[Basin] = ()
 ) -> str:
     """Return the report as one HTML text; `content` of `leaderboard.json` tells the command and versions."""
+    text = _rendered(board, content, draws, basins, with_rows=True)
+    return text if len(text.encode()) < MOST_BYTES else _rendered(board, content, draws, basins, with_rows=False)
+
+
+def _rendered(
+    board: Leaderboard, content: Mapping[str, Any], draws: Sequence[Draw], basins: Sequence[Basin], with_rows: bool
+) -> str:
     variants = [_variant(board, name) for name in board.variants]
     nominal = variants[0]["name"] == NOMINAL
     return (
-        _environment()
+        _environment(board)
         .get_template("report.html.j2")
         .render(
             board=board,
+            with_rows=with_rows,
+            headline=headline(board),
+            data=chart_data(board),
+            plotly=plotly(),
+            charts=Markup(page_file("charts.js").decode()),
             content=content,
             vehicles=board.samples[0].scene.vehicles,
             boards=variants[:1] if nominal else variants,  # faults have one table
@@ -44,8 +59,6 @@ def report_text(
             nominal=nominal,
             honest=honest_line(board.rows),
             failures=failures(board.rows),
-            heat=_picture(board, "variants", variants[0]["name"]),
-            cost=_picture(board, "cost", variants[0]["name"]),
             basins=basins,
             basin_failures=basin_failures(basins),
             basin_map=_svg(basin_figure(board.environment, draws)) if draws else "",
@@ -57,11 +70,11 @@ def report_text(
     )
 
 
-def _environment() -> Environment:
+def _environment(board: Leaderboard) -> Environment:
     environment = Environment(
-        loader=PackageLoader("coopenv.bench.observers", ""), autoescape=True, undefined=StrictUndefined
+        loader=PackageLoader("coopenv.bench.observers", "page"), autoescape=True, undefined=StrictUndefined
     )
-    environment.globals |= {"with_error": with_error, "extremes": _extremes, "mean": mean_of, "nan": math.nan}
+    environment.globals |= {"with_error": with_error, "breakable": _breakable, "tint": _tints(board), "nan": math.nan}
     environment.filters["append"] = lambda text, more: text + more
     return environment
 
@@ -74,12 +87,14 @@ def _variant(board: Leaderboard, name: str) -> dict[str, Any]:
         "bounds": {BOUNDS[column]: values for column, values in board.bounds_in(name).items()},
         "paper_noise": board.samples[0].scene.paper_noise,
         "observers": {
-            observer: {"rows": board.rows_in(name, observer), "total": board.totals[name, observer]}
+            observer: {
+                "rows": board.rows_in(name, observer),
+                "total": board.totals[name, observer],
+                **quality(board, name, observer),
+            }
             for observer in board.ranked
         },
         "windows": {observer: _windows(board, name, observer) for observer in board.ranked},
-        "errors": _picture(board, "errors", name),
-        "consistency": _picture(board, "consistency", name),
     }
 
 
@@ -93,15 +108,23 @@ def _windows(board: Leaderboard, variant: str, observer: str) -> list[dict[str, 
     ]
 
 
-def _extremes(rows: Sequence[Row], column: str) -> str:
-    finite = [value for row in rows if math.isfinite(value := getattr(row, column))]
-    return f"{number(min(finite), 3)} … {number(max(finite), 3)}" if finite else "-"
+def _breakable(name: str) -> Markup:
+    """Return a name that may be broken after underscores."""
+    return Markup("<wbr>").join(re.split(r"(?<=_)", name))
 
 
-def _picture(board: Leaderboard, kind: str, variant: str) -> str:
-    """Return a figure as SVG for the page, empty where there is nothing to draw."""
-    figure = KINDS[kind](board, variant, None)
-    return "" if figure is None else _svg(figure)
+def _tints(board: Leaderboard) -> Callable[[float], Markup]:
+    """Return what gives a cell of the table of variants the darker a background, the larger its error."""
+    sizes = [math.log(total.rmse.value) for total in board.totals.values() if total.rmse.value > 0]
+    low, high = min(sizes, default=0.0), max(sizes, default=1.0)
+
+    def tint(value: float) -> Markup:
+        if not value > 0:
+            return Markup("")
+        share = (math.log(value) - low) / max(high - low, 1e-9)
+        return Markup(f' style="background: rgb(213 94 0 / {0.45 * share:.2f})"')  # text stays legible on it
+
+    return tint
 
 
 def _svg(figure: Figure) -> Markup:

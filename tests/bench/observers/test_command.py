@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import json
 import re
+from base64 import b64decode
 from dataclasses import fields, replace
+from gzip import decompress
 from html.parser import HTMLParser
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -13,9 +15,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import coopenv
 from coopenv.bench.observers import compare
+from coopenv.bench.observers.charts import PLOTLY, chart_data, page_file
 from coopenv.bench.observers.command import figure_files
+from coopenv.bench.observers.quality import headline, quality
+from coopenv.bench.observers.report import report_text
 from coopenv.bench.observers.rows import Row
+from coopenv.bench.observers.samples import Series
 from coopenv.cli import main
 from coopenv.observers import registry
 from tests.bench.observers.test_compare import Raises
@@ -60,6 +67,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.fixture(scope="module")
+def comparison_of_two() -> coopenv.Comparison:
+    return compare(["riccati", "mekf"], "overtaking", 2, overrides={"horizon": 1.0})
+
+
 def test_json(folder: Path) -> None:
     board = json.loads((folder / "leaderboard.json").read_text())
     assert set(board) == {"command", "versions", "seeds", "rows", "windows", "basin"}
@@ -102,16 +114,69 @@ def test_report(folder: Path) -> None:
     assert not page.open
     headings = [place for place in page.places if f'<h2 id="{place[1:]}"' in text]
     assert [anchor for anchor in page.anchors if anchor in headings] == headings and len(headings) == 8
-    assert not page.sources and text.count("<svg") == 7  # of two variants each two, map, cost, basin
+    assert not page.sources and text.count("<svg") == 1  # the basin
+    assert len(text.encode()) < 2_000_000
     # What figures refer to is on the page, and the names of formats are no addresses that anybody opens.
     assert {*re.findall(r"url\(([^)]*)\)", text)} <= {*page.places}
     assert not re.search(r"(?:src|href)=.?http|@import", text)
+    for figure in ("settled", "ANEES", "mean RMSE"):  # one screen of summary comes first
+        assert text.index('id="summary"') < text.index(figure) < text.index("</section>")
     for wanted in ("--seeds 2", "numpy", "seeds 0 to 1", "Basin of attraction", "Cost against accuracy", "viewport"):
         assert wanted in text
     assert "no landmark is seen for 10 s" in text and "ANEES of an honest filter: 1 (" in text and "×" in text
     assert "standard error over\nthe 2 seeds" in text
     for name in (f.name for f in fields(Row)):
         assert f"<dt>{name}</dt>" in text
+
+
+def test_the_data_of_the_charts_are_those_of_the_samples(comparison_of_two: coopenv.Comparison) -> None:
+    board = comparison_of_two
+    data = json.loads(decompress(b64decode(chart_data(board))))
+    assert data["observers"] == board.ranked and data["vehicles"] == ["vehicle_1", "vehicle_2"]
+    (variant,) = data["variants"]
+    own = board.samples_in("nominal")["mekf"]
+    assert len(variant["t"]) == len(own[0].scene.t) == len(variant["curves"]["mekf"]["error"][1])
+    error = np.median([sample.series.position_error[:, 1] for sample in own], axis=0)
+    np.testing.assert_allclose(variant["curves"]["mekf"]["error"][1], error, rtol=6e-3)
+    costs = {point["observer"]: point for point in data["cost"]}
+    assert costs["mekf"]["rmse"] == board.totals["nominal", "mekf"].rmse.value
+    assert costs["mekf"]["se"] == board.totals["nominal", "mekf"].rmse.error
+
+
+def test_a_comparison_of_many_stays_below_two_megabytes(comparison_of_two: coopenv.Comparison) -> None:
+    """Fifteen observers in eight variants, with curves of noise, which nothing packs well."""
+    rng = np.random.default_rng(0)
+    names, variants = [f"observer_{i}" for i in range(15)], {f"variant_{i}": "about" for i in range(8)}
+    t = np.linspace(0.0, 50.0, 400)
+    samples = []
+    for variant in variants:
+        for name in names:
+            for sample in comparison_of_two.samples[:2]:
+                scene = replace(sample.scene, t=t, bound=np.abs(rng.standard_normal((400, 2))))
+                series = Series(*np.exp(rng.standard_normal((3, 400, 2))))
+                samples.append(replace(sample, variant=variant, observer=name, scene=scene, series=series))
+    many = replace(comparison_of_two, observers=tuple(names), variants=variants, samples=samples)
+    text = report_text(many, {"command": "", "versions": {}})
+    assert 700_000 < len(text.encode()) < 2_000_000
+
+
+def test_quality_has_errors_over_the_seeds(comparison_of_two: coopenv.Comparison) -> None:
+    found = quality(comparison_of_two, "nominal", "mekf")
+    own = comparison_of_two.samples_in("nominal")["mekf"]
+    sent = np.array([sample.bytes_per_s.mean() for sample in own])
+    assert found["sent"].value == pytest.approx(sent.mean())
+    assert found["sent"].error == pytest.approx(sent.std(ddof=1) / np.sqrt(2))
+    settled = [100 * np.isfinite(sample.measured("settle_time")).mean() for sample in own]
+    assert found["settled"] == pytest.approx((np.mean(settled), np.std(settled, ddof=1) / np.sqrt(2)))
+    best = headline(comparison_of_two)[0]
+    assert best.startswith(f"Best of 2 in overtaking, seeds 0 to 1 (nominal): {comparison_of_two.ranked[0]}")
+    assert " ± " in best
+
+
+def test_plotly_is_the_published_bundle_with_its_licence() -> None:
+    text = decompress(page_file(PLOTLY)).decode()
+    assert "plotly.js (basic - minified) v4.1.1" in text[:200] and "MIT license" in text[:400]
+    assert "MIT License" in page_file("plotly.LICENSE").decode()
 
 
 def test_tables_fit_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -234,6 +299,7 @@ def test_an_observer_in_a_file_and_figures_as_files(tmp_path: Path, monkeypatch:
             "leaderboard.json",
             "leaderboard.csv",
             "windows.csv",
+            "leaderboard.tex",
             "report.html",
         }
         assert figures == {*figure_files(["nominal"], form)} - {f"variants.{form}"}

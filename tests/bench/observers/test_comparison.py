@@ -10,7 +10,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+from matplotlib.text import Text
 from rich.console import Console
 
 import coopenv
@@ -20,6 +22,8 @@ from coopenv.errors import CoopenvError
 from coopenv.format import in_parentheses, with_error
 from coopenv.observers import Estimate, Setup, Tick, registry
 from coopenv.observers.dead_reckoning import DeadReckoning
+from coopenv.viz.contrast import LEAST, contrast
+from coopenv.viz.paper import COLUMNS
 
 
 class Mine(DeadReckoning):
@@ -176,3 +180,24 @@ def test_the_report_is_sorted_and_has_errors_beside_its_figures(comparison: coop
 def test_seeds_are_named_as_a_range_where_they_are_one(comparison: coopenv.Comparison) -> None:
     assert replace(comparison, seeds=(4, 5, 6)).title == "overtaking, seeds 4 to 6"
     assert replace(comparison, seeds=(4,)).title == "overtaking, seed 4"
+
+
+def test_numbers_in_the_map_of_variants_stand_out_from_their_cells(comparison: coopenv.Comparison) -> None:
+    figure = comparison.figure("variants")
+    ax = figure.axes[0]
+    (image,) = ax.images
+    for text in ax.texts:
+        x, y = (round(value) for value in text.get_position())
+        shown = float(np.asarray(image.get_array())[y, x])
+        behind = image.cmap(image.norm(shown))[:3] if np.isfinite(shown) else (1.0, 1.0, 1.0)
+        assert contrast(text.get_color(), behind) >= LEAST
+    assert len(ax.texts) == len(comparison.observers) * len(comparison.variants)
+
+
+def test_figures_have_the_width_and_font_of_a_column(comparison: coopenv.Comparison, tmp_path: Path) -> None:
+    figure = comparison.figure("errors", width="ieee1", path=tmp_path / "errors.svg")
+    assert figure.get_figwidth() == 3.5
+    assert {text.get_fontfamily()[0] for text in figure.findobj(Text)} == {COLUMNS["ieee1"].font}
+    assert "environment: overtaking" in (tmp_path / "errors.svg").read_text()
+    with pytest.raises(CoopenvError, match="unknown width 'ieee3'"):
+        comparison.figure("errors", width="ieee3")

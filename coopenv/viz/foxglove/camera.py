@@ -1,0 +1,80 @@
+"""What each camera sees, as an image panel shows it: calibration, an empty image, and targets as circles with names."""
+
+from collections.abc import Iterator
+from io import BytesIO
+
+import numpy as np
+from foxglove import messages as fox
+from numpy.typing import NDArray
+from PIL import Image
+
+from coopenv.estimation.arrays import Array
+from coopenv.scenario.sensing import Camera
+from coopenv.svea.lens import distort
+from coopenv.viz.foxglove.shown import Shown, colour, colour_of
+from coopenv.viz.style import DARK_BLUE
+
+_CANVAS = (236, 239, 244)  # RGB of an image without anything
+_RING, _WORDS = 10.0, 11.0  # px
+_NEAREST = 1e-3  # of a unit bearing's depth: beside the camera there is no image
+
+
+def calibration(shown: Shown, vehicle: int, camera: Camera) -> Iterator[tuple[int, bytes]]:
+    """Yield a camera's calibration, once."""
+    (fx, fy), (cx, cy) = camera.focal_length, camera.principal_point
+    width, height = camera.image_size
+    yield (
+        0,
+        fox.CameraCalibration(
+            timestamp=shown.stamp(0),
+            frame_id=f"{shown.names[vehicle]}/camera",
+            width=int(width),
+            height=int(height),
+            distortion_model="plumb_bob",
+            D=list(camera.distortion),
+            K=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+            R=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+            P=[fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+        ).encode(),
+    )
+
+
+def image(shown: Shown, vehicle: int, camera: Camera) -> Iterator[tuple[int, bytes]]:
+    """Yield an empty image, once: a canvas for the annotations, as simulated cameras have no pixels."""
+    file = BytesIO()
+    Image.new("RGB", (int(camera.image_size[0]), int(camera.image_size[1])), _CANVAS).save(file, "png")
+    frame = f"{shown.names[vehicle]}/camera"
+    picture = fox.CompressedImage(timestamp=shown.stamp(0), frame_id=frame, data=file.getvalue(), format="png")
+    yield 0, picture.encode()
+
+
+def annotations(shown: Shown, vehicle: int, camera: Camera) -> Iterator[tuple[int, bytes]]:
+    """Yield circles where the measured bearings hit the image, with the names of the targets."""
+    r = shown.recording
+    names, L = r.setups[vehicle].target_names, r.landmarks.shape[1]
+    for k in shown.ticks:
+        stamp, targets = shown.stamp(k), np.flatnonzero(r.visible[k, vehicle])
+        places, ahead = pixels(r.bearings[k, vehicle, targets] @ shown.optical(k, vehicle), camera)
+        circles, words = [], []
+        for target, place in zip(targets[ahead].tolist(), places[ahead].tolist(), strict=True):
+            look = colour(DARK_BLUE) if target < L else colour_of(target - L)
+            center = fox.Point2(x=place[0], y=place[1])
+            circles.append(
+                fox.CircleAnnotation(
+                    timestamp=stamp, position=center, diameter=_RING, thickness=2.0, outline_color=look
+                )
+            )
+            beside = fox.Point2(x=place[0] + _RING, y=place[1])
+            words.append(
+                fox.TextAnnotation(
+                    timestamp=stamp, position=beside, text=names[target], font_size=_WORDS, text_color=look
+                )
+            )
+        yield k, fox.ImageAnnotations(circles=circles, texts=words).encode()
+
+
+def pixels(rays: Array, camera: Camera) -> tuple[Array, NDArray[np.bool_]]:
+    """Return where rays (m, 3) in the optical frame hit the image, (m, 2) px, and which are ahead of the camera."""
+    ahead = rays[:, 2] > _NEAREST
+    flat = rays[:, :2] / np.where(ahead, rays[:, 2], 1.0)[:, None]
+    return distort(flat, camera.distortion) * camera.focal_length + camera.principal_point, ahead

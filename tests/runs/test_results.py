@@ -1,0 +1,78 @@
+"""What a run has written is read again: its figures drawn anew, its trajectories exported."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from coopenv.cli import main
+from coopenv.runs.results import Results
+from coopenv.viz import FIGURE_NAMES
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("run") / "overtaking"
+    words = ["run", "overtaking", "--seed", "2", "--set", "horizon=2.0", "--set", "observer.name=robust"]
+    assert main([*words, "--no-figures", "--out", str(out)]) == 0
+    return out
+
+
+def test_a_run_is_read_again(folder: Path) -> None:
+    results = Results.read(folder)
+    assert results.metrics["observer"] == "robust" and results.metrics["seed"] == 2
+    assert results.trajectory.vehicles.tolist() == ["vehicle_1", "vehicle_2"]
+    assert np.isnan(results.ends).all() and results.steady_from == pytest.approx(1.4)
+    scenario = results.scenario()
+    assert scenario is not None and scenario.observer.name == "robust" and scenario.horizon == 2.0
+
+
+@pytest.mark.parametrize("arguments", [[], ["--format", "svg", "--width", "ieee1"]])
+def test_figures_are_drawn_anew_and_say_of_what_they_are(
+    arguments: list[str], folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["figures", str(folder), *arguments, "--out", str(tmp_path / "new")]) == 0
+    form = "svg" if arguments else "pdf"
+    assert {path.name for path in (tmp_path / "new").iterdir()} == {f"{name}.{form}" for name in FIGURE_NAMES}
+    text = (tmp_path / "new" / f"errors.{form}").read_bytes().decode("latin-1")
+    assert "environment: overtaking; observer: robust; seed: 2" in text
+    if arguments:
+        assert 'width="252pt"' in text  # 3.5 in
+        assert "seed 2</text" not in text and "overtaking, robust" not in text
+    assert "errors" in capsys.readouterr().out
+
+
+def test_trajectories_are_exported(folder: Path, tmp_path: Path) -> None:
+    assert main(["export", str(folder), "--format", "tum", "--out", str(tmp_path / "tum")]) == 0
+    rows = np.loadtxt(tmp_path / "tum" / "vehicle_2_estimate.tum")
+    trajectory = Results.read(folder).trajectory
+    np.testing.assert_allclose(rows[:, 1:4], trajectory.position_estimate[:, 1], atol=1e-9)
+
+
+def test_what_is_no_run_is_one_line(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def said(change: str) -> str:
+        assert main(["figures", str(tmp_path / change)]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1
+        return error
+
+    assert "no folder of `coopenv run` (metrics.json: No such file" in said("nothing")
+    for name, text, why in (
+        ("text", "hello", "metrics.json: not JSON"),
+        ("list", "[]", "not of a run, missing: environment, seed"),
+        ("empty", "{}", "not of a run, missing: environment, seed"),
+    ):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "metrics.json").write_text(text)
+        assert why in said(name)
+    shutil.copytree(folder, tmp_path / "other")
+    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics["vehicles"][0]["vehicle"] = "vehicle_9"
+    (tmp_path / "other" / "metrics.json").write_text(json.dumps(metrics))
+    assert "vehicles are not those of trajectory.npz" in said("other")
+    (tmp_path / "other" / "trajectory.npz").write_text("no archive")
+    assert "trajectory.npz: not a readable .npz file" in said("other")

@@ -1,0 +1,318 @@
+"""Logs hold what Foxglove and Lichtblick show, in the published types, read back with other libraries.
+
+The SDK encodes; Foxglove's own protobuf package and the mcap libraries decode.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from coopenv.backends.mcap import read_recording, write_recording
+from coopenv.cli import main
+from coopenv.estimation.coordinates import Coordinates
+from coopenv.estimation.map_covariance import covariance_in_map
+from coopenv.observers import Run, run
+from coopenv.observers.recording import Recording
+from coopenv.scenario.sensing import Camera
+from tests.helpers.four_way import FOUR_WAY
+from tests.helpers.recordings import differences, simulated
+
+pytest.importorskip("foxglove", reason="needs the extra 'log'")
+pytest.importorskip("mcap_protobuf", reason="needs mcap-protobuf-support")
+START = 1_700_000_000.25
+
+
+class Log:
+    """A file, decoded: messages by topic as (schema, time in s, message)."""
+
+    def __init__(self, path: Path) -> None:
+        from mcap.reader import make_reader
+        from mcap_protobuf.decoder import DecoderFactory
+
+        self.messages: dict[str, list[tuple[Any, float, Any]]] = defaultdict(list)
+        self.sizes: dict[str, int] = defaultdict(int)
+        self.order: list[int] = []
+        with path.open("rb") as stream:
+            reader = make_reader(stream, decoder_factories=[DecoderFactory()], validate_crcs=True)
+            decoders: dict[int, Any] = {}
+            for schema, channel, message in reader.iter_messages(log_time_order=False):
+                assert schema is not None
+                if schema.encoding == "protobuf":
+                    if channel.id not in decoders:
+                        decoders[channel.id] = DecoderFactory().decoder_for("protobuf", schema)
+                    content = decoders[channel.id](message.data)
+                else:
+                    content = json.loads(message.data) if channel.message_encoding == "json" else message.data
+                self.messages[channel.topic].append((schema, message.log_time * 1e-9, content))
+                self.sizes[channel.topic] += len(message.data)
+                self.order.append(message.log_time)
+
+    def __getitem__(self, topic: str) -> list[Any]:
+        return [content for _, _, content in self.messages[topic]]
+
+    def entities(self, topic: str, k: int = 0) -> dict[str, Any]:
+        return {entity.id: entity for entity in self[topic][k].entities}
+
+
+def written(recording: Recording, observer: str, path: Path) -> tuple[Run, Log]:
+    from coopenv.viz.foxglove import views
+
+    result = run(observer, recording)
+    write_recording(recording, path, views=views(recording, result, start=START), start=START)
+    return result, Log(path)
+
+
+@pytest.fixture(scope="module")
+def crossing(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recording, Run, Log, Path]:
+    made = simulated(FOUR_WAY, horizon=2.0, seed=1)
+    path = tmp_path_factory.mktemp("log") / "drive.mcap"
+    return (made, *written(made, "robust", path), path)
+
+
+def test_the_recording_is_read_back_bit_for_bit(crossing: Any) -> None:
+    made, _, _, path = crossing
+    assert differences(made, read_recording(path)) == []
+
+
+def test_schemas_are_those_that_foxglove_publishes(crossing: Any) -> None:
+    """The descriptors in the file have every field of the published package, with the same number and type."""
+    from foxglove_schemas_protobuf import (
+        CameraCalibration_pb2,
+        CompressedImage_pb2,
+        FrameTransforms_pb2,
+        ImageAnnotations_pb2,
+        SceneUpdate_pb2,
+    )
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+
+    published = {
+        "foxglove.CameraCalibration": CameraCalibration_pb2.CameraCalibration,
+        "foxglove.CompressedImage": CompressedImage_pb2.CompressedImage,
+        "foxglove.FrameTransforms": FrameTransforms_pb2.FrameTransforms,
+        "foxglove.ImageAnnotations": ImageAnnotations_pb2.ImageAnnotations,
+        "foxglove.SceneUpdate": SceneUpdate_pb2.SceneUpdate,
+    }
+    found = {schema.name: schema for rows in crossing[2].messages.values() for schema, _, _ in rows}
+    assert published.keys() <= found.keys()
+    for name, kind in published.items():
+        assert found[name].encoding == "protobuf"
+        files = FileDescriptorSet.FromString(found[name].data).file
+        (message,) = (m for f in files for m in f.message_type if f"{f.package}.{m.name}" == name)
+        told = {field.name: (field.number, field.type) for field in message.field}
+        for field in kind.DESCRIPTOR.fields:
+            assert told[field.name] == (field.number, field.type), f"{name}.{field.name}"
+
+
+def test_messages_come_in_the_order_of_time_with_wall_clock_stamps(crossing: Any) -> None:
+    made, _, log, _ = crossing
+    assert log.order == sorted(log.order)
+    assert log.order[0] == round(START * 1e9)
+    for k, (_, when, message) in zip(range(0, made.ticks, 3), log.messages["/tf"], strict=True):
+        assert when == pytest.approx(START + k * made.dt, abs=1e-6)
+        stamp = message.transforms[0].timestamp
+        assert stamp.seconds + 1e-9 * stamp.nanos == pytest.approx(when, abs=1e-6)
+
+
+def test_the_scene_has_buildings_roads_landmarks_with_names_and_vehicles(crossing: Any) -> None:
+    made, _, log, _ = crossing
+    scenario, world = made.scenario, log.entities("/scene/world")
+    names = made.setups[0].target_names[: made.landmarks.shape[1]]
+    assert {f"landmark {name}" for name in names} <= world.keys()
+    assert {f"building {building.name}" for building in scenario.obstacles} <= world.keys()
+    assert len(world["roads"].triangles[0].points) == 6 * len(scenario.roads)
+    for i, name in enumerate(names):
+        entity = world[f"landmark {name}"]
+        assert entity.texts[0].text == name and entity.frame_id == "map"
+        place = entity.spheres[0].pose.position
+        np.testing.assert_allclose([place.x, place.y, place.z], made.landmarks[0, i], rtol=1e-6, atol=1e-6)
+    vehicles = log.entities("/scene/vehicles")
+    assert vehicles.keys() == {f"vehicle_{i}{kind}" for i in range(1, 5) for kind in ("", " estimate")}
+    box = vehicles["vehicle_2"]
+    assert box.frame_locked and box.frame_id == "vehicle_2"
+    size = box.cubes[0].size
+    np.testing.assert_allclose([size.x, size.y, size.z], scenario.vehicles[1].body.size, rtol=1e-6)
+
+
+def test_transforms_are_the_poses(crossing: Any) -> None:
+    made, result, log, _ = crossing
+    for n, message in enumerate(log["/tf"]):
+        frames = {t.child_frame_id: t for t in message.transforms}
+        k = 3 * n
+        for i in range(4):
+            for name, R, p in (
+                (f"vehicle_{i + 1}", made.truth.rotation[k, i], made.truth.position[k, i]),
+                (f"vehicle_{i + 1}/estimate", result.rotation[k, i], result.position[k, i]),
+            ):
+                t, q = frames[name].translation, frames[name].rotation
+                assert frames[name].parent_frame_id == "map"
+                np.testing.assert_allclose([t.x, t.y, t.z], p, rtol=1e-6, atol=1e-5)
+                np.testing.assert_allclose(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), R, atol=1e-5)
+
+
+def test_lines_of_sight_end_where_the_measured_bearings_point(crossing: Any) -> None:
+    made, _, log, _ = crossing
+    seen = 0
+    for n, message in enumerate(log["/scene/sight"]):
+        entities = {entity.id: entity for entity in message.entities}
+        for i in range(4):
+            lines = entities[f"sight of vehicle_{i + 1}"].lines
+            targets = np.flatnonzero(made.visible[3 * n, i])
+            ends = np.array([[p.x, p.y, p.z] for p in lines[0].points]) if lines else np.empty((0, 3))
+            assert len(ends) == 2 * len(targets)
+            for target, start, end in zip(targets, ends[::2], ends[1::2], strict=True):
+                way = made.truth.rotation[3 * n, i].T @ (end - start)
+                assert way @ made.bearings[3 * n, i, target] == pytest.approx(np.linalg.norm(way), rel=2e-3)
+                seen += 1
+    assert seen > 50
+
+
+def test_estimates_have_the_covariance_in_the_maps_axes(crossing: Any) -> None:
+    from coopenv.backends.mcap.messages import codec
+
+    made, result, log, _ = crossing
+    P = covariance_in_map(result.coordinates, result.rotation, result.position, result.covariance)
+    stated = 0
+    for n, data in enumerate(log["/vehicle_3/estimate"]):
+        message = codec().deserialize_cdr(data, "geometry_msgs/msg/PoseWithCovarianceStamped")
+        p, found = message.pose.pose.position, message.pose.covariance.reshape(6, 6)
+        np.testing.assert_allclose([p.x, p.y, p.z], result.position[3 * n, 2], rtol=1e-6, atol=1e-5)
+        if np.isfinite(P[3 * n, 2]).all():
+            np.testing.assert_allclose(found, P[3 * n, 2], rtol=1e-5, atol=1e-9)
+            stated += 1
+        else:
+            assert not found.any()
+    assert stated > 30
+    balls = log.entities("/scene/uncertainty", 20)["3 sigma of vehicle_3"].spheres[0]
+    sizes = sorted([balls.size.x, balls.size.y, balls.size.z])
+    np.testing.assert_allclose(sizes, 6.0 * np.sqrt(np.linalg.eigvalsh(P[60, 2, :3, :3])), rtol=1e-4)
+    assert log["/vehicle_3/error"][20]["position_error_m"] == pytest.approx(result.position_error[60, 2], rel=1e-4)
+    assert made.ticks == 121
+
+
+@pytest.mark.parametrize("coordinates", Coordinates)
+def test_covariances_turn_to_the_map_as_errors_do(coordinates: Coordinates) -> None:
+    """By derivatives of the definition of the error, taken numerically."""
+    rng = np.random.default_rng(3)
+    R_hat, p_hat = Rotation.random(random_state=4).as_matrix(), np.array([7.0, -3.0, 2.0])
+    root = rng.standard_normal((6, 6))
+    expected = root @ root.T  # of (position, rotation about the map's axes)
+    step = 1e-6
+    columns = []
+    for axis in np.eye(6):
+        ends = []
+        for sign in (1.0, -1.0):
+            d, phi = sign * step * axis[:3], sign * step * axis[3:]
+            R = Rotation.from_rotvec(phi).as_matrix() @ R_hat
+            ends.append(coordinates.error(R[None], (p_hat + d)[None], R_hat[None], p_hat[None])[0])
+        columns.append((ends[0] - ends[1]) / (2 * step))
+    J = np.array(columns).T
+    found = covariance_in_map(coordinates, R_hat, p_hat, J @ expected @ J.T)
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
+
+
+def test_projected_targets_are_where_the_camera_measured_them(crossing: Any) -> None:
+    """Undistorted pixels of the annotations, by the calibration in the file, are the bearings again."""
+    from coopenv.svea.lens import directions, undistort
+
+    made, _, log, _ = crossing
+    (calibration,) = log["/vehicle_1/camera/calibration"]
+    assert (calibration.width, calibration.height) == (316, 208)
+    assert calibration.distortion_model == "plumb_bob" and len(calibration.D) == 5
+    K = np.array(calibration.K).reshape(3, 3)
+    mounted = {t.child_frame_id: t.rotation for t in log["/tf"][0].transforms}["vehicle_1/camera"]
+    R = Rotation.from_quat([mounted.x, mounted.y, mounted.z, mounted.w]).as_matrix()
+    names, seen = list(made.setups[0].target_names), 0
+    for n, message in enumerate(log["/vehicle_1/camera/annotations"]):
+        for circle, label in zip(message.circles, message.texts, strict=True):
+            pixel = np.array([circle.position.x, circle.position.y])
+            assert (pixel > -2).all() and (pixel < [318, 210]).all()  # bearings have noise
+            flat, there = undistort(((pixel - K[:2, 2]) / K[[0, 1], [0, 1]])[None], tuple(calibration.D))
+            bearing = made.bearings[3 * n, 0, names.index(label.text)]
+            assert there.all()
+            np.testing.assert_allclose(R @ directions(flat)[0], bearing, atol=1e-5)
+            seen += 1
+    assert seen > 20
+    (image,) = log["/vehicle_1/camera/image"]
+    assert image.format == "png" and image.data.startswith(b"\x89PNG")
+
+
+def test_distortion_moves_the_targets() -> None:
+    from coopenv.viz.foxglove.camera import pixels
+
+    rays = np.array([[0.3, 0.2, 0.9], [0.0, 0.0, 1.0], [0.1, 0.1, -0.5]])
+    straight, ahead = pixels(rays, Camera(model="pinhole"))
+    bent, _ = pixels(rays, Camera(model="pinhole", distortion=(-0.35, 0.14, 0.0, 0.0, 0.0)))
+    assert ahead.tolist() == [True, True, False]
+    np.testing.assert_allclose(straight[1], Camera().principal_point)
+    assert np.linalg.norm(bent[0] - straight[0]) > 4.0
+
+
+def test_what_is_shown_costs_little(crossing: Any) -> None:
+    """At 20 Hz, in single precision: less than two thirds of what the recording itself takes."""
+    sizes = crossing[2].sizes
+    shown = {t: n for t, n in sizes.items() if t.startswith(("/scene", "/tf")) or t.endswith(("error", "estimate"))}
+    shown |= {t: n for t, n in sizes.items() if "/camera/" in t}
+    assert sum(shown.values()) < 0.66 * (sum(sizes.values()) - sum(shown.values()))
+
+
+def test_gain_matrices_are_no_covariances(tmp_path: Path) -> None:
+    from coopenv.backends.mcap.messages import codec
+    from coopenv.viz.foxglove import views
+
+    made, path = simulated("crossing_path", horizon=22.0), tmp_path / "gain.mcap"
+    shown = views(made, run("riccati", made), gain=True)
+    write_recording(made, path, views=shown)
+    log = Log(path)
+    assert "/scene/uncertainty" not in log.messages
+    for data in log["/vehicle_1/estimate"]:
+        assert not codec().deserialize_cdr(data, "geometry_msgs/msg/PoseWithCovarianceStamped").pose.covariance.any()
+    assert log["/vehicle_1/error"][-1]["nees"] is None
+    assert len(log["/scene/landmarks"]) == len(log["/tf"])  # the moving one
+    assert {entity.id for entity in log["/scene/landmarks"][3].entities} == {"landmark ML"}
+
+
+def test_the_command_writes_a_scene_and_a_layout_of_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    record = ["record", FOUR_WAY, "--set", "horizon=0.5", "--out"]
+    assert main([*record, "a.mcap", "--observer", "robust"]) == 0
+    assert main([*record, "b.mcap", "--no-scene"]) == 0
+    assert differences(read_recording("a.mcap"), read_recording("b.mcap")) == []
+    capsys.readouterr()
+    assert main(["export", "a.mcap", "--format", "foxglove-layout"]) == 0
+    assert "foxglove_layout.json: import it in Foxglove" in capsys.readouterr().out
+    layout = json.loads(Path("foxglove_layout.json").read_text())
+    topics = set(Log(Path("a.mcap")).messages)
+    panels = layout["configById"]
+    assert panels["3D!scene"]["topics"].keys() <= topics
+    assert {t for t, shown in panels["3D!scene"]["topics"].items() if shown["visible"]} == {
+        *("/scene/world", "/scene/vehicles", "/scene/sight", "/scene/uncertainty")
+    }
+    mode = panels["Image!camera"]["imageMode"]
+    assert {mode["imageTopic"], mode["calibrationTopic"], *mode["annotations"]} <= topics
+    for name in ("Plot!position", "Plot!orientation"):
+        for path in panels[name]["paths"]:
+            topic, _, column = path["value"].partition(".")
+            assert column in Log(Path("a.mcap"))[topic][0]
+
+    def leaves(node: Any) -> list[str]:
+        return [node] if isinstance(node, str) else [*leaves(node["first"]), *leaves(node["second"])]
+
+    assert sorted(leaves(layout["layout"])) == sorted(panels)
+    assert main(["export", "b.mcap", "--format", "foxglove-layout"]) == 2
+    assert "b.mcap: has no scene, `coopenv record --scene` writes one" in capsys.readouterr().err
+    assert main(["export", "nowhere.mcap", "--format", "foxglove-layout"]) == 2
+    assert "nowhere.mcap: cannot be read" in capsys.readouterr().err
+    assert main([*record, "c.mcap", "--no-scene", "--observer", "robust"]) == 2
+    assert "--observer robust: is for a scene" in capsys.readouterr().err
+    assert main([*record, "c.mcap", "--observer", "robst"]) == 2
+    assert "unknown observer 'robst' (did you mean 'robust'?)" in capsys.readouterr().err
+    assert not Path("c.mcap").exists()
