@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
+
+from tests.helpers.chromium import chromium
 
 APPROVED = Path(__file__).parent / "approved"
 SIZES = {"laptop": (1280, 800), "phone": (390, 844)}
@@ -61,15 +62,9 @@ class Watched:
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
-    """Debian's chromium."""
-    sync = pytest.importorskip("playwright.sync_api", reason="needs chromium and playwright: make test-browser")
-    path = shutil.which("chromium")
-    if path is None:
-        pytest.skip("needs chromium and playwright: make test-browser")
-    with sync.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=path, args=SOFTWARE)
+    """A browser without a graphics card."""
+    with chromium(SOFTWARE) as started:
         yield started
-        started.close()
 
 
 @pytest.fixture(params=SIZES)
