@@ -111,17 +111,21 @@ MAX_BEARING_COST = 25.0
 nothing."""
 MAX_PRIOR_COST = 50.0  # most that being far from the prior costs: that may be wrong altogether
 PRUNE_GAP = 30.0  # by how much the cost may exceed the least one: odds of exp(-15)
-MAX_BEST_COST = 80.0
-"""Most that the best may cost beyond twice what is expected of a true one: `MAX_PRIOR_COST` and one wrong bearing."""
-CLEAR_TIME, PATIENCE = 0.25, 15.0
-"""s, for which all solutions must have been well determined, and after which that is asked no more. Chosen."""
+MAX_MISFIT = 50.0
+"""Most that the best may cost beyond twice what is expected of a true one: two wrong bearings."""
+CLEAR_TIME, PATIENCE = 0.25, 2.0
+"""s, for which all solutions must have been well determined, and after which that is asked no more. Tuned."""
 DOUBT_TIME = 0.1
 """s from a frame in which a solution was not well determined to the next look: what has to change is the vehicle's
 place, or what its neighbours know. Chosen."""
-MIN_SEARCH_TIME = 0.5  # s, before a hypothesis becomes the belief. Chosen
+MIN_SEARCH_TIME, MIN_DOUBTFUL_TIME = 0.5, 3.0
+"""s, before a hypothesis becomes the belief; where a solution was not well determined. Tuned."""
+SURE = 4.0
+"""Times smaller than to tell others the variances of a pose that is found must be. Chosen: half the deviation."""
 MAX_SPEED = 1.0  # m/s at which a sender may have gone on since a message that is used in the search. Chosen
-CORRELATION_FACTOR = 4.0
-"""Factor of a neighbour's variance in the search: its error changes slowly and does not average out. Tuned."""
+CORRELATION_FACTOR, CORRELATION_TIME = 4.0, 1.0
+"""Factor of a neighbour's variance in a frame that is solved; s for which its error is the same while hypotheses are
+followed, so that all frames of that time count as one. Tuned."""
 SAME_HYPOTHESIS, SAME_PRIOR = 16.0, 30.0
 """Squared distance, in standard deviations, below which two hypotheses are one (chi-square of 6, 0.986), and one is the
 prior (1 - 4e-5)."""

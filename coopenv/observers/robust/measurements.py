@@ -16,6 +16,7 @@ from coopenv.observers.robust.constants import (
     BEND_TIME,
     CONSIDERED_BEND_TIME,
     CORRELATION_FACTOR,
+    CORRELATION_TIME,
     MAX_ACCELERATION,
     MAX_SPEED,
     MEMBER_BEND_TIME,
@@ -73,13 +74,19 @@ def is_heard(model: Any, state: Any, memory: Any, world: int, i: int, sender: in
 
 
 @wp.func
-def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, tick: int):
-    """Return the variance per axis, m^2, of where a sender says that it is, as it counts in the search."""
+def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, tick: int, period: Any):
+    """Return the variance per axis, m^2, of where a sender says that it is, as it counts in the search.
+
+    Hypotheses are followed through many frames, in all of which that error is much the same.
+    """
     P = memory.inbox[world, i, sender].P
     variance = (wp.float64(P[3, 3]) + wp.float64(P[4, 4]) + wp.float64(P[5, 5])) * wp.float64(THIRD)
     age = wp.float64(tick - memory.inbox[world, i, sender].tick) * model.camera_period
     gone = wp.float64(MAX_SPEED) * age
-    return wp.float64(CORRELATION_FACTOR) * (variance + gone * gone)
+    factor = wp.float64(CORRELATION_FACTOR)
+    if memory.search[world, i].hypotheses > 0:
+        factor = wp.max(factor, wp.float64(CORRELATION_TIME) / period)
+    return factor * (variance + gone * gone)
 
 
 @wp.func
@@ -122,7 +129,7 @@ def set_line_to_member(
 
 @wp.func
 def set_line_to_target(
-    model: Any, state: Any, memory: Any, world: int, i: int, n: int, target: int, tick: int, purpose: int
+    model: Any, state: Any, memory: Any, world: int, i: int, n: int, target: int, tick: int, period: Any, purpose: int
 ) -> bool:
     """Let the n-th line be the bearing to a target in view; return whether that can be used now."""
     b = vec3d(body_bearing(model, state, world, i, target))
@@ -134,7 +141,7 @@ def set_line_to_target(
     if purpose == SEARCH:
         heard = heard and not is_barred(memory, world, i, sender, tick)
         if heard:
-            variance = received_variance(model, memory, world, i, sender, tick)
+            variance = received_variance(model, memory, world, i, sender, tick, period)
             set_line(memory, world, n, 0, b, memory.inbox[world, i, sender].pose.p, variance)
         return heard
     member = index_of(memory, world, i, sender)
@@ -154,7 +161,7 @@ def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
     for n in range(model.target_count[i]):
         target = model.targets[i, n]
         if state.sight[world, i, target] == VISIBLE:
-            if set_line_to_target(model, state, memory, world, i, lines, target, tick, purpose):
+            if set_line_to_target(model, state, memory, world, i, lines, target, tick, period, purpose):
                 lines += 1
     mounting = int(0)
     variance = bearing_variance(model, i)
@@ -240,14 +247,13 @@ def linearise(frame: Frame, memory: Any, world: int, i: int, n: int):
 
 
 @wp.func
-def innovation_squared(frame: Frame, memory: Any, world: int, i: int, n: int):
-    """Linearise a line and return its normalised innovation squared, infinite where the target is not ahead."""
-    if not linearise(frame, memory, world, i, n):
-        return wp.float64(wp.inf)
+def innovation_with(frame: Frame, memory: Any, world: int, i: int, n: int, more: Any):
+    """Return the normalised innovation squared of a line that has been linearised, with more noise per axis, rad^2."""
     member = memory.line[world, n].member
     residual = memory.line[world, n].residual
     H = memory.line[world, n].jacobian
-    S = memory.line[world, n].noise * wp.identity(2, wp.float64) + (H * memory.P[world, i, 0, 0]) * wp.transpose(H)
+    noise = memory.line[world, n].noise + more
+    S = noise * wp.identity(2, wp.float64) + (H * memory.P[world, i, 0, 0]) * wp.transpose(H)
     if member > 0:
         G = memory.line[world, n].member_jacobian
         cross = (H * memory.P[world, i, 0, member]) * wp.transpose(G)
@@ -261,3 +267,11 @@ def innovation_squared(frame: Frame, memory: Any, world: int, i: int, n: int):
         own = (J * memory.P[world, i, frame.mounting, frame.mounting]) * wp.transpose(J)
         S = S + cross + wp.transpose(cross) + own
     return wp.dot(residual, wp.inverse(S) * residual)
+
+
+@wp.func
+def innovation_squared(frame: Frame, memory: Any, world: int, i: int, n: int):
+    """Linearise a line and return its normalised innovation squared, infinite where the target is not ahead."""
+    if not linearise(frame, memory, world, i, n):
+        return wp.float64(wp.inf)
+    return innovation_with(frame, memory, world, i, n, wp.float64(0.0))

@@ -123,6 +123,7 @@ class Search:
     prior: Estimate  # carried on by odometry
     hypotheses: wp.int32  # how many
     followed_time: wp.float64  # s for which hypotheses have been followed
+    least_time: wp.float64  # s for which they have to be before one is believed
     waited_time: wp.float64  # s for which there were none
     clear_time: wp.float64  # s for which the frames' solutions have been well determined; below 0: s to the next look
     attempts: wp.int32
@@ -133,9 +134,9 @@ class Hypothesis:
     """A pose that may be the vehicle's."""
 
     estimate: Estimate
-    cost: wp.float64  # sum of normalised innovations squared, each limited
+    cost: wp.float64  # sum of normalised innovations squared, each limited, by the noise common to all hypotheses
     prior_distance: wp.float64  # squared, in standard deviations
-    bearings: wp.int32  # in the cost
+    misfit: wp.float64  # sum of what bearings cost by its own noise, less twice what is expected of a true one
 
 
 @wp.struct
@@ -163,6 +164,7 @@ class Line:
     member_jacobian: mat26d  # H of the member's error
     mounting_jacobian: mat26d  # H of that of the mounting
     noise: wp.float64  # rad^2 per axis
+    common_noise: wp.float64  # rad^2, the largest for any hypothesis
     distance: wp.float64  # m
     residual: vec2d  # rad
     weight: mat22d  # 1/rad^2, inverse of the innovation's covariance

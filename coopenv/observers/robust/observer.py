@@ -14,7 +14,7 @@ from coopenv.estimation.linalg import symmetric_part
 from coopenv.estimation.so3 import orthonormalise, skew
 from coopenv.observers.robust.algebra import distance_squared, is_known, odometry_noise, sheared
 from coopenv.observers.robust.belief import begin_belief, own_estimate
-from coopenv.observers.robust.constants import SAME_PRIOR
+from coopenv.observers.robust.constants import SAME_PRIOR, SURE
 from coopenv.observers.robust.measurements import RESECTION, TRACKING, set_lines
 from coopenv.observers.robust.memory import Estimate, Pose, clear, mat33d, vec3d
 from coopenv.observers.robust.mounting import walk_mounting
@@ -108,7 +108,7 @@ def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, s
     if standing == BELIEVING:
         memory.search[world, i].active = 0
         update(model, state, memory, world, i, now, frame)
-    elif resect(frame, memory, world, i) and is_known(memory.P[world, i, 0, 0]):
+    elif resect(frame, memory, world, i) and is_known(wp.float64(SURE) * memory.P[world, i, 0, 0]):
         memory.search[world, i].active = 0
 
 

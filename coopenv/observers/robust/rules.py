@@ -47,15 +47,15 @@ def rules_for(members: int) -> dict[str, Rule]:
     )
     ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick"
     large = (
-        "hypothesis.cost hypothesis.prior_distance line.variance line.noise line.weight scratch.column gain "
-        "word.certainty"
+        "hypothesis.cost hypothesis.misfit hypothesis.prior_distance line.variance line.noise line.common_noise "
+        "line.weight scratch.column gain word.certainty"
     )
     rules = {
         **dict.fromkeys(flags.split(), FLAG),
         **dict.fromkeys(ticks.split(), TICK),
         **dict.fromkeys(large.split(), LARGE),
         **dict.fromkeys(("belief.odometry.R", "anchor.estimate.pose.R", "anchor.odometry.R"), ROTATION),
-        **dict.fromkeys(("search.attempts", "hypothesis.bearings", "belief.told_interval"), whole(0, 10**9)),
+        **dict.fromkeys(("search.attempts", "belief.told_interval"), whole(0, 10**9)),
         "word.offences": whole(0, MAX_OFFENCES),
         "word.barred_until": whole(0, 2**31 - 1),
         "belief.members": whole(1, members),

@@ -2,7 +2,8 @@
 
 Each hypothesis is a small filter of its own; one that predicts the bearings much worse than the best is given up. It
 costs its normalised innovations squared, each limited, so that the difference of two costs is twice the logarithm of
-their likelihoods' ratio; those that cost least come first. While a vehicle searches it believes nothing, so that the
+their likelihoods' ratio; those that cost least come first. For that their noise must be the same: a vague hypothesis,
+whose linearisation leaves more out, would win by its noise. While a vehicle searches it believes nothing, so that the
 belief's arrays serve to correct one hypothesis after the other.
 """
 
@@ -14,7 +15,7 @@ from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import carried, distance_squared, is_known
 from coopenv.observers.robust.belief import begin_belief, own_estimate
 from coopenv.observers.robust.correction import iterated_update
-from coopenv.observers.robust.measurements import SEARCH, innovation_squared, set_lines
+from coopenv.observers.robust.measurements import SEARCH, innovation_squared, innovation_with, linearise, set_lines
 from coopenv.observers.robust.memory import Estimate, Frame, Hypothesis, Pose, Search
 from coopenv.observers.robust.solutions import is_new, next_triple, solve_triple
 
@@ -25,6 +26,7 @@ def begin_search(memory: Any, world: int, i: int, prior: Estimate):
     memory.search[world, i] = Search()
     memory.search[world, i].active = 1
     memory.search[world, i].prior = prior
+    memory.search[world, i].least_time = wp.float64(constants.MIN_SEARCH_TIME)
 
 
 @wp.func
@@ -62,16 +64,43 @@ def prune(memory: Any, world: int, i: int):
     """Give up what costs much more than the best, what is the same as a better one, and all if the best is not good."""
     sort_hypotheses(memory, world, i)
     least = memory.hypothesis[world, i, 0].cost
-    expected = wp.float64(2.0) * wp.float64(memory.hypothesis[world, i, 0].bearings)
+    misfit = memory.hypothesis[world, i, 0].misfit
     kept = int(0)
     for h in range(memory.search[world, i].hypotheses):
         near = memory.hypothesis[world, i, h].cost <= least + wp.float64(constants.PRUNE_GAP)
         if near and is_new(memory, world, i, h, kept):
             memory.hypothesis[world, i, kept] = memory.hypothesis[world, i, h]
             kept += 1
-    if least > wp.float64(constants.MAX_BEST_COST) + wp.float64(2.0) * expected:
+    if misfit > wp.float64(constants.MAX_MISFIT):
         kept = 0
     memory.search[world, i].hypotheses = kept
+
+
+@wp.func
+def set_common_noise(frame: Frame, memory: Any, world: int, i: int):
+    """Set for every line the largest noise that it has for any hypothesis, by which all of them are compared."""
+    for n in range(frame.lines):
+        memory.line[world, n].common_noise = wp.float64(0.0)
+    for h in range(memory.search[world, i].hypotheses):
+        begin_belief(memory, world, i, memory.hypothesis[world, i, h].estimate)
+        for n in range(frame.lines):
+            linearise(frame, memory, world, i, n)
+            noise = memory.line[world, n].noise
+            memory.line[world, n].common_noise = wp.max(memory.line[world, n].common_noise, noise)
+
+
+@wp.func
+def expected_of(frame: Frame, memory: Any, world: int, n: int):
+    """Return the normalised innovation squared of a line that is expected of a true hypothesis.
+
+    Noise that is not the camera's stands for an error that is the same for a while, times the frames in that.
+    """
+    time = wp.float64(constants.BEND_TIME)
+    if memory.line[world, n].variance > wp.float64(0.0):
+        time = wp.float64(constants.CORRELATION_TIME)
+    noise = memory.line[world, n].noise
+    lasting = (noise - frame.variance) / wp.max(time / frame.period, wp.float64(1.0))
+    return wp.float64(2.0) * (frame.variance + lasting) / noise
 
 
 @wp.func
@@ -85,8 +114,13 @@ def follow_hypothesis(frame: Frame, memory: Any, world: int, i: int, h: int, use
             nis = innovation_squared(frame, memory, world, i, n)
             if nis < wp.float64(constants.BEARING_GATE):
                 fits = 1
-            memory.hypothesis[world, i, h].cost += wp.min(nis, wp.float64(constants.MAX_BEARING_COST))
-            memory.hypothesis[world, i, h].bearings += 1
+            cost = nis
+            if wp.isfinite(nis):
+                more = memory.line[world, n].common_noise - memory.line[world, n].noise
+                cost = innovation_with(frame, memory, world, i, n, more)
+            memory.hypothesis[world, i, h].cost += wp.min(cost, wp.float64(constants.MAX_BEARING_COST))
+            memory.hypothesis[world, i, h].misfit += wp.min(nis, wp.float64(constants.MAX_BEARING_COST))
+            memory.hypothesis[world, i, h].misfit -= wp.float64(2.0) * expected_of(frame, memory, world, n)
         memory.line[world, n].fits = fits
         fitting += fits
     if fitting > 0:
@@ -144,8 +178,10 @@ def solve_chosen(frame: Frame, memory: Any, world: int, i: int, lines: Any, peri
             distance = distance_squared(memory.search[world, i].prior, memory.hypothesis[world, i, h].estimate)
             memory.hypothesis[world, i, h].cost = wp.min(distance, wp.float64(constants.MAX_PRIOR_COST))
             memory.hypothesis[world, i, h].prior_distance = distance
-            memory.hypothesis[world, i, h].bearings = 0
+            memory.hypothesis[world, i, h].misfit = wp.float64(0.0)
         clear = wp.float64(0.0)
+        least = wp.where(patient, wp.float64(constants.MIN_SEARCH_TIME), wp.float64(constants.MIN_DOUBTFUL_TIME))
+        memory.search[world, i].least_time = least
     memory.search[world, i].clear_time = clear
     return following
 
@@ -182,6 +218,7 @@ def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now:
         if frame.lines < 3:
             return False
         lines, solved = begin_hypotheses(frame, memory, world, i, now.period)
+    set_common_noise(frame, memory, world, i)
     for h in range(memory.search[world, i].hypotheses):
         used = wp.vec3i(-1, -1, -1)
         if h < solved:
@@ -194,4 +231,4 @@ def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now:
     memory.search[world, i].followed_time += now.period
     prune(memory, world, i)
     alone = memory.search[world, i].hypotheses == 1
-    return alone and memory.search[world, i].followed_time >= wp.float64(constants.MIN_SEARCH_TIME)
+    return alone and memory.search[world, i].followed_time >= memory.search[world, i].least_time

@@ -31,6 +31,7 @@ from coopenv.observers.robust.constants import (
     MIN_VELOCITY_STD,
     MOUNTING_WALK,
     SAME_TIME,
+    SURE,
 )
 from tests.oracles.robust.belief import Belief, Member
 from tests.oracles.robust.matrices import solve_positive
@@ -167,7 +168,7 @@ class Common:
             self._look(tick)
             return
         self._begin(found, tick)
-        if resect(self.belief, lambda: self._view(tick, True)) and is_known(self.belief.P[:6, :6]):
+        if resect(self.belief, lambda: self._view(tick, True)) and is_known(SURE * self.belief.P[:6, :6]):
             self.search = None
 
     def _begin(self, pose: Belief, tick: Tick) -> None:

@@ -18,15 +18,18 @@ from coopenv.estimation.rotations import tangent_basis
 from coopenv.observers.contract import Tick
 from coopenv.observers.robust.constants import (
     BEARING_GATE,
+    BEND_TIME,
     CLEAR_TIME,
     CORRELATION_FACTOR,
+    CORRELATION_TIME,
     DOUBT_TIME,
     KNOWN_ANGLE,
     KNOWN_POSITION,
     MAX_BEARING_COST,
-    MAX_BEST_COST,
     MAX_HYPOTHESES,
+    MAX_MISFIT,
     MAX_PRIOR_COST,
+    MIN_DOUBTFUL_TIME,
     MIN_SEARCH_TIME,
     PATIENCE,
     PERTURBATION,
@@ -60,7 +63,8 @@ class Hypothesis:
     paid: float
     surprise: float
     """Squared distance from the prior, which ranks those that have paid the same."""
-    bearings: int = 0
+    misfit: float = 0.0
+    """What it has paid by its own noise, less twice what a true one pays."""
 
     @property
     def price(self) -> tuple[float, float]:
@@ -83,6 +87,7 @@ class Search:
         self.prior = Belief(vehicle, R, p, P)
         self.bank: list[Hypothesis] = []
         self.age, self.waited, self.clear, self.attempts = 0.0, 0.0, 0.0, 0
+        self.least_age = MIN_SEARCH_TIME
         self.next_look = 0.0  # not before so much has been waited
 
     @property
@@ -102,10 +107,9 @@ class Search:
                 self._begin(tick, sightings, variance)
             return None
         self.age += tick.dt
-        for hypothesis in self.bank:
-            _follow(hypothesis, tick, sightings, variance)
+        _follow(self.bank, tick, sightings, variance, max(CORRELATION_FACTOR, CORRELATION_TIME / tick.dt))
         self._prune()
-        return self.bank[0].belief if len(self.bank) == 1 and self.age >= MIN_SEARCH_TIME else None
+        return self.bank[0].belief if len(self.bank) == 1 and self.age >= self.least_age else None
 
     def _begin(self, tick: Tick, sightings: list[Sighting], variance: float) -> None:
         """Follow a known prior at first; then a frame's solutions, too, if for a while all were well determined.
@@ -114,7 +118,8 @@ class Search:
         noise makes them come and go. A follower's leaders improve meanwhile, which sets them apart.
         """
         if self.attempts == 0 and is_known(self.prior.P):
-            self.bank, self.age, self.attempts = [self._prior(tick, sightings, variance)], 0.0, 1
+            self.bank, self.age, self.attempts = [self._prior()], 0.0, 1
+            _follow(self.bank, tick, sightings, variance, CORRELATION_FACTOR)
             return
         triples = sorted(combinations(range(len(sightings)), 3), key=lambda c: -_spread(sightings, c))
         three = triples[self.attempts % len(triples)]
@@ -129,19 +134,16 @@ class Search:
         if self.clear < CLEAR_TIME and self.waited < PATIENCE:
             return
         solutions = self._different(poses)
-        for hypothesis in solutions:
-            _follow(hypothesis, tick, [s for n, s in enumerate(sightings) if n not in three], variance)
-        if is_known(self.prior.P):
-            solutions.append(self._prior(tick, sightings, variance))
-        self.bank = sorted(solutions, key=lambda h: h.price)[:MAX_HYPOTHESES]
+        bank = [*solutions, self._prior()] if is_known(self.prior.P) else solutions
+        _follow(bank, tick, sightings, variance, CORRELATION_FACTOR, dict.fromkeys(range(len(solutions)), three))
+        self.bank = sorted(bank, key=lambda h: h.price)[:MAX_HYPOTHESES]
         self.age, self.clear, self.attempts = 0.0, 0.0, self.attempts + 1
+        self.least_age = MIN_SEARCH_TIME if self.waited < PATIENCE else MIN_DOUBTFUL_TIME
 
-    def _prior(self, tick: Tick, sightings: list[Sighting], variance: float) -> Hypothesis:
+    def _prior(self) -> Hypothesis:
         """Return the prior as a hypothesis."""
         own = self.prior.own
-        prior = Hypothesis(Belief(self.vehicle, own.R, own.p, self.prior.P.copy()), 0.0, 0.0)
-        _follow(prior, tick, sightings, variance)
-        return prior
+        return Hypothesis(Belief(self.vehicle, own.R, own.p, self.prior.P.copy()), 0.0, 0.0)
 
     def _poses(self, tick: Tick, three: list[Sighting], variance: float) -> list[Belief] | None:
         """Return the poses that explain three sightings; None if one of them is not well determined."""
@@ -182,8 +184,7 @@ class Search:
         for hypothesis in ranked:
             if hypothesis.paid <= ranked[0].paid + PRUNE_GAP and not any(_same(hypothesis, other) for other in kept):
                 kept.append(hypothesis)
-        best = kept[0]
-        self.bank = [] if best.paid > MAX_BEST_COST + 4.0 * best.bearings else kept
+        self.bank = [] if kept[0].misfit > MAX_MISFIT else kept
 
 
 def is_known(P: Array) -> bool:
@@ -225,11 +226,13 @@ def _perspectives(three: list[Sighting], variance: float) -> Iterator[tuple[Arra
     yield from zip(R[mask], camera[mask], strict=True)
 
 
-def _seen(belief: Belief, tick: Tick, sightings: list[Sighting], variance: float) -> tuple[Sight, Array]:
-    """Return sightings as measurements at a pose, and their variances (m,)."""
+def _seen(
+    belief: Belief, tick: Tick, sightings: list[Sighting], variance: float, factor: float = CORRELATION_FACTOR
+) -> tuple[Sight, Array]:
+    """Return sightings as measurements at a pose, and their variances (m,), with those of places times a factor."""
     b, z = np.array([s.bearing for s in sightings]), np.array([s.z for s in sightings])
     sight = belief.sight(b, tick.lever_arm, z, period=tick.dt)
-    places = CORRELATION_FACTOR * np.array([s.variance for s in sightings]) / sight.distance**2
+    places = factor * np.array([s.variance for s in sightings]) / sight.distance**2
     return sight, variance + places + sight.bend
 
 
@@ -244,18 +247,41 @@ def _covariance(belief: Belief, tick: Tick, sightings: list[Sighting], variance:
     return P if np.diag(P)[:3].max() < 1.0 else None
 
 
-def _follow(hypothesis: Hypothesis, tick: Tick, sightings: list[Sighting], variance: float) -> None:
-    """Let a hypothesis pay for a frame's sightings and learn from those that fit."""
-    if not sightings:
-        return
+def _follow(
+    bank: list[Hypothesis],
+    tick: Tick,
+    sightings: list[Sighting],
+    variance: float,
+    factor: float,
+    used: dict[int, tuple[int, ...]] | None = None,
+) -> None:
+    """Let hypotheses pay for a frame's sightings, but those used to find them, and learn from those that fit.
+
+    They pay by the largest noise that a sighting has for any of them.
+    """
+    common = np.max([_seen(h.belief, tick, sightings, variance, factor)[1] for h in bank], axis=0)
+    for h, hypothesis in enumerate(bank):
+        left = [n for n in range(len(sightings)) if n not in (used or {}).get(h, ())]
+        if left:
+            _follow_one(hypothesis, tick, [sightings[n] for n in left], variance, factor, common[left])
+
+
+def _follow_one(
+    hypothesis: Hypothesis, tick: Tick, sightings: list[Sighting], variance: float, factor: float, common: Array
+) -> None:
+    """Let one hypothesis pay and learn."""
     belief = hypothesis.belief
-    sight, noise = _seen(belief, tick, sightings, variance)
+    sight, noise = _seen(belief, tick, sightings, variance, factor)
     nis = sight.normalised(belief.P, noise)
-    hypothesis.paid += float(np.where(sight.ahead, np.minimum(nis, MAX_BEARING_COST), MAX_BEARING_COST).sum())
-    hypothesis.bearings += len(sightings)
+    paid = [np.where(sight.ahead, np.minimum(x, MAX_BEARING_COST), MAX_BEARING_COST) for x in
+            (nis, sight.normalised(belief.P, common))]  # fmt: skip
+    time = np.where([s.variance > 0.0 for s in sightings], CORRELATION_TIME, BEND_TIME)
+    lasting = (noise - variance) / np.maximum(time / tick.dt, 1.0)
+    hypothesis.misfit += float((paid[0] - 4.0 * (variance + lasting) / noise).sum())
+    hypothesis.paid += float(paid[1].sum())
     fits = sight.ahead & (nis < BEARING_GATE)
     if fits.any():
-        belief.settle(sight, noise, fits, lambda: _seen(belief, tick, sightings, variance))
+        belief.settle(sight, noise, fits, lambda: _seen(belief, tick, sightings, variance, factor))
 
 
 def _same(one: Hypothesis, other: Hypothesis) -> bool:
