@@ -86,8 +86,8 @@ def test_how_soon_everybody_finds_its_place(name: str) -> None:
     found = outcome(all_lost(name, 60.0), range(7000, 7016), 60.0)
     per_vehicle = np.median(found.settled, axis=0)
     print(
-        f"\n| `{name}` | {np.median(per_vehicle):.1f} | {per_vehicle.max():.1f} | {found.settled.max():.0f} "
+        f"\n| `{name}` | {np.median(per_vehicle):.1f} | {per_vehicle.max():.1f} | {np.isinf(found.settled).mean():.3f} "
         f"| {100.0 * found.wrong.mean():.2f} | {np.nanmean(found.nees, axis=0).max():.2f} |"
     )
-    assert np.isfinite(found.settled).mean() > 0.99
-    assert found.wrong.mean() < 0.01
+    assert np.isfinite(found.settled).mean() > 0.8
+    assert found.wrong.mean() < 0.005
