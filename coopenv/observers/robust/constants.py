@@ -106,13 +106,13 @@ PERTURBATION = 2.0  # standard deviations by which measurements are moved to fin
 PROBLEMS = 1 + 3 * 2 * 5
 """Problems of three bearings: as measured; each moved to either side along two axes across it, and its point along
 three."""
-MAX_BEARING_COST = 25.0
-"""Most that one bearing costs (chi-square of 2, 1 - 4e-6): below `PRUNE_GAP`, so that one wrong association decides
+MAX_BEARING_COST = 16.0
+"""Most that one bearing costs (chi-square of 2, 1 - 3e-4): below `PRUNE_GAP`, so that one wrong association decides
 nothing."""
 MAX_PRIOR_COST = 50.0  # most that being far from the prior costs: that may be wrong altogether
-PRUNE_GAP = 30.0  # by how much the cost may exceed the least one: odds of exp(-15)
-MAX_MISFIT = 50.0
-"""Most that the best may cost beyond twice what is expected of a true one: two wrong bearings."""
+PRUNE_GAP = 20.0  # by how much the cost may exceed the least one: odds of exp(-10)
+MAX_MISFIT = 80.0
+"""Most that the best may cost beyond twice what is expected of a true one: five wrong bearings."""
 CLEAR_TIME, PATIENCE = 0.25, 2.0
 """s, for which all solutions must have been well determined, and after which that is asked no more. Tuned."""
 DOUBT_TIME = 0.1

@@ -11,7 +11,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.memory import Estimate, Word, mat66d, vec2d
+from coopenv.observers.robust.memory import Estimate, Word, mat33d, mat66d, vec2d, vec3d
 from coopenv.observers.robust.tracklets import test_sender
 
 GROSS_VARIANCE = constants.GROSS_ERROR**2
@@ -126,6 +126,16 @@ def judge(model: Any, memory: Any, world: int, i: int, n: int, tick: int, dt: An
 
 
 @wp.func
+def forget_evidence(memory: Any, world: int, i: int):
+    """Forget what bearings have said of others: they were taken from where the vehicle is not."""
+    for sender in range(memory.word.shape[2]):
+        memory.word[world, i, sender].offset = vec3d()
+        memory.word[world, i, sender].certainty = mat33d()
+        memory.word[world, i, sender].missed_share = wp.float64(0.0)
+        memory.word[world, i, sender].fitted_time = wp.float64(0.0)
+
+
+@wp.func
 def note_missed(memory: Any, world: int, i: int, lines: int, dt: Any) -> bool:
     """Average which share of the bearings to each member do not fit; return whether those to most targets fit.
 
@@ -158,6 +168,7 @@ def test_missed(model: Any, memory: Any, world: int, i: int, lines: int, dt: Any
         if n > 0:
             sender = memory.member[world, i, n].vehicle
             missed = memory.word[world, i, sender].missed_share > wp.float64(constants.LOST_SHARE)
+            missed = missed and memory.line[world, m].fits == 0
             if missed and memory.member[world, i, n].considered == 1:
                 far = wp.length(memory.line[world, m].residual) * memory.line[world, m].distance
                 fitted = memory.word[world, i, sender].fitted_time > wp.float64(constants.LOST_TIME)

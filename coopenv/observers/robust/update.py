@@ -27,7 +27,7 @@ from coopenv.observers.robust.measurements import innovation_squared
 from coopenv.observers.robust.memory import Anchor, Estimate, Frame, mat66d, vec2d, vec6d
 from coopenv.observers.robust.odometry import begin_errors, lasting_noise
 from coopenv.observers.robust.search import begin_search
-from coopenv.observers.robust.trust import test_missed
+from coopenv.observers.robust.trust import forget_evidence, test_missed
 
 
 @wp.func
@@ -78,6 +78,7 @@ def is_sound(estimate: Estimate):
 @wp.func
 def lose(model: Any, memory: Any, world: int, i: int, tick: int):
     """Search anew, from where most bearings fitted, carried on by odometry since."""
+    forget_evidence(memory, world, i)
     anchor = memory.anchor[world, i]
     elapsed = wp.float64(tick - anchor.tick) * model.camera_period
     step = between(anchor.odometry, memory.belief[world, i].odometry)

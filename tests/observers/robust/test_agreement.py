@@ -87,8 +87,10 @@ CASES: dict[str, Callable[[float], Recording]] = {
 def check(recording: Recording, played: Played, tamper: Lie | None = None) -> None:
     result = run(Spoken, recording, tamper)
     assert not result.failure
-    assert_allclose(played.position[1:], result.position[1:], rtol=0, atol=1e-9)
-    assert_allclose(played.rotation[1:], result.rotation[1:], rtol=0, atol=1e-9)
+    for ours, theirs in ((played.position, result.position), (played.rotation, result.rotation)):
+        assert_allclose(ours[1:][~played.searching[1:]], theirs[1:][~played.searching[1:]], rtol=0, atol=1e-9)
+        # Where two solutions of three bearings nearly meet, they differ by the square root of what the bearings differ.
+        assert_allclose(ours[1:], theirs[1:], rtol=0, atol=1e-7)
     for k in range(1, recording.ticks, 50):
         for i in range(len(recording.setups)):
             P = result.covariance[k, i]
@@ -163,7 +165,7 @@ def test_it_does_so_while_a_follower_waits_for_its_leaders(seed: int) -> None:
     played = replayed(recording)
     check(recording, played)
     found = (~played.searching).argmax(axis=0) * recording.dt
-    assert found[3] < 6.0 < 10.0 < found[4] < 20.0
+    assert found[3] < 5.0 < 10.0 < found[4] < 20.0
 
 
 @pytest.mark.slow

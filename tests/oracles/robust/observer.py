@@ -212,6 +212,13 @@ class Robust(Common):
         self.belief.P[block, block] += self._by_clocks(member)
         return True
 
+    def _lose(self, time: float) -> None:
+        """Search anew, without what bearings have said of others from where the vehicle is not."""
+        super()._lose(time)
+        for sender, word in self.words.items():
+            drifts = {"drift": word.drift, "slow_drift": word.slow_drift}
+            self.words[sender] = Word(**drifts, offences=word.offences, barred_until=word.barred_until)
+
     def _word(self, sender: int) -> Word:
         """Return what is thought of a sender's word."""
         return self.words.setdefault(sender, Word())
@@ -308,6 +315,8 @@ class Robust(Common):
                 good, counts = word.missed < 0.5, self.contacts[member.vehicle].trusted
             balance += (2 * int(good) - 1) * counts
         for k, member in enumerate(of if balance > 0 else []):
+            if view.fits[k]:
+                continue
             if member is not None and member.considered and self._word(member.vehicle).missed > LOST_SHARE:
                 far = float(np.linalg.norm(view.sight.residual[k]) * view.sight.distance[k])
                 fitted = self._word(member.vehicle).fitted > LOST_TIME
