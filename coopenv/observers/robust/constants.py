@@ -7,7 +7,7 @@ MAX_MEMBERS, MAX_MEMBERS_JOINT = 5, 8
 `robust_joint`."""
 MAX_LINEARISATIONS, RELINEARISATION_ANGLE = 8, 0.05
 """Linearisations of one correction; how far it may turn a line of sight to be near, rad. Tuned."""
-BEND_TIME, MEMBER_BEND_TIME, CONSIDERED_BEND_TIME = 0.1, 1.0, 4.0
+BEND_TIME, MEMBER_BEND_TIME, CONSIDERED_BEND_TIME = 0.1, 1.0, 12.0
 """s for which what a bearing's linearisation leaves out is the same, so that all frames of that time count as one: to a
 landmark; to a member; and to one that is only considered, so that no later bearing repairs it. Tuned."""
 SAME_TIME = 1e-6  # s; times that differ by less differ by rounding only
@@ -78,9 +78,9 @@ LEAST_NEWS = 0.1
 learnt in small steps it has learnt by linearisations, which add up. Tuned."""
 STEP_GATE = 22.5
 """Gate of the squared size of such a step in standard deviations: chi-square of 6, 0.999."""
-MAX_TOLD_VARIANCE = 0.3**2
-"""m^2 per axis, of a sender that knows its place no better, at which nobody follows it: its steps are no small errors.
-Chosen."""
+MAX_TOLD_ANGLE = 0.01
+"""rad, by how much a standard deviation of a sender's position may turn the line of sight to it for its steps to be
+followed: larger ones are no small errors. Tuned."""
 RELATIVE_NOISE = 1e-6  # share of a variance, that regressions have as noise
 LEAST_FORGIVEN = 0.005
 """Share of its covariance that is added to that of a sender which depends on others. What is told of correlations is

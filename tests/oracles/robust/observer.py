@@ -35,7 +35,7 @@ from coopenv.observers.robust.constants import (
     LOST_SHARE,
     LOST_TIME,
     MAX_CORRELATIONS,
-    MAX_TOLD_VARIANCE,
+    MAX_TOLD_ANGLE,
     NEWS_TIME,
     SAME_TIME,
     SHARE_OF_CHANGE,
@@ -355,7 +355,8 @@ class Robust(Common):
         before = before[:, block]
         belief.P[block], belief.P[:, block] = row, row.T
         N = before - (1.0 - forgiven) * after + LEAST_NEWS * np.diag(before.diagonal())
-        vague = before[3:, 3:].trace() > 3.0 * MAX_TOLD_VARIANCE
+        reach = MAX_TOLD_ANGLE * float(np.linalg.norm(member.p - belief.own.p))
+        vague = before[3:, 3:].trace() > 3.0 * reach**2
         if not following or forgiven < 0.0 or vague or not is_positive(N) or d.dot(np.linalg.solve(N, d)) > STEP_GATE:
             return
         free = 6 * belief.others
