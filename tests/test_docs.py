@@ -14,7 +14,6 @@ import pytest
 
 from coopenv.api.reward import FIELDS, OTHERS
 from coopenv.api.terms.layout import observation_layout
-from coopenv.backends.mcap.topics import topics_of
 from coopenv.observers import registry, run
 from coopenv.observers.registry import find
 from coopenv.policies import load_agent
@@ -25,7 +24,6 @@ from coopenv.svea.deployment import Car, Deployment, Safety, Security, Sensors
 from coopenv.svea.network import GateLink, Network, Tls
 from coopenv.svea.remote import Remote
 from coopenv.svea.topics import TOPICS
-from coopenv.viz import FIGURE_NAMES
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -63,22 +61,6 @@ def test_the_tutorials_observer_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     # vehicles 1 to 3 see two landmarks and more, and turn towards them
     assert (result.orientation_error[-1, :3] < result.orientation_error[0, :3]).all()
     assert np.isfinite(result.position_error).all()
-
-
-def test_the_programs_on_figures_and_logs_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("mcap", reason="needs the extra 'log'")
-    pytest.importorskip("foxglove", reason="needs the extra 'log'")
-    monkeypatch.chdir(tmp_path)
-    blocks = python_blocks(DOCS / "figures.md")
-    assert len(blocks) == 3
-    for block in blocks:
-        exec(compile(block, "figures.md", "exec"), {})
-    assert {path.name for path in tmp_path.glob("figures/*")} == {f"{name}.pdf" for name in FIGURE_NAMES}
-    for name in ("errors.svg", "mine.pdf", "errors.tex", "errors.pdf"):
-        assert (tmp_path / name).stat().st_size > 400
-    (block,) = (block for block in python_blocks(DOCS / "replay.md") if "foxglove" in block)
-    exec(compile(block, "replay.md", "exec"), {})
-    assert "/scene/world" in topics_of("shown.mcap")
 
 
 def test_the_page_on_terms_lists_every_term() -> None:

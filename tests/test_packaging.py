@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tarfile
 import venv
 import zipfile
 from pathlib import Path
@@ -42,6 +43,18 @@ def test_wheel_contents(wheel: Path) -> None:
     tops = {Path(n).parts[0] for n in names}
     assert {t for t in tops if not t.endswith(".dist-info")} == {"coopenv"}
     assert "coopenv/py.typed" in names
+
+
+def test_the_source_distribution_is_the_repository(tmp_path: Path) -> None:
+    if not (ROOT / ".git").exists():
+        pytest.skip("what belongs to the repository is known to git alone")
+    run(sys.executable, "-m", "build", "--sdist", "--no-isolation", "--outdir", tmp_path, ROOT, cwd=tmp_path)
+    (built,) = tmp_path.glob("*.tar.gz")
+    with tarfile.open(built) as archive:
+        names = {name.partition("/")[2] for name in archive.getnames()}
+    tracked = {name for name in run("git", "ls-files", cwd=ROOT).splitlines() if (ROOT / name).exists()}
+    assert tracked - names == set()
+    assert {name.partition("/")[0] for name in names - tracked} <= {"PKG-INFO", *(n.partition("/")[0] for n in tracked)}
 
 
 @pytest.mark.slow

@@ -12,9 +12,6 @@ from coopenv.scenario.randomness import LEVELS, PARAMETERS
 SETTINGS = ("parameters", "difficulty")
 """Options that hold until they are given again."""
 
-IGNORED = ("options", "arm")
-"""What PettingZoo's own tests of conformance pass to every environment, and what lets cars drive: simulated ones do."""
-
 
 def checked_options(options: object, known: tuple[str, ...], ignored: tuple[str, ...] = ()) -> dict[str, Any]:
     """Return options by name.

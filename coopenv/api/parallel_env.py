@@ -12,11 +12,11 @@ from coopenv.api.actions import ActionReader
 from coopenv.api.choices import check_choice
 from coopenv.api.engine import Engine
 from coopenv.api.infos import InfoWriter, state_space, state_vector
-from coopenv.api.options import IGNORED, SETTINGS, checked_options, world_number, world_parameters
+from coopenv.api.options import SETTINGS, checked_options, world_number, world_parameters
 from coopenv.api.pictures import Pictures
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
-from coopenv.backends.base import EPISODE_OVER, Backend, Health
+from coopenv.backends.base import EPISODE_OVER, IGNORED_OPTIONS, Backend, Health
 from coopenv.backends.sources import simulation_of
 from coopenv.errors import CoopenvError, shown, suggest
 from coopenv.scenario import Scenario
@@ -141,7 +141,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         """
         first, own, parameters = 0, options or {}, None
         if self.engine.backend.capabilities.batched:
-            wanted, own = checked_options(options, ("world", *SETTINGS), IGNORED), {}
+            wanted, own = checked_options(options, ("world", *SETTINGS), IGNORED_OPTIONS), {}
             first, parameters = world_number(wanted.get("world", 0)), world_parameters(wanted, 1, self.scenario)
         keys = None if seed is None else world_keys(seed, 1, first)
         if keys is not None:

@@ -14,7 +14,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from coopenv.errors import CoopenvError
+from coopenv.errors import CoopenvError, shown, suggest
 from coopenv.estimation.arrays import Array
 from coopenv.observers.briefing import briefing_of
 from coopenv.observers.contract import Message
@@ -168,8 +168,15 @@ Episode = Generator[Sensed, Command, None]
 """Yields tick 0, and then one tick for every command that it is sent; it ends by returning, or by being closed."""
 
 
+IGNORED_OPTIONS = ("options", "arm")
+"""What PettingZoo's own tests of conformance pass to every environment, and what lets cars drive: simulated ones do."""
+
+
 class TickGenerator(ABC):
     """A backend that is told how an episode goes, in simulated time; see `Backend` for its methods."""
+
+    options: tuple[str, ...] = ()
+    """Names of the options of a reset that `episode` reads; others are refused."""
 
     def __init__(self, scenario: Scenario, capabilities: Capabilities) -> None:
         self.scenario = scenario
@@ -183,7 +190,11 @@ class TickGenerator(ABC):
         """Return a new episode; arguments as for `Backend.reset`."""
 
     def reset(self, seed: int | None, options: Mapping[str, Any]) -> Sensed:
-        """Begin an episode and return tick 0. Raises CoopenvError: there is no tick."""
+        """Begin an episode and return tick 0. Raises CoopenvError: an option is not known, or there is no tick."""
+        for key in options:
+            if key not in self.options and key not in IGNORED_OPTIONS:
+                known = ", ".join(self.options) or "none"
+                raise CoopenvError(f"unknown option {shown(key)}{suggest(str(key), self.options)}; known: {known}")
         self.stop("reset")
         self._episode = self.episode(seed, options)
         first = next(self._episode, None)

@@ -89,7 +89,7 @@ def failure_status(error: BaseException) -> int:
         drop_output()
         return PIPE_CLOSED
     if isinstance(error, UsageError):
-        message = error.format_message()
+        message = error.format_message().replace("Value error, ", "")  # a word of the library that checks values
     elif isinstance(error, CoopenvError):
         message = str(error)
     elif isinstance(error, OSError):

@@ -23,6 +23,7 @@ from coopenv.runs.rollouts import Rollout
 from coopenv.runs.side_by_side import Episodes, side_by_side
 from coopenv.scenario import Scenario
 from coopenv.shipped import data_directory
+from coopenv.svea.transport.zenoh import library
 
 FLEETS = {"svea_overtaking": "overtaking.toml", "svea_crossing": "crossing.toml"}
 """Deployment files of the experiments, in `examples/fleet`."""
@@ -95,8 +96,10 @@ def run_demo(demo: Demo, port: int | None, log: Console, out: Console) -> None:
         out: results.
 
     Raises:
-        CoopenvError: a process does not start, the cars cannot be armed, or results cannot be written.
+        CoopenvError: the extra is missing, a process does not start, the cars cannot be armed, or results cannot be
+            written.
     """
+    library()
     fleet, kept, driven = demo.fleet, Punctuality(), Episodes(STEADY_FROM)
     with writing(demo.drive.parent):
         demo.drive.parent.mkdir(parents=True, exist_ok=True)

@@ -28,6 +28,7 @@ OVERRIDES = "overrides (--set)"
 MOST_BYTES = 8 * 2**20  # of a file; 20,000 landmarks take one or two million
 
 
+EXPECTED = "expected a scenario (.toml), a log file (.mcap) or a ROS bag (.bag, .db3, a folder with metadata.yaml)"
 BAGS = (".db3", ".bag")  # suffixes of ROS bags, which are taken for log files by mistake
 
 
@@ -50,9 +51,12 @@ def scenario_path(name_or_path: str | Path) -> Path:
                 f"{path}: a ROS bag is no scenario; it runs with a map of its topics: coopenv run BAG --map topics.toml"
             )
         if not there:
-            raise UnknownEnvironmentError(f"no such scenario file: {shortened(str(path), 200)}")
+            found = f"{shortened(str(path), 200)}: a folder; {EXPECTED}" if os.path.isdir(path) else ""  # noqa: PTH112
+            raise UnknownEnvironmentError(found or f"no such scenario file: {shortened(str(path), 200)}")
         return path
     if text not in list_envs():
+        if os.path.isfile(text):  # noqa: PTH113 (never raises)
+            raise UnknownEnvironmentError(f"{shortened(text, 200)}: a file of an unknown kind; {EXPECTED}")
         known = f"{suggest(text, list_envs())}; known: {', '.join([*list_envs(), *(f'{kind}:N' for kind in SCENES)])}"
         raise UnknownEnvironmentError(f"unknown environment {shown(text)}{known}")
     return data_directory("envs") / f"{text}.toml"

@@ -52,6 +52,7 @@ def make_keys(folder: str | Path, identities: Iterable[str], force: bool = False
     for name in names:
         if not is_identity(name):
             raise KeyFileError(f"{shown(name)} names no key: expected 1 to {LONGEST_IDENTITY} letters, digits, _ or -")
+    library()
     with writing(folder):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     public = _read_public(folder / PUBLIC) if (folder / PUBLIC).exists() else {}

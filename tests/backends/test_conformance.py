@@ -186,7 +186,9 @@ def test_masks_and_ages_mean_the_same(make: Make) -> None:
                 ever_seen |= bool(infos[agent]["visible"])
             ever_heard |= bool(observations.get("vehicle_2", {"message_mask": np.zeros(1)})["message_mask"].any())
         assert steps > 15 and ever_seen and ever_heard
-        assert all(info["position_error"] < 0.2 for info in infos.values())
+        errors = [info["position_error"] for info in infos.values()]
+        known = env.engine.backend.capabilities.truth
+        assert all(error < 0.2 if known else np.isnan(error) for error in errors)
     finally:
         env.close()
 

@@ -69,6 +69,17 @@ def test_vehicles_find_out_where_they_are(observer: str, dtype: str) -> None:
         assert info["position_error"] < 0.1 and info["orientation_error"] < 3.0
 
 
+def test_options_that_it_does_not_read_are_refused() -> None:
+    class Windy(Fleet):
+        options = ("wind",)
+
+    with pytest.raises(CoopenvError, match="unknown option 'wind'; known: none"):
+        make(Fleet()).reset(seed=0, options={"wind": 1.0})
+    with pytest.raises(CoopenvError, match=r"unknown option 'wnd' \(did you mean 'wind'"):
+        make(Windy()).reset(seed=0, options={"wnd": 1.0})
+    make(Windy()).reset(seed=0, options={"wind": 1.0})
+
+
 def test_it_is_driven_by_commands_in_si_units() -> None:
     fleet = Fleet()
     env = make(fleet)

@@ -52,15 +52,19 @@ def test_shipped_environments_load_under_their_names() -> None:
         assert scenario_path(name).stem == name
 
 
-def test_unknown_names_and_files(tmp_path: Path) -> None:
+def test_unknown_names_and_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UnknownEnvironmentError, match=r"unknown environment 'busy'.*known: .*busy_intersection"):
         load_scenario("busy")
     with pytest.raises(UnknownEnvironmentError, match=r"did you mean 'busy_intersection'"):
         load_scenario("busy_intersecton")
     with pytest.raises(UnknownEnvironmentError, match=r"no such scenario file: .*gone.toml"):
         load_scenario(tmp_path / "gone.toml")
-    with pytest.raises(UnknownEnvironmentError, match="no such scenario file"):
+    with pytest.raises(UnknownEnvironmentError, match=r": a folder; expected a scenario \(\.toml\)"):
         load_scenario(str(tmp_path) + "/")
+    with pytest.raises(UnknownEnvironmentError, match=r"notes\.txt: a file of an unknown kind; expected a scenario"):
+        (tmp_path / "notes.txt").touch()
+        monkeypatch.chdir(tmp_path)
+        load_scenario("notes.txt")
 
 
 @pytest.mark.parametrize("name", ["~nosuchuser/x.toml", "a" * 5000 + ".toml", "x\0.toml", "/" + "a/" * 5000])

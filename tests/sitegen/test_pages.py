@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,8 @@ from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from coopenv.shipped import list_agents, list_envs
 from sitegen import links, mirror, pages
 from tests.helpers.sessions import ROOT
+
+LINK = re.compile(r"\]\(([^)]+)\)")
 
 
 @pytest.fixture(scope="module")
@@ -25,6 +28,22 @@ def test_there_is_a_page_of_every_observer_agent_and_environment(made: dict[str,
     listed = [next(iter(row.values())) for rows in pages.LISTED.values() for row in rows()]
     assert len(listed) == len(ZOO) + len(list_agents()) + len(list_envs())
     assert {page for page in listed if page.startswith("reference/")} <= made.keys()
+
+
+@pytest.mark.parametrize(
+    ("front", "observations"), [("README.md", "docs/terms.md"), ("docs/index.md", "docs/reference/observation.md")]
+)
+def test_what_people_come_for_is_one_click_away(front: str, observations: str) -> None:
+    """How to plug in an observer, train, open a bag, drive cars, and what the entries of an observation mean."""
+    text = (ROOT / front).read_text(encoding="utf-8")
+    led_to = {target.partition("#")[0] for target in LINK.findall(text)}
+    found = {(Path(front).parent / target).as_posix() for target in led_to}
+    assert found >= {observations, *(f"docs/tutorials/{name}.md" for name in ("own_observer", "train", "logs", "cars"))}
+
+
+def test_the_front_page_counts_the_observers() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert f"with {len(ZOO)} estimators" in text
 
 
 def test_pages_of_observers_say_where_they_come_from(made: dict[str, str]) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from coopenv.observers import registry
+from coopenv.viz import FIGURE_NAMES
 from tests.helpers import bags
 from tests.helpers.sessions import blocks, compare, run_page
 
@@ -62,6 +63,15 @@ def test_the_page_runs(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch)
         }
         assert mean["robust"] < mean["Mine"] < mean["riccati"] < mean["dead_reckoning"]
         assert {"errors.png", "out"} <= {path.name for path in folder.iterdir()}
+    elif page == "how-to/figures.md":
+        drawn = {"figures": "pdf", "out/paper": "pdf", "out/springer": "svg"}
+        for where, suffix in drawn.items():
+            assert {path.name for path in (folder / where).glob(f"*.{suffix}")} == {
+                f"{n}.{suffix}" for n in FIGURE_NAMES
+            }
+        assert len(list((folder / "out" / "paper" / "tum").iterdir())) == 10
+        for name in ("errors.svg", "mine.pdf", "errors.tex", "errors.pdf", "rows.csv"):
+            assert (folder / name).stat().st_size > 400
     elif page == "tutorials/train.md":
         assert program["infos"]["vehicle_1"]["outcome"] == "arrived" and program["worst"] < 0.5
     elif page == "tutorials/logs.md":

@@ -11,7 +11,7 @@ from coopenv.backends.bags.topic_map import TopicMap, load_map
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
 from coopenv.backends.svea.assembler import Assembler
 from coopenv.backends.svea.binding import Binding, bind
-from coopenv.backends.svea.options import wishes_of
+from coopenv.backends.svea.options import OPTIONS, wishes_of
 from coopenv.errors import CoopenvError, DataError, DataWarning, ScenarioWarning
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.svea.samples import Sample
@@ -31,6 +31,8 @@ class Bag(TickGenerator):
     a tick is half a period behind the frames of the camera that began last. Initial estimates and radio are those of
     the environment: a seed draws them where they are random.
     """
+
+    options = OPTIONS
 
     def __init__(
         self,

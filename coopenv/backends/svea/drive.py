@@ -5,15 +5,15 @@ import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
-from coopenv.backends.mcap.container import Container
+from coopenv.backends.mcap.messages import codec
 from coopenv.backends.mcap.peek import CUT_OFF, metadata_names
 from coopenv.backends.svea.assembler import Assembler
 from coopenv.backends.svea.binding import Binding, bind
 from coopenv.backends.svea.intake import Intake
-from coopenv.backends.svea.options import wishes_of
+from coopenv.backends.svea.options import OPTIONS, wishes_of
 from coopenv.backends.svea.tape import ATTACHMENT, FORMAT, NAME
 from coopenv.errors import CoopenvError, DataError, DataWarning
 from coopenv.scenario.files import override, parse_scenario
@@ -23,6 +23,9 @@ from coopenv.svea.definitions import STOPPED, TICK
 from coopenv.svea.deployment import Deployment, parse_deployment
 from coopenv.svea.topics import STOPPED_TOPIC, TICK_TOPIC
 from coopenv.svea.transport.base import Arrival
+
+if TYPE_CHECKING:
+    from coopenv.backends.mcap.container import Container
 
 
 def head_of(deployment: Deployment, binding: Binding, only: str | None) -> bytes:
@@ -64,6 +67,8 @@ class Drive(TickGenerator):
     Of one whose end is missing, as the process that wrote it was killed, what is whole is replayed.
     """
 
+    options = OPTIONS
+
     def __init__(self, path: str | Path, overrides: Mapping[str, Any] | None = None) -> None:
         """Open a file that `coopenv svea run --record` has written.
 
@@ -73,8 +78,11 @@ class Drive(TickGenerator):
 
         Raises:
             DataError: it is none, or is damaged.
-            CoopenvError: an override is not valid.
+            CoopenvError: an override is not valid, or the extra is missing.
         """
+        codec()  # says which extra is missing
+        from coopenv.backends.mcap.container import Container
+
         self._where = str(path)
         try:
             container = Container(Path(path), forgiving=True)
@@ -130,7 +138,7 @@ class Drive(TickGenerator):
             stacklevel=3,
         )
 
-    def _read(self, container: Container) -> Iterator[Arrival | Mark | Stopped]:
+    def _read(self, container: "Container") -> Iterator[Arrival | Mark | Stopped]:
         try:
             for channel, _, message in container.messages():
                 topic = channel.topic.lstrip("/")

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from coopenv.backends.base import IGNORED_OPTIONS
 from coopenv.errors import CoopenvError, shown, suggest
 
-OPTIONS = ("arm", "release", "options")
-"""The last one is passed by PettingZoo's own tests and means nothing."""
+OPTIONS = ("arm", "release")
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,9 @@ def wishes_of(options: Mapping[str, Any]) -> Wishes:
         CoopenvError: an option is not known, or not what it must be.
     """
     for key in options:
-        if key not in OPTIONS:
+        if key not in OPTIONS and key not in IGNORED_OPTIONS:
             raise CoopenvError(f"unknown option {shown(key)}{suggest(str(key), OPTIONS)}; known: arm, release")
-    found = {name: options.get(name, False) for name in OPTIONS[:2]}
+    found = {name: options.get(name, False) for name in OPTIONS}
     for name, value in found.items():
         if not isinstance(value, bool):
             raise CoopenvError(f"option '{name}' must be true or false, got {shown(value)}")

@@ -67,6 +67,15 @@ class Zenoh:
             self._session.close()
 
 
+def library() -> Any:
+    """Return the library. Raises CoopenvError: the extra is not installed."""
+    try:
+        import zenoh
+    except ImportError:
+        raise CoopenvError("Zenoh needs an extra: pip install '.[svea]'") from None
+    return zenoh
+
+
 def open_zenoh(
     mode: Literal["client", "peer", "router"],
     connect: Sequence[str] = (),
@@ -90,10 +99,7 @@ def open_zenoh(
     for endpoint in (*connect, *listen):
         if (address_of(endpoint).protocol in SECURE) != (tls is not None):
             raise CoopenvError(f"{endpoint}: tls/... and certificates (tls) go together")
-    try:
-        import zenoh
-    except ImportError:
-        raise CoopenvError("Zenoh needs an extra: pip install '.[svea]'") from None
+    zenoh = library()
     config = zenoh.Config()
     entries: dict[str, Any] = {
         "mode": mode,

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import shutil
+import subprocess
 import sys
 from dataclasses import replace
 from io import StringIO
@@ -73,10 +75,33 @@ def test_csv_and_latex(comparison: coopenv.Comparison, tmp_path: Path) -> None:
     assert table[0]["position_rmse_m"] == "" and float(table[4]["position_rmse_se_m"]) > 0
     text = comparison.to_latex(tmp_path / "rows.tex")
     assert (tmp_path / "rows.tex").read_text() == text
-    assert r"vehicle\_1" in text and r"\pm" in text and text.count(r"\\") == 1 + 3 + 3
+    row = comparison.rows_in("nominal", "riccati")[0]
+    assert in_parentheses(row.position_rmse_m, row.position_rmse_se_m) in text
+    assert r" & f1 & f2 \\" in text and text.count(r"\\") == 1 + 3 + 3
     body = [line for line in text.splitlines() if "&" in line]
     assert [line.count("&") for line in body] == [2] * len(body)
     assert r"Fails & failed & failed \\" in text
+
+
+def test_the_table_fits_a_column_of_a_paper(tmp_path: Path) -> None:
+    """Five vehicles and an observer with a long name in 3.5 in, as LaTeX sets them."""
+    style = shutil.which("kpsewhich") and subprocess.run(["kpsewhich", "booktabs.sty"], capture_output=True).stdout
+    if not (style and shutil.which("pdflatex")):
+        pytest.skip("LaTeX with booktabs is not installed")
+    found = coopenv.compare(
+        ["split_covariance_intersection", "dead_reckoning"],
+        "busy_intersection_tracking",
+        2,
+        overrides={"horizon": 1.0},
+        steady_from=0.5,
+    )
+    found.to_latex(tmp_path / "rows.tex")
+    paper = r"\documentclass{article}\usepackage{booktabs}\begin{document}\noindent"
+    paper += r"\begin{minipage}{3.5in}\input{rows}\end{minipage}\end{document}"
+    (tmp_path / "paper.tex").write_text(paper)
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "paper"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, errors="replace", timeout=120)
+    assert done.returncode == 0 and "Overfull" not in done.stdout, done.stdout[-2000:]
 
 
 def test_pandas_is_given_every_column(comparison: coopenv.Comparison, monkeypatch: pytest.MonkeyPatch) -> None:

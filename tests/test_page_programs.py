@@ -1,0 +1,202 @@
+"""Programs and tables of single pages, each as it stands; those of tutorials are in tests/sitegen/test_sessions.py."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coopenv.backends.bags.topic_map import load_map
+from coopenv.bench.learning.study import read_study
+from coopenv.scenario import load_scenario, parse_scenario
+from coopenv.training.settings import Clone, Settings, read_settings
+from tests.helpers import bags, mrclam_files
+from tests.test_docs import DOCS, python_blocks
+
+ROOT = DOCS.parent
+ELSEWHERE = {"agents.md", "backends.md", "observers.md", "terms.md"}
+"""Run by tests/test_docs.py."""
+HERE = {"README.md", "bags.md", "cars.md", "data.md", "draws.md", "highway.md", "replay.md", "trainers.md", "view.md"}
+
+
+def run(page: Path, *without: str) -> list[dict[str, Any]]:
+    """Run a page's programs, but those that hold one of some words, and return the names of each."""
+    programs = []
+    for block in python_blocks(page):
+        if not any(word in block for word in without):
+            programs.append({"__name__": "__main__"})
+            exec(compile(block, page.name, "exec"), programs[-1])
+    return programs
+
+
+def tables(page: str) -> list[str]:
+    return re.findall(r"^```toml\n(.*?)^```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
+
+
+def test_every_page_with_programs_is_run() -> None:
+    pages = {page.name for page in (ROOT / "README.md", *DOCS.glob("*.md")) if python_blocks(page)}
+    assert pages == ELSEWHERE | HERE
+
+
+def test_the_front_page_steps_and_draws() -> None:
+    (program,) = run(ROOT / "README.md", "coopenv.compare")
+    assert program["picture"].ndim == 3 and len(program["infos"]) >= 1
+
+
+@pytest.mark.slow
+def test_the_front_page_compares(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (program,) = run(ROOT / "README.md", "parallel_env")
+    assert program["found"].observers == ["riccati", "robust", "dead_reckoning"]
+    assert (tmp_path / "errors.pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.slow
+def test_the_page_on_bags(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("rosbags", reason="needs the extra 'log'")
+    monkeypatch.chdir(tmp_path)
+    bags.write(tmp_path / "drive", bags.messages(bags.drive()), "ros1")
+    a_map, *others = tables("bags.md")
+    for text in (a_map, *(a_map + other for other in others)):  # tables that a map can have
+        (tmp_path / "topics.toml").write_text(text, encoding="utf-8")
+        assert load_map("topics.toml").cars[0].name == "svea3"
+    (tmp_path / "topics.toml").write_text(a_map.replace("marker = 7 ", "marker = 3 "), encoding="utf-8")
+    (program,) = run(DOCS / "bags.md")
+    assert program["env"].possible_agents == ["vehicle_1"]
+
+
+@pytest.mark.slow
+def test_the_page_on_cars(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("zenoh", reason="needs the extra 'svea'")
+    monkeypatch.chdir(ROOT)
+    (program,) = run(DOCS / "cars.md")
+    assert {info["car"]["name"] for info in program["infos"].values()} <= {"svea1", "svea7"}
+
+
+def test_the_page_on_recorded_robots(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "recordings").mkdir()
+    mrclam_files.write(tmp_path / "recordings", 6, seconds=15.0)
+    run(DOCS / "data.md")
+    errors = np.array([float(number) for number in re.findall(r"\d\.\d+", capsys.readouterr().out)])
+    assert errors.shape == (5,) and (errors < 0.5).all()
+
+
+def test_the_page_on_draws() -> None:
+    (program,) = run(DOCS / "draws.md")
+    assert program["envs"].action_space.shape[0] == 16
+    lot = {
+        "title": "draws",
+        "horizon": 1.0,
+        "landmarks": [{"name": "a", "position": [1.0, 1.0, 1.0]}],
+        "vehicles": [{"motion": {"kind": "driven"}, "initial_pose": {"position": [0.0, 0.0, 0.0]}}],
+    }
+    routes, landmarks, factors = (tomllib.loads(text) for text in tables("draws.md"))
+    routes["routes"].append({"name": "straight", "waypoints": [[-8.0, -0.5], [8.0, -0.5]]})
+    assert parse_scenario(lot | routes, "draws.md").vehicles[0].routes == ("left", "straight")
+    assert len(parse_scenario(lot | landmarks, "draws.md").landmarks) == 11
+    assert parse_scenario(lot | factors, "draws.md").randomisation.camera_range == (0.8, 1.2)
+
+
+@pytest.mark.slow
+def test_the_page_on_highway(capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("highway_env", reason="needs the extra 'highway'")
+    roundabout, estimates = run(DOCS / "highway.md")
+    assert not roundabout["env"].agents and np.isfinite(estimates["info"]["localisation"]["position_error"])
+    assert "vehicle_1" in capsys.readouterr().out
+    (text,) = tables("highway.md")
+    raw = {"title": "highway", "horizon": 1.0, "landmarks": [{"name": "a", "position": [1.0, 1.0, 1.0]}]}
+    assert parse_scenario(raw | tomllib.loads(text), "highway.md").backend == "highway"
+
+
+@pytest.mark.slow
+def test_the_page_on_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("foxglove", reason="needs the extra 'log'")
+    from coopenv.backends.mcap.topics import topics_of
+
+    monkeypatch.chdir(tmp_path)
+    _, recorded, replayed = run(DOCS / "replay.md")
+    assert "/scene/world" in topics_of("shown.mcap")
+    again, first = (
+        recorded["run"]("riccati", r) for r in (recorded["read_recording"]("drive.mcap"), recorded["recording"])
+    )
+    np.testing.assert_array_equal(again.position_error, first.position_error)
+    assert replayed["env"].possible_agents == [f"vehicle_{i}" for i in range(1, 6)]
+
+
+def test_the_page_on_watching(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("viser", reason="needs the extra 'view'")
+    monkeypatch.chdir(tmp_path)
+    run(DOCS / "view.md")
+    assert (tmp_path / "replay.html").stat().st_size > 500_000
+
+
+def test_the_tables_of_terms() -> None:
+    own, driven = (tomllib.loads(text) for text in tables("terms.md"))
+    lanes = tomllib.loads((ROOT / "examples" / "lane_keeping" / "lane_keeping.toml").read_text(encoding="utf-8"))
+    for table in ("reward", "observation", "termination"):
+        assert own[table].items() <= (lanes[table] | own[table]).items()
+        assert own[table]["custom"].keys() == lanes[table]["custom"].keys()
+    overrides = {f"{table}.{key}": value for table, keys in driven.items() for key, value in keys.items()}
+    assert load_scenario("urban_crossing", overrides).observation.map_size == 6
+
+
+def test_the_settings_of_training_are_the_defaults(tmp_path: Path) -> None:
+    settings, study = tables("trainers.md")
+    path = tmp_path / "train.toml"
+    path.write_text(settings, encoding="utf-8")
+    said = read_settings(path)
+    assert said == Settings(steps=2_000_000)
+    commented = re.search(r"# \[clone\].*?\n\n", settings, re.DOTALL)
+    assert commented
+    path.write_text(re.sub(r"^# ", "", commented[0], flags=re.MULTILINE), encoding="utf-8")
+    assert read_settings(path).clone == Clone(agent="route_follower")
+    (tmp_path / "study.toml").write_text(study, encoding="utf-8")
+    path.write_text("[arms.quality]\n[arms.plain]\n", encoding="utf-8")
+    assert len(list(read_study(tmp_path / "study.toml").runs)) == 12
+
+
+@pytest.mark.train
+@pytest.mark.slow
+def test_the_page_trains_with_stable_baselines(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As long as one rollout: what the page's two million steps give is in nobody's patience."""
+    pytest.importorskip("stable_baselines3", reason="needs the extra 'train'")
+    monkeypatch.chdir(tmp_path)
+    train, drive = (block for block in python_blocks(DOCS / "trainers.md") if "stable_baselines3" in block)
+    assert train.count("2_000_000") == 1
+    exec(compile(train.replace("2_000_000", "16_384"), "trainers.md", "exec"), {"__name__": "__main__"})
+    capsys.readouterr()
+    program: dict[str, Any] = {}
+    exec(compile(drive, "trainers.md", "exec"), program)
+    ends = capsys.readouterr().out.splitlines()
+    assert {line.partition(":")[0] for line in ends} <= set(program["env"].possible_agents) and ends
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("package", "word"),
+    [
+        pytest.param("ray", "CooperativeMultiAgentEnv", marks=pytest.mark.rllib),
+        pytest.param("ray", "CooperativeRows", marks=pytest.mark.rllib),
+        pytest.param("torchrl", "PettingZooWrapper", marks=pytest.mark.torchrl),
+        pytest.param("torchrl", "batched_env", marks=pytest.mark.torchrl),
+        pytest.param("benchmarl", "benchmarl", marks=pytest.mark.benchmarl),
+    ],
+)
+def test_the_page_trains_with_libraries(
+    package: str, word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip(package)
+    monkeypatch.chdir(tmp_path)
+    (block,) = (block for block in python_blocks(DOCS / "trainers.md") if re.search(rf"^from .*{word}", block, re.M))
+    exec(compile(block, "trainers.md", "exec"), {"__name__": "__main__"})
+    if package != "benchmarl":
+        assert capsys.readouterr().out
