@@ -14,7 +14,7 @@ SHIM = "https://unpkg.com/iframe-worker/shim"
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # MkDocs loads this file by its path
 
-from sitegen import links, mirror, notebooks, pages  # noqa: E402
+from sitegen import links, mirror, notebooks, pages, tables  # noqa: E402
 
 
 def on_config(config: Any) -> Any:
@@ -66,6 +66,11 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         title, _, rest = text.partition("\n")
         text = f"{title}\n\n[:material-notebook: As a notebook]({name}){{ .md-button download }}\n{rest}"
     return text
+
+
+def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
+    """Mark the cells of tables that need room."""
+    return tables.marked(html)
 
 
 def on_post_page(output: str, page: Any, config: Any) -> str:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from hypothesis import settings
+
+from tests.helpers.chromium import chromium
 
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -24,3 +28,10 @@ def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a slow machine write no more than a fast one."""
     monkeypatch.setattr("coopenv.runs.console.LINE_PERIOD", 3600.0)
     monkeypatch.setattr("coopenv.runs.console.COMPILE_NOTICE_AFTER", 3600.0)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """A browser without a screen; of one module, as no two can be there at once, nor an event loop beside it."""
+    with chromium() as started:
+        yield started

@@ -231,11 +231,16 @@ def test_results_are_shown_where_asked_for(
 ) -> None:
     shown: list[str] = []
     monkeypatch.setattr("typer.launch", lambda path: shown.append(path) or 1)
+    monkeypatch.setenv("DISPLAY", ":0")
     run = ["run", "overtaking", "--steps", "2", "--no-figures", "--out", "here", "--open"]
     board = ["bench", "observers", "overtaking", "--observers", "dead_reckoning", "--seeds", "1", "--jobs", "1"]
     assert main(run) == main([*board, "--set", "horizon=0.5", "--out", "board", "--open"]) == 0
     assert shown == ["here", "board/report.html"] and Path("board/report.html").is_file()
     assert "note: there is no program to open here" in capsys.readouterr().err
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert main(run) == 0 and len(shown) == 2
+    assert "note: there is no display to show here on" in capsys.readouterr().err
     assert main([*board, "--open"]) == 2
     assert capsys.readouterr().err == "error: --open: the report needs a folder, --out DIR\n"
 

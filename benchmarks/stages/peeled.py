@@ -12,7 +12,7 @@ import warp as wp
 
 from coopenv.observers.briefing import start_covariances
 from coopenv.observers.registry import find_embedded
-from coopenv.observers.riccati.kernels import DEAD_RECKONING
+from coopenv.observers.riccati.dead_reckoning import DEAD_RECKONING
 from coopenv.scenario import load_scenario
 from coopenv.world.collision import referee
 from coopenv.world.dynamics import move

@@ -13,6 +13,7 @@ from coopenv.backends.simulated import Simulated
 from coopenv.errors import CoopenvError, DataError, suggest
 from coopenv.observers.recording import Recording
 from coopenv.scenario import Scenario, load_scenario
+from coopenv.shipped import list_envs
 
 if TYPE_CHECKING:
     from coopenv.backends.bags import Bag
@@ -52,7 +53,7 @@ def is_bag(name: str | Path, topics: str | Path | None = None) -> bool:
     """Return whether a name is that of a ROS bag; of MCAP files it is whatever coopenv has not written.
 
     With the map of its topics given it is one as well if it cannot be read, if it is a folder, and if it is a drive of
-    cars: that is both.
+    cars: that is both. A folder that is called like an environment is ./NAME, unless a map is given.
     """
     if str(name).endswith(BAG_SUFFIXES):
         return True
@@ -61,6 +62,8 @@ def is_bag(name: str | Path, topics: str | Path | None = None) -> bool:
         if metadata is None or DRIVE in metadata:
             return topics is not None
         return not metadata & OURS
+    if str(name) in list_envs() and topics is None:
+        return False
     try:
         return (Path(name) / "metadata.yaml").is_file() or (topics is not None and Path(name).is_dir())
     except (OSError, ValueError):  # what can be no path

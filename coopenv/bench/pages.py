@@ -1,4 +1,4 @@
-"""Pages of environments as files: text, picture and measured figures of each, and an index."""
+"""Pages of environments as files: text, picture, film and measured figures of each, and an index."""
 
 from collections.abc import Callable
 from contextlib import closing
@@ -9,6 +9,7 @@ from PIL import Image
 
 from coopenv.api.engine import Engine
 from coopenv.bench.agents.dial import dial_text, measure_dial, read_dial
+from coopenv.bench.page_films import film_words, write_page_film
 from coopenv.files import check_file, replace_text, replacing_file, writing
 from coopenv.jsonable import json_text
 from coopenv.runs.page import index_text, page_text
@@ -30,18 +31,32 @@ def prepare(folder: Path, names: list[str]) -> None:
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     for name in names:
-        for suffix in ("md", "png", "json"):
+        for suffix in ("md", "png", "webp", "json"):
             check_file(folder / f"{name}.{suffix}")
 
 
 def environment_page(name: str, scenario: Scenario, folder: Path) -> str:
-    """Return the page of an environment, with the figures that stand in the folder, if any do."""
+    """Return the page of an environment, with the figures and the film that stand in the folder, if any do."""
     dial = read_dial(folder / f"{name}.json")
-    return page_text(name, scenario, "" if dial is None else dial_text(name, scenario, dial))
+    film = film_words(name, scenario) if (folder / f"{name}.webp").is_file() else ""
+    return page_text(name, scenario, "" if dial is None else dial_text(name, scenario, dial), film)
 
 
-def write_page(name: str, scenario: Scenario, folder: Path) -> None:
-    """Write text and picture of an environment's page to a folder."""
+def write_page(name: str, scenario: Scenario, folder: Path, on_film: Callable[[float], None] | None = None) -> None:
+    """Write text and picture of an environment's page to a folder.
+
+    Args:
+        name: of the environment.
+        scenario: what it is.
+        folder: which `prepare` has made.
+        on_film: called with the share of its film that is done (None: no film is made, one that is there stays).
+
+    Raises:
+        CoopenvError: the figures that stand in the folder cannot be read.
+    """
+    read_dial(folder / f"{name}.json")  # before anything is drawn
+    if on_film is not None:
+        write_page_film(name, scenario, folder, on_film)
     text = environment_page(name, scenario, folder)
     picture = Image.fromarray(first_picture(scenario)).quantize(COLOURS, kmeans=REFINED, dither=Image.Dither.NONE)
     with replacing_file(folder / f"{name}.png") as path:
@@ -70,6 +85,6 @@ def write_index(scenarios: dict[str, Scenario], folder: Path) -> None:
 
 def first_picture(scenario: Scenario) -> Any:
     """Return the top view, (H, W, 3) uint8, of the start of the episode of seed 0."""
-    with closing(Engine(scenario)) as engine, closing(TopView(scenario)) as view:
+    with closing(Engine(scenario)) as engine, closing(TopView(engine.backend.scenario)) as view:
         engine.reset([world_keys(0)[0]])
         return view.draw(engine)

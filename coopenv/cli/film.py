@@ -55,6 +55,7 @@ def film(
 ) -> None:
     """Film an episode from above: MP4, GIF or WebP."""
     from coopenv.files import check_file
+    from coopenv.runs.console import Progress
     from coopenv.runs.film import write_film
     from coopenv.runs.video import film_at
 
@@ -62,7 +63,8 @@ def film(
     film_at(out, rate)
     check_file(out)
     record = scene(source, agent, observer, seed, options.parse_overrides(overrides), (data, variant, topics), log)
-    pictures = write_film(record, out, log, rate, speed, width, not map_only)
+    with Progress(log, f"filming {out.name}", 1.0) as progress:
+        pictures = write_film(record, out, rate, speed, width, not map_only, progress.update)
     size = out.stat().st_size / 1e6
     options.console().print(f"{out}: {pictures} pictures, {pictures / rate:.3g} s, {size:.2g} MB", soft_wrap=True)
 

@@ -136,16 +136,19 @@ def print_json(result: Any) -> None:
 
 def show(path: Path) -> None:
     """Open a result with the program that the system has for it, or say that there is none."""
-    if typer.launch(str(path)) != 0:
+    if not has_display():
+        print(f"note: there is no display to show {path} on", file=sys.stderr)
+    elif typer.launch(str(path)) != 0:
         print(f"note: there is no program to open {path}", file=sys.stderr)
 
 
-def show_page(path: Path) -> None:
-    """Open a page in the user's browser; where there is no display nothing happens."""
+def show_page(address: Path | str) -> None:
+    """Open a page in the user's browser, or say that there is none; where there is no display nothing happens."""
     import webbrowser
 
-    if has_display():
-        webbrowser.open(path.resolve().as_uri())
+    url = address if isinstance(address, str) else address.resolve().as_uri()
+    if has_display() and not webbrowser.open(url):
+        print(f"note: there is no browser to open {address}", file=sys.stderr)
 
 
 def has_display() -> bool:

@@ -1,12 +1,16 @@
 """`coopenv page`: environments in Markdown."""
 
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from coopenv.cli import complete, options
 from coopenv.errors import CoopenvError
+
+if TYPE_CHECKING:
+    from coopenv.runs.console import Progress
 
 
 def page(
@@ -20,14 +24,18 @@ def page(
         ),
     ] = None,
     everything: Annotated[bool, typer.Option("--all", help="Every environment that ships with coopenv.")] = False,
-    out: Annotated[Path, typer.Option(help="Folder for ENV.md and ENV.png.")] = Path("out", "pages"),
+    out: Annotated[Path, typer.Option(help="Folder for ENV.md, ENV.png and ENV.webp.")] = Path("out", "pages"),
     measure: Annotated[
         bool,
         typer.Option("--measure", help="Measure what sensing is worth, for ENV.json; else what is there is shown."),
     ] = False,
+    film: Annotated[
+        bool,
+        typer.Option("--film/--no-film", help="Film an episode for ENV.webp; else the film that is there is shown."),
+    ] = True,
     worlds: Annotated[int, typer.Option(min=2, max=options.MOST_WORLDS, help="Held-out worlds to measure in.")] = 256,
 ) -> None:
-    """Write the pages of environments: what they are, a picture, what sensing is worth."""
+    """Write the pages of environments: what they are, a picture, a film, what sensing is worth."""
     from coopenv.bench import pages
     from coopenv.bench.agents.dial import entrants, has_dial
     from coopenv.runs.console import Progress
@@ -54,7 +62,12 @@ def page(
                     progress.update(number + done, f"{name}, {who}")
 
                 pages.write_figures(stems[name], name, scenario, out, worlds, told)
-            pages.write_page(name, scenario, out)
+            pages.write_page(name, scenario, out, partial(_filming, progress, number, name) if film else None)
     if shipped := {name: options.load(name, {}) for name in list_envs() if (out / f"{name}.md").is_file()}:
         pages.write_index(shipped, out)
     options.console().print(f"Pages in {out}: {', '.join(f'{name}.md' for name in stems)}", soft_wrap=True)
+
+
+def _filming(progress: "Progress", number: int, name: str, share: float) -> None:
+    """Say how far the film of an environment is."""
+    progress.update(number + share, f"{name}, film")

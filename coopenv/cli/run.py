@@ -1,12 +1,13 @@
 """`coopenv run | record`: simulate an environment, or keep what vehicles sense."""
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from coopenv.cli import options
-from coopenv.errors import CoopenvError, OutputError
+from coopenv.errors import CoopenvError, DataWarning, OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -88,8 +89,9 @@ def record_command(
     The file holds every tick; coopenv replays it, Foxglove and Lichtblick show it with the estimates of an observer.
     """
     from coopenv.backends.mcap import check_target
-    from coopenv.runs.log import check_scene, write_log
-    from coopenv.runs.scenes import Onlooker, write_page
+    from coopenv.backends.sources import is_bag, is_recorded
+    from coopenv.runs.log import check_scene, observer_of, write_log
+    from coopenv.runs.scenes import Onlooker, pages_can_be_written, scene_of_recording, write_page
 
     page = out.with_suffix(".html")
     check_target(out)
@@ -107,6 +109,10 @@ def record_command(
     facts = f"{len(recording.setups)} vehicles, {recording.ticks} ticks, {recording.t[-1]:g} s"
     options.console().print(f"{out}: {facts}", soft_wrap=True)
     played = None if no_replay else onlooker.record()
+    recorded = is_recorded(environment) and not is_bag(environment, topics)
+    if not no_replay and recorded and pages_can_be_written(page, log):
+        with warnings.catch_warnings(action="ignore", category=DataWarning):  # what there is to warn of has been said
+            played = scene_of_recording(environment, log, observer or observer_of(recording), data, variant)
     if played is not None and write_page(played, page, log) is not None:
         options.console().print(f"{page}: the episode, to watch in a browser", soft_wrap=True)
 

@@ -43,6 +43,7 @@ def view(
     ] = "127.0.0.1",
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Open no browser.")] = False,
     deployment: Annotated[Path | None, typer.Option(help="Of svea: the file that says which cars.")] = None,
+    connect: options.Connect = None,
     data: options.DataFolder = None,
     variant: options.Variant = None,
     topics: options.TopicMap = None,
@@ -59,7 +60,7 @@ def view(
     viser_module()
     log, changes = options.console(stderr=True), options.parse_overrides(overrides)
     with options.warned(), compile_notice(log):
-        reel = _reel(source, agent, observer, seed, changes, deployment, (data, variant, topics))
+        reel = _reel(source, agent, observer, seed, changes, (deployment, connect), (data, variant, topics))
     try:
         picked = vehicle_index(reel.scenario, vehicle)
         with serving(host, port) as (server, url):
@@ -76,10 +77,8 @@ def _announce(url: str, host: str, log: "Console", no_browser: bool) -> None:
     options.console().print(f"{url}  (Ctrl-C ends the view)", soft_wrap=True)
     if host not in ("127.0.0.1", "localhost", "::1"):
         log.print(f"warning: everybody who reaches {host} can watch, and switch what runs here", soft_wrap=True)
-    if not no_browser and options.has_display():
-        import webbrowser
-
-        webbrowser.open(url)
+    if not no_browser:
+        options.show_page(url)
 
 
 def _reel(
@@ -88,7 +87,7 @@ def _reel(
     observer: str | None,
     seed: int,
     changes: dict[str, Any],
-    deployment: Path | None,
+    cars: tuple[Path | None, str | None],
     recorded: tuple[Path | None, str | None, Path | None],
 ) -> "Reel":
     """Return where the frames of a source come from.
@@ -100,9 +99,10 @@ def _reel(
     from coopenv.runs.view.reels import EngineReel, SavedReel
 
     if source == CARS:
-        return _cars(deployment, agent, observer, seed, changes)
-    if deployment is not None:
-        raise CoopenvError(f"--deployment {deployment}: is for coopenv view svea")
+        return _cars(*cars, agent, observer, seed, changes)
+    for option, value in zip(("--deployment", "--connect"), cars, strict=True):
+        if value is not None:
+            raise CoopenvError(f"{option} {value}: is for coopenv view svea")
     saved = saved_scene(source)
     if saved is not None:
         refuse_for_saved(source, agent=agent, observer=observer, set=changes or None, seed=seed or None)
@@ -125,7 +125,12 @@ def _driver(driver_of: Any, agent: str | None, source: str, seed: int, scenario:
 
 
 def _cars(
-    deployment: Path | None, agent: str | None, observer: str | None, seed: int, changes: dict[str, Any]
+    deployment: Path | None,
+    connect: str | None,
+    agent: str | None,
+    observer: str | None,
+    seed: int,
+    changes: dict[str, Any],
 ) -> "Reel":
     """Return the cars of a deployment, which are observed and not driven."""
     from coopenv.backends.svea.opening import open_svea
@@ -138,6 +143,6 @@ def _cars(
     watching = {} if observer is None else {"observer.name": observer}
 
     def opened(more: Mapping[str, Any]) -> Any:
-        return open_svea(deployment, None, {**changes, **watching, **more})
+        return open_svea(deployment, None, {**changes, **watching, **more}, connect=connect)
 
     return EngineReel(opened, deployment.stem, seed, lambda scenario: (None, ""))

@@ -18,7 +18,7 @@ class Entry:
 
 
 ZOO = {
-    "dead_reckoning": Entry("dead_reckoning:DeadReckoning", "riccati.kernels:DEAD_RECKONING"),
+    "dead_reckoning": Entry("dead_reckoning:DeadReckoning", "riccati.dead_reckoning:DEAD_RECKONING"),
     # on a plane bearings to three points say more than a pose needs
     "p3p": Entry("single_frame:PerspectivePoints", on_a_plane=False),
     "riccati": Entry("riccati.kernels:riccati", "riccati.kernels:RICCATI", covariance=False),

@@ -1,32 +1,37 @@
 """`coopenv film`: a scene as MP4, GIF or WebP, drawn from above."""
 
+from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from rich.console import Console
 
 from coopenv.files import replacing_file
-from coopenv.runs.console import Progress
 from coopenv.runs.video import film_at
 from coopenv.viz.scene import SceneRecord
 from coopenv.viz.topview import TopView
 
 
 def write_film(
-    record: SceneRecord, path: Path, log: Console, fps: float, speed: float = 1.0, width: int = 896, panel: bool = True
+    record: SceneRecord,
+    path: Path,
+    fps: float,
+    speed: float = 1.0,
+    width: int = 896,
+    panel: bool = True,
+    on_progress: Callable[[float], None] = lambda share: None,
 ) -> int:
-    """Write a film of a scene with progress shown; return how many pictures it has.
+    """Write a film of a scene; return how many pictures it has.
 
     Args:
         record: the scene.
         path: of the film, which is replaced as a whole; its suffix is the format.
-        log: where progress is shown.
         fps: pictures a second; frames of the scene are repeated where it has fewer.
         speed: times real time.
         width: of the pictures, pixels, at most.
         panel: table and legend beside the map.
+        on_progress: called with the share of the pictures that are drawn; the file is written after the last.
 
     Raises:
         CoopenvError: unknown format, or it needs an extra.
@@ -34,16 +39,11 @@ def write_film(
     """
     film_at(path, fps)  # before anything is drawn
     chosen = frames_at(record.time, fps, speed)
-    with (
-        replacing_file(path) as new,
-        closing(TopView(record.scenario, panel=panel)) as view,
-        Progress(log, f"filming {path.name}", len(chosen)) as progress,
-    ):
+    with replacing_file(path) as new, closing(TopView(record.scenario, panel=panel)) as view:
         film = film_at(new, fps)
-        for k in chosen:
+        for done, k in enumerate(chosen, start=1):
             film.add(_within(view.paint(record.frame(int(k))), width))
-            progress.advance()
-        progress.update(len(chosen), f"finishing {path.name}")
+            on_progress(done / len(chosen))
         film.close()
     return len(chosen)
 

@@ -42,7 +42,8 @@ class Stage:
     """One world, drawn as it runs."""
 
     def __init__(self, scenario: Scenario, log: Console) -> None:
-        self.scenario, self.engine, self.view = scenario, Engine(scenario), TopView(scenario)
+        self.scenario, self.engine = scenario, Engine(scenario)
+        self.view = TopView(self.engine.backend.scenario)  # which may know of roads
         with compile_notice(log):
             self.engine.load()
 

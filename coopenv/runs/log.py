@@ -26,6 +26,11 @@ def check_scene(observer: str | None) -> None:
         find(named(observer))
 
 
+def observer_of(recording: Recording) -> str:
+    """Return the name of the observer of a recording where none is asked for."""
+    return _ON_A_PLANE if recording.scenario is None else recording.scenario.observer.name
+
+
 def write_log(recording: Recording, path: Path, log: Console, observer: str | None = None, scene: bool = True) -> None:
     """Write a recording to a file; with a scene, what Foxglove shows of it and of an observer's estimates.
 
@@ -44,8 +49,7 @@ def write_log(recording: Recording, path: Path, log: Console, observer: str | No
     start = time.time()
     shown = []
     if scene:
-        chosen = observer or (_ON_A_PLANE if recording.scenario is None else recording.scenario.observer.name)
-        name = named(chosen)
+        name = named(observer or observer_of(recording))
         with Progress(log, f"estimating with {name}"):
             result = run(name, recording)
         if result.failure:

@@ -20,18 +20,22 @@ TOLD = {"observation.include", "observation.scales", "observation.centers", "rew
 """Settings that other tables tell, as they tell the weights."""
 
 
-def page_text(name: str, scenario: Scenario, measured: str = "") -> str:
+def page_text(name: str, scenario: Scenario, measured: str = "", film: str = "") -> str:
     """Return the page of an environment.
 
     Args:
         name: of the environment; the picture beside the page is called so, too.
         scenario: what the page is about.
         measured: a part with figures that were measured, if there are any.
+        film: what the film beside the page shows, if there is one; it is called as the picture is.
     """
-    return "\n\n".join([*_head(name, scenario), *_scene(scenario), *_learning(scenario), *_end(name, measured)]) + "\n"
+    return (
+        "\n\n".join([*_head(name, scenario, film), *_scene(scenario), *_learning(scenario), *_end(name, measured)])
+        + "\n"
+    )
 
 
-def _head(name: str, scenario: Scenario) -> Iterator[str]:
+def _head(name: str, scenario: Scenario, film: str) -> Iterator[str]:
     shipped = name in list_envs()
     yield f"# {plain(scenario.title)}"
     file = f"[`envs/{name}.toml`](../../envs/{name}.toml), " if shipped else ""
@@ -42,6 +46,9 @@ def _head(name: str, scenario: Scenario) -> Iterator[str]:
             yield plain(text)
     yield f"![Top view of {name}]({name}.png)"
     yield "At the start of the episode of seed 0: true vehicles filled, estimates in outline."
+    if film:
+        yield f"![Film of {name}, from above]({name}.webp)"
+        yield film
     known_facts = facts(scenario)
     yield table(("", ""), [(subject, known_facts[subject]) for subject in GLANCE])
 

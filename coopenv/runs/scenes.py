@@ -1,9 +1,11 @@
 """Scenes of episodes: kept while they run, or read from what a run has left; and the pages that play them."""
 
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from coopenv.api.engine import Engine
@@ -15,11 +17,12 @@ from coopenv.runs.console import Progress
 from coopenv.runs.episode import play
 from coopenv.runs.video import frame_stride
 from coopenv.scenario import Scenario
-from coopenv.shipped import list_agents
+from coopenv.shipped import list_agents, list_envs
 from coopenv.viz.scene import Frame, SceneRecord, SceneWriter, Source
 from coopenv.viz.scene.record import SCENE_FILE
 
 BASELINE = "route_follower"
+MOST_SHOWN = 120.0  # s of a recording on its page, whose frames would be too far apart otherwise
 
 
 class Keeper:
@@ -53,6 +56,7 @@ def scene_of(
     source: Source,
     policy: Policy | None = None,
     on_progress: Callable[[float], None] = lambda share: None,
+    longest: float = np.inf,
 ) -> SceneRecord:
     """Play an episode in the first world of an engine and return its scene.
 
@@ -60,12 +64,14 @@ def scene_of(
         engine: any.
         source: what the scene is of; its seed is the episode's.
         policy: drives (None: action zero).
-        on_progress: called with the share of the horizon that is done.
+        on_progress: called with the share that is done.
+        longest: length, s, after which the episode is broken off.
 
     Raises:
         CoopenvError: the policy fails, or the backend cannot begin.
     """
-    keeper, ticks = Keeper(engine, source), engine.backend.scenario.horizon_ticks
+    keeper, scenario = Keeper(engine, source), engine.backend.scenario
+    ticks = int(min(scenario.horizon_ticks, longest * scenario.rates.camera))
     for tick in play(engine, [source.seed or 0], ticks, policy, to_the_end=False):
         if keeper.tick(tick) is not None:
             on_progress(tick / ticks)
@@ -101,6 +107,8 @@ def saved_scene(name: str | Path) -> SceneRecord | None:
         CoopenvError: the folder is of a run that has kept none, or the file is no scene.
     """
     path = Path(name)
+    if str(name) in list_envs():
+        return None  # a folder that is called like an environment is ./NAME
     if path.suffix == ".npz":
         return SceneRecord.load(path)
     if (path / SCENE_FILE).is_file():
@@ -156,20 +164,49 @@ def open_source(
     return open_backend(name, None, changes, data, variant, topics=topics)
 
 
+def scene_of_recording(
+    name: str,
+    log: Console,
+    observer: str | None = None,
+    data: Path | None = None,
+    variant: str | None = None,
+) -> SceneRecord:
+    """Return the scene of a log file or a data set, with progress shown: all of it, or its first `MOST_SHOWN` s.
+
+    Raises:
+        CoopenvError: there is no such recording, or the observer fails on it.
+    """
+    backend = open_source(name, {}, observer, data, variant)
+    scenario = backend.scenario
+    first = f", first {MOST_SHOWN:g} s of {scenario.horizon:.0f} s" if scenario.horizon > MOST_SHOWN else ""
+    source = Source.of(title_of(name) + first, scenario)
+    with closing(Engine(scenario, backend=backend)) as engine, Progress(log, "replaying", 1.0) as progress:
+        return scene_of(engine, source, None, progress.update, MOST_SHOWN)
+
+
 def title_of(name: str) -> str:
     """Return what a source is called in headings."""
     path = Path(name)
     return path.name if kind_of(name) in (Kind.LOG, Kind.BAG) else path.stem
 
 
-def write_page(record: SceneRecord, path: Path, log: Console) -> Path | None:
-    """Write the page that plays a scene, with progress shown; None, and a line, where the extra `view` is missing."""
-    from coopenv.viz.web.extra import has_viser
+def write_page(record: SceneRecord, path: Path, log: Console, others: Mapping[str, str] | None = None) -> Path | None:
+    """Write the page that plays a scene, with progress shown; None, and a line, where the extra `view` is missing.
 
-    if not has_viser():
-        log.print(f"note: no {path.name}: pages in the browser need an extra: pip install '.[view]'", soft_wrap=True)
+    `others` are the pages of all drivers by their names, to which this one leads.
+    """
+    if not pages_can_be_written(path, log):
         return None
     from coopenv.viz.web.replay import write_replay
 
     with Progress(log, f"writing {path.name}", total=1.0) as progress:
-        return write_replay(record, path, progress.update)
+        return write_replay(record, path, progress.update, others)
+
+
+def pages_can_be_written(path: Path, log: Console) -> bool:
+    """Return whether the extra `view` is installed; where it is not, a line says so."""
+    from coopenv.viz.web.extra import has_viser
+
+    if not has_viser():
+        log.print(f"note: no {path.name}: pages in the browser need an extra: pip install '.[view]'", soft_wrap=True)
+    return has_viser()

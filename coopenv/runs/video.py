@@ -103,7 +103,7 @@ class WebpFilm(GifFilm):
         return image
 
     def _options(self) -> dict[str, Any]:
-        return {"quality": 70, "method": 4}
+        return {"quality": 70, "method": 4, "minimize_size": True}
 
 
 Film = Mp4Film | GifFilm

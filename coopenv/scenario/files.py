@@ -33,12 +33,14 @@ BAGS = (".db3", ".bag")  # suffixes of ROS bags, which are taken for log files b
 
 
 def scenario_path(name_or_path: str | Path) -> Path:
-    """Return the file behind an environment name or a path.
+    """Return the file behind an environment name or a path; a folder that is called like an environment is ./NAME.
 
     Raises:
         UnknownEnvironmentError: there is no such environment or file.
     """
     text = str(name_or_path)
+    if text in list_envs():
+        return data_directory("envs") / f"{text}.toml"
     if text.endswith((".toml", *BAGS)) or "/" in text or "\\" in text or os.path.isdir(text):  # noqa: PTH112 (never raises)
         try:
             path = Path(text).expanduser()
@@ -54,12 +56,10 @@ def scenario_path(name_or_path: str | Path) -> Path:
             found = f"{shortened(str(path), 200)}: a folder; {EXPECTED}" if os.path.isdir(path) else ""  # noqa: PTH112
             raise UnknownEnvironmentError(found or f"no such scenario file: {shortened(str(path), 200)}")
         return path
-    if text not in list_envs():
-        if os.path.isfile(text):  # noqa: PTH113 (never raises)
-            raise UnknownEnvironmentError(f"{shortened(text, 200)}: a file of an unknown kind; {EXPECTED}")
-        known = f"{suggest(text, list_envs())}; known: {', '.join([*list_envs(), *(f'{kind}:N' for kind in SCENES)])}"
-        raise UnknownEnvironmentError(f"unknown environment {shown(text)}{known}")
-    return data_directory("envs") / f"{text}.toml"
+    if os.path.isfile(text):  # noqa: PTH113 (never raises)
+        raise UnknownEnvironmentError(f"{shortened(text, 200)}: a file of an unknown kind; {EXPECTED}")
+    known = f"{suggest(text, list_envs())}; known: {', '.join([*list_envs(), *(f'{kind}:N' for kind in SCENES)])}"
+    raise UnknownEnvironmentError(f"unknown environment {shown(text)}{known}")
 
 
 def load_scenario(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scenario:

@@ -22,7 +22,7 @@ from coopenv.viz.window import Window
 
 _SHORTEST = 28  # px, drawn length of a vehicle
 _POINTER = 13  # px
-_LABEL = 11  # px beside a vehicle
+_LABEL = 3  # px between a vehicle and its name
 _HALO: dict[str, Any] = {"path_effects": [withStroke(linewidth=2.2, foreground="white")]}
 _FARTHEST = 10.0  # pictures' sides from the middle, of an estimate as drawn
 _BOX = ("rotation", "position", "half")
@@ -44,6 +44,7 @@ class TopView:
             panel: table and legend beside the map; without them the mean error of those under way stands above it.
         """
         self.scenario, self._panel = scenario, panel
+        self._error_words = "mean error" if len(scenario.vehicles) > 1 else "error"
         self._stage, self._landmarks = Stage(scenario), len(scenario.landmarks)
         self._gain = not states_covariance(scenario.observer.name)
         self._figure, self._axes = ground.new_ground(scenario)
@@ -92,12 +93,13 @@ class TopView:
         self._others = [i for i, m in enumerate(s.landmarks) if m.body]
         bodies = [m.body for m in s.landmarks if m.body]
         self._other_box = np.array([geometry.box_shape(b.size, b.center, shortest) for b in bodies]).reshape(-1, 4, 2)
-        aside = boxes[:, 2, 1] + _LABEL * self._pixel
-        self._label = np.stack([boxes[:, :, 0].mean(axis=1), aside], axis=-1)
+        flank = np.stack([boxes[:, :, 0].mean(axis=1), boxes[:, 2, 1]], axis=-1)
+        aside = np.tile([0.0, 1.0], (len(flank), 1))
+        self._flank = geometry.turned(np.stack([flank, aside], axis=1), geometry.ways(s))
 
     def _prepare_artists(self) -> None:
         layers = self._layers
-        self._goals = Goals(self.scenario, self._axes, layers)
+        self._goals = Goals(self.scenario, layers)
         colours = [vehicle_colour(i) for i in range(len(self.scenario.vehicles))]
         self._rgba = to_rgba_array(colours)
         self._wedges = layers.polygons(facecolor=to_rgba_array(self._rgba, 0.11), edgecolor="none")
@@ -117,9 +119,14 @@ class TopView:
         self._strays = layers.polygons(linewidth=1.3)
         self._arrived = layers.points("*", "white", INK, 12)
         self._collided = layers.points("X", INK, "white", 11)
+        for landmark in ground.name_landmarks(self._axes, self.scenario):
+            layers.keep(landmark)
+        self._goals.add_names(self._axes, layers)
         look = {"fontsize": NORMAL, "weight": "bold", "ha": "center", "va": "center", "clip_on": True, **_HALO}
         names = [self._axes.text(0, 0, ground.vehicle_mark(i), color=INK, **look) for i in range(len(colours))]
         self._names = [layers.keep(name) for name in names]
+        boxes = [name.get_window_extent() for name in names]
+        self._half_name = np.array([(box.width, box.height) for box in boxes]) / 2 * self._pixel
         self._moving_names = {
             i: layers.keep(ground.label_landmark(self._axes, m.name, np.zeros(2)))
             for i, m in enumerate(self.scenario.landmarks)
@@ -131,8 +138,12 @@ class TopView:
         shown = min(count, ground.MOST_ROWS)
         x, aligned = (ground.PANEL, "left") if self._panel else (ground.MAP_RIGHT, "right")
         place = ground.pixels(x, ground.HEIGHT - 21)
-        title = self._figure.text(*place, "", fontsize=NORMAL + 1.5, weight="bold", color=INK, ha=aligned)
+        size = NORMAL + 1.5 if self._panel else NORMAL
+        title = self._figure.text(*place, "", fontsize=size, weight="bold", color=INK, ha=aligned)
         self._time = self._layers.keep(title)
+        if not self._panel:  # the title leaves room beside it
+            title.set_text(f"{self._error_words} 00.00 m   t = 000.00 s")
+            ground.shrink(self._figure.texts[0], ground.MAP_RIGHT - ground.LEFT - title.get_window_extent().width - 10)
         look: dict[str, Any] = {"fontsize": ground.SMALLER, "family": "monospace"}
         head = f"{'':6}{'error':>7}{'error':>7}{'3σ':>7}{'sees':>6}\n{'':6}{'[m]':>7}{'[deg]':>7}{'[m]':>7}"
         self._figure.text(*ground.pixels(ground.PANEL, ground.TABLE_TOP), head, color=INK, va="bottom", **look)
@@ -197,22 +208,29 @@ class TopView:
         self._moving.set_data(*target[moving].T)
         for i, name in self._moving_names.items():
             name.set_visible(bool(np.isfinite(target[i]).all()))
-            name.xy = (float(target[i, 0]), float(target[i, 1]))
+            name.xy = (float(target[i, 0]), float(target[i, 1]) + self._above(frame, i))
+
+    def _above(self, frame: Frame, landmark: int) -> float:
+        """Return how far the body of a landmark reaches to the north of its middle, m; its name stands beyond."""
+        body = self.scenario.landmarks[landmark].body
+        return 0.0 if body is None else float(np.abs(frame.rotation[landmark, 1]) @ np.array(body.size) / 2)
 
     def _place_marks(self, frame: Frame) -> None:
         L, R, position, ended = self._landmarks, frame.rotation, frame.position, frame.ended
         place = geometry.outlines(R[L:], position[L:, :2], self._box.mean(axis=1, keepdims=True))[:, 0]
         self._arrived.set_data(*place[ended == Outcome.ARRIVED].T)
         self._collided.set_data(*place[ended == Outcome.COLLIDED].T)
-        beside = geometry.outlines(R[L:], position[L:, :2], self._label[:, None])[:, 0]
+        flank = geometry.outlines(R[L:], position[L:, :2], self._flank[:, :1])[:, 0]
+        aside = geometry.outlines(R[L:], np.zeros_like(flank), self._flank[:, 1:])[:, 0]
+        half = np.sum(np.abs(aside) * self._half_name, axis=-1, keepdims=True)  # of the name, away from the vehicle
+        beside = flank + (half + _LABEL * self._pixel) * aside
         for name, (x, y) in zip(self._names, beside.tolist(), strict=True):
             name.set_position((x, y))
 
     def _write(self, frame: Frame, sigma: np.ndarray) -> None:
         time = float(frame.tick) / self.scenario.rates.camera
         errors = frame.position_error[frame.under_way]
-        word = "mean error" if len(self.scenario.vehicles) > 1 else "error"
-        error = f"{word} {fixed(errors.mean(), 2)} m   " if len(errors) and not self._panel else ""
+        error = f"{self._error_words} {fixed(errors.mean(), 2)} m   " if len(errors) and not self._panel else ""
         self._time.set_text(f"{error}t = {time:.2f} s")
         for i, row in enumerate(self._rows):
             error, angle = frame.position_error[i], frame.orientation_error[i]

@@ -119,17 +119,18 @@ def free_lengths(
     whose origin is at `shift` in the coordinates of the buildings, those of the scenario's file, m.
     """
     length = np.repeat(np.broadcast_to(np.asarray(reach, float), len(rays))[:, None], rays.shape[1], axis=1)
-    for obstacle in obstacles:
-        Rt = about_z(-obstacle.yaw)
-        start = (origin - (np.array(obstacle.center) - shift)) @ Rt.T
-        way = rays @ Rt.T
-        way = np.where(np.abs(way) < 1e-9, 1e-9, way)
-        half = np.array(obstacle.size) / 2
-        sides = np.stack([(-half - start[:, None]) / way, (half - start[:, None]) / way])
-        enter, leave = sides.min(axis=0).max(axis=-1), sides.max(axis=0).min(axis=-1)
-        hit = (enter < leave) & (leave > 0)
-        length = np.where(hit, np.minimum(length, np.maximum(enter, 0.0)), length)
-    return length
+    if not obstacles:
+        return length
+    turn = np.array([about_z(obstacle.yaw) for obstacle in obstacles])[:, None]  # (boxes, 1, 3, 3)
+    center = np.array([obstacle.center for obstacle in obstacles]) - shift
+    half = np.array([obstacle.size for obstacle in obstacles])[:, None, None] / 2
+    start = (origin - center[:, None])[:, :, None] @ turn  # (boxes, N, 1, 3)
+    way = rays @ turn  # (boxes, N, K, 3)
+    way = np.where(np.abs(way) < 1e-9, 1e-9, way)
+    one, other = (-half - start) / way, (half - start) / way
+    enter, leave = np.minimum(one, other).max(axis=-1), np.maximum(one, other).min(axis=-1)
+    free = np.where((enter < leave) & (leave > 0), np.maximum(enter, 0.0), np.inf)
+    return np.asarray(np.minimum(length, free.min(axis=0)))
 
 
 def about_z(angle: float) -> np.ndarray:

@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba_array
+from matplotlib.patheffects import withStroke
+from matplotlib.text import Text
 
 from coopenv.scenario import Scenario
 from coopenv.viz.scene.frame import Frame
@@ -15,36 +17,73 @@ from coopenv.viz.topview_layers import Layers
 _CORNERS = 48  # of the polygon that stands for a circle
 _ANGLE = np.linspace(0.0, 2 * np.pi, _CORNERS, endpoint=False)
 _CIRCLE = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=-1)
+_GAP = 3  # px between goals and their name
+_MOST_NAMES = 3  # that stand for goals which touch one another; of the others there is the number
 
 
 class Goals:
     """The goals of all vehicles, and the routes of those that have drawn one."""
 
-    def __init__(self, scenario: Scenario, axes: Axes, layers: Layers) -> None:
-        """Add the artists."""
-        self._radius = np.array([vehicle.goal_radius for vehicle in scenario.vehicles])
-        self._there = [i for i, radius in enumerate(self._radius) if radius > 0]
-        colours = [vehicle_colour(i) for i in self._there]
-        self._rgba = to_rgba_array(colours)
+    def __init__(self, scenario: Scenario, layers: Layers) -> None:
+        """Add all but the names."""
+        there = [i for i, vehicle in enumerate(scenario.vehicles) if vehicle.goal_radius > 0]
+        self._there = there
+        self._radius = np.array([scenario.vehicles[i].goal_radius for i in there])
+        colours = to_rgba_array([vehicle_colour(i) for i in there])
         self._routes = layers.lines(linewidth=0.9, alpha=0.55)
         self._discs = layers.polygons(facecolor="white", edgecolor="none", alpha=0.6)
-        self._rims = layers.polygons(facecolor="none", edgecolor=self._rgba, linestyle=DOTTED, linewidth=1.6)
-        look: dict[str, Any] = {"fontsize": SMALL, "ha": "center", "va": "center", "clip_on": True}
-        texts = [axes.text(0, 0, vehicle_mark(i), color=INK, **look) for i in self._there]
-        self._names = [layers.keep(text) for text in texts]
+        self._rims = layers.polygons(facecolor="none", edgecolor=colours, linestyle=DOTTED, linewidth=1.6)
+
+    def add_names(self, axes: Axes, layers: Layers) -> None:
+        """Add the names, over all that has been added before."""
+        low, self._high = axes.get_xlim()
+        self._pixel = (self._high - low) / axes.get_window_extent().width  # m
+        halo = [withStroke(linewidth=2.2, foreground="white")]
+        look: dict[str, Any] = {"fontsize": SMALL, "va": "center", "clip_on": True, "color": INK, "path_effects": halo}
+        self._names: list[Text] = [layers.keep(axes.text(0, 0, "", **look)) for _ in self._there]
 
     def place(self, frame: Frame) -> None:
         """Move them to where they are now."""
         center = frame.goal[self._there, :2]
-        shapes = center[:, None] + self._radius[self._there, None, None] * _CIRCLE
+        shapes = center[:, None] + self._radius[:, None, None] * _CIRCLE
         self._discs.set_verts(list(shapes))
         self._rims.set_verts(list(shapes))
-        for i, (name, place) in enumerate(zip(self._names, center, strict=True)):
-            apart = np.linalg.norm(center - place, axis=-1)
-            same = np.flatnonzero(apart < self._radius[self._there] / 2).tolist()
-            more = f" +{len(same) - 1}" if len(same) > 1 else ""  # goals at one place have one name
-            name.set_text(vehicle_mark(self._there[i]) + more if i == same[0] else "")
-            name.set_position(place.tolist())
+        groups = touching(center, self._radius)
+        for name, members in zip(self._names, groups + [[]] * (len(self._names) - len(groups)), strict=True):
+            name.set_text(self._text(members))
+            if members:
+                self._put(name, center[members], self._radius[members])
         drawn = [i for i in self._there if frame.route_drawn[i] >= 0]
         self._routes.set_segments([frame.route[i, : int(frame.route_count[i]), :2] for i in drawn])
         self._routes.set_color([vehicle_colour(i) for i in drawn])
+
+    def _text(self, members: list[int]) -> str:
+        """Return the name of goals that touch one another."""
+        named = len(members) if len(members) <= _MOST_NAMES else _MOST_NAMES - 1
+        marks = ", ".join(vehicle_mark(self._there[k]) for k in members[:named])
+        return marks + (f" +{len(members) - named}" if len(members) > named else "")
+
+    def _put(self, name: Text, center: np.ndarray, radius: np.ndarray) -> None:
+        """Write a name into a goal if it fits, else to the right of it, or to the left at the border of the map."""
+        wide = name.get_window_extent().width * self._pixel
+        gap = _GAP * self._pixel
+        left, right = float((center[:, 0] - radius).min()), float((center[:, 0] + radius).max())
+        y = float((center[:, 1].min() + center[:, 1].max()) / 2)
+        if len(center) == 1 and wide + 2 * gap < right - left:
+            name.set(x=(left + right) / 2, y=y, ha="center")
+        elif right + gap + wide < self._high:
+            name.set(x=right + gap, y=y, ha="left")
+        else:
+            name.set(x=left - gap, y=y, ha="right")
+
+
+def touching(center: np.ndarray, radius: np.ndarray) -> list[list[int]]:
+    """Return the indices of circles, centres (N, 2) and radii (N,), in groups that touch one another."""
+    groups: list[list[int]] = []
+    for i in range(len(center)):
+        if not np.isfinite(center[i]).all():
+            continue
+        reach = np.linalg.norm(center - center[i], axis=-1) < radius + radius[i]
+        near = [group for group in groups if reach[group].any()]
+        groups = [group for group in groups if group not in near] + [sorted(sum(near, [i]))]
+    return groups

@@ -10,20 +10,21 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
-from matplotlib.text import Annotation
+from matplotlib.text import Annotation, Text
 
 from coopenv.estimation.outcomes import Sight
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Obstacle
+from coopenv.viz.labels import place_names
 from coopenv.viz.scene.stage import sees_a_part
 from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, legend, new_figure, vehicle_colour
 from coopenv.viz.topview_geometry import limits, road_corners, ways
 
 WIDTH, HEIGHT = 896, 672  # px; multiples of 16, as video codecs like them
-_LEFT, _BOTTOM, _SIDE = 54, 46, 592  # px, of the square axes
+LEFT, _BOTTOM, _SIDE = 54, 46, 592  # px, of the square axes
 _WORDS = 36  # px, from the axes to what is written beside them, whatever numbers stand between
-MAP_RIGHT, MAP_WIDTH = _LEFT + _SIDE, _LEFT + _SIDE + 6  # px, right edge of the axes, and with what stands out there
+MAP_RIGHT, MAP_WIDTH = LEFT + _SIDE, LEFT + _SIDE + 6  # px, right edge of the axes, and with what stands out there
 PANEL = MAP_RIGHT + 12  # px, left edge of the panel
 SMALLER = 6.5  # pt
 ROW = 16  # px
@@ -57,7 +58,7 @@ def pixels(x: float, y: float) -> tuple[float, float]:
 def new_ground(scenario: Scenario) -> tuple[Figure, Axes]:
     """Return a figure with everything that does not change during an episode."""
     figure = new_figure((WIDTH + 0.1) / DPI, (HEIGHT + 0.1) / DPI)
-    ax = figure.add_axes((*pixels(_LEFT, _BOTTOM), *pixels(_SIDE, _SIDE)))
+    ax = figure.add_axes((*pixels(LEFT, _BOTTOM), *pixels(_SIDE, _SIDE)))
     ax.set_facecolor(GROUND)
     ax.set_axisbelow(True)
     ax.grid(True, color="white", linewidth=0.8)
@@ -71,10 +72,15 @@ def new_ground(scenario: Scenario) -> tuple[Figure, Axes]:
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.set_aspect("equal")
     ax.set_autoscale_on(False)
-    figure.text(*pixels(_LEFT, HEIGHT - 21), scenario.title, fontsize=NORMAL + 1.5, color=INK)
+    figure.text(*pixels(LEFT, HEIGHT - 21), scenario.title, fontsize=NORMAL + 1.5, color=INK)
     draw_site(ax, scenario)
-    _name_landmarks(ax, scenario)
     return figure, ax
+
+
+def shrink(text: Text, width: float) -> None:
+    """Make a text small enough for a width, px."""
+    wide = text.get_window_extent().width
+    text.set_fontsize(float(text.get_fontsize()) * min(1.0, width / wide))
 
 
 def draw_site(ax: Axes, scenario: Scenario) -> None:
@@ -98,20 +104,21 @@ def footprint(scenario: Scenario, obstacle: Obstacle) -> np.ndarray:
     return np.asarray(corners + np.array(obstacle.center)[:2] - np.array(scenario.map.origin)[:2])
 
 
-def _name_landmarks(ax: Axes, scenario: Scenario) -> None:
-    """Write the names of landmarks that are always in the same place."""
-    origin = np.array(scenario.map.origin)[:2]
-    for landmark in scenario.landmarks:
-        if landmark.motion.kind == "static" and not landmark.is_drawn:
-            place = np.array(landmark.position)[:2] + np.array(landmark.marker)[:2] - origin
-            label_landmark(ax, landmark.name, place)
+def name_landmarks(ax: Axes, scenario: Scenario) -> list[Annotation]:
+    """Write the names of landmarks that are always in the same place, and return them."""
+    fixed = [m for m in scenario.landmarks if m.motion.kind == "static" and not m.is_drawn]
+    places = np.array([np.add(m.position, m.marker) for m in fixed]).reshape(-1, 3) - np.array(scenario.map.origin)
+    at = ax.transData.transform(places[:, :2])
+    offsets = place_names([m.name for m in fixed], at, at, np.zeros((0, 2)), SMALL)
+    named = zip(fixed, places, offsets.tolist(), strict=True)
+    return [label_landmark(ax, landmark.name, place, (x, y)) for landmark, place, (x, y) in named]
 
 
-def label_landmark(ax: Axes, name: str, place: np.ndarray) -> Annotation:
-    """Write a landmark's name beside it."""
+def label_landmark(ax: Axes, name: str, place: np.ndarray, offset: tuple[float, float] = (4.5, 4.5)) -> Annotation:
+    """Write a landmark's name beside it; `offset` is that of the name's lower left corner, pt."""
     look: dict[str, Any] = {"path_effects": [withStroke(linewidth=1.8, foreground="white")], "annotation_clip": True}
-    anchor, offset = (float(place[0]), float(place[1])), (4.5, 4.5)
-    return ax.annotate(name, anchor, offset, textcoords="offset points", fontsize=SMALL, color=DARK_BLUE, **look)
+    look |= {"textcoords": "offset points", "fontsize": SMALL, "color": DARK_BLUE}
+    return ax.annotate(name, (float(place[0]), float(place[1])), offset, **look)
 
 
 def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
@@ -119,14 +126,13 @@ def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
     sensed, end = scenario.topology.mode == "sensed", scenario.termination
     moving = any(landmark.motion.kind != "static" for landmark in scenario.landmarks)
     goals, bodies = (any(getattr(vehicle, part) for vehicle in scenario.vehicles) for part in ("goal_radius", "body"))
+    honest = states_covariance(scenario.observer.name)
     marks: list[tuple[object, Artist]] = [
         (True, Patch(facecolor=GREY, edgecolor=INK, linewidth=0.7, label=_vehicle_words(scenario))),
         (True, Patch(facecolor="white", edgecolor=GREY, linewidth=1.4, label="its estimate")),
         (True, Line2D([], [], color=GREY, linewidth=1.0, linestyle=DOTTED, label="error of the estimate")),
-        (
-            states_covariance(scenario.observer.name),
-            Patch(facecolor="#7F7F7F30", edgecolor=GREY, linewidth=0.8, label=_ellipse_words(scenario)),
-        ),
+        (honest, Patch(facecolor="#7F7F7F30", edgecolor=GREY, linewidth=0.8, label=_ellipse_words(scenario))),
+        (not honest, _mark("$-$", INK, INK, 5, "no 3σ: P is a gain matrix")),
         (sees_a_part(scenario), Patch(facecolor="#7F7F7F24", edgecolor="none", label="field of view")),
         (True, _sight(Sight.VISIBLE, "sees (its colour)")),
         (sensed and scenario.obstacles, _sight(Sight.OCCLUDED_BY_BUILDING, "hidden by a building")),

@@ -21,6 +21,7 @@ from coopenv.backends.mrclam.recording import recording_of
 from coopenv.cli import main
 from coopenv.observers import Recording, run
 from coopenv.observers.recording import Truth
+from coopenv.viz.web.extra import has_viser
 from tests.helpers import mrclam_files
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import differences, simulated
@@ -266,6 +267,9 @@ def test_command_records_robots(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert main(["record", "mrclam_6", *data, "--variant", "blind", "--out", str(path)]) == 0
     assert differences(recording_of(load_dataset("mrclam_6", tmp_path), "blind"), read_recording(path)) == []
     assert not capsys.readouterr().err
+    if has_viser():
+        page = path.with_suffix(".html").read_text(encoding="utf-8")
+        assert "mrclam_6, observer planar_robust" in page and "first" not in page.split("<details id")[1]
     (tmp_path / "MRCLAM_Dataset6" / "Robot5_Measurement.dat").write_text("")
     assert main(["record", "mrclam_6", *data, "--force", "--out", str(path)]) == 0
     assert capsys.readouterr().err == "warning: mrclam_6: no detections of robot 5\n"

@@ -49,6 +49,12 @@ def test_the_page_of_every_environment_is_up_to_date(name: str) -> None:
     assert not measure or (PAGES / f"{name}.json").is_file(), again + measure
     with Image.open(PAGES / f"{name}.png") as picture:
         assert picture.size == (WIDTH, HEIGHT), again
+    with Image.open(PAGES / f"{name}.webp") as film:
+        assert film.n_frames > 20, again
+
+
+def test_films_of_all_environments_are_small() -> None:
+    assert sum(path.stat().st_size for path in PAGES.glob("*.webp")) < 3e6
 
 
 def test_the_index_lists_every_environment() -> None:
@@ -60,7 +66,7 @@ def test_the_index_lists_every_environment() -> None:
 def test_a_page_says_what_the_file_says(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["page", str(small), "--out", str(tmp_path / "pages")]) == 0
     assert "small.md" in capsys.readouterr().out
-    assert sorted(path.name for path in (tmp_path / "pages").iterdir()) == ["small.md", "small.png"]
+    assert sorted(path.name for path in (tmp_path / "pages").iterdir()) == ["small.md", "small.png", "small.webp"]
     text = (tmp_path / "pages" / "small.md").read_text(encoding="utf-8")
     for line in (
         *("# A | b", "One &lt;car>.", "- whether a landmark is there: with 75 %", "| `time` | 0.375 | s |"),
@@ -76,6 +82,31 @@ def test_a_page_says_what_the_file_says(small: Path, tmp_path: Path, capsys: pyt
             assert line.endswith("|")
     with Image.open(tmp_path / "pages" / "small.png") as picture:
         assert np.ptp(np.asarray(picture.convert("L"))) > 100
+
+
+def test_what_moves_has_a_film(tmp_path: Path) -> None:
+    """Where nothing moves there is none, and one of earlier is no longer there."""
+    moving, still = tmp_path / "moving.toml", tmp_path / "still.toml"
+    for path, motion in ((moving, 'kind = "constant", linear = [1, 0, 0]'), (still, 'kind = "static"')):
+        path.write_text(
+            'title = "Straight on"\nhorizon = 2.0\nobserver.name = "dead_reckoning"\n'
+            'landmarks = [{ name = "sign", position = [1, 2, 3] }]\n'
+            f"[[vehicles]]\ninitial_pose = {{ position = [0, 0, 0] }}\nmotion = {{ {motion} }}\n"
+        )
+    out = tmp_path / "pages"
+    out.mkdir()
+    (out / "still.webp").write_bytes(b"earlier")
+    assert main(["page", str(moving), str(still), "--out", str(out)]) == 0
+    assert sorted(path.name for path in out.glob("*.webp")) == ["moving.webp"]
+    with Image.open(out / "moving.webp") as film:
+        assert film.n_frames == 13  # 2 s at 6 pictures a second, and the first
+    text = (out / "moving.md").read_text(encoding="utf-8")
+    assert "](moving.webp)" in text and "estimated by `dead_reckoning`" in text and "driven by" not in text
+    assert ".webp" not in (out / "still.md").read_text(encoding="utf-8")
+    before = (out / "moving.webp").stat().st_mtime_ns
+    assert main(["page", str(moving), "--no-film", "--out", str(out)]) == 0
+    assert (out / "moving.webp").stat().st_mtime_ns == before
+    assert "](moving.webp)" in (out / "moving.md").read_text(encoding="utf-8")
 
 
 def test_the_dial_is_measured_and_shown(tmp_path: Path) -> None:

@@ -12,14 +12,11 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
-from tests.helpers.chromium import chromium
-
 APPROVED = Path(__file__).parent / "approved"
 SIZES = {"laptop": (1280, 800), "phone": (390, 844)}
 LOADING = 60_000  # ms
 _COARSE = (64, 64)
 _DIFFERENT = 0.06  # mean difference of two pictures, of the whole range
-SOFTWARE = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 HARMLESS = ("THREE.Clock", "GPU stall due to ReadPixels", "GL Driver Message")
 """Warnings of the drawing library and of drawing without a graphics card."""
 
@@ -58,13 +55,6 @@ class Watched:
         """Return the addresses outside this computer that were asked for."""
         own = ("file:", "data:", "blob:", "http://127.0.0.1:", "ws://127.0.0.1:")
         return [url for url in self.requests if not url.startswith(own)]
-
-
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Any]:
-    """A browser without a graphics card."""
-    with chromium(SOFTWARE) as started:
-        yield started
 
 
 @pytest.fixture(params=SIZES)

@@ -12,6 +12,8 @@ import pytest
 
 from coopenv.cli import main
 from coopenv.cli.options import has_display
+from coopenv.fake.fleet import fakes
+from coopenv.shipped import data_directory
 from tests.helpers.processes import COOPENV, start
 
 pytest.importorskip("viser", reason="needs the extra view")
@@ -67,7 +69,11 @@ def test_without_the_extra_runs_say_what_is_missing(
         (["view", "svea"], "--deployment: needed by coopenv view svea"),
         (["view", "svea", "--deployment", "none.toml"], "none.toml"),
         (["view", "overtaking", "--deployment", "x.toml"], "--deployment x.toml: is for coopenv view svea"),
+        (["view", "overtaking", "--connect", "tcp/127.0.0.1:1"], "--connect tcp/127.0.0.1:1: is for coopenv view svea"),
         (["view", "no.mcap"], "no.mcap"),
+        (["view", "cut.npz"], "cut.npz: not a readable scene: it is cut off"),
+        (["film", "cut.npz", "--out", "film.gif"], "cut.npz: not a readable scene: it is cut off"),
+        (["view", "cut.mcap"], "cut.mcap: cut off"),
         (["view", "no.bag"], "no.bag"),
         (["view", "scene.npz"], "scene.npz: not a readable scene"),
         (["view", "others.mcap"], "others.mcap"),
@@ -79,6 +85,12 @@ def test_without_the_extra_runs_say_what_is_missing(
 )
 def test_bad_input_is_one_line(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path("others.mcap").write_bytes(b"\x89MCAP0\r\nnothing")
+    if arguments[1].startswith("cut"):
+        assert main(["record", *SHORT, "--no-scene", "--no-replay", "--out", "whole.mcap"]) == 0
+        Path("cut.mcap").write_bytes(Path("whole.mcap").read_bytes()[:5000])
+        assert main(["run", *SHORT, "--no-figures", "--out", "run"]) == 0
+        Path("cut.npz").write_bytes(Path("run/scene.npz").read_bytes()[:5000])
+        capsys.readouterr()
     assert main(arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -86,7 +98,9 @@ def test_bad_input_is_one_line(arguments: list[str], message: str, capsys: pytes
     assert message in captured.err
 
 
-def test_without_a_display_no_browser_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_display_no_browser_is_opened(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
@@ -95,9 +109,28 @@ def test_without_a_display_no_browser_is_opened(monkeypatch: pytest.MonkeyPatch)
     assert main(["run", *SHORT, "--out", "there", "--open"]) == 0
     monkeypatch.setenv("DISPLAY", ":0")
     opened: list[str] = []
-    monkeypatch.setattr("webbrowser.open", opened.append)
-    assert main(["run", *SHORT, "--out", "there", "--open"]) == 0
-    assert opened == [(Path.cwd() / "there" / "replay.html").as_uri()]
+    monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url) or len(opened) == 1)
+    capsys.readouterr()
+    for said in ("", "note: there is no browser to open there/replay.html\n"):
+        assert main(["run", *SHORT, "--out", "there", "--open"]) == 0
+        assert capsys.readouterr().err == said
+    assert opened == 2 * [(Path.cwd() / "there" / "replay.html").as_uri()]
+
+
+def test_a_folder_does_not_take_the_place_of_an_environment(capsys: pytest.CaptureFixture[str]) -> None:
+    """A run that was kept as `overtaking` is ./overtaking; `overtaking` is the environment, which can be changed."""
+    assert main(["run", *SHORT, "--no-figures", "--out", "overtaking"]) == 0
+    assert main(["film", *SHORT, "--fps", "1", "--out", "film.gif"]) == 0
+    assert main(["run", "overtaking", "--steps", "2", "--no-figures", "--out", "again"]) == 0
+    Path("crossing_path").mkdir()
+    Path("crossing_path/metadata.yaml").touch()  # as a bag has it
+    assert main(["run", "crossing_path", "--steps", "2", "--no-figures", "--out", "again"]) == 0
+    capsys.readouterr()
+    assert main(["film", "./overtaking", "--fps", "1", "--out", "film.gif"]) == 0
+    assert main(["film", "./overtaking", "--set", "horizon=1.0", "--out", "film.gif"]) == 2
+    assert "./overtaking has been run" in capsys.readouterr().err
+    assert main(["run", "./crossing_path", "--no-figures", "--out", "again"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_the_view_serves_on_loopback_until_it_is_ended(folder: Path) -> None:
@@ -113,3 +146,25 @@ def test_the_view_serves_on_loopback_until_it_is_ended(folder: Path) -> None:
     os.kill(process.pid, signal.SIGINT)
     _, errors = process.communicate(timeout=20)
     assert process.returncode == 130 and "Traceback" not in errors
+
+
+@pytest.mark.slow
+def test_cars_are_watched_where_they_are(folder: Path) -> None:
+    """Fake cars, their router and the view are processes of their own; a program reads what a browser would be sent."""
+    connect = pytest.importorskip("websockets.sync.client").connect
+    viser = pytest.importorskip("viser")
+    fleet = data_directory("examples/fleet") / "overtaking.toml"
+    with fakes(fleet, None, 0) as router:
+        command = (*COOPENV, "view", "svea", "--deployment", str(fleet), "--connect", router, "--no-browser")
+        process = start(command, folder)
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert "http" in line, process.communicate()
+        address = line.split()[0].replace("http", "ws")
+        versions = [f"viser-v{viser.__version__}"]
+        with connect(address, subprotocols=versions, max_size=None) as link:
+            moved = [message for message in (link.recv(timeout=30) for _ in range(40)) if isinstance(message, bytes)]
+        assert len(moved) == 40
+        os.kill(process.pid, signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130 and "Traceback" not in errors, errors

@@ -9,11 +9,13 @@ from typing import Any
 
 import pytest
 
+SOFTWARE = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+"""Draws without a graphics card."""
 REASON = "needs chromium and playwright: make test-browser"
 
 
 @contextmanager
-def chromium(arguments: Sequence[str] = ("--no-sandbox",)) -> Iterator[Any]:
+def chromium(arguments: Sequence[str] = SOFTWARE) -> Iterator[Any]:
     """Start a browser and end it; skip the test where there is none."""
     playwright = pytest.importorskip("playwright.sync_api", reason=REASON)
     program = shutil.which("chromium")

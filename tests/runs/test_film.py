@@ -10,7 +10,6 @@ from PIL import Image
 
 import coopenv
 from coopenv.api.engine import Engine
-from coopenv.cli.options import console
 from coopenv.errors import CoopenvError, OutputError
 from coopenv.runs.film import frames_at, write_film
 from coopenv.runs.scenes import scene_of
@@ -35,7 +34,7 @@ def test_a_film_shows_the_frame_that_is_there() -> None:
 @pytest.mark.parametrize("suffix", [".webp", ".gif"])
 def test_a_film_is_the_top_view_in_time(suffix: str, record: SceneRecord, tmp_path: Path) -> None:
     path = tmp_path / f"film{suffix}"
-    assert write_film(record, path, console(), fps=5.0, width=448, panel=False) == 16
+    assert write_film(record, path, fps=5.0, width=448, panel=False) == 16
     with Image.open(path) as film:
         assert film.n_frames == 16 and film.size[0] == 448
         film.seek(15)
@@ -49,7 +48,7 @@ def test_a_film_is_the_top_view_in_time(suffix: str, record: SceneRecord, tmp_pa
 
 def test_mp4_has_every_picture(record: SceneRecord, tmp_path: Path) -> None:
     ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
-    assert write_film(record, tmp_path / "film.mp4", console(), fps=10.0, speed=2.0) == 16
+    assert write_film(record, tmp_path / "film.mp4", fps=10.0, speed=2.0) == 16
     assert ffmpeg.count_frames_and_secs(str(tmp_path / "film.mp4"))[0] == 16
 
 
@@ -57,8 +56,8 @@ def test_other_formats_and_missing_extras_are_told(
     record: SceneRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(OutputError, match=r"film\.avi: unknown format of a film; known: \.mp4, \.gif, \.webp"):
-        write_film(record, tmp_path / "film.avi", console(), fps=10.0)
+        write_film(record, tmp_path / "film.avi", fps=10.0)
     monkeypatch.setattr("coopenv.runs.video.find_spec", lambda name: None)
     with pytest.raises(CoopenvError, match=r"pip install '\.\[video\]'"):
-        write_film(record, tmp_path / "film.mp4", console(), fps=10.0)
+        write_film(record, tmp_path / "film.mp4", fps=10.0)
     assert not list(tmp_path.iterdir())

@@ -126,8 +126,31 @@ def test_switches_change_what_is_shown(viewer: Viewer) -> None:
     wish(viewer, ("magnification", 10.0), ("show names", False), ("show views", False))
     large = np.array(viewer._picture.actors._ellipsoids.handle.batched_scales)
     np.testing.assert_allclose(large[small > 0.05] / small[small > 0.05], 10.0, rtol=0.05)
-    assert not any(label.visible for label in viewer._picture._labels._cars)
-    assert not any(view.visible for view in viewer._picture._views)
+    assert not any(label.handle.visible for label in viewer._picture._labels._cars)
+    assert not any(view.handle.visible for view in viewer._picture._views)
+
+
+def test_what_stands_still_is_not_sent_again(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A frame that is shown twice costs nothing but the time, and while playing every other name and view waits."""
+    from viser.infra._async_message_buffer import AsyncMessageBuffer
+
+    sent: list[str] = []
+    push = AsyncMessageBuffer.push
+    monkeypatch.setattr(
+        AsyncMessageBuffer, "push", lambda buffer, message: (sent.append(repr(message)), push(buffer, message))
+    )
+    wish(viewer, ("play", None), ("seek", 1.0))
+    picture, frame = viewer._picture, viewer._frame
+    sent.clear()
+    picture.show(frame)
+    assert sent == []
+    later = viewer._reel.frames[len(viewer._reel.frames) // 2]
+    for turn in (0, 1):
+        picture.show(later, turn)
+    by_turns = [handle.handle.vertices.copy() for handle in picture._views]
+    picture.show(later)
+    for kept, handle in zip(by_turns, picture._views, strict=True):
+        np.testing.assert_array_equal(kept, handle.handle.vertices)
 
 
 def test_wrong_wishes_are_answered_and_the_view_goes_on(viewer: Viewer) -> None:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-
-from tests.helpers.chromium import chromium
 
 pytestmark = pytest.mark.browser
 LOCAL = ("file:", "data:", "blob:")
@@ -28,12 +25,6 @@ CUT = """() => {
     return found.slice(0, 3);
 }"""
 """What of the text a reader cannot get to: wide tables and code scroll in boxes of their own."""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with chromium() as started:
-        yield started
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from itertools import combinations
 from typing import Any
 
 import matplotlib as mpl
@@ -34,6 +35,7 @@ from coopenv.viz.topview_geometry import (
     position_covariance,
     ways,
 )
+from coopenv.viz.topview_goals import touching
 from coopenv.viz.topview_ground import HEIGHT, MAP_WIDTH, PANEL, ROW, TABLE_TOP, WIDTH
 from tests.helpers.builders import scenario
 from tests.helpers.four_way import FOUR_WAY
@@ -401,3 +403,49 @@ def test_ways_differ_from_bodies_only_where_the_paper_has_them_so() -> None:
     turned = ways(load_scenario("busy_intersection"))
     np.testing.assert_allclose(turned, [np.pi / 2, np.pi / 2, 0, 0, 0], atol=1e-9)
     assert not ways(load_scenario("urban_crossing")).any()
+
+
+def test_goals_that_touch_share_a_name() -> None:
+    center = np.array([[0, 0], [5, 0], [1.5, 0], [2.9, 0], [np.nan, 0], [0, 9]])
+    assert touching(center, np.full(6, 0.8)) == [[1], [0, 2, 3], [5]]
+    engine = Engine(load_scenario("large_crossing"))
+    engine.reset([0])
+    view = TopView(engine.backend.scenario)
+    view.draw(engine)
+    names = [name for name in view._goals._names if name.get_text()]
+    assert 1 < len(names) < 16
+    boxes = [name.get_window_extent() for name in names]
+    assert not any(a.overlaps(b) for a, b in combinations(boxes, 2))
+    map_box = view._axes.get_window_extent()
+    assert all(map_box.x0 <= box.x0 and box.x1 <= map_box.x1 for box in boxes)
+
+
+@pytest.mark.parametrize("name", ["busy_intersection", "large_crossing", "svea_overtaking"])
+def test_names_stand_beside_their_vehicles(name: str) -> None:
+    engine = Engine(load_scenario(name))
+    engine.reset([0])
+    view = TopView(engine.backend.scenario)
+    view.draw(engine)
+    for label, body in zip(view._names, view._truth.get_paths(), strict=True):
+        corners = view._axes.transData.transform(body.vertices[:4])
+        if not np.isfinite(corners).all():  # is not there
+            continue
+        text = label.get_window_extent()
+        apart = [text.x0 - corners[:, 0].max(), corners[:, 0].min() - text.x1]
+        apart += [text.y0 - corners[:, 1].max(), corners[:, 1].min() - text.y1]
+        assert max(apart) > -2.0, label.get_text()  # px
+
+
+def test_the_title_of_a_map_alone_ends_where_the_error_begins() -> None:
+    made = load_scenario("busy_intersection", {"title": "Busy intersection, with a mirrored start and more"})
+    engine, view = Engine(made), TopView(made, panel=False)
+    engine.reset([0])
+    view.draw(engine)
+    assert view._figure.texts[0].get_window_extent().x1 < view._time.get_window_extent().x0
+
+
+def test_the_legend_says_why_there_is_no_sigma() -> None:
+    for name, gain in (("riccati", True), ("robust", False)):
+        view = TopView(load_scenario("busy_intersection", {"observer.name": name}))
+        words = [text.get_text() for part in view._figure.legends for text in part.get_texts()]
+        assert ("no 3σ: P is a gain matrix" in words) == gain

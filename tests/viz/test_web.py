@@ -21,6 +21,7 @@ from coopenv.viz.scene import SceneRecord, Source, Stage
 from coopenv.viz.web.copies import placed, quaternions
 from coopenv.viz.web.extra import has_viser, viser_module
 from coopenv.viz.web.ground import spacing_of
+from coopenv.viz.web.labels import levels
 from coopenv.viz.web.legend import GAIN
 from coopenv.viz.web.look import linear
 from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, useful_magnification
@@ -44,6 +45,11 @@ def messages(page: str) -> tuple[float, list[tuple[float, dict[str, Any]]]]:
     length = int.from_bytes(inner[:8], "little")
     content = msgspec.msgpack.decode(inner[8 : 8 + length])
     return content["durationSeconds"], content["messages"]
+
+
+def test_names_of_vehicles_that_are_close_stand_above_each_other() -> None:
+    points = np.array([[0.0, 0], [1, 0], [9, 0], [1.5, 0], [np.nan, 0], [9, -0.5]])
+    assert levels(points, 2.0).tolist() == [0, 1, 1, 2, 0, 0]
 
 
 def test_a_page_holds_the_episode(tmp_path: Path) -> None:

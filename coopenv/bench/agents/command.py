@@ -103,16 +103,17 @@ def write(
     """
     if (folder / JSON_FILE).exists() and not force:
         raise OutputError(f"{folder / JSON_FILE}: exists already; --force replaces it")
-    with replacing_folder(folder, result_names()) as new:
+    earlier = [path.name for path in folder.glob("replay_*.html")]
+    with replacing_folder(folder, [*result_names(), *earlier]) as new:
         evaluation = run(request, entrants, log)
         replace_text(new / JSON_FILE, json_text(document(request, evaluation)))
         if figures is not None:
             from coopenv.bench.agents.figures import save_figures
-            from coopenv.bench.agents.replay import write_replay
+            from coopenv.bench.agents.replay import write_replays
 
             with Progress(log, "drawing figures"):
                 save_figures(evaluation, new, figures, width)
-            write_replay(evaluation, new / REPLAY_FILE, log)
+            write_replays(evaluation, new, log)
         if film:
             from coopenv.bench.agents.film import write_film
 
@@ -121,7 +122,7 @@ def write(
 
 
 def result_names() -> list[str]:
-    """Return the names of all files that an evaluation can write."""
+    """Return the names of all files that an evaluation can write, but for the pages of further drivers."""
     return [JSON_FILE, *(f"{name}.{form}" for name in FIGURES for form in FORMATS), *FILMS, REPLAY_FILE]
 
 

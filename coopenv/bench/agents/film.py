@@ -36,8 +36,8 @@ def write_film(evaluation: Evaluation, folder: Path, log: Console) -> Path:
 def pictures_of(entrant: Entrant, seed: int) -> Iterator[np.ndarray]:
     """Yield the pictures, (H, W, 3) uint8, of a driver's episode: its name, the error and the time above the map."""
     scenario = entrant.scenario
-    view = TopView(scenario.model_copy(update={"title": entrant.name}), panel=False)
     engine = Engine(scenario)
+    view = TopView(engine.backend.scenario.model_copy(update={"title": entrant.name}), panel=False)
     try:
         for tick in play(engine, [seed], scenario.horizon_ticks, entrant.policy, to_the_end=False):
             if tick % frame_stride(scenario) == 0:

@@ -68,16 +68,6 @@ def shrink(turn: Any, limit: Any):
 
 
 @wp.func
-def dead_reckon(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
-    """Run one tick without correction: the estimate follows odometry, P grows."""
-    predict(model, state, world, vehicle, type(model.observer.max_turn)(now.period))
-    if now.due:
-        state.corrected_tick[world, vehicle] = now.tick
-    # Products of rotations drift by rounding; once per tick is enough to keep Rhat a rotation.
-    state.estimate_rotation[world, vehicle] = orthonormalise(state.estimate_rotation[world, vehicle])
-
-
-@wp.func
 def kalman_step(
     k: Any, h: Any, limit: Any, last: bool, M11: Any, M12: Any, M22: Any, L11: Any, L21: Any, L22: Any, r1: Any, r2: Any
 ):
@@ -177,7 +167,6 @@ def fitted(model: Any) -> Embedded:
 RICCATI = Embedded("riccati", make_estimate(gain_step), start_nothing, send_nothing, fit=fitted, messages=POSITION)
 KALMAN = replace(RICCATI, name="riccati_kalman", estimate=make_estimate(kalman_step))
 """Where every gain k is 1: the eigenvalues that other gains need are not even compiled."""
-DEAD_RECKONING = Embedded("dead_reckoning", dead_reckon, start_nothing, send_nothing)
 
 
 def riccati(setup: Setup) -> Observer:

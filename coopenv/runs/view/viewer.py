@@ -16,6 +16,7 @@ from coopenv.viz.web.panel import NO_FAULT, Panel
 from coopenv.viz.web.picture import Picture, useful_magnification
 from coopenv.viz.web.plots import History
 from coopenv.viz.web.replay import aim
+from coopenv.viz.web.sent import Sent
 
 _NAP = 0.05  # s, longest sleep: wishes are not kept waiting longer
 _LAG = 0.5  # s that frames may be late before time is let go
@@ -43,6 +44,7 @@ class Viewer:
         self._panel = Panel(server.gui, self._stage, reel.source, self._look, reel.abilities(), reel.length)
         aim(server.initial_camera, self._stage)
         self._picture = Picture(server.scene, self._stage, reel.source, self._look)
+        self._root = Sent(self._picture.ground.root)
         self._picture.actors.cars.handle.on_click(
             lambda event: self._panel.wishes.put(("vehicle", event.instance_index))
         )
@@ -112,12 +114,12 @@ class Viewer:
         picked = self._panel.picked
         self._look.only = picked if self._alone else None
         with self._server.atomic():
-            self._picture.show(self._frame)
+            self._picture.show(self._frame, self.shown if self.playing else None)
             place = np.zeros(3)
             if picked is not None and self._follow and np.isfinite(self._frame.vehicle_position[picked]).all():
                 place = self._middle - [*self._frame.vehicle_position[picked, :2], 0.0]
-            self._picture.ground.root.position = tuple(np.round(place, 4).tolist())
-        self._panel.show(self._frame, self._history, now)
+            self._root.tell(position=tuple(np.round(place, 4).tolist()))
+            self._panel.show(self._frame, self._history, now, exact=not self.playing)
         self._shown_at = now
         self.shown += 1
 

@@ -125,7 +125,9 @@ class SceneRecord:
                 fields = {name: data[name] for name in FIELDS}
         except CoopenvError:
             raise
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except zipfile.BadZipFile:
+            raise DataError(f"{path}: not a readable scene: it is cut off or damaged, or was never one") from None
+        except (OSError, ValueError, KeyError, EOFError) as error:
             why = getattr(error, "strerror", None) or error
             raise DataError(f"{path}: not a readable scene ({why})") from None
         return cls._checked(path, header, fields)

@@ -16,6 +16,8 @@ REACH = 0.4
 _SHORTEST = 0.035  # of the picture's side, drawn length of a vehicle
 _CAR = Body(size=(4.4, 1.9, 1.5), center=(0.0, 0.0, 0.75))  # stands in for a vehicle without a body
 
+_ALL = slice(None)
+
 
 class Box(NamedTuple):
     """A box that hides what is behind it."""
@@ -94,17 +96,17 @@ class Stage:
         """Return the points that cameras see, (A, 3)."""
         return np.asarray(frame.position + (frame.rotation @ self.marker[..., None])[..., 0])
 
-    def fields_of_view(self, frame: Frame, every: int = 1) -> np.ndarray | None:
+    def fields_of_view(self, frame: Frame, every: int = 1, of: slice = _ALL) -> np.ndarray | None:
         """Return the fields of view in plan as polygons (N, K + 1, 3), the camera first; None where all see everything.
 
-        Buildings end them. Of the rays along the rim every so many are taken.
+        Buildings end them. Of the rays along the rim every so many are taken, and of the vehicles those `of` a slice.
         """
         if not self.sees_a_part:
             return None
-        eye = self.eyes(frame)
-        turned = np.array([geometry.about_z(pan) for pan in frame.pan])
-        rays = self._fan[:, ::every] @ np.swapaxes(frame.vehicle_rotation @ turned, 1, 2)
-        length = geometry.free_lengths(eye, rays, self.reach, self.scenario.obstacles, self.origin)
+        eye = self.eyes(frame)[of]
+        turned = np.array([geometry.about_z(pan) for pan in frame.pan[of]])
+        rays = self._fan[of, ::every] @ np.swapaxes(frame.vehicle_rotation[of] @ turned, 1, 2)
+        length = geometry.free_lengths(eye, rays, self.reach[of], self.scenario.obstacles, self.origin)
         return np.concatenate([eye[:, None], eye[:, None] + length[..., None] * rays], axis=1)
 
     def hider(self, frame: Frame, vehicle: int, target: int) -> str | None:

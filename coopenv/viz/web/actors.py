@@ -15,6 +15,7 @@ from coopenv.viz.web.look import Look, rgb
 _SHELL = 1.08  # size of an estimate: around the true vehicle, so that both are seen where they agree
 _LARGEST = 0.5  # of the scene's side, largest semi-axis of an ellipsoid that is drawn
 _HONEST, _GAIN = 0.2, 0.08  # opacity of an ellipsoid: of a covariance, of a matrix of gains
+_STEPS, _TURN = 32, 2.0**-9  # of an ellipsoid: sizes in a doubling, and steps of its quaternion
 _DOT = 0.008  # of the scene's side, radius of a landmark
 _FAR = 2.0  # scene's sides from its middle: estimates farther away are drawn there
 
@@ -80,8 +81,9 @@ class Actors:
         axes = axes * np.sign(np.linalg.det(axes))[:, None, None]
         semi = look.magnification * 3.0 * np.sqrt(np.maximum(variance, 0.0))
         drawn = finite & (variance[:, 0] >= 0.0) & (semi[:, 2] <= _LARGEST * self._stage.side)
-        semi = fine(np.where(drawn[:, None], semi, np.nan), self._step / 4)
-        self._ellipsoids.put(placed(axes, self._near(frame.estimate_position), semi), look.ellipsoids)
+        steps = np.log2(np.maximum(np.where(drawn[:, None], semi, np.nan), self._step / 4)) * _STEPS
+        semi = 2.0 ** (np.round(steps) / _STEPS)
+        self._ellipsoids.put(placed(axes, self._near(frame.estimate_position), semi, _TURN), look.ellipsoids)
 
     def _place_landmarks(self, frame: Frame) -> None:
         L, side = self._stage.landmarks, self._stage.side

@@ -47,6 +47,12 @@ def legend_html(stage: Stage, source: Source, magnification: float) -> str:
     return rows + note
 
 
+def swatch(colour: str) -> str:
+    """Return a small square in a colour, beside which text stands in ink: many colours are too pale for text."""
+    look = f"width:9px;height:9px;background:{colour};border:1px solid {INK}"
+    return f'<span style="display:inline-block;{look}"></span>'
+
+
 def _svg(content: str) -> str:
     return f'<svg width="22" height="12" viewBox="0 0 22 12" style="vertical-align:middle">{content}</svg>'
 

@@ -11,6 +11,7 @@ from coopenv.viz.scene.stage import Box
 from coopenv.viz.style import GREY, INK
 from coopenv.viz.web import shapes
 from coopenv.viz.web.look import Look, linear, rgb
+from coopenv.viz.web.sent import Sent
 
 Coloured = tuple[np.ndarray, np.ndarray]
 """Segments (K, 2, 3), m, and their colours (K, 3) uint8."""
@@ -29,26 +30,31 @@ class Segments:
         """Begin with none; the thickness is in pixels."""
         self._scene, self._name, self._thickness = scene, name, thickness
         self._room = 0
-        self._handle: Any = None
+        self._node: Sent | None = None
+        self._colours, self._shade = np.zeros((0, 3), np.uint8), np.zeros((0, 2, 3), np.uint8)
 
     def show(self, points: np.ndarray, colours: np.ndarray) -> None:
         """Show segments (K, 2, 3) in colours (K, 3); those with NaN are left out."""
         good = np.isfinite(points).all(axis=(1, 2))
-        points, colours = points[good], colours[good]
-        if self._handle is not None:
-            self._handle.visible = len(points) > 0
+        if not good.all():
+            points, colours = points[good], colours[good]
+        if self._node is not None:
+            self._node.tell(visible=len(points) > 0)
         if not len(points):
             return
-        if len(points) > self._room:
+        grown = len(points) > self._room
+        if grown:
             self._room = -(-len(points) // _GROWTH) * _GROWTH
-        whole = np.tile(points[:1, :1], (self._room, 2, 1)).astype(np.float32)
-        shade = np.tile(linear(colours)[:1, None], (self._room, 2, 1)).astype(np.uint8)
-        whole[: len(points)], shade[: len(points)] = points, linear(colours)[:, None]
-        if self._handle is None or self._handle.points.shape != whole.shape:
+        whole = np.empty((self._room, 2, 3), np.float32)
+        whole[: len(points)], whole[len(points) :] = points, points[0, 0]
+        if grown or not np.array_equal(colours, self._colours):
+            self._colours, shade = colours, linear(colours)
+            self._shade = np.empty((self._room, 2, 3), np.uint8)
+            self._shade[: len(points)], self._shade[len(points) :] = shade[:, None], shade[0]
+        if self._node is None or grown:
             look: dict[str, Any] = {"thickness": self._thickness, "thickness_units": "screen"}
-            self._handle = self._scene.add_line_segments(self._name, whole, shade, **look)
-        else:
-            self._handle.points, self._handle.colors = whole, shade
+            self._node = Sent(self._scene.add_line_segments(self._name, whole, self._shade, **look))
+        self._node.tell(points=whole, colors=self._shade)
 
 
 def joined(*parts: Coloured) -> Coloured:
@@ -82,14 +88,15 @@ def sight_lines(stage: Stage, frame: Frame, colours: np.ndarray, look: Look) -> 
 
 def stopped(start: np.ndarray, end: np.ndarray, boxes: list[Box]) -> np.ndarray:
     """Return where the ways from start to end (K, 3) enter a box first, not one that they begin in; or the end."""
-    share = np.ones(len(start))
-    for box in boxes:
-        half = np.asarray(box.size, float) / 2
-        a, way = (start - box.center) @ box.rotation, (end - start) @ box.rotation
-        way = np.where(np.abs(way) < 1e-12, 1e-12, way)
-        sides = np.sort(np.stack([(-half - a) / way, (half - a) / way]), axis=0)
-        enter, leave = sides[0].max(axis=-1), sides[1].min(axis=-1)
-        share = np.where((enter < leave) & (enter > 1e-6), np.minimum(share, enter), share)
+    if not len(start) or not boxes:
+        return np.asarray(end)
+    turn, center = np.stack([box.rotation for box in boxes]), np.stack([box.center for box in boxes])
+    half = np.array([box.size for box in boxes], float)[:, None] / 2
+    a, way = (start - center[:, None]) @ turn, (end - start) @ turn  # (boxes, K, 3)
+    way = np.where(np.abs(way) < 1e-12, 1e-12, way)
+    one, other = (-half - a) / way, (half - a) / way
+    enter, leave = np.minimum(one, other).max(axis=-1), np.maximum(one, other).min(axis=-1)
+    share = np.where((enter < leave) & (enter > 1e-6) & (enter < 1.0), enter, 1.0).min(axis=0)
     return np.asarray(start + share[:, None] * (end - start))
 
 
@@ -116,14 +123,14 @@ def way_lines(stage: Stage, frame: Frame, colours: np.ndarray, z: float) -> Colo
 class Trails:
     """Where vehicles have been in the last seconds."""
 
-    def __init__(self, vehicles: int) -> None:
+    def __init__(self) -> None:
         """Begin with nothing."""
         self._points: deque[np.ndarray] = deque(maxlen=_TRAIL)
         self._times: deque[float] = deque(maxlen=_TRAIL)
-        self._vehicles = vehicles
+        self._drawn: Coloured = np.zeros((0, 2, 3)), np.zeros((0, 3), np.uint8)
 
     def lines(self, frame: Frame, time: float, colours: np.ndarray, z: float) -> Coloured:
-        """Add a frame and return the trails (paler where they are older), at a height."""
+        """Add a frame and return the trails (paler where they are older), at a height; the same ones till they grow."""
         if self._times and not 0.0 <= time - self._times[-1] < 10.0 * _TRAIL_STEP:
             self._points.clear()
             self._times.clear()
@@ -132,6 +139,10 @@ class Trails:
             place[:, 2] += z - place[:, 2]
             self._points.append(place)
             self._times.append(time)
+            self._drawn = self._segments(colours)
+        return self._drawn
+
+    def _segments(self, colours: np.ndarray) -> Coloured:
         points = np.array(self._points)
         if len(points) < 2:
             return np.zeros((0, 2, 3)), np.zeros((0, 3), np.uint8)

@@ -13,7 +13,7 @@ from coopenv.format import fixed
 from coopenv.viz.camera_image import camera_image
 from coopenv.viz.scene import Frame, Source, Stage
 from coopenv.viz.style import vehicle_colour
-from coopenv.viz.web.legend import legend_html
+from coopenv.viz.web.legend import legend_html, swatch
 from coopenv.viz.web.look import Look
 from coopenv.viz.web.plots import History, Plots
 
@@ -22,8 +22,8 @@ MAGNIFICATIONS = ("1", "10", "100")
 _CELL = "padding:2px 5px;text-align:right"
 NOBODY = "nobody"
 NO_FAULT = "none"
-TEXTS_EVERY, PLOTS_EVERY = 0.25, 0.5
-"""s of real time between two tables, and between two images and plots."""
+TIME_EVERY, TEXTS_EVERY, PLOTS_EVERY = 0.1, 0.25, 0.5
+"""s of real time between two positions of the slider, two tables, and two images and plots."""
 
 
 @dataclass
@@ -50,7 +50,7 @@ class Panel:
         self._gui, self._abilities = gui, abilities
         self.picked: int | None = None
         """Index of the vehicle that is looked at."""
-        self._texts_at = self._plots_at = -np.inf
+        self._time_at = self._texts_at = self._plots_at = -np.inf
         self._drawn = 0.0
         self._playing: Any = None
         self._time: Any = None
@@ -163,9 +163,13 @@ class Panel:
             self._vehicle_words.content = "*Pick a vehicle above, or click on one in the scene.*"
         self._plots_at = -np.inf
 
-    def show(self, frame: Frame, history: History, now: float) -> None:
-        """Tell a frame in numbers, not more often than can be read; `now` is real time, s."""
-        if self._time is not None:
+    def show(self, frame: Frame, history: History, now: float, exact: bool = False) -> None:
+        """Tell a frame in numbers, not more often than can be read; `now` is real time, s.
+
+        With `exact` the time is told in any case.
+        """
+        if self._time is not None and (exact or now - self._time_at >= TIME_EVERY):
+            self._time_at = now
             self._time.value = round(float(frame.tick) / self._stage.scenario.rates.camera, 2)
         if now - self._texts_at >= TEXTS_EVERY:
             self._texts_at = now
@@ -188,8 +192,8 @@ def table_html(stage: Stage, source: Source, frame: Frame) -> str:
         angle, seen = fixed(frame.orientation_error[i], 1), f"{frame.sees[i]}/{frame.could_see[i]}"
         values = lengths[0], angle, lengths[1], seen
         numbers = "".join(f'<td style="{_CELL}">{value}</td>' for value in values)
-        mark = f'<td style="color:{vehicle_colour(i)};font-weight:700">{stage.short_name(stage.landmarks + i)}</td>'
-        rows.append(f"<tr>{mark}{numbers}</tr>")
+        mark = f"{swatch(vehicle_colour(i))} <b>{stage.short_name(stage.landmarks + i)}</b>"
+        rows.append(f'<tr><td style="white-space:nowrap">{mark}</td>{numbers}</tr>')
     style = "width:100%;font:12px/1.3 ui-monospace,monospace;border-collapse:collapse"
     table = f'<table style="{style}"><tr><th></th>{cells}</tr>{"".join(rows)}</table>'
     return f'<div style="padding:2px 14px;max-height:260px;overflow:auto">{table}</div>'

@@ -12,6 +12,7 @@ from coopenv.viz.web.ground import ROOT, Ground
 from coopenv.viz.web.labels import Labels
 from coopenv.viz.web.look import Look, vehicle_colours
 from coopenv.viz.web.pulses import Pulses
+from coopenv.viz.web.sent import Sent
 
 FIELD_OF_VIEW = 0.72
 """Vertical angle of the first camera, rad."""
@@ -29,24 +30,33 @@ class Picture:
         self.actors = Actors(scene, stage, source, self.ground, self._colours)
         self._labels = Labels(scene, stage)
         self._pulses = Pulses(scene, stage, self._colours)
-        self._trails = lines.Trails(stage.vehicles)
+        self._trails = lines.Trails()
         self._sight = lines.Segments(scene, f"{ROOT}/sight", 2.0)
         self._errors = lines.Segments(scene, f"{ROOT}/errors", 1.5)
         self._ways = lines.Segments(scene, f"{ROOT}/ways", 2.0)
         self._trail = lines.Segments(scene, f"{ROOT}/trails", 3.0)
-        self._views: list[Any] = []
+        self._views: list[Sent] = []
+        self._drawn_trail: lines.Coloured | None = None
+        self._trails_shown = True
         self._drawn_ways: tuple[bytes, ...] = ()
         self._step = 2.0 ** np.floor(np.log2(stage.side * 1e-4))
 
-    def show(self, frame: Frame) -> None:
-        """Show a frame."""
+    def show(self, frame: Frame, turn: int | None = None) -> None:
+        """Show a frame.
+
+        Args:
+            frame: what is shown.
+            turn: its number where another one follows at once: then every other name and field of view waits for it.
+        """
         time, look, nothing = float(frame.tick) / self.stage.scenario.rates.camera, self.look, np.zeros((0, 2, 3))
         none = nothing, np.zeros((0, 3), np.uint8)
         self.actors.place(frame, look)
-        self._labels.place(frame, time, look.names)
+        self._labels.place(frame, time, look.names, turn)
         self._pulses.place(frame, time, look.messages)
         trail = self._trails.lines(frame, time, self._colours, self.ground.z + 1e-3 * self.stage.side)
-        self._show(self._trail, trail if look.trails else none)
+        if trail is not self._drawn_trail or look.trails != self._trails_shown:
+            self._drawn_trail, self._trails_shown = trail, look.trails
+            self._show(self._trail, trail if look.trails else none)
         sight = lines.sight_lines(self.stage, frame, self._colours, look) if look.sight else none
         self._show(self._sight, sight)
         self._show(self._errors, lines.error_lines(frame, self._colours) if look.estimates else none)
@@ -54,31 +64,35 @@ class Picture:
         if ways != self._drawn_ways:
             self._drawn_ways = ways
             self._show(self._ways, lines.way_lines(self.stage, frame, self._colours, self.ground.z))
-        self._show_views(frame)
+        self._show_views(frame, turn)
 
     def _show(self, node: lines.Segments, what: lines.Coloured) -> None:
         node.show(fine(what[0], self._step), what[1])
 
-    def _show_views(self, frame: Frame) -> None:
-        views = self.stage.fields_of_view(frame, _VIEW_RAYS) if self.look.views else None
+    def _show_views(self, frame: Frame, turn: int | None) -> None:
+        mine = slice(None) if turn is None or not self._views else slice(turn % 2, None, 2)
+        views = self.stage.fields_of_view(frame, _VIEW_RAYS, mine) if self.look.views else None
         if views is None:
             for view in self._views:
-                view.visible = False
+                view.tell(visible=False)
             return
+        views[..., 2] = (self.ground.z + 2e-4 * self.stage.side * np.arange(1, self.stage.vehicles + 1))[mine, None]
         corners = fine(views, self._step)
         if not self._views:
-            n = np.arange(1, corners.shape[1] - 1)
-            faces = np.stack([np.zeros_like(n), n + 1, n], axis=-1)
-            flat: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False, "side": "double", "opacity": 0.16}
-            self._views = [
-                self._scene.add_mesh_simple(f"{ROOT}/views/{i}", corners[i], faces, color=tuple(colour), **flat)
-                for i, colour in enumerate(self._colours.tolist())
-            ]
-        for i, view in enumerate(self._views):
-            view.visible = bool(np.isfinite(corners[i]).all())
-            if view.visible:
-                corners[i, :, 2] = self.ground.z + 2e-4 * self.stage.side * (i + 1)
-                view.vertices = corners[i]
+            self._add_views(corners)
+        there = np.isfinite(corners).all(axis=(1, 2)).tolist()
+        for i, view in enumerate(self._views[mine]):
+            view.tell(visible=there[i])
+            if there[i]:
+                view.tell(vertices=corners[i])
+
+    def _add_views(self, corners: np.ndarray) -> None:
+        n = np.arange(1, corners.shape[1] - 1)
+        faces = np.stack([np.zeros_like(n), n + 1, n], axis=-1)
+        flat: dict[str, Any] = {"cast_shadow": False, "receive_shadow": False, "side": "double", "opacity": 0.16}
+        for i, colour in enumerate(self._colours.tolist()):
+            mesh = self._scene.add_mesh_simple(f"{ROOT}/views/{i}", corners[i], faces, color=tuple(colour), **flat)
+            self._views.append(Sent(mesh))
 
 
 def first_camera(stage: Stage, aspect: float = 1.6) -> tuple[np.ndarray, np.ndarray]:

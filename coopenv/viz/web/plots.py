@@ -9,6 +9,7 @@ import numpy as np
 from coopenv.viz.consistency import NEES_BOUNDS
 from coopenv.viz.scene import Frame, Source
 from coopenv.viz.style import BLUE, GREY, VEHICLE_COLOURS
+from coopenv.viz.web.legend import swatch
 
 _LONGEST = 600  # frames that are kept
 _LEAST = 1e-4  # on a logarithmic axis
@@ -63,7 +64,7 @@ class Plots:
             named = list(zip(self._terms, VEHICLE_COLOURS, strict=False))
             data = (start, *(np.zeros(2) for _ in named))
             self._reward = gui.add_uplot(data, _series(*named), title="Reward terms", scales=dict(_X), **_LOOK)
-            words = ", ".join(f'<b style="color:{colour}">{escape(name)}</b>' for name, colour in named)
+            words = " &nbsp; ".join(f"{swatch(colour)} {escape(name)}" for name, colour in named)
             gui.add_html(f'<div style="font-size:12px;padding:0 14px">{words}</div>')
 
     def show(self, history: History, vehicle: int) -> None:

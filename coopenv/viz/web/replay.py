@@ -1,9 +1,10 @@
 """`replay.html`: one page that plays an episode; it opens from disk and asks nobody for anything."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from html import escape
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 
@@ -21,23 +22,33 @@ _PHONE = 0.7  # width over height, from which on the camera begins farther away
 _LOOPBACK = "127.0.0.1"
 
 
-def write_replay(record: SceneRecord, path: Path, on_progress: Callable[[float], None] = lambda share: None) -> Path:
+def write_replay(
+    record: SceneRecord,
+    path: Path,
+    on_progress: Callable[[float], None] = lambda share: None,
+    others: Mapping[str, str] | None = None,
+) -> Path:
     """Write the page of an episode and return its path.
 
     Args:
         record: the episode.
         path: of the page, which is replaced as a whole.
         on_progress: called with the share that is done.
+        others: pages in the same folder by the names of their drivers, this one among them, to which this one leads.
 
     Raises:
         CoopenvError: the extra `view` is not installed.
         OutputError: the file cannot be written.
     """
-    replace_text(path, replay_html(record, on_progress))
+    replace_text(path, replay_html(record, on_progress, others))
     return path
 
 
-def replay_html(record: SceneRecord, on_progress: Callable[[float], None] = lambda share: None) -> str:
+def replay_html(
+    record: SceneRecord,
+    on_progress: Callable[[float], None] = lambda share: None,
+    others: Mapping[str, str] | None = None,
+) -> str:
     """Return the page of an episode; arguments and errors as for `write_replay`."""
     record = record.of(np.unique(np.linspace(0, len(record) - 1, min(len(record), MOST_FRAMES)).round().astype(int)))
     stage = Stage(record.scenario)
@@ -57,7 +68,7 @@ def replay_html(record: SceneRecord, on_progress: Callable[[float], None] = lamb
         page = recording.as_html()
     finally:
         server.stop()
-    return _dressed(page, record, stage, look)
+    return _dressed(page, record, stage, look, others or {})
 
 
 def aim(camera: object, stage: Stage, aspect: float = 1.6, raised: float = 0.0) -> None:
@@ -68,7 +79,7 @@ def aim(camera: object, stage: Stage, aspect: float = 1.6, raised: float = 0.0) 
         setattr(camera, name, value)
 
 
-def _dressed(page: str, record: SceneRecord, stage: Stage, look: Look) -> str:
+def _dressed(page: str, record: SceneRecord, stage: Stage, look: Look, others: Mapping[str, str]) -> str:
     """Return viser's page with the title of the episode and the legend, and a camera for narrow screens."""
     title = escape(record.scenario.title)
     far, middle = first_camera(stage, aspect=0.52)
@@ -81,6 +92,7 @@ def _dressed(page: str, record: SceneRecord, stage: Stage, look: Look) -> str:
     )
     overlay = (
         f'<details id="about" open><summary>{title}</summary><p>{escape(record.source.words)}</p>'
+        f"{_choice(record.source.policy, others)}"
         f"{legend_html(stage, record.source, look.magnification)}<p>{_KEYS}</p></details>"
         "<script>if(innerWidth<700)document.getElementById('about').open=false</script>"
     )
@@ -88,6 +100,17 @@ def _dressed(page: str, record: SceneRecord, stage: Stage, look: Look) -> str:
     page = page.replace("</head>", f"{head}</head>", 1)
     place = page.rindex("</body>")
     return page[:place] + overlay + page[place:]
+
+
+def _choice(driver: str, others: Mapping[str, str]) -> str:
+    """Return links to the pages of the other drivers; nothing where there are none."""
+    if len(others) < 2:
+        return ""
+    names = [
+        f"<b>{escape(name)}</b>" if name == driver else f'<a href="{escape(quote(file))}">{escape(name)}</a>'
+        for name, file in others.items()
+    ]
+    return f"<p>Who drives: {', '.join(names)}</p>"
 
 
 _KEYS = "Drag to turn, right drag to move, wheel to come nearer. Space: pause."

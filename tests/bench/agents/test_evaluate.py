@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -40,8 +41,11 @@ def test_tables_and_files(capsys: pytest.CaptureFixture[str], monkeypatch: pytes
     assert max(map(len, out.splitlines())) <= 100 and "…" not in out
     assert "3 held-out worlds, block 0" in out and "against route_follower" in out
     files = {"evaluation.json", "video.gif", "error_along_the_way.png", "time_against_error.png", "looking.png"}
-    files.add("replay.html")
+    files |= {"replay.html", "replay_route_follower.html", "replay_ideal_sensing.html"}
     assert {path.name for path in Path("eval").iterdir()} == files
+    for page in Path("eval").glob("*.html"):  # each leads to the two others
+        links = {"replay.html", "replay_route_follower.html", "replay_ideal_sensing.html"} - {page.name}
+        assert set(re.findall(r'<a href="(replay\w*\.html)"', page.read_text(encoding="utf-8"))) == links
     found = json.loads(Path("eval/evaluation.json").read_text())
     keys = {"agent", "kind", "environment", "metric", "mean", "ci_low", "ci_high", "n"}
     assert all(set(row) == keys for row in found["rows"])

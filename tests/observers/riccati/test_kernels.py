@@ -9,7 +9,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from coopenv.api.engine import Engine
+from coopenv.observers import registry
+from coopenv.observers.dead_reckoning import DeadReckoning
 from coopenv.scenario import load_scenario
+from coopenv.viz.topview_geometry import position_covariance
 from coopenv.world.world import World
 from tests.helpers.builders import (
     constant,
@@ -184,6 +188,7 @@ def test_slow_observer_corrects_at_its_own_rate_for_as_long() -> None:
 
 
 def test_dead_reckoning_only_predicts() -> None:
+    """Without noise of odometry the error stays, and so does the covariance of the position, P(0) here."""
     world = start(
         scenario(
             [vehicle(motion=constant([0.5, 0, 0], [0, 0, 0.3]), initial_estimate={"position_offset": [0.4, 0, 0]})],
@@ -195,7 +200,28 @@ def test_dead_reckoning_only_predicts() -> None:
     position, angle = errors(world, state)
     assert_allclose(position, 0.4, atol=1e-10)
     assert angle.max() < 1e-10
-    assert_allclose(state["covariance"][0, 0], np.diag([1.0 + 1.0] * 3 + [100.0 + 10.0] * 3), atol=1e-10)
+    R, p, P = (state[name][0, 0] for name in ("estimate_rotation", "estimate_position", "covariance"))
+    assert_allclose(position_covariance(R, p, P), 100.0 * np.eye(3), rtol=1e-5, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["busy_intersection_tracking", "urban_crossing", "overtaking"])
+def test_dead_reckoning_is_the_plug_in_of_that_name(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same estimates and the same covariance, by kernels on the paper's state and by NumPy in the map frame."""
+    monkeypatch.setattr(registry, "_registered", {})
+    registry.register("on_the_host", DeadReckoning)
+    engines = []
+    for observer in ("dead_reckoning", "on_the_host"):
+        made = load_scenario(name, {"observer.name": observer})
+        engine = Engine(made, dtype="float64")
+        engine.reset([3])
+        engine.step(ticks=90)
+        engines.append(engine)
+    embedded, plug_in = (
+        {field: np.array(engine.view(field)[0]) for field in ("estimate_rotation", "estimate_position", "covariance")}
+        for engine in engines
+    )
+    for field, values in embedded.items():
+        assert_allclose(values, plug_in[field], rtol=1e-6, atol=1e-9)
 
 
 def test_prediction_does_not_look_at_the_truth() -> None:
