@@ -51,7 +51,7 @@ def test_the_front_page_steps_and_draws() -> None:
 def test_the_front_page_compares(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (program,) = run(ROOT / "README.md", "parallel_env")
-    assert program["found"].observers == ["riccati", "robust", "dead_reckoning"]
+    assert program["found"].observers == ("riccati", "robust", "dead_reckoning")
     assert (tmp_path / "errors.pdf").read_bytes().startswith(b"%PDF")
 
 
