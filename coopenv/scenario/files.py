@@ -57,7 +57,7 @@ def scenario_path(name_or_path: str | Path) -> Path:
             raise UnknownEnvironmentError(found or f"no such scenario file: {shortened(str(path), 200)}")
         return path
     if os.path.isfile(text):  # noqa: PTH113 (never raises)
-        raise UnknownEnvironmentError(f"{shortened(text, 200)}: a file of an unknown kind; {EXPECTED}")
+        raise UnknownEnvironmentError(f"unknown environment {shown(text)}: a file of an unknown kind; {EXPECTED}")
     known = f"{suggest(text, list_envs())}; known: {', '.join([*list_envs(), *(f'{kind}:N' for kind in SCENES)])}"
     raise UnknownEnvironmentError(f"unknown environment {shown(text)}{known}")
 

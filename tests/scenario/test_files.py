@@ -61,7 +61,7 @@ def test_unknown_names_and_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         load_scenario(tmp_path / "gone.toml")
     with pytest.raises(UnknownEnvironmentError, match=r": a folder; expected a scenario \(\.toml\)"):
         load_scenario(str(tmp_path) + "/")
-    with pytest.raises(UnknownEnvironmentError, match=r"notes\.txt: a file of an unknown kind; expected a scenario"):
+    with pytest.raises(UnknownEnvironmentError, match=r"notes\.txt': a file of an unknown kind; expected a scenario"):
         (tmp_path / "notes.txt").touch()
         monkeypatch.chdir(tmp_path)
         load_scenario("notes.txt")
