@@ -120,8 +120,8 @@ DOUBT_TIME = 0.1
 place, or what its neighbours know. Chosen."""
 MIN_SEARCH_TIME, MIN_DOUBTFUL_TIME = 0.5, 3.0
 """s, before a hypothesis becomes the belief; where a solution was not well determined. Tuned."""
-SURE = 4.0
-"""Times smaller than to tell others the variances of a pose that is found must be. Chosen: half the deviation."""
+SURE = 3.5
+"""Times smaller than to tell others the variances of a pose that is found must be. Tuned."""
 MAX_SPEED = 1.0  # m/s at which a sender may have gone on since a message that is used in the search. Chosen
 CORRELATION_FACTOR, CORRELATION_TIME = 4.0, 1.0
 """Factor of a neighbour's variance in a frame that is solved; s for which its error is the same while hypotheses are
