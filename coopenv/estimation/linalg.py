@@ -92,6 +92,16 @@ def block3(M: Any, row: int, column: int):
 
 
 @wp.func
+def sheared(P: Any, S: Any):
+    """Return T P T^T for a symmetric 6x6 matrix P and T = [[I, 0], [S, I]]."""
+    SA = S * block3(P, 0, 0)
+    SB = S * block3(P, 0, 3)
+    B = block3(P, 0, 3) + wp.transpose(SA)
+    D = block3(P, 3, 3) + SB + wp.transpose(SB) + SA * wp.transpose(S)
+    return join6(block3(P, 0, 0), B, wp.transpose(B), D)
+
+
+@wp.func
 def jacobi_rotation(a_pp: Any, a_qq: Any, a_pq: Any):
     """Return (cosine, sine) of the plane rotation that annihilates a_pq (Golub and Van Loan, 8.5)."""
     one = type(a_pq)(1.0)

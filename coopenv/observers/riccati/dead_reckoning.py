@@ -8,9 +8,9 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3, join6, symmetric_part
+from coopenv.estimation.linalg import block3, join6, sheared, symmetric_part
 from coopenv.estimation.so3 import orthonormalise, skew
-from coopenv.observers.riccati import equations
+from coopenv.observers.riccati.kernels import predict
 from coopenv.world.embedded import Embedded, send_nothing
 from coopenv.world.faults import start_covariance
 
@@ -18,40 +18,24 @@ from coopenv.world.faults import start_covariance
 @wp.func
 def start(model: Any, state: Any, memory: Any, world: int, vehicle: int):
     """Start with the covariance of the initial estimate, in the coordinates of the state."""
-    P = start_covariance(model, state, world, vehicle)
-    S = skew(wp.vec3d(state.estimate_position[world, vehicle]))
-    A, B = block3(P, 0, 0), block3(P, 0, 3)
-    SA, SB = S * A, S * B
-    D = block3(P, 3, 3) + SB + wp.transpose(SB) + SA * wp.transpose(S)
-    cross = B + wp.transpose(SA)
-    whole = join6(A, cross, wp.transpose(cross), symmetric_part(D))
-    state.covariance[world, vehicle] = type(state.covariance[world, vehicle])(whole)
+    P = sheared(start_covariance(model, state, world, vehicle), skew(wp.vec3d(state.estimate_position[world, vehicle])))
+    state.covariance[world, vehicle] = type(state.covariance[world, vehicle])(symmetric_part(P))
 
 
 @wp.func
 def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
     """Run one tick: the estimate follows odometry, and P grows by the noise of odometry."""
-    rotation = state.increment_rotation[world, vehicle]
-    R, p = equations.predict_pose(
-        state.estimate_rotation[world, vehicle],
-        state.estimate_position[world, vehicle],
-        rotation,
-        state.increment_translation[world, vehicle],
-    )
     noise = model.noise[vehicle]
     density = type(noise.velocity)(model.odometry_period * now.period)
     turn = noise.angular_velocity * noise.angular_velocity * density
-    step = noise.velocity * noise.velocity * density
+    predict(state, world, vehicle, turn, noise.velocity * noise.velocity * density)
+    S = skew(state.estimate_position[world, vehicle])
     P = state.covariance[world, vehicle]
-    E = wp.transpose(rotation)
-    A, B, D = equations.predict_covariance(E, block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3), turn, step)
-    St = wp.transpose(skew(p))
-    B = B + turn * St
-    D = D + turn * symmetric_part(wp.transpose(St) * St)
-    state.covariance[world, vehicle] = join6(A, B, wp.transpose(B), D)
-    state.estimate_position[world, vehicle] = p
+    B = block3(P, 0, 3) - turn * S
+    D = block3(P, 3, 3) - turn * symmetric_part(S * S)
+    state.covariance[world, vehicle] = join6(block3(P, 0, 0), B, wp.transpose(B), D)
     # Products of rotations drift by rounding; once per tick is enough to keep Rhat a rotation.
-    state.estimate_rotation[world, vehicle] = orthonormalise(R)
+    state.estimate_rotation[world, vehicle] = orthonormalise(state.estimate_rotation[world, vehicle])
     if now.due:
         state.corrected_tick[world, vehicle] = now.tick
 

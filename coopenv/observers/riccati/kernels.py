@@ -43,8 +43,8 @@ def information(model: Any, state: Any, world: int, vehicle: int, tick: int, R: 
 
 
 @wp.func
-def predict(model: Any, state: Any, world: int, vehicle: int, dt: Any):
-    """Carry the estimate and P through one tick of odometry."""
+def predict(state: Any, world: int, vehicle: int, v1: Any, v2: Any):
+    """Carry the estimate and P through one tick of odometry, which adds v1 and v2 (per axis) to the blocks of P."""
     rotation = state.increment_rotation[world, vehicle]
     R, p = equations.predict_pose(
         state.estimate_rotation[world, vehicle],
@@ -54,7 +54,6 @@ def predict(model: Any, state: Any, world: int, vehicle: int, dt: Any):
     )
     P = state.covariance[world, vehicle]
     E = wp.transpose(rotation)
-    v1, v2 = model.observer.v1 * dt, model.observer.v2 * dt
     A, B, D = equations.predict_covariance(E, block3(P, 0, 0), block3(P, 0, 3), block3(P, 3, 3), v1, v2)
     state.estimate_rotation[world, vehicle] = R
     state.estimate_position[world, vehicle] = p
@@ -148,7 +147,8 @@ def make_estimate(step: Any) -> Any:
     @wp.func
     def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
         """Run one tick of the observer of one vehicle: predict, and correct when its rate says so."""
-        predict(model, state, world, vehicle, type(model.observer.max_turn)(now.period))
+        dt = type(model.observer.max_turn)(now.period)
+        predict(state, world, vehicle, model.observer.v1 * dt, model.observer.v2 * dt)
         if now.due:
             unit = type(model.observer.max_turn)(model.camera_period)
             duration = unit * type(unit)(now.tick - state.corrected_tick[world, vehicle])

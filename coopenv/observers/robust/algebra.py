@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3, cholesky6, eigen_symmetric6, join6, symmetric_part
+from coopenv.estimation.linalg import block3, cholesky6, eigen_symmetric6, symmetric_part
 from coopenv.estimation.so3 import (
     exp_so3,
     orthonormalise,
@@ -120,16 +120,6 @@ def transition(step: Pose):
     """Return F of the left error over an increment of odometry."""
     E = wp.transpose(step.R)
     return lower_blocks(E, -E * skew(step.p), E)
-
-
-@wp.func
-def sheared(P: Any, S: Any):
-    """Return T P T^T for a symmetric 6x6 matrix P and T = [[I, 0], [S, I]]."""
-    SA = S * block3(P, 0, 0)
-    SB = S * block3(P, 0, 3)
-    B = block3(P, 0, 3) + wp.transpose(SA)
-    D = block3(P, 3, 3) + SB + wp.transpose(SB) + SA * wp.transpose(S)
-    return join6(block3(P, 0, 0), B, wp.transpose(B), D)
 
 
 @wp.func

@@ -10,9 +10,9 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import symmetric_part
+from coopenv.estimation.linalg import sheared, symmetric_part
 from coopenv.estimation.so3 import orthonormalise, skew
-from coopenv.observers.robust.algebra import distance_squared, is_known, odometry_noise, sheared
+from coopenv.observers.robust.algebra import distance_squared, is_known, odometry_noise
 from coopenv.observers.robust.belief import begin_belief, own_estimate
 from coopenv.observers.robust.constants import SAME_PRIOR, SURE
 from coopenv.observers.robust.measurements import RESECTION, TRACKING, set_lines

@@ -11,6 +11,7 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.estimation.linalg import sheared
 from coopenv.estimation.so3 import skew
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import propagate
@@ -42,7 +43,7 @@ def own_report(model: Any, memory: Any, world: int, i: int, tick: int):
     if memory.search[world, i].active == 0 and algebra.is_known(P):
         marker = vec3d(model.scene.marker[model.landmarks + i])
         if wp.length_sq(marker) > wp.float64(0.0):
-            P = algebra.sheared(P, -skew(marker))
+            P = sheared(P, -skew(marker))
         pose = memory.member[world, i, 0].pose
         odometry = memory.belief[world, i].odometry
         report.valid = 1

@@ -1,5 +1,6 @@
 """Where the frames of the live view come from: an episode that runs, one that has been kept, or cars."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -19,7 +20,7 @@ Driver = Callable[[Scenario], tuple[Policy | None, str]]
 """Returns who drives in a scenario, and its name."""
 
 
-class Reel:
+class Reel(ABC):
     """Frames, one after the other; those that have been are kept."""
 
     def __init__(self, scenario: Scenario, source: Source, length: float) -> None:
@@ -29,9 +30,9 @@ class Reel:
         self.real_time = False
         """Whether frames come when they come."""
 
+    @abstractmethod
     def more(self) -> bool:
         """Append the next frame; return False where there is none."""
-        raise NotImplementedError
 
     def abilities(self) -> Abilities:
         """Return what one can do."""
@@ -49,7 +50,7 @@ class Reel:
         """
         raise CoopenvError("nothing can be changed here")
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 (most hold nothing)
         """Let go of everything."""
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.estimation.linalg import block3, cholesky6
+from coopenv.estimation.linalg import block3, cholesky6, sheared
 from coopenv.estimation.so3 import exp_so3, skew
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.memory import Pose, Report, mat66d, mat66f, vec3d
@@ -66,7 +66,7 @@ def own_correlation(model: Any, memory: Any, world: int, i: int, n: int):
     C = memory.P[world, i, 0, n]
     marker = vec3d(model.scene.marker[model.landmarks + i])
     if wp.length_sq(marker) > wp.float64(0.0):
-        P = algebra.sheared(P, -skew(marker))
+        P = sheared(P, -skew(marker))
         C = marker_jacobian(marker) * C
     X = algebra.inverse_factor(P) * C * wp.transpose(algebra.inverse_factor(memory.P[world, i, n, n]))
     steps = wp.float64(constants.STEPS)
