@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from coopenv.runs.view.reels import FAULTS, EngineReel, Reel, SavedReel
 from coopenv.runs.view.serving import free_port, serving, vehicle_index
 from coopenv.runs.view.viewer import Viewer
 from coopenv.viz.scene import Source
+from tests.helpers.fleet import Fleet
 
 pytest.importorskip("viser", reason="needs the extra view")
 
@@ -164,6 +167,20 @@ def test_the_end_is_told(viewer: Viewer) -> None:
     wish(viewer, ("seek", 100.0), ("play", None))
     viewer.run(turns(3))
     assert not viewer.playing and "over" in viewer._panel._status.content
+
+
+def test_when_cars_end_the_view_stays_and_waits() -> None:
+    fleet = Fleet(horizon=0.5)
+    fleet.capabilities = replace(fleet.capabilities, real_time=True)
+    reel = EngineReel(lambda _: fleet, "fleet", 0, lambda _: (None, ""))
+    with serving("127.0.0.1", None) as (server, _):
+        shown = Viewer(server, reel)
+        shown.run(turns(100))
+        assert "The episode is over." in shown._panel._status.content
+        begun = monotonic()
+        shown.run(turns(10))
+        assert monotonic() - begun > 0.4  # it sleeps
+    reel.close()
 
 
 def test_a_kept_scene_is_shown_and_cannot_be_changed() -> None:

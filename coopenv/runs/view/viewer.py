@@ -51,6 +51,7 @@ class Viewer:
         server.on_client_connect(self._welcome)
         self._history = History(reel.scenario.rates.camera)
         self._k, self._speed, self.playing = 0, 1.0, True
+        self._live = reel.real_time
         self._due = self._shown_at = self._faded_at = -np.inf
         self._middle = np.array([*(self._stage.low + self._stage.high) / 2, 0.0])
         self._follow, self._alone = True, False
@@ -69,23 +70,24 @@ class Viewer:
         while going():
             changed = self._obey()
             now = monotonic()
-            moved = self._go_on(now) if self.playing or self._reel.real_time else False
+            moved = self._go_on(now) if self.playing or self._live else False
             if (moved and now - self._shown_at >= 0.9 / MAX_FPS) or changed:
                 self._show(now)
             self._fade(now)
-            if not self._reel.real_time:
+            if not self._live:  # cars wait themselves
                 sleep(max(0.0, min(_NAP, self._due - monotonic())) if self.playing else _NAP)
 
     def _go_on(self, now: float) -> bool:
         """Go to the frame that is due; return whether another one is."""
-        if not self._reel.real_time and now < self._due:
+        if not self._live and now < self._due:
             return False
         if now - self._due > _LAG:
             self._due = now
         if not self._step():
-            if not self._reel.real_time:
-                self._set_playing(False)
-                self._panel.tell("The episode is over; Restart shows it again.")
+            self._live = False
+            self._set_playing(False)
+            again = "; Restart shows it again" if self._reel.abilities().seek else ""
+            self._panel.tell(f"The episode is over{again}.")
             return False
         self._due += self._period() / self._speed
         return True
