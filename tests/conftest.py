@@ -27,6 +27,7 @@ settings.load_profile("repeatable")
 def no_lines_of_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a slow machine write no more than a fast one."""
     monkeypatch.setattr("coopenv.runs.console.LINE_PERIOD", 3600.0)
+    monkeypatch.setattr("coopenv.runs.console.HINT_FROM", 3600.0)
     monkeypatch.setattr("coopenv.runs.console.COMPILE_NOTICE_AFTER", 3600.0)
 
 

@@ -13,7 +13,7 @@ from coopenv.backends.base import Backend
 from coopenv.backends.sources import Kind, kind_of, open_backend
 from coopenv.errors import CoopenvError
 from coopenv.policies import Policy, agents_for, find_agent, load_policy
-from coopenv.runs.console import Progress
+from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.episode import play
 from coopenv.runs.video import frame_stride
 from coopenv.scenario import Scenario
@@ -180,8 +180,11 @@ def scene_of_recording(
     scenario = backend.scenario
     first = f", first {MOST_SHOWN:g} s of {scenario.horizon:.0f} s" if scenario.horizon > MOST_SHOWN else ""
     source = Source.of(title_of(name) + first, scenario)
-    with closing(Engine(scenario, backend=backend)) as engine, Progress(log, "replaying", 1.0) as progress:
-        return scene_of(engine, source, None, progress.update, MOST_SHOWN)
+    with closing(Engine(scenario, backend=backend)) as engine:
+        with compile_notice(log):
+            engine.load()
+        with Progress(log, "replaying", 1.0) as progress:
+            return scene_of(engine, source, None, progress.update, MOST_SHOWN)
 
 
 def title_of(name: str) -> str:

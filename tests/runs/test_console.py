@@ -42,6 +42,7 @@ def test_time_left_is_not_told_before_there_is_enough_to_go_by(
 ) -> None:
     clock = [100.0]
     monkeypatch.setattr(module, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(module, "HINT_FROM", 20.0)
     progress = Progress(Console(file=text), "simulating", total=400)
     progress.__enter__()
     clock[0] = 103.0  # until it begins
