@@ -1,20 +1,31 @@
-"""Warp's cache of compiled kernels on the disk: what is damaged is built again, what cannot be written is one line."""
+"""Warp's cache of compiled kernels on the disk.
+
+What is damaged is built again, what cannot be written is one line, and what several processes need is compiled by one.
+"""
 
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from glob import escape
 from pathlib import Path
 from typing import Any
 
 import warp as wp
 
+try:
+    import fcntl
+except ImportError:  # Windows, where every process compiles for itself
+    fcntl = None  # type: ignore[assignment]
+
 from coopenv.errors import CoopenvError
 
 ATTEMPTS = 3
 """Attempts to load a module. The second builds it anew; a third is for two processes that mend the same one."""
 PROBE_BYTES = 5 << 20  # as much as the source and the code of a large module have
+_MODULE, _LOCKS = "wp_", "locks"
+"""How names of folders of modules begin; the folder of the locks."""
+_loaded: set[str] = set()  # names of modules that this process has loaded
 
 
 class KernelCacheError(CoopenvError):
@@ -41,8 +52,16 @@ def start() -> None:
 
 def launch(kernel: wp.Kernel, **options: Any) -> Any:
     """Do what `wp.launch` does with a kernel that is in memory, in the cache, damaged there, or not compiled yet."""
+    name = kernel.module.name
+    with nullcontext() if name in _loaded else _alone(name):
+        done = _launch(kernel, options)
+    _loaded.add(name)
+    return done
+
+
+def _launch(kernel: wp.Kernel, options: dict[str, Any]) -> Any:
     for attempt in range(ATTEMPTS):
-        kept = list(cache_folder().glob(f"wp_{escape(kernel.module.name)}_{'[0-9a-f]' * 7}"))
+        kept = list(cache_folder().glob(f"{_MODULE}{escape(kernel.module.name)}_{'[0-9a-f]' * 7}"))
         if not kept:
             probe()  # LLVM ends the process where it cannot write
         try:
@@ -57,6 +76,22 @@ def launch(kernel: wp.Kernel, **options: Any) -> Any:
     return None
 
 
+@contextmanager
+def _alone(name: str) -> Iterator[None]:
+    """Let one process at a time load a module, so that the others find what it has compiled."""
+    stream = None
+    with suppress(OSError):  # a cache that is only read, or on a disk without locks
+        (cache_folder() / _LOCKS).mkdir(exist_ok=True)
+        stream = (cache_folder() / _LOCKS / name).open("wb")
+        if fcntl is not None:
+            fcntl.flock(stream, fcntl.LOCK_EX)
+    try:
+        yield
+    finally:
+        if stream is not None:
+            stream.close()
+
+
 def cache_folder() -> Path:
     """Return the folder of the cache of this version of Warp."""
     return Path(wp.config.kernel_cache_dir or "")
@@ -65,7 +100,7 @@ def cache_folder() -> Path:
 def modules() -> set[str]:
     """Return the names of the folders of compiled modules; those that are being compiled have one, too."""
     try:
-        return {entry.name for entry in cache_folder().iterdir()}
+        return {entry.name for entry in cache_folder().iterdir() if entry.name.startswith(_MODULE)}
     except OSError:
         return set()
 

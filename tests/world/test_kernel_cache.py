@@ -59,6 +59,19 @@ def test_what_is_damaged_is_built_again(suffix: str, left: float, program: Path,
     assert len(part.read_bytes()) == len(good)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no locks of files")
+def test_of_many_processes_one_compiles(program: Path, tmp_path: Path) -> None:
+    loud = "    start_warp()\n    wp.config.log_level = wp.LOG_INFO\n"
+    program.write_text(PROGRAM.replace("    start_warp()\n", loud))
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "WARP_CACHE_PATH": str(tmp_path / "cache")}
+    command = [sys.executable, str(program)]
+    started = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    said = [process.communicate(timeout=120)[0] for process in started]
+    assert all(words.endswith(DONE) for words in said)
+    loaded = [next(line for line in words.splitlines() if "twice" in line) for words in said]
+    assert sorted("(compiled)" in line for line in loaded) == [False, False, True]
+
+
 @pytest.mark.parametrize("place", ["/dev/null", "/proc/nowhere"])
 @pytest.mark.parametrize("variable", ["WARP_CACHE_PATH", "HOME"])
 def test_a_place_that_cannot_be_is_one_line(variable: str, place: str, tmp_path: Path) -> None:
