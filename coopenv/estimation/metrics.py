@@ -11,8 +11,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import median_filter
-from scipy.stats import theilslopes
 
 from coopenv.errors import CoopenvError
 from coopenv.estimation.guaranteed_rate import slowest_decay
@@ -209,6 +207,9 @@ def fit_exponential_rate(t: np.ndarray, error: np.ndarray, noise_floor: float | 
     are a lower limit of the uncertainty. Without a descent of at least three samples that stands out of the scatter the
     rate is NaN, with a remark. The noise floor is by default the median over the last fifth of the record.
     """
+    from scipy.ndimage import median_filter  # here, as loading them takes 0.4 s
+    from scipy.stats import theilslopes
+
     t, error = np.asarray(t, float), np.asarray(error, float)
     if not np.isfinite(error).all():
         return _no_rate("error is not finite")

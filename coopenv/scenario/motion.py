@@ -7,7 +7,6 @@ pose at any time is then a closed form, so truth does not drift and any instant 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from coopenv.scenario.bodies import ConstantMotion, SegmentMotion, WaypointMotion
@@ -88,6 +87,8 @@ def _sample_times(times: np.ndarray, until: float) -> np.ndarray:
 
 def _sample_spline(motion: WaypointMotion, until: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times (S,), positions (S, 3) and continuous headings (S,) along the spline."""
+    from scipy.interpolate import PchipInterpolator  # here, as loading it takes 0.2 s
+
     times = np.array([w.time for w in motion.waypoints])
     # Shape preserving: between two equal waypoints the agent stands still instead of swinging.
     spline = PchipInterpolator(times, np.array([w.position for w in motion.waypoints]))
