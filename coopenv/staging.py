@@ -8,7 +8,9 @@ import sys
 from collections.abc import Collection, Iterator
 from contextlib import suppress
 from glob import escape
+from math import inf
 from pathlib import Path
+from time import monotonic, sleep
 
 try:
     import fcntl
@@ -16,6 +18,7 @@ except ImportError:  # no POSIX: nobody can tell whether a hidden folder is stil
     fcntl = None  # type: ignore[assignment]
 
 PART, OLD = ".part", ".old"  # suffixes of hidden folders: what is being written, and what has made room for it
+POLL = 0.02  # s between attempts to lock
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
 
 
@@ -25,7 +28,7 @@ def new_part(place: Path) -> tuple[Path, int | None]:
         part = place.with_name(f".{place.name}.{secrets.token_hex(4)}{PART}")
         part.mkdir()
         with suppress(FileNotFoundError):
-            descriptor = lock(part, wait=True)
+            descriptor = lock(part, wait=inf)
             if part.exists():  # not taken for abandoned before it was locked
                 return part, descriptor
             if descriptor is not None:
@@ -46,17 +49,24 @@ def abandoned(place: Path, suffix: str) -> Iterator[Path]:
                 os.close(descriptor)
 
 
-def lock(folder: Path, wait: bool = False) -> int | None:
-    """Return a descriptor that holds a folder until it is closed, or None: held by others, or there are no locks."""
+def lock(folder: Path, wait: float = 0.0) -> int | None:
+    """Return a descriptor that holds a folder until it is closed, or None: no locks, or held by others for `wait` s."""
     if fcntl is None:
         return None
     descriptor = os.open(folder, os.O_RDONLY)
+    end = monotonic() + wait
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return descriptor
+            except BlockingIOError:
+                if monotonic() >= end:
+                    raise
+                sleep(POLL)
     except OSError:
         os.close(descriptor)
         return None
-    return descriptor
 
 
 def put_in_place(part: Path, place: Path, names: Collection[str]) -> None:

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -369,3 +370,15 @@ def test_a_limit_on_the_size_of_files_keeps_the_old_result(place: Path) -> None:
         signal.signal(signal.SIGXFSZ, kept)
     assert generation_of(place / "result") == 0
     assert hidden(place) == []
+
+
+def test_a_folder_that_is_held_is_waited_for_so_long(tmp_path: Path) -> None:
+    first = staging.lock(tmp_path)
+    assert first is not None
+    assert staging.lock(tmp_path) is None and staging.lock(tmp_path, wait=0.1) is None
+    with ThreadPoolExecutor(1) as pool:
+        second = pool.submit(staging.lock, tmp_path, 60.0)
+        os.close(first)
+        descriptor = second.result(timeout=60)
+    assert descriptor is not None
+    os.close(descriptor)

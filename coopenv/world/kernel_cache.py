@@ -3,6 +3,7 @@
 What is damaged is built again, what cannot be written is one line, and what several processes need is compiled by one.
 """
 
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -13,16 +14,13 @@ from typing import Any
 
 import warp as wp
 
-try:
-    import fcntl
-except ImportError:  # Windows, where every process compiles for itself
-    fcntl = None  # type: ignore[assignment]
-
 from coopenv.errors import CoopenvError
+from coopenv.staging import lock
 
 ATTEMPTS = 3
 """Attempts to load a module. The second builds it anew; a third is for two processes that mend the same one."""
 PROBE_BYTES = 5 << 20  # as much as the source and the code of a large module have
+LONGEST_COMPILATION = 120.0  # s; who holds a module for longer has been stopped, by Ctrl-Z for example
 _MODULE, _LOCKS = "wp_", "locks"
 """How names of folders of modules begin; the folder of the locks."""
 _loaded: set[str] = set()  # names of modules that this process has loaded
@@ -79,17 +77,15 @@ def _launch(kernel: wp.Kernel, options: dict[str, Any]) -> Any:
 @contextmanager
 def _alone(name: str) -> Iterator[None]:
     """Let one process at a time load a module, so that the others find what it has compiled."""
-    stream = None
+    place, descriptor = cache_folder() / _LOCKS / name, None
     with suppress(OSError):  # a cache that is only read, or on a disk without locks
-        (cache_folder() / _LOCKS).mkdir(exist_ok=True)
-        stream = (cache_folder() / _LOCKS / name).open("wb")
-        if fcntl is not None:
-            fcntl.flock(stream, fcntl.LOCK_EX)
+        place.mkdir(parents=True, exist_ok=True)
+        descriptor = lock(place, LONGEST_COMPILATION)
     try:
         yield
     finally:
-        if stream is not None:
-            stream.close()
+        if descriptor is not None:
+            os.close(descriptor)
 
 
 def cache_folder() -> Path:
