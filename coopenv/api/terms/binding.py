@@ -87,7 +87,8 @@ def _all_bound(kind: Registry[Term], used: Mapping[str, float], part: Any, first
 def _bound(kind: Registry[Any], name: str, row: Row, number: int, records: tuple[int, ...]) -> Bound:
     title, function = f"{kind.kind} '{name}'", row.function
     if isinstance(function, str):
-        linecache.checkcache()  # Warp reads the source of a file that may have changed
+        if name not in kind.built_in:
+            linecache.checkcache()  # Warp reads the source of a file that may have changed
         try:
             function = user_code.load(function)
         except CoopenvError as error:
