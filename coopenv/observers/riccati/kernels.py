@@ -44,7 +44,10 @@ def information(model: Any, state: Any, world: int, vehicle: int, tick: int, R: 
 
 @wp.func
 def predict(state: Any, world: int, vehicle: int, v1: Any, v2: Any):
-    """Carry the estimate and P through one tick of odometry, which adds v1 and v2 (per axis) to the blocks of P."""
+    """Carry the estimate and P (6x6) through one tick of odometry.
+
+    `v1` and `v2`, per axis, are what its noise adds to the blocks of P of 2 lambda (rad^2) and of the position (m^2).
+    """
     rotation = state.increment_rotation[world, vehicle]
     R, p = equations.predict_pose(
         state.estimate_rotation[world, vehicle],
