@@ -7,6 +7,7 @@ import warp as wp
 
 from coopenv.estimation.so3 import rotation_angle
 from coopenv.world.collision import UNDER_WAY
+from coopenv.world.device_function import device_function
 from coopenv.world.precision import Precision
 from coopenv.world.quality import (
     cholesky_of,
@@ -68,7 +69,7 @@ MEMORY = {
 """Fields that carry over from one step to the next, and what a saved state may hold of them."""
 
 
-@wp.func
+@device_function
 def remember(state: Any, results: Any, world: int, vehicle: int, way: Any, furthest: Any, tick: int):
     """Keep what the next step compares with; `assess` comes before."""
     results.last_arrivals[world, vehicle] = state.arrivals[world, vehicle]
@@ -79,7 +80,7 @@ def remember(state: Any, results: Any, world: int, vehicle: int, way: Any, furth
     results.last_tick[world, vehicle] = tick
 
 
-@wp.func
+@device_function
 def assess(model: Any, state: Any, results: Any, world: int, vehicle: int):
     """Compare the estimate with the truth and with what it believes of itself."""
     agent = model.landmarks + vehicle
@@ -99,7 +100,7 @@ def assess(model: Any, state: Any, results: Any, world: int, vehicle: int):
     results.targets_in_view[world, vehicle] = targets_in_view(model, state, world, vehicle)
 
 
-@wp.func
+@device_function
 def is_over(model: Any, state: Any, world: int) -> bool:
     """Return whether a world is at its horizon, without further ticks, or has no vehicle under way."""
     if state.tick[world] >= model.horizon_ticks or state.exhausted[world] != 0:
@@ -110,7 +111,7 @@ def is_over(model: Any, state: Any, world: int) -> bool:
     return True
 
 
-@wp.func
+@device_function
 def set_flags(results: Any, world: int, vehicle: int, ended: int, over: bool, horizon_ticks: int):
     """Write who was under way, who has just ended, and whether the world is over."""
     # Over since the last step: nothing more is earned before a reset (each vehicle reads its own memory only).

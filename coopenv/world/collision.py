@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.estimation.outcomes import Outcome
+from coopenv.world.device_function import device_function
 from coopenv.world.draw_route import draw_next_route
 from coopenv.world.model import CONTINUE, LEAVE
 from coopenv.world.route import goal_distance, has_routes, is_past_end, place_on_route, route_length
@@ -40,13 +41,13 @@ def boxes_touch(ca: Any, Ra: Any, ha: Any, cb: Any, Rb: Any, hb: Any) -> bool:
     return True
 
 
-@wp.func
+@device_function
 def touches_anything(model: Any, state: Any, world: int, vehicle: int) -> int:
     """Return 1 when a vehicle's box overlaps a building or another body."""
     return touches_one_of(model, state, world, vehicle, model.agents)
 
 
-@wp.func
+@device_function
 def touches_one_of(model: Any, state: Any, world: int, vehicle: int, count: int) -> int:
     """Return 1 when a vehicle's box overlaps a building or the body of another one of the first `count` agents."""
     agent = model.landmarks + vehicle
@@ -82,7 +83,7 @@ def touches_one_of(model: Any, state: Any, world: int, vehicle: int, count: int)
     return 0
 
 
-@wp.func
+@device_function
 def reaches_goal(model: Any, state: Any, world: int, vehicle: int) -> bool:
     """Return whether a vehicle has a goal and is within its radius, or past the end of the route that it drew."""
     radius = model.scene.goal_radius[vehicle]
@@ -93,7 +94,7 @@ def reaches_goal(model: Any, state: Any, world: int, vehicle: int) -> bool:
     return has_routes(model, vehicle) and is_past_end(model, state, world, vehicle, radius)
 
 
-@wp.func
+@device_function
 def has_left_route(model: Any, state: Any, world: int, vehicle: int) -> bool:
     """Return whether a vehicle is farther beside its route, or beyond an end of it, than is allowed.
 
@@ -108,7 +109,7 @@ def has_left_route(model: Any, state: Any, world: int, vehicle: int) -> bool:
     return wp.max(wp.abs(offset), beyond) > allowed
 
 
-@wp.func
+@device_function
 def depart(model: Any, state: Any, world: int):
     """Take the vehicles that have arrived off the scene, where they leave; called at the start of a tick."""
     if model.drawn.after_arrival == LEAVE:
@@ -117,7 +118,7 @@ def depart(model: Any, state: Any, world: int):
                 state.present[world, model.landmarks + vehicle] = 0
 
 
-@wp.func
+@device_function
 def referee(model: Any, state: Any, world: int, vehicle: int):
     """Mark contact, and end the vehicle's episode on a collision or an arrival that counts; or give it a new route."""
     touching = touches_anything(model, state, world, vehicle)

@@ -12,6 +12,7 @@ import warp as wp
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.world.camera import observe
 from coopenv.world.collision import depart, referee
+from coopenv.world.device_function import device_function
 from coopenv.world.dynamics import move
 from coopenv.world.odometry import measure_odometry
 from coopenv.world.reset import reset_world
@@ -35,7 +36,7 @@ class Now:
     due: wp.bool  # whether the scenario's observer rate asks for a correction
 
 
-@wp.func
+@device_function
 def correction_due(model: Any, tick: int) -> bool:
     """Return whether the scenario's observer rate (`rates.observer`) asks for a correction at a camera tick."""
     ratio = model.observer.rate * model.camera_period
@@ -43,7 +44,7 @@ def correction_due(model: Any, tick: int) -> bool:
     return wp.floor(wp.float64(tick) * ratio + wp.float64(1.0e-9)) > before
 
 
-@wp.func
+@device_function
 def regular_tick(model: Any, tick: int):
     """Return a tick of a world whose ticks come at the camera's rate."""
     now = Now()
@@ -115,17 +116,17 @@ class Source:
     knows_truth: bool = True  # the truth is always there; otherwise it may be NaN
 
 
-@wp.func
+@device_function
 def start_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int):
     """Begin an episode of an observer without a memory."""
 
 
-@wp.func
+@device_function
 def estimate_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int, now: Any):
     """Leave the estimate as it is: somebody else writes it."""
 
 
-@wp.func
+@device_function
 def send_nothing(model: Any, state: Any, memory: Any, world: int, vehicle: int, tick: int):
     """Add nothing to the V2X pose estimate."""
 
@@ -134,13 +135,13 @@ HOST = Embedded("host", estimate_nothing, start_nothing, send_nothing)
 """In place of an observer that runs on the host (`coopenv.api.plugins`)."""
 
 
-@wp.func
+@device_function
 def begin_simulation(model: Any, state: Any, record: Any, world: int):
     """Draw the start of an episode."""
     reset_world(model, state, world)
 
 
-@wp.func
+@device_function
 def sense_simulation(model: Any, state: Any, record: Any, world: int, tick: int):
     """Move the truth of one world to a tick and measure it."""
     depart(model, state, world)
@@ -153,7 +154,7 @@ def sense_simulation(model: Any, state: Any, record: Any, world: int, tick: int)
         observe(model, state, world, vehicle, tick)
 
 
-@wp.func
+@device_function
 def deliver_simulation(model: Any, state: Any, record: Any, world: int, vehicle: int, tick: int):
     """Receive what the radio lets through."""
     deliver(model, state, world, vehicle, tick)

@@ -46,17 +46,31 @@ def start_warp() -> None:
 def kernel(function: Function, precision_name: str, differentiable: bool = False) -> wp.Kernel:
     """Return a plain Python function as a Warp kernel whose module serves one precision only.
 
-    Options in its attribute `options` hold for it, besides those that its file sets with `wp.set_module_options`.
-    What is a kernel already stays as it is.
+    Options in its attribute `options` hold for it, besides those that its file sets with `wp.set_module_options`;
+    "inline_threshold" is the compiler's, see `inlining`. What is a kernel already stays as it is.
     """
     if isinstance(function, wp.Kernel):
         return function
     kind = ".differentiable" if differentiable else ""
     module = wp.get_module(f"{function.__module__}.{function.__name__}.{precision_name}{kind}")
     module.options.update(wp.get_module(function.__module__).options)
-    module.options.update(getattr(function, "options", {}))
+    options = dict(getattr(function, "options", {}))
+    threshold = options.pop("inline_threshold", None)
+    module.options.update(options if threshold is None else {**inlining(threshold), **options})
     module.options["enable_backward"] = differentiable
     return wp.Kernel(func=function, key=function.__name__, module=module)
+
+
+def inlining(threshold: int) -> dict[str, Any]:
+    """Return options of kernels in which functions up to a cost are inlined: Warp's 9000 takes long to compile.
+
+    It serves functions that are handed large records, of which others than `device_function`s get copies.
+    """
+    flags = (wp.config.cpu_compiler_flags or "").split()
+    if not any("-inline-threshold" in flag for flag in flags):
+        return {}  # somebody has chosen others
+    kept = [flag for flag in flags if "-inline-" not in flag]
+    return {"cpu_compiler_flags": " ".join([*kept, f"-mllvm=-inline-threshold={threshold}"])}
 
 
 def run_seldom() -> dict[str, Any]:

@@ -7,6 +7,7 @@ import warp as wp
 from coopenv.estimation.linalg import block3, cholesky6, join6, smallest_eigenvalue6
 from coopenv.estimation.so3 import identity3, quaternion_vector, skew
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
+from coopenv.world.device_function import device_function
 from coopenv.world.v2x import fresh
 
 
@@ -60,7 +61,7 @@ def position_variance(P: Any, p_hat: Any):
     return wp.max(wp.trace(position_covariance(P, p_hat)), p_hat.dtype(0.0))
 
 
-@wp.func
+@device_function
 def usable(model: Any, state: Any, world: int, vehicle: int, target: int, tick: int) -> bool:
     """Return whether the observer can use this target now: seen, and its position known or heard."""
     if state.sight[world, vehicle, target] != VISIBLE:
@@ -70,7 +71,7 @@ def usable(model: Any, state: Any, world: int, vehicle: int, target: int, tick: 
     return fresh(model, state, world, vehicle, target - model.landmarks, tick)
 
 
-@wp.func
+@device_function
 def known_position(model: Any, state: Any, world: int, vehicle: int, target: int):
     """Return where a target is: a landmark's known place, or a neighbour's message (Rhat_j phat_j)."""
     if target < model.landmarks:
@@ -80,7 +81,7 @@ def known_position(model: Any, state: Any, world: int, vehicle: int, target: int
     return state.inbox_position[world, vehicle, sender] + R * model.scene.marker[target]
 
 
-@wp.func
+@device_function
 def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: int, block: int, dt: Any):
     """Add C^T C dt, dt being the time (or the way) since the last sample, to a block of the sliding Gramian.
 
@@ -108,7 +109,7 @@ def accumulate_gramian(model: Any, state: Any, world: int, vehicle: int, tick: i
     state.gramian_time[world, vehicle, block] = state.gramian_time[world, vehicle, block] + dt
 
 
-@wp.func
+@device_function
 def empty_block(state: Any, world: int, vehicle: int, block: int):
     """Begin a block of the sliding Gramian anew."""
     zero = type(state.gramian_11[world, vehicle, block])()
@@ -118,7 +119,7 @@ def empty_block(state: Any, world: int, vehicle: int, block: int):
     state.gramian_time[world, vehicle, block] = zero[0, 0]
 
 
-@wp.func
+@device_function
 def sample_by_time(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Add this tick to the sliding Gramian over a time."""
     block = (tick // model.observer.block_ticks) % model.observer.blocks
@@ -128,7 +129,7 @@ def sample_by_time(model: Any, state: Any, world: int, vehicle: int, tick: int):
     accumulate_gramian(model, state, world, vehicle, tick, block, dt * type(dt)(model.observer.gramian_stride))
 
 
-@wp.func
+@device_function
 def sample_by_way(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Add the way since the last sample to the sliding Gramian over a way: nothing while the vehicle stands."""
     since = state.gramian_way[world, vehicle]
@@ -142,7 +143,7 @@ def sample_by_way(model: Any, state: Any, world: int, vehicle: int, tick: int):
         state.gramian_way[world, vehicle] = since + way
 
 
-@wp.func
+@device_function
 def sample_gramian(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Add this tick to the sliding Gramian when a sample is due."""
     by_way = model.observer.block_way > type(model.observer.max_turn)(0.0)
@@ -156,7 +157,7 @@ def sample_gramian(model: Any, state: Any, world: int, vehicle: int, tick: int):
             sample_by_time(model, state, world, vehicle, tick)
 
 
-@wp.func
+@device_function
 def gramian_smallest_eigenvalue(model: Any, state: Any, world: int, vehicle: int):
     """Return the smallest eigenvalue of (1/T) int Phi^T C^T C Phi dt over the sliding window; 0 before any data.
 
@@ -184,7 +185,7 @@ def cholesky_of(P: Any):
     return I11, L21, I22
 
 
-@wp.func
+@device_function
 def targets_in_view(model: Any, state: Any, world: int, vehicle: int) -> int:
     """Return how many targets the vehicle measures in this frame."""
     count = int(0)

@@ -7,14 +7,16 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.world.device_function import device_function
 
-@wp.func
+
+@device_function
 def has_routes(model: Any, vehicle: int) -> bool:
     """Return whether a vehicle's route is drawn among the scenario's (otherwise it leads straight to its goal)."""
     return model.routes.first[vehicle + 1] > model.routes.first[vehicle]
 
 
-@wp.func
+@device_function
 def route_length(state: Any, world: int, vehicle: int):
     """Return the length of a vehicle's route, m; 0 without one."""
     length = type(state.speed[world, vehicle])(0.0)
@@ -23,7 +25,7 @@ def route_length(state: Any, world: int, vehicle: int):
     return length
 
 
-@wp.func
+@device_function
 def route_tangent(state: Any, world: int, vehicle: int, segment: int, share: Any):
     """Return the horizontal direction of a route, of length 1, at a share in [0, 1] of the way along a segment.
 
@@ -40,7 +42,7 @@ def route_tangent(state: Any, world: int, vehicle: int, segment: int, share: Any
     return wp.normalize(first + (second - first) * share)
 
 
-@wp.func
+@device_function
 def place_on_route(state: Any, world: int, vehicle: int, x: Any, y: Any):
     """Return (s, lateral offset, heading) of the place of a vehicle's route that is nearest to a point of the map.
 
@@ -84,7 +86,7 @@ def place_on_route(state: Any, world: int, vehicle: int, x: Any, y: Any):
     return a[2] + share * (b[2] - a[2]), lateral, wp.atan2(tangent[1], tangent[0])
 
 
-@wp.func
+@device_function
 def point_on_route(state: Any, world: int, vehicle: int, s: Any):
     """Return (x, y, heading) of a vehicle's route at an arc length, m and rad; 0 without a route."""
     count = state.route_count[world, vehicle]
@@ -106,14 +108,14 @@ def point_on_route(state: Any, world: int, vehicle: int, s: Any):
     return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), wp.atan2(tangent[1], tangent[0])
 
 
-@wp.func
+@device_function
 def goal_distance(model: Any, state: Any, world: int, vehicle: int):
     """Return the horizontal distance to the vehicle's goal, m."""
     to_goal = state.goal[world, vehicle] - state.position[world, model.landmarks + vehicle]
     return wp.sqrt(to_goal[0] * to_goal[0] + to_goal[1] * to_goal[1])
 
 
-@wp.func
+@device_function
 def remaining_way(model: Any, state: Any, world: int, vehicle: int):
     """Return the way left to the goal, m: along the route that was drawn, or as the crow flies where none was."""
     if has_routes(model, vehicle):
@@ -123,7 +125,7 @@ def remaining_way(model: Any, state: Any, world: int, vehicle: int):
     return goal_distance(model, state, world, vehicle)
 
 
-@wp.func
+@device_function
 def is_past_end(model: Any, state: Any, world: int, vehicle: int, radius: Any) -> bool:
     """Return whether a vehicle has left its drawn route behind, no farther than `radius` beside its prolongation."""
     count = state.route_count[world, vehicle]

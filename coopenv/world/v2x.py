@@ -4,12 +4,13 @@ from typing import Any
 
 import warp as wp
 
+from coopenv.world.device_function import device_function
 from coopenv.world.faults import alter, as_told, content_tick, stamp
 from coopenv.world.parameters import V2X_LOSS
 from coopenv.world.random import RADIO, pair, random_words, uniform
 
 
-@wp.func
+@device_function
 def broadcast(model: Any, state: Any, world: int, vehicle: int, tick: int):
     """Put this vehicle's estimate (Rhat, Rhat phat) on the air if a message is due and it is there."""
     slot = tick % model.radio.slots
@@ -23,7 +24,7 @@ def broadcast(model: Any, state: Any, world: int, vehicle: int, tick: int):
     state.outbox_tick[world, vehicle, slot] = sent
 
 
-@wp.func
+@device_function
 def put_into_inbox(model: Any, state: Any, world: int, receiver: int, sender: int, sent: int, tick: int):
     """Let a receiver hear at a tick what a sender put on the air at another one, unless it has heard something newer.
 
@@ -39,7 +40,7 @@ def put_into_inbox(model: Any, state: Any, world: int, receiver: int, sender: in
     state.inbox_stamp[world, receiver, sender] = believed
 
 
-@wp.func
+@device_function
 def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
     """Receive what arrives at this tick from the neighbours that may be heard, and decide what the own message says.
 
@@ -70,7 +71,7 @@ def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
                     put_into_inbox(model, state, world, receiver, sender, due, tick)
 
 
-@wp.func
+@device_function
 def fresh(model: Any, state: Any, world: int, receiver: int, sender: int, tick: int) -> bool:
     """Return whether a message has been heard and is not older than the staleness limit."""
     sent = state.inbox_stamp[world, receiver, sender]

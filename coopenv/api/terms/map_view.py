@@ -19,6 +19,7 @@ from coopenv.world.camera import (
     project,
     segment_hits_box,
 )
+from coopenv.world.device_function import device_function
 from coopenv.world.v2x import fresh
 
 
@@ -44,7 +45,7 @@ class Nearest:
     distance: wp.float32  # m, horizontal
 
 
-@wp.func
+@device_function
 def next_nearest(model: Any, state: Any, world: int, vehicle: int, last: Nearest) -> Nearest:
     """Return the landmark that follows `last` in the order of the distance from the estimate, then of the index."""
     p = state.estimate_rotation[world, vehicle] * state.estimate_position[world, vehicle]
@@ -62,7 +63,7 @@ def next_nearest(model: Any, state: Any, world: int, vehicle: int, last: Nearest
     return found
 
 
-@wp.func
+@device_function
 def behind_vehicle(model: Any, state: Any, world: int, vehicle: int, origin: Any, line: Any, inverse_square: Any):
     """Return whether another vehicle is in the way of a line of sight where its last message puts it."""
     now = state.tick[world]
@@ -77,7 +78,7 @@ def behind_vehicle(model: Any, state: Any, world: int, vehicle: int, origin: Any
     return False
 
 
-@wp.func
+@device_function
 def to_be_seen(model: Any, state: Any, world: int, vehicle: int, point: Any) -> bool:
     """Return whether a point of the map, m, is in view from a vehicle's estimate.
 
@@ -101,7 +102,7 @@ def to_be_seen(model: Any, state: Any, world: int, vehicle: int, point: Any) -> 
     return not behind_vehicle(model, state, world, vehicle, origin, line, inverse_square)
 
 
-@wp.func
+@device_function
 def map_record(model: Any, state: Any, world: int, vehicle: int, place: Nearest) -> MapLandmark:
     """Return the record of a landmark."""
     landmark = MapLandmark()

@@ -14,6 +14,7 @@ from coopenv.api.terms.way import metres, seen_from_estimate
 from coopenv.world.camera import VISIBLE, body_bearing
 from coopenv.world.collision import UNDER_WAY
 from coopenv.world.command import ACCELERATION, SPEED, STEERING
+from coopenv.world.device_function import device_function
 from coopenv.world.quality import position_covariance
 from coopenv.world.route import goal_distance, route_length
 from coopenv.world.v2x import fresh
@@ -136,7 +137,7 @@ def odometry_age(samples: int, time: wp.float64, rate: wp.float64) -> wp.float32
     return wp.float32(wp.where(samples == 0, NEVER, age))
 
 
-@wp.func
+@device_function
 def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, way: Any):
     """Return the records of a vehicle: what it knows, and what is true.
 
@@ -221,7 +222,7 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     return ego, truth
 
 
-@wp.func
+@device_function
 def target_record(model: Any, state: Any, world: int, vehicle: int, index: int) -> Target:
     """Return the record of a target."""
     target = Target()
@@ -232,7 +233,7 @@ def target_record(model: Any, state: Any, world: int, vehicle: int, index: int) 
     return target
 
 
-@wp.func
+@device_function
 def neighbour_record(model: Any, state: Any, world: int, vehicle: int, sender: int) -> Neighbour:
     """Return the record of another vehicle."""
     neighbour = Neighbour()

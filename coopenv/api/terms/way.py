@@ -5,13 +5,14 @@ from typing import Any
 import warp as wp
 
 from coopenv.world.collision import ARRIVED
+from coopenv.world.device_function import device_function
 from coopenv.world.route import place_on_route, point_on_route, route_length
 
 FASTEST = wp.constant(wp.float64(2.0))
 """A vehicle's way grows at most by so many times its top speed (a bend's inside is shorter): a jump is no driving."""
 
 
-@wp.func
+@device_function
 def way_made(model: Any, state: Any, world: int, vehicle: int):
     """Return (how far along its way the vehicle believes to be, how long that is), m; (0, 0) without a goal."""
     p = state.estimate_rotation[world, vehicle] * state.estimate_position[world, vehicle]
@@ -26,7 +27,7 @@ def turn_between(first: Any, second: Any):
     return wp.atan2(wp.sin(first - second), wp.cos(first - second))
 
 
-@wp.func
+@device_function
 def seen_from_estimate(model: Any, state: Any, world: int, vehicle: int):
     """Return a vehicle's way as it believes to see it; 0 without a goal.
 
@@ -51,7 +52,7 @@ def seen_from_estimate(model: Any, state: Any, world: int, vehicle: int):
     return offset, turn_between(heading, along), wp.max(length - s, zero), ahead
 
 
-@wp.func
+@device_function
 def furthest_so_far(state: Any, results: Any, world: int, vehicle: int):
     """Return the farthest along its present way that a vehicle had believed to be, m: 0 on a route that is new."""
     last = results.furthest[world, vehicle]
@@ -63,7 +64,7 @@ def furthest_so_far(state: Any, results: Any, world: int, vehicle: int):
     return last
 
 
-@wp.func
+@device_function
 def metres(model: Any, state: Any, results: Any, world: int, vehicle: int, elapsed: wp.float64):
     """Return the metres of its way that a vehicle gains in this decision, and those that it will never drive.
 

@@ -22,6 +22,7 @@ from coopenv.observers.robust.constants import (
     MIN_VELOCITY_STD,
 )
 from coopenv.observers.robust.memory import Estimate, Pose, mat66d, vec2d, vec6d
+from coopenv.world.device_function import device_function
 
 KNOWN_ANGLE_VARIANCE = KNOWN_ANGLE**2
 KNOWN_POSITION_VARIANCE = KNOWN_POSITION**2
@@ -78,18 +79,46 @@ def recentring(error: Any):
 
 
 @wp.func
+def by_rows(H: Any, M: Any):
+    """Return H M for a 2x6 matrix H and a 6x6 matrix M: by rows, which compilers make vector operations of."""
+    return wp.matrix_from_rows(
+        H[0, 0] * M[0] + H[0, 1] * M[1] + H[0, 2] * M[2] + H[0, 3] * M[3] + H[0, 4] * M[4] + H[0, 5] * M[5],
+        H[1, 0] * M[0] + H[1, 1] * M[1] + H[1, 2] * M[2] + H[1, 3] * M[3] + H[1, 4] * M[4] + H[1, 5] * M[5],
+    )
+
+
+@wp.func
+def transposed_by_rows(K: Any, H: Any):
+    """Return K^T H for two 2x6 matrices, likewise."""
+    a = H[0]
+    b = H[1]
+    return wp.matrix_from_rows(
+        K[0, 0] * a + K[1, 0] * b,
+        K[0, 1] * a + K[1, 1] * b,
+        K[0, 2] * a + K[1, 2] * b,
+        K[0, 3] * a + K[1, 3] * b,
+        K[0, 4] * a + K[1, 4] * b,
+        K[0, 5] * a + K[1, 5] * b,
+    )
+
+
+@wp.func
+def diagonal_by_rows(G: Any, M: Any):
+    """Return G M for 6x6 matrices of which G is zero but for its blocks of 3x3 on the diagonal, likewise."""
+    return wp.matrix_from_rows(
+        G[0, 0] * M[0] + G[0, 1] * M[1] + G[0, 2] * M[2],
+        G[1, 0] * M[0] + G[1, 1] * M[1] + G[1, 2] * M[2],
+        G[2, 0] * M[0] + G[2, 1] * M[1] + G[2, 2] * M[2],
+        G[3, 3] * M[3] + G[3, 4] * M[4] + G[3, 5] * M[5],
+        G[4, 3] * M[3] + G[4, 4] * M[4] + G[4, 5] * M[5],
+        G[5, 3] * M[3] + G[5, 4] * M[4] + G[5, 5] * M[5],
+    )
+
+
+@wp.func
 def recentred(left: Any, P: Any, right: Any):
     """Return left P right^T for two matrices that are zero but for their blocks of 3x3 on the diagonal."""
-    A = block3(left, 0, 0)
-    D = block3(left, 3, 3)
-    At = wp.transpose(block3(right, 0, 0))
-    Dt = wp.transpose(block3(right, 3, 3))
-    result = mat66d()
-    result[:3, :3] = A * block3(P, 0, 0) * At
-    result[:3, 3:] = A * block3(P, 0, 3) * Dt
-    result[3:, :3] = D * block3(P, 3, 0) * At
-    result[3:, 3:] = D * block3(P, 3, 3) * Dt
-    return result
+    return wp.transpose(diagonal_by_rows(right, wp.transpose(diagonal_by_rows(left, P))))
 
 
 @wp.func
@@ -146,7 +175,7 @@ def propagated(P: Any, step: Pose):
     return forward(step, wp.transpose(forward(step, P)))
 
 
-@wp.func
+@device_function
 def odometry_noise(model: Any, i: int, dt: Any):
     """Return the variances (rotation, translation) per axis of an increment of vehicle i's odometry over dt."""
     scale = model.odometry_period * dt
@@ -155,7 +184,7 @@ def odometry_noise(model: Any, i: int, dt: Any):
     return vec2d(angular * angular * scale, linear * linear * scale)
 
 
-@wp.func
+@device_function
 def averaging_time(model: Any, i: int):
     """Return over which time vehicle i averages a velocity by odometry that changes by `MAX_ACCELERATION` at most, s.
 

@@ -11,6 +11,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust.algebra import (
+    diagonal_by_rows,
     displaced,
     forward,
     moved,
@@ -22,11 +23,12 @@ from coopenv.observers.robust.algebra import (
 from coopenv.observers.robust.constants import FORGET_TIME, SAME_TIME
 from coopenv.observers.robust.memory import ERRORS, MOUNTING, Estimate, Member, Pose, mat66d
 from coopenv.world.camera import VISIBLE
+from coopenv.world.device_function import device_function
 
 MAX_UNSEEN_TIME = FORGET_TIME + SAME_TIME
 
 
-@wp.func
+@device_function
 def index_of(memory: Any, world: int, i: int, vehicle: int) -> int:
     """Return the index of a vehicle among the members of i's belief, 0 if it is not one of the others."""
     for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
@@ -35,7 +37,7 @@ def index_of(memory: Any, world: int, i: int, vehicle: int) -> int:
     return 0
 
 
-@wp.func
+@device_function
 def begin_belief(memory: Any, world: int, i: int, estimate: Estimate):
     """Believe in the vehicle itself alone, and of its odometry's errors what was believed before."""
     others = memory.belief[world, i].others
@@ -49,13 +51,13 @@ def begin_belief(memory: Any, world: int, i: int, estimate: Estimate):
     memory.P[world, i, 0, 0] = estimate.P
 
 
-@wp.func
+@device_function
 def own_estimate(memory: Any, world: int, i: int):
     """Return what is believed of the vehicle itself."""
     return Estimate(memory.member[world, i, 0].pose, memory.P[world, i, 0, 0])
 
 
-@wp.func
+@device_function
 def propagate(memory: Any, world: int, i: int, n: int, step: Pose, noise: Any):
     """Carry a member through an increment of odometry with noise."""
     memory.member[world, i, n].pose = moved(memory.member[world, i, n].pose, step)
@@ -67,19 +69,19 @@ def propagate(memory: Any, world: int, i: int, n: int, step: Pose, noise: Any):
     memory.P[world, i, n, n] = with_noise(propagated(memory.P[world, i, n, n], step), noise)
 
 
-@wp.func
+@device_function
 def apply_error(memory: Any, world: int, i: int, n: int, error: Any):
     """Move a member's pose by an error."""
     memory.member[world, i, n].pose = displaced(memory.member[world, i, n].pose, error)
 
 
-@wp.func
+@device_function
 def is_free(memory: Any, world: int, i: int, k: int) -> bool:
     """Return whether bearings correct a member; those of others that are considered are as they say."""
     return memory.member[world, i, k].considered == 0
 
 
-@wp.func
+@device_function
 def correct_member(memory: Any, world: int, i: int, k: int):
     """Move a member by its correction, and set the derivative of errors about where it is then by those before."""
     correction = memory.scratch[world, k].correction
@@ -93,7 +95,7 @@ def correct_member(memory: Any, world: int, i: int, k: int):
     memory.scratch[world, k].recentring = G
 
 
-@wp.func
+@device_function
 def apply_corrections(memory: Any, world: int, i: int):
     """Move all members that are free by their corrections, and let the covariance be about where they are then."""
     for k in range(memory.belief[world, i].members):
@@ -107,16 +109,16 @@ def apply_corrections(memory: Any, world: int, i: int):
                 if k == j:
                     block = symmetric_part(block)
             elif free:
-                block = memory.scratch[world, k].recentring * block
+                block = diagonal_by_rows(memory.scratch[world, k].recentring, block)
             elif is_free(memory, world, i, j):
-                block = block * wp.transpose(memory.scratch[world, j].recentring)
+                block = wp.transpose(diagonal_by_rows(memory.scratch[world, j].recentring, wp.transpose(block)))
             else:
                 continue
             memory.P[world, i, k, j] = block
             memory.P[world, i, j, k] = wp.transpose(block)
 
 
-@wp.func
+@device_function
 def subtract_block(memory: Any, world: int, i: int, k: int, j: int, block: Any):
     """Subtract a block from the covariance at (k, j), and its transpose at (j, k)."""
     left = memory.P[world, i, k, j] - block
@@ -126,7 +128,7 @@ def subtract_block(memory: Any, world: int, i: int, k: int, j: int, block: Any):
     memory.P[world, i, j, k] = wp.transpose(left)
 
 
-@wp.func
+@device_function
 def append_member(memory: Any, world: int, i: int, vehicle: int, pose: Pose, P: Any):
     """Add a member whose error is independent of those of the others; there must be room. Nothing else is set."""
     n = memory.belief[world, i].members
@@ -141,7 +143,7 @@ def append_member(memory: Any, world: int, i: int, vehicle: int, pose: Pose, P: 
     memory.belief[world, i].members = n + 1
 
 
-@wp.func
+@device_function
 def remove_member(memory: Any, world: int, i: int, n: int):
     """Remove a member; those behind it move up."""
     members = memory.belief[world, i].members
@@ -155,7 +157,7 @@ def remove_member(memory: Any, world: int, i: int, n: int):
     memory.belief[world, i].members = members - 1
 
 
-@wp.func
+@device_function
 def mark_seen(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Note which members are in view."""
     for n in range(model.target_count[i]):
@@ -166,13 +168,13 @@ def mark_seen(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
                 memory.member[world, i, member].seen_tick = tick
 
 
-@wp.func
+@device_function
 def is_unseen(model: Any, memory: Any, world: int, i: int, n: int, tick: int):
     """Return whether a member has been out of view for so long that it may be evicted."""
     return wp.float64(tick - memory.member[world, i, n].seen_tick) * model.camera_period > wp.float64(MAX_UNSEEN_TIME)
 
 
-@wp.func
+@device_function
 def longest_unseen(model: Any, memory: Any, world: int, i: int, tick: int) -> int:
     """Return the member that has been out of view for longest, 0 if all have been in view lately."""
     found = int(0)
@@ -183,13 +185,13 @@ def longest_unseen(model: Any, memory: Any, world: int, i: int, tick: int) -> in
     return found
 
 
-@wp.func
+@device_function
 def most_others(memory: Any) -> int:
     """Return how many other vehicles there is room for in a belief."""
     return memory.member.shape[2] - 1 - MOUNTING
 
 
-@wp.func
+@device_function
 def make_room(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
     """Return whether there is room for one more, after an eviction if there has to be one and may be one."""
     if memory.belief[world, i].members - memory.belief[world, i].others < most_others(memory):

@@ -4,14 +4,15 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.observers.robust.algebra import displaced, recentring
+from coopenv.observers.robust.algebra import by_rows, displaced, recentring, transposed_by_rows
 from coopenv.observers.robust.belief import apply_corrections, is_free, subtract_block
 from coopenv.observers.robust.constants import BEARING_GATE, MAX_LINEARISATIONS, RELINEARISATION_ANGLE
-from coopenv.observers.robust.measurements import linearise
+from coopenv.observers.robust.measurements import across_line, linearise, project
 from coopenv.observers.robust.memory import Frame, mat66d, vec6d
+from coopenv.world.device_function import device_function
 
 
-@wp.func
+@device_function
 def store_poses(memory: Any, world: int, i: int):
     """Store poses as they are before a correction."""
     for k in range(memory.belief[world, i].members):
@@ -19,57 +20,36 @@ def store_poses(memory: Any, world: int, i: int):
         memory.scratch[world, k].pose = memory.member[world, i, k].pose
 
 
-@wp.func
+@device_function
 def linearise_again(frame: Frame, memory: Any, world: int, i: int, share: Any):
-    """Linearise the lines at where a share of the correction puts the poses, in the errors about those before."""
+    """Linearise the lines at where a share of the correction puts the poses, in the errors about those before.
+
+    Members that are considered stay.
+    """
     for k in range(memory.belief[world, i].members):
-        correction = share * memory.scratch[world, k].correction
-        memory.scratch[world, k].last_correction = correction
-        memory.scratch[world, k].recentring = recentring(correction)
-        memory.member[world, i, k].pose = displaced(memory.scratch[world, k].pose, correction)
+        if is_free(memory, world, i, k):
+            correction = share * memory.scratch[world, k].correction
+            memory.scratch[world, k].last_correction = correction
+            memory.scratch[world, k].recentring = recentring(correction)
+            memory.member[world, i, k].pose = displaced(memory.scratch[world, k].pose, correction)
     for n in range(frame.lines):
         if memory.line[world, n].fits == 1:
             linearise(frame, memory, world, i, n)
             member = memory.line[world, n].member
-            memory.line[world, n].jacobian = memory.line[world, n].jacobian * memory.scratch[world, 0].recentring
-            if member > 0:
-                G = memory.scratch[world, member].recentring
-                memory.line[world, n].member_jacobian = memory.line[world, n].member_jacobian * G
+            H = memory.line[world, n].jacobian
+            memory.line[world, n].jacobian = by_rows(H, memory.scratch[world, 0].recentring)
+            if member > 0 and is_free(memory, world, i, member):
+                H = memory.line[world, n].member_jacobian
+                memory.line[world, n].member_jacobian = by_rows(H, memory.scratch[world, member].recentring)
             if frame.mounting > 0:
-                G = memory.scratch[world, frame.mounting].recentring
-                memory.line[world, n].mounting_jacobian = memory.line[world, n].mounting_jacobian * G
+                H = memory.line[world, n].mounting_jacobian
+                memory.line[world, n].mounting_jacobian = by_rows(H, memory.scratch[world, frame.mounting].recentring)
 
 
-@wp.func
-def across_line(memory: Any, world: int, n: int, m: int):
-    """Return the covariance, 2x2, of what the n-th line measures with what is left of the m-th one's innovation."""
-    S = memory.line[world, n].jacobian * wp.transpose(memory.gain[world, m, 0])
-    member = memory.line[world, n].member
-    if member > 0:
-        S = S + memory.line[world, n].member_jacobian * wp.transpose(memory.gain[world, m, member])
-    mounting = memory.line[world, n].mounting
-    if mounting > 0:
-        S = S + memory.line[world, n].mounting_jacobian * wp.transpose(memory.gain[world, m, mounting])
-    return S
-
-
-@wp.func
+@device_function
 def set_gain(memory: Any, world: int, i: int, n: int):
-    """Set a line's `gain`, H P with the covariance that the lines before leave, and its `weight` S^-1."""
+    """Let a line's `gain`, H P, be with the covariance that the lines before leave, and set its `weight` S^-1."""
     members = memory.belief[world, i].members
-    member = memory.line[world, n].member
-    H = memory.line[world, n].jacobian
-    for k in range(members):
-        memory.gain[world, n, k] = H * memory.P[world, i, 0, k]
-    if member > 0:
-        H = memory.line[world, n].member_jacobian
-        for k in range(members):
-            memory.gain[world, n, k] = memory.gain[world, n, k] + H * memory.P[world, i, member, k]
-    mounting = memory.line[world, n].mounting
-    if mounting > 0:
-        H = memory.line[world, n].mounting_jacobian
-        for k in range(members):
-            memory.gain[world, n, k] = memory.gain[world, n, k] + H * memory.P[world, i, mounting, k]
     for m in range(n):
         if memory.line[world, m].fits == 1:
             share = across_line(memory, world, n, m) * memory.line[world, m].weight
@@ -79,7 +59,7 @@ def set_gain(memory: Any, world: int, i: int, n: int):
     memory.line[world, n].weight = wp.inverse(S)
 
 
-@wp.func
+@device_function
 def hold_considered(memory: Any, world: int, i: int):
     """Take back the corrections of the members that are considered."""
     for k in range(memory.belief[world, i].members):
@@ -88,23 +68,26 @@ def hold_considered(memory: Any, world: int, i: int):
             memory.scratch[world, k].correction = vec6d()
 
 
-@wp.func
+@device_function
 def error_left(memory: Any, world: int, k: int):
     """Return where the lines were linearised, less the correction so far."""
     return memory.scratch[world, k].last_correction - memory.scratch[world, k].correction
 
 
-@wp.func
+@device_function
 def correct_by_lines(memory: Any, world: int, i: int, lines: int, judging: bool):
     """Find the correction of the poses before by all lines that fit; the covariance stays as it is.
 
-    One line after the other, with the residual that those before have left, is the batch update.
+    One line after the other, with the residual that those before have left, is the batch update. `judging`: lines are
+    as the gate has linearised and projected them, and those to members have to fit what those before leave.
     """
     members = memory.belief[world, i].members
     for k in range(members):
         memory.scratch[world, k].correction = vec6d()
     for n in range(lines):
         if memory.line[world, n].fits == 1:
+            if not judging:
+                project(memory, world, i, n)
             set_gain(memory, world, i, n)
             member = memory.line[world, n].member
             residual = memory.line[world, n].residual + memory.line[world, n].jacobian * error_left(memory, world, 0)
@@ -123,7 +106,7 @@ def correct_by_lines(memory: Any, world: int, i: int, lines: int, judging: bool)
     hold_considered(memory, world, i)
 
 
-@wp.func
+@device_function
 def condense(memory: Any, world: int, i: int, lines: int):
     """Let the covariance be that after the lines that fit; that of errors that are only considered stays."""
     for k in range(memory.belief[world, i].members):
@@ -133,11 +116,11 @@ def condense(memory: Any, world: int, i: int, lines: int):
                 for n in range(lines):
                     if memory.line[world, n].fits == 1:
                         K = memory.line[world, n].weight * memory.gain[world, n, k]
-                        block = block + wp.transpose(K) * memory.gain[world, n, j]
+                        block = block + transposed_by_rows(K, memory.gain[world, n, j])
                 subtract_block(memory, world, i, k, j, block)
 
 
-@wp.func
+@device_function
 def nearest(memory: Any, world: int, lines: int):
     """Return the distance of the nearest target whose line fits, m."""
     distance = wp.float64(wp.inf)
@@ -154,7 +137,7 @@ def turn_of_sight(error: Any, distance: Any):
     return wp.max(wp.max(size[:3]), wp.max(size[3:]) / distance)
 
 
-@wp.func
+@device_function
 def next_share(memory: Any, world: int, i: int, lines: int, first: bool):
     """Return at which share of the correction to linearise next, 0 if that would be where it was done last.
 
@@ -163,20 +146,22 @@ def next_share(memory: Any, world: int, i: int, lines: int, first: bool):
     distance = nearest(memory, world, lines)
     turn = wp.float64(0.0)
     for k in range(memory.belief[world, i].members):
-        turn = wp.max(turn, turn_of_sight(memory.scratch[world, k].correction, distance))
+        if is_free(memory, world, i, k):
+            turn = wp.max(turn, turn_of_sight(memory.scratch[world, k].correction, distance))
     share = wp.float64(1.0)
     if turn < wp.float64(RELINEARISATION_ANGLE):
         share = wp.float64(0.5)
     turn = wp.float64(0.0)
     for k in range(memory.belief[world, i].members):
-        further = share * memory.scratch[world, k].correction - memory.scratch[world, k].last_correction
-        turn = wp.max(turn, turn_of_sight(further, distance))
+        if is_free(memory, world, i, k):
+            further = share * memory.scratch[world, k].correction - memory.scratch[world, k].last_correction
+            turn = wp.max(turn, turn_of_sight(further, distance))
     if turn < wp.float64(RELINEARISATION_ANGLE) and not first:
         share = wp.float64(0.0)
     return share
 
 
-@wp.func
+@device_function
 def iterated_update(frame: Frame, memory: Any, world: int, i: int):
     """Correct by the lines that fit, linearised anew half way, or where they put the poses if that is far.
 

@@ -13,11 +13,12 @@ from coopenv.estimation.linalg import block3, symmetric_part
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.evidence import carry_evidence, size_squared
 from coopenv.observers.robust.memory import Drift, Estimate, Report, mat33d, mat66d
+from coopenv.world.device_function import device_function
 
 THIRD = 1.0 / 3.0
 
 
-@wp.func
+@device_function
 def has_jumped(model: Any, memory: Any, world: int, i: int, n: int, step: Any, dt: Any) -> bool:
     """Return whether member n's odometry changes by more than brakes and steering can, as a repeated message's does."""
     if memory.member[world, i, n].has_twist == 0:
@@ -35,7 +36,7 @@ def summed(drift: Drift, x: Any, N: Any, dt: Any, time: Any):
     return Drift(share * drift.sum + x, (share * share) * drift.covariance + N)
 
 
-@wp.func
+@device_function
 def note_step(memory: Any, world: int, i: int, sender: int, last: Report, report: Report, noise: Any, dt: Any):
     """Sum up by how far a sender says to be from where its odometry has led since its last report.
 
@@ -63,7 +64,7 @@ def note_step(memory: Any, world: int, i: int, sender: int, last: Report, report
     carry_evidence(memory, world, i, sender, x, noise[1])
 
 
-@wp.func
+@device_function
 def drifted(memory: Any, world: int, i: int, sender: int, gate: Any, least: Any):
     """Return how far a sender has drifted from its odometry, in m, if by more than it may and by `least`, else 0."""
     fast = memory.word[world, i, sender].drift
@@ -75,7 +76,7 @@ def drifted(memory: Any, world: int, i: int, sender: int, gate: Any, least: Any)
     return wp.float64(0.0)
 
 
-@wp.func
+@device_function
 def drift_of(memory: Any, world: int, i: int, n: int):
     """Return how far member n has drifted from its odometry, in m; 0 if by no more than it may, distrusted by less."""
     sender = memory.member[world, i, n].vehicle

@@ -15,6 +15,7 @@ from coopenv.estimation.linalg import block3
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.memory import Frame, mat33d
 from coopenv.observers.robust.trust import distrust
+from coopenv.world.device_function import device_function
 
 
 @wp.func
@@ -23,7 +24,7 @@ def size_squared(x: Any, P: Any):
     return wp.max(wp.dot(x, wp.inverse(P) * x), wp.float64(0.0))
 
 
-@wp.func
+@device_function
 def certainty_of(memory: Any, world: int, i: int, sender: int):
     """Return the information on how far a sender is from where it says, 1/m^2; at first there is hardly any."""
     V = memory.word[world, i, sender].certainty
@@ -32,7 +33,7 @@ def certainty_of(memory: Any, world: int, i: int, sender: int):
     return V
 
 
-@wp.func
+@device_function
 def carry_evidence(memory: Any, world: int, i: int, sender: int, x: Any, variance: Any):
     """Let evidence be about where a sender says to be now: x (m) from where odometry of a variance (m^2) has led."""
     covariance = wp.inverse(certainty_of(memory, world, i, sender))
@@ -42,7 +43,7 @@ def carry_evidence(memory: Any, world: int, i: int, sender: int, x: Any, varianc
     memory.word[world, i, sender].offset = certainty * believed
 
 
-@wp.func
+@device_function
 def share_of(frame: Frame, memory: Any, world: int, dt: Any):
     """Return which share of a frame's information counts: noise that is not the camera's lasts for many frames."""
     frames = wp.max(wp.float64(constants.NEWS_TIME) / dt, wp.float64(1.0))
@@ -54,7 +55,7 @@ def share_of(frame: Frame, memory: Any, world: int, dt: Any):
     return wp.float64(constants.EVIDENCE_SHARE) * frame.variance / most
 
 
-@wp.func
+@device_function
 def note_evidence(memory: Any, world: int, i: int, n: int, lines: int, share: Any):
     """Add what a frame says of how far member n is from where it says, along the axes of the map."""
     D = mat33d()
@@ -73,33 +74,38 @@ def note_evidence(memory: Any, world: int, i: int, n: int, lines: int, share: An
     memory.word[world, i, sender].certainty = certainty
 
 
-@wp.func
+@device_function
 def contradiction(memory: Any, world: int, i: int, n: int):
-    """Return by how much bearings contradict member n, squared in standard deviations, and a likely error in m."""
+    """Return by how much bearings contradict member n, squared in standard deviations."""
     sender = memory.member[world, i, n].vehicle
     certainty = certainty_of(memory, world, i, sender)
     offset = memory.word[world, i, sender].offset
     covariance = wp.inverse(certainty)
     R = memory.member[world, i, n].pose.R
     P = R * block3(memory.P[world, i, n, n], 3, 3) * wp.transpose(R)
-    likely = wp.inverse(certainty + wp.identity(3, wp.float64)) * offset  # some metre at most, unless bearings tell
-    return size_squared(covariance * offset, P + covariance), wp.length(likely)
+    return size_squared(covariance * offset, P + covariance)
 
 
-@wp.func
+@device_function
+def likely_error(memory: Any, world: int, i: int, n: int):
+    """Return how far member n is likely to be from where it says, m: some metre at most, unless bearings tell."""
+    sender = memory.member[world, i, n].vehicle
+    certainty = certainty_of(memory, world, i, sender)
+    return wp.length(wp.inverse(certainty + wp.identity(3, wp.float64)) * memory.word[world, i, sender].offset)
+
+
+@device_function
 def test_words(model: Any, frame: Frame, memory: Any, world: int, i: int, now: Any):
     """Weigh a frame's bearings against what every member says; believe the one no more that they contradict most."""
     worst = int(0)
     most = wp.float64(constants.WORD_GATE)
-    error = wp.float64(0.0)
     share = share_of(frame, memory, world, now.period)
     for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
         if memory.member[world, i, n].considered == 1:
             note_evidence(memory, world, i, n, frame.lines, share)
-            size, far = contradiction(memory, world, i, n)
+            size = contradiction(memory, world, i, n)
             if size > most:
                 worst = n
                 most = size
-                error = far
     if worst > 0:
-        distrust(model, memory, world, i, worst, now.tick, error, True)
+        distrust(model, memory, world, i, worst, now.tick, likely_error(memory, world, i, worst), True)

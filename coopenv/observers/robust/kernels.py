@@ -11,7 +11,8 @@ from coopenv.observers.robust.told.memory import TOLD_SIZES, ToldMemory, told_ru
 from coopenv.observers.robust.told.messages import TOLD_MESSAGES
 from coopenv.world.embedded import Embedded
 
-OPTIONS = {"max_unroll": 1}  # of the Warp module; without it there is long straight code, which takes long to compile
+OPTIONS = {"max_unroll": 1, "inline_threshold": 1000}
+"""Of the Warp module; without them there is long straight code, which takes long to compile and is no faster."""
 
 ROBUST = Embedded(
     "robust",

@@ -10,7 +10,7 @@ import warp as wp
 from coopenv.estimation.linalg import block3
 from coopenv.estimation.so3 import exp_so3, skew
 from coopenv.observers.contract import MIN_BEARING_STD
-from coopenv.observers.robust.algebra import between, odometry_noise
+from coopenv.observers.robust.algebra import between, by_rows, odometry_noise
 from coopenv.observers.robust.belief import index_of
 from coopenv.observers.robust.constants import (
     BEND_TIME,
@@ -26,6 +26,7 @@ from coopenv.observers.robust.mounting import mounting_of, mounting_variances
 from coopenv.observers.robust.odometry import increment_noise
 from coopenv.observers.robust.trust import is_barred
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
+from coopenv.world.device_function import device_function
 from coopenv.world.v2x import fresh
 
 HALF_ACCELERATION = 0.5 * MAX_ACCELERATION
@@ -34,7 +35,7 @@ THIRD = 1.0 / 3.0
 SEARCH, RESECTION, TRACKING = 0, 1, 2  # what bearings are for
 
 
-@wp.func
+@device_function
 def bearing_variance(model: Any, i: int):
     """Return the variance of a bearing of vehicle i per tangent axis."""
     std = wp.float64(model.noise[i].bearing)
@@ -55,7 +56,7 @@ def tangent_basis(b: Any):
     return wp.matrix_from_rows(x, vec3d(c, sign + b[1] * b[1] * a, -b[1]))
 
 
-@wp.func
+@device_function
 def set_line(memory: Any, world: int, n: int, member: int, b: Any, point: Any, variance: Any):
     """Let the n-th bearing b be to a point in the body of a member, or (member 0) in the map.
 
@@ -67,13 +68,13 @@ def set_line(memory: Any, world: int, n: int, member: int, b: Any, point: Any, v
     memory.line[world, n].variance = variance
 
 
-@wp.func
+@device_function
 def is_heard(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int) -> bool:
     """Return whether there is a message of a sender that knows where it is."""
     return fresh(model, state, world, i, sender, tick) and memory.inbox[world, i, sender].valid == 1
 
 
-@wp.func
+@device_function
 def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, tick: int, period: Any):
     """Return the variance per axis, m^2, of where a sender says that it is, as it counts in the search.
 
@@ -89,7 +90,7 @@ def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, 
     return factor * (variance + gone * gone)
 
 
-@wp.func
+@device_function
 def set_line_to_member(
     model: Any, memory: Any, world: int, i: int, n: int, member: int, heard: bool, tick: int, b: Any, purpose: int
 ) -> bool:
@@ -127,7 +128,7 @@ def set_line_to_member(
     return True
 
 
-@wp.func
+@device_function
 def set_line_to_target(
     model: Any, state: Any, memory: Any, world: int, i: int, n: int, target: int, tick: int, period: Any, purpose: int
 ) -> bool:
@@ -150,7 +151,7 @@ def set_line_to_target(
     return False
 
 
-@wp.func
+@device_function
 def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int, period: Any, purpose: int):
     """Set the lines of sight of the bearings to landmarks and vehicles that can be used, and return their frame.
 
@@ -172,7 +173,7 @@ def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
     return Frame(lines, mounting, vec3d(model.camera[i].position), variance, period)
 
 
-@wp.func
+@device_function
 def bend_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: Any, distance: Any, period: Any):
     """Return the variance of what a bearing's linearisation leaves out, rad^2.
 
@@ -200,7 +201,7 @@ def bend_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: An
     return wp.max(time / period, wp.float64(1.0)) * along * across / (square * square)
 
 
-@wp.func
+@device_function
 def linearise(frame: Frame, memory: Any, world: int, i: int, n: int):
     """Linearise the n-th bearing, residual = H x + noise; return whether its target is ahead of the camera."""
     member = memory.line[world, n].member
@@ -246,32 +247,50 @@ def linearise(frame: Frame, memory: Any, world: int, i: int, n: int):
     return wp.dot(u, bearing) > wp.float64(0.0)
 
 
-@wp.func
-def innovation_with(frame: Frame, memory: Any, world: int, i: int, n: int, more: Any):
-    """Return the normalised innovation squared of a line that has been linearised, with more noise per axis, rad^2."""
-    member = memory.line[world, n].member
-    residual = memory.line[world, n].residual
+@device_function
+def project(memory: Any, world: int, i: int, n: int):
+    """Set a line's `gain` to H P."""
     H = memory.line[world, n].jacobian
-    noise = memory.line[world, n].noise + more
-    S = noise * wp.identity(2, wp.float64) + (H * memory.P[world, i, 0, 0]) * wp.transpose(H)
-    if member > 0:
-        G = memory.line[world, n].member_jacobian
-        cross = (H * memory.P[world, i, 0, member]) * wp.transpose(G)
-        S = S + cross + wp.transpose(cross) + (G * memory.P[world, i, member, member]) * wp.transpose(G)
-    if frame.mounting > 0:
-        J = memory.line[world, n].mounting_jacobian
-        rows = H * memory.P[world, i, 0, frame.mounting]
+    member = memory.line[world, n].member
+    mounting = memory.line[world, n].mounting
+    for k in range(memory.belief[world, i].members):
+        rows = by_rows(H, memory.P[world, i, 0, k])
         if member > 0:
-            rows = rows + memory.line[world, n].member_jacobian * memory.P[world, i, member, frame.mounting]
-        cross = rows * wp.transpose(J)
-        own = (J * memory.P[world, i, frame.mounting, frame.mounting]) * wp.transpose(J)
-        S = S + cross + wp.transpose(cross) + own
+            rows = rows + by_rows(memory.line[world, n].member_jacobian, memory.P[world, i, member, k])
+        if mounting > 0:
+            rows = rows + by_rows(memory.line[world, n].mounting_jacobian, memory.P[world, i, mounting, k])
+        memory.gain[world, n, k] = rows
+
+
+@device_function
+def across_line(memory: Any, world: int, n: int, m: int):
+    """Return the covariance, 2x2, of what the n-th line measures with what is left of the m-th one's innovation."""
+    S = memory.line[world, n].jacobian * wp.transpose(memory.gain[world, m, 0])
+    member = memory.line[world, n].member
+    if member > 0:
+        S = S + memory.line[world, n].member_jacobian * wp.transpose(memory.gain[world, m, member])
+    mounting = memory.line[world, n].mounting
+    if mounting > 0:
+        S = S + memory.line[world, n].mounting_jacobian * wp.transpose(memory.gain[world, m, mounting])
+    return S
+
+
+@device_function
+def innovation_with(memory: Any, world: int, n: int, more: Any):
+    """Return the normalised innovation squared of a line that has its `gain`, with more noise per axis, rad^2."""
+    residual = memory.line[world, n].residual
+    noise = memory.line[world, n].noise + more
+    S = noise * wp.identity(2, wp.float64) + across_line(memory, world, n, n)
     return wp.dot(residual, wp.inverse(S) * residual)
 
 
-@wp.func
+@device_function
 def innovation_squared(frame: Frame, memory: Any, world: int, i: int, n: int):
-    """Linearise a line and return its normalised innovation squared, infinite where the target is not ahead."""
+    """Linearise a line and return its normalised innovation squared, infinite where the target is not ahead.
+
+    Its `gain` is set to H P.
+    """
     if not linearise(frame, memory, world, i, n):
         return wp.float64(wp.inf)
-    return innovation_with(frame, memory, world, i, n, wp.float64(0.0))
+    project(memory, world, i, n)
+    return innovation_with(memory, world, n, wp.float64(0.0))

@@ -9,6 +9,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust.constants import MAX_HYPOTHESES, MAX_MEMBERS
+from coopenv.world.device_function import device_function
 from coopenv.world.records import array
 
 vec2d: Any = wp.vec2d
@@ -209,7 +210,7 @@ MOUNTING = 2  # the member that stands for the error of the camera's mounting, w
 SIZES = {"K": MAX_MEMBERS + MOUNTING, "H": MAX_HYPOTHESES + 1}  # besides the hypotheses of one frame there is the prior
 
 
-@wp.func
+@device_function
 def clear(model: Any, memory: Any, world: int, i: int):
     """Forget an earlier episode, down to what is only used within a tick: equal states are equal in every bit."""
     memory.belief[world, i] = Belief()

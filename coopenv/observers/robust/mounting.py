@@ -12,9 +12,10 @@ import warp as wp
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.algebra import with_noise
 from coopenv.observers.robust.memory import MOUNTING, Member, vec2d
+from coopenv.world.device_function import device_function
 
 
-@wp.func
+@device_function
 def mounting_variances(model: Any, i: int):
     """Return the variances, as declared, of the turn and of the shift, per axis."""
     turn = wp.float64(model.camera[i].orientation_std)
@@ -22,13 +23,13 @@ def mounting_variances(model: Any, i: int):
     return vec2d(turn * turn, shift * shift)
 
 
-@wp.func
+@device_function
 def has_mounting_errors(model: Any, i: int) -> bool:
     """Return whether the mounting is declared not to be known."""
     return wp.max(mounting_variances(model, i)) > wp.float64(0.0)
 
 
-@wp.func
+@device_function
 def begin_mounting(model: Any, memory: Any, world: int, i: int):
     """Let member 2 stand for the mounting, and believe of it what is declared."""
     if has_mounting_errors(model, i):
@@ -46,7 +47,7 @@ def begin_mounting(model: Any, memory: Any, world: int, i: int):
         memory.P[world, i, MOUNTING, MOUNTING] = P
 
 
-@wp.func
+@device_function
 def walk_mounting(model: Any, memory: Any, world: int, i: int, dt: Any):
     """Let the mounting be a little less certain after a time: see `MOUNTING_WALK`."""
     if mounting_of(memory, world, i) > 0:
@@ -55,7 +56,7 @@ def walk_mounting(model: Any, memory: Any, world: int, i: int, dt: Any):
         memory.P[world, i, MOUNTING, MOUNTING] = with_noise(P, declared)
 
 
-@wp.func
+@device_function
 def mounting_of(memory: Any, world: int, i: int) -> int:
     """Return the member that stands for the mounting, 0 if there is none."""
     return wp.where(memory.belief[world, i].others > MOUNTING, MOUNTING, 0)

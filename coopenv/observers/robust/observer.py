@@ -22,12 +22,13 @@ from coopenv.observers.robust.odometry import begin_errors, increment_noise, pro
 from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
 from coopenv.observers.robust.tracklets import bit_of
 from coopenv.observers.robust.update import is_sound, lose, resect, set_anchor, update
+from coopenv.world.device_function import device_function
 from coopenv.world.faults import start_covariance
 
 BELIEVING, SEARCHING, FOUND = 0, 1, 2  # how a vehicle stands to its pose; found in the search at this tick
 
 
-@wp.func
+@device_function
 def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: Estimate):
     """Believe in a pose alone; on all that may be heard it may depend."""
     begin_belief(memory, world, i, estimate)
@@ -39,7 +40,7 @@ def restart_belief(model: Any, memory: Any, world: int, i: int, estimate: Estima
     memory.belief[world, i].depends_on = bits
 
 
-@wp.func
+@device_function
 def write(state: Any, memory: Any, world: int, i: int):
     """Write the pose believed, while it is searched for that of the best hypothesis, as the state holds it.
 
@@ -60,7 +61,7 @@ def write(state: Any, memory: Any, world: int, i: int):
 def make_start(clear_messages: Any, receive: Any) -> Any:
     """Return the Warp function that starts an observer, given those that forget and take what the radio delivers."""
 
-    @wp.func
+    @device_function
     def start(model: Any, state: Any, memory: Any, world: int, i: int):
         """Start at the initial estimate, and take what the leaders have sent.
 
@@ -85,7 +86,7 @@ def make_start(clear_messages: Any, receive: Any) -> Any:
     return start
 
 
-@wp.func
+@device_function
 def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> int:
     """Search for the pose; with one hypothesis left, believe in the prior if it is that, else in the hypothesis."""
     if not advance_search(model, state, memory, world, i, now):
@@ -99,7 +100,7 @@ def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) ->
     return wp.where(confirmed, BELIEVING, FOUND)
 
 
-@wp.func
+@device_function
 def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, standing: int):
     """Correct the belief by a frame; that of a pose that has just been found, take from this frame alone."""
     purpose = wp.where(standing == BELIEVING, TRACKING, RESECTION)
@@ -115,7 +116,7 @@ def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, s
 def make_estimate(receive: Any, fuse_messages: Any) -> Any:
     """Return the Warp function of one tick, given those that take what the radio delivers and fuse it."""
 
-    @wp.func
+    @device_function
     def estimate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
         """Take one camera tick of one vehicle, whose messages have been delivered."""
         state.nis[world, i] = wp.float64(0.0)

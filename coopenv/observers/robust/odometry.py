@@ -23,11 +23,12 @@ from coopenv.observers.robust.constants import (
 )
 from coopenv.observers.robust.memory import ERRORS, Member, Pose, mat33d, mat66d, vec2d, vec3d
 from coopenv.observers.robust.mounting import begin_mounting, has_mounting_errors
+from coopenv.world.device_function import device_function
 
 TWELFTH = 1.0 / 12.0
 
 
-@wp.func
+@device_function
 def lasting_variances(model: Any, i: int):
     """Return the variances, as declared, of the gyro's bias per axis and of the odometry's scale."""
     noise = model.noise[i]
@@ -35,7 +36,7 @@ def lasting_variances(model: Any, i: int):
     return wp.cw_mul(bias, bias), wp.float64(noise.odometry_scale) * wp.float64(noise.odometry_scale)
 
 
-@wp.func
+@device_function
 def walk_variances(model: Any, i: int):
     """Return by how much these variances grow, per second."""
     noise = model.noise[i]
@@ -44,7 +45,7 @@ def walk_variances(model: Any, i: int):
     return wp.cw_mul(bias, bias), scale * scale
 
 
-@wp.func
+@device_function
 def has_lasting_errors(model: Any, i: int) -> bool:
     """Return whether a scale error or a bias of the gyro is declared."""
     bias, scale = lasting_variances(model, i)
@@ -52,7 +53,7 @@ def has_lasting_errors(model: Any, i: int) -> bool:
     return wp.max(bias + bias_walk) + scale + scale_walk > wp.float64(0.0)
 
 
-@wp.func
+@device_function
 def begin_errors(model: Any, memory: Any, world: int, i: int):
     """Let member 1 stand for the odometry's errors, where there are any, and believe of them what is declared."""
     if has_lasting_errors(model, i) or has_mounting_errors(model, i):
@@ -71,7 +72,7 @@ def begin_errors(model: Any, memory: Any, world: int, i: int):
     begin_mounting(model, memory, world, i)
 
 
-@wp.func
+@device_function
 def walk_errors(model: Any, memory: Any, world: int, i: int, dt: Any):
     """Let the odometry's errors have walked for a time."""
     if memory.belief[world, i].others > ERRORS:
@@ -81,7 +82,7 @@ def walk_errors(model: Any, memory: Any, world: int, i: int, dt: Any):
         memory.P[world, i, ERRORS, ERRORS][3, 3] += scale * dt
 
 
-@wp.func
+@device_function
 def corrected(memory: Any, world: int, i: int, step: Pose, dt: Any):
     """Return an increment over dt without the errors that are believed, to first order in the bias."""
     if memory.belief[world, i].others <= ERRORS:
@@ -92,7 +93,7 @@ def corrected(memory: Any, world: int, i: int, step: Pose, dt: Any):
     return Pose(step.R * exp_so3(-turn), (step.p - wp.float64(0.5) * wp.cross(turn, step.p)) / scale)
 
 
-@wp.func
+@device_function
 def errors_transition(memory: Any, world: int, i: int, step: Pose, dt: Any):
     """Return the derivative, 6x6, of the left error after a corrected increment by the odometry's errors."""
     scale = wp.float64(1.0) + memory.member[world, i, ERRORS].v[0]
@@ -107,7 +108,7 @@ def errors_transition(memory: Any, world: int, i: int, step: Pose, dt: Any):
     return G
 
 
-@wp.func
+@device_function
 def propagate_own(memory: Any, world: int, i: int, step: Pose, noise: Any, dt: Any):
     """Carry the vehicle itself through a corrected increment over dt, with noise and the errors that are left."""
     propagate(memory, world, i, 0, step, noise)
@@ -124,7 +125,7 @@ def propagate_own(memory: Any, world: int, i: int, step: Pose, noise: Any, dt: A
                 memory.P[world, i, 0, 0] = symmetric_part(memory.P[world, i, 0, 0] + both)
 
 
-@wp.func
+@device_function
 def lasting_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, correlated: Any):
     """Return the variances (rotation, translation) of an increment over dt by errors of odometry, taken as noise.
 
@@ -140,7 +141,7 @@ def lasting_noise(memory: Any, world: int, i: int, step: Pose, dt: Any, correlat
     return noise
 
 
-@wp.func
+@device_function
 def increment_noise(model: Any, memory: Any, world: int, i: int, step: Pose, dt: Any):
     """Return the variances (rotation, translation) of an increment over dt, errors that last among them."""
     noise = odometry_noise(model, i, dt)
@@ -159,7 +160,7 @@ def jump_variance(change: Any, std: Any, period: Any, smooth: Any):
     return wp.where(square > gate, square * period * period * wp.float64(TWELFTH), wp.float64(0.0))
 
 
-@wp.func
+@device_function
 def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: Any):
     """Return the increment over a tick of dt and variances to add to its noise; carry the dead reckoning through it.
 

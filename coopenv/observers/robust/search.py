@@ -18,9 +18,10 @@ from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.measurements import SEARCH, innovation_squared, innovation_with, linearise, set_lines
 from coopenv.observers.robust.memory import Estimate, Frame, Hypothesis, Pose, Search
 from coopenv.observers.robust.solutions import is_new, next_triple, solve_triple
+from coopenv.world.device_function import device_function
 
 
-@wp.func
+@device_function
 def begin_search(memory: Any, world: int, i: int, prior: Estimate):
     """Start from a prior, without hypotheses."""
     memory.search[world, i] = Search()
@@ -29,7 +30,7 @@ def begin_search(memory: Any, world: int, i: int, prior: Estimate):
     memory.search[world, i].least_time = wp.float64(constants.MIN_SEARCH_TIME)
 
 
-@wp.func
+@device_function
 def propagate_search(memory: Any, world: int, i: int, step: Pose, noise: Any):
     """Carry the prior and all hypotheses through a tick's odometry."""
     memory.search[world, i].prior = carried(memory.search[world, i].prior, step, noise)
@@ -37,7 +38,7 @@ def propagate_search(memory: Any, world: int, i: int, step: Pose, noise: Any):
         memory.hypothesis[world, i, h].estimate = carried(memory.hypothesis[world, i, h].estimate, step, noise)
 
 
-@wp.func
+@device_function
 def costs_less(memory: Any, world: int, i: int, h: int, g: int) -> bool:
     """Return whether a hypothesis costs less than another one, or as much and is nearer to the prior."""
     a = memory.hypothesis[world, i, h].cost
@@ -47,7 +48,7 @@ def costs_less(memory: Any, world: int, i: int, h: int, g: int) -> bool:
     return a < b
 
 
-@wp.func
+@device_function
 def sort_hypotheses(memory: Any, world: int, i: int):
     """Put those that cost least first."""
     count = memory.search[world, i].hypotheses
@@ -59,7 +60,7 @@ def sort_hypotheses(memory: Any, world: int, i: int):
                 memory.hypothesis[world, i, g] = other
 
 
-@wp.func
+@device_function
 def prune(memory: Any, world: int, i: int):
     """Give up what costs much more than the best, what is the same as a better one, and all if the best is not good."""
     sort_hypotheses(memory, world, i)
@@ -76,7 +77,7 @@ def prune(memory: Any, world: int, i: int):
     memory.search[world, i].hypotheses = kept
 
 
-@wp.func
+@device_function
 def set_common_noise(frame: Frame, memory: Any, world: int, i: int):
     """Set for every line the largest noise that it has for any hypothesis, by which all of them are compared."""
     for n in range(frame.lines):
@@ -89,7 +90,7 @@ def set_common_noise(frame: Frame, memory: Any, world: int, i: int):
             memory.line[world, n].common_noise = wp.max(memory.line[world, n].common_noise, noise)
 
 
-@wp.func
+@device_function
 def expected_of(frame: Frame, memory: Any, world: int, n: int):
     """Return the normalised innovation squared of a line that is expected of a true hypothesis.
 
@@ -103,7 +104,7 @@ def expected_of(frame: Frame, memory: Any, world: int, n: int):
     return wp.float64(2.0) * (frame.variance + lasting) / noise
 
 
-@wp.func
+@device_function
 def follow_hypothesis(frame: Frame, memory: Any, world: int, i: int, h: int, used: Any):
     """Add the frame's bearings, but those used already, to the cost of a hypothesis; correct it by those that fit."""
     begin_belief(memory, world, i, memory.hypothesis[world, i, h].estimate)
@@ -117,7 +118,7 @@ def follow_hypothesis(frame: Frame, memory: Any, world: int, i: int, h: int, use
             cost = nis
             if wp.isfinite(nis):
                 more = memory.line[world, n].common_noise - memory.line[world, n].noise
-                cost = innovation_with(frame, memory, world, i, n, more)
+                cost = innovation_with(memory, world, n, more)
             memory.hypothesis[world, i, h].cost += wp.min(cost, wp.float64(constants.MAX_BEARING_COST))
             memory.hypothesis[world, i, h].misfit += wp.min(nis, wp.float64(constants.MAX_BEARING_COST))
             memory.hypothesis[world, i, h].misfit -= wp.float64(2.0) * expected_of(frame, memory, world, n)
@@ -128,7 +129,7 @@ def follow_hypothesis(frame: Frame, memory: Any, world: int, i: int, h: int, use
         memory.hypothesis[world, i, h].estimate = own_estimate(memory, world, i)
 
 
-@wp.func
+@device_function
 def add_prior(memory: Any, world: int, i: int):
     """Add the prior as a hypothesis if it is known well enough to be followed."""
     prior = memory.search[world, i].prior
@@ -139,7 +140,7 @@ def add_prior(memory: Any, world: int, i: int):
         memory.search[world, i].hypotheses = h + 1
 
 
-@wp.func
+@device_function
 def chosen_triple(frame: Frame, memory: Any, world: int, i: int):
     """Return three well placed bearings, others at every attempt."""
     triples = frame.lines * (frame.lines - 1) * (frame.lines - 2) // 6
@@ -151,7 +152,7 @@ def chosen_triple(frame: Frame, memory: Any, world: int, i: int):
     return lines
 
 
-@wp.func
+@device_function
 def wait(memory: Any, world: int, i: int, period: Any) -> bool:
     """Count the time of a frame; return whether to look at it: not soon after one that was in doubt."""
     memory.search[world, i].waited_time += period
@@ -160,7 +161,7 @@ def wait(memory: Any, world: int, i: int, period: Any) -> bool:
     return not patient or memory.search[world, i].clear_time > wp.float64(-constants.SAME_TIME)
 
 
-@wp.func
+@device_function
 def solve_chosen(frame: Frame, memory: Any, world: int, i: int, lines: Any, period: Any) -> bool:
     """Solve a triple; return whether its solutions are hypotheses now: if for a while all were well determined.
 
@@ -186,7 +187,7 @@ def solve_chosen(frame: Frame, memory: Any, world: int, i: int, lines: Any, peri
     return following
 
 
-@wp.func
+@device_function
 def begin_hypotheses(frame: Frame, memory: Any, world: int, i: int, period: Any):
     """Begin with a known prior at first, then with a frame's solutions, too; every attempt takes other bearings.
 
@@ -207,7 +208,7 @@ def begin_hypotheses(frame: Frame, memory: Any, world: int, i: int, period: Any)
     return lines, solved
 
 
-@wp.func
+@device_function
 def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> bool:
     """Take a frame's bearings; return whether one hypothesis alone is left after some frames."""
     frame = set_lines(model, state, memory, world, i, now.tick, now.period, SEARCH)

@@ -15,9 +15,10 @@ from coopenv.observers.robust.belief import begin_belief
 from coopenv.observers.robust.measurements import linearise, tangent_basis
 from coopenv.observers.robust.memory import Estimate, Frame, Pose, mat33d, mat66d
 from coopenv.observers.robust.p3p import camera_pose, solve_triangle
+from coopenv.world.device_function import device_function
 
 
-@wp.func
+@device_function
 def next_triple(memory: Any, world: int, count: int, size: Any, number: int):
     """Return (bearings, size, number) of the triple that spans most after the one of this size and number.
 
@@ -50,7 +51,7 @@ def angles_within(P: Any, most: Any) -> bool:
     return True
 
 
-@wp.func
+@device_function
 def covariance_of(frame: Frame, memory: Any, world: int, i: int, lines: Any, patient: bool):
     """Return whether three bearings determine the pose believed well enough, and its covariance."""
     M = mat66d()
@@ -64,7 +65,7 @@ def covariance_of(frame: Frame, memory: Any, world: int, i: int, lines: Any, pat
     return angles_within(P, wp.float64(1.0)) and is_regular(M, wp.float64(constants.MIN_INFORMATION_RATIO)), P
 
 
-@wp.func
+@device_function
 def is_new(memory: Any, world: int, i: int, h: int, count: int) -> bool:
     """Return whether a hypothesis can be told apart from each of the first `count`."""
     for g in range(count):
@@ -74,7 +75,7 @@ def is_new(memory: Any, world: int, i: int, h: int, count: int) -> bool:
     return True
 
 
-@wp.func
+@device_function
 def add_hypothesis(memory: Any, world: int, i: int, estimate: Estimate):
     """Add a hypothesis, unless there is one like it."""
     h = memory.search[world, i].hypotheses
@@ -84,7 +85,7 @@ def add_hypothesis(memory: Any, world: int, i: int, estimate: Estimate):
             memory.search[world, i].hypotheses = h + 1
 
 
-@wp.func
+@device_function
 def solve(frame: Frame, memory: Any, world: int, i: int, lines: Any, b: Any, z: Any, patient: bool, following: bool):
     """Solve one problem of bearings b and points z, rows; return whether `patient` finds all solutions determined.
 
@@ -104,7 +105,7 @@ def solve(frame: Frame, memory: Any, world: int, i: int, lines: Any, b: Any, z: 
     return True
 
 
-@wp.func
+@device_function
 def problem(frame: Frame, memory: Any, world: int, lines: Any, number: int):
     """Return whether there is the problem of a number, below `PROBLEMS`, and its bearings and points, rows.
 
@@ -133,7 +134,7 @@ def problem(frame: Frame, memory: Any, world: int, lines: Any, number: int):
     return exists, b, z
 
 
-@wp.func
+@device_function
 def solve_triple(frame: Frame, memory: Any, world: int, i: int, lines: Any, patient: bool, following: bool) -> bool:
     """Make hypotheses of the poses that agree with three bearings, in their order, if they are to be followed.
 

@@ -16,6 +16,7 @@ from coopenv.estimation.so3 import skew
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import propagate
 from coopenv.observers.robust.memory import Estimate, Pose, Report, mat66f, vec3d
+from coopenv.world.device_function import device_function
 from coopenv.world.faults import as_told, claimed_std, content_tick
 
 LEAST_TIME = constants.NEWS_TIME - constants.SAME_TIME
@@ -34,7 +35,7 @@ def marker_jacobian(marker: Any):
     return algebra.lower_blocks(one, -skew(marker), one)
 
 
-@wp.func
+@device_function
 def own_report(model: Any, memory: Any, world: int, i: int, tick: int):
     """Return pose, covariance and odometry at the marker, or an empty report while the pose is not known."""
     report = Report()
@@ -54,7 +55,7 @@ def own_report(model: Any, memory: Any, world: int, i: int, tick: int):
     return report
 
 
-@wp.func
+@device_function
 def clear_messages(model: Any, memory: Any, world: int, i: int):
     """Forget what was sent and received."""
     for slot in range(model.radio.slots):
@@ -64,7 +65,7 @@ def clear_messages(model: Any, memory: Any, world: int, i: int):
         memory.inbox[world, i, sender].tick = -1
 
 
-@wp.func
+@device_function
 def told_report(model: Any, state: Any, world: int, i: int, report: Report):
     """Return a report as a vehicle broadcasts it, which may lie, see `[faults]`."""
     R, p = as_told(model, state, world, i, report.pose.R, report.pose.p)
@@ -75,7 +76,7 @@ def told_report(model: Any, state: Any, world: int, i: int, report: Report):
     return report
 
 
-@wp.func
+@device_function
 def send(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Send a report if one is due."""
     if tick % model.radio.period == 0:
@@ -83,7 +84,7 @@ def send(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
         memory.outbox[world, i, tick % model.radio.slots] = report
 
 
-@wp.func
+@device_function
 def arrived(state: Any, memory: Any, world: int, i: int, sender: int) -> int:
     """Return the tick at which the message was sent that the radio has delivered now; -1 where there is none."""
     if sender < 0:  # a landmark
@@ -92,7 +93,7 @@ def arrived(state: Any, memory: Any, world: int, i: int, sender: int) -> int:
     return wp.where(state.inbox_stamp[world, i, sender] != memory.inbox[world, i, sender].tick, sent, -1)
 
 
-@wp.func
+@device_function
 def receive(model: Any, state: Any, memory: Any, world: int, i: int):
     """Take what the radio has delivered at this tick."""
     for n in range(model.target_count[i]):
@@ -104,7 +105,7 @@ def receive(model: Any, state: Any, memory: Any, world: int, i: int):
             memory.inbox[world, i, sender].tick = state.inbox_stamp[world, i, sender]
 
 
-@wp.func
+@device_function
 def propagate_member(model: Any, memory: Any, world: int, i: int, n: int, step: Pose, dt: Any, noise: Any):
     """Carry a member on to its new message by its odometry over dt, and average its twist."""
     averaged = wp.max(algebra.averaging_time(model, i), wp.float64(0.5) * dt)
@@ -123,7 +124,7 @@ def propagate_member(model: Any, memory: Any, world: int, i: int, n: int, step: 
     memory.member[world, i, n].has_twist = 1
 
 
-@wp.func
+@device_function
 def test_sender(memory: Any, world: int, i: int, n: int, told: Estimate, dt: Any):
     """Decide whether a sender is trusted, from its new report, dt after the last one, and the belief about it."""
     believed = Estimate(memory.member[world, i, n].pose, memory.P[world, i, n, n])
@@ -140,7 +141,7 @@ def test_sender(memory: Any, world: int, i: int, n: int, told: Estimate, dt: Any
     memory.member[world, i, n].distrusted = distrusted
 
 
-@wp.func
+@device_function
 def information_share(memory: Any, world: int, i: int, depends_on: wp.uint64):
     """Return which share of its new information counts of a sender that depends on these vehicles.
 
@@ -159,7 +160,7 @@ def information_share(memory: Any, world: int, i: int, depends_on: wp.uint64):
     return wp.float64(1.0) / wp.float64(count)
 
 
-@wp.func
+@device_function
 def is_due(model: Any, before: int, sent: int) -> bool:
     """Return whether a message comes long enough after the last one of the sender that was fused to be so, too."""
     return wp.float64(sent - before) * model.camera_period > wp.float64(LEAST_TIME)

@@ -13,12 +13,13 @@ import warp as wp
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.memory import Estimate, Word, mat33d, mat66d, vec2d, vec3d
 from coopenv.observers.robust.tracklets import test_sender
+from coopenv.world.device_function import device_function
 
 GROSS_VARIANCE = constants.GROSS_ERROR**2
 THIRD = 1.0 / 3.0
 
 
-@wp.func
+@device_function
 def is_barred(memory: Any, world: int, i: int, sender: int, tick: int) -> bool:
     """Return whether a sender is not to be believed yet."""
     return tick < memory.word[world, i, sender].barred_until
@@ -34,7 +35,7 @@ def only_position(M: Any):
     return result
 
 
-@wp.func
+@device_function
 def enlarge(memory: Any, world: int, i: int, n: int, variance: Any):
     """Let member n be farther from where it says, by a variance per axis in m^2, with all that depends on its error."""
     members = memory.belief[world, i].members
@@ -49,7 +50,7 @@ def enlarge(memory: Any, world: int, i: int, n: int, variance: Any):
             memory.P[world, i, j, k] = wp.transpose(block)
 
 
-@wp.func
+@device_function
 def reopen(memory: Any, world: int, i: int, n: int, variance: Any):
     """Let all that depends on what member n said be as uncertain as that is now; where that is much, the own pose.
 
@@ -61,7 +62,7 @@ def reopen(memory: Any, world: int, i: int, n: int, variance: Any):
         memory.P[world, i, 0, 0] = algebra.with_noise(memory.P[world, i, 0, 0], vec2d(turn, variance))
 
 
-@wp.func
+@device_function
 def distrust(model: Any, memory: Any, world: int, i: int, n: int, tick: int, error: Any, believed: bool):
     """Believe member n no more, which is off by some metres; `believed`: the own pose has followed that error."""
     sender = memory.member[world, i, n].vehicle
@@ -80,7 +81,7 @@ def distrust(model: Any, memory: Any, world: int, i: int, n: int, tick: int, err
     memory.word[world, i, sender] = word
 
 
-@wp.func
+@device_function
 def admits(memory: Any, world: int, i: int, n: int, dt: Any) -> bool:
     """Take note where member n's new report admits that what it said before was wrong; return whether it starts anew.
 
@@ -101,7 +102,7 @@ def admits(memory: Any, world: int, i: int, n: int, dt: Any) -> bool:
     return False
 
 
-@wp.func
+@device_function
 def judge(model: Any, memory: Any, world: int, i: int, n: int, tick: int, dt: Any, drift: Any, jumped: bool) -> bool:
     """Decide whether member n is believed, from its new report, dt after the last one; return whether it starts anew.
 
@@ -125,7 +126,7 @@ def judge(model: Any, memory: Any, world: int, i: int, n: int, tick: int, dt: An
     return False
 
 
-@wp.func
+@device_function
 def forget_evidence(memory: Any, world: int, i: int):
     """Forget what bearings have said of others: they were taken from where the vehicle is not."""
     for sender in range(memory.word.shape[2]):
@@ -135,7 +136,7 @@ def forget_evidence(memory: Any, world: int, i: int):
         memory.word[world, i, sender].fitted_time = wp.float64(0.0)
 
 
-@wp.func
+@device_function
 def note_missed(memory: Any, world: int, i: int, lines: int, dt: Any) -> bool:
     """Average which share of the bearings to each member do not fit; return whether those to most targets fit.
 
@@ -158,7 +159,7 @@ def note_missed(memory: Any, world: int, i: int, lines: int, dt: Any) -> bool:
     return balance > 0
 
 
-@wp.func
+@device_function
 def test_missed(model: Any, memory: Any, world: int, i: int, lines: int, dt: Any, tick: int):
     """Believe those members no more to which most bearings do not fit, while those to most targets do."""
     if not note_missed(memory, world, i, lines, dt):

@@ -28,9 +28,10 @@ from coopenv.observers.robust.memory import Anchor, Estimate, Frame, mat66d, vec
 from coopenv.observers.robust.odometry import begin_errors, lasting_noise
 from coopenv.observers.robust.search import begin_search
 from coopenv.observers.robust.trust import forget_evidence, test_missed
+from coopenv.world.device_function import device_function
 
 
-@wp.func
+@device_function
 def gate(frame: Frame, memory: Any, world: int, i: int):
     """Linearise the lines and mark those that fit; return the share of the others, how many fit, and their NIS.
 
@@ -58,7 +59,7 @@ def gate(frame: Frame, memory: Any, world: int, i: int):
     return share, fitting, total
 
 
-@wp.func
+@device_function
 def set_anchor(memory: Any, world: int, i: int, P: Any, tick: int):
     """Remember where the vehicle is, for a search after a loss."""
     here = Estimate(memory.member[world, i, 0].pose, P)
@@ -75,7 +76,7 @@ def is_sound(estimate: Estimate):
     return wp.isfinite(wp.trace(factor) + wp.length(estimate.pose.p) + wp.trace(estimate.pose.R))
 
 
-@wp.func
+@device_function
 def lose(model: Any, memory: Any, world: int, i: int, tick: int):
     """Search anew, from where most bearings fitted, carried on by odometry since."""
     forget_evidence(memory, world, i)
@@ -87,7 +88,7 @@ def lose(model: Any, memory: Any, world: int, i: int, tick: int):
     begin_search(memory, world, i, carried(anchor.estimate, step, noise))
 
 
-@wp.func
+@device_function
 def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, frame: Frame):
     """Correct the belief by every bearing of a frame that fits it; search anew when most do not."""
     share, fitting, nis = gate(frame, memory, world, i)
@@ -113,7 +114,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
         set_anchor(memory, world, i, with_noise(wp.float64(4.0) * memory.P[world, i, 0, 0], noise), now.tick)
 
 
-@wp.func
+@device_function
 def weight_of(memory: Any, world: int, i: int, n: int):
     """Return the weight of a bearing, to whose variance the error of the member that it is to adds."""
     N = memory.line[world, n].noise * wp.identity(2, wp.float64)
@@ -124,7 +125,7 @@ def weight_of(memory: Any, world: int, i: int, n: int):
     return wp.inverse(N)
 
 
-@wp.func
+@device_function
 def write_resected_covariance(memory: Any, world: int, i: int, lines: int, inverse: Any):
     """Set the vehicle's covariance to that of the solution, the members' errors included."""
     members = memory.belief[world, i].members
@@ -149,7 +150,7 @@ def write_resected_covariance(memory: Any, world: int, i: int, lines: int, inver
     memory.P[world, i, 0, 0] = symmetric_part(inverse * own * wp.transpose(inverse))
 
 
-@wp.func
+@device_function
 def resect(frame: Frame, memory: Any, world: int, i: int) -> bool:
     """Put the vehicle where a frame's bearings see it, by least squares from where it is; return whether that works."""
     lines = frame.lines

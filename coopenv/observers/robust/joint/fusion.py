@@ -22,9 +22,10 @@ from coopenv.observers.robust.measurements import is_heard
 from coopenv.observers.robust.memory import Estimate
 from coopenv.observers.robust.tracklets import bit_of, information_share, is_due, test_sender
 from coopenv.world.camera import VISIBLE
+from coopenv.world.device_function import device_function
 
 
-@wp.func
+@device_function
 def is_told(memory: Any, world: int, count: int, vehicle: int) -> bool:
     """Return whether the message that has been read tells of a vehicle."""
     for n in range(count):
@@ -33,7 +34,7 @@ def is_told(memory: Any, world: int, count: int, vehicle: int) -> bool:
     return False
 
 
-@wp.func
+@device_function
 def make_joint_room(model: Any, memory: Any, world: int, i: int, tick: int, count: int) -> bool:
     """Remove the members that the message tells of and, for want of room, those unseen for longest.
 
@@ -59,7 +60,7 @@ def make_joint_room(model: Any, memory: Any, world: int, i: int, tick: int, coun
     return True
 
 
-@wp.func
+@device_function
 def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, count: int, tick: int):
     """Add all that the message that has been read tells of, if there is room; their errors are as it says."""
     if not make_joint_room(model, memory, world, i, tick, count):
@@ -89,7 +90,7 @@ def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, 
     radio.forget_contacts(memory, world, i)
 
 
-@wp.func
+@device_function
 def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, sender: int, count: int):
     """Carry all that a message tells of to it, and fuse what has been learnt since the contact's last message."""
     ticks = memory.told[world, 0].tick - memory.contact_told[world, i, c, 0].tick
@@ -114,7 +115,7 @@ def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, send
         memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
 
 
-@wp.func
+@device_function
 def told_vehicle(memory: Any, world: int, i: int, sender: int, n: int) -> int:
     """Return the n-th vehicle of which a received message tells, the sender first."""
     if n == 0:
@@ -122,7 +123,7 @@ def told_vehicle(memory: Any, world: int, i: int, sender: int, n: int) -> int:
     return memory.inbox_told[world, i, sender, n - 1].vehicle
 
 
-@wp.func
+@device_function
 def tells_of_visible(model: Any, state: Any, memory: Any, world: int, i: int, sender: int) -> bool:
     """Return whether a received message tells of a vehicle in view."""
     for n in range(radio.others_told(memory, world, i, sender) + 1):
@@ -131,7 +132,7 @@ def tells_of_visible(model: Any, state: Any, memory: Any, world: int, i: int, se
     return False
 
 
-@wp.func
+@device_function
 def fuse_one(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int):
     """Fuse one message, or add those that it tells of, or neither where another message has said it all."""
     count = radio.read_message(memory, world, i, sender)
@@ -149,7 +150,7 @@ def fuse_one(model: Any, state: Any, memory: Any, world: int, i: int, sender: in
         memory.contact[world, i, c].fused = 1
 
 
-@wp.func
+@device_function
 def fuse_joint_messages(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Fuse the messages that tell of members, and add those that vehicles in view tell of; who tells of most first."""
     radio.forget_contacts(memory, world, i)  # the belief may have begun anew

@@ -20,9 +20,10 @@ from coopenv.observers.robust.joint.matrices import (
 from coopenv.observers.robust.memory import mat66d, vec6d
 from coopenv.observers.robust.odometry import increment_noise
 from coopenv.observers.robust.tracklets import propagate_member
+from coopenv.world.device_function import device_function
 
 
-@wp.func
+@device_function
 def predict_told(model: Any, memory: Any, world: int, i: int, c: int, count: int):
     """Carry the contact's last message on to the new one by odometry: poses to `step`, covariance to BEFORE."""
     for a in range(count):
@@ -47,7 +48,7 @@ def predict_told(model: Any, memory: Any, world: int, i: int, c: int, count: int
         memory.matrix[world, BEFORE, a, a] = block
 
 
-@wp.func
+@device_function
 def propagate_told(model: Any, memory: Any, world: int, i: int, count: int):
     """Carry the members that a message tells of on to where it says that they were, unless they stand there already."""
     for a in range(count):
@@ -64,7 +65,7 @@ def propagate_told(model: Any, memory: Any, world: int, i: int, count: int):
                 memory.member[world, i, n].report.odometry = told.odometry
 
 
-@wp.func
+@device_function
 def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
     """Turn the covariances BEFORE and AFTER into new information, of which a share counts; return whether there is any.
 
@@ -107,7 +108,7 @@ def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
     return wp.isfinite(size)
 
 
-@wp.func
+@device_function
 def fuse_joint_information(memory: Any, world: int, i: int, count: int):
     """Fuse information about the errors of all that a message tells of, see `fuse_information`.
 

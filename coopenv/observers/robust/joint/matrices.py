@@ -5,11 +5,12 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust.memory import mat66d
+from coopenv.world.device_function import device_function
 
 BEFORE, AFTER, INVERSE = 0, 1, 2  # the matrices
 
 
-@wp.func
+@device_function
 def multiply(memory: Any, world: int, x: int, y: int, z: int, count: int):
     """Write the product of the matrices x and y, of so many blocks, to z."""
     for a in range(count):
@@ -20,7 +21,7 @@ def multiply(memory: Any, world: int, x: int, y: int, z: int, count: int):
             memory.matrix[world, z, a, b] = product
 
 
-@wp.func
+@device_function
 def recentre(memory: Any, world: int, x: int, count: int):
     """Turn the information x about some errors into that about others, of which `scratch` holds the derivatives."""
     for a in range(count):
@@ -30,7 +31,7 @@ def recentre(memory: Any, world: int, x: int, count: int):
             memory.matrix[world, x, a, b] = block
 
 
-@wp.func
+@device_function
 def symmetrise(memory: Any, world: int, x: int, count: int):
     """Replace the matrix x, of so many blocks, by its symmetric part."""
     for a in range(count):
@@ -41,13 +42,13 @@ def symmetrise(memory: Any, world: int, x: int, count: int):
             memory.matrix[world, x, b, a] = wp.transpose(block)
 
 
-@wp.func
+@device_function
 def entry(memory: Any, world: int, x: int, k: int, j: int):
     """Return the number (k, j) of the matrix x."""
     return memory.matrix[world, x, k // 6, j // 6][k % 6, j % 6]
 
 
-@wp.func
+@device_function
 def swap_rows(memory: Any, world: int, x: int, k: int, j: int, count: int):
     """Swap two rows of the matrix x."""
     for b in range(count):
@@ -56,7 +57,7 @@ def swap_rows(memory: Any, world: int, x: int, k: int, j: int, count: int):
         memory.matrix[world, x, j // 6, b][j % 6] = row
 
 
-@wp.func
+@device_function
 def subtract_row(memory: Any, world: int, x: int, k: int, j: int, factor: Any, count: int):
     """Subtract a multiple of row k of the matrix x from its row j."""
     for b in range(count):
@@ -64,7 +65,7 @@ def subtract_row(memory: Any, world: int, x: int, k: int, j: int, factor: Any, c
         memory.matrix[world, x, j // 6, b][j % 6] = row
 
 
-@wp.func
+@device_function
 def invert(memory: Any, world: int, x: int, y: int, count: int):
     """Write the inverse of the matrix x, of so many blocks, to y, by Gauss-Jordan elimination; x is lost."""
     n = 6 * count
@@ -91,7 +92,7 @@ def invert(memory: Any, world: int, x: int, y: int, count: int):
                 subtract_row(memory, world, y, k, j, factor, count)
 
 
-@wp.func
+@device_function
 def factorise(memory: Any, world: int, x: int, n: int) -> bool:
     """Replace the lower triangle of the n x n matrix x by its Cholesky factor; return whether it has one."""
     for k in range(n):

@@ -21,12 +21,13 @@ from coopenv.observers.robust.tracklets import (
     receive,
     told_report,
 )
+from coopenv.world.device_function import device_function
 from coopenv.world.faults import claimed_std, content_tick
 
 MAX_AGE = SUPERSEDING_TIME + SAME_TIME
 
 
-@wp.func
+@device_function
 def clear_joint_messages(model: Any, memory: Any, world: int, i: int):
     """Forget what was sent and received, all contacts, and what is only used within a tick."""
     clear_messages(model, memory, world, i)
@@ -58,7 +59,7 @@ def clear_joint_messages(model: Any, memory: Any, world: int, i: int):
             memory.inbox_factor[world, i, sender, k] = wp.float32(0.0)
 
 
-@wp.func
+@device_function
 def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Send the belief about oneself and as many others as fit, if a message is due."""
     if tick % model.radio.period != 0:
@@ -100,7 +101,7 @@ def send_joint(model: Any, state: Any, memory: Any, world: int, i: int, tick: in
     memory.outbox_joint[world, i, slot] = joint
 
 
-@wp.func
+@device_function
 def receive_joint(model: Any, state: Any, memory: Any, world: int, i: int):
     """Take what the radio has delivered at this tick."""
     for n in range(model.target_count[i]):
@@ -121,7 +122,7 @@ def receive_joint(model: Any, state: Any, memory: Any, world: int, i: int):
     receive(model, state, memory, world, i)
 
 
-@wp.func
+@device_function
 def others_told(memory: Any, world: int, i: int, sender: int) -> int:
     """Return of how many other vehicles a received message tells; of none where the sender depends on this vehicle."""
     if (memory.inbox[world, i, sender].depends_on & bit_of(i)) != wp.uint64(0):
@@ -129,7 +130,7 @@ def others_told(memory: Any, world: int, i: int, sender: int) -> int:
     return memory.inbox_joint[world, i, sender].others
 
 
-@wp.func
+@device_function
 def dependence(memory: Any, world: int, i: int, sender: int) -> wp.uint64:
     """Return on whom a received message depends: on nobody where it tells of all that its sender believes in."""
     depends_on = memory.inbox[world, i, sender].depends_on
@@ -139,7 +140,7 @@ def dependence(memory: Any, world: int, i: int, sender: int) -> wp.uint64:
     return depends_on
 
 
-@wp.func
+@device_function
 def read_message(memory: Any, world: int, i: int, sender: int) -> int:
     """Write what a received message tells of to `told`, their covariance to AFTER; return how many they are."""
     report = memory.inbox[world, i, sender]
@@ -161,7 +162,7 @@ def read_message(memory: Any, world: int, i: int, sender: int) -> int:
     return others + 1
 
 
-@wp.func
+@device_function
 def contact_of(memory: Any, world: int, i: int, sender: int) -> int:
     """Return the contact with a sender, -1 if there is none."""
     for c in range(memory.contact.shape[2]):
@@ -170,7 +171,7 @@ def contact_of(memory: Any, world: int, i: int, sender: int) -> int:
     return -1
 
 
-@wp.func
+@device_function
 def store_contact(memory: Any, world: int, i: int, c: int, sender: int, count: int):
     """Let the message that has been read be the last one of a contact."""
     memory.contact[world, i, c].sender = sender
@@ -183,7 +184,7 @@ def store_contact(memory: Any, world: int, i: int, c: int, sender: int, count: i
             memory.contact_P[world, i, c, MAX_TOLD * a + b] = memory.matrix[world, AFTER, a, b]
 
 
-@wp.func
+@device_function
 def tells_of_the_same(memory: Any, world: int, i: int, c: int, count: int) -> bool:
     """Return whether there is a contact whose last message tells of the same vehicles as the one that has been read."""
     if c < 0:
@@ -196,7 +197,7 @@ def tells_of_the_same(memory: Any, world: int, i: int, c: int, count: int) -> bo
     return True
 
 
-@wp.func
+@device_function
 def is_superseded(model: Any, memory: Any, world: int, i: int, sender: int, count: int) -> bool:
     """Return whether a message that is fused already says all that the one that has been read does."""
     for c in range(memory.contact.shape[2]):
@@ -212,7 +213,7 @@ def is_superseded(model: Any, memory: Any, world: int, i: int, sender: int, coun
     return False
 
 
-@wp.func
+@device_function
 def forget_contacts(memory: Any, world: int, i: int):
     """Forget the senders that tell of vehicles which are no members; they may be met again."""
     for c in range(memory.contact.shape[2]):
@@ -222,7 +223,7 @@ def forget_contacts(memory: Any, world: int, i: int):
                 memory.contact[world, i, c].sender = -1
 
 
-@wp.func
+@device_function
 def note_contacts(memory: Any, world: int, i: int):
     """Let the members show what their contacts say: whether they are trusted, and on whom they depend."""
     for n in range(memory.belief[world, i].others, memory.belief[world, i].members):

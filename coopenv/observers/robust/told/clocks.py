@@ -11,9 +11,10 @@ import warp as wp
 from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust.constants import LEAST_CHANGE, SHARE_OF_CHANGE
 from coopenv.observers.robust.memory import mat66d
+from coopenv.world.device_function import device_function
 
 
-@wp.func
+@device_function
 def by_clocks(model: Any, memory: Any, world: int, i: int, n: int):
     """Return the covariance, 6x6, of how far member n is off by clocks; zero before its velocity is known."""
     std = wp.float64(model.fault[i].clock)
@@ -23,7 +24,7 @@ def by_clocks(model: Any, memory: Any, world: int, i: int, n: int):
     return P
 
 
-@wp.func
+@device_function
 def changes_speed(model: Any, memory: Any, world: int, i: int, n: int) -> bool:
     """Let clocks count by the velocity of member n where that has changed much; return whether it has.
 

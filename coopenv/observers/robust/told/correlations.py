@@ -15,6 +15,7 @@ from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.memory import Pose, Report, mat66d, mat66f, vec3d
 from coopenv.observers.robust.told.memory import Correlation, Known
 from coopenv.observers.robust.tracklets import arrived, clear_messages, marker_jacobian, receive, send
+from coopenv.world.device_function import device_function
 from coopenv.world.faults import content_tick
 
 
@@ -36,13 +37,13 @@ def bit_count(mask: wp.uint64) -> int:
     return count
 
 
-@wp.func
+@device_function
 def rank(model: Any, vehicle: int, report: Report) -> int:
     """Return a number that is larger for vehicles that depend on more others, and then for later ones."""
     return bit_count(report.depends_on) * model.vehicles + vehicle
 
 
-@wp.func
+@device_function
 def next_told(model: Any, memory: Any, world: int, i: int, last: int) -> int:
     """Return the considered member of the highest rank below that of member `last` (0: any), 0 if there is none."""
     found = int(0)
@@ -59,7 +60,7 @@ def next_told(model: Any, memory: Any, world: int, i: int, last: int) -> int:
     return found
 
 
-@wp.func
+@device_function
 def own_correlation(model: Any, memory: Any, world: int, i: int, n: int):
     """Return the correlation, 6x6 in whole steps, of the vehicle's left error at its marker with that of a member."""
     P = memory.P[world, i, 0, 0]
@@ -84,7 +85,7 @@ def no_correlation():
     return none
 
 
-@wp.func
+@device_function
 def has_news(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
     """Return whether a report at a tick is the first of an interval of `NEWS_TIME`, and note that it is."""
     time = wp.float64(tick) * model.camera_period + wp.float64(constants.SAME_TIME)
@@ -95,7 +96,7 @@ def has_news(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
     return True
 
 
-@wp.func
+@device_function
 def tell(model: Any, memory: Any, world: int, i: int, slot: int):
     """Tell of correlations with the members that depend on most others."""
     memory.outbox[world, i, slot].news = 1
@@ -111,7 +112,7 @@ def tell(model: Any, memory: Any, world: int, i: int, slot: int):
         memory.outbox_correlation[world, i, slot, c] = told
 
 
-@wp.func
+@device_function
 def send_told(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Send a report if one is due; the first of an interval counts, and tells of correlations."""
     send(model, state, memory, world, i, tick)
@@ -125,7 +126,7 @@ def send_told(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
                 tell(model, memory, world, i, slot)
 
 
-@wp.func
+@device_function
 def clear_told(model: Any, memory: Any, world: int, i: int):
     """Forget what was sent and received."""
     clear_messages(model, memory, world, i)
@@ -140,7 +141,7 @@ def clear_told(model: Any, memory: Any, world: int, i: int):
             memory.factor[world, a, b] = mat66d()
 
 
-@wp.func
+@device_function
 def receive_told(model: Any, state: Any, memory: Any, world: int, i: int):
     """Take what the radio has delivered at this tick."""
     for n in range(model.target_count[i]):
@@ -156,7 +157,7 @@ def receive_told(model: Any, state: Any, memory: Any, world: int, i: int):
     receive(model, state, memory, world, i)
 
 
-@wp.func
+@device_function
 def place_of(memory: Any, world: int, i: int, sender: int, vehicle: int) -> int:
     """Return where it is kept what a sender has told of a vehicle, -1 if it has told nothing."""
     for c in range(memory.correlation.shape[3]):
@@ -165,13 +166,13 @@ def place_of(memory: Any, world: int, i: int, sender: int, vehicle: int) -> int:
     return -1
 
 
-@wp.func
+@device_function
 def matrix_of(memory: Any, world: int, i: int, sender: int, c: int):
     """Return a correlation that is kept."""
     return mat66d(memory.correlation[world, i, sender, c].matrix) * (wp.float64(1.0) / wp.float64(constants.STEPS))
 
 
-@wp.func
+@device_function
 def correlation_of(memory: Any, world: int, i: int, n: int, k: int, met: bool):
     """Return (whether it is known, matrix) the correlation of the new error of member n with that of member k.
 

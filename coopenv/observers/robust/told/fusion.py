@@ -23,9 +23,10 @@ from coopenv.observers.robust.told.regression import is_positive, regress
 from coopenv.observers.robust.tracklets import bit_of, propagate_member
 from coopenv.observers.robust.trust import is_barred, judge
 from coopenv.world.camera import VISIBLE
+from coopenv.world.device_function import device_function
 
 
-@wp.func
+@device_function
 def set_row(memory: Any, world: int, i: int, n: int):
     """Put `scratch.row` into the covariance."""
     for k in range(memory.belief[world, i].members):
@@ -33,7 +34,7 @@ def set_row(memory: Any, world: int, i: int, n: int):
         memory.P[world, i, k, n] = wp.transpose(memory.scratch[world, k].row)
 
 
-@wp.func
+@device_function
 def place(model: Any, memory: Any, world: int, i: int, n: int):
     """Put a member where its report says that it is, whatever was believed of it before."""
     report = memory.member[world, i, n].report
@@ -48,7 +49,7 @@ def place(model: Any, memory: Any, world: int, i: int, n: int):
     set_row(memory, world, i, n)
 
 
-@wp.func
+@device_function
 def add_member(model: Any, memory: Any, world: int, i: int, sender: int, tick: int):
     """Add a sender that is new to the belief, if there is room."""
     if make_room(model, memory, world, i, tick):
@@ -62,7 +63,7 @@ def add_member(model: Any, memory: Any, world: int, i: int, sender: int, tick: i
         memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
 
 
-@wp.func
+@device_function
 def follow(memory: Any, world: int, i: int, n: int, d: Any, N: Any):
     """Let the vehicle's own pose follow a step d, whose covariances with all errors are in `scratch.column`."""
     members = memory.belief[world, i].members
@@ -80,7 +81,7 @@ def follow(memory: Any, world: int, i: int, n: int, d: Any, N: Any):
     apply_corrections(memory, world, i)
 
 
-@wp.func
+@device_function
 def step_to(model: Any, memory: Any, world: int, i: int, n: int, following: bool):
     """Put a trusted member where its new report says that it is, and follow the step there if that tells anything."""
     report = memory.member[world, i, n].report
@@ -89,9 +90,9 @@ def step_to(model: Any, memory: Any, world: int, i: int, n: int, following: bool
     G = algebra.recentring(news)
     members = memory.belief[world, i].members
     for k in range(members):
-        block = G * memory.P[world, i, n, k]
+        block = algebra.diagonal_by_rows(G, memory.P[world, i, n, k])
         if k == n:
-            block = block * wp.transpose(G)
+            block = wp.transpose(algebra.diagonal_by_rows(G, wp.transpose(block)))
         memory.P[world, i, n, k] = block
         memory.P[world, i, k, n] = wp.transpose(block)
     d = G * news
@@ -112,7 +113,7 @@ def step_to(model: Any, memory: Any, world: int, i: int, n: int, following: bool
             follow(memory, world, i, n, d, N)
 
 
-@wp.func
+@device_function
 def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick: int):
     """Take a member's new report."""
     sent = memory.inbox[world, i, sender].tick
@@ -139,7 +140,7 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick:
         step_to(model, memory, world, i, n, steady)
 
 
-@wp.func
+@device_function
 def is_pending(model: Any, state: Any, memory: Any, world: int, i: int, n: int, tick: int) -> bool:
     """Return whether a report of member n that counts has been heard and not been taken."""
     sender = memory.member[world, i, n].vehicle
@@ -149,7 +150,7 @@ def is_pending(model: Any, state: Any, memory: Any, world: int, i: int, n: int, 
     return memory.inbox[world, i, sender].news == 1 and report > memory.member[world, i, n].report.tick
 
 
-@wp.func
+@device_function
 def has_to_wait(model: Any, state: Any, memory: Any, world: int, i: int, n: int, tick: int) -> bool:
     """Return whether a report of member n has to wait for another one, so that all fit what is told of them.
 
@@ -173,7 +174,7 @@ def has_to_wait(model: Any, state: Any, memory: Any, world: int, i: int, n: int,
     return False
 
 
-@wp.func
+@device_function
 def next_member(model: Any, state: Any, memory: Any, world: int, i: int, tick: int) -> int:
     """Return the member whose report is to be taken next, 0 if there is none: leaders first, but see `has_to_wait`."""
     found = int(0)
@@ -191,7 +192,7 @@ def next_member(model: Any, state: Any, memory: Any, world: int, i: int, tick: i
     return found
 
 
-@wp.func
+@device_function
 def next_met(model: Any, state: Any, memory: Any, world: int, i: int, last: int, tick: int) -> int:
     """Return the rank of the next vehicle in view, by rank, that is no member and has been heard; -1 if none is left.
 
@@ -210,7 +211,7 @@ def next_met(model: Any, state: Any, memory: Any, world: int, i: int, last: int,
     return best
 
 
-@wp.func
+@device_function
 def hear_all(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
     """Take the reports of members that count, and add senders in view to the belief."""
     mark_seen(model, state, memory, world, i, tick)

@@ -14,18 +14,19 @@ from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.memory import mat66d
 from coopenv.observers.robust.told.correlations import correlation_of, factor
 from coopenv.observers.robust.tracklets import bit_of
+from coopenv.world.device_function import device_function
 
 INFLATION = 1.0 + constants.RELATIVE_NOISE
 
 
-@wp.func
+@device_function
 def note_known(memory: Any, world: int, at: int, member: int, covariance: Any):
     """Note the covariance with a member's error as the next that is known."""
     memory.known[world, at].member = member
     memory.known[world, at].covariance = covariance
 
 
-@wp.func
+@device_function
 def gather_known(memory: Any, world: int, i: int, n: int, after: Any, heard: bool) -> int:
     """Note all that is known of member n's new error, that with its last one first; return how much it is."""
     count = int(0)
@@ -51,7 +52,7 @@ def inflated(P: Any):
     return more
 
 
-@wp.func
+@device_function
 def factorise(memory: Any, world: int, i: int, a: int):
     """Set row a of the block Cholesky factor of the covariance of what is known; on its diagonal the inverse."""
     row = memory.known[world, a].member
@@ -67,7 +68,7 @@ def factorise(memory: Any, world: int, i: int, a: int):
             memory.factor[world, a, b] = X * wp.transpose(memory.factor[world, b, b])
 
 
-@wp.func
+@device_function
 def solve_known(memory: Any, world: int, i: int, count: int):
     """Set the coefficients L of what is known."""
     for a in range(count):
@@ -84,7 +85,7 @@ def solve_known(memory: Any, world: int, i: int, count: int):
         memory.known[world, a].coefficient = Y * memory.factor[world, a, a]
 
 
-@wp.func
+@device_function
 def regressed(memory: Any, world: int, i: int, count: int, k: int):
     """Return the covariance L cov(x, y) with the error y of member k."""
     block = mat66d()
@@ -103,7 +104,7 @@ def is_positive(P: Any) -> bool:
     return wp.min(wp.get_diag(P)) > wp.float64(0.0)
 
 
-@wp.func
+@device_function
 def least_forgiven(memory: Any, world: int, i: int, n: int):
     """Return the share of its covariance that is added to member n's: a little if it depends on others.
 
@@ -122,7 +123,7 @@ def least_forgiven(memory: Any, world: int, i: int, n: int):
     return count
 
 
-@wp.func
+@device_function
 def try_known(memory: Any, world: int, i: int, n: int, after: Any, count: int):
     """Return what has to be forgiven the sender, as a share of its covariance, so that what is known fits; -1: more.
 
@@ -145,7 +146,7 @@ def try_known(memory: Any, world: int, i: int, n: int, after: Any, count: int):
     return forgiven
 
 
-@wp.func
+@device_function
 def regress(memory: Any, world: int, i: int, n: int, after: Any, heard: bool):
     """Set `scratch.row` to the covariance of member n's new error with all errors; return what is forgiven the sender.
 

@@ -1,0 +1,92 @@
+"""Functions that are handed records by reference: they do what plain ones do, and get no copies."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+
+from coopenv.world import launch
+from coopenv.world.device_function import device_function
+
+
+@wp.struct
+class Single:
+    values: wp.array(dtype=wp.float32)
+    step: wp.float32
+
+
+@wp.struct
+class Double:
+    values: wp.array(dtype=wp.float64)
+    step: wp.float64
+
+
+@device_function
+def stepped(state: Any, i: int, times: int):
+    return state.values[i] + state.step * type(state.step)(times)
+
+
+@device_function
+def advance(state: Any, i: int, times: int):
+    state.values[i] = stepped(state, i, times)
+
+
+def make_twice(function: Any) -> Any:
+    """Return a function that closes over another one, as an observer's do."""
+
+    @device_function
+    def twice(state: Any, i: int, times: int):
+        function(state, i, times)
+        function(state, i, times)
+
+    return twice
+
+
+advance_twice = make_twice(advance)
+
+
+def move(state: Any, times: int):
+    advance_twice(state, wp.tid(), times)
+
+
+def start_of(record: Any, dtype: Any) -> Any:
+    state = record()
+    state.values = wp.array([1.0, 2.0, 3.0], dtype=dtype, device="cpu")
+    state.step = 0.5
+    return state
+
+
+@pytest.mark.parametrize(("record", "dtype"), [(Single, wp.float32), (Double, wp.float64)])
+def test_functions_write_into_the_arrays_of_records(record: Any, dtype: Any) -> None:
+    state = start_of(record, dtype)
+    wp.launch(launch.kernel(move, dtype.__name__), dim=3, inputs=[state, 3], device="cpu")
+    np.testing.assert_allclose(state.values.numpy(), [4.0, 5.0, 6.0])
+
+
+def test_records_are_handed_over_by_reference_and_numbers_are_not() -> None:
+    for function in (advance, advance_twice, stepped):
+        overload = function.get_overload([Single, wp.int32, wp.int32], {})
+        assert overload.input_types == {"state": wp.ref[Single], "i": wp.int32, "times": wp.int32}
+
+
+def test_what_is_no_record_stays_a_value() -> None:
+    @device_function
+    def increased(state: Any):
+        return state + type(state)(1.0)
+
+    assert increased.get_overload([wp.float32], {}).input_types == {"state": wp.float32}
+
+
+def test_inlining_changes_the_threshold_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    flags = "-march=native -mllvm=-inline-threshold=9000 -mllvm=-inline-cold-callsite-threshold=3000 -O1"
+    monkeypatch.setattr(wp.config, "cpu_compiler_flags", flags)
+    assert launch.inlining(7) == {"cpu_compiler_flags": "-march=native -O1 -mllvm=-inline-threshold=7"}
+
+
+@pytest.mark.parametrize("flags", [None, "", "-march=native -O0"])
+def test_flags_that_somebody_has_chosen_stay(monkeypatch: pytest.MonkeyPatch, flags: str | None) -> None:
+    monkeypatch.setattr(wp.config, "cpu_compiler_flags", flags)
+    assert launch.inlining(7) == {}
