@@ -1,4 +1,4 @@
-"""Figures are drawn without a warning."""
+"""Figures are drawn without a warning, most of them of one run."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import warnings
 from collections.abc import Iterator
 
 import pytest
+
+from coopenv.estimation.trajectory import Trajectory
+from tests.helpers.synthetic import make_trajectory
 
 
 @pytest.fixture(autouse=True)
@@ -15,3 +18,8 @@ def no_warnings() -> Iterator[None]:
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", category=DeprecationWarning, module="matplotlib|pyparsing")
         yield
+
+
+@pytest.fixture(scope="module")
+def run() -> Trajectory:
+    return make_trajectory(noise=0.02)
