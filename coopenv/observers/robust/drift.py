@@ -11,7 +11,7 @@ import warp as wp
 
 from coopenv.estimation.linalg import block3, symmetric_part
 from coopenv.observers.robust import algebra, constants
-from coopenv.observers.robust.evidence import carry_evidence, size_squared
+from coopenv.observers.robust.evidence import size_squared
 from coopenv.observers.robust.memory import Drift, Estimate, Report, mat33d, mat66d
 from coopenv.world.device_function import device_function
 
@@ -38,7 +38,7 @@ def summed(drift: Drift, x: Any, N: Any, dt: Any, time: Any):
 
 @device_function
 def note_step(memory: Any, world: int, i: int, sender: int, last: Report, report: Report, noise: Any, dt: Any):
-    """Sum up by how far a sender says to be from where its odometry has led since its last report.
+    """Sum up by how far a sender says to be from where its odometry has led since its last report; return that.
 
     Who has been silent for long, or knows much less than before, may be anywhere.
     """
@@ -61,7 +61,7 @@ def note_step(memory: Any, world: int, i: int, sender: int, last: Report, report
     word.drift = summed(word.drift, x, N, dt, wp.float64(constants.DRIFT_TIME))
     word.slow_drift = summed(word.slow_drift, x, N, dt, wp.float64(constants.SLOW_DRIFT_TIME))
     memory.word[world, i, sender] = word
-    carry_evidence(memory, world, i, sender, x, noise[1])
+    return x
 
 
 @device_function

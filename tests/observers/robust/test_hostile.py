@@ -1,4 +1,8 @@
-"""Messages that no honest vehicle sends, but that pass as messages, end no run of `robust` and `robust_joint`."""
+"""Messages that no honest vehicle sends, but that pass as messages, end no run of `robust` and `robust_joint`.
+
+Nor do those of one sender lead others astray that see two honest targets besides.
+`pytest -s -m slow tests/observers/robust/test_hostile.py` prints the table of docs/robust.md.
+"""
 
 from __future__ import annotations
 
@@ -11,16 +15,19 @@ import pytest
 from coopenv.observers import Message, run
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
+from tests.observers.robust.test_liars import scene
 
 
 @dataclass
 class Alters:
-    """Changes an entry of a field in most messages of the second vehicle: by a little, by much, or to another one's."""
+    """Changes an entry of a field in most messages of a vehicle: by a little, by much, or to another one's."""
 
     rng: np.random.Generator
+    sender: int = 1
+    start: float = 0.0  # s
 
     def applies(self, vehicle: int, time: float) -> bool:
-        return vehicle == 1 and self.rng.random() < 0.8
+        return vehicle == self.sender and time >= self.start and self.rng.random() < 0.8
 
     def told(self, observer: Any, message: Message) -> Message:
         if message.position is None:
@@ -59,3 +66,35 @@ def test_messages_with_altered_entries_end_no_run(observer: str, seed: int) -> N
     assert not found.failure
     assert np.isfinite(found.position).all()
     assert found.position_error[-60:, 0].max() < 0.2  # who hears nobody is not touched
+
+
+def errors_beside(sender: int, start: float, seed: int, horizon: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return (K, N-1) errors of the others in m, from `start` (at least 5 s) on: honest, and with altered messages."""
+    recording = record(scene(horizon=horizon), seed)
+    altered = run("robust", recording, Alters(np.random.default_rng(seed), sender, start))
+    assert not altered.failure
+    ticks = recording.t > max(start, 5.0)
+    others = [n for n in range(5) if n != sender]
+    honest = run("robust", recording)
+    return honest.position_error[ticks][:, others], altered.position_error[ticks][:, others]
+
+
+@pytest.mark.parametrize(("sender", "seed", "horizon"), [(1, 2, 26.0), (3, 2, 38.0)])
+def test_who_is_believed_again_is_not_held_to_what_it_said_meanwhile(sender: int, seed: int, horizon: float) -> None:
+    """Its altered places counted as evidence against its first true one, which made all others uncertain by 300 m."""
+    _, altered = errors_beside(sender, 15.0, seed, horizon)
+    assert altered.max() < 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", [0.0, 15.0])
+@pytest.mark.parametrize("sender", range(4))
+def test_what_altered_messages_of_one_sender_cost(sender: int, start: float) -> None:
+    pairs = [errors_beside(sender, start, seed, 40.0) for seed in range(500, 512)]
+    without = np.mean([honest.mean() for honest, _ in pairs])
+    cost = np.array([altered.mean() for _, altered in pairs]) / without
+    worst = max(float(altered.max()) for _, altered in pairs)
+    print(
+        f"\n{sender + 1} from {start:.0f} s: {cost.mean():.2f}({cost.std(ddof=1) / 12**0.5:.2f}), worst {worst:.2f} m"
+    )
+    assert np.median(cost) < 2.0

@@ -176,7 +176,7 @@ class Robust(Common):
         belief.follow(n, report.odometry_turn[0], report.odometry_position[0], float(report.time[0]), self.noise)
         steady = not self._changes_speed(n)
         word = self._word(sender)
-        word.step(last, report, self.noise, belief.errors_covariance)
+        word.step(last, report, self.noise, belief.errors_covariance, contact.trusted)
         drift = word.drifted(DRIFT_GATE, least_drift(report)) if contact.trusted else word.drifted(DRIFT_CLEAR, 0.0)
         anew = self._decide(contact, report, time, dt, drift, jumped)
         if not contact.trusted:

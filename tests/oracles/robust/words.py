@@ -69,8 +69,11 @@ class Word:
         until = time + AGREEMENT_TIME * 2 ** (offences - 1)
         return Word(slow_drift=self.slow_drift, offences=offences, barred_until=until)
 
-    def step(self, last: Report, new: Report, noise: SensorNoise, errors: Array | None) -> None:
-        """Take note of the step from where the odometry has led since the last report to the new one."""
+    def step(self, last: Report, new: Report, noise: SensorNoise, errors: Array | None, trusted: bool = True) -> None:
+        """Take note of the step from where the odometry has led since the last report to the new one.
+
+        Of who is not believed there is no evidence.
+        """
         dR, dp = new.motion_since(last, 0)
         dt = float(new.time[0] - last.time[0])
         Q = noise.odometry(dt) + as_noise(errors, dp, dt, ERRORS_TIME)
@@ -83,6 +86,8 @@ class Word:
         N = (R.dot(N).dot(R.T) if N.trace() >= 0.0 else np.zeros((3, 3))) + SLACK * Q[3] * np.eye(3)
         self.drift.add(x, N, dt)
         self.slow_drift.add(x, N, dt)
+        if not trusted:
+            return
         covariance = np.linalg.inv(self.certainty)
         believed = covariance.dot(self.offset) - x
         self.certainty = np.linalg.inv(covariance + Q[3] * np.eye(3))

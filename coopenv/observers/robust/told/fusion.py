@@ -14,6 +14,7 @@ import warp as wp
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import append_member, apply_corrections, index_of, make_room, mark_seen
 from coopenv.observers.robust.drift import drift_of, has_jumped, note_step
+from coopenv.observers.robust.evidence import carry_evidence
 from coopenv.observers.robust.measurements import is_heard
 from coopenv.observers.robust.memory import mat66d, vec6d
 from coopenv.observers.robust.odometry import increment_noise
@@ -127,7 +128,9 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick:
     propagate_member(model, memory, world, i, n, step, dt, noise)
     steady = not changes_speed(model, memory, world, i, n)
     memory.member[world, i, n].report = report
-    note_step(memory, world, i, sender, last, report, noise, dt)
+    learnt = note_step(memory, world, i, sender, last, report, noise, dt)
+    if memory.member[world, i, n].distrusted == 0:  # else there is no evidence, and what it says may leap
+        carry_evidence(memory, world, i, sender, learnt, noise[1])
     drift = drift_of(memory, world, i, n)
     anew = judge(model, memory, world, i, n, tick, dt, drift, jumped)
     if memory.member[world, i, n].distrusted == 1:
