@@ -35,7 +35,7 @@ def _as_handed(name: str, kind: Any) -> Any:
 
 
 def device_function(function: Callable[..., Any]) -> Any:
-    """Return what `wp.func` makes of a function, with its model, state, memory and record by reference.
+    """Return what `wp.func` makes of a function, with arguments that are `RECORDS` by reference.
 
     For functions that are large or call large ones. Not for those of which derivatives are taken: Warp has none of
     references.

@@ -38,9 +38,9 @@ def summed(drift: Drift, x: Any, N: Any, dt: Any, time: Any):
 
 @device_function
 def note_step(memory: Any, world: int, i: int, sender: int, last: Report, report: Report, noise: Any, dt: Any):
-    """Sum up by how far a sender says to be from where its odometry has led since its last report; return that.
+    """Sum up by how far a sender says to be from where its odometry has led since its last report.
 
-    Who has been silent for long, or knows much less than before, may be anywhere.
+    Who has been silent for long, or knows much less than before, may be anywhere. Return how far (3,), m, in the map.
     """
     step = algebra.between(last.odometry, report.odometry)
     carried = algebra.carried(Estimate(last.pose, mat66d(last.P)), step, noise)

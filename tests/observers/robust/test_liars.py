@@ -36,9 +36,6 @@ LIES: dict[str, tuple[tuple[int, ...], dict[str, Any]]] = {
     "the first two collude from 15 s on, 5 m": ((0, 1), {"kind": "collude", "start": 15.0}),
 }
 
-HARD = pytest.mark.xfail(reason="in one world of six, followers believe the liar at first and others no more")
-OTHERS = [pytest.param(name, marks=HARD if name.startswith("the second from its first") else ()) for name in LIES]
-
 
 def scene(liars: tuple[int, ...] = (), horizon: float = 50.0, **lie: Any) -> Scenario:
     """Return the five vehicles, of which some lie."""
@@ -114,7 +111,7 @@ def test_liars_are_judged_as_in_numpy(lie: dict[str, Any]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.parametrize("name", LIES)
 def test_what_lies_cost_in_other_worlds(name: str) -> None:
     ratio, means = costs(name, range(500, 524), 45)
     each = " ".join("-" if np.isnan(r) else f"{r:.2f}" for r in ratio)

@@ -91,9 +91,11 @@ def step_to(model: Any, memory: Any, world: int, i: int, n: int, following: bool
     G = algebra.recentring(news)
     members = memory.belief[world, i].members
     for k in range(members):
-        block = algebra.diagonal_by_rows(G, memory.P[world, i, n, k])
+        block = memory.P[world, i, n, k]
         if k == n:
-            block = wp.transpose(algebra.diagonal_by_rows(G, wp.transpose(block)))
+            block = algebra.recentred(G, block, G)
+        else:
+            block = algebra.diagonal_by_rows(G, block)
         memory.P[world, i, n, k] = block
         memory.P[world, i, k, n] = wp.transpose(block)
     d = G * news
