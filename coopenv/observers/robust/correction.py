@@ -79,8 +79,10 @@ def correct_by_lines(memory: Any, world: int, i: int, lines: int, judging: bool)
     """Find the correction of the poses before by all lines that fit; the covariance stays as it is.
 
     One line after the other, with the residual that those before have left, is the batch update. `judging`: lines are
-    as the gate has linearised and projected them, and those to members have to fit what those before leave.
+    as the gate has linearised and projected them, and those to members have to fit what those before leave. Return the
+    sum of the innovations squared, normalised.
     """
+    total = wp.float64(0.0)
     members = memory.belief[world, i].members
     for k in range(members):
         memory.scratch[world, k].correction = vec6d()
@@ -97,13 +99,16 @@ def correct_by_lines(memory: Any, world: int, i: int, lines: int, judging: bool)
             if mounting > 0:
                 residual = residual + memory.line[world, n].mounting_jacobian * error_left(memory, world, mounting)
             weighted = memory.line[world, n].weight * residual
-            if judging and member > 0 and wp.dot(weighted, residual) > wp.float64(BEARING_GATE):
+            nis = wp.dot(weighted, residual)
+            if judging and member > 0 and nis > wp.float64(BEARING_GATE):
                 memory.line[world, n].fits = 0
             else:
+                total += nis
                 for k in range(members):
                     correction = memory.scratch[world, k].correction + weighted * memory.gain[world, n, k]
                     memory.scratch[world, k].correction = correction
     hold_considered(memory, world, i)
+    return total
 
 
 @device_function

@@ -14,7 +14,7 @@ import warp as wp
 from coopenv.estimation.linalg import block3
 from coopenv.observers.robust import constants
 from coopenv.observers.robust.memory import Frame, mat33d
-from coopenv.observers.robust.trust import distrust
+from coopenv.observers.robust.trust import accuse
 from coopenv.world.device_function import device_function
 
 
@@ -95,8 +95,8 @@ def likely_error(memory: Any, world: int, i: int, n: int):
 
 
 @device_function
-def test_words(model: Any, frame: Frame, memory: Any, world: int, i: int, now: Any):
-    """Weigh a frame's bearings against what every member says; believe the one no more that they contradict most."""
+def test_words(frame: Frame, memory: Any, world: int, i: int, now: Any):
+    """Weigh a frame's bearings against what every member says; accuse the one that they contradict most."""
     worst = int(0)
     most = wp.float64(constants.WORD_GATE)
     share = share_of(frame, memory, world, now.period)
@@ -108,4 +108,4 @@ def test_words(model: Any, frame: Frame, memory: Any, world: int, i: int, now: A
                 worst = n
                 most = size
     if worst > 0:
-        distrust(model, memory, world, i, worst, now.tick, likely_error(memory, world, i, worst), True)
+        accuse(memory, world, i, worst, likely_error(memory, world, i, worst), 1)

@@ -5,10 +5,11 @@ from coopenv.estimation.coordinates import Coordinates
 from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.robust.observer import make_estimate, make_start
-from coopenv.observers.robust.told.correlations import clear_told, receive_told, send_told
+from coopenv.observers.robust.told.correlations import receive_told, send_told
 from coopenv.observers.robust.told.fusion import hear_all
 from coopenv.observers.robust.told.memory import TOLD_SIZES, ToldMemory, told_rules
 from coopenv.observers.robust.told.messages import TOLD_MESSAGES
+from coopenv.observers.robust.told.separation import begin_told, separate
 from coopenv.world.embedded import Embedded
 
 OPTIONS = {"max_unroll": 1, "inline_threshold": 1000}
@@ -16,8 +17,8 @@ OPTIONS = {"max_unroll": 1, "inline_threshold": 1000}
 
 ROBUST = Embedded(
     "robust",
-    make_estimate(receive_told, hear_all),
-    make_start(clear_told, receive_told),
+    make_estimate(receive_told, hear_all, separate),
+    make_start(begin_told, receive_told),
     send_told,
     ToldMemory,
     TOLD_SIZES,

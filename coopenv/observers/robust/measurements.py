@@ -174,6 +174,13 @@ def set_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
 
 
 @device_function
+def time_between(model: Any, state: Any, world: int, i: int, now: Any):
+    """Return the time since the last frame that has corrected the belief, or a tick where that is more, s."""
+    since = wp.float64(now.tick - state.corrected_tick[world, i]) * model.camera_period
+    return wp.max(since, now.period)
+
+
+@device_function
 def bend_variance(memory: Any, world: int, i: int, member: int, turn: Any, u: Any, distance: Any, period: Any):
     """Return the variance of what a bearing's linearisation leaves out, rad^2.
 

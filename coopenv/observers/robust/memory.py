@@ -104,6 +104,9 @@ class Belief:
     depends_on: wp.uint64  # bits of vehicles
     missed_share: wp.float64  # mean share of bearings that do not fit
     healthy_time: wp.float64  # s for which it has been low
+    accused: wp.int32  # the member that this frame's bearings contradict, 0: none
+    accused_error: wp.float64  # m, by which it is off
+    accused_followed: wp.int32  # whether the own pose has followed that error
     told_interval: wp.int32  # of `NEWS_TIME`, the last with a report that counts, from 1 on
 
 

@@ -15,7 +15,7 @@ from coopenv.estimation.so3 import orthonormalise, skew
 from coopenv.observers.robust.algebra import distance_squared, is_known, odometry_noise
 from coopenv.observers.robust.belief import begin_belief, own_estimate
 from coopenv.observers.robust.constants import SAME_PRIOR, SURE
-from coopenv.observers.robust.measurements import RESECTION, TRACKING, set_lines
+from coopenv.observers.robust.measurements import RESECTION, TRACKING, set_lines, time_between
 from coopenv.observers.robust.memory import Estimate, Pose, clear, mat33d, vec3d
 from coopenv.observers.robust.mounting import walk_mounting
 from coopenv.observers.robust.odometry import begin_errors, increment_noise, propagate_own, take_odometry, walk_errors
@@ -58,8 +58,11 @@ def write(state: Any, memory: Any, world: int, i: int):
     state.covariance[world, i] = type(state.covariance[world, i])(P)
 
 
-def make_start(clear_messages: Any, receive: Any) -> Any:
-    """Return the Warp function that starts an observer, given those that forget and take what the radio delivers."""
+def make_start(begin_messages: Any, receive: Any) -> Any:
+    """Return the Warp function that starts an observer, given those that begin anew and take what the radio delivers.
+
+    The former is called with the belief that the vehicle starts with.
+    """
 
     @device_function
     def start(model: Any, state: Any, memory: Any, world: int, i: int):
@@ -68,7 +71,6 @@ def make_start(clear_messages: Any, receive: Any) -> Any:
         An estimate that is too uncertain to linearise about is only a prior for the search.
         """
         clear(model, memory, world, i)
-        clear_messages(model, memory, world, i)
         memory.belief[world, i].others = 1
         begin_errors(model, memory, world, i)
         R = orthonormalise(mat33d(state.estimate_rotation[world, i]))
@@ -80,6 +82,7 @@ def make_start(clear_messages: Any, receive: Any) -> Any:
         set_anchor(memory, world, i, initial.P, 0)
         if not is_known(initial.P):
             begin_search(memory, world, i, initial)
+        begin_messages(model, memory, world, i)
         write(state, memory, world, i)
         receive(model, state, memory, world, i)
 
@@ -104,8 +107,7 @@ def search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) ->
 def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, standing: int):
     """Correct the belief by a frame; that of a pose that has just been found, take from this frame alone."""
     purpose = wp.where(standing == BELIEVING, TRACKING, RESECTION)
-    since = wp.float64(now.tick - state.corrected_tick[world, i]) * model.camera_period
-    frame = set_lines(model, state, memory, world, i, now.tick, wp.max(since, now.period), purpose)
+    frame = set_lines(model, state, memory, world, i, now.tick, time_between(model, state, world, i, now), purpose)
     if standing == BELIEVING:
         memory.search[world, i].active = 0
         update(model, state, memory, world, i, now, frame)
@@ -113,8 +115,14 @@ def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, s
         memory.search[world, i].active = 0
 
 
-def make_estimate(receive: Any, fuse_messages: Any) -> Any:
-    """Return the Warp function of one tick, given those that take what the radio delivers and fuse it."""
+def make_estimate(receive: Any, fuse_messages: Any, separate: Any) -> Any:
+    """Return the Warp function of one tick.
+
+    Args:
+        receive: takes what the radio delivers.
+        fuse_messages: fuses it.
+        separate: at last, holds the belief against what landmarks alone say.
+    """
 
     @device_function
     def estimate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
@@ -141,6 +149,7 @@ def make_estimate(receive: Any, fuse_messages: Any) -> Any:
                 correct(model, state, memory, world, i, now, standing)
             if memory.search[world, i].active == 0 and not is_sound(own_estimate(memory, world, i)):
                 lose(model, memory, world, i, now.tick)  # a message that no honest vehicle sends
+        separate(model, state, memory, world, i, now)
         write(state, memory, world, i)
         if now.due:
             state.corrected_tick[world, i] = now.tick

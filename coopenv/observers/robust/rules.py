@@ -43,7 +43,8 @@ def rules_for(members: int) -> dict[str, Rule]:
     """Return what a saved memory with so many members may hold, by field, see `coopenv.world.saved_state`."""
     flags = (
         "search.active outbox.valid inbox.valid belief.has_sample member.has_twist member.distrusted "
-        "member.considered outbox.news inbox.news member.report.news member.report.valid line.fits"
+        "member.considered outbox.news inbox.news member.report.news member.report.valid line.fits "
+        "belief.accused_followed"
     )
     ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick"
     large = (
@@ -59,6 +60,7 @@ def rules_for(members: int) -> dict[str, Rule]:
         "word.offences": whole(0, MAX_OFFENCES),
         "word.barred_until": whole(0, 2**31 - 1),
         "belief.members": whole(1, members),
+        "belief.accused": whole(0, members - 1),
         "belief.others": whole(1, MOUNTING + 1),
         "P": Rule("a covariance", lambda P, fields, model: are_joint(P, fields["observer_belief.members"]), axes=4),
         "anchor.estimate.P": COVARIANCE,

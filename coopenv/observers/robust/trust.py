@@ -1,7 +1,8 @@
 """Whom a vehicle believes, and what follows when it believes somebody no more.
 
 Tests of a sender's word are in drift.py (its place against its odometry), in evidence.py (against bearings, slowly) and
-here (bearings to it that do not fit at all). Who is not believed is tracked by its odometry and by bearings, for a
+here (bearings to it that do not fit at all). Bearings tell that two contradict each other; which of them is wrong tell
+those to landmarks, see told/separation.py. Who is not believed is tracked by its odometry and by bearings, for a
 second at least, and twice as long every further time. What the vehicle's own pose owes to that sender becomes uncertain
 again: with errors e = C P_s^-1 e_s + w, a larger P_s enlarges all that depends on it.
 """
@@ -79,6 +80,18 @@ def distrust(model: Any, memory: Any, world: int, i: int, n: int, tick: int, err
     time = wp.float64(constants.AGREEMENT_TIME) * wp.float64(1 << (word.offences - 1))
     word.barred_until = tick + int(wp.ceil(time / model.camera_period - wp.float64(constants.SAME_TIME)))
     memory.word[world, i, sender] = word
+
+
+@device_function
+def accuse(memory: Any, world: int, i: int, n: int, error: Any, followed: int):
+    """Say that bearings contradict member n, if they do no other: it is off by some metres.
+
+    `followed`: the own pose has followed that error. What becomes of it is told/separation.py's.
+    """
+    if memory.belief[world, i].accused == 0:
+        memory.belief[world, i].accused = n
+        memory.belief[world, i].accused_error = error
+        memory.belief[world, i].accused_followed = followed
 
 
 @device_function
@@ -160,8 +173,8 @@ def note_missed(memory: Any, world: int, i: int, lines: int, dt: Any) -> bool:
 
 
 @device_function
-def test_missed(model: Any, memory: Any, world: int, i: int, lines: int, dt: Any, tick: int):
-    """Believe those members no more to which most bearings do not fit, while those to most targets do."""
+def test_missed(memory: Any, world: int, i: int, lines: int, dt: Any):
+    """Accuse a member to which most bearings do not fit, while those to most targets do."""
     if not note_missed(memory, world, i, lines, dt):
         return
     for m in range(lines):
@@ -173,4 +186,4 @@ def test_missed(model: Any, memory: Any, world: int, i: int, lines: int, dt: Any
             if missed and memory.member[world, i, n].considered == 1:
                 far = wp.length(memory.line[world, m].residual) * memory.line[world, m].distance
                 fitted = memory.word[world, i, sender].fitted_time > wp.float64(constants.LOST_TIME)
-                distrust(model, memory, world, i, n, tick, far, fitted)
+                accuse(memory, world, i, n, far, wp.where(fitted, 1, 0))

@@ -96,7 +96,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
     state.nis_dof[world, i] = 2 * fitting
     if fitting > 0:
         iterated_update(frame, memory, world, i)
-        test_words(model, frame, memory, world, i, now)
+        test_words(frame, memory, world, i, now)
     if share < wp.float64(0.0):
         return
     weight = wp.min(wp.float64(1.0), now.period / wp.float64(constants.LOST_TIME))
@@ -105,7 +105,7 @@ def update(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, fr
     if missed >= wp.float64(constants.HEALTHY_SHARE):
         healthy = wp.float64(0.0)
     memory.belief[world, i].missed_share = missed
-    test_missed(model, memory, world, i, frame.lines, now.period, now.tick)
+    test_missed(memory, world, i, frame.lines, now.period)
     memory.belief[world, i].healthy_time = healthy
     if missed > wp.float64(constants.LOST_SHARE):
         lose(model, memory, world, i, now.tick)

@@ -142,7 +142,8 @@ def test_a_vehicle_that_is_lost_says_nothing_and_finds_itself_again():
     class Kidnapped(OpenRobust):
         def update(self, tick):
             if tick.index == 300 and self.setup.vehicle == 0:
-                self.members["pose"]["p"][0] += np.array([5.0, -4.0, 1.0])
+                for pose in (self.members["pose"][0], self.memory.alone["estimate"]["pose"]):
+                    pose["p"] += np.array([5.0, -4.0, 1.0])
             return super().update(tick)
 
         def message(self):

@@ -123,6 +123,7 @@ class Common:
             self._listen(tick)
             if tick.due:
                 self._look(tick)
+        self._separate(tick)
         if tick.due:
             self.frame_time = tick.time
         belief = self.belief if self.search is None else self.search.best
@@ -273,6 +274,9 @@ class Common:
 
     def _count(self, tick: Tick, view: View) -> None:
         """Count to whom bearings do not fit."""
+
+    def _separate(self, tick: Tick) -> None:
+        """Hold the belief against what landmarks alone say."""
 
     def _is_barred(self, sender: int, time: float) -> bool:
         """Return whether a sender is not to be believed."""

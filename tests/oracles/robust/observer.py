@@ -16,6 +16,7 @@ correct it in the vehicle's own pose; the others stand where they say that they 
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -24,11 +25,14 @@ from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Message, Setup, Tick
 from coopenv.observers.robust.constants import (
     ADMISSION,
+    DISPUTE_MARGIN,
     DRIFT_CLEAR,
     DRIFT_GATE,
     ERROR_FACTOR,
     GROSS_ERROR,
     GROSS_TURN,
+    KNOWN_ANGLE,
+    KNOWN_POSITION,
     LEAST_CHANGE,
     LEAST_FORGIVEN,
     LEAST_NEWS,
@@ -38,14 +42,16 @@ from coopenv.observers.robust.constants import (
     MAX_TOLD_ANGLE,
     NEWS_TIME,
     SAME_TIME,
+    SEPARATION_GATE,
     SHARE_OF_CHANGE,
     SILENCE_TIME,
     STEP_GATE,
     STEPS,
     WORD_GATE,
 )
+from tests.oracles.robust.alone import Alone, cost_of, most_of_consistent
 from tests.oracles.robust.belief import Member, recentring
-from tests.oracles.robust.common import Common, Contact
+from tests.oracles.robust.common import Anchor, Common, Contact
 from tests.oracles.robust.eviction import room_for
 from tests.oracles.robust.sight import View
 from tests.oracles.robust.told import Correlations, factor, is_positive, is_same, regress
@@ -68,6 +74,11 @@ class Robust(Common):
         """Start at a pose, and with no opinion of anybody."""
         super().reset(initial_pose, initial_covariance)
         self.words = {}
+        self.accused: tuple[int, float, bool] | None = None
+        self.alone: Alone | None = None
+        if self.search is None:
+            own = self.belief.own
+            self.alone = Alone(own.R, own.p, self.belief.P[:6, :6], self.odometry, 0.0)
 
     def message(self) -> Message:
         """Return pose, covariance, odometry and the correlations with members."""
@@ -212,9 +223,97 @@ class Robust(Common):
         self.belief.P[block, block] += self._by_clocks(member)
         return True
 
+    def _separate(self, tick: Tick) -> None:
+        """Judge whom bearings contradict, and now and then the belief as a whole by what landmarks alone say."""
+        accused, self.accused = self.accused, None
+        if self.search is not None:
+            self.alone = None
+        elif tick.due:
+            own = self.belief.own
+            if self.alone is None:
+                P = np.diag(np.repeat([KNOWN_ANGLE**2, KNOWN_POSITION**2], 3))
+                self.alone = Alone(own.R, own.p, P, self.odometry, tick.time)
+            if accused is not None:
+                self._judge_accused(tick, *accused)
+            elif self.alone.is_due(tick.time):
+                self._judge_belief(tick)
+
+    def _judge_accused(self, tick: Tick, sender: int, error: float, followed: bool) -> None:
+        """Believe a sender no more that bearings contradict, or else the one that it contradicts: who landmarks do."""
+        assert self.alone is not None
+        self.alone.follow(self.odometry, tick.time, self.noise, self.belief.errors_covariance)
+        costs = self._costs_without(tick)
+        culprit = min(costs, key=costs.__getitem__, default=sender)
+        if costs.get(sender, np.inf) - costs.get(culprit, np.inf) > DISPUTE_MARGIN:
+            self._stand_alone(tick, culprit)
+        else:
+            self._distrust(self.contacts[sender], tick.time, error, followed)
+
+    def _judge_belief(self, tick: Tick) -> None:
+        """Leave the belief where it is not what landmarks alone say; but that is wrong where many contradict it."""
+        assert self.alone is not None
+        dt = self.alone.follow(self.odometry, tick.time, self.noise, self.belief.errors_covariance)
+        fits = self.alone.correct(tick, self.landmarks, self.variance, float(self.mounting[0]), dt)
+        if not fits or self.alone.separation(self.belief) <= SEPARATION_GATE:
+            return
+        costs = self._costs_without(tick)
+        if not costs or min(costs.values()) <= most_of_consistent(len(costs) - 1):
+            self._stand_alone(tick, min(costs, key=costs.__getitem__, default=-1))
+        else:
+            self.alone = None
+
+    def _costs_without(self, tick: Tick) -> dict[int, float]:
+        """Return what bearings to believed senders cost without each of them, were one where landmarks alone say."""
+        assert self.alone is not None
+        held = self.belief
+        self.belief = deepcopy(held)
+        self.alone.replace_own(self.belief)
+        view = self._view(tick)
+        believed = self._believed_in(view)
+        costs = {s: cost_of(view, self.belief.P, [k for t, k in believed.items() if t != s]) for s in believed}
+        self.belief = held
+        return costs
+
+    def _believed_in(self, view: View) -> dict[int, int]:
+        """Return the bearings of a frame to members that are believed, by vehicle."""
+        of = [self._target_of(view, k) for k in range(len(view.fits))]
+        return {member.vehicle: k for k, member in enumerate(of) if member is not None and member.considered}
+
+    def _stand_alone(self, tick: Tick, culprit: int) -> None:
+        """Believe what landmarks alone say, and a culprit and all that contradict landmarks by themselves no more."""
+        assert self.alone is not None
+        belief, alone = self.belief, self.alone.belief.own
+        away = float(np.linalg.norm(alone.p - belief.own.p))
+        self.alone.replace_own(belief)
+        self._forget_errors()
+        self._forget_evidence()
+        for n, member in enumerate(belief.members):
+            if n >= belief.others and not member.considered:
+                belief.P[6 * n + 3 : 6 * n + 6, 6 * n + 3 : 6 * n + 6] += away**2 * np.eye(3)
+        self.missed = 0.0
+        self.anchor = Anchor(alone.R, alone.p, self.alone.belief.P.copy(), self.odometry, tick.time)
+        view = self._view(tick)
+        for sender, k in self._believed_in(view).items():
+            if sender == culprit or not view.fits[k]:
+                off = float(np.linalg.norm(view.sight.residual[k]) * view.sight.distance[k])
+                self._distrust(self.contacts[sender], tick.time, off, False)
+
+    def _forget_errors(self) -> None:
+        """Believe of the odometry's errors and of the mounting what is declared."""
+        belief, end = self.belief, 6 * self.belief.others
+        fresh = self._alone(belief.own.R, belief.own.p, belief.P[:6, :6])
+        belief.members[1 : belief.others] = fresh.members[1:]
+        belief.P[6:end], belief.P[:, 6:end] = 0.0, 0.0
+        belief.P[6:end, 6:end] = fresh.P[6:, 6:]
+
     def _lose(self, time: float) -> None:
         """Search anew, without what bearings have said of others from where the vehicle is not."""
         super()._lose(time)
+        self.alone = None
+        self._forget_evidence()
+
+    def _forget_evidence(self) -> None:
+        """Forget what bearings have said of others: they were taken from where the vehicle is not."""
         for sender, word in self.words.items():
             drifts = {"drift": word.drift, "slow_drift": word.slow_drift}
             self.words[sender] = Word(**drifts, offences=word.offences, barred_until=word.barred_until)
@@ -291,7 +390,12 @@ class Robust(Common):
                 if size > most:
                     worst, most, error = member.vehicle, size, far
         if worst is not None:
-            self._distrust(self.contacts[worst], tick.time, error, True)
+            self._accuse(worst, error, True)
+
+    def _accuse(self, sender: int, error: float, followed: bool) -> None:
+        """Say that bearings contradict a sender, if they do no other: it is off by some metres."""
+        if self.accused is None:
+            self.accused = sender, error, followed
 
     def _target_of(self, view: View, k: int) -> Member | None:
         """Return the member that a bearing is to, None if it is to a landmark."""
@@ -320,7 +424,7 @@ class Robust(Common):
             if member is not None and member.considered and self._word(member.vehicle).missed > LOST_SHARE:
                 far = float(np.linalg.norm(view.sight.residual[k]) * view.sight.distance[k])
                 fitted = self._word(member.vehicle).fitted > LOST_TIME
-                self._distrust(self.contacts[member.vehicle], tick.time, far, fitted)
+                self._accuse(member.vehicle, far, fitted)
 
     def _least(self, report: Report) -> float:
         """Return the share of its covariance that is added to a sender's: a little if it depends on others.

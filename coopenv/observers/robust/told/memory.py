@@ -5,10 +5,10 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust.constants import MAX_CORRELATIONS, STEPS
-from coopenv.observers.robust.memory import SIZES, CommonMemory, mat66d, mat66f
-from coopenv.observers.robust.rules import rules_for
+from coopenv.observers.robust.memory import SIZES, CommonMemory, Estimate, Pose, mat66d, mat66f
+from coopenv.observers.robust.rules import rules_for, where
 from coopenv.world.records import array, extended
-from coopenv.world.saved_state import TICK, Rule, whole
+from coopenv.world.saved_state import COVARIANCE, FLAG, ROTATION, TICK, Rule, whole
 
 
 @wp.struct
@@ -29,10 +29,21 @@ class Known:
     coefficient: mat66d
 
 
+@wp.struct
+class Alone:
+    """Where landmarks and odometry alone put a vehicle, see separation.py."""
+
+    begun: wp.int32  # 0 while the pose is searched for
+    tick: wp.int32  # when it was last carried on
+    odometry: Pose  # of the belief, then
+    estimate: Estimate
+
+
 ToldMemory = extended(
     CommonMemory,
     "ToldMemory",
     """C correlations in a message.""",
+    alone=array("WN", Alone),
     outbox_correlation=array("WNSC", Correlation),
     correlation=array("WNNC", Correlation),  # per receiver and sender
     known=array("WK", Known),  # scratch
@@ -49,4 +60,7 @@ def told_rules() -> dict[str, Rule]:
     rules: dict[str, Any] = rules_for(TOLD_SIZES["K"])
     for box in ("outbox_correlation", "correlation"):
         rules |= {f"{box}.vehicle": VEHICLE, f"{box}.tick": TICK, f"{box}.matrix": WITHIN}
+    rules |= {"alone.begun": FLAG, "alone.tick": TICK}
+    rules |= where("alone.begun", {"alone.estimate.pose.R": ROTATION, "alone.estimate.P": COVARIANCE})
+    rules |= where("alone.begun", {"alone.odometry.R": ROTATION})
     return rules | {"known.member": whole(0, TOLD_SIZES["K"] - 1)}

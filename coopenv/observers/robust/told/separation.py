@@ -1,0 +1,270 @@
+"""The belief against what landmarks and odometry alone say, and who is wrong of two that contradict each other.
+
+A second estimate of the vehicle's pose takes no message. It is vaguer than the belief, but nobody can mislead it, and
+it shares all its information with a belief that is right: so the belief is nearly always within its covariance. Where
+it is not, and where bearings contradict one sender, every sender in view is left out in turn: the one without whom the
+bearings to the others agree best with landmarks is believed no more. Then the belief is that estimate again.
+Source: separation of solutions, Brown and McBurney, Self-contained GPS integrity check using maximum solution
+separation, Navigation 35(1), 1988.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.observers.robust import constants
+from coopenv.observers.robust.algebra import between, carried, inverse_factor, left_error, with_noise
+from coopenv.observers.robust.belief import own_estimate
+from coopenv.observers.robust.correction import correct_by_lines, iterated_update, store_poses
+from coopenv.observers.robust.measurements import TRACKING, innovation_squared, set_lines, time_between
+from coopenv.observers.robust.memory import Estimate, Frame, mat66d, vec2d
+from coopenv.observers.robust.mounting import mounting_variances
+from coopenv.observers.robust.odometry import begin_errors, increment_noise
+from coopenv.observers.robust.told.correlations import clear_told
+from coopenv.observers.robust.told.memory import Alone
+from coopenv.observers.robust.trust import distrust, forget_evidence
+from coopenv.observers.robust.update import set_anchor
+from coopenv.world.device_function import device_function
+
+LASTING_FRAME = constants.BEND_TIME / constants.CONSIDERED_BEND_TIME
+"""Share of its period that a frame counts for, so that what a linearisation leaves out is the same for longer."""
+
+
+@device_function
+def begin_alone(memory: Any, world: int, i: int, estimate: Estimate, tick: int):
+    """Begin with an estimate at a tick."""
+    memory.alone[world, i] = Alone(1, tick, memory.belief[world, i].odometry, estimate)
+
+
+@device_function
+def begin_told(model: Any, memory: Any, world: int, i: int):
+    """Forget what was sent and received; begin with the initial estimate, unless the pose is searched for."""
+    clear_told(model, memory, world, i)
+    memory.alone[world, i] = Alone()
+    if memory.search[world, i].active == 0:
+        begin_alone(memory, world, i, own_estimate(memory, world, i), 0)
+
+
+@device_function
+def follow_alone(model: Any, memory: Any, world: int, i: int, tick: int):
+    """Carry the estimate on by odometry; return for which time, s."""
+    alone = memory.alone[world, i]
+    elapsed = wp.float64(tick - alone.tick) * model.camera_period
+    step = between(alone.odometry, memory.belief[world, i].odometry)
+    noise = wp.float64(constants.ALONE_NOISE) * increment_noise(model, memory, world, i, step, elapsed)
+    begin_alone(memory, world, i, carried(alone.estimate, step, noise), tick)
+    return elapsed
+
+
+@device_function
+def correct_alone(model: Any, frame: Frame, memory: Any, world: int, i: int, elapsed: Any) -> bool:
+    """Correct the estimate by the landmarks of a frame, elapsed (s) after the last one; return whether any fits.
+
+    It stands in the belief's place meanwhile. What is the same in all frames counts as one measurement.
+    """
+    own = own_estimate(memory, world, i)
+    members = memory.belief[world, i].members
+    others = memory.belief[world, i].others
+    memory.belief[world, i].members = 1
+    memory.belief[world, i].others = 1
+    put_own(memory, world, i, memory.alone[world, i].estimate)
+    frames = wp.max(wp.float64(constants.CONSIDERED_BEND_TIME) / elapsed, wp.float64(1.0))
+    variance = wp.float64(constants.ALONE_NOISE) * frame.variance + frames * mounting_variances(model, i)[0]
+    alone = Frame(frame.lines, 0, frame.lever, variance, wp.float64(LASTING_FRAME) * elapsed)
+    fitting = int(0)
+    for n in range(alone.lines):
+        fits = int(0)
+        if memory.line[world, n].member == 0:
+            if innovation_squared(alone, memory, world, i, n) < wp.float64(constants.BEARING_GATE):
+                fits = 1
+        memory.line[world, n].fits = fits
+        fitting += fits
+    if fitting > 0:
+        iterated_update(alone, memory, world, i)
+        memory.alone[world, i].estimate = own_estimate(memory, world, i)
+    memory.belief[world, i].members = members
+    memory.belief[world, i].others = others
+    put_own(memory, world, i, own)
+    return fitting > 0
+
+
+@device_function
+def put_own(memory: Any, world: int, i: int, estimate: Estimate):
+    """Put the vehicle itself where an estimate says."""
+    memory.member[world, i, 0].pose = estimate.pose
+    memory.P[world, i, 0, 0] = estimate.P
+
+
+@device_function
+def separation(memory: Any, world: int, i: int):
+    """Return the squared distance of the belief from the estimate, in standard deviations of that."""
+    alone = memory.alone[world, i].estimate
+    error = left_error(alone.pose, memory.member[world, i, 0].pose)
+    return wp.length_sq(inverse_factor(alone.P) * error)
+
+
+@device_function
+def exchange_own(memory: Any, world: int, i: int, estimate: Estimate):
+    """Put the vehicle itself where an estimate says that depends on nobody; keep what it shared with others."""
+    put_own(memory, world, i, estimate)
+    for k in range(1, memory.belief[world, i].members):
+        memory.scratch[world, k].row = memory.P[world, i, 0, k]
+        memory.P[world, i, 0, k] = mat66d()
+        memory.P[world, i, k, 0] = mat66d()
+
+
+@device_function
+def restore_own(memory: Any, world: int, i: int, estimate: Estimate):
+    """Put the vehicle back, with what it shared with others."""
+    put_own(memory, world, i, estimate)
+    for k in range(1, memory.belief[world, i].members):
+        memory.P[world, i, 0, k] = memory.scratch[world, k].row
+        memory.P[world, i, k, 0] = wp.transpose(memory.scratch[world, k].row)
+
+
+@device_function
+def is_believed(memory: Any, world: int, i: int, n: int) -> bool:
+    """Return whether the n-th bearing is to a sender that is believed."""
+    member = memory.line[world, n].member
+    return member > 0 and memory.member[world, i, wp.max(member, 0)].considered == 1
+
+
+@device_function
+def cost_without(memory: Any, world: int, i: int, lines: int, without: int):
+    """Return what the bearings to all senders cost that are believed, but for one line."""
+    for n in range(lines):
+        fits = int(0)
+        if n != without and is_believed(memory, world, i, n):
+            fits = 1
+        memory.line[world, n].fits = fits
+    return correct_by_lines(memory, world, i, lines, False)
+
+
+@device_function
+def find_culprit(frame: Frame, memory: Any, world: int, i: int, accused: int):
+    """Return the sender without whom bearings to the others cost least, that cost, and that without the accused one.
+
+    Besides how many bearings to senders there are. The own pose has to be what landmarks alone say. The sender is a
+    member, 0 if none is in view.
+    """
+    culprit = int(0)
+    least = wp.float64(wp.inf)
+    without = wp.float64(wp.inf)
+    count = int(0)
+    for n in range(frame.lines):
+        if not innovation_squared(frame, memory, world, i, n) < wp.float64(wp.inf):
+            memory.line[world, n].residual = vec2d(wp.float64(constants.NOT_AHEAD), wp.float64(constants.NOT_AHEAD))
+    store_poses(memory, world, i)
+    for n in range(frame.lines):
+        if is_believed(memory, world, i, n):
+            count += 1
+            cost = cost_without(memory, world, i, frame.lines, n)
+            member = memory.line[world, n].member
+            if cost < least:
+                culprit = member
+                least = cost
+            if member == accused:
+                without = cost
+    return culprit, least, without, count
+
+
+@wp.func
+def consistent_cost(bearings: int):
+    """Return what so many bearings that agree cost at most: the 0.999 quantile of chi-square, by Wilson and Hilferty.
+
+    Source: Wilson and Hilferty, The distribution of chi-square, Proc. National Academy of Sciences 17(12), 1931.
+    """
+    dof = wp.float64(2.0) * wp.float64(bearings)
+    if bearings == 0:
+        return wp.float64(0.0)
+    a = wp.float64(2.0 / 9.0) / dof
+    root = wp.float64(1.0) - a + wp.float64(constants.CONSISTENT_QUANTILE) * wp.sqrt(a)
+    return dof * root * root * root
+
+
+@device_function
+def stand_alone(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int, culprit: int):
+    """Believe what landmarks alone say, and a culprit and all that contradict landmarks by themselves no more."""
+    alone = memory.alone[world, i].estimate
+    away = wp.length(alone.pose.p - memory.member[world, i, 0].pose.p)
+    exchange_own(memory, world, i, alone)
+    members = memory.belief[world, i].members
+    others = memory.belief[world, i].others
+    for k in range(1, members):
+        for j in range(1, k):
+            if j < others:
+                memory.P[world, i, k, j] = mat66d()
+                memory.P[world, i, j, k] = mat66d()
+    begin_errors(model, memory, world, i)
+    forget_evidence(memory, world, i)
+    for k in range(others, members):
+        if memory.member[world, i, k].considered == 0:
+            noise = vec2d(wp.float64(0.0), away * away)
+            memory.P[world, i, k, k] = with_noise(memory.P[world, i, k, k], noise)
+    memory.belief[world, i].missed_share = wp.float64(0.0)
+    set_anchor(memory, world, i, alone.P, tick)
+    for n in range(frame.lines):
+        if is_believed(memory, world, i, n):
+            fits = innovation_squared(frame, memory, world, i, n) < wp.float64(constants.BEARING_GATE)
+            member = memory.line[world, n].member
+            if member == culprit or not fits:
+                far = wp.length(memory.line[world, n].residual) * memory.line[world, n].distance
+                distrust(model, memory, world, i, member, tick, far, False)
+
+
+@device_function
+def judge_accused(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int):
+    """Believe a sender no more that bearings contradict, or else the one that it contradicts: who landmarks do."""
+    accused = memory.belief[world, i].accused
+    own = own_estimate(memory, world, i)
+    follow_alone(model, memory, world, i, tick)
+    exchange_own(memory, world, i, memory.alone[world, i].estimate)
+    culprit, least, without, _ = find_culprit(frame, memory, world, i, accused)
+    restore_own(memory, world, i, own)
+    if without - least > wp.float64(constants.DISPUTE_MARGIN):
+        stand_alone(model, frame, memory, world, i, tick, culprit)
+    else:
+        followed = memory.belief[world, i].accused_followed == 1
+        distrust(model, memory, world, i, accused, tick, memory.belief[world, i].accused_error, followed)
+
+
+@device_function
+def judge_belief(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int):
+    """Leave the belief where it is not what landmarks alone say; but that itself is wrong where many contradict it."""
+    elapsed = follow_alone(model, memory, world, i, tick)
+    if not correct_alone(model, frame, memory, world, i, elapsed):
+        return
+    if separation(memory, world, i) > wp.float64(constants.SEPARATION_GATE):
+        own = own_estimate(memory, world, i)
+        exchange_own(memory, world, i, memory.alone[world, i].estimate)
+        culprit, least, _, count = find_culprit(frame, memory, world, i, 0)
+        restore_own(memory, world, i, own)
+        if count == 0 or least <= consistent_cost(count - 1):
+            stand_alone(model, frame, memory, world, i, tick, culprit)
+        else:
+            memory.alone[world, i].begun = 0
+
+
+@device_function
+def separate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
+    """Judge whom this frame's bearings contradict, and now and then the belief as a whole."""
+    if memory.search[world, i].active == 1:
+        memory.alone[world, i].begun = 0
+    elif now.due:
+        if memory.alone[world, i].begun == 0:
+            variances = vec2d(
+                wp.float64(constants.KNOWN_ANGLE * constants.KNOWN_ANGLE),
+                wp.float64(constants.KNOWN_POSITION * constants.KNOWN_POSITION),
+            )
+            pose = memory.member[world, i, 0].pose
+            begin_alone(memory, world, i, Estimate(pose, with_noise(mat66d(), variances)), now.tick)
+        since = wp.float64(now.tick - memory.alone[world, i].tick) * model.camera_period
+        looking = since > wp.float64(constants.ALONE_TIME - constants.SAME_TIME)
+        if looking or memory.belief[world, i].accused > 0:
+            period = time_between(model, state, world, i, now)
+            frame = set_lines(model, state, memory, world, i, now.tick, period, TRACKING)
+            if memory.belief[world, i].accused > 0:
+                judge_accused(model, frame, memory, world, i, now.tick)
+            else:
+                judge_belief(model, frame, memory, world, i, now.tick)
+    memory.belief[world, i].accused = 0

@@ -1,0 +1,109 @@
+"""What landmarks and odometry alone say: it is consistent, and a belief that is elsewhere goes back to it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import warp as wp
+from numpy.testing import assert_allclose
+from scipy.stats import chi2
+
+from coopenv.estimation.coordinates import Coordinates
+from coopenv.observers import run
+from coopenv.observers.robust.constants import SEPARATION_GATE
+from coopenv.observers.robust.told.separation import consistent_cost
+from coopenv.runs.recorder import record
+from coopenv.scenario import Scenario, load_scenario
+from coopenv.world.launch import start_warp
+from tests.helpers.builders import reset, simulate
+from tests.helpers.robust_observers import OpenRobust
+from tests.observers.robust.test_liars import scene
+from tests.oracles.robust.spoken import Spoken
+
+start_warp()
+
+
+@wp.kernel(enable_backward=False, module="unique")
+def costs_kernel(costs: wp.array(dtype=wp.float64)):
+    n = wp.tid()
+    costs[n] = consistent_cost(n)
+
+
+def test_what_consistent_bearings_cost_is_a_quantile_of_chi_square() -> None:
+    costs = wp.zeros(7, dtype=wp.float64, device="cpu")
+    wp.launch(costs_kernel, 7, [costs], device="cpu")
+    assert costs.numpy()[0] == 0.0
+    assert_allclose(costs.numpy()[1:], chi2.ppf(0.999, 2 * np.arange(1, 7)), rtol=0.03)
+
+
+@pytest.mark.parametrize("seed", [515, 522])
+def test_beliefs_that_a_lie_has_misled_go_back_as_in_numpy(seed: int) -> None:
+    """The second vehicle lies from its first word: followers that see two landmarks and three of them fit some pose."""
+    recording = record(scene((1,), 2.0, kind="jump"), seed)
+    back = []
+
+    class Watched(Spoken):
+        def _stand_alone(self, *arguments: Any) -> None:
+            back.append(self.vehicle)
+            super()._stand_alone(*arguments)
+
+    expected, result = run(Watched, recording), run("robust", recording)
+    assert back
+    assert not result.failure
+    for name in ("position", "rotation", "nees", "nis"):
+        assert_allclose(getattr(result, name), getattr(expected, name), rtol=1e-7, atol=1e-9, err_msg=name)
+
+
+def nees_alone(scenario: Scenario, worlds: int, seconds: int) -> np.ndarray:
+    """Return (K, W, N) the NEES of what landmarks alone say in honest worlds.
+
+    NaN where it has not just been carried on.
+    """
+    world = simulate(scenario, worlds)
+    reset(world, range(800, 800 + worlds))
+    found = []
+    for k in range(seconds):
+        world.advance(60)
+        alone = world.memory.alone.numpy()
+        assert alone["begun"].all()
+        estimate = alone["estimate"]
+        R, p = (world.view(name)[:, world.model.landmarks :] for name in ("rotation", "position"))
+        e = Coordinates.LEFT.error(R, p, estimate["pose"]["R"], estimate["pose"]["p"])
+        nees = np.einsum("...i,...i", e, np.linalg.solve(estimate["P"], e[..., None])[..., 0])
+        found.append(np.where(alone["tick"] == 60 * (k + 1), nees, np.nan))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("name", ["busy_intersection_tracking", "random:12,seed=5"])
+def test_landmarks_alone_are_consistent(name: str) -> None:
+    """Also with two of them in view, where a filter that believes its noise gets sure of what it cannot know."""
+    scenario = load_scenario(name, {"observer.name": "robust", "horizon": 61.0})
+    nees = nees_alone(scenario, 8, 60)
+    assert np.isfinite(nees).mean() > 0.9
+    assert np.nanmean(nees, axis=(0, 1)).max() / 6.0 < 2.0
+    assert np.nanquantile(nees, 0.999) < SEPARATION_GATE
+
+
+def test_a_belief_that_somebody_has_moved_goes_back_at_once() -> None:
+    """The second vehicle sees three landmarks; its belief is moved by 2 m and thinks itself as sure as before."""
+    errors, said = [], []
+
+    class Moved(OpenRobust):
+        def update(self, tick: Any) -> Any:
+            if self.setup.vehicle == 1 and tick.index == 295:
+                self.members["pose"]["p"][0] += np.array([1.2, -1.6, 0.0])
+            return super().update(tick)
+
+        def message(self) -> Any:
+            message = super().message()
+            if self.setup.vehicle == 1:
+                said.append(message.position is not None)
+            return message
+
+    result = run(Moved, record(scene(horizon=8.0), 4))
+    errors = result.position_error[:, 1]
+    assert errors[295] > 1.0
+    assert errors[310:].max() < 0.3
+    assert all(said)
