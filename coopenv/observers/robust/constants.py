@@ -66,12 +66,13 @@ ANCHOR_ANGLE_VARIANCE, ANCHOR_POSITION_VARIANCE = 0.05**2, 0.5**2
 """rad^2 and m^2, added to the covariance of an anchor, which may be wrong where the belief was lost. Chosen."""
 ALONE_TIME = 0.2  # s between corrections of what landmarks alone say. Chosen
 ALONE_NOISE = 4.0
-"""Ratio of the variances of its bearings and odometry to those declared: with two landmarks in view, linearisations make
-a filter sure of what it cannot know. Tuned."""
+"""Ratio of the variances of its bearings and odometry to those declared: with two landmarks in view, linearisations
+make a filter sure of what it cannot know. Tuned."""
 SEPARATION_GATE = 24.0  # of the squared distance of the belief from that: chi-square of 6, 0.9995
 DISPUTE_MARGIN = 6.0
 """By how much less bearings to the others must cost without a sender for it to be wrong, and not the one that bearings
 contradict: odds of exp(-3)."""
+ENOUGH_LANDMARKS = 2  # in view, for what they say alone to outweigh several senders. Chosen
 NOT_AHEAD = 10.0  # rad, in place of the residual of a bearing whose target is behind the camera. It fits nothing
 CONSISTENT_QUANTILE = 3.09  # of a normal distribution, 0.999: what bearings may cost that agree
 

@@ -90,7 +90,7 @@ def test_who_is_believed_again_is_not_held_to_what_it_said_meanwhile(sender: int
 @pytest.mark.parametrize("start", [0.0, 15.0])
 @pytest.mark.parametrize("sender", range(4))
 def test_what_altered_messages_of_one_sender_cost(sender: int, start: float) -> None:
-    pairs = [errors_beside(sender, start, seed, 40.0) for seed in range(500, 512)]
+    pairs = [errors_beside(sender, start, seed, 40.0) for seed in range(900, 912)]
     without = np.mean([honest.mean() for honest, _ in pairs])
     cost = np.array([altered.mean() for _, altered in pairs]) / without
     worst = max(float(altered.max()) for _, altered in pairs)

@@ -30,6 +30,7 @@ class Alone:
         """Start at a pose, at a time by dead reckoning (s)."""
         self.belief = Belief(0, R, p, P.copy(), time)
         self.odometry = odometry
+        self.lost = False  # whether landmarks are in view and none fits
 
     def is_due(self, time: float) -> bool:
         """Return whether it is to be corrected."""
@@ -43,8 +44,8 @@ class Alone:
         self.belief.own.time = time
         return dt
 
-    def correct(self, tick: Tick, landmarks: int, variance: float, mounting: float, dt: float) -> bool:
-        """Correct it by the bearings to landmarks that fit, dt after the last ones; return whether there are any.
+    def correct(self, tick: Tick, landmarks: int, variance: float, mounting: float, dt: float) -> int:
+        """Correct it by the bearings to landmarks that fit, dt after the last ones; return how many there are.
 
         What does not change from frame to frame, as the mounting's error does not, counts as one measurement.
         """
@@ -61,7 +62,8 @@ class Alone:
         fits = sight.ahead & (sight.normalised(self.belief.P, noise) < BEARING_GATE)
         if fits.any():
             self.belief.settle(sight, noise, fits, look)
-        return bool(fits.any())
+        self.lost = len(seen) > 0 and not fits.any()
+        return int(fits.sum())
 
     def separation(self, belief: Belief) -> float:
         """Return how far a belief is from it, squared in its standard deviations."""

@@ -28,6 +28,7 @@ from coopenv.observers.robust.constants import (
     DISPUTE_MARGIN,
     DRIFT_CLEAR,
     DRIFT_GATE,
+    ENOUGH_LANDMARKS,
     ERROR_FACTOR,
     GROSS_ERROR,
     GROSS_TURN,
@@ -254,10 +255,13 @@ class Robust(Common):
         assert self.alone is not None
         dt = self.alone.follow(self.odometry, tick.time, self.noise, self.belief.errors_covariance)
         fits = self.alone.correct(tick, self.landmarks, self.variance, float(self.mounting[0]), dt)
-        if not fits or self.alone.separation(self.belief) <= SEPARATION_GATE:
+        if self.alone.lost:
+            self.alone = None
+            return
+        if fits == 0 or self.alone.separation(self.belief) <= SEPARATION_GATE:
             return
         costs = self._costs_without(tick)
-        if not costs or min(costs.values()) <= most_of_consistent(len(costs) - 1):
+        if fits >= ENOUGH_LANDMARKS or not costs or min(costs.values()) <= most_of_consistent(len(costs) - 1):
             self._stand_alone(tick, min(costs, key=costs.__getitem__, default=-1))
         else:
             self.alone = None

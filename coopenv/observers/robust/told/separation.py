@@ -57,9 +57,10 @@ def follow_alone(model: Any, memory: Any, world: int, i: int, tick: int):
 
 
 @device_function
-def correct_alone(model: Any, frame: Frame, memory: Any, world: int, i: int, elapsed: Any) -> bool:
-    """Correct the estimate by the landmarks of a frame, elapsed (s) after the last one; return whether any fits.
+def correct_alone(model: Any, frame: Frame, memory: Any, world: int, i: int, elapsed: Any) -> int:
+    """Correct the estimate by the landmarks of a frame, elapsed (s) after the last one; return how many fit.
 
+    Where none fits that are in view, it begins anew.
     It stands in the belief's place meanwhile. What is the same in all frames counts as one measurement.
     """
     own = own_estimate(memory, world, i)
@@ -72,9 +73,11 @@ def correct_alone(model: Any, frame: Frame, memory: Any, world: int, i: int, ela
     variance = wp.float64(constants.ALONE_NOISE) * frame.variance + frames * mounting_variances(model, i)[0]
     alone = Frame(frame.lines, 0, frame.lever, variance, wp.float64(LASTING_FRAME) * elapsed)
     fitting = int(0)
+    landmarks = int(0)
     for n in range(alone.lines):
         fits = int(0)
         if memory.line[world, n].member == 0:
+            landmarks += 1
             if innovation_squared(alone, memory, world, i, n) < wp.float64(constants.BEARING_GATE):
                 fits = 1
         memory.line[world, n].fits = fits
@@ -82,10 +85,12 @@ def correct_alone(model: Any, frame: Frame, memory: Any, world: int, i: int, ela
     if fitting > 0:
         iterated_update(alone, memory, world, i)
         memory.alone[world, i].estimate = own_estimate(memory, world, i)
+    elif landmarks > 0:
+        memory.alone[world, i].begun = 0
     memory.belief[world, i].members = members
     memory.belief[world, i].others = others
     put_own(memory, world, i, own)
-    return fitting > 0
+    return fitting
 
 
 @device_function
@@ -230,16 +235,19 @@ def judge_accused(model: Any, frame: Frame, memory: Any, world: int, i: int, tic
 
 @device_function
 def judge_belief(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int):
-    """Leave the belief where it is not what landmarks alone say; but that itself is wrong where many contradict it."""
+    """Leave the belief where it is not what landmarks alone say.
+
+    But where several senders contradict that and hardly a landmark is in view, odometry may be wrong: that begins anew.
+    """
     elapsed = follow_alone(model, memory, world, i, tick)
-    if not correct_alone(model, frame, memory, world, i, elapsed):
-        return
-    if separation(memory, world, i) > wp.float64(constants.SEPARATION_GATE):
+    landmarks = correct_alone(model, frame, memory, world, i, elapsed)
+    if landmarks > 0 and separation(memory, world, i) > wp.float64(constants.SEPARATION_GATE):
         own = own_estimate(memory, world, i)
         exchange_own(memory, world, i, memory.alone[world, i].estimate)
         culprit, least, _, count = find_culprit(frame, memory, world, i, 0)
         restore_own(memory, world, i, own)
-        if count == 0 or least <= consistent_cost(count - 1):
+        alone = count == 0 or least <= consistent_cost(count - 1)
+        if alone or landmarks >= constants.ENOUGH_LANDMARKS:
             stand_alone(model, frame, memory, world, i, tick, culprit)
         else:
             memory.alone[world, i].begun = 0
