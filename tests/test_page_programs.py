@@ -194,7 +194,8 @@ def test_the_page_trains_with_stable_baselines(
 def test_the_page_trains_with_libraries(
     package: str, word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip(package, reason=f"needs {package}")
+    extra = {"ray": "rllib"}.get(package, package)
+    pytest.importorskip(package, reason=f"needs the extra {extra!r}")
     monkeypatch.chdir(tmp_path)
     (block,) = (block for block in python_blocks(DOCS / "trainers.md") if re.search(rf"^from .*{word}", block, re.M))
     exec(compile(block, "trainers.md", "exec"), {"__name__": "__main__"})

@@ -87,6 +87,6 @@ def test_a_reset_begins_anew() -> None:
 
 
 def test_tensors_are_refused() -> None:
-    pytest.importorskip("torch", reason="needs torch")
+    pytest.importorskip("torch", reason="needs the extra 'train'")
     with pytest.raises(coopenv.CoopenvError, match=r"needs NumPy arrays: make_vec\(arrays='numpy'\)"):
         RecordVehicleEpisodes(coopenv.make_vec(FOUR_WAY, arrays="torch", **OPTIONS))

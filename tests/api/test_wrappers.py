@@ -55,7 +55,7 @@ def test_time_limit_and_statistics_of_one_vehicle() -> None:
 
 @pytest.mark.filterwarnings("ignore:.*Overwriting existing videos")
 def test_record_video_of_one_vehicle(tmp_path: Path) -> None:
-    pytest.importorskip("moviepy", reason="RecordVideo needs moviepy")
+    pytest.importorskip("moviepy", reason="RecordVideo needs the extra 'video'")
     env = RecordVideo(gymnasium.make(CROSSING, render_mode="rgb_array"), str(tmp_path), video_length=4)
     env.reset(seed=0)
     for _ in range(5):
@@ -99,7 +99,7 @@ def test_a_generator_for_wrappers_follows_the_seed() -> None:
 
 @pytest.mark.filterwarnings("ignore:.*Overwriting existing videos")
 def test_record_video_of_all_vehicles(tmp_path: Path) -> None:
-    pytest.importorskip("moviepy", reason="RecordVideoParallel needs moviepy")
+    pytest.importorskip("moviepy", reason="RecordVideoParallel needs the extra 'video'")
     env = RecordVideoParallel(
         coopenv.parallel_env(FOUR_WAY, render_mode="rgb_array", overrides={"horizon": 0.5}), str(tmp_path)
     )
@@ -226,7 +226,7 @@ def test_partial_reset_under_statistics() -> None:
 
 @pytest.mark.skipif(not hasattr(wrappers, "RecordVideo"), reason="this Gymnasium records no batches")
 def test_record_video_of_a_batch(tmp_path: Path) -> None:
-    pytest.importorskip("moviepy", reason="RecordVideo needs moviepy")
+    pytest.importorskip("moviepy", reason="RecordVideo needs the extra 'video'")
     env = wrappers.RecordVideo(batch(render_mode="rgb_array"), str(tmp_path), video_length=3)
     env.reset(seed=0)
     for _ in range(4):

@@ -151,8 +151,8 @@ def test_the_view_serves_on_loopback_until_it_is_ended(folder: Path) -> None:
 @pytest.mark.slow
 def test_cars_are_watched_where_they_are(folder: Path) -> None:
     """Fake cars, their router and the view are processes of their own; a program reads what a browser would be sent."""
-    connect = pytest.importorskip("websockets.sync.client").connect
-    viser = pytest.importorskip("viser")
+    connect = pytest.importorskip("websockets.sync.client", reason="needs the extra 'view'").connect
+    viser = pytest.importorskip("viser", reason="needs the extra 'view'")
     fleet = data_directory("examples/fleet") / "overtaking.toml"
     with fakes(fleet, None, 0) as router:
         command = (*COOPENV, "view", "svea", "--deployment", str(fleet), "--connect", router, "--no-browser")

@@ -30,7 +30,7 @@ def test_a_line_is_a_pose(tmp_path: Path) -> None:
 
 
 def test_evo_measures_the_same_errors(tmp_path: Path) -> None:
-    pytest.importorskip("evo", reason="evo is not installed")
+    pytest.importorskip("evo", reason="needs evo: pip install evo")
     from evo.core import metrics, sync
     from evo.tools import file_interface
 

@@ -18,7 +18,8 @@ nbformat = pytest.importorskip("nbformat", reason="needs the extra 'docs'")
 from sitegen import notebooks  # noqa: E402
 
 NAMES = ("first_steps", "own_observer", "train", "logs", "cars")
-NEEDS = {"train": "stable_baselines3", "logs": "rosbags", "cars": "zenoh"}
+NEEDS = {"train": ("stable_baselines3", "train"), "logs": ("rosbags", "log"), "cars": ("zenoh", "svea")}
+"""A module and the extra that brings it."""
 
 
 def cells(text: str) -> list[str]:
@@ -53,7 +54,8 @@ def test_notebooks_run(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     nbclient = pytest.importorskip("nbclient", reason="needs the extra 'docs'")
     pytest.importorskip("ipykernel", reason="needs the extra 'docs'")
     if name in NEEDS:
-        pytest.importorskip(NEEDS[name])
+        module, extra = NEEDS[name]
+        pytest.importorskip(module, reason=f"needs the extra {extra!r}")
     if name == "logs":  # the reader's bag
         bags.write(tmp_path / "drive", bags.messages(bags.drive()), "ros1")
     tool = tmp_path / "bin" / "coopenv"

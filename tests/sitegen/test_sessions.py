@@ -25,7 +25,12 @@ PAGES = {
     "how-to/batches.md": [],
     "contributing/agent.md": [],
 }
-NEEDS = {"tutorials/train.md": "stable_baselines3", "tutorials/logs.md": "rosbags", "tutorials/cars.md": "zenoh"}
+NEEDS = {
+    "tutorials/train.md": ("stable_baselines3", "train"),
+    "tutorials/logs.md": ("rosbags", "log"),
+    "tutorials/cars.md": ("zenoh", "svea"),
+}
+"""A module and the extra that brings it."""
 
 
 def test_every_page_with_programs_is_run() -> None:
@@ -46,7 +51,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize("page", [pytest.param(page, marks=marks, id=page) for page, marks in PAGES.items()])
 def test_the_page_runs(page: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if page in NEEDS:
-        pytest.importorskip(NEEDS[page])
+        module, extra = NEEDS[page]
+        pytest.importorskip(module, reason=f"needs the extra {extra!r}")
     if page == "tutorials/logs.md":  # the reader's bag
         bags.write(folder / "drive", bags.messages(bags.drive()), "ros1")
     program = run_page(DOCS / page, folder, monkeypatch)

@@ -40,7 +40,7 @@ def test_worlds_agree_with_the_cpu(name: str, device: str) -> None:
 @pytest.mark.parametrize("device", ["cpu", CUDA])
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
 def test_tensors_share_memory_and_agree_with_numpy(device: str, autoreset: str) -> None:
-    torch = pytest.importorskip("torch", reason="needs torch")
+    torch = pytest.importorskip("torch", reason="needs the extra 'train'")
     options: dict[str, Any] = {"num_worlds": 4, "autoreset": autoreset, "overrides": OVERRIDES}
     tensors = coopenv.make_vec(FOUR_WAY, device=device, arrays="torch", **options)
     arrays = coopenv.make_vec(FOUR_WAY, **options)

@@ -25,7 +25,7 @@ from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.recordings import differences, simulated
 
 pytest.importorskip("foxglove", reason="needs the extra 'log'")
-pytest.importorskip("mcap_protobuf", reason="needs mcap-protobuf-support")
+pytest.importorskip("mcap_protobuf", reason="needs the extra 'dev'")
 START = 1_700_000_000.25
 
 
