@@ -14,7 +14,7 @@ SHIM = "https://unpkg.com/iframe-worker/shim"
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # MkDocs loads this file by its path
 
-from sitegen import links, mirror, notebooks, pages, tables  # noqa: E402
+from sitegen import code, links, mirror, not_found, notebooks, pages, tables  # noqa: E402
 
 
 def on_config(config: Any) -> Any:
@@ -69,8 +69,8 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
-    """Mark the cells of tables that need room."""
-    return tables.marked(html)
+    """Mark the cells of tables that need room, and code that may be wrapped."""
+    return code.marked(tables.marked(html))
 
 
 def on_post_page(output: str, page: Any, config: Any) -> str:
@@ -79,8 +79,9 @@ def on_post_page(output: str, page: Any, config: Any) -> str:
 
 
 def on_post_template(output_content: str, template_name: str, config: Any) -> str:
-    """Do the same for 404.html."""
-    return output_content.replace(SHIM, "/javascripts/iframe-worker.js")
+    """Do the same for 404.html, which also opens from disk."""
+    text = output_content.replace(SHIM, "/javascripts/iframe-worker.js")
+    return not_found.relative(text) if template_name == "404.html" else text
 
 
 def on_post_build(config: Any) -> None:

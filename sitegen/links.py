@@ -35,8 +35,6 @@ def problems(site: Path) -> Iterator[str]:
     page = cache(Page)
     for path in sorted(site.rglob("*.html")):
         here = path.relative_to(site)
-        if here.name == "404.html":  # its links are those of a server's root
-            continue
         for link in page(path).loads:
             if urlsplit(link).scheme not in ("", "data") or link.startswith("//"):
                 yield f"{here}: loads {link}"

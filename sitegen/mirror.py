@@ -12,6 +12,8 @@ PAGES = {
     "README.md": "index.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing/index.md",
+    "CODE_OF_CONDUCT.md": "contributing/code_of_conduct.md",
+    "SECURITY.md": "contributing/security.md",
     "agents/README.md": "reference/agents/index.md",
     "docs": "index.md",
     "examples": "files/examples.md",

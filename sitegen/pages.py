@@ -1,8 +1,9 @@
 """Pages of the reference that are made from the project when the site is built."""
 
+import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 from coopenv.observers.zoo import ZOO
 from coopenv.runs.markdown import table
@@ -30,7 +31,7 @@ def generated() -> Iterator[tuple[str, str]]:
 
 def mirrored() -> dict[str, str]:
     """Return which files of the repository are pages as they are, and which."""
-    files = ["CHANGELOG.md", "CONTRIBUTING.md", "agents/README.md"]
+    files = ["CHANGELOG.md", "CODE_OF_CONDUCT.md", "CONTRIBUTING.md", "SECURITY.md", "agents/README.md"]
     cards = sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("agents/*/card.md"))
     return {file: page_of(file) for file in [*files, *cards]}
 
@@ -40,7 +41,20 @@ def command_line() -> str:
     command = [sys.executable, "-m", "typer", "coopenv.cli", "utils", "docs", "--name", "coopenv"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     text = done.stdout.replace("# `coopenv`\n", "# Command line\n", 1)
-    return text.replace("**Usage**:\n\n```console\n$ ", "```console\n$ ")
+    text = text.replace("**Usage**:\n\n```console\n$ ", "```console\n$ ")
+    about = dict(re.findall(r"^##+ `coopenv ([^`]+)`\n\n(.+)$", text, re.MULTILINE))
+    return "\n\n## ".join(_listed_whole(part, about) for part in text.split("\n\n## "))
+
+
+def _listed_whole(part: str, about: Mapping[str, str]) -> str:
+    """Return a command's part of the page with whole sentences in its list of commands, which typer shortens."""
+    found = re.match(r"`coopenv (.+)`\n", part)
+    group = f"{found[1]} " if found else ""
+
+    def row(match: re.Match[str]) -> str:
+        return f"* `{match[1]}`: {about.get(group + match[1], match[2])}"
+
+    return re.sub(r"^\* `([a-z0-9-]+)`: (.+)$", row, part, flags=re.MULTILINE)
 
 
 def observation() -> str:
@@ -52,13 +66,13 @@ def observation() -> str:
     groups: dict[str, list[tuple[str, ...]]] = {}
     for name, field in OBSERVATION_FIELDS.built_in.items():
         planar = "" if field.planar is None else str(len(field.planar))
-        row = (f"`{name}`", field.per, str(field.size), planar, field.unit, str(field.scale), field.meaning)
+        row = (f"`{name}`", field.meaning, field.unit, str(field.scale), field.per, str(field.size), planar)
         groups.setdefault(field.group, []).append(row)
     for group, rows in groups.items():
-        parts += [f"## {group}", table(("field", "one per", "entries", "planar", "unit", "scale", "meaning"), rows)]
+        parts += [f"## {group}", table(("field", "meaning", "unit", "scale", "one per", "entries", "planar"), rows)]
     rewards = [
-        (f"`{name}`", term.unit, term.meaning + (" (uses the truth)" if term.privileged else ""))
+        (f"`{name}`", term.meaning + (" (uses the truth)" if term.privileged else ""), term.unit)
         for name, term in REWARD_TERMS.built_in.items()
     ]
     parts += ["## Terms of the reward", "`reward.weights.NAME` in a scenario weighs them; each counts per decision."]
-    return "\n\n".join([*parts, table(("term", "unit", "meaning"), rewards)]) + "\n"
+    return "\n\n".join([*parts, table(("term", "meaning", "unit"), rewards)]) + "\n"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -42,7 +43,7 @@ def test_every_page_opens(site: Path, browser: Any, size: str) -> None:
             request.url.startswith(("file:", "data:", "blob:")) or problems.append(f"{here}: asks {request.url}")
         ),
     )
-    pages = [path for path in sorted(site.rglob("*.html")) if path.name != "404.html"]
+    pages = sorted(site.rglob("*.html"))
     assert len(pages) > 80
     for path in pages:
         here = str(path.relative_to(site))
@@ -78,6 +79,24 @@ def test_search_works_from_disk(site: Path, browser: Any) -> None:
         ".md-search-result__item a", "links => links.map(link => link.getAttribute('href'))"
     )
     assert any("glossary.html" in link or "observers.html" in link for link in found), found
+    page.close()
+
+
+def test_a_page_that_is_missing_leads_on(site: Path, browser: Any) -> None:
+    """A server shows 404.html whatever the folder that was asked for."""
+
+    def serve(route: Any) -> None:
+        path = site / urlsplit(route.request.url).path.removeprefix("/")
+        route.fulfill(path=path if path.is_file() else site / "404.html")
+
+    page = browser.new_page(viewport={"width": 1280, "height": 800})
+    page.route("http://site.test/**", serve)
+    page.goto("http://site.test/some/where/else")
+    assert page.evaluate("getComputedStyle(document.querySelector('.md-header')).position") == "sticky"
+    page.fill("input.md-search__input", "basin")
+    page.locator(".md-search-result__item a").first.click(timeout=20_000)
+    page.wait_for_url("http://site.test/*.html*")
+    assert page.inner_text("article h1") != "404 - Not found"
     page.close()
 
 

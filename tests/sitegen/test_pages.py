@@ -56,8 +56,10 @@ def test_pages_of_observers_say_where_they_come_from(made: dict[str, str]) -> No
 
 def test_the_page_on_observations_explains_every_entry(made: dict[str, str]) -> None:
     page = made["reference/observation.md"]
-    assert all(f"| `{name}` | {field.per} |" in page for name, field in OBSERVATION_FIELDS.built_in.items())
-    assert all(f"| `{name}` | {term.unit} |" in page for name, term in REWARD_TERMS.built_in.items())
+    assert all(
+        f"| `{name}` | {field.meaning} | {field.unit} |" in page for name, field in OBSERVATION_FIELDS.built_in.items()
+    )
+    assert all(f"| `{name}` |" in page and f"| {term.unit} |" in page for name, term in REWARD_TERMS.built_in.items())
     assert all(f"(../environments/{name}.md#observation)" in page for name in list_envs())
 
 
@@ -66,6 +68,8 @@ def test_the_page_of_the_command_line_has_every_command(made: dict[str, str]) ->
     for command in ("run", "bench observers", "svea gate", "import", "train"):
         assert f"`coopenv {command}`\n" in page
     assert "--observers" in page
+    lists = re.findall(r"^\* `[a-z-]+`: (.+)$", page, re.MULTILINE)
+    assert len(lists) > 20 and not [line for line in lists if line.endswith("...")]
 
 
 def test_links_into_the_repository_become_pages() -> None:

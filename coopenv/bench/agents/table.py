@@ -59,7 +59,7 @@ def cell(result: Mapping[str, Any], factor: float) -> str:
     """Return a figure of a file, `mean` with `ci_low` and `ci_high`, with its interval in brackets."""
     values = [float("nan") if result[key] is None else factor * result[key] for key in ("mean", "ci_low", "ci_high")]
     mean, low, high = shown(*values)
-    return f"{mean} [{low}, {high}]"
+    return NONE if mean == NONE else f"{mean} [{low}, {high}]"
 
 
 def _cell(result: Result, factor: float) -> str:
