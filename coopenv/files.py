@@ -30,6 +30,10 @@ def writing(path: str | Path) -> Iterator[None]:
     """Turn the system's refusal to write `path` into an `OutputError`."""
     try:
         yield
+    except FileExistsError:  # where a folder is to be made
+        raise OutputError(f"cannot write to {path}: it is not a folder") from None
+    except NotADirectoryError:
+        raise OutputError(f"cannot write to {path}: what stands above it is not a folder") from None
     except OSError as error:
         raise OutputError(f"cannot write to {path}: {error.strerror or error}") from None
 
@@ -135,6 +139,7 @@ def _written(path: str | Path, place: Path) -> None:
 
 def _check_file(path: str | Path, place: Path) -> None:
     reasons = {
+        f"{Path(path).parent} is not a folder": place.parent.exists() and not place.parent.is_dir(),
         f"folder {Path(path).parent} does not exist": not place.parent.is_dir(),
         "it is a folder": place.is_dir(),
         "it is no plain file": os.path.lexists(place) and not place.is_file(),

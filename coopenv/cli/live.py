@@ -64,11 +64,9 @@ def play(
 ) -> None:
     """Drive a vehicle by the arrow keys."""
     from coopenv.runs import live
-    from coopenv.runs.keyboard import HELP
 
     scenario, log = options.load(environment, options.parse_overrides(overrides)), options.console(stderr=True)
     index = live.vehicle_index(scenario, vehicle)
     policy = live.others_of(scenario, Path(environment).stem, others, seed)
-    log.print(HELP)
     stage = live.drive_by_hand(scenario, index, policy, seed, log)
     options.console().print(stage.outcomes()[index], soft_wrap=True)

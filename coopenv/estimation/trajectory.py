@@ -1,9 +1,11 @@
 """The record of one run: what was true, what was estimated, and what was in view."""
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Self
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -79,7 +81,10 @@ class Trajectory:
                 if missing:
                     raise DataError(f"{path}: not a trajectory, arrays missing: {', '.join(missing)}")
                 return cls(**{f.name: data[f.name] for f in fields(cls)})
+        except DataError:
+            raise
+        except (BadZipFile, EOFError, zlib.error):
+            raise DataError(f"{path}: not a readable .npz file: it is cut off or damaged, or was never one") from None
         except (OSError, ValueError) as error:
-            if isinstance(error, DataError):
-                raise
-            raise DataError(f"{path}: not a readable .npz file ({error})") from None
+            why = getattr(error, "strerror", None) or error
+            raise DataError(f"{path}: not a readable .npz file ({why})") from None

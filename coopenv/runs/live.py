@@ -14,7 +14,7 @@ from coopenv.files import replacing_folder
 from coopenv.policies import Policy, agents_for, load_policy
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.episode import play
-from coopenv.runs.keyboard import AGAIN, LEAVE, Keyboard, Keys
+from coopenv.runs.keyboard import AGAIN, HELP, LEAVE, Keyboard, Keys
 from coopenv.runs.video import frame_stride, open_film
 from coopenv.scenario import Scenario
 from coopenv.viz.topview import TopView
@@ -135,6 +135,7 @@ def drive_by_hand(
         CoopenvError: there is no display.
     """
     stage, window = opened(scenario, seed, log, window)
+    log.print(HELP)
     keys = Keys(window.canvas)
     policy = Keyboard(scenario, vehicle, others, keys)
 

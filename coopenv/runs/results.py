@@ -34,6 +34,8 @@ class Results:
         path = folder / METRICS_FILE
         try:
             metrics = json.loads(path.read_text(encoding="utf-8"))
+        except NotADirectoryError:
+            raise DataError(f"{folder}: a file; expected a folder that `coopenv run` has written") from None
         except OSError as error:
             raise DataError(f"{folder}: no folder of `coopenv run` ({METRICS_FILE}: {error.strerror})") from None
         except ValueError as error:

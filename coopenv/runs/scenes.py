@@ -113,8 +113,8 @@ def saved_scene(name: str | Path) -> SceneRecord | None:
         return SceneRecord.load(path)
     if (path / SCENE_FILE).is_file():
         return SceneRecord.load(path / SCENE_FILE)
-    if (path / "trajectory.npz").is_file():
-        raise CoopenvError(f"{path}: has no {SCENE_FILE}: it was written by an earlier coopenv; run it again")
+    if any((path / kept).is_file() for kept in ("trajectory.npz", "metrics.json")):
+        raise CoopenvError(f"{path}: has no {SCENE_FILE}, which `coopenv run` writes since 0.2; run it again")
     return None
 
 

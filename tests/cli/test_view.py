@@ -34,7 +34,7 @@ def test_a_run_can_be_watched_and_filmed(capsys: pytest.CaptureFixture[str]) -> 
     assert capsys.readouterr().out.startswith("film.webp: 5 pictures, 1.25 s")
     Path("there/scene.npz").unlink()
     assert main(["film", "there", "--out", "film.webp"]) == 2
-    assert "has no scene.npz: it was written by an earlier coopenv" in capsys.readouterr().err
+    assert "has no scene.npz, which `coopenv run` writes" in capsys.readouterr().err
 
 
 def test_a_recording_has_its_page(capsys: pytest.CaptureFixture[str]) -> None:
@@ -81,6 +81,13 @@ def test_without_the_extra_runs_say_what_is_missing(
         (["view", "overtaking", "--host", "192.0.2.7"], "--host 192.0.2.7: is no address of this computer"),
         (["film", "overtaking", "--out", "film.avi"], "film.avi: unknown format of a film"),
         (["film", "overtaking", "--out", "none/film.gif"], "folder none does not exist"),
+        (["film", "overtaking", "--out", "others.mcap/film.gif"], "others.mcap/film.gif: others.mcap is not a folder"),
+        (["view", "run"], "run: has no scene.npz"),
+        (["export", "run", "--out", "others.mcap/tum"], "what stands above it is not a folder"),
+        (["figures", "run", "--out", "others.mcap"], "cannot write to others.mcap: it is not a folder"),
+        (["export", "cut.mcap", "--format", "foxglove-layout"], "cut.mcap: cut off"),
+        (["export", "others.mcap", "--format", "foxglove-layout"], "others.mcap: cut off"),
+        (["export", "run", "--format", "foxglove-layout"], "run: a folder; expected a log file (.mcap)"),
     ],
 )
 def test_bad_input_is_one_line(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -90,6 +97,10 @@ def test_bad_input_is_one_line(arguments: list[str], message: str, capsys: pytes
         Path("cut.mcap").write_bytes(Path("whole.mcap").read_bytes()[:5000])
         assert main(["run", *SHORT, "--no-figures", "--out", "run"]) == 0
         Path("cut.npz").write_bytes(Path("run/scene.npz").read_bytes()[:5000])
+        capsys.readouterr()
+    if arguments[1] == "run":
+        assert main(["run", *SHORT, "--no-figures", "--out", "run"]) == 0
+        Path("run/scene.npz").unlink()
         capsys.readouterr()
     assert main(arguments) == 2
     captured = capsys.readouterr()

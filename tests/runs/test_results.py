@@ -76,3 +76,10 @@ def test_what_is_no_run_is_one_line(folder: Path, tmp_path: Path, capsys: pytest
     assert "vehicles are not those of trajectory.npz" in said("other")
     (tmp_path / "other" / "trajectory.npz").write_text("no archive")
     assert "trajectory.npz: not a readable .npz file" in said("other")
+    whole = (folder / "trajectory.npz").read_bytes()
+    for broken in (whole[:300], whole[: len(whole) // 2], whole[:400] + bytes(400) + whole[800:]):
+        (tmp_path / "other" / "trajectory.npz").write_bytes(broken)
+        assert "trajectory.npz: not a readable .npz file: it is cut off or damaged" in said("other")
+    (tmp_path / "other" / "trajectory.npz").unlink()
+    assert "trajectory.npz: not a readable .npz file (No such file or directory)" in said("other")
+    assert "metrics.json: a file; expected a folder that `coopenv run` has written" in said("other/metrics.json")

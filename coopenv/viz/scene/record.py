@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -125,9 +126,9 @@ class SceneRecord:
                 fields = {name: data[name] for name in FIELDS}
         except CoopenvError:
             raise
-        except zipfile.BadZipFile:
+        except (zipfile.BadZipFile, EOFError, zlib.error):
             raise DataError(f"{path}: not a readable scene: it is cut off or damaged, or was never one") from None
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError) as error:
             why = getattr(error, "strerror", None) or error
             raise DataError(f"{path}: not a readable scene ({why})") from None
         return cls._checked(path, header, fields)
