@@ -1,6 +1,7 @@
 """The geometry behind the top view: everything in plan (x east, y north), in the map frame, m."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -121,9 +122,8 @@ def free_lengths(
     length = np.repeat(np.broadcast_to(np.asarray(reach, float), len(rays))[:, None], rays.shape[1], axis=1)
     if not obstacles:
         return length
-    turn = np.array([about_z(obstacle.yaw) for obstacle in obstacles])[:, None]  # (boxes, 1, 3, 3)
-    center = np.array([obstacle.center for obstacle in obstacles]) - shift
-    half = np.array([obstacle.size for obstacle in obstacles])[:, None, None] / 2
+    turn, center, half = _boxes(tuple(obstacles))
+    center = center - shift
     start = (origin - center[:, None])[:, :, None] @ turn  # (boxes, N, 1, 3)
     way = rays @ turn  # (boxes, N, K, 3)
     way = np.where(np.abs(way) < 1e-9, 1e-9, way)
@@ -131,6 +131,14 @@ def free_lengths(
     enter, leave = np.minimum(one, other).max(axis=-1), np.maximum(one, other).min(axis=-1)
     free = np.where((enter < leave) & (leave > 0), np.maximum(enter, 0.0), np.inf)
     return np.asarray(np.minimum(length, free.min(axis=0)))
+
+
+@lru_cache(maxsize=4)
+def _boxes(obstacles: tuple[Obstacle, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return rotations (B, 1, 3, 3), centres (B, 3) and half edges (B, 1, 1, 3) of buildings, which stand still."""
+    turn = np.array([about_z(obstacle.yaw) for obstacle in obstacles])[:, None]
+    half = np.array([obstacle.size for obstacle in obstacles])[:, None, None] / 2
+    return turn, np.array([obstacle.center for obstacle in obstacles]), half
 
 
 def about_z(angle: float) -> np.ndarray:

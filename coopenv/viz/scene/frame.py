@@ -94,10 +94,15 @@ class Frame:
     @property
     def three_sigma(self) -> np.ndarray:
         """(N,) m: three standard deviations of the estimated position in plan, along the axis where it is worst."""
-        plan = self.position_covariance[:, :2, :2]
-        finite = np.isfinite(plan).all(axis=(-1, -2))
-        variance = np.linalg.eigvalsh(np.where(finite[:, None, None], plan, 0.0))
-        return np.where(finite & (variance[:, 0] >= 0.0), 3.0 * np.sqrt(np.maximum(variance[:, 1], 0.0)), np.nan)
+        return three_sigma(self.position_covariance)
+
+
+def three_sigma(covariance: np.ndarray) -> np.ndarray:
+    """Return (N,) m of covariances (N, 3, 3), m^2: three standard deviations in plan along the worst axis, or NaN."""
+    plan = covariance[:, :2, :2]
+    finite = np.isfinite(plan).all(axis=(-1, -2))
+    variance = np.linalg.eigvalsh(np.where(finite[:, None, None], plan, 0.0))
+    return np.where(finite & (variance[:, 0] >= 0.0), 3.0 * np.sqrt(np.maximum(variance[:, 1], 0.0)), np.nan)
 
 
 _FLOATS = (

@@ -8,9 +8,10 @@ from coopenv.estimation.outcomes import Outcome
 from coopenv.format import fixed
 from coopenv.viz.scene import Frame, Stage
 from coopenv.viz.web.ground import ROOT
+from coopenv.viz.web.look import in_turn
 from coopenv.viz.web.sent import Sent
 
-_OFTEN = 0.25  # s between two texts of a label
+_OFTEN = 0.5  # s between two texts of a label
 _CLOSE, _RAISED = 0.09, 0.035  # of the scene's side: vehicles so close have their names so far above each other
 _APART = 0.06  # of the scene's side, distance from which on an estimate has a name of its own
 _MOST_NAMES = 24  # landmarks; more would hide one another
@@ -39,13 +40,13 @@ class Labels:
         }
 
     def place(self, frame: Frame, time: float, shown: bool, turn: int | None = None) -> None:
-        """Put them over what they name; with a `turn` every other vehicle's, as in `Picture.show`."""
+        """Put them over what they name; with a `turn` those of some vehicles, as in `Picture.show`."""
         again = not 0.0 <= time - self._said < _OFTEN - 1e-9
         self._said = time if again else self._said
         if again and shown:
             for i, label in enumerate(self._cars):
                 label.tell(text=self._text(frame, i))
-        mine = slice(None) if turn is None else slice(turn % 2, None, 2)
+        mine = in_turn(turn, self._stage.vehicles)
         places = frame.vehicle_position + self._above
         places[:, 2] += _RAISED * self._stage.side * levels(places[:, :2], _CLOSE * self._stage.side)
         for label, place in zip(self._cars[mine], places[mine], strict=True):

@@ -81,7 +81,7 @@ def sight_lines(stage: Stage, frame: Frame, colours: np.ndarray, look: Look) -> 
     start, end, _ = of(Sight.OCCLUDED_BY_BUILDING)
     built = np.stack([start, stopped(start, end, stage.buildings)], axis=1), _one(GREY, len(start))
     start, end, _ = of(Sight.OCCLUDED_BY_BODY)
-    bodies = stage.solid(frame)
+    bodies = stage.solid(frame) if len(start) else []
     bodily = np.stack([start, stopped(start, end, bodies)], axis=1), _one(INK, len(start))
     return joined(seen, missed, built, bodily)
 

@@ -7,6 +7,8 @@ from matplotlib.colors import to_rgb
 
 from coopenv.viz.style import vehicle_colour
 
+_AT_ONCE = 4  # names and fields of view in a frame while it plays
+
 
 @dataclass
 class Look:
@@ -25,6 +27,12 @@ class Look:
     messages: bool = True
     trails: bool = True
     names: bool = True
+
+
+def in_turn(turn: int | None, count: int) -> slice:
+    """Return which of so many names, or fields of view, are sent in a turn: half, at most four; None: all of them."""
+    parts = max(2, -(-count // _AT_ONCE))
+    return slice(None) if turn is None else slice(turn % parts, None, parts)
 
 
 def rgb(colour: str) -> tuple[int, int, int]:

@@ -186,10 +186,10 @@ def table_html(stage: Stage, source: Source, frame: Frame) -> str:
     sigma = "3σ [m]" if source.honest else "P, gain [m]"
     heads = ("error [m]", "[deg]", sigma, "sees")
     cells = "".join(f'<th style="{_CELL}">{name}</th>' for name in heads)
-    rows = []
+    rows, three_sigma, sees, could_see = [], frame.three_sigma, frame.sees, frame.could_see
     for i in range(stage.vehicles):
-        lengths = fixed(frame.position_error[i], 3), fixed(frame.three_sigma[i], 3)
-        angle, seen = fixed(frame.orientation_error[i], 1), f"{frame.sees[i]}/{frame.could_see[i]}"
+        lengths = fixed(frame.position_error[i], 3), fixed(three_sigma[i], 3)
+        angle, seen = fixed(frame.orientation_error[i], 1), f"{sees[i]}/{could_see[i]}"
         values = lengths[0], angle, lengths[1], seen
         numbers = "".join(f'<td style="{_CELL}">{value}</td>' for value in values)
         mark = f"{swatch(vehicle_colour(i))} <b>{stage.short_name(stage.landmarks + i)}</b>"

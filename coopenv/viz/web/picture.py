@@ -10,7 +10,7 @@ from coopenv.viz.web.actors import Actors
 from coopenv.viz.web.copies import fine
 from coopenv.viz.web.ground import ROOT, Ground
 from coopenv.viz.web.labels import Labels
-from coopenv.viz.web.look import Look, vehicle_colours
+from coopenv.viz.web.look import Look, in_turn, vehicle_colours
 from coopenv.viz.web.pulses import Pulses
 from coopenv.viz.web.sent import Sent
 
@@ -46,7 +46,8 @@ class Picture:
 
         Args:
             frame: what is shown.
-            turn: its number where another one follows at once: then every other name and field of view waits for it.
+            turn: its number where another one follows at once: then a part of the names and fields of view waits
+                for it, as `in_turn` says.
         """
         time, look, nothing = float(frame.tick) / self.stage.scenario.rates.camera, self.look, np.zeros((0, 2, 3))
         none = nothing, np.zeros((0, 3), np.uint8)
@@ -70,7 +71,7 @@ class Picture:
         node.show(fine(what[0], self._step), what[1])
 
     def _show_views(self, frame: Frame, turn: int | None) -> None:
-        mine = slice(None) if turn is None or not self._views else slice(turn % 2, None, 2)
+        mine = in_turn(turn if self._views else None, self.stage.vehicles)
         views = self.stage.fields_of_view(frame, _VIEW_RAYS, mine) if self.look.views else None
         if views is None:
             for view in self._views:

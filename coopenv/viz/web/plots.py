@@ -8,6 +8,7 @@ import numpy as np
 
 from coopenv.viz.consistency import NEES_BOUNDS
 from coopenv.viz.scene import Frame, Source
+from coopenv.viz.scene.frame import three_sigma
 from coopenv.viz.style import BLUE, GREY, VEHICLE_COLOURS
 from coopenv.viz.web.legend import swatch
 
@@ -29,19 +30,21 @@ class History:
     def __init__(self, rate: float) -> None:
         """Begin with nothing; `rate` are camera ticks per second."""
         self._rate = rate
-        self._rows: deque[tuple[float, np.ndarray]] = deque(maxlen=_LONGEST)
+        self._frames: deque[tuple[float, Frame]] = deque(maxlen=_LONGEST)
 
     def add(self, frame: Frame) -> None:
         """Add a frame; one that is not later than the last one begins anew."""
         time = float(frame.tick) / self._rate
-        if self._rows and time <= self._rows[-1][0]:
-            self._rows.clear()
-        numbers = (frame.position_error, frame.three_sigma, frame.nees)
-        self._rows.append((time, np.column_stack([*numbers, frame.terms])))
+        if self._frames and time <= self._frames[-1][0]:
+            self._frames.clear()
+        self._frames.append((time, frame))
 
     def of(self, vehicle: int) -> tuple[np.ndarray, np.ndarray]:
         """Return times (K,) and error, three sigma, NEES and terms, (K, 3 + R), of a vehicle."""
-        return np.array([time for time, _ in self._rows]), np.array([row[vehicle] for _, row in self._rows])
+        frames = [frame for _, frame in self._frames]
+        sigma = three_sigma(np.array([frame.position_covariance[vehicle] for frame in frames]).reshape(-1, 3, 3))
+        told = [(frame.position_error[vehicle], frame.nees[vehicle], *frame.terms[vehicle]) for frame in frames]
+        return np.array([time for time, _ in self._frames]), np.insert(np.array(told), 1, sigma, axis=1)
 
 
 class Plots:
