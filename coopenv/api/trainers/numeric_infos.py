@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from gymnasium.spaces import flatdim, unflatten
 from pettingzoo.utils import BaseParallelWrapper
 
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
@@ -18,13 +19,27 @@ class PlainInfos(BaseParallelWrapper[str, Any, np.ndarray]):
     keeps infos for whole episodes. Truth is left out, so that no policy can be built on it by accident.
     """
 
-    def __init__(self, env: CooperativeLocalisationEnv) -> None:
+    def __init__(self, env: CooperativeLocalisationEnv, everybody: bool = False) -> None:
+        """Wrap a world.
+
+        Args:
+            env: the world.
+            everybody: whether a reset also returns zeros for vehicles that are absent in the episode, which are in
+                `possible_agents` and not in `agents`. TorchRL's wrapper asks for them.
+        """
         super().__init__(env)
         self.state_space = env.state_space
+        self.everybody = everybody
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         observations, infos = self.env.reset(seed=seed, options=options)
-        return observations, {agent: plain(info) for agent, info in infos.items()}
+        infos = {agent: plain(info) for agent, info in infos.items()}
+        for agent in self.possible_agents if self.everybody else ():
+            if agent not in infos:
+                space = self.observation_space(agent)
+                observations[agent] = unflatten(space, np.zeros(flatdim(space), dtype=np.float32))
+                infos[agent] = dict.fromkeys(NUMBERS, 0.0)
+        return observations, infos
 
     def step(self, actions: dict[str, np.ndarray]) -> Any:
         living = {agent: actions[agent] for agent in self.env.agents if agent in actions}

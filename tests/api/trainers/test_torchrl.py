@@ -31,6 +31,19 @@ def crossing(**overrides: Any) -> PettingZooWrapper:
     return PettingZooWrapper(world, done_on_any=False, use_mask=True, return_state=True)
 
 
+def test_vehicles_may_be_absent() -> None:
+    """In `urban_crossing` they are, in some episodes; their rows are masked."""
+    world = PlainInfos(coopenv.parallel_env("urban_crossing"), everybody=True)
+    absent = 0
+    for seed in range(4):
+        env = PettingZooWrapper(world, done_on_any=False, use_mask=True, return_state=True, seed=seed)
+        first = env.reset()["vehicle", "mask"]
+        assert first.tolist() == [agent in world.agents for agent in world.possible_agents]
+        absent += int((~first).sum())
+        assert env.rollout(5).batch_size == (5,)
+    assert absent > 0
+
+
 def actor(env: PettingZooWrapper) -> ProbabilisticActor:
     size = env.observation_spec["vehicle", "observation"].shape[-1]
     network = torch.nn.Sequential(MLP(size, 4, num_cells=[64, 64]), NormalParamExtractor())
