@@ -60,7 +60,7 @@ def rules_for(members: int) -> dict[str, Rule]:
         "word.offences": whole(0, MAX_OFFENCES),
         "word.barred_until": whole(0, 2**31 - 1),
         "belief.members": whole(1, members),
-        "belief.accused": whole(0, members - 1),
+        "belief.accused": whole(0, 0),
         "belief.others": whole(1, MOUNTING + 1),
         "P": Rule("a covariance", lambda P, fields, model: are_joint(P, fields["observer_belief.members"]), axes=4),
         "anchor.estimate.P": COVARIANCE,

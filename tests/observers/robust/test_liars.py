@@ -58,7 +58,7 @@ def mean_errors(made: Scenario, seeds: range, seconds: int, start: float) -> np.
         if (k + 1) / 2 > start:
             state = {name: world.view(name).copy() for name in ("rotation", "position")}
             state |= {name: world.view(name).copy() for name in ("estimate_rotation", "estimate_position")}
-            found.append(errors(world, state)[1])
+            found.append(errors(world, state)[0])
     return np.mean(found, axis=0)
 
 

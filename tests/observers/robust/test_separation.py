@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -76,19 +77,53 @@ def nees_alone(scenario: Scenario, worlds: int, seconds: int) -> np.ndarray:
     return np.array(found)
 
 
-@pytest.mark.parametrize("name", ["busy_intersection_tracking", "random:12,seed=5"])
-def test_landmarks_alone_are_consistent(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "faults"),
+    [
+        ("busy_intersection_tracking", {}),
+        ("busy_intersection_tracking", {"camera.extrinsics_position_error": 0.2, "camera.extrinsics_error": 0.02}),
+        ("random:12,seed=5", {}),
+    ],
+)
+def test_landmarks_alone_are_consistent(name: str, faults: dict[str, float]) -> None:
     """Also with two of them in view, where a filter that believes its noise gets sure of what it cannot know."""
-    scenario = load_scenario(name, {"observer.name": "robust", "horizon": 61.0})
+    scenario = load_scenario(name, {"observer.name": "robust", "horizon": 61.0, **faults})
     nees = nees_alone(scenario, 8, 60)
     assert np.isfinite(nees).mean() > 0.9
     assert np.nanmean(nees, axis=(0, 1)).max() / 6.0 < 2.0
     assert np.nanquantile(nees, 0.999) < SEPARATION_GATE
 
 
+def test_who_hears_nobody_does_not_go_back() -> None:
+    """What landmarks alone say is the same, only vaguer."""
+    world = simulate(scene(horizon=6.0), 2)
+    reset(world, range(2))
+    world.advance(300)
+    assert world.memory.alone.numpy()["exposed"].tolist() == [[0, 1, 1, 1, 1]] * 2
+
+
+def test_who_is_accused_and_out_of_view_is_blamed_alone() -> None:
+    """The fifth vehicle sees four others; while bearings contradict the second one that one is hidden."""
+    trusted: list[dict[int, bool]] = []
+
+    class Accusing(OpenRobust):
+        def update(self, tick: Any) -> Any:
+            if self.setup.vehicle != 4 or tick.index != 295:
+                return super().update(tick)
+            self.memory.belief["accused"] = 1 + self.member_numbers[1:].index(1)
+            self.memory.belief["accused_error"] = 0.3
+            hidden = tick.targets == self.setup.landmarks + 1
+            estimate = super().update(replace(tick, valid=tick.valid & ~hidden))
+            trusted.append(self.trusted)
+            return estimate
+
+    run(Accusing, record(scene(horizon=5.0), 4))
+    assert trusted == [{0: True, 1: False, 2: True, 3: True}]
+
+
 def test_a_belief_that_somebody_has_moved_goes_back_at_once() -> None:
     """The second vehicle sees three landmarks; its belief is moved by 2 m and thinks itself as sure as before."""
-    errors, said = [], []
+    said = []
 
     class Moved(OpenRobust):
         def update(self, tick: Any) -> Any:

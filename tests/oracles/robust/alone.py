@@ -44,19 +44,20 @@ class Alone:
         self.belief.own.time = time
         return dt
 
-    def correct(self, tick: Tick, landmarks: int, variance: float, mounting: float, dt: float) -> int:
+    def correct(self, tick: Tick, landmarks: int, variance: float, mounting: Array, dt: float) -> int:
         """Correct it by the bearings to landmarks that fit, dt after the last ones; return how many there are.
 
         What does not change from frame to frame, as the mounting's error does not, counts as one measurement.
         """
         seen = np.flatnonzero(tick.valid & (tick.targets < landmarks))
-        variance = ALONE_NOISE * variance + mounting * max(CONSIDERED_BEND_TIME / dt, 1.0)
+        turn, shift = ALONE_NOISE * mounting * max(CONSIDERED_BEND_TIME / dt, 1.0)
+        variance = ALONE_NOISE * variance + turn
         period = dt * BEND_TIME / CONSIDERED_BEND_TIME
 
         def look() -> tuple[Sight, Array]:
             z = tick.landmarks[tick.targets[seen]]
             sight = self.belief.sight(tick.bearings[seen], tick.lever_arm, z, period=period)
-            return sight, variance + sight.bend
+            return sight, variance + shift / sight.distance**2 + sight.bend
 
         sight, noise = look()
         fits = sight.ahead & (sight.normalised(self.belief.P, noise) < BEARING_GATE)

@@ -76,6 +76,7 @@ class Robust(Common):
         super().reset(initial_pose, initial_covariance)
         self.words = {}
         self.accused: tuple[int, float, bool] | None = None
+        self.exposed = False
         self.alone: Alone | None = None
         if self.search is None:
             own = self.belief.own
@@ -234,6 +235,7 @@ class Robust(Common):
             if self.alone is None:
                 P = np.diag(np.repeat([KNOWN_ANGLE**2, KNOWN_POSITION**2], 3))
                 self.alone = Alone(own.R, own.p, P, self.odometry, tick.time)
+            self.exposed = self.exposed or any(member.considered for member in self.belief.members)
             if accused is not None:
                 self._judge_accused(tick, *accused)
             elif self.alone.is_due(tick.time):
@@ -245,7 +247,7 @@ class Robust(Common):
         self.alone.follow(self.odometry, tick.time, self.noise, self.belief.errors_covariance)
         costs = self._costs_without(tick)
         culprit = min(costs, key=costs.__getitem__, default=sender)
-        if costs.get(sender, np.inf) - costs.get(culprit, np.inf) > DISPUTE_MARGIN:
+        if sender in costs and costs[sender] - costs[culprit] > DISPUTE_MARGIN:
             self._stand_alone(tick, culprit)
         else:
             self._distrust(self.contacts[sender], tick.time, error, followed)
@@ -254,11 +256,11 @@ class Robust(Common):
         """Leave the belief where it is not what landmarks alone say; but that is wrong where many contradict it."""
         assert self.alone is not None
         dt = self.alone.follow(self.odometry, tick.time, self.noise, self.belief.errors_covariance)
-        fits = self.alone.correct(tick, self.landmarks, self.variance, float(self.mounting[0]), dt)
+        fits = self.alone.correct(tick, self.landmarks, self.variance, self.mounting[[0, 3]], dt)
         if self.alone.lost:
             self.alone = None
             return
-        if fits == 0 or self.alone.separation(self.belief) <= SEPARATION_GATE:
+        if fits == 0 or not self.exposed or self.alone.separation(self.belief) <= SEPARATION_GATE:
             return
         costs = self._costs_without(tick)
         if fits >= ENOUGH_LANDMARKS or not costs or min(costs.values()) <= most_of_consistent(len(costs) - 1):
@@ -295,6 +297,7 @@ class Robust(Common):
             if n >= belief.others and not member.considered:
                 belief.P[6 * n + 3 : 6 * n + 6, 6 * n + 3 : 6 * n + 6] += away**2 * np.eye(3)
         self.missed = 0.0
+        self.exposed = False
         self.anchor = Anchor(alone.R, alone.p, self.alone.belief.P.copy(), self.odometry, tick.time)
         view = self._view(tick)
         for sender, k in self._believed_in(view).items():

@@ -33,7 +33,8 @@ class Known:
 class Alone:
     """Where landmarks and odometry alone put a vehicle, see separation.py."""
 
-    begun: wp.int32  # 0 while the pose is searched for
+    begun: wp.int32  # 0 while the pose is searched for, and where it has been found wrong: it begins anew
+    exposed: wp.int32  # whether a sender may have misled the belief since the belief was last this
     tick: wp.int32  # when it was last carried on
     odometry: Pose  # of the belief, then
     estimate: Estimate
@@ -60,7 +61,7 @@ def told_rules() -> dict[str, Rule]:
     rules: dict[str, Any] = rules_for(TOLD_SIZES["K"])
     for box in ("outbox_correlation", "correlation"):
         rules |= {f"{box}.vehicle": VEHICLE, f"{box}.tick": TICK, f"{box}.matrix": WITHIN}
-    rules |= {"alone.begun": FLAG, "alone.tick": TICK}
+    rules |= {"alone.begun": FLAG, "alone.exposed": FLAG, "alone.tick": TICK}
     rules |= where("alone.begun", {"alone.estimate.pose.R": ROTATION, "alone.estimate.P": COVARIANCE})
     rules |= where("alone.begun", {"alone.odometry.R": ROTATION})
     return rules | {"known.member": whole(0, TOLD_SIZES["K"] - 1)}

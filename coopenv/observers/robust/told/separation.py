@@ -1,9 +1,10 @@
 """The belief against what landmarks and odometry alone say, and who is wrong of two that contradict each other.
 
-A second estimate of the vehicle's pose takes no message. It is vaguer than the belief, but nobody can mislead it, and
-it shares all its information with a belief that is right: so the belief is nearly always within its covariance. Where
-it is not, and where bearings contradict one sender, every sender in view is left out in turn: the one without whom the
-bearings to the others agree best with landmarks is believed no more. Then the belief is that estimate again.
+A second estimate of the vehicle's pose takes no message; of the odometry's errors, where there are any, it takes what
+is believed. It is vaguer than the belief, but hardly to be misled, and it shares all its information with a belief that
+is right: so the belief is nearly always within its covariance. Where it is not, and where bearings contradict one
+sender, every sender in view is left out in turn: the one without whom the bearings to the others agree best with
+landmarks is believed no more. Then the belief is that estimate again.
 Source: separation of solutions, Brown and McBurney, Self-contained GPS integrity check using maximum solution
 separation, Navigation 35(1), 1988.
 """
@@ -33,7 +34,10 @@ LASTING_FRAME = constants.BEND_TIME / constants.CONSIDERED_BEND_TIME
 @device_function
 def begin_alone(memory: Any, world: int, i: int, estimate: Estimate, tick: int):
     """Begin with an estimate at a tick."""
-    memory.alone[world, i] = Alone(1, tick, memory.belief[world, i].odometry, estimate)
+    memory.alone[world, i].begun = 1
+    memory.alone[world, i].tick = tick
+    memory.alone[world, i].odometry = memory.belief[world, i].odometry
+    memory.alone[world, i].estimate = estimate
 
 
 @device_function
@@ -70,7 +74,8 @@ def correct_alone(model: Any, frame: Frame, memory: Any, world: int, i: int, ela
     memory.belief[world, i].others = 1
     put_own(memory, world, i, memory.alone[world, i].estimate)
     frames = wp.max(wp.float64(constants.CONSIDERED_BEND_TIME) / elapsed, wp.float64(1.0))
-    variance = wp.float64(constants.ALONE_NOISE) * frame.variance + frames * mounting_variances(model, i)[0]
+    mounting = wp.float64(constants.ALONE_NOISE) * frames * mounting_variances(model, i)
+    variance = wp.float64(constants.ALONE_NOISE) * frame.variance + mounting[0]
     alone = Frame(frame.lines, 0, frame.lever, variance, wp.float64(LASTING_FRAME) * elapsed)
     fitting = int(0)
     landmarks = int(0)
@@ -78,6 +83,7 @@ def correct_alone(model: Any, frame: Frame, memory: Any, world: int, i: int, ela
         fits = int(0)
         if memory.line[world, n].member == 0:
             landmarks += 1
+            memory.line[world, n].variance = mounting[1]
             if innovation_squared(alone, memory, world, i, n) < wp.float64(constants.BEARING_GATE):
                 fits = 1
         memory.line[world, n].fits = fits
@@ -150,7 +156,7 @@ def find_culprit(frame: Frame, memory: Any, world: int, i: int, accused: int):
     """Return the sender without whom bearings to the others cost least, that cost, and that without the accused one.
 
     Besides how many bearings to senders there are. The own pose has to be what landmarks alone say. The sender is a
-    member, 0 if none is in view.
+    member, 0 if none is in view; the last cost is infinite where the accused one is not.
     """
     culprit = int(0)
     least = wp.float64(wp.inf)
@@ -208,6 +214,7 @@ def stand_alone(model: Any, frame: Frame, memory: Any, world: int, i: int, tick:
             memory.P[world, i, k, k] = with_noise(memory.P[world, i, k, k], noise)
     memory.belief[world, i].missed_share = wp.float64(0.0)
     set_anchor(memory, world, i, alone.P, tick)
+    memory.alone[world, i].exposed = 0
     for n in range(frame.lines):
         if is_believed(memory, world, i, n):
             fits = innovation_squared(frame, memory, world, i, n) < wp.float64(constants.BEARING_GATE)
@@ -226,7 +233,7 @@ def judge_accused(model: Any, frame: Frame, memory: Any, world: int, i: int, tic
     exchange_own(memory, world, i, memory.alone[world, i].estimate)
     culprit, least, without, _ = find_culprit(frame, memory, world, i, accused)
     restore_own(memory, world, i, own)
-    if without - least > wp.float64(constants.DISPUTE_MARGIN):
+    if wp.isfinite(without) and without - least > wp.float64(constants.DISPUTE_MARGIN):
         stand_alone(model, frame, memory, world, i, tick, culprit)
     else:
         followed = memory.belief[world, i].accused_followed == 1
@@ -241,7 +248,8 @@ def judge_belief(model: Any, frame: Frame, memory: Any, world: int, i: int, tick
     """
     elapsed = follow_alone(model, memory, world, i, tick)
     landmarks = correct_alone(model, frame, memory, world, i, elapsed)
-    if landmarks > 0 and separation(memory, world, i) > wp.float64(constants.SEPARATION_GATE):
+    exposed = memory.alone[world, i].exposed == 1
+    if exposed and landmarks > 0 and separation(memory, world, i) > wp.float64(constants.SEPARATION_GATE):
         own = own_estimate(memory, world, i)
         exchange_own(memory, world, i, memory.alone[world, i].estimate)
         culprit, least, _, count = find_culprit(frame, memory, world, i, 0)
@@ -251,6 +259,14 @@ def judge_belief(model: Any, frame: Frame, memory: Any, world: int, i: int, tick
             stand_alone(model, frame, memory, world, i, tick, culprit)
         else:
             memory.alone[world, i].begun = 0
+
+
+@device_function
+def note_exposure(memory: Any, world: int, i: int):
+    """Note whether any sender is believed: then the belief may be misled."""
+    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
+        if memory.member[world, i, n].considered == 1:
+            memory.alone[world, i].exposed = 1
 
 
 @device_function
@@ -266,6 +282,7 @@ def separate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
             )
             pose = memory.member[world, i, 0].pose
             begin_alone(memory, world, i, Estimate(pose, with_noise(mat66d(), variances)), now.tick)
+        note_exposure(memory, world, i)
         since = wp.float64(now.tick - memory.alone[world, i].tick) * model.camera_period
         looking = since > wp.float64(constants.ALONE_TIME - constants.SAME_TIME)
         if looking or memory.belief[world, i].accused > 0:
