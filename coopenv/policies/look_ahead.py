@@ -1,5 +1,6 @@
 """Planning what to look at: the belief rolled forward over sampled plans. A yardstick of what is possible."""
 
+from collections.abc import Callable
 from functools import partial
 from itertools import product
 from typing import NamedTuple
@@ -19,6 +20,8 @@ OUTSIDE, BACK = 5.0, 0.5  # s/s for each metre too far out; s for each metre fro
 LEAST_BEARING_STD = 0.001  # rad, of a frame: where there is no noise to speak of
 BENT = 4.0  # weight of what the linearisation of a bearing leaves out
 FAR = 3.0  # m, how much farther one would drive blind after a plan
+FORESIGHT = 3.0  # s; others that look around, too, do not go straight on for longer
+CLOSE = 20.0  # s/s for each metre that a plan comes too close to another vehicle
 
 
 class _Path(NamedTuple):
@@ -49,8 +52,10 @@ class _Path(NamedTuple):
 class LookAhead(RouteFollower):
     """The route follower with the heading of the best of many plans.
 
-    A plan is two headings off the way, one after the other. Its cost in seconds is the time that it loses, and what its
-    uncertainty costs: the standard deviation of the position, over the plan and a few metres beyond.
+    A plan is two headings off the way, one after the other. Its cost in seconds is the time that it loses, what its
+    uncertainty costs (the standard deviation of the position, over the plan and a few metres beyond), and what it
+    costs to come close to others. It gives way only to those that come too close within `FORESIGHT`: of drivers that
+    turn to landmarks and back, headings tell nothing of later.
     """
 
     needs = ("axis_std", "heading_std", "map_position", "route_heading", "route_offset", "route_ahead")
@@ -60,7 +65,7 @@ class LookAhead(RouteFollower):
         scenario: Scenario,
         *,
         price: float = 10.0,
-        tolerated: float = 0.06,
+        tolerated: float = 0.02,
         farthest: float = 0.8,
     ) -> None:
         """Choose what matters.
@@ -72,6 +77,7 @@ class LookAhead(RouteFollower):
             farthest: offset from the way that costs nothing, m.
         """
         super().__init__(scenario)
+        self.foresight = min(self.foresight, FORESIGHT)
         self.view, self.occluders = FieldOfView(scenario.camera), Occluders(scenario, self.layout)
         self.price, self.tolerated, self.farthest = price, tolerated, farthest
         noise, rates = scenario.noise, scenario.rates
@@ -115,6 +121,7 @@ class LookAhead(RouteFollower):
         boxes = self.occluders.boxes(partial(self.read, observations))
         known = self.known(observations)[:, None]
         belief, offsets, now = self._belief(observations), self._offsets, self._start(observations)
+        too_close = self._too_close(observations)
         cost, stride = np.zeros_like(now.x), self.cruise * STEP
         for step in range(STEPS):
             if step == FIRST:  # each first leg goes on with each second one
@@ -135,9 +142,27 @@ class LookAhead(RouteFollower):
             belief = belief.measured(line, (self.bearing + bend_variance) / (self.frames * STEP), odds)
             cost = cost + STEP * self.price * np.maximum(belief.std - self.tolerated, 0.0)
             cost = cost + STEP * OUTSIDE * np.maximum(np.abs(now.aside) - self.farthest, 0.0)
+            cost = cost + STEP * CLOSE * too_close(place, STEP * (step + 1))
         later = belief.driven(FAR * np.cos(now.heading), FAR * np.sin(now.heading), 0.0, 0.0)
         cost = cost + self.price * FAR / self.cruise * np.maximum(later.std - self.tolerated, 0.0)
         return np.asarray(cost - now.along / self.cruise + BACK * np.abs(now.aside))
+
+    def _too_close(self, observations: np.ndarray) -> Callable[[np.ndarray, float], np.ndarray]:
+        """Return what tells of places, (rows, plans, 2), how much closer they are than allowed, (rows, plans) in m.
+
+        After a time, s. Those that are heard are expected to go straight on at the speed `cruise`.
+        """
+        if "message_mask" not in self.layout:
+            return lambda place, time: np.zeros(place.shape[:2])
+        mask, others, forward = self.heard(observations)
+        keep = np.broadcast_to(self.distance_to_keep(observations), len(observations))
+
+        def too_close(place: np.ndarray, time: float) -> np.ndarray:
+            apart = (others + self.cruise * time * forward)[:, None] - place[:, :, None]
+            distance = np.min(np.linalg.norm(apart, axis=-1), axis=2, where=mask[:, None], initial=np.inf)
+            return np.asarray(np.maximum(keep[:, None] - distance, 0.0))
+
+        return too_close
 
     def _start(self, observations: np.ndarray) -> "_Path":
         shape = len(observations), len(self._offsets)

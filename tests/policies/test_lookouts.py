@@ -10,6 +10,7 @@ from coopenv.evaluation import drive, held_out_seeds, score
 from coopenv.policies import load_agent, restart
 from coopenv.policies.belief import Belief
 from coopenv.policies.idm import IntelligentDriver
+from coopenv.policies.look_ahead import LookAhead
 from coopenv.policies.peek import Peek
 from coopenv.policies.route_follower import RouteFollower, nearest
 from coopenv.policies.stop_when_lost import StopWhenLost
@@ -119,6 +120,24 @@ def other(x: float, y: float, angle: float) -> dict[str, object]:
 )
 def test_giving_way(x: float, y: float, angle: float, speed: float) -> None:
     assert RouteFollower(SCENARIO).speed(observation(**other(x, y, angle)))[0] == speed
+
+
+@pytest.mark.parametrize(("away", "speed"), [(2.0, 0.0), (4.8, 1.0)])
+def test_who_looks_around_gives_way_to_what_is_soon(away: float, speed: float) -> None:
+    """Cars that turn to landmarks and back would otherwise wait for meetings that never come."""
+    crossing = observation(**other(away, -away, np.pi / 2))  # would meet after so many seconds
+    assert RouteFollower(SCENARIO).speed(crossing)[0] == 0.0
+    assert LookAhead(SCENARIO).speed(crossing)[0] == speed
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_plans_that_lead_towards_others_cost_more(side: float) -> None:
+    """Towards the side where somebody comes, not away from it."""
+    planner = LookAhead(SCENARIO)
+    coming = planner.costs(observation(**other(4.0, side, np.pi)))[0] - planner.costs(observation())[0]
+    turned = side * planner._first
+    assert coming[(turned > 0.3) & (side * planner._second >= 0.0)].min() > 0.5
+    np.testing.assert_allclose(coming[(turned < -0.3) & (side * planner._second <= 0.0)], 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize(("std", "speed"), [(0.03, 1.0), (0.3, 0.0)])
