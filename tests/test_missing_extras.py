@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+from tests.helpers.commands import ROOT, Commands, commands
+
 WITHOUT = """
 import sys
 
@@ -27,10 +26,20 @@ class Filtered:
         return None if name.partition(".")[0] in LIBRARIES else self.finder.find_spec(name, path, target)
 
 sys.meta_path[:] = [Filtered(finder) if hasattr(finder, "find_spec") else finder for finder in sys.meta_path]
+import coopenv.api.engine
+import coopenv.policies
+import coopenv.runs.demo
+import coopenv.runs.driven
+import coopenv.runs.film
 from coopenv.cli import main
-sys.exit(main())
 """
 FLEET = ROOT / "examples" / "fleet" / "overtaking.toml"
+
+
+@pytest.fixture(scope="module")
+def without_extras(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Commands]:
+    with commands(WITHOUT, tmp_path_factory.mktemp("printed")) as started:
+        yield started
 
 
 @pytest.fixture
@@ -73,15 +82,8 @@ def metadata(name: str) -> bytes:
         (f"svea health {FLEET} --car svea7", "svea"),
     ],
 )
-def test_one_line_names_the_extra(command: str, extra: str, folder: Path) -> None:
-    result = subprocess.run(
-        [sys.executable, "-c", WITHOUT, *command.split()],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
+def test_one_line_names_the_extra(command: str, extra: str, folder: Path, without_extras: Commands) -> None:
+    result = without_extras.run(command.split(), folder)
     assert result.returncode == 2, result.stderr
     assert len(result.stderr.splitlines()) == 1, result.stderr
     assert f"pip install '.[{extra}]'" in result.stderr
