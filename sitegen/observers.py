@@ -69,7 +69,7 @@ def _page(name: str, entry: Entry, about: str, sends: str) -> str:
                 about[0].upper() + about[1:] + ".",
                 bullets(facts),
                 "## Method and source",
-                re.sub(r"([*<])", r"\\\1", doc),
+                doc.replace("*", r"\*").replace("<", "&lt;"),
                 *([f"[More]({MORE[name]})."] if name in MORE else []),
                 *shown,
                 "## Code",
