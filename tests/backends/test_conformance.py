@@ -193,49 +193,49 @@ def test_masks_and_ages_mean_the_same(make: Make) -> None:
         env.close()
 
 
-def step_of(drive: Any, wanted: np.ndarray) -> int:
-    """Return which of the wanted speeds and angles (steps, 2) a command is."""
-    same = np.abs(wanted - [drive.speed, drive.steering_angle]).max(axis=1) < 1e-6
-    assert same.sum() == 1, drive
-    return int(same.argmax())
+def begins_at(commands: dict[int, np.ndarray], wanted: np.ndarray) -> list[int]:
+    """Return which number the first of the wanted speeds and angles (steps, 2) may have, by what was heard."""
+    possible = range(max(commands) - len(wanted) + 1, min(commands) + 1)
+    return [k for k in possible if all(np.abs(wanted[n - k] - c).max() < 1e-6 for n, c in commands.items())]
 
 
 def test_actions_mean_the_same_speeds_and_angles(lab: tuple[Path, Any], processes: Path) -> None:
     """What goes out to the gates is what the simulated vehicles follow, whatever network it takes.
 
-    Commands are not sent again where a network loses one, so the same actions come round until all have been heard.
+    Commands are not sent again where a network loses one, so that actions go on until enough have been heard.
     """
     path, hub = lab
-    actions = [np.array(a, np.float32) for a in ((-1.0, 0.0), (0.5, 1.0), (1.0, -1.0), (0.0, 0.3))]
+    actions = 10 * [np.array(a, np.float32) for a in ((-1.0, 0.0), (0.5, 1.0), (1.0, -1.0), (0.0, 0.3))]
     expected = simulated()
     expected.reset(seed=1)
     told = []
     for action in actions:
         expected.step(dict.fromkeys(expected.possible_agents, action))
         told.append(expected.engine.view("command")[0, :, :2].copy())
+    assert len({tuple(np.round(command[0], 6)) for command in told}) > 4
     wanted = dict(zip(("svea7", "svea1"), np.swapaxes(told, 0, 1), strict=True))
     watch = open_zenoh("client", [line.split('"')[1] for line in processes.read_text().splitlines() if "tcp/" in line])
     for network, env in ((hub.connect(), in_process(path, hub)), (watch, over_zenoh(processes))):
-        heard: list[Arrival] = []
+        arrivals: list[Arrival] = []
         for car in wanted:
-            network.subscribe(topic_of(car, Role.COMMAND), heard.append)
-        steps: dict[str, dict[int, int]] = {}
+            network.subscribe(topic_of(car, Role.COMMAND), arrivals.append)
+        heard: dict[str, dict[int, np.ndarray]] = {car: {} for car in wanted}
         try:
             env.reset(seed=1, options={"arm": True})
-            for turn in range(40):
-                env.step(dict.fromkeys(env.possible_agents, actions[turn % len(actions)]))
-                for car, each in wanted.items():
-                    commands = [decode(a.payload, TOPICS[Role.COMMAND].type) for a in heard if car in a.topic]
-                    numbers = [int(command.header.frame_id.rpartition(":")[2]) for command in commands]
-                    steps[car] = {n: step_of(c.drive, each) for n, c in zip(numbers, commands, strict=True)}
-                if all(len(set(found.values())) == len(actions) for found in steps.values()):
+            for action in actions:
+                env.step(dict.fromkeys(env.possible_agents, action))
+                for car, commands in heard.items():
+                    for arrival in [a for a in arrivals if car in a.topic]:
+                        command = decode(arrival.payload, TOPICS[Role.COMMAND].type)
+                        number = int(command.header.frame_id.rpartition(":")[2])
+                        commands[number] = np.array([command.drive.speed, command.drive.steering_angle])
+                if min(map(len, heard.values())) >= 6:
                     break
         finally:
             env.close()
             network.close()
-        for found in steps.values():
-            assert set(found.values()) == set(range(len(actions)))
-            assert len({(number - step) % len(actions) for number, step in found.items()}) == 1  # in their order
+        for car, commands in heard.items():
+            assert len(commands) >= 6 and len(begins_at(commands, wanted[car])) == 1, (car, commands)
 
 
 @pytest.mark.parametrize("options", [{"nonsense": 1}])
