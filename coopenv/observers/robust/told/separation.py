@@ -137,7 +137,7 @@ def restore_own(memory: Any, world: int, i: int, estimate: Estimate):
 def is_believed(memory: Any, world: int, i: int, n: int) -> bool:
     """Return whether the n-th bearing is to a sender that is believed."""
     member = memory.line[world, n].member
-    return member > 0 and memory.member[world, i, wp.max(member, 0)].considered == 1
+    return member > 0 and memory.member[world, i, member].considered == 1
 
 
 @device_function
@@ -155,9 +155,12 @@ def cost_without(memory: Any, world: int, i: int, lines: int, without: int):
 def find_culprit(frame: Frame, memory: Any, world: int, i: int, accused: int):
     """Return the sender without whom bearings to the others cost least, that cost, and that without the accused one.
 
-    Besides how many bearings to senders there are. The own pose has to be what landmarks alone say. The sender is a
-    member, 0 if none is in view; the last cost is infinite where the accused one is not.
+    Besides how many bearings to senders there are. The own pose is what landmarks alone say meanwhile. The sender is a
+    member, 0 if none is in view; costs are normalised innovations squared, the last one infinite where the accused one
+    is out of view.
     """
+    own = own_estimate(memory, world, i)
+    exchange_own(memory, world, i, memory.alone[world, i].estimate)
     culprit = int(0)
     least = wp.float64(wp.inf)
     without = wp.float64(wp.inf)
@@ -176,6 +179,7 @@ def find_culprit(frame: Frame, memory: Any, world: int, i: int, accused: int):
                 least = cost
             if member == accused:
                 without = cost
+    restore_own(memory, world, i, own)
     return culprit, least, without, count
 
 
@@ -228,11 +232,8 @@ def stand_alone(model: Any, frame: Frame, memory: Any, world: int, i: int, tick:
 def judge_accused(model: Any, frame: Frame, memory: Any, world: int, i: int, tick: int):
     """Believe a sender no more that bearings contradict, or else the one that it contradicts: who landmarks do."""
     accused = memory.belief[world, i].accused
-    own = own_estimate(memory, world, i)
     follow_alone(model, memory, world, i, tick)
-    exchange_own(memory, world, i, memory.alone[world, i].estimate)
     culprit, least, without, _ = find_culprit(frame, memory, world, i, accused)
-    restore_own(memory, world, i, own)
     if wp.isfinite(without) and without - least > wp.float64(constants.DISPUTE_MARGIN):
         stand_alone(model, frame, memory, world, i, tick, culprit)
     else:
@@ -250,10 +251,7 @@ def judge_belief(model: Any, frame: Frame, memory: Any, world: int, i: int, tick
     landmarks = correct_alone(model, frame, memory, world, i, elapsed)
     exposed = memory.alone[world, i].exposed == 1
     if exposed and landmarks > 0 and separation(memory, world, i) > wp.float64(constants.SEPARATION_GATE):
-        own = own_estimate(memory, world, i)
-        exchange_own(memory, world, i, memory.alone[world, i].estimate)
         culprit, least, _, count = find_culprit(frame, memory, world, i, 0)
-        restore_own(memory, world, i, own)
         alone = count == 0 or least <= consistent_cost(count - 1)
         if alone or landmarks >= constants.ENOUGH_LANDMARKS:
             stand_alone(model, frame, memory, world, i, tick, culprit)
