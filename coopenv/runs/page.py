@@ -84,10 +84,12 @@ def _learning(scenario: Scenario) -> Iterator[str]:
     yield table(("group", "field", "size", "unit", "center", "scale", "low", "meaning"), rows)
     if scenario.driven:
         yield "## Action"
-        yield "Entries in [-1, 1] span what follows, here of the first vehicle."
+        driven = next(i for i, vehicle in enumerate(scenario.vehicles) if vehicle.motion.kind == "driven")
+        who = f"`{scenario.vehicle_names[driven]}`, the first driven vehicle"
+        yield f"Entries in [-1, 1] span what follows, here of {who}."
         yield table(
             ("entry", "at -1", "at 1", "unit"),
-            [(entry.name, number(entry.low), number(entry.high), entry.unit) for entry in layout.action],
+            [(entry.name, number(entry.low), number(entry.high), entry.unit) for entry in layout.actions[driven]],
         )
     yield "## Reward"
     terms = REWARD_TERMS.known(scenario.reward.custom)

@@ -24,13 +24,19 @@ class Listing(NamedTuple):
 
 
 def scene(scenario: Scenario, grouped: bool = True) -> Iterator[Listing]:
-    """Yield the tables of who and what is there; those without rows are left out.
+    """Yield the tables of who and what is there; those without rows are left out, as are their empty columns.
 
     `grouped` says whether landmarks that a group draws have rows of their own.
     """
     marks = landmarks(scenario, grouped)
     tables = (vehicles(scenario), routes(scenario), marks, groups(scenario), motions(scenario), buildings(scenario))
-    yield from (table for table in tables if table.rows)
+    yield from (_without_empty_columns(table) for table in tables if table.rows)
+
+
+def _without_empty_columns(table: Listing) -> Listing:
+    kept = [i for i in range(len(table.columns)) if any(row[i] for row in table.rows)]
+    rows = [tuple(row[i] for i in kept) for row in table.rows]
+    return Listing(table.title, tuple(table.columns[i] for i in kept), rows)
 
 
 def vehicles(scenario: Scenario) -> Listing:

@@ -85,7 +85,7 @@ class Dynamics(Part):
     max_acceleration: Positive = 2.0
     """m/s^2"""
     max_steering: float = Field(default=0.6981317007977318, gt=0.0, lt=1.5)
-    """rad (40 deg)"""
+    """rad, to either side"""
     max_steering_rate: Positive = 2.0
     """rad/s"""
     speed_time_constant: NonNegative = 0.1
