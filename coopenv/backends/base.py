@@ -71,7 +71,7 @@ class Capabilities:
 class Told:
     """What one vehicle has to say after a tick."""
 
-    vehicle: int
+    vehicle: int  # its index
     rotation: Array  # (3, 3) body to map, estimated
     position: Array  # (3,) of the body's origin, map, m
     covariance: Array  # (6, 6) over (2 lambda, p)
@@ -82,10 +82,10 @@ class Told:
 class Health:
     """What has come since the backend was built; `late`, `missing` and `empty` count vehicles' rows."""
 
-    ticks: int = 0
-    late: int = 0
-    missing: int = 0
-    empty: int = 0
+    ticks: int = 0  # that were given
+    late: int = 0  # rows that came after their deadline
+    missing: int = 0  # rows of vehicles from which nothing came
+    empty: int = 0  # rows in which nothing was detected
     received: int = 0  # messages from vehicles or sensors, of any kind
     rejected: int = 0  # those of them that were refused
 
@@ -106,7 +106,9 @@ class Backend(Protocol):
     scenario: Scenario
     """Who is there, how they sense, talk and estimate."""
     capabilities: Capabilities
+    """What it can do; fixed once it is built."""
     health: Health
+    """What has come since it was built."""
 
     @property
     def clock(self) -> float:

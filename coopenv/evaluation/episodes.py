@@ -18,6 +18,7 @@ class Episodes:
     """What the driven vehicles did; K decisions, W worlds, N driven vehicles. Row k is the end of decision k."""
 
     vehicles: tuple[str, ...]
+    """(N,) names."""
     period: float
     """Of a decision, s."""
     under_way: np.ndarray

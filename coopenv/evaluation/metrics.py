@@ -98,9 +98,13 @@ class Result:
     """A figure of a driver with its 95 % interval over worlds."""
 
     metric: str
+    """Its name in `METRICS`, which has its unit."""
     mean: float
+    """Over all worlds together."""
     ci_low: float
+    """Lower end of the interval."""
     ci_high: float
+    """Its upper end."""
     n: int
     """Worlds that the figure is of."""
 
@@ -110,14 +114,21 @@ class Difference:
     """How much larger a figure of a driver is than that of another one on the same worlds."""
 
     metric: str
+    """Its name in `METRICS`, which has its unit."""
     difference: float
+    """This driver's figure minus the other one's."""
     ci_low: float
+    """Lower end of the 95 % interval of the difference over worlds."""
     ci_high: float
+    """Its upper end."""
     relative: float
     """Difference by the other one's figure; NaN where that is 0."""
     relative_ci_low: float
+    """Lower end of the interval of that quotient."""
     relative_ci_high: float
+    """Its upper end."""
     n: int
+    """Worlds that the figures are of, the smaller number of both."""
 
 
 def score(episodes: Episodes, seed: int = 0) -> list[Result]:

@@ -32,9 +32,9 @@ class SensorNoise:
     """Axis of that image plane, unit vector in the body frame; None: the noise is in the tangent plane."""
     odometry_scale: float = 0.0
     """Of the lasting errors, see `[noise]` and `[camera]` of a scenario; walks are per square root of a second."""
-    odometry_scale_walk: float = 0.0
+    odometry_scale_walk: float = 0.0  # per square root of a second
     gyro_bias: tuple[float, float, float] = (0.0, 0.0, 0.0)  # rad/s, body axes
-    gyro_bias_walk: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gyro_bias_walk: tuple[float, float, float] = (0.0, 0.0, 0.0)  # rad/s per square root of a second, body axes
     slip: tuple[float, float, float, float] = (0.0, 1.0, 0.0, 0.0)
     """Slips per second, their mean duration in s, the largest share that wheels read too much, and the largest side
     slip angle in rad."""
@@ -78,26 +78,26 @@ class SensorNoise:
 class Gains:
     """The scenario's gains for the Riccati observer of one vehicle."""
 
-    k: float
-    q: Array  # (T,) per target
-    V: tuple[float, float]
-    P0: tuple[float, float]
-    max_turn: float  # rad
+    k: float  # gain k_i, above 0.5
+    q: Array  # (T,) weights q_ij of bearings, per target
+    V: tuple[float, float]  # V = diag(V[0] I3, V[1] I3) over (2 lambda, p)
+    P0: tuple[float, float]  # P(0) = diag(P0[0] I3, P0[1] I3)
+    max_turn: float  # rad, by which the attitude turns within a tick until the correction is linearised anew
 
 
 @dataclass(frozen=True)
 class Setup:
     """What one vehicle knows before it starts. Targets are landmarks first, then vehicles."""
 
-    vehicle: int
-    name: str
-    target_names: tuple[str, ...]
+    vehicle: int  # its index, 0 is the first
+    name: str  # of the vehicle
+    target_names: tuple[str, ...]  # (T,)
     landmarks: int  # how many of the targets are landmarks; vehicle j is target `landmarks + j`
     targets: NDArray[np.int64]  # (m,) its neighbours
     lever_arm: Array  # (3,) the camera's place in the body, m
     marker: Array  # (3,) the point of this vehicle that others' cameras measure, in its body, m
-    noise: SensorNoise
-    gains: Gains
+    noise: SensorNoise  # standard deviations of what this vehicle senses
+    gains: Gains  # of the Riccati observer
     planar: bool = False
     """Whether the vehicle moves on a plane (z = 0, yaw only) and its odometry is the commands it was given, which
     need calibration; so it is for recorded robots."""
@@ -111,10 +111,10 @@ class Message:
     point, both in the map frame. `extra` holds anything else, as arrays.
     """
 
-    position: Array | None = None
-    rotation: Array | None = None
-    covariance: Array | None = None
-    extra: Mapping[str, Array] = field(default_factory=dict)
+    position: Array | None = None  # (3,) of the sender's marker, map, m
+    rotation: Array | None = None  # (3, 3) body to map
+    covariance: Array | None = None  # (3, 3) of `position`, map, m^2
+    extra: Mapping[str, Array] = field(default_factory=dict)  # by name, whatever the observer sends beside
 
     @property
     def size_bytes(self) -> int:
@@ -137,7 +137,7 @@ class Message:
 class Received:
     """A neighbour's latest message that arrived and is not stale."""
 
-    message: Message
+    message: Message  # as it was sent
     age: float  # s since it was sent
 
 
@@ -145,8 +145,8 @@ class Received:
 class Tick:
     """Everything that one vehicle senses and hears at one camera frame."""
 
-    index: int
-    time: float  # s
+    index: int  # number of the camera frame, 0 at the start
+    time: float  # s since the start
     dt: float  # s since the last tick
     rotation: Array  # (3, 3) odometry dR over the tick: R <- R dR
     translation: Array  # (3,) odometry dp over the tick, in the body frame at its start: p <- p + R dp, m
@@ -158,7 +158,7 @@ class Tick:
     landmarks: Array  # (L, 3) known positions of the landmarks now, map frame, m
     messages: Mapping[int, Received]  # by target index
     lever_arm: Array  # (3,) the camera's place in the body, m
-    noise: SensorNoise
+    noise: SensorNoise  # standard deviations, those of the setup
     due: bool = True  # whether the scenario's observer rate (`rates.observer`) asks for a correction at this frame
 
     def usable(self) -> list[tuple[int, Array, Array, Message | None]]:
@@ -186,7 +186,7 @@ class Estimate:
     """(3,) of the body's origin in the MAP frame, m (the paper's pbar; its p_i is rotation.T @ position)."""
     covariance: Array | None = None
     """(6, 6) over the error in `coordinates`, rad and m; None: the observer states none."""
-    coordinates: Coordinates = Coordinates.LEFT
+    coordinates: Coordinates = Coordinates.LEFT  # of the error that the covariance is about
     nis: float | None = None
     """Normalised innovation squared r^T S^-1 r of this tick's correction; None: there was none, or it is not told."""
     nis_dof: int = 0  # its degrees of freedom: two per bearing used
@@ -213,7 +213,7 @@ class JointObserver(Protocol):
     Its class has `joint = True`, and it is built as `factory(setups)`, one setup per vehicle.
     """
 
-    joint: bool
+    joint: bool  # True
 
     def reset(self, initial_poses: Sequence[tuple[Array, Array]], initial_covariances: Sequence[Array]) -> None:
         """Start at one pose and covariance per vehicle, as for `Observer`."""

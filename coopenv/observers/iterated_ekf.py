@@ -17,6 +17,9 @@ class IteratedEkf(MekfCovariance):
     """Error-state filter that iterates corrections; sends covariances."""
 
     def settled(self, P: Array, first: Stacked, look: Look, sight: Sight) -> tuple[Array, Array, float]:
-        """Return what `iterated` does."""
+        """Return the correction (n,), the covariance (n, n) after it and r^T S^-1 r at the prediction.
+
+        The update is linearised anew until it stays where it is.
+        """
         distance = float(lengths(sight.positions - self.state.p).min())
         return iterated(P, first, look, lambda dx: turn_of_sight(dx, distance))

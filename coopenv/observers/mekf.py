@@ -173,5 +173,8 @@ class Mekf(PoseObserver):
         return nis
 
     def settled(self, P: Array, first: Stacked, look: Look, sight: Sight) -> tuple[Array, Array, float]:
-        """Return what `halfway` does."""
+        """Return the correction (n,), the covariance (n, n) after it and r^T S^-1 r at the prediction.
+
+        The update is linearised half way to where it leads.
+        """
         return halfway(P, first, look)

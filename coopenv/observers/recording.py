@@ -50,7 +50,7 @@ class Sensed:
     has of a vehicle at that time is in its row; of a vehicle from which nothing came the row is not read.
     """
 
-    index: int
+    index: int  # k
     dt: float  # s, between ticks
     rotation: Array  # (N, 3, 3) odometry increments since the last tick
     translation: Array  # (N, 3) m
@@ -66,7 +66,7 @@ class Sensed:
     bearing_age: Array | None = None  # (N,) s since the frame was exposed; None: 0
     missing: NDArray[np.bool_] | None = None  # (N,) of whom nothing came; None: of nobody
     late: NDArray[np.bool_] | None = None  # (N,) whose row came after its deadline; None: nobody's
-    truth: Truth | None = None
+    truth: Truth | None = None  # of this tick; None: not known
     inbox_tick: NDArray[np.int64] | None = None
     """(N receiver, N sender) tick of sending of the last message that arrived, -1: none, where the source knows what
     its radio delivered; None: the scenario's radio decides. What they say is up to the senders' observers, which keep
@@ -119,7 +119,7 @@ PER_TICK = ("rotation", "translation", "velocity", "angular_velocity", "bearings
 class Recording:
     """K ticks (t = 0 included) of N vehicles and T targets, of which the first L are landmarks."""
 
-    setups: tuple[Setup, ...]
+    setups: tuple[Setup, ...]  # (N,) what each vehicle knows before it starts
     order: tuple[int, ...]  # vehicles in the order in which they estimate: leaders first
     dt: float  # s
     rotation: Array  # (K, N, 3, 3) odometry increments
@@ -136,7 +136,7 @@ class Recording:
     start_rotation: Array  # (N, 3, 3) initial estimates
     start_position: Array  # (N, 3) map, m
     start_covariance: Array  # (N, 6, 6) LEFT coordinates
-    truth: Truth
+    truth: Truth  # of the K ticks
     pan: Array | None = None  # (K, N) rad, by which cameras were turned to the left; None: never
     scenario: "Scenario | None" = None  # the world that was recorded; None for recorded robots
     drawn: Drawn | None = None  # None: not simulated

@@ -32,7 +32,7 @@ class Run:
     rotation: Array  # (K, N, 3, 3) estimates
     position: Array  # (K, N, 3) map, m
     covariance: Array  # (K, N, 6, 6) rad and m, NaN where the observer states none
-    coordinates: Coordinates
+    coordinates: Coordinates  # of the error that the covariance is about
     judged: NDArray[np.bool_]  # (K, N) where the truth is known
     position_error: Array  # (K, N) m
     orientation_error: Array  # (K, N) deg, geodesic

@@ -56,11 +56,11 @@ class Agent:
     """What tables call it."""
     entry: str
     """A class, which is built with the scenario and the options, or else a policy."""
-    kind: Kind = "scripted"
+    kind: Kind = "scripted"  # trained, written by hand, or a yardstick that says what is possible
     environments: tuple[str, ...] = ()
     """Names, or paths of TOML files."""
-    options: Mapping[str, Any] = field(default_factory=dict)
-    description: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)  # that its class is built with
+    description: str = ""  # what it does, in a sentence
     folder: Path | None = None
     """Where its `agent.toml` and its card are; None for a place in code."""
 

@@ -78,6 +78,7 @@ class Embedded:
     """
 
     name: str
+    """By which scenarios and tables call it."""
     estimate: Any
     """(model, state, memory, world, vehicle, now): take one camera tick `Now`; messages have been delivered."""
     start: Any

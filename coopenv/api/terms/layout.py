@@ -20,15 +20,15 @@ from coopenv.world.command import STEERING
 class Field:
     """One named part of the flat observation; every entry is (value - center) / scale, clipped to [low, 1]."""
 
-    start: int
-    stop: int
-    shape: tuple[int, ...]
-    group: str
-    unit: str
-    scale: float
-    low: float
-    meaning: str
-    center: float = 0.0
+    start: int  # its first entry's place in the flat vector
+    stop: int  # the place after its last entry
+    shape: tuple[int, ...]  # of its values
+    group: str  # of `observation.include`
+    unit: str  # of its values, center and scale
+    scale: float  # what a value is divided by, in its unit
+    low: float  # -1, or 0 where a value cannot be negative
+    meaning: str  # in words
+    center: float = 0.0  # what is subtracted before, in its unit
 
     @property
     def slice(self) -> slice:
@@ -45,10 +45,10 @@ class Field:
 class ActionField:
     """One entry of an action, which spans [low, high] as it goes from -1 to 1."""
 
-    name: str
-    unit: str
-    low: float
-    high: float
+    name: str  # of what is commanded
+    unit: str  # of low and high
+    low: float  # what -1 asks for
+    high: float  # what 1 asks for
 
     def level(self, value: float) -> float:
         """Return the entry of an action that asks for a value in the field's unit; beyond [-1, 1] if out of reach."""

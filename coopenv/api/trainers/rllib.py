@@ -64,9 +64,11 @@ class CooperativeMultiAgentEnv(MultiAgentEnv):
 class CooperativeRows(VectorWrapper):
     """A batch as a vector environment of RLlib: rows (world, vehicle) for one policy that all vehicles share.
 
-        PPOConfig()
-        .environment(CooperativeRows, env_config={"env": "urban_crossing"})
-        .env_runners(num_envs_per_env_runner=256, gym_env_vectorize_mode="vector_entry_point")
+        config = (
+            PPOConfig()
+            .environment(CooperativeRows, env_config={"env": "urban_crossing"})
+            .env_runners(num_envs_per_env_runner=256, gym_env_vectorize_mode="vector_entry_point")
+        )
 
     An episode is a vehicle's, see `TrueEnds`. There are no infos: RLlib would keep them of every step.
     """

@@ -13,7 +13,7 @@ from coopenv.api.trainers.sb3 import CooperativeSB3VecEnv
 class ActingRowsBuffer(RolloutBuffer):
     """Gives PPO minibatches of those rows alone whose vehicle was under way; flat observations only.
 
-    model = PPO("MlpPolicy", env, rollout_buffer_class=ActingRowsBuffer, rollout_buffer_kwargs={"rows": env})
+        model = PPO("MlpPolicy", env, rollout_buffer_class=ActingRowsBuffer, rollout_buffer_kwargs={"rows": env})
 
     Advantages need no correction: a row is done when its vehicle's episode ends, so nothing of the time parked reaches
     back to before it.
