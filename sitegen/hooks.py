@@ -14,7 +14,7 @@ SHIM = "https://unpkg.com/iframe-worker/shim"
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))  # MkDocs loads this file by its path
 
-from sitegen import code, links, mirror, not_found, notebooks, pages, tables  # noqa: E402
+from sitegen import code, links, mirror, not_found, notebooks, pages, paths, pictures, tables, titles  # noqa: E402
 
 
 def on_config(config: Any) -> Any:
@@ -69,8 +69,14 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
-    """Mark the cells of tables that need room, and code that may be wrapped."""
-    return code.marked(tables.marked(html))
+    """Let paths and pictures be links, and say where lines of titles, tables and code may be broken."""
+
+    def address(path: str) -> str | None:
+        found = files.get_file_from_path(mirror.page_of(path))
+        return None if found is None or found is page.file else get_relative_url(found.url, page.url)
+
+    html = paths.linked(pictures.linked(html), address)
+    return titles.breakable(code.marked(tables.marked(html)))
 
 
 def on_post_page(output: str, page: Any, config: Any) -> str:

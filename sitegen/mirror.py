@@ -103,8 +103,13 @@ def examples_page() -> str:
     for file in listed("examples"):
         text = (ROOT / file).read_text(encoding="utf-8")
         about = (ast.get_docstring(ast.parse(text)) or "") if file.endswith(".py") else _title(text)
-        rows.append(f"- [{file}]({file}.md): {about.partition('. ')[0].partition(chr(10))[0].rstrip('.')}.")
+        rows.append(f"- [{file}]({file}.md): {_first_sentence(about)}")
     return "# Examples\n\nShort programs to run from top to bottom in a clone.\n\n" + "\n".join(rows) + "\n"
+
+
+def _first_sentence(text: str) -> str:
+    sentence = text.partition("\n")[0].partition(". ")[0].rstrip(".")
+    return sentence if sentence.endswith(("?", "!")) else f"{sentence}."
 
 
 def _title(text: str) -> str:

@@ -6,7 +6,9 @@ FROM_ROOT = re.compile(r'\b(href|src)="/(?!/)')
 SERVED = 'location.protocol!="file:"'
 BASE = f"<script>if({SERVED})document.write('<base href=\"/\">')</script>"
 """A server's pages are below its root, wherever the missing one was looked for."""
-WORDS = '<p>There is no such page. <a href="index.html">The front page</a> leads on, and the field above searches.</p>'
+WORDS = (
+    '<p>There is no such page. <a href="index.html">The front page</a> leads on; the search above finds the rest.</p>'
+)
 SETTINGS = '<script>if({})__config.textContent=__config.textContent.replace(\'"base": "."\',\'"base": "/"\')</script>'
 
 

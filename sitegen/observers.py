@@ -3,7 +3,9 @@
 import ast
 import re
 from collections.abc import Iterator
+from pkgutil import resolve_name
 
+from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.zoo import ZOO, Entry
 from coopenv.runs.markdown import bullets, table
 from sitegen.mirror import ROOT, relinked
@@ -45,6 +47,17 @@ def _docstring(file: str) -> str:
     return ast.get_docstring(ast.parse((ROOT / file).read_text(encoding="utf-8"))) or ""
 
 
+def _where(entry: Entry) -> str:
+    """Return the sentence that says where an observer is computed."""
+    if entry.kernels:
+        return "Runs inside the kernels of a batch, on the CPU and on a GPU."
+    if not entry.needs:
+        made = resolve_name(f"{PACKAGE}.{entry.plugin}")
+        if isinstance(made, type) and issubclass(made, KernelObserver):
+            return "Runs in kernels on the CPU that the host calls, a vehicle at a time; not in those of a batch."
+    return "Runs in Python on the host."
+
+
 def _page(name: str, entry: Entry, about: str, sends: str) -> str:
     place, _, item = entry.plugin.partition(":")
     file = f"coopenv/observers/{place.replace('.', '/')}.py"
@@ -53,9 +66,7 @@ def _page(name: str, entry: Entry, about: str, sends: str) -> str:
     facts = [
         f"Sends: {sends}.",
         f"Source: `{file}`.",
-        "Runs inside the kernels of a batch, on the CPU and on a GPU."
-        if entry.kernels
-        else "Runs in Python on the host.",
+        _where(entry),
     ]
     facts += [] if entry.in_space else ["Only for recorded robots on a plane."]
     facts += [] if entry.on_a_plane else ["Only for vehicles in space, not for recorded robots on a plane."]

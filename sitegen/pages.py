@@ -57,6 +57,10 @@ def _listed_whole(part: str, about: Mapping[str, str]) -> str:
     return re.sub(r"^\* `([a-z0-9-]+)`: (.+)$", row, part, flags=re.MULTILINE)
 
 
+SCALES = {"targets": "number of targets", "steering": "angle at action 1", "pan": "angle at action 1"}
+"""What the scales that are no setting of `[observation]` are."""
+
+
 def observation() -> str:
     """Return the page that says what every entry of an observation and every term of the reward means."""
     from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
@@ -66,7 +70,8 @@ def observation() -> str:
     groups: dict[str, list[tuple[str, ...]]] = {}
     for name, field in OBSERVATION_FIELDS.built_in.items():
         planar = "" if field.planar is None else str(len(field.planar))
-        row = (f"`{name}`", field.meaning, field.unit, str(field.scale), field.per, str(field.size), planar)
+        scale = SCALES.get(str(field.scale), str(field.scale))
+        row = (f"`{name}`", field.meaning, field.unit, scale, field.per, str(field.size), planar)
         groups.setdefault(field.group, []).append(row)
     for group, rows in groups.items():
         parts += [f"## {group}", table(("field", "meaning", "unit", "scale", "one per", "entries", "planar"), rows)]

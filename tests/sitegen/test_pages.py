@@ -53,10 +53,14 @@ def test_pages_of_observers_say_where_they_come_from(made: dict[str, str]) -> No
         assert f"::: coopenv.observers.{place}.{item}" in page and "## Method and source" in page
         assert "<" not in page.partition("## Method and source")[2]  # Markdown's escape of it is none
         assert ("inside the kernels" in page) == bool(entry.kernels)
+    assert "Runs in kernels on the CPU that the host calls" in made["reference/observers/hamel_samson_.md"]
+    assert "Runs in Python on the host." in made["reference/observers/mekf_.md"]
 
 
 def test_the_page_on_observations_explains_every_entry(made: dict[str, str]) -> None:
     page = made["reference/observation.md"]
+    assert "| targets | number of targets | vehicle |" in page and "| rad | angle at action 1 | vehicle |" in page
+    assert not re.search(r"\| (targets|steering|pan) \| vehicle \|", page)
     assert all(
         f"| `{name}` | {field.meaning} | {field.unit} |" in page for name, field in OBSERVATION_FIELDS.built_in.items()
     )
@@ -71,6 +75,39 @@ def test_the_page_of_the_command_line_has_every_command(made: dict[str, str]) ->
     assert "--observers" in page
     lists = re.findall(r"^\* `[a-z-]+`: (.+)$", page, re.MULTILINE)
     assert len(lists) > 20 and not [line for line in lists if line.endswith("...")]
+
+
+def test_examples_are_told_in_whole_sentences(made: dict[str, str]) -> None:
+    rows = re.findall(r"^- \[.+\]\(.+\): (.+)$", made["files/examples.md"], re.MULTILINE)
+    assert len(rows) == len(mirror.listed("examples"))
+    assert not [row for row in rows if not re.search(r"\w[.?!]$|\)\.$", row)]
+    assert any(row.endswith("?") for row in rows)
+
+
+def test_titles_are_those_of_the_navigation() -> None:
+    for page, title in (("agents", "Comparing agents"), ("observers", "Comparing observers")):
+        assert (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8").startswith(f"# {title}\n")
+        assert f"- {title}: {page}.md\n" in (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+
+
+def test_no_two_pages_have_the_same_title(made: dict[str, str]) -> None:
+    """A search lists them by their titles."""
+    texts = [text for page, text in made.items() if not page.startswith("files/")]
+    texts += [path.read_text(encoding="utf-8") for path in (ROOT / "docs").rglob("*.md")]
+    titles = [text.partition("\n")[0] for text in texts]
+    assert not {title for title in titles if titles.count(title) > 1}
+
+
+def test_the_how_to_page_lists_every_page_of_the_navigation() -> None:
+    navigation = (
+        (ROOT / "mkdocs.yml").read_text(encoding="utf-8").partition("- How-to:\n")[2].partition("- Reference:")[0]
+    )
+    listed = set(re.findall(r": (\S+)\.md$", navigation, re.MULTILINE)) - {"files/examples"}
+    text = (ROOT / "docs" / "how-to" / "index.md").read_text(encoding="utf-8")
+    linked = {target.partition("#")[0].removesuffix(".md") for target in LINK.findall(text)}
+    assert len(listed) > 10
+    assert {page.removeprefix("how-to/") if "/" in page else f"../{page}" for page in listed} <= linked
+    assert "../../examples" in linked
 
 
 def test_links_into_the_repository_become_pages() -> None:
