@@ -26,6 +26,28 @@ CUT = """() => {
     return found.slice(0, 3);
 }"""
 """What of the text a reader cannot get to: wide tables and code scroll in boxes of their own."""
+SPLIT = """() => [...document.querySelectorAll('article :is(.option, .quantity, .numbers)')]
+    .filter(part => {
+        const range = document.createRange();
+        range.selectNodeContents(part);
+        return new Set([...range.getClientRects()].map(box => Math.round(box.bottom))).size > 1;
+    }).map(part => part.textContent)"""
+"""Options and numbers with lines broken in them."""
+COVERED = """() => {
+    const found = [], range = document.createRange();
+    for (const block of document.querySelectorAll('article .wraps')) {
+        const button = block.querySelector('button').getBoundingClientRect();
+        const texts = document.createTreeWalker(block.querySelector('code'), NodeFilter.SHOW_TEXT);
+        while (texts.nextNode()) for (const word of texts.currentNode.data.matchAll(/\\S+/g)) {
+            range.setStart(texts.currentNode, word.index);
+            range.setEnd(texts.currentNode, word.index + word[0].length);
+            for (const box of range.getClientRects())
+                if (box.right > button.left && box.top < button.bottom && box.bottom > button.top) found.push(word[0]);
+        }
+    }
+    return found;
+}"""
+"""Words of wrapped code that lie under the button that copies it."""
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -67,6 +89,43 @@ def test_text_that_is_cut_is_noticed(browser: Any, text: str) -> None:
     assert page.evaluate(CUT) == []
     page.set_content(f"<article><h1>A page</h1>{text}</article>")
     assert page.evaluate(CUT)
+    page.close()
+
+
+@pytest.mark.parametrize("name", ["results", "benchmarks", "how-to/figures", "reference/command_line", "bags"])
+def test_options_and_numbers_are_whole_and_nothing_covers_code(site: Path, browser: Any, name: str) -> None:
+    page = browser.new_page(viewport={"width": 390, "height": 844})
+    page.goto((site / f"{name}.html").as_uri())
+    if page.locator("article .wraps").count():
+        page.wait_for_selector("article .wraps button")
+    assert page.locator("article :is(.option, .numbers)").count() > 5
+    assert page.evaluate(SPLIT) == [] == page.evaluate(COVERED)
+    page.add_style_tag(content=".md-typeset :is(.option, .numbers) { white-space: normal !important; width: 1px }")
+    page.add_style_tag(content=".md-typeset .wraps pre > code { padding-right: 0 !important }")
+    if name in ("results", "how-to/figures"):
+        assert page.evaluate(SPLIT), "the check itself sees what is split"
+    if name == "how-to/figures":
+        assert page.evaluate(COVERED), "and what is covered"
+    page.close()
+
+
+def test_code_is_copied_as_it_stands(site: Path, browser: Any) -> None:
+    page = browser.new_page(viewport={"width": 390, "height": 844})
+    page.goto((site / "how-to" / "figures.html").as_uri())
+    page.evaluate("document.addEventListener('copy', () => { window.copied = document.getSelection().toString(); })")
+    page.locator("article .wraps button").first.click()
+    page.wait_for_function("window.copied")
+    lines = page.evaluate("window.copied").splitlines()
+    assert lines[0] == "coopenv run busy_intersection --set horizon=5 --figures pdf --width ieee1 --out out/paper"
+    assert len(lines) == 2
+    page.close()
+
+
+def test_a_picture_opens_by_itself(site: Path, browser: Any) -> None:
+    page = browser.new_page(viewport={"width": 390, "height": 844})
+    page.goto((site / "environments" / "behind_truck.html").as_uri())
+    page.locator("article a.picture").first.click()
+    page.wait_for_url("**/environments/behind_truck.png")
     page.close()
 
 
