@@ -53,6 +53,22 @@ def test_the_page_of_every_environment_is_up_to_date(name: str) -> None:
         assert film.n_frames > 20, again
 
 
+def test_actions_are_told_of_a_vehicle_that_is_driven() -> None:
+    page = environment_page("behind_truck", load_scenario("behind_truck"), PAGES)  # vehicle_1 is the truck
+    assert "here of `vehicle_2`, the first driven vehicle" in page and "| speed | 0 | 0.9 | m/s |" in page
+
+
+def test_columns_with_nothing_in_them_are_left_out() -> None:
+    heads = {
+        name: environment_page(name, load_scenario(name), PAGES).partition("## Routes (m)\n\n")[2].partition("\n")[0]
+        for name in ("svea_crossing", "behind_truck")
+    }
+    assert heads == {
+        "svea_crossing": "| route | waypoints | corners |",
+        "behind_truck": "| route | waypoints | corners | drawn |",
+    }
+
+
 def test_films_of_all_environments_are_small() -> None:
     assert sum(path.stat().st_size for path in PAGES.glob("*.webp")) < 3e6
 
