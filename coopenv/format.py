@@ -14,7 +14,7 @@ def number(value: float, digits: int = 4) -> str:
         return NONE
     if 10**digits <= abs(value) < 1e6:
         return f"{value:.0f}"
-    return f"{value + 0.0:.{digits}g}"  # + 0.0: no minus zero
+    return f"{value:z.{digits}g}"
 
 
 def fixed(value: float, decimals: int) -> str:
@@ -38,7 +38,7 @@ def _aligned(value: float, decimals: int) -> str:
     if math.isnan(value):
         return NONE
     lost = value != 0.0 and abs(value) < 0.5 * 10.0**-decimals
-    return f"{value:.0e}" if lost or abs(value) >= 1e6 else f"{value + 0.0:.{decimals}f}"
+    return f"{value:.0e}" if lost or abs(value) >= 1e6 else f"{value:z.{decimals}f}"
 
 
 def seconds(values: Sequence[float]) -> list[str]:

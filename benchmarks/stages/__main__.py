@@ -111,7 +111,8 @@ def stage_table(asked: argparse.Namespace, overrides: dict[str, Any], log: Conso
             steps.append(stepper(world, WARM_UP))
     with Progress(log, "measuring"):
         times = 1e9 * alternate([partial(step, asked.decisions) for step in steps], asked.rounds)
-    table = number_table([f"stage ({asked.environment})"], ["cost", "middle half\nof rounds", "left\nwithout it"])
+    headings = ["cost\n[ns]", "middle half\nof rounds", "left with-\nout it [ns]"]
+    table = number_table([f"stage ({asked.environment})"], headings)
     table.add_row("whole tick", "", "", f"{np.median(times[:, 0]):.0f}")
     for name, before, after in zip(names, times.T, times.T[1:], strict=False):
         low, high = np.quantile(before - after, (0.25, 0.75))

@@ -111,7 +111,7 @@ class TopView:
         self._traffic = layers.polygons(facecolor=ground.TRAFFIC, edgecolor="white", linewidth=0.8)
         self._truth = layers.polygons(facecolor=self._rgba, edgecolor=INK, linewidth=0.8)
         self._truth_nose = layers.polygons(facecolor="white", edgecolor="none")
-        self._links = layers.lines(color=colours, linewidth=1.0, linestyle=ground.DOTTED)
+        self._links = layers.lines(color=colours, linewidth=1.0, linestyle=ground.DASH_DOTTED)
         self._casing = layers.polygons(facecolor="none", edgecolor="white", linewidth=2.3)
         self._estimate = layers.polygons(facecolor="none", edgecolor=self._rgba, linewidth=1.1)
         self._estimate_nose = layers.polygons(facecolor="none", edgecolor=self._rgba, linewidth=0.9)
@@ -119,9 +119,8 @@ class TopView:
         self._strays = layers.polygons(linewidth=1.3)
         self._arrived = layers.points("*", "white", INK, 12)
         self._collided = layers.points("X", INK, "white", 11)
-        for landmark in ground.name_landmarks(self._axes, self.scenario):
-            layers.keep(landmark)
-        self._goals.add_names(self._axes, layers)
+        landmarks = [layers.keep(name) for name in ground.name_landmarks(self._axes, self.scenario)]
+        self._goals.add_names(self._axes, layers, landmarks)
         look = {"fontsize": NORMAL, "weight": "bold", "ha": "center", "va": "center", "clip_on": True, **_HALO}
         names = [self._axes.text(0, 0, ground.vehicle_mark(i), color=INK, **look) for i in range(len(colours))]
         self._names = [layers.keep(name) for name in names]

@@ -1,5 +1,6 @@
 """Goals and routes in the top view, where a reset has drawn them."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -34,10 +35,12 @@ class Goals:
         self._discs = layers.polygons(facecolor="white", edgecolor="none", alpha=0.6)
         self._rims = layers.polygons(facecolor="none", edgecolor=colours, linestyle=DOTTED, linewidth=1.6)
 
-    def add_names(self, axes: Axes, layers: Layers) -> None:
-        """Add the names, over all that has been added before."""
+    def add_names(self, axes: Axes, layers: Layers, others: Sequence[Text]) -> None:
+        """Add the names, over all that has been added before and where `others`, which stand still, are not."""
         low, self._high = axes.get_xlim()
         self._pixel = (self._high - low) / axes.get_window_extent().width  # m
+        taken = [axes.transData.inverted().transform(other.get_window_extent()) for other in others]
+        self._taken = np.array(taken).reshape(-1, 2, 2)  # m, lower left and upper right corners
         halo = [withStroke(linewidth=2.2, foreground="white")]
         look: dict[str, Any] = {"fontsize": SMALL, "va": "center", "clip_on": True, "color": INK, "path_effects": halo}
         self._names: list[Text] = [layers.keep(axes.text(0, 0, "", **look)) for _ in self._there]
@@ -64,17 +67,21 @@ class Goals:
         return marks + (f" +{len(members) - named}" if len(members) > named else "")
 
     def _put(self, name: Text, center: np.ndarray, radius: np.ndarray) -> None:
-        """Write a name into a goal if it fits, else to the right of it, or to the left at the border of the map."""
-        wide = name.get_window_extent().width * self._pixel
-        gap = _GAP * self._pixel
+        """Write a name into a goal if it fits, else to the right of it, or to the left, where no other name is."""
+        extent = name.get_window_extent()
+        wide, high, gap = extent.width * self._pixel, extent.height * self._pixel, _GAP * self._pixel
         left, right = float((center[:, 0] - radius).min()), float((center[:, 0] + radius).max())
         y = float((center[:, 1].min() + center[:, 1].max()) / 2)
+        places = [right + gap, left - gap - wide]  # of the name's left end
         if len(center) == 1 and wide + 2 * gap < right - left:
-            name.set(x=(left + right) / 2, y=y, ha="center")
-        elif right + gap + wide < self._high:
-            name.set(x=right + gap, y=y, ha="left")
-        else:
-            name.set(x=left - gap, y=y, ha="right")
+            places.insert(0, (left + right - wide) / 2)
+        inside = [x for x in places if x + wide < self._high] or places[-1:]
+        name.set(x=next((x for x in inside if self._is_free(x, y, wide, high)), inside[0]), y=y)
+
+    def _is_free(self, x: float, y: float, wide: float, high: float) -> bool:
+        """Return whether a name of a size would cover no other one; `x`, `y`: the middle of its left side, m."""
+        low, far = np.array([x, y - high / 2]), np.array([x + wide, y + high / 2])
+        return not ((self._taken[:, 0] < far) & (self._taken[:, 1] > low)).all(axis=1).any()
 
 
 def touching(center: np.ndarray, radius: np.ndarray) -> list[list[int]]:

@@ -34,7 +34,7 @@ _SWATCH = 8  # px
 LARGEST_ELLIPSE = 0.3  # of the side of the map, semi-axis of an ellipse that is drawn
 
 GROUND, ASPHALT, WALL, ROOF, TRAFFIC = "#F4F2EC", "#E2E2E2", "#8A8172", "#C9C2B4", "#6E6E6E"
-DASHED, DOTTED = (0, (4, 2.5)), (0, (1, 1.8))
+DASHED, DOTTED, DASH_DOTTED = (0, (4, 2.5)), (0, (1, 1.8)), (0, (5, 1.8, 1, 1.8))
 
 SIGHT_LOOKS: dict[Sight, dict[str, object]] = {
     Sight.VISIBLE: {"linewidth": 1.1, "alpha": 0.9},
@@ -130,7 +130,7 @@ def draw_legend(figure: Figure, scenario: Scenario, rows: int) -> None:
     marks: list[tuple[object, Artist]] = [
         (True, Patch(facecolor=GREY, edgecolor=INK, linewidth=0.7, label=_vehicle_words(scenario))),
         (True, Patch(facecolor="white", edgecolor=GREY, linewidth=1.4, label="its estimate")),
-        (True, Line2D([], [], color=GREY, linewidth=1.0, linestyle=DOTTED, label="error of the estimate")),
+        (True, Line2D([], [], color=GREY, linewidth=1.0, linestyle=DASH_DOTTED, label="error of the estimate")),
         (honest, Patch(facecolor="#7F7F7F30", edgecolor=GREY, linewidth=0.8, label=_ellipse_words(scenario))),
         (not honest, _mark("$-$", INK, INK, 5, "no 3σ: P is a gain matrix")),
         (sees_a_part(scenario), Patch(facecolor="#7F7F7F24", edgecolor="none", label="field of view")),

@@ -7,7 +7,7 @@ from typing import Any
 
 from coopenv.bench.agents.contest import IDEAL, Entrant, Evaluation
 from coopenv.bench.agents.seeds_section import seeds_section
-from coopenv.bench.agents.table import COLUMNS, cell
+from coopenv.bench.agents.table import COLUMNS, EXPLANATIONS, cell
 from coopenv.errors import CoopenvError
 from coopenv.files import check_file, replace_text
 from coopenv.jsonable import json_text
@@ -81,7 +81,8 @@ def text(description: str, card: dict[str, Any]) -> str:
     for name, entry in card["environments"].items():
         cells = [cell(entry["results"][metric], factor) for metric, (_, factor) in COLUMNS.items()]
         lines.append(f"| {name} | {entry['worlds']} | {' | '.join(cells)} |")
-    lines += ["", "With 95 % intervals over worlds; errors from 3 s on, of vehicles under way. Measured with", ""]
+    meaning = "; ".join(f"{word}: {words}" for word, words in EXPLANATIONS.items())
+    lines += ["", f"{meaning[0].upper()}{meaning[1:]}. Measured with", ""]
     commands = dict.fromkeys((entry["command"], entry["coopenv"]) for entry in card["environments"].values())
     lines += [f"    {command} --write-card  # coopenv {number}" for command, number in commands]
     if "study" in card:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from rich.console import Console
 
 from coopenv.bench.agents.contest import Entrant, Evaluation, contest, enter
-from coopenv.bench.agents.table import differences_table, explanations, results_table
+from coopenv.bench.agents.table import EXPLANATIONS, differences_table, results_table
 from coopenv.errors import OutputError
 from coopenv.evaluation import METRICS
 from coopenv.files import replace_text, replacing_folder
@@ -136,5 +136,5 @@ def report(evaluation: Evaluation, out: Console) -> None:
         out.print()
         out.print(differences_table(evaluation))
     out.print()
-    for words, meaning in explanations(evaluation).items():
+    for words, meaning in EXPLANATIONS.items():
         out.print(f"{words}: {meaning}.")

@@ -51,7 +51,7 @@ def shown(mean: float, low: float, high: float) -> tuple[str, str, str]:
     decimals = 1
     if np.isfinite(width) and width > 0.0:
         decimals = int(np.clip(-np.floor(np.log10(width)), 0, 2))
-    first, second, third = (f"{v + 0.0:.{decimals}f}" if np.isfinite(v) else NONE for v in (mean, low, high))
+    first, second, third = (f"{v:z.{decimals}f}" if np.isfinite(v) else NONE for v in (mean, low, high))
     return first, second, third
 
 
@@ -73,11 +73,10 @@ def _change(difference: Difference) -> str:
     return f"{mean}\n{low}..{high}" if np.isfinite(percent[1]) else mean
 
 
-def explanations(evaluation: Evaluation) -> Mapping[str, str]:
-    """Return what the words of the tables mean."""
-    return {
-        "intervals": "95 %, bootstrap over worlds",
-        "e50, e95": "median and 95th percentile of the error of vehicles under way, from 3 s on",
-        "few": "share of that time with fewer than three targets in view",
-        "return": "sum of the rewards of a vehicle",
-    }
+EXPLANATIONS = {
+    "intervals": "95 %, bootstrap over worlds",
+    "e50, e95": "median and 95th percentile of the error of vehicles under way, from 3 s on",
+    "few": "share of that time with fewer than three targets in view",
+    "return": "sum of the rewards of a vehicle",
+}
+"""What the words of the tables mean."""
