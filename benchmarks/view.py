@@ -1,13 +1,15 @@
-"""What the live view costs: the share of a core of the process that simulates, draws and serves, at 20 frames a second.
+"""What the live view costs: the share of a core of the process that simulates, draws and serves.
 
-`python -m benchmarks.view [ENV ...]` prints it without anybody who watches, and with one who reads everything.
+`python -m benchmarks.view [ENV ...]` prints it without anybody who watches, and with one who reads everything: at the
+frames a second that the environment gives, and at 20, of which that without the simulation is what watching adds.
 """
 
 import argparse
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from time import monotonic, process_time
+from time import monotonic, process_time, thread_time
+from typing import NamedTuple
 
 from coopenv.runs.scenes import driver_of, open_source
 from coopenv.runs.view.reels import EngineReel
@@ -15,6 +17,15 @@ from coopenv.runs.view.serving import serving
 from coopenv.runs.view.viewer import Viewer
 
 WARM_UP = 2.0  # s
+RATE = 20.0  # frames/s, to which shares are scaled
+
+
+class Measured(NamedTuple):
+    """What was measured in a second: frames, and CPU time, s, of the whole process and of the simulation in it."""
+
+    frames: float
+    cpu: float
+    simulation: float
 
 
 def main() -> None:
@@ -24,26 +35,44 @@ def main() -> None:
     parser.add_argument("--observer", default=None)
     parser.add_argument("--seconds", type=float, default=15.0)
     asked = parser.parse_args()
-    print(f"{'environment':20} {'watched':8} {'frames/s':>9} {'of a core':>10}")
+    print(f"{'':20} {'':8} {'':>9} {'of a core':>10} {'the same':>10} {'without the':>12}")
+    print(f"{'environment':20} {'watched':8} {'frames/s':>9} {'':>10} {f'at {RATE:g}/s':>10} {'simulation':>12}")
     for name in asked.environments:
         for watched in (False, True):
-            rate, share = measured(name, asked.observer, asked.seconds, watched)
-            print(f"{name:20} {'yes' if watched else 'no':8} {rate:9.1f} {100 * share:9.1f}%", flush=True)
+            frames, cpu, simulation = measured(name, asked.observer, asked.seconds, watched)
+            scaled = [100 * cpu, 100 * cpu * RATE / frames, 100 * (cpu - simulation) * RATE / frames]
+            shares = " ".join(f"{share:{width}.1f}%" for share, width in zip(scaled, (9, 9, 11), strict=True))
+            print(f"{name:20} {'yes' if watched else 'no':8} {frames:9.1f} {shares}", flush=True)
 
 
-def measured(name: str, observer: str | None, seconds: float, watched: bool) -> tuple[float, float]:
-    """Return frames a second and the share of a core."""
+class TimedReel(EngineReel):
+    """A reel that knows how long the simulation of its frames took."""
+
+    simulated = 0.0
+    """CPU time, s."""
+
+    def more(self) -> bool:
+        """Run on to the next frame."""
+        begin = thread_time()
+        try:
+            return super().more()
+        finally:
+            self.simulated += thread_time() - begin
+
+
+def measured(name: str, observer: str | None, seconds: float, watched: bool) -> Measured:
+    """Show an environment for some seconds."""
     opened = partial(open_source, name, observer=observer)
-    reel = EngineReel(opened, name, 0, lambda scenario: driver_of(None, scenario, name, 0))
+    reel = TimedReel(opened, name, 0, lambda scenario: driver_of(None, scenario, name, 0))
     try:
         with serving("127.0.0.1", None) as (server, url):
             viewer = Viewer(server, reel)
             with somebody(url) if watched else nobody():
                 viewer.run(until(WARM_UP))
-                frames, cpu, begin = viewer.shown, process_time(), monotonic()
+                before, begin = (viewer.shown, process_time(), reel.simulated), monotonic()
                 viewer.run(until(seconds))
-                elapsed = monotonic() - begin
-                return (viewer.shown - frames) / elapsed, (process_time() - cpu) / elapsed
+                after, elapsed = (viewer.shown, process_time(), reel.simulated), monotonic() - begin
+                return Measured(*((b - a) / elapsed for a, b in zip(before, after, strict=True)))
     finally:
         reel.close()
 

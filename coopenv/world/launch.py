@@ -73,8 +73,8 @@ def inlining(threshold: int) -> dict[str, Any]:
     return {"cpu_compiler_flags": " ".join([*kept, f"-mllvm=-inline-threshold={threshold}"])}
 
 
-def run_seldom() -> dict[str, Any]:
-    """Return options of kernels that run once per episode: compiled sooner, without Warp's far inlining."""
+def near_inlining() -> dict[str, Any]:
+    """Return options of kernels that gain nothing from Warp's far inlining: compiled in half the time without it."""
     flags = (wp.config.cpu_compiler_flags or "").split()
     kept = " ".join(flag for flag in flags if not flag.startswith("-mllvm"))
     return {"cpu_compiler_flags": kept} if len(kept.split()) < len(flags) else {}

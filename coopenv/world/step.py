@@ -13,7 +13,7 @@ import warp as wp
 from coopenv.world.command import decide
 from coopenv.world.embedded import Embedded, Now, Source, regular_tick
 from coopenv.world.faults import forget_everything
-from coopenv.world.launch import run_seldom
+from coopenv.world.launch import near_inlining
 from coopenv.world.quality import sample_gramian
 from coopenv.world.v2x import broadcast
 
@@ -87,7 +87,7 @@ def restart_kernel(source: Source, observer: Embedded) -> Kernel:
                 start(model, state, memory, world, vehicle)
                 send(model, state, memory, world, vehicle, 0)
 
-    return _named(restart, source.name, observer.name, **{**run_seldom(), **observer.options})
+    return _named(restart, source.name, observer.name, **{**near_inlining(), **observer.options})
 
 
 @cache
@@ -108,7 +108,7 @@ def revive_kernel(observer: Embedded) -> Kernel:
                     forget_everything(model, state, world, vehicle)
                     start(model, state, memory, world, vehicle)
 
-    return _named(revive, observer.name, **{**run_seldom(), **observer.options})
+    return _named(revive, observer.name, **{**near_inlining(), **observer.options})
 
 
 def decide_kernel(model: Any, state: Any, actions: wp.array3d(dtype=Any), hold: wp.array(dtype=wp.int32)):

@@ -21,6 +21,7 @@ from coopenv.api.terms.way import furthest_so_far, way_made
 from coopenv.errors import CoopenvError
 from coopenv.world import kernel_cache
 from coopenv.world.collision import UNDER_WAY
+from coopenv.world.launch import near_inlining
 from coopenv.world.precision import Precision
 from coopenv.world.route import remaining_way
 
@@ -197,5 +198,5 @@ def _kernel(function: Callable[..., None], name: str, terms: Sequence[Bound]) ->
     parts = [f"{t.number} {t.size} {t.entries} {t.own} {t.function.key} {_source(t)}" for t in terms]
     fingerprint = sha256("\n".join(parts).encode()).hexdigest()[:12]
     module = wp.get_module(f"{__name__}.{function.__name__}.{name}.{fingerprint}")
-    module.options["enable_backward"] = False
+    module.options.update({"enable_backward": False, **near_inlining()})
     return wp.Kernel(func=function, key=function.__name__, module=module)
