@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from glob import escape
 from pathlib import Path
 from typing import Any
@@ -51,7 +51,12 @@ def start() -> None:
 def launch(kernel: wp.Kernel, **options: Any) -> Any:
     """Do what `wp.launch` does with a kernel that is in memory, in the cache, damaged there, or not compiled yet."""
     name = kernel.module.name
-    with nullcontext() if name in _loaded else _alone(name):
+    if name in _loaded:
+        try:
+            return wp.launch(kernel, **options)
+        except Exception:  # a function of it has been defined anew, and what the cache has of that is damaged
+            _loaded.discard(name)
+    with _alone(name):
         done = _launch(kernel, options)
     _loaded.add(name)
     return done
