@@ -1,7 +1,7 @@
 """The kernels that terms run in, made for the terms that a scenario names: a term that is not named costs nothing.
 
 Each combination of terms has a Warp module of its own, which is compiled once per machine and precision. Loops over
-terms are unrolled by `wp.static`.
+terms are written out (`unrolled.py`).
 """
 
 import inspect
@@ -17,6 +17,7 @@ from coopenv.api.step_results import assess, is_over, remember, set_flags
 from coopenv.api.terms.binding import Bound, Terms
 from coopenv.api.terms.map_view import MapLandmark, Nearest, map_record, next_nearest
 from coopenv.api.terms.records import Ego, Neighbour, Target, Truth, neighbour_record, own_records, target_record
+from coopenv.api.terms.unrolled import unrolled
 from coopenv.api.terms.way import furthest_so_far, way_made
 from coopenv.errors import CoopenvError
 from coopenv.world import kernel_cache
@@ -33,10 +34,11 @@ def put(size: int, entries: tuple[int, ...], own: bool) -> wp.Function:
     NaN of own fields stays.
     """
     many, count = size > 1, len(entries)
+    chosen = wp.types.vector(count, wp.int32)(*entries)
 
     def put_value(out: Any, world: int, vehicle: int, first: int, value: Any, center: wp.float32, factor: wp.float32):
         for place in range(wp.static(count)):
-            entry = wp.float32(value[wp.static(entries[place])] if many else value)
+            entry = wp.float32(value[chosen[place]] if many else value)
             entry = (entry - center) * factor
             clipped = wp.clamp(entry, -1.0, 1.0)
             out[world, vehicle, first + place] = wp.where(wp.isnan(entry), entry, clipped) if own else clipped
@@ -130,7 +132,9 @@ def results_kernel(terms: Terms, p: Precision) -> wp.Kernel:
             for k in range(wp.static(len(of_landmark))):
                 wp.static(of_landmark[k])(out, start, center, factor, world, vehicle, n, ego, landmark)
 
-    return _kernel(step_results, p.name, [*chain(*terms[:5])])
+    loops = {"own": own, "of_target": of_target, "of_neighbour": of_neighbour, "of_landmark": of_landmark}
+    source = unrolled(step_results, rewards=rewards, **loops)
+    return _kernel(step_results, p.name, [*chain(*terms[:5])], source)
 
 
 @cache
@@ -151,7 +155,7 @@ def endings_kernel(conditions: tuple[Bound, ...], p: Precision) -> wp.Kernel:
                 if state.ended[world, vehicle] == UNDER_WAY and wp.static(fulfilled[k])(ego, truth):
                     state.ended[world, vehicle] = wp.static(conditions[k].number)
 
-    return _kernel(end_episodes, p.name, conditions)
+    return _kernel(end_episodes, p.name, conditions, unrolled(end_episodes, fulfilled=fulfilled))
 
 
 def check_own_terms(terms: Terms, device: str) -> None:
@@ -193,10 +197,10 @@ def _source(term: Bound) -> str:
     return inspect.getsource(term.function.func)
 
 
-def _kernel(function: Callable[..., None], name: str, terms: Sequence[Bound]) -> wp.Kernel:
+def _kernel(function: Callable[..., None], name: str, terms: Sequence[Bound], source: str | None = None) -> wp.Kernel:
     """Return a kernel in a module that is named after its terms, the same in every process."""
     parts = [f"{t.number} {t.size} {t.entries} {t.own} {t.function.key} {_source(t)}" for t in terms]
     fingerprint = sha256("\n".join(parts).encode()).hexdigest()[:12]
     module = wp.get_module(f"{__name__}.{function.__name__}.{name}.{fingerprint}")
     module.options.update({"enable_backward": False, **near_inlining()})
-    return wp.Kernel(func=function, key=function.__name__, module=module)
+    return wp.Kernel(func=function, key=function.__name__, module=module, source=source)
