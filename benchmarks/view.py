@@ -5,12 +5,14 @@ frames a second that the environment gives, and at 20, of which that without the
 """
 
 import argparse
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from time import monotonic, process_time, thread_time
 from typing import NamedTuple
 
+from coopenv.errors import CoopenvError
 from coopenv.runs.scenes import driver_of, open_source
 from coopenv.runs.view.reels import EngineReel
 from coopenv.runs.view.serving import serving
@@ -28,13 +30,23 @@ class Measured(NamedTuple):
     simulation: float
 
 
-def main() -> None:
-    """Measure and print a line per environment."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure and print a line per environment; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("environments", nargs="*", default=["busy_intersection", "urban_crossing", "large_crossing"])
     parser.add_argument("--observer", default=None)
     parser.add_argument("--seconds", type=float, default=15.0)
-    asked = parser.parse_args()
+    asked = parser.parse_args(arguments)
+    try:
+        measure(asked)
+    except CoopenvError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def measure(asked: argparse.Namespace) -> None:
+    """Print the table."""
     print(f"{'':20} {'':8} {'':>9} {'of a core':>10} {'the same':>10} {'without the':>12}")
     print(f"{'environment':20} {'watched':8} {'frames/s':>9} {'':>10} {f'at {RATE:g}/s':>10} {'simulation':>12}")
     for name in asked.environments:
@@ -93,7 +105,6 @@ def nobody() -> Iterator[None]:
 def somebody(url: str) -> Iterator[None]:
     """Let a program in a process of its own read all that is sent, as a browser does."""
     import subprocess
-    import sys
 
     code = (
         "import sys, viser\nfrom websockets.sync.client import connect\n"
@@ -112,4 +123,4 @@ def somebody(url: str) -> Iterator[None]:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
