@@ -6,10 +6,11 @@ from contextlib import contextmanager
 from functools import cache
 from hashlib import sha256
 from importlib import import_module
+from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from traceback import extract_tb
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any
 
 from coopenv.errors import CoopenvError, shown, suggest, told
@@ -81,11 +82,19 @@ def _file(place: str, folder: Path | None = None) -> Path:
         raise CoopenvError(f"{shown(place)}: no such file ({getattr(error, 'strerror', None) or error})") from None
 
 
+class _FromSource(SourceFileLoader):
+    """Reads a file as it is now: bytecode is taken for that of a file of the same size and of the same second."""
+
+    def get_code(self, fullname: str) -> CodeType:
+        path = self.get_filename(fullname)
+        return self.source_to_code(self.get_data(path), path)
+
+
 @cache
 def _module_of(path: Path, modified: int) -> ModuleType:
     """Return a file as a module, whose name no other file has."""
     name = f"coopenv_user_{sha256(str(path).encode()).hexdigest()[:12]}_{path.stem}"
-    spec = spec_from_file_location(name, path)
+    spec = spec_from_file_location(name, path, loader=_FromSource(name, str(path)))
     assert spec is not None and spec.loader is not None  # it ends with .py
     module = sys.modules[name] = module_from_spec(spec)  # where dataclasses look for it
     try:

@@ -85,3 +85,12 @@ def test_mistakes_are_one_line(folder: Path, reference: str, message: str) -> No
 
 def test_names_are_no_references() -> None:
     assert is_reference("mine.py:Mine") and not is_reference("riccati")
+
+
+def test_a_file_that_changes_within_a_second_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    path, second = tmp_path / "own.py", 1_700_000_000_000_000_000
+    for value in (3, 4):
+        path.write_text(f"VALUE = {value}\n")
+        os.utime(path, ns=(second, second + value))
+        assert load(f"{path}:VALUE") == value
