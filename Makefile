@@ -42,9 +42,6 @@ $(VENV)/.svea: $(VENV)/.base
 svea-demo: $(VENV)/.svea ## two fake cars overtake in real time; table here, figures in out/svea_overtaking, half a minute
 	@$(BIN)/coopenv svea demo --out out/svea_overtaking
 
-# Without files of bytecode each of the many processes of the tests would read all sources anew.
-unexport PYTHONDONTWRITEBYTECODE
-
 # Three workers on two cores: tests of cars wait for their clock most of the time.
 test: lint ## lint, type check and all tests but the slow ones
 	@$(BIN)/python -m pytest -n 3 --dist loadfile -m "not slow and not nats and not ros1 and not browser"

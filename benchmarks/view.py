@@ -52,6 +52,8 @@ def measure(asked: argparse.Namespace) -> None:
     for name in asked.environments:
         for watched in (False, True):
             frames, cpu, simulation = measured(name, asked.observer, asked.seconds, watched)
+            if frames == 0.0:
+                raise CoopenvError(f"--seconds {asked.seconds:g}: nothing was shown in that time, give more")
             scaled = [100 * cpu, 100 * cpu * RATE / frames, 100 * (cpu - simulation) * RATE / frames]
             shares = " ".join(f"{share:{width}.1f}%" for share, width in zip(scaled, (9, 9, 11), strict=True))
             print(f"{name:20} {'yes' if watched else 'no':8} {frames:9.1f} {shares}", flush=True)

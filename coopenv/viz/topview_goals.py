@@ -37,8 +37,8 @@ class Goals:
 
     def add_names(self, axes: Axes, layers: Layers, others: Sequence[Text]) -> None:
         """Add the names, over all that has been added before and where `others`, which stand still, are not."""
-        low, self._high = axes.get_xlim()
-        self._pixel = (self._high - low) / axes.get_window_extent().width  # m
+        low, self._end = axes.get_xlim()
+        self._pixel = (self._end - low) / axes.get_window_extent().width  # m
         taken = [axes.transData.inverted().transform(other.get_window_extent()) for other in others]
         self._taken = np.array(taken).reshape(-1, 2, 2)  # m, lower left and upper right corners
         halo = [withStroke(linewidth=2.2, foreground="white")]
@@ -69,19 +69,19 @@ class Goals:
     def _put(self, name: Text, center: np.ndarray, radius: np.ndarray) -> None:
         """Write a name into a goal if it fits, else to the right of it, or to the left, where no other name is."""
         extent = name.get_window_extent()
-        wide, high, gap = extent.width * self._pixel, extent.height * self._pixel, _GAP * self._pixel
+        wide, tall, gap = extent.width * self._pixel, extent.height * self._pixel, _GAP * self._pixel
         left, right = float((center[:, 0] - radius).min()), float((center[:, 0] + radius).max())
         y = float((center[:, 1].min() + center[:, 1].max()) / 2)
         places = [right + gap, left - gap - wide]  # of the name's left end
         if len(center) == 1 and wide + 2 * gap < right - left:
             places.insert(0, (left + right - wide) / 2)
-        inside = [x for x in places if x + wide < self._high] or places[-1:]
-        name.set(x=next((x for x in inside if self._is_free(x, y, wide, high)), inside[0]), y=y)
+        inside = [x for x in places if x + wide < self._end] or places[-1:]
+        name.set(x=next((x for x in inside if self._is_free(x, y, wide, tall)), inside[0]), y=y)
 
-    def _is_free(self, x: float, y: float, wide: float, high: float) -> bool:
+    def _is_free(self, x: float, y: float, wide: float, tall: float) -> bool:
         """Return whether a name of a size would cover no other one; `x`, `y`: the middle of its left side, m."""
-        low, far = np.array([x, y - high / 2]), np.array([x + wide, y + high / 2])
-        return not ((self._taken[:, 0] < far) & (self._taken[:, 1] > low)).all(axis=1).any()
+        low, high = np.array([x, y - tall / 2]), np.array([x + wide, y + tall / 2])
+        return not ((self._taken[:, 0] < high) & (self._taken[:, 1] > low)).all(axis=1).any()
 
 
 def touching(center: np.ndarray, radius: np.ndarray) -> list[list[int]]:
