@@ -449,3 +449,25 @@ def test_the_legend_says_why_there_is_no_sigma() -> None:
         view = TopView(load_scenario("busy_intersection", {"observer.name": name}))
         words = [text.get_text() for part in view._figure.legends for text in part.get_texts()]
         assert ("no 3σ: P is a gain matrix" in words) == gain
+
+
+def test_names_of_goals_do_not_cover_those_of_landmarks() -> None:
+    """A landmark's name stands where a goal's would be: in the goal, and, of the other one, to its right."""
+    landmarks = [{"name": "P1", "position": [3.6, 4.0, 1.0]}, {"name": "P2", "position": [-2.7, -4.0, 1.0]}]
+    goals = [{"position": [4.0, 4.2, 0.0], "radius": 1.0}, {"position": [-4.0, -3.8, 0.0], "radius": 0.3}]
+    starts = [{"position": [0.0, -8.0, 0.0]}, {"position": [0.0, 8.0, 0.0]}]
+    vehicles = [
+        {"initial_pose": start, "motion": {"kind": "driven"}, "goal": goal}
+        for start, goal in zip(starts, goals, strict=True)
+    ]
+    made = scenario(vehicles, landmarks=landmarks)
+    engine = Engine(made)
+    engine.reset([0])
+    view = TopView(made)
+    view.draw(engine)
+    texts = {text.get_text(): text.get_window_extent() for text in view._axes.texts if text in view._layers._artists}
+    shown = [name for name in view._goals._names if name.get_text()]
+    assert len(shown) == 2
+    for name in shown:
+        for landmark in ("P1", "P2"):
+            assert not name.get_window_extent().overlaps(texts[landmark])
