@@ -1,6 +1,7 @@
 """`coopenv run`: simulate with progress shown, write the results, print the table."""
 
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from textwrap import fill
 from typing import Any
@@ -58,10 +59,12 @@ def execute(
     if run.policy_name not in ("zero", "recorded") and not scenario.driven:
         log.print("note: all motion here is prescribed, the policy has no effect", soft_wrap=True)
     steady = steady_start(steady_from, scenario.horizon, run.ticks_planned / scenario.rates.camera)
-    with replacing_folder(out, result_names()) as folder:
+    with replacing_folder(out, result_names()) as folder, ExitStack() as films:
         with compile_notice(log):
             run.engine.load()
         film = open_film(folder, scenario.rates.camera / frame_stride(scenario)) if video else None
+        if film is not None:
+            films.enter_context(film)
         scene = _simulate(name, run, film, log, describe)
         trajectory = run.trajectory()
         judged, endings = trajectory.of_vehicles(run.vehicles).where_truth_is_known(), run.endings()

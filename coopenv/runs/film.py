@@ -39,8 +39,11 @@ def write_film(
     """
     film_at(path, fps)  # before anything is drawn
     chosen = frames_at(record.time, fps, speed)
-    with replacing_file(path) as new, closing(TopView(record.scenario, panel=panel)) as view:
-        film = film_at(new, fps)
+    with (
+        replacing_file(path) as new,
+        closing(TopView(record.scenario, panel=panel)) as view,
+        film_at(new, fps) as film,
+    ):
         for done, k in enumerate(chosen, start=1):
             film.add(_within(view.paint(record.frame(int(k))), width))
             on_progress(done / len(chosen))

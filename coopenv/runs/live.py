@@ -114,7 +114,7 @@ def film(scenario: Scenario, policy: Policy, seed: int, folder: Path, log: Conso
     stage = Stage(scenario, log)
     with replacing_folder(folder, FILMS) as new:
         made = open_film(new, scenario.rates.camera / frame_stride(scenario))
-        with Progress(log, f"filming {made.path.name}"):
+        with made, Progress(log, f"filming {made.path.name}"):
             stage.run(policy, seed, made.add, Clock(np.inf), lambda: True)
             made.close()
     return stage

@@ -1,9 +1,10 @@
 """Films: MP4 through ffmpeg where the extra `video` is installed, animated GIF and WebP through Pillow."""
 
+from contextlib import suppress
 from importlib.util import find_spec
 from math import ceil
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from PIL import Image
@@ -23,11 +24,21 @@ def frame_stride(scenario: Scenario) -> int:
 
 
 class Mp4Film:
-    """H.264, written while the pictures come."""
+    """H.264, written while the pictures come, by a process that ends with the context of the film."""
 
     def __init__(self, path: Path, fps: float) -> None:
         self.path, self._fps, self._frames = path, fps, 0
         self._writer: Any = None
+
+    def __enter__(self) -> Self:
+        """Return the film."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop writing; what `close` has not finished is no film."""
+        if self._writer is not None:
+            with suppress(OSError, RuntimeError):
+                self._writer.close()
 
     def add(self, picture: np.ndarray) -> None:
         """Append a picture, cut to even width and height as the codec asks for."""
@@ -73,6 +84,14 @@ class GifFilm:
         """Begin; pictures are made smaller where they are wider or higher than `size` pixels."""
         self.path, self._fps, self._size = path, fps, size
         self._frames: list[Image.Image] = []
+
+    def __enter__(self) -> Self:
+        """Return the film."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Forget the pictures."""
+        self._frames.clear()
 
     def add(self, picture: np.ndarray) -> None:
         """Append a picture."""

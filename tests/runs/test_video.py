@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from inspect import GEN_CLOSED, getgeneratorstate
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +40,13 @@ def test_a_film_that_does_not_fit_on_the_disk_is_told(tmp_path: Path, capfd: pyt
         film(disk / "video.mp4", 12)
     assert "\n" not in str(error.value)
     assert capfd.readouterr() == ("", "")
+
+
+def test_nobody_writes_to_a_film_that_was_left(tmp_path: Path) -> None:
+    with suppress(KeyError), Mp4Film(tmp_path / "video.mp4", 10.0) as made:
+        made.add(pictures(1)[0])
+        raise KeyError
+    assert getgeneratorstate(made._writer) == GEN_CLOSED
 
 
 def test_a_film_without_pictures_is_no_file(tmp_path: Path) -> None:

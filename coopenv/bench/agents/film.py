@@ -25,7 +25,7 @@ def write_film(evaluation: Evaluation, folder: Path, log: Console) -> Path:
     scenario = evaluation.entrants[0].scenario
     seed = held_out_seeds(evaluation.block, evaluation.worlds)[0]
     film = open_film(folder, scenario.rates.camera / frame_stride(scenario))
-    with Progress(log, f"filming {film.path.name}", scenario.horizon_ticks) as progress:
+    with film, Progress(log, f"filming {film.path.name}", scenario.horizon_ticks) as progress:
         for done, pictures in enumerate(_together([pictures_of(entrant, seed) for entrant in evaluation.entrants])):
             film.add(tiled(pictures))
             progress.update(done * frame_stride(scenario))
