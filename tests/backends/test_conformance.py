@@ -176,6 +176,7 @@ def test_masks_and_ages_mean_the_same(make: Make) -> None:
     try:
         env.reset(seed=5)
         ever_seen, ever_heard, steps = False, False, 0
+        known, errors = env.engine.backend.capabilities.truth, dict[str, float]()
         while env.agents and steps < 25:
             observations, rewards, _, _, infos = env.step(dict.fromkeys(env.agents, AHEAD))
             steps += 1
@@ -184,11 +185,13 @@ def test_masks_and_ages_mean_the_same(make: Make) -> None:
                 assert all(part.dtype == np.float32 and np.isfinite(part).all() for part in seen.values())
                 masks_and_ages(env, agent, seen, infos[agent])
                 ever_seen |= bool(infos[agent]["visible"])
+                # A computer that was busy leaves gaps in the poses of a bag: the truth is then NaN for some ticks.
+                if np.isfinite(error := infos[agent]["position_error"]):
+                    errors[agent] = error
             ever_heard |= bool(observations.get("vehicle_2", {"message_mask": np.zeros(1)})["message_mask"].any())
         assert steps > 15 and ever_seen and ever_heard
-        errors = [info["position_error"] for info in infos.values()]
-        known = env.engine.backend.capabilities.truth
-        assert all(error < 0.2 if known else np.isnan(error) for error in errors)
+        assert sorted(errors) == (env.possible_agents if known else [])
+        assert all(error < 0.2 for error in errors.values()), errors
     finally:
         env.close()
 
