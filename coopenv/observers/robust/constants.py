@@ -22,6 +22,8 @@ JUMP_GATE = 32.5
 MAX_SMOOTH_ACCELERATION, MAX_SMOOTH_ANGULAR_ACCELERATION = 10.0, 30.0
 """m/s^2 and rad/s^2 beyond which a change is one that no brakes and no steering make. Chosen."""
 
+VELOCITY_TIME = 1.0
+"""s over which the velocity is averaged by which a scale error counts. Chosen: little noise is left, and little lag."""
 ERRORS_TIME = 1.0
 """s for which an error of a vehicle's odometry that lasts counts as the same where it is taken as noise. Chosen."""
 SHARE_OF_CHANGE, LEAST_CHANGE = 0.2, 0.05
@@ -84,6 +86,10 @@ DEPENDENT_SHARE = 0.7
 """Share that counts of the information of a sender that depends on others: some may have arrived already. Tuned."""
 STEPS = 127  # of a correlation, as it is sent
 MAX_CORRELATIONS = 2  # in a message, which has 256 bytes then
+RETURNING_SHARE = 0.7
+"""Ratio of the variance of a sender's position to that of one's own, above which bearings to it do not count if it
+depends on this vehicle: then no circle of vehicles confirms itself. Tuned: at 1 they change places too often, and at
+0.5 much is left unused."""
 LEAST_NEWS = 0.1
 """Share of a sender's variance that counts as noise of the step by which it moves at its next message: what it has
 learnt in small steps it has learnt by linearisations, which add up. Tuned."""
@@ -96,8 +102,9 @@ RELATIVE_NOISE = 1e-6  # share of a variance, that regressions have as noise
 LEAST_FORGIVEN = 0.005
 """Share of its covariance that is added to that of a sender which depends on others. What is told of correlations is
 not all there is, so that everybody is a little too sure, and who hears him more so. Tuned."""
-MAX_CONTRADICTION = 0.1
-"""By how much of its covariance a sender may seem to know itself better than what it tells of others allows. Chosen."""
+LEAST_CONTRADICTION, MAX_CONTRADICTION = 0.0125, 0.1
+"""By how much of its covariance a sender may seem to know itself better than what it tells of others allows: the first
+share that is tried, and the last, each twice the one before. Chosen."""
 MAX_VARIANCE_GROWTH = 1.01
 """Ratio of a variance to the predicted one; beyond it the sender has lost information, and its message has no news."""
 MAX_GROWTH = 2.0  # of a variance by information that is negative by rounding; it is below 1.1 as a rule

@@ -37,10 +37,14 @@ def summed(drift: Drift, x: Any, N: Any, dt: Any, time: Any):
 
 
 @device_function
-def note_step(memory: Any, world: int, i: int, sender: int, last: Report, report: Report, noise: Any, dt: Any):
+def note_step(
+    memory: Any, world: int, i: int, sender: int, last: Report, report: Report, noise: Any, lasting: Any, dt: Any
+):
     """Sum up by how far a sender says to be from where its odometry has led since its last report.
 
-    Who has been silent for long, or knows much less than before, may be anywhere. Return how far (3,), m, in the map.
+    Who has been silent for long, or knows much less than before, may be anywhere. `noise` and `lasting` are variances
+    (rotation, translation) of the odometry, rad^2 and m^2; errors that last are the same in all steps of a sum.
+    Return how far (3,), m, in the map.
     """
     step = algebra.between(last.odometry, report.odometry)
     carried = algebra.carried(Estimate(last.pose, mat66d(last.P)), step, noise)
@@ -58,8 +62,11 @@ def note_step(memory: Any, world: int, i: int, sender: int, last: Report, report
     if gained < wp.float64(0.0):
         N = mat33d()
     N = N + wp.float64(constants.SLACK) * noise[1] * one
-    word.drift = summed(word.drift, x, N, dt, wp.float64(constants.DRIFT_TIME))
-    word.slow_drift = summed(word.slow_drift, x, N, dt, wp.float64(constants.SLOW_DRIFT_TIME))
+    same = lasting[1] * one
+    fast = N + wp.float64(constants.DRIFT_TIME / constants.ERRORS_TIME) * same
+    slow = N + wp.float64(constants.SLOW_DRIFT_TIME / constants.ERRORS_TIME) * same
+    word.drift = summed(word.drift, x, fast, dt, wp.float64(constants.DRIFT_TIME))
+    word.slow_drift = summed(word.slow_drift, x, slow, dt, wp.float64(constants.SLOW_DRIFT_TIME))
     memory.word[world, i, sender] = word
     return x
 

@@ -10,7 +10,7 @@ import warp as wp
 from coopenv.estimation.linalg import block3
 from coopenv.estimation.so3 import exp_so3, skew
 from coopenv.observers.contract import MIN_BEARING_STD
-from coopenv.observers.robust.algebra import between, by_rows, odometry_noise
+from coopenv.observers.robust.algebra import averaging_time, between, by_rows, odometry_noise
 from coopenv.observers.robust.belief import index_of
 from coopenv.observers.robust.constants import (
     BEND_TIME,
@@ -24,6 +24,7 @@ from coopenv.observers.robust.constants import (
 from coopenv.observers.robust.memory import Frame, mat26d, vec3d
 from coopenv.observers.robust.mounting import mounting_of, mounting_variances
 from coopenv.observers.robust.odometry import increment_noise
+from coopenv.observers.robust.tracklets import only_returns
 from coopenv.observers.robust.trust import is_barred
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.device_function import device_function
@@ -90,14 +91,31 @@ def received_variance(model: Any, memory: Any, world: int, i: int, sender: int, 
     return factor * (variance + gone * gone)
 
 
+@wp.func
+def frames_in(time: Any, period: Any):
+    """Return how many frames, one every `period` (s), there are in a time (s): at least one."""
+    return wp.max(time / period, wp.float64(1.0))
+
+
 @device_function
 def set_line_to_member(
-    model: Any, memory: Any, world: int, i: int, n: int, member: int, heard: bool, tick: int, b: Any, purpose: int
+    model: Any,
+    memory: Any,
+    world: int,
+    i: int,
+    n: int,
+    member: int,
+    heard: bool,
+    tick: int,
+    b: Any,
+    period: Any,
+    purpose: int,
 ) -> bool:
     """Let a bearing be to a member, which has moved on since its last message that was fused; return whether it is.
 
     By its odometry as far as messages tell it, and from there by its last twist. Until a second message tells that,
     its bearing says nothing, but for a resection: there it has gone as little as in the search that comes before.
+    What is the same for some frames, which follow one another by `period`, counts once in all of them.
     """
     stands = memory.member[world, i, member].report.tick
     sender = memory.member[world, i, member].vehicle
@@ -114,7 +132,7 @@ def set_line_to_member(
     age = wp.float64(tick - stands) * model.camera_period
     if age > wp.float64(0.0):
         away = wp.float64(HALF_ACCELERATION) * age * age
-        variance += odometry_noise(model, i, age)[1] + away * away
+        variance += odometry_noise(model, i, age)[1] * frames_in(age, period) + away * away
         if memory.member[world, i, member].has_twist == 0:
             if purpose == TRACKING:
                 return False
@@ -123,7 +141,8 @@ def set_line_to_member(
         else:
             half_turn = memory.member[world, i, member].w * (wp.float64(0.5) * age)
             gone = gone + turned * (exp_so3(half_turn) * memory.member[world, i, member].v * age)
-            variance += memory.member[world, i, member].velocity_variance * age * age
+            averaged = frames_in(averaging_time(model, i), period)
+            variance += memory.member[world, i, member].velocity_variance * age * age * averaged
     set_line(memory, world, n, member, b, gone, variance)
     return True
 
@@ -146,8 +165,8 @@ def set_line_to_target(
             set_line(memory, world, n, 0, b, memory.inbox[world, i, sender].pose.p, variance)
         return heard
     member = index_of(memory, world, i, sender)
-    if member > 0:
-        return set_line_to_member(model, memory, world, i, n, member, heard, tick, b, purpose)
+    if member > 0 and not (purpose == TRACKING and only_returns(memory, world, i, member)):
+        return set_line_to_member(model, memory, world, i, n, member, heard, tick, b, period, purpose)
     return False
 
 

@@ -99,6 +99,7 @@ class Belief:
     has_sample: wp.int32  # whether there has been a tick
     sample_v: vec3d  # m/s, body: the odometry sample held at the last tick's end
     sample_w: vec3d  # rad/s, body
+    mean_v: vec3d  # m/s, body: of the samples of late, see odometry.py
     members: wp.int32  # how many
     others: wp.int32  # the first of them that is another vehicle; before it the odometry's errors and the mounting
     depends_on: wp.uint64  # bits of vehicles

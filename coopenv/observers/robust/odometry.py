@@ -20,6 +20,7 @@ from coopenv.observers.robust.constants import (
     MAX_SMOOTH_ANGULAR_ACCELERATION,
     MIN_ERROR_STD,
     SAME_TIME,
+    VELOCITY_TIME,
 )
 from coopenv.observers.robust.memory import ERRORS, Member, Pose, mat33d, mat66d, vec2d, vec3d
 from coopenv.observers.robust.mounting import begin_mounting, has_mounting_errors
@@ -95,14 +96,20 @@ def corrected(memory: Any, world: int, i: int, step: Pose, dt: Any):
 
 @device_function
 def errors_transition(memory: Any, world: int, i: int, step: Pose, dt: Any):
-    """Return the derivative, 6x6, of the left error after a corrected increment by the odometry's errors."""
+    """Return the derivative, 6x6, of the left error after a corrected increment by the odometry's errors.
+
+    The velocity is the mean of a second (m/s, body), not the measured one, whose noise is in the pose's error as well:
+    regressing one on the other would give a scale error of the ratio of noise to velocity, squared.
+    Source: errors in variables, Fuller, Measurement Error Models, 1987, section 1.1.
+    """
     scale = wp.float64(1.0) + memory.member[world, i, ERRORS].v[0]
+    p = (dt / scale) * memory.belief[world, i].mean_v
     Rt = wp.transpose(step.R)
     G = mat66d()
     for k in range(3):
         G[k, k] = -dt
-    G[3:, :3] = Rt * skew((wp.float64(0.5) * dt) * step.p)
-    along = -(Rt * step.p) / scale
+    G[3:, :3] = Rt * skew((wp.float64(0.5) * dt) * p)
+    along = -(Rt * p) / scale
     for k in range(3):
         G[k + 3, 3] = along[k]
     return G
@@ -164,6 +171,7 @@ def jump_variance(change: Any, std: Any, period: Any, smooth: Any):
 def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: Any):
     """Return the increment over a tick of dt and variances to add to its noise; carry the dead reckoning through it.
 
+    The mean velocity of late is kept, too, for `errors_transition`.
     Samples are held until the next one, so that the sum lags by half a period. Half of what the held sample has changed
     by makes it the trapezoidal rule: (v0 + v1) T / 2 = v0 T + (v1 - v0) T / 2. The noise that comes in goes out again
     with the next sample.
@@ -183,6 +191,10 @@ def take_odometry(model: Any, state: Any, memory: Any, world: int, i: int, dt: A
         linear, angular = wp.float64(MAX_SMOOTH_ACCELERATION), wp.float64(MAX_SMOOTH_ANGULAR_ACCELERATION)
         noise[0] = jump_variance(change_w, wp.float64(model.noise[i].angular_velocity), period, angular)
         noise[1] = jump_variance(change_v, wp.float64(model.noise[i].velocity), period, linear)
+        share = dt / (dt + wp.float64(VELOCITY_TIME))
+        memory.belief[world, i].mean_v = memory.belief[world, i].mean_v + share * (v - memory.belief[world, i].mean_v)
+    else:
+        memory.belief[world, i].mean_v = v
     memory.belief[world, i].has_sample = 1
     memory.belief[world, i].sample_v = v
     memory.belief[world, i].sample_w = w

@@ -142,6 +142,31 @@ def test_sender(memory: Any, world: int, i: int, n: int, told: Estimate, dt: Any
 
 
 @device_function
+def depends_on_own(memory: Any, world: int, i: int, n: int) -> bool:
+    """Return whether what member n says may be this vehicle's own words."""
+    return (memory.member[world, i, n].report.depends_on & bit_of(i)) != wp.uint64(0)
+
+
+@wp.func
+def position_variance(P: Any):
+    """Return the sum of the variances of a position, m^2."""
+    return wp.float64(P[3, 3] + P[4, 4] + P[5, 5])
+
+
+@device_function
+def only_returns(memory: Any, world: int, i: int, n: int) -> bool:
+    """Return whether member n depends on this vehicle and knows its place hardly better.
+
+    In a circle of vehicles the one that knows its place best does not follow the one before it: the rest has an order,
+    as the paper's Assumption 1 has it for all.
+    """
+    if memory.member[world, i, n].considered == 0 or not depends_on_own(memory, world, i, n):
+        return False
+    own = position_variance(memory.P[world, i, 0, 0])
+    return position_variance(memory.member[world, i, n].report.P) > wp.float64(constants.RETURNING_SHARE) * own
+
+
+@device_function
 def information_share(memory: Any, world: int, i: int, depends_on: wp.uint64):
     """Return which share of its new information counts of a sender that depends on these vehicles.
 
@@ -155,7 +180,7 @@ def information_share(memory: Any, world: int, i: int, depends_on: wp.uint64):
         return wp.float64(constants.DEPENDENT_SHARE)
     count = int(1)
     for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
-        if (memory.member[world, i, n].report.depends_on & own) != wp.uint64(0):
+        if depends_on_own(memory, world, i, n):
             count += 1
     return wp.float64(1.0) / wp.float64(count)
 

@@ -74,7 +74,7 @@ def test_the_errors_drive_the_pose_as_finite_differences_say() -> None:
     belief.move(0, dR, dp, np.zeros(6))
     assert_allclose(belief.own.p, expected[1], atol=5e-4 * dt)
     assert_allclose(belief.own.R, expected[0], atol=5e-4 * dt)
-    belief.drift(dR, dp, dt)
+    belief.drift(dR, v, dt)
     for k in range(4):
         change = left_error(*expected, *after(1e-4 * np.eye(4)[k])) / 1e-4
         assert_allclose(belief.P[:6, 6 + k], change, atol=3e-2 * dt)

@@ -123,10 +123,11 @@ class Belief:
         turn = self.errors.w * dt
         return dR.dot(exp_so3(-turn)), (dp - np.cross(turn, dp) / 2) / (1.0 + self.errors.v[0])
 
-    def drift(self, dR: Array, dp: Array, dt: float) -> None:
-        """Let the odometry's errors be in the vehicle's own after a corrected increment."""
+    def drift(self, dR: Array, v: Array, dt: float) -> None:
+        """Let the odometry's errors be in the vehicle's own after a corrected increment at a measured mean velocity."""
         if self.errors is None or self.errors.v is None:
             return
+        dp = v * dt / (1.0 + self.errors.v[0])
         A = np.eye(len(self.P))
         A[:3, 6:9] = -dt * np.eye(3)
         A[3:6, 6:9] = dR.T.dot(skew(dp)) * dt / 2
@@ -189,7 +190,7 @@ class Belief:
         dR, dp = R.T.dot(odometry_turn), R.T.dot(odometry_position - p)
         self.move(n, dR, dp, noise.odometry(dt) + as_noise(self.errors_covariance, dp, dt, ERRORS_TIME))
         q = float(noise.odometry(1.0)[3])
-        averaged = max((q / (4.0 * MAX_ACCELERATION**2)) ** (1.0 / 3.0), dt / 2.0)
+        averaged = max(averaging_time(noise), dt / 2.0)
         member.velocity_variance = (MAX_ACCELERATION * averaged) ** 2 + q / (2.0 * averaged)
         v, w = dp / dt, log_so3(dR) / dt
         if member.v is None or member.w is None:
@@ -406,6 +407,11 @@ def recentring(dx: Array) -> Array:
         G[n : n + 3, n : n + 3] = np.eye(3) - (1 - np.cos(x)) / x**2 * S + (x - np.sin(x)) / x**3 * S @ S
         G[n + 3 : n + 6, n + 3 : n + 6] = exp_so3(-w)
     return G
+
+
+def averaging_time(noise: SensorNoise) -> float:
+    """Return over which time a velocity by odometry is averaged, s."""
+    return float((noise.odometry(1.0)[3] / (4.0 * MAX_ACCELERATION**2)) ** (1.0 / 3.0))
 
 
 def errors_of(members: Sequence[int]) -> NDArray[np.int64]:

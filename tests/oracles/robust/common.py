@@ -32,8 +32,9 @@ from coopenv.observers.robust.constants import (
     MOUNTING_WALK,
     SAME_TIME,
     SURE,
+    VELOCITY_TIME,
 )
-from tests.oracles.robust.belief import Belief, Member
+from tests.oracles.robust.belief import Belief, Member, averaging_time
 from tests.oracles.robust.matrices import solve_positive
 from tests.oracles.robust.odometry import Lasting, as_noise, trapezoidal
 from tests.oracles.robust.resection import resect
@@ -104,6 +105,10 @@ class Common:
     def update(self, tick: Tick) -> Estimate:
         """Take one camera tick."""
         before, self.sample = self.sample, (tick.angular_velocity, tick.velocity)
+        if before is None:
+            self.mean_velocity = tick.velocity
+        share = tick.dt / (tick.dt + VELOCITY_TIME)
+        self.mean_velocity = self.mean_velocity + share * (tick.velocity - self.mean_velocity)
         tick, jumps = trapezoidal(tick, before, self.noise.odometry_period, self.sample_noise)
         dR, dp = self.belief.corrected(tick.rotation, tick.translation, tick.dt)
         tick = replace(tick, rotation=dR, translation=dp)
@@ -118,7 +123,7 @@ class Common:
                 self._search(tick)
         else:
             self.belief.move(0, tick.rotation, tick.translation, noise)
-            self.belief.drift(tick.rotation, tick.translation, tick.dt)
+            self.belief.drift(tick.rotation, self.mean_velocity, tick.dt)
             self.belief.own.time = tick.time
             self._listen(tick)
             if tick.due:
@@ -282,12 +287,16 @@ class Common:
         """Return whether a sender is not to be believed."""
         return False
 
+    def _only_returns(self, member: Member) -> bool:
+        """Return whether bearings to a member do not count, because it may say one's own words."""
+        return False
+
     def _view(self, tick: Tick, resecting: bool = False) -> View:
         """Return the frame's bearings to landmarks and to members of the belief, as measurements."""
         belief = self.belief
         heard = {report.vehicles[0]: report for report in self._reports(tick)}
         known, z, drift, counts, places, points = [], [], [], [], [], []
-        targets = tick.targets.tolist()
+        targets, period = tick.targets.tolist(), max(tick.time - self.frame_time, tick.dt)
         for n in tick.valid.nonzero()[0].tolist():  # landmarks come first
             vehicle = targets[n] - self.landmarks
             if vehicle < 0:
@@ -295,6 +304,8 @@ class Common:
                 drift.append(0.0)
                 counts.append(True)
             elif (place := belief.place(vehicle)) is not None:
+                if not resecting and self._only_returns(belief.members[place]):
+                    continue
                 member, contact = belief.members[place], self.contacts.get(vehicle)
                 turned, gone, stands, variance = self._gone(member, heard.get(vehicle))
                 age = tick.time - stands
@@ -307,7 +318,9 @@ class Common:
                 z.append(member.p + member.R.dot(point))
                 places.append(place)
                 points.append(point)
-                drift.append(variance + unknown**2 + self._drift(age) + member.velocity_variance * max(age, 0.0) ** 2)
+                variance += unknown**2 + self._drift(age, period)
+                frames = max(averaging_time(self.noise) / period, 1.0)
+                drift.append(variance + member.velocity_variance * max(age, 0.0) ** 2 * frames)
                 counts.append(contact is None or contact.trusted)
             else:
                 continue
@@ -319,7 +332,7 @@ class Common:
             places,
             points,
             not resecting,
-            max(tick.time - self.frame_time, tick.dt),
+            period,
         )
         variance = self.variance + (self.mounting[0] if resecting else 0.0)
         noise = variance + np.array(drift) / sight.distance**2 + sight.bend
@@ -338,8 +351,8 @@ class Common:
         noise = self.noise.odometry(dt) + as_noise(self.belief.errors_covariance, dp, dt, ERRORS_TIME)
         return dR, dp, float(report.time[0]), float(noise[3])
 
-    def _drift(self, age: float) -> float:
+    def _drift(self, age: float, period: float) -> float:
         """Return the variance per axis, m^2, of where a sender is a time after its last message."""
         if age <= 0.0:
             return 0.0
-        return float(self.noise.odometry(age)[3]) + (0.5 * MAX_ACCELERATION * age * age) ** 2
+        return float(self.noise.odometry(age)[3]) * max(age / period, 1.0) + (0.5 * MAX_ACCELERATION * age * age) ** 2

@@ -30,6 +30,7 @@ from coopenv.observers.robust.constants import (
     DRIFT_GATE,
     ENOUGH_LANDMARKS,
     ERROR_FACTOR,
+    ERRORS_TIME,
     GROSS_ERROR,
     GROSS_TURN,
     KNOWN_ANGLE,
@@ -42,6 +43,7 @@ from coopenv.observers.robust.constants import (
     MAX_CORRELATIONS,
     MAX_TOLD_ANGLE,
     NEWS_TIME,
+    RETURNING_SHARE,
     SAME_TIME,
     SEPARATION_GATE,
     SHARE_OF_CHANGE,
@@ -54,6 +56,7 @@ from tests.oracles.robust.alone import Alone, cost_of, most_of_consistent
 from tests.oracles.robust.belief import Member, recentring
 from tests.oracles.robust.common import Anchor, Common, Contact
 from tests.oracles.robust.eviction import room_for
+from tests.oracles.robust.odometry import as_noise
 from tests.oracles.robust.sight import View
 from tests.oracles.robust.told import Correlations, factor, is_positive, is_same, regress
 from tests.oracles.robust.tracklets import Report, left_error, marker_jacobian, mask_of
@@ -197,7 +200,10 @@ class Robust(Common):
         self.depends_on |= report.depends_on
         report = replace(report, P=report.P + self._by_clocks(belief.members[n]))
         if not anew:
-            self._step(n, report, steady)
+            lasting = as_noise(belief.errors_covariance, step, dt, ERRORS_TIME)
+            known = bool((lasting <= self.noise.odometry(dt)).all())
+            belief.P[6 * n : 6 * n + 6, 6 * n : 6 * n + 6] -= np.diag(lasting)  # what that takes is no news
+            self._step(n, report, steady and known and not self._depends_on_own(report))
             return
         member, block = belief.members[n], slice(6 * n, 6 * n + 6)
         member.considered = True
@@ -440,10 +446,19 @@ class Robust(Common):
         """
         if not report.depends_on:
             return 0.0
-        own = int(mask_of({self.vehicle}))
-        if not report.depends_on & own:
+        if not self._depends_on_own(report):
             return LEAST_FORGIVEN
-        return float(sum(bool(contact.last.depends_on & own) for contact in self.contacts.values()))
+        return float(sum(self._depends_on_own(contact.last) for contact in self.contacts.values()))
+
+    def _depends_on_own(self, report: Report) -> bool:
+        """Return whether what a report says may be one's own words."""
+        return bool(report.depends_on & int(mask_of({self.vehicle})))
+
+    def _only_returns(self, member: Member) -> bool:
+        """Return whether a member depends on this vehicle and knows its place hardly better."""
+        if not member.considered or not self._depends_on_own(report := self.contacts[member.vehicle].last):
+            return False
+        return bool(report.P[3:6, 3:6].trace() > RETURNING_SHARE * self.belief.P[3:6, 3:6].trace())
 
     def _step(self, n: int, report: Report, following: bool) -> None:
         """Put a trusted sender where it says that it is; the step d there tells of all errors that correlate with it.

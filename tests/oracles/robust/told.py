@@ -9,6 +9,7 @@ import numpy as np
 from coopenv.estimation.arrays import Array, cholesky
 from coopenv.observers.contract import Message
 from coopenv.observers.robust.constants import (
+    LEAST_CONTRADICTION,
     MAX_CONTRADICTION,
     RELATIVE_NOISE,
     ROUNDING,
@@ -99,7 +100,7 @@ def regress(
     Known is its covariance `after`, that with the errors of which `crosses` tells and, where the sender was heard
     before, that with its error then, which is `after`, too. Regressed on these errors it correlates with the others as
     they do, and the joint covariance stays positive definite, if what is left over is. Where that is not so, a share of
-    its covariance is forgiven; else less is taken as known; -1: nothing is left.
+    its covariance is forgiven; else less is taken as known; -1: nothing is left, and the error before has grown.
     """
     block = slice(6 * n, 6 * n + 6)
     for used in (crosses, {}) if crosses else ({},):
@@ -111,11 +112,14 @@ def regress(
         right = np.hstack([after] * heard + list(used.values()))
         L = np.linalg.solve(J + RELATIVE_NOISE * np.diag(J.diagonal()), right.T).T
         left = after - L.dot(J).dot(L.T)
-        for needed, forgiven in ((0.0, least), (MAX_CONTRADICTION, max(MAX_CONTRADICTION, least))):
+        for needed in (0.0, *np.geomspace(LEAST_CONTRADICTION, MAX_CONTRADICTION, 4)):
             if is_positive(left + needed * after):
-                row = L.dot(P[index])
+                forgiven = max(float(needed), least)
+                row = L.dot(P[index]) * np.sqrt((1.0 + forgiven) / (1.0 + needed))
                 row[:, block] = (1.0 + forgiven) * after
                 return row, forgiven
     row = np.zeros((6, len(P)))
+    if heard:
+        row = factor(after).dot(np.linalg.solve(factor(P[block, block]), P[block]))
     row[:, block] = after
     return row, -1.0

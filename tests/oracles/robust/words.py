@@ -76,7 +76,8 @@ class Word:
         """
         dR, dp = new.motion_since(last, 0)
         dt = float(new.time[0] - last.time[0])
-        Q = noise.odometry(dt) + as_noise(errors, dp, dt, ERRORS_TIME)
+        lasting = as_noise(errors, dp, dt, ERRORS_TIME)
+        Q = noise.odometry(dt) + lasting
         F = LeftError.transition(dR, dp)
         before = (F.dot(last.P).dot(F.T) + np.diag(Q))[3:, 3:]
         R, N = orthonormalise(last.R[0].dot(dR)), before - new.P[3:6, 3:6]
@@ -84,8 +85,8 @@ class Word:
         if dt > SILENCE_TIME or N.trace() < -ADMISSION * before.trace():
             self.drift, self.slow_drift = Drift(DRIFT_TIME), Drift(SLOW_DRIFT_TIME)
         N = (R.dot(N).dot(R.T) if N.trace() >= 0.0 else np.zeros((3, 3))) + SLACK * Q[3] * np.eye(3)
-        self.drift.add(x, N, dt)
-        self.slow_drift.add(x, N, dt)
+        for drift in (self.drift, self.slow_drift):  # in which errors that last are the same
+            drift.add(x, N + drift.time / ERRORS_TIME * lasting[3] * np.eye(3), dt)
         if not trusted:
             return
         covariance = np.linalg.inv(self.certainty)

@@ -17,11 +17,11 @@ from coopenv.observers.robust.drift import drift_of, has_jumped, note_step
 from coopenv.observers.robust.evidence import carry_evidence
 from coopenv.observers.robust.measurements import is_heard
 from coopenv.observers.robust.memory import mat66d, vec6d
-from coopenv.observers.robust.odometry import increment_noise
+from coopenv.observers.robust.odometry import lasting_noise
 from coopenv.observers.robust.told.clocks import by_clocks, changes_speed
 from coopenv.observers.robust.told.correlations import place_of, rank
 from coopenv.observers.robust.told.regression import is_positive, regress
-from coopenv.observers.robust.tracklets import bit_of, propagate_member
+from coopenv.observers.robust.tracklets import bit_of, depends_on_own, propagate_member
 from coopenv.observers.robust.trust import is_barred, judge
 from coopenv.world.camera import VISIBLE
 from coopenv.world.device_function import device_function
@@ -83,10 +83,16 @@ def follow(memory: Any, world: int, i: int, n: int, d: Any, N: Any):
 
 
 @device_function
-def step_to(model: Any, memory: Any, world: int, i: int, n: int, following: bool):
-    """Put a trusted member where its new report says that it is, and follow the step there if that tells anything."""
+def step_to(model: Any, memory: Any, world: int, i: int, n: int, following: bool, lasting: Any):
+    """Put a trusted member where its new report says that it is, and follow the step there if that tells anything.
+
+    `lasting`, variances (rotation, translation) in rad^2 and m^2, is what errors of its odometry that last may have
+    added since the last one. The sender knows them, how well nobody else knows: so they do not count here, because it
+    would seem to have learnt what it has not lost.
+    """
     report = memory.member[world, i, n].report
     after = mat66d(report.P) + by_clocks(model, memory, world, i, n)
+    memory.P[world, i, n, n] = algebra.with_noise(memory.P[world, i, n, n], -lasting)
     news = algebra.left_error(memory.member[world, i, n].pose, report.pose)
     G = algebra.recentring(news)
     members = memory.belief[world, i].members
@@ -125,12 +131,14 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick:
     report = memory.inbox[world, i, sender]
     dt = wp.float64(sent - before) * model.camera_period
     step = algebra.between(last.odometry, report.odometry)
-    noise = increment_noise(model, memory, world, i, step, dt)
+    white = algebra.odometry_noise(model, i, dt)
+    lasting = lasting_noise(memory, world, i, step, dt, wp.float64(constants.ERRORS_TIME))
+    noise = white + lasting
     jumped = has_jumped(model, memory, world, i, n, step, dt)
     propagate_member(model, memory, world, i, n, step, dt, noise)
     steady = not changes_speed(model, memory, world, i, n)
     memory.member[world, i, n].report = report
-    learnt = note_step(memory, world, i, sender, last, report, noise, dt)
+    learnt = note_step(memory, world, i, sender, last, report, noise, lasting, dt)
     if memory.member[world, i, n].distrusted == 0:  # else there is no evidence, and what it says may leap
         carry_evidence(memory, world, i, sender, learnt, noise[1])
     drift = drift_of(memory, world, i, n)
@@ -142,7 +150,9 @@ def hear(model: Any, memory: Any, world: int, i: int, n: int, sender: int, tick:
     if anew:
         place(model, memory, world, i, n)
     else:
-        step_to(model, memory, world, i, n, steady)
+        telling = steady and lasting[0] <= white[0] and lasting[1] <= white[1]
+        telling = telling and not depends_on_own(memory, world, i, n)
+        step_to(model, memory, world, i, n, telling, lasting)
 
 
 @device_function

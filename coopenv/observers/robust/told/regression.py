@@ -13,7 +13,7 @@ import warp as wp
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.memory import mat66d
 from coopenv.observers.robust.told.correlations import correlation_of, factor
-from coopenv.observers.robust.tracklets import bit_of
+from coopenv.observers.robust.tracklets import depends_on_own
 from coopenv.world.device_function import device_function
 
 INFLATION = 1.0 + constants.RELATIVE_NOISE
@@ -104,6 +104,22 @@ def is_positive(P: Any) -> bool:
     return wp.min(wp.get_diag(P)) > wp.float64(0.0)
 
 
+@wp.func
+def contradiction_of(left: Any, after: Any):
+    """Return which share of a sender's covariance makes what is left over positive definite; -1: too large a one.
+
+    No more than has to be: what is added correlates with nothing.
+    """
+    if is_positive(left):
+        return wp.float64(0.0)
+    share = wp.float64(constants.LEAST_CONTRADICTION)
+    while share < wp.float64(1.5 * constants.MAX_CONTRADICTION):
+        if is_positive(left + share * after):
+            return share
+        share = share * wp.float64(2.0)
+    return wp.float64(-1.0)
+
+
 @device_function
 def least_forgiven(memory: Any, world: int, i: int, n: int):
     """Return the share of its covariance that is added to member n's: a little if it depends on others.
@@ -113,12 +129,11 @@ def least_forgiven(memory: Any, world: int, i: int, n: int):
     depends_on = memory.member[world, i, n].report.depends_on
     if depends_on == wp.uint64(0):
         return wp.float64(0.0)
-    own = bit_of(i)
-    if (depends_on & own) == wp.uint64(0):
+    if not depends_on_own(memory, world, i, n):
         return wp.float64(constants.LEAST_FORGIVEN)
     count = wp.float64(0.0)
     for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
-        if (memory.member[world, i, k].report.depends_on & own) != wp.uint64(0):
+        if depends_on_own(memory, world, i, k):
             count += wp.float64(1.0)
     return count
 
@@ -134,15 +149,15 @@ def try_known(memory: Any, world: int, i: int, n: int, after: Any, count: int):
     for a in range(count):
         block = regressed(memory, world, i, count, memory.known[world, a].member)
         left = left - block * wp.transpose(memory.known[world, a].coefficient)
-    forgiven = wp.float64(-1.0)
-    if is_positive(left):
-        forgiven = least_forgiven(memory, world, i, n)
-    elif is_positive(left + wp.float64(constants.MAX_CONTRADICTION) * after):
-        forgiven = wp.max(wp.float64(constants.MAX_CONTRADICTION), least_forgiven(memory, world, i, n))
-    if forgiven >= wp.float64(0.0):
-        for k in range(memory.belief[world, i].members):
-            memory.scratch[world, k].row = regressed(memory, world, i, count, k)
-        memory.scratch[world, n].row = (wp.float64(1.0) + forgiven) * after
+    needed = contradiction_of(left, after)
+    if needed < wp.float64(0.0):
+        return needed
+    forgiven = wp.max(needed, least_forgiven(memory, world, i, n))
+    # What is forgiven beyond that is the same error, only larger.
+    growth = wp.sqrt((wp.float64(1.0) + forgiven) / (wp.float64(1.0) + needed))
+    for k in range(memory.belief[world, i].members):
+        memory.scratch[world, k].row = growth * regressed(memory, world, i, count, k)
+    memory.scratch[world, n].row = (wp.float64(1.0) + forgiven) * after
     return forgiven
 
 
@@ -150,7 +165,8 @@ def try_known(memory: Any, world: int, i: int, n: int, after: Any, count: int):
 def regress(memory: Any, world: int, i: int, n: int, after: Any, heard: bool):
     """Set `scratch.row` to the covariance of member n's new error with all errors; return what is forgiven the sender.
 
-    That is a share of its covariance. Where more would have to be, less is taken as known; -1: nothing is left.
+    That is a share of its covariance. Where more would have to be, less is taken as known. -1: nothing is left; the new
+    error is the one before, only larger, because of errors of the sender's odometry that last.
     """
     count = gather_known(memory, world, i, n, after, heard)
     alone = wp.where(heard, 1, 0)
@@ -160,7 +176,10 @@ def regress(memory: Any, world: int, i: int, n: int, after: Any, heard: bool):
     if heard and forgiven < wp.float64(0.0):
         forgiven = try_known(memory, world, i, n, after, 1)
     if forgiven < wp.float64(0.0):
+        growth = mat66d()
+        if heard:
+            growth = factor(after) * algebra.inverse_factor(memory.P[world, i, n, n])
         for k in range(memory.belief[world, i].members):
-            memory.scratch[world, k].row = mat66d()
+            memory.scratch[world, k].row = growth * memory.P[world, i, n, k]
         memory.scratch[world, n].row = after
     return forgiven
