@@ -86,6 +86,9 @@ DEPENDENT_SHARE = 0.7
 """Share that counts of the information of a sender that depends on others: some may have arrived already. Tuned."""
 STEPS = 127  # of a correlation, as it is sent
 MAX_CORRELATIONS = 2  # in a message, which has 256 bytes then
+TOLD_TIME = 1.037
+"""s between two reports of a vehicle for which what is told of one counts for the other: the correlation hardly changes
+within a second, and not to know it is worse. No multiple of usual frame periods. Chosen."""
 RETURNING_SHARE = 0.7
 """Ratio of the variance of a sender's position to that of one's own, above which bearings to it do not count if it
 depends on this vehicle: then no circle of vehicles confirms itself. Tuned: at 1 they change places too often, and at
@@ -102,9 +105,8 @@ RELATIVE_NOISE = 1e-6  # share of a variance, that regressions have as noise
 LEAST_FORGIVEN = 0.005
 """Share of its covariance that is added to that of a sender which depends on others. What is told of correlations is
 not all there is, so that everybody is a little too sure, and who hears him more so. Tuned."""
-LEAST_CONTRADICTION, MAX_CONTRADICTION = 0.0125, 0.1
-"""By how much of its covariance a sender may seem to know itself better than what it tells of others allows: the first
-share that is tried, and the last, each twice the one before. Chosen."""
+LEAST_LEFT = 0.003
+"""Share of a sender's variance, in all directions, that neither its past nor what is told of others explains. Tuned."""
 MAX_VARIANCE_GROWTH = 1.01
 """Ratio of a variance to the predicted one; beyond it the sender has lost information, and its message has no news."""
 MAX_GROWTH = 2.0  # of a variance by information that is negative by rounding; it is below 1.1 as a rule

@@ -67,6 +67,7 @@ class Member:
     distrusted: wp.int32
     agreement_time: wp.float64  # s for which a distrusted sender has agreed
     considered: wp.int32  # whether it stands as it says, and bearings do not correct it
+    untold: wp.int32  # whether it had been heard before it was met, and nobody has told how its error correlates
 
 
 @wp.struct

@@ -43,7 +43,7 @@ def rules_for(members: int) -> dict[str, Rule]:
     """Return what a saved memory with so many members may hold, by field, see `coopenv.world.saved_state`."""
     flags = (
         "search.active outbox.valid inbox.valid belief.has_sample member.has_twist member.distrusted "
-        "member.considered outbox.news inbox.news member.report.news member.report.valid line.fits "
+        "member.considered member.untold outbox.news inbox.news member.report.news member.report.valid line.fits "
         "belief.accused_followed"
     )
     ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick"

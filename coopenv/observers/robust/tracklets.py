@@ -155,12 +155,14 @@ def position_variance(P: Any):
 
 @device_function
 def only_returns(memory: Any, world: int, i: int, n: int) -> bool:
-    """Return whether member n depends on this vehicle and knows its place hardly better.
+    """Return whether member n may say what this vehicle knows already, and knows its place hardly better.
 
+    It may where it depends on this vehicle, and where this vehicle depends on it and nobody has told how.
     In a circle of vehicles the one that knows its place best does not follow the one before it: the rest has an order,
     as the paper's Assumption 1 has it for all.
     """
-    if memory.member[world, i, n].considered == 0 or not depends_on_own(memory, world, i, n):
+    shares = depends_on_own(memory, world, i, n) or memory.member[world, i, n].untold == 1
+    if memory.member[world, i, n].considered == 0 or not shares:
         return False
     own = position_variance(memory.P[world, i, 0, 0])
     return position_variance(memory.member[world, i, n].report.P) > wp.float64(constants.RETURNING_SHARE) * own

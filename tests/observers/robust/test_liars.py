@@ -83,7 +83,7 @@ def test_a_lie_costs_little(name: str) -> None:
     """In most worlds, and on average."""
     each = costs(name, range(6), 25)[1]
     assert np.median(each) < 3.0
-    assert each[:4].mean() < 3.5
+    assert each.mean() < 3.0
 
 
 def test_who_is_honest_is_believed() -> None:

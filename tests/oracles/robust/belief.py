@@ -56,6 +56,8 @@ class Member:
     """s, when it was last in view, or was told of along with one in view."""
     considered: bool = False
     """Whether it stands as told, and bearings do not correct it."""
+    untold: bool = False
+    """Whether it had been heard before it was met, and nobody has told how its error correlates."""
 
     def carried(self, age: float) -> Array:
         """Return (3,) how far it comes in its body frame at the last known twist in a time, m."""

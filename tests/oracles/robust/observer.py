@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 
 from coopenv.estimation.arrays import Array
-from coopenv.observers.contract import Message, Setup, Tick
+from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.robust.constants import (
     ADMISSION,
     DISPUTE_MARGIN,
@@ -82,8 +82,15 @@ class Robust(Common):
         self.exposed = False
         self.alone: Alone | None = None
         if self.search is None:
+            self.depends_on = 0
             own = self.belief.own
             self.alone = Alone(own.R, own.p, self.belief.P[:6, :6], self.odometry, 0.0)
+
+    def update(self, tick: Tick) -> Estimate:
+        """Take one camera tick; what is told is noted during a search, too."""
+        for target, received in tick.messages.items():
+            self.correlations.hear(target - self.landmarks, received.message, tick.time - received.age)
+        return super().update(tick)
 
     def message(self) -> Message:
         """Return pose, covariance, odometry and the correlations with members."""
@@ -127,8 +134,6 @@ class Robust(Common):
     def _listen(self, tick: Tick) -> None:
         """Take in the messages of members that count, and those of others in view, leaders first."""
         in_view = {target - self.landmarks for target in tick.targets[tick.valid].tolist()}
-        for target, received in tick.messages.items():
-            self.correlations.hear(target - self.landmarks, received.message, tick.time - received.age)
         reports = {report.vehicles[0]: report for report in self._reports(tick)}
         self._notice(in_view, list(reports.values()), tick.time)
         news = {s: r for s, r in reports.items() if "told" in tick.messages[s + self.landmarks].message.extra}
@@ -171,13 +176,15 @@ class Robust(Common):
         self.belief.add([member], report.P)
         self.contacts[report.vehicles[0]] = Contact(report)
         self.contacts = {v: c for v, c in self.contacts.items() if v not in forgotten}
+        member.untold = bool(self.depends_on & int(mask_of(told)))
         self._relate(len(self.belief.members) - 1, report)
         self.depends_on |= report.depends_on | int(mask_of(told))
 
     def _relate(self, n: int, report: Report) -> None:
         """Let the error of a sender that has just been met depend on those of the others as told."""
         crosses = self.correlations.crosses(self.belief, n, report.P, True)
-        row, _ = regress(self.belief.P, n, report.P, crosses, False, self._least(report))
+        row, _, told = regress(self.belief.P, n, report.P, crosses, False, self._least(report))
+        self.belief.members[n].untold &= not told
         block = slice(6 * n, 6 * n + 6)
         self.belief.P[block], self.belief.P[:, block] = row, row.T
 
@@ -455,8 +462,9 @@ class Robust(Common):
         return bool(report.depends_on & int(mask_of({self.vehicle})))
 
     def _only_returns(self, member: Member) -> bool:
-        """Return whether a member depends on this vehicle and knows its place hardly better."""
-        if not member.considered or not self._depends_on_own(report := self.contacts[member.vehicle].last):
+        """Return whether a member may say what this vehicle knows already, and knows its place hardly better."""
+        report = self.contacts[member.vehicle].last if member.considered else None
+        if report is None or not (member.untold or self._depends_on_own(report)):
             return False
         return bool(report.P[3:6, 3:6].trace() > RETURNING_SHARE * self.belief.P[3:6, 3:6].trace())
 
@@ -475,15 +483,16 @@ class Robust(Common):
         member.R, member.p = report.R[0], report.p[0]
         d, before = G.dot(d), belief.P[block].copy()
         crosses = self.correlations.crosses(belief, n, after, False)
-        row, forgiven = regress(belief.P, n, after, crosses, True, self._least(report))
+        row, more, told = regress(belief.P, n, after, crosses, True, self._least(report))
+        member.untold &= not told
         D = before - row
-        D[:, block] = -forgiven * after
+        D[:, block] = -more
         before = before[:, block]
         belief.P[block], belief.P[:, block] = row, row.T
-        N = before - (1.0 - forgiven) * after + LEAST_NEWS * np.diag(before.diagonal())
+        N = before - after + more + LEAST_NEWS * np.diag(before.diagonal())
         reach = MAX_TOLD_ANGLE * float(np.linalg.norm(member.p - belief.own.p))
         vague = before[3:, 3:].trace() > 3.0 * reach**2
-        if not following or forgiven < 0.0 or vague or not is_positive(N) or d.dot(np.linalg.solve(N, d)) > STEP_GATE:
+        if not following or vague or not is_positive(N) or d.dot(np.linalg.solve(N, d)) > STEP_GATE:
             return
         free = 6 * belief.others
         K = np.linalg.solve(N, D[:, :free]).T

@@ -1,8 +1,9 @@
 """How senders' errors correlate with those of the vehicles that they hear: told, kept, looked up.
 
 With every message a vehicle tells of some members n the correlation A^-1 C B^-T of its own error with n's, A and B
-being Cholesky factors of their covariances and C their cross-covariance. That fits the report that it comes with: later
-or earlier ones of the same vehicles are about other errors.
+being Cholesky factors of their covariances and C their cross-covariance. That fits the report that it comes with. Where
+messages are lost, what was told of a report a little older or newer stands in: correlations change more slowly than
+errors do.
 """
 
 from typing import Any
@@ -172,23 +173,30 @@ def matrix_of(memory: Any, world: int, i: int, sender: int, c: int):
     return mat66d(memory.correlation[world, i, sender, c].matrix) * (wp.float64(1.0) / wp.float64(constants.STEPS))
 
 
+@wp.func
+def is_near(model: Any, tick: int, other: int) -> bool:
+    """Return whether what is told of a report of one tick counts for that of another."""
+    return wp.float64(wp.abs(tick - other)) * model.camera_period < wp.float64(constants.TOLD_TIME)
+
+
 @device_function
-def correlation_of(memory: Any, world: int, i: int, n: int, k: int, met: bool):
-    """Return (whether it is known, matrix) the correlation of the new error of member n with that of member k.
+def correlation_of(model: Any, memory: Any, world: int, i: int, n: int, k: int, met: bool):
+    """Return (is known, is told, matrix) of the correlation of the new error of member n with that of member k.
 
     Member n has told it; or k, which counts where they have just met; or, where neither hears the other, both have told
-    of a third one, of several that on which they depend most. Only what is told of the same reports counts.
+    of a third one, of several that on which they depend most: that is only likely. What is told of reports far apart
+    does not count.
     """
     sender = memory.member[world, i, n].vehicle
     other = memory.member[world, i, k].vehicle
     c = place_of(memory, world, i, sender, other)
     if c >= 0:
-        same = memory.correlation[world, i, sender, c].tick == memory.member[world, i, k].report.tick
-        return same, matrix_of(memory, world, i, sender, c)
+        near = is_near(model, memory.correlation[world, i, sender, c].tick, memory.member[world, i, k].report.tick)
+        return near, True, matrix_of(memory, world, i, sender, c)
     c = place_of(memory, world, i, other, sender)
     if c >= 0:
-        same = memory.correlation[world, i, other, c].tick == memory.member[world, i, n].report.tick
-        return met and same, wp.transpose(matrix_of(memory, world, i, other, c))
+        near = is_near(model, memory.correlation[world, i, other, c].tick, memory.member[world, i, n].report.tick)
+        return met and near, True, wp.transpose(matrix_of(memory, world, i, other, c))
     most = wp.float64(-1.0)
     shared = mat66d()
     for a in range(memory.correlation.shape[3]):
@@ -196,10 +204,11 @@ def correlation_of(memory: Any, world: int, i: int, n: int, k: int, met: bool):
         if third >= 0:
             b = place_of(memory, world, i, other, third)
             if b >= 0:
-                if memory.correlation[world, i, sender, a].tick == memory.correlation[world, i, other, b].tick:
+                tick = memory.correlation[world, i, other, b].tick
+                if is_near(model, memory.correlation[world, i, sender, a].tick, tick):
                     X = matrix_of(memory, world, i, sender, a) * wp.transpose(matrix_of(memory, world, i, other, b))
                     size = wp.ddot(X, X)
                     if size > most:
                         most = size
                         shared = X
-    return most >= wp.float64(0.0), shared
+    return most >= wp.float64(0.0), False, shared

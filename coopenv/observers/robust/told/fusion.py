@@ -46,7 +46,7 @@ def place(model: Any, memory: Any, world: int, i: int, n: int):
         memory.P[world, i, n, k] = mat66d()
         memory.P[world, i, k, n] = mat66d()
     memory.P[world, i, n, n] = after
-    regress(memory, world, i, n, after, False)
+    regress(model, memory, world, i, n, after, False)
     set_row(memory, world, i, n)
 
 
@@ -59,6 +59,8 @@ def add_member(model: Any, memory: Any, world: int, i: int, sender: int, tick: i
         append_member(memory, world, i, sender, report.pose, mat66d(report.P))
         memory.member[world, i, n].report = report
         memory.member[world, i, n].seen_tick = tick
+        known = memory.belief[world, i].depends_on & bit_of(sender)
+        memory.member[world, i, n].untold = wp.where(known != wp.uint64(0), 1, 0)
         place(model, memory, world, i, n)
         depends_on = report.depends_on | bit_of(sender)
         memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
@@ -107,17 +109,17 @@ def step_to(model: Any, memory: Any, world: int, i: int, n: int, following: bool
     d = G * news
     before = mat66d(memory.P[world, i, n, n])
     memory.member[world, i, n].pose = report.pose
-    forgiven = regress(memory, world, i, n, after, True)
+    more = regress(model, memory, world, i, n, after, True)
     for k in range(members):
         memory.scratch[world, k].column = memory.P[world, i, n, k] - memory.scratch[world, k].row
-    memory.scratch[world, n].column = -forgiven * after
+    memory.scratch[world, n].column = -more
     set_row(memory, world, i, n)
-    N = before - (wp.float64(1.0) - forgiven) * after
+    N = before - after + more
     for k in range(6):
         N[k, k] = N[k, k] + wp.float64(constants.LEAST_NEWS) * before[k, k]
     variance = before[3, 3] + before[4, 4] + before[5, 5]
     reach = wp.float64(constants.MAX_TOLD_ANGLE) * wp.length(report.pose.p - memory.member[world, i, 0].pose.p)
-    if following and forgiven >= wp.float64(0.0) and variance <= wp.float64(3.0) * reach * reach and is_positive(N):
+    if following and variance <= wp.float64(3.0) * reach * reach and is_positive(N):
         if wp.length_sq(algebra.inverse_factor(N) * d) <= wp.float64(constants.STEP_GATE):
             follow(memory, world, i, n, d, N)
 

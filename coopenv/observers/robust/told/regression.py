@@ -3,13 +3,15 @@
 Known is its own covariance P+, that with other members' errors as told, and, where the sender was heard before, that
 with its error then, which is P+, too, because the step from one to the other is not correlated with where it ends.
 The new error is regressed on these: e+ = L x + w, so that with any other error y it is L cov(x, y), and the joint
-covariance stays positive definite, if that of w is. All in blocks of 6x6.
+covariance stays positive definite, if that of w is. Where it is not, the sender seems to know itself better than what
+it tells allows: P+ is taken larger in those directions, so that all it correlates with is kept. All in blocks of 6x6.
 """
 
 from typing import Any
 
 import warp as wp
 
+from coopenv.estimation.linalg import eigen_symmetric6, symmetric_part
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.memory import mat66d
 from coopenv.observers.robust.told.correlations import correlation_of, factor
@@ -27,20 +29,30 @@ def note_known(memory: Any, world: int, at: int, member: int, covariance: Any):
 
 
 @device_function
-def gather_known(memory: Any, world: int, i: int, n: int, after: Any, heard: bool) -> int:
-    """Note all that is known of member n's new error, that with its last one first; return how much it is."""
+def note_told(model: Any, memory: Any, world: int, i: int, n: int, after: Any, heard: bool, count: int, told: bool):
+    """Note what is told (else what is only likely) of member n's new error; return how much is noted then."""
+    A = factor(after)
+    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
+        if k != n and memory.member[world, i, k].considered == 1:  # else it does not stand where its report puts it
+            known, is_told, X = correlation_of(model, memory, world, i, n, k, not heard)
+            if known and is_told == told:
+                note_known(memory, world, count, k, A * X * wp.transpose(factor(memory.P[world, i, k, k])))
+                count += 1
+    return count
+
+
+@device_function
+def gather_known(model: Any, memory: Any, world: int, i: int, n: int, after: Any, heard: bool):
+    """Note all of member n's new error: that with its last one, what is told, what is likely.
+
+    Return how much that is, and how much of it is not only likely.
+    """
     count = int(0)
     if heard:
         note_known(memory, world, 0, n, after)
         count = 1
-    A = factor(after)
-    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
-        if k != n:
-            known, X = correlation_of(memory, world, i, n, k, not heard)
-            if known:
-                note_known(memory, world, count, k, A * X * wp.transpose(factor(memory.P[world, i, k, k])))
-                count += 1
-    return count
+    sure = note_told(model, memory, world, i, n, after, heard, count, True)
+    return note_told(model, memory, world, i, n, after, heard, sure, False), sure
 
 
 @wp.func
@@ -105,19 +117,21 @@ def is_positive(P: Any) -> bool:
 
 
 @wp.func
-def contradiction_of(left: Any, after: Any):
-    """Return which share of a sender's covariance makes what is left over positive definite; -1: too large a one.
+def excess(left: Any, after: Any):
+    """Return by how much a covariance is to be larger so that of what is left over a share of it is in all directions.
 
-    No more than has to be: what is added correlates with nothing.
+    That is as little as possible: only in the directions in which it has to be.
     """
-    if is_positive(left):
-        return wp.float64(0.0)
-    share = wp.float64(constants.LEAST_CONTRADICTION)
-    while share < wp.float64(1.5 * constants.MAX_CONTRADICTION):
-        if is_positive(left + share * after):
-            return share
-        share = share * wp.float64(2.0)
-    return wp.float64(-1.0)
+    more = mat66d()
+    share = wp.float64(constants.LEAST_LEFT)
+    if not is_positive(left - share * after):
+        X = algebra.inverse_factor(after)
+        values, axes = eigen_symmetric6(symmetric_part(X * left * wp.transpose(X)))
+        B = factor(after) * axes
+        for k in range(6):
+            values[k, k] = wp.max(share - values[k, k], wp.float64(0.0))
+        more = B * wp.diag(wp.get_diag(values)) * wp.transpose(B)
+    return more
 
 
 @device_function
@@ -139,47 +153,37 @@ def least_forgiven(memory: Any, world: int, i: int, n: int):
 
 
 @device_function
-def try_known(memory: Any, world: int, i: int, n: int, after: Any, count: int):
-    """Return what has to be forgiven the sender, as a share of its covariance, so that what is known fits; -1: more.
-
-    Blocks of the new row are left in `scratch.row`.
-    """
+def solve_for(memory: Any, world: int, i: int, after: Any, count: int):
+    """Set the coefficients L of what is known; return what they leave over of a covariance."""
     solve_known(memory, world, i, count)
     left = mat66d(after)
     for a in range(count):
         block = regressed(memory, world, i, count, memory.known[world, a].member)
         left = left - block * wp.transpose(memory.known[world, a].coefficient)
-    needed = contradiction_of(left, after)
-    if needed < wp.float64(0.0):
-        return needed
-    forgiven = wp.max(needed, least_forgiven(memory, world, i, n))
-    # What is forgiven beyond that is the same error, only larger.
-    growth = wp.sqrt((wp.float64(1.0) + forgiven) / (wp.float64(1.0) + needed))
-    for k in range(memory.belief[world, i].members):
-        memory.scratch[world, k].row = growth * regressed(memory, world, i, count, k)
-    memory.scratch[world, n].row = (wp.float64(1.0) + forgiven) * after
-    return forgiven
+    return left
 
 
 @device_function
-def regress(memory: Any, world: int, i: int, n: int, after: Any, heard: bool):
-    """Set `scratch.row` to the covariance of member n's new error with all errors; return what is forgiven the sender.
+def regress(model: Any, memory: Any, world: int, i: int, n: int, after: Any, heard: bool):
+    """Set `scratch.row` to the covariance of member n's new error with all errors; return by how much more it has.
 
-    That is a share of its covariance. Where more would have to be, less is taken as known. -1: nothing is left; the new
-    error is the one before, only larger, because of errors of the sender's odometry that last.
+    That is added to the covariance that it states. Where what is only likely contradicts the rest, it does not count.
     """
-    count = gather_known(memory, world, i, n, after, heard)
-    alone = wp.where(heard, 1, 0)
-    forgiven = wp.float64(-1.0)
-    if count > alone:
-        forgiven = try_known(memory, world, i, n, after, count)
-    if heard and forgiven < wp.float64(0.0):
-        forgiven = try_known(memory, world, i, n, after, 1)
-    if forgiven < wp.float64(0.0):
-        growth = mat66d()
-        if heard:
-            growth = factor(after) * algebra.inverse_factor(memory.P[world, i, n, n])
-        for k in range(memory.belief[world, i].members):
-            memory.scratch[world, k].row = growth * memory.P[world, i, n, k]
-        memory.scratch[world, n].row = after
-    return forgiven
+    count, sure = gather_known(model, memory, world, i, n, after, heard)
+    more = mat66d()
+    growth = wp.float64(0.0)
+    if count > 0:
+        left = solve_for(memory, world, i, after, count)
+        if sure > 0 and sure < count:
+            if not is_positive(left - wp.float64(constants.LEAST_LEFT) * after):
+                count = sure
+                left = solve_for(memory, world, i, after, count)
+        larger = wp.float64(1.0) + least_forgiven(memory, world, i, n)  # what is forgiven is the same error
+        more = larger * (after + excess(left, after)) - after
+        growth = wp.sqrt(larger)
+    if count > wp.where(heard, 1, 0):
+        memory.member[world, i, n].untold = 0
+    for k in range(memory.belief[world, i].members):
+        memory.scratch[world, k].row = growth * regressed(memory, world, i, count, k)
+    memory.scratch[world, n].row = after + more
+    return more

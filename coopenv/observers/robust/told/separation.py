@@ -42,10 +42,14 @@ def begin_alone(memory: Any, world: int, i: int, estimate: Estimate, tick: int):
 
 @device_function
 def begin_told(model: Any, memory: Any, world: int, i: int):
-    """Forget what was sent and received; begin with the initial estimate, unless the pose is searched for."""
+    """Forget what was sent and received; begin with the initial estimate, unless the pose is searched for.
+
+    A search may use what anybody says; who begins with an estimate depends on nobody yet.
+    """
     clear_told(model, memory, world, i)
     memory.alone[world, i] = Alone()
     if memory.search[world, i].active == 0:
+        memory.belief[world, i].depends_on = wp.uint64(0)
         begin_alone(memory, world, i, own_estimate(memory, world, i), 0)
 
 

@@ -1,0 +1,74 @@
+"""Whom a vehicle's estimate depends on, and what a sender counts that is met again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coopenv.api.engine import Engine
+from coopenv.evaluation import held_out_seeds
+from coopenv.policies import decide, find_agent, restart
+from coopenv.scenario.files import load_scenario
+from tests.helpers.builders import reset, simulate
+from tests.observers.robust.test_driving import nees_of
+
+ROBUST = {"observer.name": "robust"}
+
+
+def test_it_depends_on_those_that_it_has_heard() -> None:
+    world = simulate(load_scenario("lane:5,seen=2", ROBUST | {"horizon": 3.0}), 2)
+    reset(world)
+    memory: Any = world.memory
+    world.advance(0)
+    assert (memory.belief.numpy()["depends_on"] <= [0, 0b1, 0b11, 0b110, 0b1100]).all()  # at most on first messages
+    world.advance(60)
+    assert (memory.belief.numpy()["depends_on"] == [0, 0b1, 0b11, 0b111, 0b1111]).all()
+
+
+def test_nobody_depends_on_who_is_not_heard() -> None:
+    world = simulate(load_scenario("lane:5,seen=2", ROBUST | {"horizon": 3.0, "v2x.loss": 0.999999}), 2)
+    reset(world)
+    world.advance(60)
+    memory: Any = world.memory
+    assert (memory.belief.numpy()["depends_on"] == 0).all()
+
+
+def test_nobody_in_a_lane_is_met_again() -> None:
+    world = simulate(load_scenario("lane:6,seen=3", ROBUST | {"horizon": 3.0}), 2)
+    reset(world)
+    memory: Any = world.memory
+    for _ in range(20):
+        world.advance(6)
+        assert (memory.member.numpy()["untold"] == 0).all()
+
+
+def meeting(worlds: int, **overrides: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return ANEES/6 (W,), the position error (W,) in m and how often a member in view is marked, sixteen cars."""
+    scenario = load_scenario("large_crossing", ROBUST | overrides)
+    engine, policy = Engine(scenario, worlds), find_agent("route_follower").policy(scenario)
+    engine.reset(held_out_seeds(3, worlds))
+    actions, observed, found, marked = engine.world.actions.numpy(), engine.view("observation"), [], []
+    restart(policy, np.ones(engine.view("alive").size, dtype=bool))
+    while not engine.view("over").all():
+        rows = observed.reshape(-1, observed.shape[-1])
+        actions[...] = decide(policy, rows, actions.shape[-1]).reshape(actions.shape)
+        engine.step()
+        found.append(nees_of(engine.world))
+        memory: Any = engine.world.memory
+        marked.append(memory.member.numpy()["untold"].mean())
+    nees, errors = (np.array(part)[15:] for part in zip(*found, strict=True))
+    return np.nanmean(nees, axis=(0, 2)), np.sqrt(np.nanmean(errors**2, axis=(0, 2))), np.array(marked)
+
+
+@pytest.mark.slow
+def test_cars_that_meet_again_and_again_know_how_well_they_stand() -> None:
+    """Their ANEES/6 grew up to 3 and more while strangers' errors counted as independent."""
+    nees, errors, marked = meeting(16)
+    mean, std = nees.mean(), nees.std() / np.sqrt(len(nees))
+    print(
+        f"\nlarge_crossing: ANEES/6 {mean:.2f} +- {std:.2f}, {100 * errors.mean():.0f} cm, marked {marked.mean():.3f}"
+    )
+    assert marked.max() > 0.0
+    assert mean - 2.0 * std < 1.3
