@@ -47,6 +47,12 @@ def log_so3(R: Any):
 
 
 @wp.func
+def position_variance(P: Any):
+    """Return the sum of the variances of a position, m^2, of a covariance, 6x6."""
+    return wp.float64(P[3, 3] + P[4, 4] + P[5, 5])
+
+
+@wp.func
 def left_error(pose: Pose, other: Pose):
     """Return the left error (theta, rho) of another pose against one."""
     Rt = wp.transpose(pose.R)

@@ -91,8 +91,8 @@ TOLD_TIME = 1.037
 within a second, and not to know it is worse. No multiple of usual frame periods. Chosen."""
 RETURNING_SHARE = 0.7
 """Ratio of the variance of a sender's position to that of one's own, above which bearings to it do not count if it
-depends on this vehicle: then no circle of vehicles confirms itself. Tuned: at 1 they change places too often, and at
-0.5 much is left unused."""
+depends on this vehicle, or is met again: then no circle of vehicles confirms itself. Tuned: at 1 they change places too
+often, and at 0.5 much is left unused."""
 LEAST_NEWS = 0.1
 """Share of a sender's variance that counts as noise of the step by which it moves at its next message: what it has
 learnt in small steps it has learnt by linearisations, which add up. Tuned."""

@@ -90,5 +90,5 @@ def drift_of(memory: Any, world: int, i: int, n: int):
     if memory.member[world, i, n].distrusted == 1:
         return drifted(memory, world, i, sender, wp.float64(constants.DRIFT_CLEAR), wp.float64(0.0))
     P = memory.member[world, i, n].report.P
-    std = wp.sqrt(wp.float64(THIRD) * wp.float64(P[3, 3] + P[4, 4] + P[5, 5]))
+    std = wp.sqrt(wp.float64(THIRD) * algebra.position_variance(P))
     return drifted(memory, world, i, sender, wp.float64(constants.DRIFT_GATE), wp.float64(constants.DRIFT_STD) * std)

@@ -147,12 +147,6 @@ def depends_on_own(memory: Any, world: int, i: int, n: int) -> bool:
     return (memory.member[world, i, n].report.depends_on & bit_of(i)) != wp.uint64(0)
 
 
-@wp.func
-def position_variance(P: Any):
-    """Return the sum of the variances of a position, m^2."""
-    return wp.float64(P[3, 3] + P[4, 4] + P[5, 5])
-
-
 @device_function
 def only_returns(memory: Any, world: int, i: int, n: int) -> bool:
     """Return whether member n may say what this vehicle knows already, and knows its place hardly better.
@@ -164,8 +158,8 @@ def only_returns(memory: Any, world: int, i: int, n: int) -> bool:
     shares = depends_on_own(memory, world, i, n) or memory.member[world, i, n].untold == 1
     if memory.member[world, i, n].considered == 0 or not shares:
         return False
-    own = position_variance(memory.P[world, i, 0, 0])
-    return position_variance(memory.member[world, i, n].report.P) > wp.float64(constants.RETURNING_SHARE) * own
+    own = algebra.position_variance(memory.P[world, i, 0, 0])
+    return algebra.position_variance(memory.member[world, i, n].report.P) > wp.float64(constants.RETURNING_SHARE) * own
 
 
 @device_function

@@ -103,8 +103,8 @@ def admits(memory: Any, world: int, i: int, n: int, dt: Any) -> bool:
     report = memory.member[world, i, n].report
     P = mat66d(report.P)
     before = memory.P[world, i, n, n]
-    spread = before[3, 3] + before[4, 4] + before[5, 5]
-    grown = P[3, 3] + P[4, 4] + P[5, 5] - spread
+    spread = algebra.position_variance(before)
+    grown = algebra.position_variance(P) - spread
     if grown > wp.float64(constants.ADMISSION) * spread:
         reopen(memory, world, i, n, wp.float64(THIRD) * grown)
     if dt > wp.float64(constants.SILENCE_TIME):

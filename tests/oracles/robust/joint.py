@@ -64,7 +64,7 @@ class RobustJoint(Common):
     def _report(self, message: Message, sender: int, time: float) -> Report | None:
         """Return what a message says of its sender and, unless it leans on this vehicle, of the others it tells of."""
         report = from_message(message, sender, time)
-        if report is None or report.depends_on & int(mask_of({self.vehicle})):
+        if report is None or report.depends_on_vehicle(self.vehicle):
             return report
         return _with_others(report, message)
 
@@ -152,10 +152,9 @@ class RobustJoint(Common):
         """
         if not report.depends_on:
             return 1.0
-        own = int(mask_of({self.vehicle}))
-        if not report.depends_on & own:
+        if not report.depends_on_vehicle(self.vehicle):
             return DEPENDENT_SHARE
-        return 1.0 / (1.0 + sum(bool(contact.last.depends_on & own) for contact in self.contacts.values()))
+        return 1.0 / (1.0 + sum(contact.last.depends_on_vehicle(self.vehicle) for contact in self.contacts.values()))
 
 
 def _speaks_for(other: Report, report: Report) -> bool:

@@ -140,9 +140,9 @@ class Robust(Common):
         last = {sender: float(contact.last.time[0]) + SAME_TIME for sender, contact in self.contacts.items()}
         pending = {s: r for s, r in news.items() if s in last and r.time[0] > last[s]}
         while pending:
-            s = min(pending, key=lambda s: (self._has_to_wait(s, pending), *_rank(pending[s])))
+            s = min(pending, key=lambda s: (self._has_to_wait(s, pending), *pending[s].rank))
             self._hear(self.contacts[s], pending.pop(s), tick.time)
-        for report in sorted(reports.values(), key=_rank):
+        for report in sorted(reports.values(), key=lambda report: report.rank):
             sender = report.vehicles[0]
             if sender in in_view and sender not in self.contacts and not self._is_barred(sender, tick.time):
                 self._meet(report, tick.time)
@@ -210,7 +210,7 @@ class Robust(Common):
             lasting = as_noise(belief.errors_covariance, step, dt, ERRORS_TIME)
             known = bool((lasting <= self.noise.odometry(dt)).all())
             belief.P[6 * n : 6 * n + 6, 6 * n : 6 * n + 6] -= np.diag(lasting)  # what that takes is no news
-            self._step(n, report, steady and known and not self._depends_on_own(report))
+            self._step(n, report, steady and known and not report.depends_on_vehicle(self.vehicle))
             return
         member, block = belief.members[n], slice(6 * n, 6 * n + 6)
         member.considered = True
@@ -453,18 +453,14 @@ class Robust(Common):
         """
         if not report.depends_on:
             return 0.0
-        if not self._depends_on_own(report):
+        if not report.depends_on_vehicle(self.vehicle):
             return LEAST_FORGIVEN
-        return float(sum(self._depends_on_own(contact.last) for contact in self.contacts.values()))
-
-    def _depends_on_own(self, report: Report) -> bool:
-        """Return whether what a report says may be one's own words."""
-        return bool(report.depends_on & int(mask_of({self.vehicle})))
+        return float(sum(contact.last.depends_on_vehicle(self.vehicle) for contact in self.contacts.values()))
 
     def _only_returns(self, member: Member) -> bool:
         """Return whether a member may say what this vehicle knows already, and knows its place hardly better."""
         report = self.contacts[member.vehicle].last if member.considered else None
-        if report is None or not (member.untold or self._depends_on_own(report)):
+        if report is None or not (member.untold or report.depends_on_vehicle(self.vehicle)):
             return False
         return bool(report.P[3:6, 3:6].trace() > RETURNING_SHARE * self.belief.P[3:6, 3:6].trace())
 
@@ -501,8 +497,3 @@ class Robust(Common):
         dx = np.zeros(len(belief.P))
         dx[:free] = K.dot(d)
         belief.shift_about(dx)
-
-
-def _rank(report: Report) -> tuple[int, int]:
-    """Return a key that is larger for who depends on more others, and then for later ones."""
-    return report.depends_on.bit_count(), report.vehicles[0]

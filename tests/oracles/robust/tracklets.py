@@ -46,6 +46,15 @@ class Report:
     depends_on: int
     """Bits of all vehicles whose messages are in it."""
 
+    @property
+    def rank(self) -> tuple[int, int]:
+        """What is larger for who depends on more others, and then for later ones."""
+        return self.depends_on.bit_count(), self.vehicles[0]
+
+    def depends_on_vehicle(self, vehicle: int) -> bool:
+        """Return whether what it says may be a vehicle's own words."""
+        return bool(self.depends_on & int(mask_of({vehicle})))
+
     def motion_since(self, last: Report, n: int) -> tuple[Array, Array]:
         """Return member n's odometry increment (dR, dp) since the last report."""
         R = last.odometry_turn[n].T

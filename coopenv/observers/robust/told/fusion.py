@@ -117,7 +117,7 @@ def step_to(model: Any, memory: Any, world: int, i: int, n: int, following: bool
     N = before - after + more
     for k in range(6):
         N[k, k] = N[k, k] + wp.float64(constants.LEAST_NEWS) * before[k, k]
-    variance = before[3, 3] + before[4, 4] + before[5, 5]
+    variance = algebra.position_variance(before)
     reach = wp.float64(constants.MAX_TOLD_ANGLE) * wp.length(report.pose.p - memory.member[world, i, 0].pose.p)
     if following and variance <= wp.float64(3.0) * reach * reach and is_positive(N):
         if wp.length_sq(algebra.inverse_factor(N) * d) <= wp.float64(constants.STEP_GATE):

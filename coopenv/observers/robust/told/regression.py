@@ -120,7 +120,7 @@ def is_positive(P: Any) -> bool:
 def excess(left: Any, after: Any):
     """Return by how much a covariance is to be larger so that of what is left over a share of it is in all directions.
 
-    That is as little as possible: only in the directions in which it has to be.
+    All are 6x6, of left errors, rad and m. It is as little as possible: only in the directions in which it has to be.
     """
     more = mat66d()
     share = wp.float64(constants.LEAST_LEFT)
@@ -167,7 +167,8 @@ def solve_for(memory: Any, world: int, i: int, after: Any, count: int):
 def regress(model: Any, memory: Any, world: int, i: int, n: int, after: Any, heard: bool):
     """Set `scratch.row` to the covariance of member n's new error with all errors; return by how much more it has.
 
-    That is added to the covariance that it states. Where what is only likely contradicts the rest, it does not count.
+    That is added to the covariance that it states, `after`; both are 6x6, rad and m. Where what is only likely
+    contradicts the rest, it does not count.
     """
     count, sure = gather_known(model, memory, world, i, n, after, heard)
     more = mat66d()
