@@ -136,7 +136,7 @@ MAX_MISFIT = 80.0
 CLEAR_TIME, PATIENCE = 0.25, 2.0
 """s, for which all solutions must have been well determined, and after which that is asked no more. Tuned."""
 DOUBT_TIME = 0.1
-"""s from a frame in which a solution was not well determined to the next look: what has to change is the vehicle's
+"""s from a frame that has not told the pose well enough to the next look: what has to change is the vehicle's
 place, or what its neighbours know. Chosen."""
 MIN_SEARCH_TIME, MIN_DOUBTFUL_TIME = 0.5, 3.0
 """s, before a hypothesis becomes the belief; where a solution was not well determined. Tuned."""
@@ -150,5 +150,5 @@ SAME_HYPOTHESIS, SAME_PRIOR = 16.0, 30.0
 """Squared distance, in standard deviations, below which two hypotheses are one (chi-square of 6, 0.986), and one is the
 prior (1 - 4e-5)."""
 GAUSS_NEWTON_STEPS = 6  # steps of the least squares from one frame. Chosen
-MIN_INFORMATION_RATIO = 1e-12
-"""Ratio of the information in the weakest direction to that in the strongest; below it a frame determines no pose."""
+MAX_CONDITION = 1e12
+"""Condition number, see `is_regular`, of the information of a frame; from there on it determines no pose."""

@@ -19,7 +19,7 @@ from coopenv.observers.robust.measurements import RESECTION, TRACKING, set_lines
 from coopenv.observers.robust.memory import Estimate, Pose, clear, mat33d, vec3d
 from coopenv.observers.robust.mounting import walk_mounting
 from coopenv.observers.robust.odometry import begin_errors, increment_noise, propagate_own, take_odometry, walk_errors
-from coopenv.observers.robust.search import advance_search, begin_search, propagate_search
+from coopenv.observers.robust.search import advance_search, begin_search, propagate_search, put_off
 from coopenv.observers.robust.tracklets import bit_of
 from coopenv.observers.robust.update import is_sound, lose, resect, set_anchor, update
 from coopenv.world.device_function import device_function
@@ -113,6 +113,8 @@ def correct(model: Any, state: Any, memory: Any, world: int, i: int, now: Any, s
         update(model, state, memory, world, i, now, frame)
     elif resect(frame, memory, world, i) and is_known(wp.float64(SURE) * memory.P[world, i, 0, 0]):
         memory.search[world, i].active = 0
+    else:
+        put_off(memory, world, i)
 
 
 def make_estimate(receive: Any, fuse_messages: Any, separate: Any) -> Any:

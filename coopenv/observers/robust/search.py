@@ -209,6 +209,12 @@ def begin_hypotheses(frame: Frame, memory: Any, world: int, i: int, period: Any)
 
 
 @device_function
+def put_off(memory: Any, world: int, i: int):
+    """Follow the hypothesis that is left for some more frames: this one has not told the pose well enough."""
+    memory.search[world, i].least_time = memory.search[world, i].followed_time + wp.float64(constants.DOUBT_TIME)
+
+
+@device_function
 def advance_search(model: Any, state: Any, memory: Any, world: int, i: int, now: Any) -> bool:
     """Take a frame's bearings; return whether one hypothesis alone is left after some frames."""
     frame = set_lines(model, state, memory, world, i, now.tick, now.period, SEARCH)

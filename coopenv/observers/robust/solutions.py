@@ -60,9 +60,9 @@ def covariance_of(frame: Frame, memory: Any, world: int, i: int, lines: Any, pat
         H = memory.line[world, lines[n]].jacobian
         M += (wp.transpose(H) * (wp.float64(1.0) / memory.line[world, lines[n]].noise)) * H
     P = symmetric_part(inverse6(M))
-    if patient:  # then the information is far from singular, and needs no costly spectrum
+    if patient:
         return is_known(P), P
-    return angles_within(P, wp.float64(1.0)) and is_regular(M, wp.float64(constants.MIN_INFORMATION_RATIO)), P
+    return angles_within(P, wp.float64(1.0)) and is_regular(M, P, wp.float64(constants.MAX_CONDITION)), P
 
 
 @device_function

@@ -17,6 +17,7 @@ from coopenv.observers.robust.constants import (
     ANCHOR_ANGLE_VARIANCE,
     ANCHOR_POSITION_VARIANCE,
     BEARING_GATE,
+    DOUBT_TIME,
     ERRORS_TIME,
     HEALTHY_SHARE,
     HEALTHY_TIME,
@@ -176,6 +177,8 @@ class Common:
         self._begin(found, tick)
         if resect(self.belief, lambda: self._view(tick, True)) and is_known(SURE * self.belief.P[:6, :6]):
             self.search = None
+        else:
+            self.search.least_age = self.search.age + DOUBT_TIME
 
     def _begin(self, pose: Belief, tick: Tick) -> None:
         """Believe in a pose and in those that are in view."""

@@ -7,8 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from coopenv.estimation.arrays import solve
-from coopenv.observers.robust.constants import GAUSS_NEWTON_STEPS, MIN_INFORMATION_RATIO
+from coopenv.observers.robust.constants import GAUSS_NEWTON_STEPS, MAX_CONDITION
 from tests.oracles.robust.belief import Belief
+from tests.oracles.robust.matrices import condition
 from tests.oracles.robust.sight import View
 
 
@@ -34,8 +35,7 @@ def resect(belief: Belief, look: Callable[[], View]) -> bool:
         W = np.linalg.inv(N[:, None, None] * np.eye(2) + rest @ others @ rest.transpose(0, 2, 1))
         weighted = own.transpose(0, 2, 1) @ W
         M = (weighted @ own).sum(axis=0)
-        spectrum = np.linalg.eigvalsh(M)
-        if not spectrum[0] > MIN_INFORMATION_RATIO * spectrum[-1]:
+        if not condition(M) < MAX_CONDITION:
             return False
         G = solve(M, np.concatenate(weighted, axis=1))
         if step < GAUSS_NEWTON_STEPS - 1:

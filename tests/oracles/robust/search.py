@@ -26,6 +26,7 @@ from coopenv.observers.robust.constants import (
     KNOWN_ANGLE,
     KNOWN_POSITION,
     MAX_BEARING_COST,
+    MAX_CONDITION,
     MAX_HYPOTHESES,
     MAX_MISFIT,
     MAX_PRIOR_COST,
@@ -41,7 +42,7 @@ from coopenv.observers.robust.constants import (
 from tests.helpers.p3p import solve_one
 from tests.oracles.p3p import solve_p3p
 from tests.oracles.robust.belief import Belief
-from tests.oracles.robust.matrices import invert_positive
+from tests.oracles.robust.matrices import condition, invert_positive
 from tests.oracles.robust.sight import Sight
 from tests.oracles.robust.tracklets import left_error
 
@@ -240,8 +241,7 @@ def _covariance(belief: Belief, tick: Tick, sightings: list[Sighting], variance:
     """Return the covariance (6, 6) of a pose that is solved from sightings; None if they do not tell it."""
     sight, noise = _seen(belief, tick, sightings, variance)
     M = (np.swapaxes(sight.H, 1, 2) / noise[:, None, None] @ sight.H).sum(axis=0)
-    spectrum = np.linalg.eigvalsh(M)
-    if not spectrum[0] > 1e-12 * spectrum[-1]:
+    if not condition(M) < MAX_CONDITION:
         return None
     P = invert_positive(M)
     return P if np.diag(P)[:3].max() < 1.0 else None
