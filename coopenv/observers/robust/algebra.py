@@ -226,9 +226,9 @@ def is_known(P: Any):
 
 @wp.func
 def is_regular(M: Any, inverse: Any, most: Any):
-    """Return whether the condition number of a positive definite M, by the traces of M and its inverse, is below one.
+    """Return whether tr(M) tr(M^-1) of a positive definite M, 6x6, is below `most`; False where numbers are none.
 
-    That is between the ratio of the largest eigenvalue to the smallest and 36 times it; no spectrum has to be found.
+    That is at least the condition number, the ratio of the largest eigenvalue to the smallest, and at most 36 times it.
     """
     return wp.trace(M) * wp.trace(inverse) < most
 

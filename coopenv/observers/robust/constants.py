@@ -151,4 +151,4 @@ SAME_HYPOTHESIS, SAME_PRIOR = 16.0, 30.0
 prior (1 - 4e-5)."""
 GAUSS_NEWTON_STEPS = 6  # steps of the least squares from one frame. Chosen
 MAX_CONDITION = 1e12
-"""Condition number, see `is_regular`, of the information of a frame; from there on it determines no pose."""
+"""Of the information of a frame, as `is_regular` bounds it; from there on the frame determines no pose. Chosen."""

@@ -165,8 +165,10 @@ def resect(frame: Frame, memory: Any, world: int, i: int) -> bool:
                 HtW = wp.transpose(H) * weight_of(memory, world, i, n)
                 M += HtW * H
                 b += HtW * memory.line[world, n].residual
+        if fitting < 3:
+            return False
         inverse = inverse6(M)
-        if fitting < 3 or not is_regular(M, inverse, wp.float64(constants.MAX_CONDITION)):
+        if not is_regular(M, inverse, wp.float64(constants.MAX_CONDITION)):
             return False
         if step < constants.GAUSS_NEWTON_STEPS - 1:
             apply_error(memory, world, i, 0, inverse * b)
