@@ -57,7 +57,12 @@ CELLS = [
     Cell("haswell", "BLAS kernels of Haswell", environment={"OPENBLAS_CORETYPE": "Haswell"}),
     Cell("nehalem", "BLAS kernels of Nehalem", environment={"OPENBLAS_CORETYPE": "Nehalem"}),
     Cell("no-simd", "NumPy without dispatched CPU features", no_simd=True),
-    Cell("generic", "Warp kernels for any x86-64, without FMA", options=("-p", "tests.helpers.generic_kernels")),
+    Cell(
+        "generic",
+        "Warp kernels and Numba functions for any x86-64, without FMA",
+        environment={"NUMBA_CPU_NAME": "generic"},
+        options=("-p", "tests.helpers.generic_kernels"),
+    ),
     Cell("random-order", f"order of seed {SEED}", options=(f"--randomly-seed={SEED}",), packages=("pytest-randomly",)),
 ]
 """Python 3.13 with pinned versions is left out: `newest` differs in the same way and more."""

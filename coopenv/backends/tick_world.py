@@ -13,6 +13,7 @@ from coopenv.backends.tick_checks import MEASURED, check_tick, is_sound
 from coopenv.errors import CoopenvError
 from coopenv.estimation.rotations import exp_se3
 from coopenv.observers.briefing import start_covariances
+from coopenv.observers.checks import compiled_checks
 from coopenv.observers.contract import Message
 from coopenv.observers.kernel_world import views_of
 from coopenv.observers.recording import Briefing, Sensed, Truth, is_due
@@ -96,6 +97,7 @@ class TickWorld(SensingWorld):
     def load(self) -> None:
         """Load the kernels, see `World.load`."""
         super().load()
+        compiled_checks()
         self.mask.fill_(1)  # so that nothing moves: in real time the first tick must not wait for its launch
         super().advance(1)
         self.decide()

@@ -41,13 +41,15 @@ def run(
 ) -> None:
     """Run an environment; write metrics, arrays, figures and a page that plays the episode."""
     from coopenv.runs.command import REPLAY_FILE, execute, report
+    from coopenv.runs.console import compile_notice
     from coopenv.runs.rollouts import Rollout
 
     changes, name = options.parse_overrides(overrides), Path(environment).stem
     refuse_for_recordings(environment, seed=seed, policy=policy)
     backend = options.open_source(environment, changes, data, variant, topics)
-    rollout = Rollout(backend.scenario, seed, steps, dtype, device, policy, backend)
     folder, form, log = out or Path("out") / name, None if no_figures else figures.value, options.console(stderr=True)
+    with compile_notice(log):
+        rollout = Rollout(backend.scenario, seed, steps, dtype, device, policy, backend)
     result = execute(name, rollout, folder, log, changes, steady_from, form, video, width=width and width.value)
     if as_json:
         options.print_json(result)

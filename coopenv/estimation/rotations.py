@@ -32,7 +32,7 @@ def lengths(v: Array) -> Array:
 
 def exp_so3(w: Array) -> Array:
     """Return Exp(w), the rotation by |w| rad about w (3,)."""
-    x, y, z = w.tolist()  # scalars: a small array costs more than all of this
+    x, y, z = float(w[0]), float(w[1]), float(w[2])  # numbers: a small array costs more than all of this
     xx, yy, zz = x * x, y * y, z * z
     square = xx + yy + zz
     if square > 1e-8:
@@ -52,7 +52,7 @@ def exp_so3(w: Array) -> Array:
 
 def right_jacobian(w: Array) -> Array:
     """Return J (3, 3) with Exp(w + d) = Exp(w) Exp(J d) to first order in d."""
-    x, y, z = w.tolist()
+    x, y, z = float(w[0]), float(w[1]), float(w[2])
     square = x * x + y * y + z * z
     if square > 1e-6:
         angle = math.sqrt(square)
@@ -87,21 +87,6 @@ def orthonormalise(R: Array) -> Array:
     return result
 
 
-def tangent_basis(b: Array) -> Array:
-    """Return (m, 2, 3) orthonormal rows across each unit vector b (m, 3).
-
-    Source: Duff et al., Building an orthonormal basis, revisited, Journal of Computer Graphics Techniques 6(1), 2017.
-    """
-    x, y, z = b.T
-    sign = np.copysign(1.0, z)
-    a = -1.0 / (sign + z)
-    c = x * y * a
-    B = np.empty((len(b), 2, 3))
-    B[:, 0, 0], B[:, 0, 1], B[:, 0, 2] = 1.0 + sign * x * x * a, sign * c, -sign * x
-    B[:, 1, 0], B[:, 1, 1], B[:, 1, 2] = c, sign + y * y * a, -y
-    return B
-
-
 def exp_se3(xi: Array) -> tuple[Array, Array]:
     """Return the rotations (..., 3, 3) and translations (..., 3) of Exp(xi) for xi (..., 6)."""
     theta, rho = xi[..., :3], xi[..., 3:]
@@ -116,12 +101,17 @@ def exp_se3(xi: Array) -> tuple[Array, Array]:
 
 
 def rigid_exp(w: Array, v: Array) -> tuple[Array, Array]:
-    """Return the rotation (3, 3) and translation (3,) of Exp((w, v)), as `exp_se3` does of one pair, but faster.
+    """Return the rotation (3, 3) and translation (3,) of Exp((w, v)), as `exp_se3` does of one pair, but faster."""
+    return exp_so3(w), exp_translation(w, v)
+
+
+def exp_translation(w: Array, v: Array) -> Array:
+    """Return the translation (3,) of Exp((w, v)).
 
     Source: the closed form J v = a v + b w x v + c (w . v) w of the left Jacobian J of SO(3).
     """
-    wx, wy, wz = w.tolist()
-    vx, vy, vz = v.tolist()
+    wx, wy, wz = float(w[0]), float(w[1]), float(w[2])
+    vx, vy, vz = float(v[0]), float(v[1]), float(v[2])
     square = wx * wx + wy * wy + wz * wz
     if square > 1e-8:
         angle = math.sqrt(square)
@@ -133,7 +123,7 @@ def rigid_exp(w: Array, v: Array) -> tuple[Array, Array]:
     x = a * vx + b * (wy * vz - wz * vy) + along * wx
     y = a * vy + b * (wz * vx - wx * vz) + along * wy
     z = a * vz + b * (wx * vy - wy * vx) + along * wz
-    return exp_so3(w), np.array([x, y, z])
+    return np.array([x, y, z])
 
 
 def adjoint(R: Array, p: Array) -> Array:

@@ -10,6 +10,8 @@ Mask = NDArray[np.bool_]
 
 MAX_BEND = 1e-6
 """By how much entries of R^T R may differ from those of I, and the squared length of a direction from 1."""
+MOST_LOPSIDED = 1e-6
+"""By how much a covariance and its transpose may differ, relative to it, in Frobenius' norm."""
 MAX_ASYMMETRY = 1e-6
 """By how much entries of a covariance may differ from its transpose, relative to the standard deviations."""
 

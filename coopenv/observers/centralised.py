@@ -103,8 +103,8 @@ class Centralised:
         """Return the bearings of a mask (m,) of vehicle i, linearised by all errors, and whether they point ahead."""
         R, p = self.poses[i]
         targets = tick.targets[mask].tolist()
-        z = np.array([self.place(target, tick) for target in targets]).reshape(-1, 3)
-        bearings = tick.bearings[mask]
+        z = np.array([self.place(target, tick) for target in targets], float).reshape(-1, 3)
+        bearings = np.asarray(tick.bearings[mask], float)
         known = Sight(bearings, z, np.zeros((len(z), 3, 3)), np.array(targets), (None,) * len(z))
         own = linearised(LeftError(R, p, self.P), tick, known)
         H = np.zeros((len(z), 2, len(self.P)))

@@ -50,7 +50,7 @@ class SensorNoise:
         """
         scale = self.odometry_period * dt
         turn, step = self.angular_velocity**2 * scale, self.velocity**2 * scale
-        return np.array([turn, turn, turn, step, step, step])
+        return np.array([turn, turn, turn, step, step, step], float)
 
     def bearing_information(self, bearings: Array) -> Array:
         """Return the information matrices (m, 3, 3), 1/rad^2, of unit bearings (m, 3), body frame, about themselves.

@@ -14,6 +14,8 @@ from collections.abc import Callable
 import numpy as np
 
 from coopenv.estimation.arrays import Array, solve
+from coopenv.estimation.compiled import MATRIX, VECTOR, compiled
+from coopenv.estimation.compiled_matrices import eliminated, place, transformed
 
 CLOSE = 1e-3  # rad, by which the last step of an iteration may turn a line of sight
 MOST = 8  # steps, and halvings of a step
@@ -24,29 +26,30 @@ Stacked = tuple[Array, Array, Array]
 Look = Callable[[Array], Stacked]
 
 
+@compiled(MATRIX, MATRIX, MATRIX, VECTOR)
 def gain(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array, float]:
     """Return (K, dx, r^T S^-1 r) of a Kalman update with measurement covariance N."""
-    PHt = P.dot(H.T)
-    if len(H) == 2:  # one bearing: in closed form
-        (a, b), (_, d) = (H.dot(PHt) + N).tolist()
-        x, y = residual.tolist()
-        determinant = a * d - b * b
-        if determinant == 0.0:
-            raise np.linalg.LinAlgError("singular matrix")
-        inverse = np.array([[d / determinant, -b / determinant], [-b / determinant, a / determinant]])
-        K = PHt.dot(inverse)
-        return K, K.dot(residual), (d * x * x - 2.0 * b * x * y + a * y * y) / determinant
-    solved = solve(H.dot(PHt) + N, np.concatenate([PHt.T, residual[:, None]], axis=1))
-    K = solved[:, :-1].T
-    return K, K.dot(residual), float(residual.dot(solved[:, -1]))
+    n, m = len(P), len(residual)
+    H, right = np.ascontiguousarray(H), np.empty((m, n + 1))
+    HP = H.dot(np.ascontiguousarray(P.T))
+    place(right, 0, 0, HP)
+    for k in range(m):
+        right[k, n] = residual[k]
+    solved = eliminated(HP.dot(H.T) + N, right)
+    nis = 0.0
+    for k in range(m):
+        nis += residual[k] * solved[k, n]
+    return solved[:, :n].T, transformed(solved[:, :n].T, residual), nis
 
 
+@compiled(MATRIX, MATRIX, MATRIX, MATRIX)
 def joseph(P: Array, K: Array, H: Array, N: Array) -> Array:
     """Return the covariance after an update with any gain K."""
-    A = -K.dot(H)
-    A.flat[:: len(P) + 1] += 1.0
-    P = A.dot(P).dot(A.T) + K.dot(N).dot(K.T)
-    return np.asarray((P + P.T) / 2)
+    K = np.ascontiguousarray(K)
+    A = np.eye(len(P)) - K.dot(np.ascontiguousarray(H))
+    after: Array = A.dot(np.ascontiguousarray(P)).dot(A.T) + K.dot(np.ascontiguousarray(N)).dot(K.T)
+    after = (after + after.T) / 2
+    return after
 
 
 def kalman(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array, float]:
@@ -61,7 +64,7 @@ def turn_of_sight(dx: Array, distance: float) -> float:
     return float(max(size[0], size[1] / distance))
 
 
-def halfway(P: Array, first: Stacked, look: Look, moved: int | None = None) -> tuple[Array, Array, float]:
+def halfway(P: Array, first: Stacked, look: Look) -> tuple[Array, Array, float]:
     """Return (dx, P+, r^T S^-1 r at the prediction) of an update linearised half way.
 
     Args:
@@ -69,15 +72,12 @@ def halfway(P: Array, first: Stacked, look: Look, moved: int | None = None) -> t
         first: the measurements linearised at the prediction.
         look: returns them linearised at the prediction moved by an error (n,), H still by the error about the
             prediction.
-        moved: how many errors are corrected, None: all. Those behind are considered and not corrected (Schmidt).
     """
     residual, H, N = first
     _, dx, nis = gain(P, H, N, residual)
     at = 0.5 * dx
-    at[moved or len(at) :] = 0.0
     residual, H, N = look(at)
     K, dx, _ = gain(P, H, N, residual + H.dot(at))
-    K[moved or len(at) :] = dx[moved or len(at) :] = 0.0
     return dx, joseph(P, K, H, N), nis
 
 

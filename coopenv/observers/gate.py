@@ -14,9 +14,11 @@ while it is open is believed.
 """
 
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array
+from coopenv.estimation.compiled import MATRICES, MATRIX, compiled
 from coopenv.observers.lines import normalised
 
 LARGEST = 13.8155  # 0.999 of a chi-square of 2: -2 log 0.001
@@ -48,13 +50,23 @@ class Gate:
             S: (m, 2, 2) rad^2, their covariances; where one is none, or not a number, its bearing is never taken.
             in_front: (m,) whether the targets are where the bearings point.
         """
-        squared = normalised(residual, S)
-        definite = squared >= 0.0
-        fits = definite & (squared <= LARGEST) & in_front
-        refused = 1.0 - np.count_nonzero(fits) / len(fits)
+        definite, fits, refused, widest = judged(residual, S, in_front)
         self.share += (refused - self.share) * min(1.0, max(0.0, time - self.time) / AVERAGING)
-        if (S[:, 0, 0] + S[:, 1, 1]).max() > WIDE:
+        if widest > WIDE:
             self.share = 1.0
         self.time = time
         self.is_open = self.share > (FOUND_SHARE if self.is_open else LOST_SHARE)
-        return definite if self.is_open else fits
+        taken: NDArray[np.bool_] = definite if self.is_open else fits
+        return taken
+
+
+@compiled(MATRIX, MATRICES, types.Array(types.boolean, 1, "A", readonly=True))
+def judged(
+    residual: Array, S: Array, in_front: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], float, float]:
+    """Return (m,) which S are covariances, (m,) which bearings fit, the share of the others, and the largest trace."""
+    squared = normalised(residual, S)
+    definite = squared >= 0.0
+    fits = definite & (squared <= LARGEST) & in_front
+    widest = np.max(S[:, 0, 0] + S[:, 1, 1])
+    return definite, fits, 1.0 - np.count_nonzero(fits) / len(fits), widest

@@ -75,9 +75,7 @@ class Group:
             try:
                 self.observers.append(self.factory(setup))
                 self.observers[i].reset(poses[i], covariances[i])
-                message = self.observers[i].message()
-                check_message(message)
-                self._post(i, 0, message, interference, None)
+                self._post(i, 0, self.observers[i].message(), interference, None)
             except ANYTHING as error:
                 raise self._blamed(error, 0, i) from error
 
@@ -101,7 +99,6 @@ class Group:
             elapsed = perf_counter() - begin
             self._check(estimate)
             if message is not None:
-                check_message(message)
                 self._post(vehicle, k, message, interference, self.tamper)
         except ANYTHING as error:
             raise self._blamed(error, k, vehicle) from error
@@ -117,7 +114,13 @@ class Group:
     def _post(
         self, vehicle: int, k: int, message: Message, interference: Interference | None, tamper: Tamper | None
     ) -> None:
-        """Send a message, or what the world's faults and whoever tampers with it make of it."""
+        """Send a message, or what the world's faults and whoever tampers with it make of it.
+
+        A CoopenvError says that it is none. Where nothing is made of it, only the mailbox looks at it, if it is sound.
+        """
+        unchanged = interference is None and tamper is None
+        if not unchanged:
+            check_message(message)
         observer, replay, kept = self.observers[vehicle], 0, 0
         self.mail.expect_as(vehicle, message)
         if interference is not None:
@@ -125,7 +128,8 @@ class Group:
             replay, kept = int(interference.replay[vehicle]), int(interference.kept[vehicle])
         if tamper is not None and tamper.applies(vehicle, k * self.briefing.dt):
             message = tamper.told(observer, message)
-        self.mail.post(vehicle, k, message, replay, kept)
+        if not self.mail.post(vehicle, k, message, replay, kept) and unchanged:
+            check_message(message)
 
     @property
     def refused(self) -> NDArray[np.int64]:

@@ -6,20 +6,27 @@ and Jacobians as in mekf.py. Being linearised at the end and not half way, it ha
 correction.py tells of, inwards.
 """
 
+import numpy as np
+
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import lengths
-from coopenv.observers.correction import Look, Stacked, iterated, turn_of_sight
-from coopenv.observers.lines import Sight
+from coopenv.observers.contract import Tick
+from coopenv.observers.correction import Stacked, iterated, turn_of_sight
+from coopenv.observers.lines import Sight, linearised
 from coopenv.observers.mekf_covariance import MekfCovariance
 
 
 class IteratedEkf(MekfCovariance):
     """Error-state filter that iterates corrections; sends covariances."""
 
-    def settled(self, P: Array, first: Stacked, look: Look, sight: Sight) -> tuple[Array, Array, float]:
-        """Return the correction (n,), the covariance (n, n) after it and r^T S^-1 r at the prediction.
+    def fuse(self, tick: Tick, sight: Sight) -> float:
+        """Correct by bearings, linearised anew until the pose stays where it is; return what `Mekf.fuse` does."""
+        before, distance = self.state, float(lengths(sight.positions - self.state.p).min())
 
-        The update is linearised anew until it stays where it is.
-        """
-        distance = float(lengths(sight.positions - self.state.p).min())
-        return iterated(P, first, look, lambda dx: turn_of_sight(dx, distance))
+        def look(at: Array) -> Stacked:
+            residual, H, N = linearised(before.moved(at, before.P), tick, sight).stacked()
+            return residual, H.dot(before.recentring(at)), N
+
+        dx, P, nis = iterated(before.P, look(np.zeros(6)), look, lambda dx: turn_of_sight(dx, distance))
+        self.state = before.corrected(dx, P)
+        return nis

@@ -5,17 +5,16 @@ residual of a bearing b is B b, and its derivative by the line J = B / |d|.
 """
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array
-from coopenv.estimation.rotations import lengths, tangent_basis
+from coopenv.estimation.compiled import FLAG, MATRICES, MATRIX, NUMBER, ROW, VECTOR, compiled
+from coopenv.estimation.compiled_matrices import congruent, place, transformed
 from coopenv.observers.contract import Message, Tick
-
-PLANE = np.eye(2)
+from coopenv.observers.pose_errors import RIGHT
 
 
 class Pose(Protocol):
@@ -29,12 +28,9 @@ class Pose(Protocol):
     def p(self) -> Array:
         """(3,) map frame, m."""
 
-    def jacobian(self, positions: Array) -> Array:
-        """Return (m, 3, n) the derivative of the lines to map positions (m, 3) by the error."""
-
     @property
-    def right(self) -> bool:
-        """Whether the error is about the map's axes, R = Exp(theta) Rhat, and not about the body's."""
+    def kind(self) -> int:
+        """Which error it is, see pose_errors.py."""
 
 
 class Sight(NamedTuple):
@@ -51,6 +47,11 @@ class Sight(NamedTuple):
         messages = tuple(message for message, keep in zip(self.messages, kept.tolist(), strict=True) if keep)
         return Sight(self.bearings[kept], self.positions[kept], self.covariances[kept], self.targets[kept], messages)
 
+    def one(self, n: int) -> "Sight":
+        """Return the n-th one alone."""
+        k = slice(n, n + 1)
+        return Sight(self.bearings[k], self.positions[k], self.covariances[k], self.targets[k], self.messages[k])
+
 
 class Lines(NamedTuple):
     """Bearings, linearised."""
@@ -64,14 +65,10 @@ class Lines(NamedTuple):
         """Return those of a mask (m,)."""
         return Lines(self.residual[kept], self.H[kept], self.N[kept], self.G[kept])
 
-    def weighed(self, bearing_std: float, factor: float) -> Array:
-        """Return N if the points' covariances were so many times larger."""
-        own = bearing_std**2 * PLANE
-        return np.asarray(own + (self.N - own) * factor)
-
     def spread(self, P: Array) -> Array:
         """Return (m, 2, 2) the covariances of the innovations, given that of the error (n, n)."""
-        return np.asarray(self.H @ P @ self.H.transpose(0, 2, 1) + self.N)
+        S: Array = spread(self.H, P, self.N)
+        return S
 
     def stacked(self) -> tuple[Array, Array, Array]:
         """Return the residual (2m,), H (2m, n) and N (2m, 2m)."""
@@ -89,7 +86,7 @@ def sight_of(tick: Tick, weighed: bool = True) -> Sight | None:
             if message is not None and message.covariance is not None:
                 covariances[n] = point_covariance(message)
     targets, bearings, positions, messages = zip(*seen, strict=True)
-    return Sight(np.array(bearings), np.array(positions), covariances, np.array(targets), messages)
+    return Sight(np.array(bearings, float), np.array(positions, float), covariances, np.array(targets), messages)
 
 
 def point_covariance(message: Message) -> Array:
@@ -100,100 +97,106 @@ def point_covariance(message: Message) -> Array:
     return np.asarray(R.dot(message.covariance[3:, 3:]).dot(R.T))
 
 
-def innovation(R: Array, p: Array, lever_arm: Array, bearings: Array, positions: Array) -> tuple[Array, Array]:
-    """Return (residual (m, 2), J (m, 2, 3)): tangent residuals and their derivative by the line d in the body frame."""
-    d = (positions - p).dot(R) - lever_arm
-    distance = np.maximum(lengths(d), 1e-9)[:, None]
-    B = tangent_basis(d / distance)
-    return (B @ bearings[..., None])[..., 0], B / distance[..., None]
+@compiled(NUMBER, NUMBER, NUMBER)
+def across(x: float, y: float, z: float) -> Array:
+    """Return (2, 3) orthonormal rows across a unit vector.
+
+    Source: Duff et al., Building an orthonormal basis, revisited, Journal of Computer Graphics Techniques 6(1), 2017.
+    """
+    sign = math.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    c = x * y * a
+    return np.array([[1.0 + sign * x * x * a, sign * c, -sign * x], [c, sign + y * y * a, -y]])
+
+
+@compiled(ROW, VECTOR, VECTOR, NUMBER)
+def put_derivative(row: Array, u: Array, about: Array, factor: float) -> None:
+    """Write (u x about, -u) times a factor into a row (6,)."""
+    for k in range(3):
+        i, j = (k + 1) % 3, (k + 2) % 3
+        row[k] = (u[i] * about[j] - u[j] * about[i]) * factor
+        row[k + 3] = -u[k] * factor
 
 
 def linearised(pose: Pose, tick: Tick, sight: Sight) -> Lines:
     """Return the lines at a pose; the points' covariances are noise, as if independent of the pose."""
-    if len(sight.bearings) == 1:
-        return _one(pose, tick, sight)
-    residual, J = innovation(pose.R, pose.p, tick.lever_arm, sight.bearings, sight.positions)
-    G = J.dot(pose.R.T)
-    N = G @ sight.covariances @ G.transpose(0, 2, 1) + tick.noise.bearing_std**2 * PLANE
-    return Lines(residual, J @ pose.jacobian(sight.positions), N, G)
+    variance = tick.noise.bearing_std**2
+    lever_arm = np.asarray(tick.lever_arm, float)
+    return Lines(*linearise(pose.R, pose.p, pose.kind == RIGHT, lever_arm, *sight[:3], variance))
 
 
-def _one(pose: Pose, tick: Tick, sight: Sight) -> Lines:
-    """Return what `linearised` does of one line, in numbers of Python: NumPy's calls take twice as long.
+@compiled(MATRIX, VECTOR, FLAG, VECTOR, MATRIX, MATRIX, MATRICES, NUMBER)
+def linearise(
+    R: Array, p: Array, right: bool, lever_arm: Array, bearings: Array, positions: Array, C: Array, variance: float
+) -> tuple[Array, Array, Array, Array]:
+    """Return residuals, H, N and G as in `Lines`; `right`: the error is about the map's axes.
 
     With the rows j of J, and g = R j, the derivative by a left error is (j x a, -j), by a right one (g x z, -g).
     """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = pose.R.tolist()
-    px, py, pz = pose.p.tolist()
-    cx, cy, cz = tick.lever_arm.tolist()
-    point, b = sight.positions[0].tolist(), sight.bearings[0].tolist()
-    x, y, z = point[0] - px, point[1] - py, point[2] - pz
-    a = (xx * x + yx * y + zx * z, xy * x + yy * y + zy * z, xz * x + yz * y + zz * z)
-    x, y, z = a[0] - cx, a[1] - cy, a[2] - cz
-    near = 1.0 / max(math.sqrt(x * x + y * y + z * z), 1e-9)
-    basis = _across(x * near, y * near, z * near)
-    rows = [(u * near, v * near, w * near) for u, v, w in basis]
-    mapped = [(xx * u + xy * v + xz * w, yx * u + yy * v + yz * w, zx * u + zy * v + zz * w) for u, v, w in rows]
-    H = [_derivative(row, point) for row in mapped] if pose.right else [_derivative(row, a) for row in rows]
-    N = _spread(mapped, sight.covariances[0].tolist(), tick.noise.bearing_std**2)
-    residual = [u * b[0] + v * b[1] + w * b[2] for u, v, w in basis]
-    return Lines(np.array([residual]), np.array([H]), np.array([N]), np.array([mapped]))
-
-
-Row = tuple[float, float, float]
-
-
-def _across(x: float, y: float, z: float) -> tuple[Row, Row]:
-    """Return the rows of `tangent_basis` of one unit vector."""
-    sign = math.copysign(1.0, z)
-    t = -1.0 / (sign + z)
-    c = x * y * t
-    return (1.0 + sign * x * x * t, sign * c, -sign * x), (c, sign + y * y * t, -y)
-
-
-def _derivative(row: Row, about: Sequence[float]) -> tuple[float, ...]:
-    (u, v, w), (x, y, z) = row, about
-    return v * z - w * y, w * x - u * z, u * y - v * x, -u, -v, -w
-
-
-def _spread(rows: list[Row], C: list[list[float]], variance: float) -> list[list[float]]:
-    """Return (2, 2) the rows' covariance of a point of covariance C (3, 3), and the bearing's."""
-    if not (C[0][0] or C[1][1] or C[2][2]):
-        return [[variance, 0.0], [0.0, variance]]
-    (u, v, w), q = rows
-    (a, b, c), (d, e, f), (g, h, i) = C
-    p = (u * a + v * d + w * g, u * b + v * e + w * h, u * c + v * f + w * i)
-    r = (q[0] * a + q[1] * d + q[2] * g, q[0] * b + q[1] * e + q[2] * h, q[0] * c + q[1] * f + q[2] * i)
-    off = p[0] * q[0] + p[1] * q[1] + p[2] * q[2]
-    return [
-        [p[0] * u + p[1] * v + p[2] * w + variance, off],
-        [r[0] * u + r[1] * v + r[2] * w, r[0] * q[0] + r[1] * q[1] + r[2] * q[2] + variance],
-    ]
-
-
-def noise(R: Array, J: Array, tick: Tick, sight: Sight) -> Array:
-    """Return (m, 2, 2) the covariances of the residuals given one's own pose; J as from `innovation`."""
-    G = J.dot(R.T)
-    return np.asarray(G @ sight.covariances @ G.transpose(0, 2, 1) + tick.noise.bearing_std**2 * PLANE)
+    m = len(bearings)
+    residual, H, N, G = np.empty((m, 2)), np.empty((m, 2, 6)), np.empty((m, 2, 2)), np.empty((m, 2, 3))
+    for n in range(m):
+        z = positions[n]
+        a = transformed(R.T, z - p)
+        d = a - lever_arm
+        distance = max(math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]), 1e-9)
+        B = across(d[0] / distance, d[1] / distance, d[2] / distance)
+        for r in range(2):
+            residual[n, r] = B[r, 0] * bearings[n, 0] + B[r, 1] * bearings[n, 1] + B[r, 2] * bearings[n, 2]
+            for k in range(3):
+                G[n, r, k] = (R[k, 0] * B[r, 0] + R[k, 1] * B[r, 1] + R[k, 2] * B[r, 2]) / distance
+            if right:
+                put_derivative(H[n, r], G[n, r], z, 1.0)
+            else:
+                put_derivative(H[n, r], B[r], a, 1.0 / distance)
+        place(N[n], 0, 0, congruent(G[n], C[n]))
+        N[n, 0, 0] += variance
+        N[n, 1, 1] += variance
+    return residual, H, N, G
 
 
 def ahead(pose: Pose, tick: Tick, sight: Sight) -> NDArray[np.bool_]:
     """Return (m,) whether the points are where the bearings point, and not opposite."""
-    d = (sight.positions - pose.p).dot(pose.R) - tick.lever_arm
-    return np.asarray((d * sight.bearings).sum(1) > 0.0)
+    of: NDArray[np.bool_] = _ahead(pose.R, pose.p, np.asarray(tick.lever_arm, float), sight.bearings, sight.positions)
+    return of
 
 
+@compiled(MATRIX, VECTOR, VECTOR, MATRIX, MATRIX)
+def _ahead(R: Array, p: Array, lever_arm: Array, bearings: Array, positions: Array) -> NDArray[np.bool_]:
+    result = np.empty(len(bearings), np.bool_)
+    for n in range(len(bearings)):
+        d = transformed(R.T, positions[n] - p) - lever_arm
+        result[n] = d[0] * bearings[n, 0] + d[1] * bearings[n, 1] + d[2] * bearings[n, 2] > 0.0
+    return result
+
+
+@compiled(MATRIX, MATRICES)
 def normalised(residual: Array, S: Array) -> Array:
     """Return (m,) r^T S^-1 r of residuals (m, 2)."""
-    x, y = residual.T
-    a, b, d = S[:, 0, 0], S[:, 0, 1], S[:, 1, 1]
-    return np.asarray((d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b))
+    result = np.empty(len(residual))
+    for n in range(len(residual)):
+        x, y = residual[n]
+        a, b, d = S[n, 0, 0], S[n, 0, 1], S[n, 1, 1]
+        result[n] = (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
+    return result
 
 
+@compiled(MATRICES)
 def dense(blocks: Array) -> Array:
     """Return (2m, 2m) the block diagonal of blocks (m, 2, 2)."""
-    m = len(blocks)
-    N = np.zeros((m, 2, m, 2))
-    each = np.arange(m)
-    N[each, :, each, :] = blocks
-    return N.reshape(2 * m, 2 * m)
+    N = np.zeros((2 * len(blocks), 2 * len(blocks)))
+    for n in range(len(blocks)):
+        place(N, 2 * n, 2 * n, blocks[n])
+    return N
+
+
+@compiled(MATRICES, MATRIX, MATRICES)
+def spread(H: Array, P: Array, N: Array) -> Array:
+    """Return (m, 2, 2) H P H^T + N of every line."""
+    S = N.copy()
+    for n in range(len(H)):
+        HPH = congruent(H[n], P)
+        for i in range(2):
+            for j in range(2):
+                S[n, i, j] += HPH[i, j]
+    return S

@@ -55,8 +55,8 @@ class Mailbox:
         if message.covariance is not None:
             self.forms[vehicle] = np.shape(message.covariance)
 
-    def post(self, vehicle: int, k: int, message: Message, replay: int = 0, kept: int = 0) -> None:
-        """Send one message; that of the start is heard but not counted.
+    def post(self, vehicle: int, k: int, message: Message, replay: int = 0, kept: int = 0) -> bool:
+        """Send one message, and return whether it is one; that of the start is heard but not counted.
 
         One that is a replay is in truth the one of so many ticks before; for that it is kept for so many.
         """
@@ -71,6 +71,7 @@ class Mailbox:
             del sent[oldest]
         if k > 0:
             self.bytes[vehicle] += _size(message)
+        return sent[k] is not None
 
     def inbox(
         self,

@@ -1,9 +1,8 @@
 """Error-state (multiplicative) Kalman filter with body-frame errors; neighbours are taken as exact.
 
 Source: Lefferts, Markley and Shuster, Kalman filtering for spacecraft attitude estimation, 1982 (multiplicative
-error); the bearing as a residual in its tangent plane. Errors: R = Rhat Exp(theta), p = phat + Rhat rho.
+error); the bearing as a residual in its tangent plane. Errors are left ones (pose_errors.py).
 
-Over a tick of odometry (dR, dp), with E = dR^T:  F = [E, 0; -E S(dp), E].
 With a = Rhat^T (z - phat), d = a - c the line from the camera c, and B a tangent basis at d / |d|:
 H = B [S(a), -I] / |d|,  residual B b. Bearings are gated (gate.py) and linearised half way (correction.py).
 """
@@ -15,11 +14,12 @@ import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
-from coopenv.estimation.rotations import IDENTITY, exp_so3, orthonormalise, right_jacobian, skew
+from coopenv.estimation.rotations import skew
+from coopenv.observers import pose_errors
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import Look, Stacked, halfway
 from coopenv.observers.gate import Gate
 from coopenv.observers.lines import Lines, Sight, ahead, linearised, sight_of
+from coopenv.observers.pose_update import frame_of, updated
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class LeftError:
     R: Array
     p: Array  # map frame
     P: Array
-    right: ClassVar[bool] = False
+    kind: ClassVar[int] = pose_errors.LEFT
 
     @classmethod
     def start(cls, R: Array, p: Array, P: Array) -> Self:
@@ -39,42 +39,28 @@ class LeftError:
     @staticmethod
     def transition(rotation: Array, translation: Array) -> Array:
         """Return F (6, 6) of the error over an odometry increment (dR, dp)."""
-        F = np.zeros((6, 6))
-        E = rotation.T
-        F[:3, :3] = F[3:, 3:] = E
-        F[3:, :3] = E.dot(skew(-translation))
+        F: Array = pose_errors.transition(np.asarray(rotation, float), np.asarray(translation, float))
         return F
 
     def predicted(self, tick: Tick) -> Self:
         """Return the state after the tick's odometry."""
-        F = self.transition(tick.rotation, tick.translation)
-        P = F.dot(self.P).dot(F.T)
-        P.flat[::7] += tick.noise.odometry(tick.dt)
-        return type(self)(orthonormalise(self.R.dot(tick.rotation)), self.p + self.R.dot(tick.translation), P)
-
-    def jacobian(self, positions: Array) -> Array:
-        """Return (m, 3, 6) the derivative of the lines to map positions (m, 3)."""
-        J = np.empty((len(positions), 3, 6))
-        J[:, :, :3] = skew((positions - self.p).dot(self.R))
-        J[:, :, 3:] = -IDENTITY
-        return J
+        rotation, translation = np.asarray(tick.rotation, float), np.asarray(tick.translation, float)
+        step = (rotation, translation, tick.noise.odometry(tick.dt))
+        return type(self)(*pose_errors.predicted(self.kind, self.R, self.p, self.P, *step))
 
     def moved(self, dx: Array, P: Array) -> Self:
         """Return the state moved by an error dx."""
-        return type(self)(self.R.dot(exp_so3(dx[:3])), self.p + self.R.dot(dx[3:]), P)
+        return type(self)(*pose_errors.moved(self.kind, self.R, self.p, dx), P)
 
-    @staticmethod
-    def recentring(dx: Array) -> Array:
+    @classmethod
+    def recentring(cls, dx: Array) -> Array:
         """Return G (6, 6): about the state moved by dx, an error of dx + d about this one is G d to first order."""
-        G = np.zeros((6, 6))
-        G[:3, :3] = right_jacobian(dx[:3])
-        G[3:, 3:] = exp_so3(dx[:3]).T
+        G: Array = pose_errors.recentring(cls.kind, dx)
         return G
 
     def corrected(self, dx: Array, P: Array) -> Self:
         """Return the state moved by an error dx, of which P is the covariance about this state."""
-        G = self.recentring(dx)
-        return self.moved(dx, G.dot(P).dot(G.T))
+        return type(self)(*pose_errors.corrected(self.kind, self.R, self.p, dx, P))
 
     def point_covariance(self, marker: Array) -> Array:
         """Return the covariance (3, 3) in map axes of a point of the body."""
@@ -156,25 +142,12 @@ class Mekf(PoseObserver):
 
     def correct(self, tick: Tick, sight: Sight, lines: Lines) -> None:
         """Correct by bearings, which are linearised at the prediction."""
-        self.nis = self.fuse(tick, sight, lines, self.state.P)
+        self.nis = self.fuse(tick, sight)
         self.nis_dof = 2 * len(lines.residual)
 
-    def fuse(self, tick: Tick, sight: Sight, lines: Lines, P: Array) -> float:
-        """Correct a prediction of covariance P by bearings; return their normalised innovation squared."""
+    def fuse(self, tick: Tick, sight: Sight) -> float:
+        """Correct by bearings; return their normalised innovation squared."""
         before = self.state
-
-        def look(at: Array) -> Stacked:
-            moved = before.moved(at, before.P)
-            residual, H, N = linearised(moved, tick, sight).stacked()
-            return residual, H.dot(before.recentring(at)), N
-
-        dx, P, nis = self.settled(P, lines.stacked(), look, sight)
-        self.state = before.corrected(dx, P)
-        return nis
-
-    def settled(self, P: Array, first: Stacked, look: Look, sight: Sight) -> tuple[Array, Array, float]:
-        """Return the correction (n,), the covariance (n, n) after it and r^T S^-1 r at the prediction.
-
-        The update is linearised half way to where it leads.
-        """
-        return halfway(P, first, look)
+        R, p, P, nis = updated(before.kind, before.R, before.p, before.P, frame_of(tick, sight))
+        self.state = self.belief(R, p, P)
+        return float(nis)

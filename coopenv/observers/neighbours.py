@@ -11,17 +11,24 @@ two have nothing in common but what the first one knows. For messages that were 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numba import types
 
-from coopenv.estimation.arrays import Array, cholesky, solve
+from coopenv.estimation.arrays import Array, cholesky
+from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled
+from coopenv.estimation.compiled_matrices import eliminated, place, product, transformed
 from coopenv.estimation.rotations import skew
 from coopenv.observers.contract import Message, Setup, Tick
-from coopenv.observers.correction import Stacked, halfway
-from coopenv.observers.lines import Lines, Sight, linearised
+from coopenv.observers.correction import gain, joseph
+from coopenv.observers.lines import Lines, Sight, dense, linearise
 from coopenv.observers.mekf import LeftError, Mekf
+from coopenv.observers.pose_errors import LEFT, corrected, moved, recentring
+from coopenv.observers.pose_update import FRAME, Frame, frame_of
 
 IDENTITY = np.eye(6)
+PLACES = types.Array(types.int64, 1, "A", readonly=True)
 MOST_LOST = 60  # messages in a row for which a factor stands in
 SHRINKING = (0.98, 0.9, 0.7, 0.4, 0.0)
 """Factors of cross-covariances where no joint distribution has them: a sender may lie, the rule approximates."""
@@ -38,7 +45,7 @@ class Neighbour:
 
 
 class Considering(Mekf):
-    """The part of a filter that keeps cross-covariances."""
+    """The part of a filter that keeps cross-covariances; its own error is a left one."""
 
     sends_covariance = True
 
@@ -97,16 +104,17 @@ class Considering(Mekf):
     def hear(self, target: int, message: Message) -> None:
         """Take what a neighbour tells of itself, if it is what this observer sends."""
         factor, number = (np.asarray(message.extra.get(name, np.nan)) for name in ("factor", "number"))
-        if message.rotation is None or message.covariance is None or factor.shape != (6, 6) or number.shape != (1,):
+        if message.rotation is None or message.covariance is None or np.shape(message.covariance) != (6, 6):
             return
+        if factor.shape != (6, 6) or number.shape != (1,) or factor.dtype.kind not in "biuf":
+            return
+        factor = factor.astype(float)
         of, now = self.neighbours.get(target), int(number[0])
         cross = np.zeros((6, 6)) if of is None else of.cross
         if of is not None and now != of.number:
             lost = max(1, min(now - of.number, MOST_LOST))
             cross = cross.dot(factor.T if lost == 1 else np.linalg.matrix_power(factor, lost).T)
-        variances = np.maximum(np.outer(self.state.P.diagonal(), message.covariance.diagonal()), 0.0)
-        limit = np.sqrt(variances)  # of any covariance: what is told may be anything
-        cross = np.clip(np.nan_to_num(cross), -limit, limit)
+        cross = bounded(cross, self.state.P, np.asarray(message.covariance, float))
         self.neighbours[target] = Neighbour(now, message.rotation, message.covariance, cross)
 
     def consider(self, tick: Tick, sight: Sight, told: Array | None = None) -> float:
@@ -114,31 +122,19 @@ class Considering(Mekf):
 
         `told` (n, n, 6, 6) holds the covariances of the neighbours with each other, in the order of the sight.
         """
-        seen = [t for t in sight.targets.tolist() if t in self.neighbours]
+        targets = sight.targets.tolist()
+        seen = [t for t in targets if t in self.neighbours]
         of, before = [self.neighbours[t] for t in seen], self.state
-        joint, P = self.joint_covariance(of, told), before.P
-        exact = sight._replace(covariances=np.zeros_like(sight.covariances))
-
-        def look(at: Array) -> Stacked:
-            moved = before.moved(at[:6], P)
-            lines = linearised(moved, tick, exact)
-            residual, H, N = lines.stacked()
-            whole = np.zeros((len(residual), len(joint)))
-            whole[:, :6] = H.dot(before.recentring(at[:6])) if at.any() else H
-            for n, target in enumerate(sight.targets.tolist()):
-                if target in self.neighbours:
-                    k = 6 * seen.index(target) + 9
-                    whole[2 * n : 2 * n + 2, k : k + 3] = lines.G[n].dot(self.neighbours[target].R)
-            return residual, whole, N
-
-        dx, after, nis = halfway(joint, look(np.zeros(len(joint))), look, 6)
-        G = before.recentring(dx[:6])
-        self.state = before.corrected(dx[:6], after[:6, :6])
-        self.carry(solve(P, after[:6, :6].dot(G.T)).T, [t for t in self.neighbours if t not in seen])
-        for n, (target, was) in enumerate(zip(seen, of, strict=True)):
-            cross = G.dot(after[:6, 6 * n + 6 : 6 * n + 12])
+        joint = self.joint_covariance(of, told)
+        places = np.array([seen.index(t) if t in self.neighbours else -1 for t in targets])
+        turns = np.array([one.R for one in of], float).reshape(-1, 3, 3)
+        exact = frame_of(tick, sight._replace(covariances=np.zeros((len(targets), 3, 3))))
+        R, p, P, carried, crosses, nis = considered(before.R, before.p, joint, exact, turns, places)
+        self.state = LeftError(R, p, P)
+        self.carry(carried, [t for t in self.neighbours if t not in seen])
+        for target, was, cross in zip(seen, of, crosses, strict=True):
             self.neighbours[target] = Neighbour(was.number, was.R, was.P, cross)
-        return nis
+        return float(nis)
 
     def joint_covariance(self, of: Sequence[Neighbour], told: Array | None) -> Array:
         """Return the joint covariance of the own error and those of neighbours, which is positive definite."""
@@ -151,17 +147,87 @@ class Considering(Mekf):
             if told is not None:
                 joint[k, 6 : 6 * n + 6] = told[n, :n].transpose(1, 0, 2).reshape(6, -1)
                 joint[6 : 6 * n + 6, k] = joint[k, 6 : 6 * n + 6].T
-        if not of or _is_definite(joint):
+        if not of or _has_factor(joint):
             return joint
         alone = np.kron(np.eye(len(of) + 1), np.ones((6, 6)))
         for factor in SHRINKING:
             shrunk = joint * (alone + factor * (1.0 - alone))
-            if _is_definite(shrunk):
+            if _has_factor(shrunk):
                 return shrunk
         return shrunk
 
 
-def _is_definite(P: Array) -> bool:
+@compiled(MATRICES, MATRICES, MATRIX, MATRICES, PLACES)
+def joint_jacobian(H: Array, G: Array, recentring: Array, turns: Array, places: Any) -> Array:
+    """Return (2m, 6 + 6k) the derivative of m bearings by one's own error and those of k neighbours.
+
+    Args:
+        H: (m, 2, 6) by the error about where it is linearised.
+        G: (m, 2, 3) by the points, map axes.
+        recentring: (6, 6) of one's own error.
+        turns: (k, 3, 3) the neighbours' orientations.
+        places: (m,) which of them is seen, -1: none.
+    """
+    whole = np.zeros((2 * len(H), 6 + 6 * len(turns)))
+    for n in range(len(H)):
+        place(whole, 2 * n, 0, product(H[n], recentring))
+        k = places[n]
+        if k >= 0:
+            place(whole, 2 * n, 6 * k + 9, product(G[n], turns[k]))
+    return whole
+
+
+@compiled(MATRIX, VECTOR, MATRIX, FRAME, MATRICES, PLACES)
+def considered(
+    R: Array, p: Array, joint: Array, frame: Frame, turns: Array, places: Any
+) -> tuple[Array, Array, Array, Array, Array, float]:
+    """Correct one's own pose by bearings, linearised half way (correction.py), and no neighbour's (Schmidt).
+
+    Args:
+        R: (3, 3) one's own orientation.
+        p: (3,) one's own position.
+        joint: (6 + 6k, 6 + 6k) covariance of one's own error and those of k neighbours.
+        frame: the bearings; points have no covariances.
+        turns: see `joint_jacobian`.
+        places: see `joint_jacobian`.
+
+    Returns:
+        Orientation, position, covariance (6, 6), what carries cross-covariances with others on (6, 6), those with the
+        neighbours (k, 6, 6), and r^T S^-1 r at the prediction.
+    """
+    residual, H, N, G = linearise(R, p, False, *frame)
+    whole = joint_jacobian(H, G, np.eye(6), turns, places)
+    _, dx, nis = gain(joint, whole, dense(N), residual.ravel())
+    at = 0.5 * dx
+    at[6:] = 0.0
+    R_there, p_there = moved(LEFT, R, p, at[:6])
+    residual, H, N, G = linearise(R_there, p_there, False, *frame)
+    whole = joint_jacobian(H, G, recentring(LEFT, at[:6]), turns, places)
+    K, dx, _ = gain(joint, whole, dense(N), residual.ravel() + transformed(whole, at))
+    K[6:] = 0.0
+    after = joseph(joint, K, whole, dense(N))
+    R, p, P = corrected(LEFT, R, p, dx[:6], after[:6, :6])
+    recentred = recentring(LEFT, dx[:6])
+    carried = eliminated(joint[:6, :6], product(after[:6, :6], recentred.T)).T
+    crosses = np.empty((len(turns), 6, 6))
+    for n in range(len(turns)):
+        place(crosses[n], 0, 0, product(recentred, after[:6, 6 * n + 6 : 6 * n + 12]))
+    return R, p, P, carried, crosses, nis
+
+
+@compiled(MATRIX, MATRIX, MATRIX)
+def bounded(cross: Array, P: Array, of: Array) -> Array:
+    """Return (6, 6) a cross-covariance within what any two errors can have in common: what is told may be anything."""
+    result = np.zeros((6, 6))
+    for i in range(6):
+        for j in range(6):
+            limit = np.sqrt(max(P[i, i] * of[j, j], 0.0))
+            if not np.isnan(cross[i, j]):
+                result[i, j] = min(max(cross[i, j], -limit), limit)
+    return result
+
+
+def _has_factor(P: Array) -> bool:
     try:
         cholesky(P)
     except np.linalg.LinAlgError:

@@ -28,5 +28,5 @@ class Pairwise(Considering):
         known = np.array([target not in self.neighbours for target in sight.targets.tolist()])
         if known.any():
             self.nis, self.nis_dof = self.consider(tick, sight.only(known)), 2 * int(known.sum())
-        for n in np.flatnonzero(~known):
-            self.consider(tick, sight.only(np.arange(len(known)) == n))
+        for n in np.flatnonzero(~known).tolist():
+            self.consider(tick, sight.one(n))

@@ -21,13 +21,65 @@ from dataclasses import replace
 import numpy as np
 
 from coopenv.estimation.arrays import Array
+from coopenv.estimation.compiled import MATRIX, NUMBER, VECTOR, WHOLE, compiled
+from coopenv.estimation.compiled_matrices import congruent
 from coopenv.observers.contract import Tick
-from coopenv.observers.correction import gain, joseph
+from coopenv.observers.correction import joseph
 from coopenv.observers.lines import Lines, Sight, linearised
 from coopenv.observers.mekf import Mekf
+from coopenv.observers.pose_errors import corrected, recentring
+from coopenv.observers.pose_update import FRAME, Frame, frame_of, halfway_gain
 
 WEIGHTS = np.concatenate([[0.02, 0.05, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8], 1.0 - np.logspace(-1.0, -6.0, 16)])
 """Among which w is searched: near one as finely as at 60 Hz a little inflation adds up."""
+
+
+@compiled(MATRIX)
+def _det(A: Array) -> float:
+    """Return the determinant of (2, 2)."""
+    result: float = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+    return result
+
+
+@compiled(MATRIX)
+def log_determinant(P: Array) -> float:
+    """Return log det P of a positive definite matrix, by elimination; not a number where it is none."""
+    rest, total = P.copy(), 0.0
+    for k in range(len(P)):
+        total += np.log(rest[k, k])
+        for i in range(k + 1, len(P)):
+            factor = rest[i, k] / rest[k, k]
+            for j in range(k + 1, len(P)):
+                rest[i, j] -= factor * rest[k, j]
+    return total
+
+
+@compiled(MATRIX, MATRIX, MATRIX, MATRIX, NUMBER)
+def best_weight(P_d: Array, P_i: Array, H: Array, N: Array, variance: float) -> float:
+    """Return the w with the least det P+ = det P_1 det P_2 / det(H P_1 H^T + P_2), 1 if there is no gain.
+
+    N is R_d + R_i, where R_i has a variance.
+    """
+    R_i = variance * np.eye(2)
+    R_d = N - R_i
+    best, least = 1.0, log_determinant(P_d + P_i)
+    for w in WEIGHTS:
+        P_1, P_2 = P_d / w + P_i, R_d / (1.0 - w) + R_i
+        cost = log_determinant(P_1) + np.log(_det(P_2) / _det(congruent(H, P_1) + P_2))
+        if cost < least:
+            best, least = w, cost
+    return best
+
+
+@compiled(WHOLE, MATRIX, VECTOR, MATRIX, MATRIX, FRAME)
+def updated_parts(
+    kind: int, R: Array, p: Array, P: Array, P_i: Array, frame: Frame
+) -> tuple[Array, Array, Array, Array, float]:
+    """Return pose, P, P_i and r^T S^-1 r of a correction of a prediction of covariance P."""
+    K, H, N, dx, nis = halfway_gain(kind, R, p, P, frame)
+    P_i = congruent(recentring(kind, dx), joseph(P_i, K, H, frame[4] * np.eye(len(H))))
+    R, p, P = corrected(kind, R, p, dx, joseph(P, K, H, N))
+    return R, p, P, P_i, nis
 
 
 class SplitCovarianceIntersection(Mekf):
@@ -54,41 +106,19 @@ class SplitCovarianceIntersection(Mekf):
         if known.any():
             self.nis = self.intersect(tick, sight.only(known))
             self.nis_dof = 2 * int(known.sum())
-        for n in np.flatnonzero(~known):
-            self.intersect(tick, sight.only(np.arange(len(known)) == n))
+        for n in np.flatnonzero(~known).tolist():
+            self.intersect(tick, sight.one(n))
 
     def intersect(self, tick: Tick, sight: Sight) -> float:
         """Correct by bearings to landmarks, or by one to a neighbour; return the normalised innovation squared."""
-        before, P_i, variance = self.state, self.independent, tick.noise.bearing_std**2
-        lines = linearised(before, tick, sight)
-        R_i, P = variance * np.eye(2 * len(lines.N)), before.P
+        state, P, P_i = self.state, self.state.P, self.independent
         if sight.covariances.any():
-            w = best_weight(P - P_i, P_i, lines.H[0], lines.N[0] - R_i, R_i)
+            lines = linearised(state, tick, sight)
+            w = best_weight(P - P_i, P_i, lines.H[0], lines.N[0], tick.noise.bearing_std**2)
             if w == 1.0:
                 return 0.0
             P = (P - P_i) / w + P_i
             sight = sight._replace(covariances=sight.covariances / (1.0 - w))
-            lines = lines._replace(N=lines.weighed(tick.noise.bearing_std, 1.0 / (1.0 - w)))
-        residual, H, N = lines.stacked()
-        _, dx, nis = gain(P, H, N, residual)
-        at = 0.5 * dx  # half way, see correction.py
-        residual, H, N = linearised(before.moved(at, P), tick, sight).stacked()
-        H = H.dot(before.recentring(at))
-        K, dx, _ = gain(P, H, N, residual + H.dot(at))
-        self.state = before.corrected(dx, joseph(P, K, H, N))
-        self.independent = before.corrected(dx, joseph(P_i, K, H, R_i)).P
-        return nis
-
-
-def best_weight(P_d: Array, P_i: Array, H: Array, R_d: Array, R_i: Array) -> float:
-    """Return the w with the least det P+ = det P_1 det P_2 / det(H P_1 H^T + P_2), 1 if there is no gain."""
-    w = WEIGHTS[:, None, None]
-    P_1, P_2 = P_d / w + P_i, R_d / (1.0 - w) + R_i
-    S = H @ P_1 @ H.T + P_2
-    cost = np.linalg.slogdet(P_1)[1] + np.log(_det(P_2)) - np.log(_det(S))
-    best = int(np.argmin(cost))
-    return float(WEIGHTS[best]) if cost[best] < np.linalg.slogdet(P_d + P_i)[1] else 1.0
-
-
-def _det(A: Array) -> Array:
-    return np.asarray(A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0])
+        R, p, P, P_i, nis = updated_parts(state.kind, state.R, state.p, P, P_i, frame_of(tick, sight))
+        self.state, self.independent = self.belief(R, p, P), P_i
+        return float(nis)

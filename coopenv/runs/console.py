@@ -1,5 +1,6 @@
 """What a command says while it works: how far it is, and what takes so long."""
 
+import sys
 import threading
 from collections.abc import Iterable, Iterator, Sized
 from contextlib import contextmanager
@@ -111,13 +112,13 @@ class Progress:
 
 @contextmanager
 def compile_notice(log: Console) -> Iterator[None]:
-    """Say what takes so long where Warp compiles kernels that are not in its cache."""
+    """Say what takes so long where Warp compiles kernels, or Numba functions, that are not in its cache."""
     start_warp()
-    before, over = kernel_cache.modules(), threading.Event()
+    before, functions, over = kernel_cache.modules(), _compiled_functions(), threading.Event()
 
     def watch() -> None:
         while not over.wait(COMPILE_NOTICE_AFTER):
-            if kernel_cache.modules() - before:
+            if kernel_cache.modules() - before or _compiled_functions() > functions:
                 log.print("compiling kernels (once per machine) ...")
                 return
 
@@ -126,3 +127,8 @@ def compile_notice(log: Console) -> Iterator[None]:
         yield
     finally:
         over.set()
+
+
+def _compiled_functions() -> int:
+    """Return how many functions Numba has compiled in this process; where nothing needs it, it is not loaded."""
+    return len(getattr(sys.modules.get("coopenv.estimation.compiled"), "fresh", ()))

@@ -60,21 +60,6 @@ def test_of_a_linear_measurement_both_are_the_kalman_update() -> None:
         assert_allclose(found[2], nis, rtol=1e-9)
 
 
-def test_errors_that_are_considered_are_not_corrected() -> None:
-    """Schmidt's update: the gain of the rest is zero, and what is left of all is the covariance of that."""
-    rng = np.random.default_rng(1)
-    P, H, N, r = spd(rng, 6), rng.normal(size=(2, 6)), spd(rng, 2), rng.normal(size=2)
-    look = lambda at: (r - H @ at, H, N)  # noqa: E731
-    dx, after, _ = halfway(P, look(np.zeros(6)), look, 4)
-    best, whole, _ = kalman(P, H, N, r)
-    assert_allclose(dx, [*best[:4], 0.0, 0.0], atol=1e-12)
-    assert_allclose(after[:4, :4], whole[:4, :4], atol=1e-12)
-    assert_allclose(after[4:, 4:], P[4:, 4:], atol=1e-12)
-    x, noise = rng.multivariate_normal(np.zeros(6), P, 200_000), rng.multivariate_normal(np.zeros(2), N, 200_000)
-    K = (np.linalg.solve(H @ P @ H.T + N, H @ P).T) * np.array([1, 1, 1, 1, 0, 0])[:, None]
-    assert_allclose(np.cov((x - (x @ H.T + noise) @ K.T).T), after, atol=0.03 * np.abs(after).max())
-
-
 def test_the_iterated_one_ends_at_the_most_probable_state() -> None:
     """A bearing in the plane to a point nearby, which is far from linear."""
     P, N, measured = np.diag([1.0, 1.0]), np.array([[1e-3]]), 1.2

@@ -10,12 +10,15 @@ from numpy.testing import assert_allclose
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
+from coopenv.estimation.rotations import right_jacobian
 from coopenv.observers import Message, Received, Recording, run
+from coopenv.observers.lines import linearise
+from coopenv.observers.neighbours import considered as update
 from coopenv.observers.pairwise import Pairwise
 from coopenv.observers.schmidt_kalman import SchmidtKalman
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
-from tests.observers.test_filters import derivative
+from tests.observers.test_filters import derivative, pose, spd
 from tests.oracles.batch import small_record
 
 FILTERS = {"pairwise": Pairwise, "schmidt_kalman": SchmidtKalman}
@@ -132,3 +135,80 @@ def test_lost_messages_are_bridged() -> None:
     whole, gaps = run("pairwise", made), run("pairwise", replace(made, inbox_tick=lost))
     assert not gaps.failure
     assert_allclose(np.diag(gaps.covariance[-1, 1]), np.diag(whole.covariance[-1, 1]), rtol=0.2)
+
+
+def own_update(
+    R: np.ndarray, p: np.ndarray, joint: np.ndarray, frame: tuple, turn: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return orientation, position, joint covariance and NIS of two bearings, the second one to a neighbour."""
+
+    def look(theta: np.ndarray, rho: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        there = R @ Rotation.from_rotvec(theta).as_matrix(), p + R @ rho
+        residual, own, _, G = linearise(*there, False, *frame)
+        H = np.zeros((4, 12))
+        H[:, :6], H[2:, 9:] = own.reshape(4, 6), G[1] @ turn
+        H[:, :6] = H[:, :6] @ block_diag(right_jacobian(theta), Rotation.from_rotvec(-theta).as_matrix())
+        return residual.ravel(), H
+
+    def solved(r: np.ndarray, H: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        S = H @ joint @ H.T + frame[4] * np.eye(4)
+        K = joint @ H.T @ np.linalg.inv(S)
+        K[6:] = 0.0
+        return K, K @ (r + H @ at)
+
+    r, H = look(np.zeros(3), np.zeros(3))
+    nis = r @ np.linalg.solve(H @ joint @ H.T + frame[4] * np.eye(4), r)
+    at = 0.5 * solved(r, H, np.zeros(12))[1]
+    r, H = look(at[:3], at[3:6])
+    K, dx = solved(r, H, at)
+    A = np.eye(12) - K @ H
+    after = A @ joint @ A.T + frame[4] * K @ K.T
+    turned = Rotation.from_rotvec(dx[:3]).as_matrix()
+    moved = block_diag(right_jacobian(dx[:3]), turned.T, np.eye(6))
+    return R @ turned, p + R @ dx[3:6], moved @ after @ moved.T, nis
+
+
+@pytest.mark.parametrize("miss", [0.0, 0.03])
+def test_neighbours_that_are_considered_are_not_corrected(miss: float) -> None:
+    """Schmidt's update: a neighbour's gain is zero, and what is left of all is the covariance of that."""
+    rng = np.random.default_rng(1)
+    (R, p), joint = pose(2), 1e-2 * spd(rng, 12)
+    z, turn, variance = rng.uniform(-8, 8, (2, 3)), pose(3)[0], 1e-3
+    d = (z - p) @ R
+    bearings = d / np.linalg.norm(d, axis=1, keepdims=True) + miss * rng.normal(size=(2, 3))
+    bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+    frame = (np.zeros(3), bearings, z, np.zeros((2, 3, 3)), variance)
+    found = update(R, p, joint, frame, turn[None], np.array([-1, 0]))
+    R_after, p_after, after, nis = own_update(R, p, joint, frame, turn)
+    assert_allclose(found[0], R_after, atol=1e-12)
+    assert_allclose(found[1], p_after, atol=1e-12)
+    assert_allclose(found[2], after[:6, :6], atol=1e-12)
+    assert_allclose(found[4][0], after[:6, 6:], atol=1e-12)
+    assert_allclose(found[5], nis, rtol=1e-9, atol=1e-12)
+    if miss > 0.0:
+        assert np.linalg.norm(p_after - p) > 0.01
+        return
+    assert_allclose(found[3] @ joint[:6, :6], after[:6, :6], atol=1e-12)
+    H = np.zeros((4, 12))
+    _, own, _, G = linearise(R, p, False, *frame)
+    H[:, :6], H[2:, 9:] = own.reshape(4, 6), G[1] @ turn
+    K = np.linalg.solve(H @ joint @ H.T + variance * np.eye(4), H @ joint).T
+    K[6:] = 0.0
+    x = rng.multivariate_normal(np.zeros(12), joint, 200_000)
+    left = x - (x @ H.T + np.sqrt(variance) * rng.normal(size=(200_000, 4))) @ K.T
+    assert_allclose(np.cov(left.T), after, atol=0.03 * np.abs(after).max())
+
+
+@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("dtype", [np.longdouble, np.float16, np.int8, bool, complex])
+def test_a_factor_of_any_type_ends_no_run(name: str, dtype: type) -> None:
+    made = small_record(3)
+    observers = [FILTERS[name](setup) for setup in made.setups]
+    for i, observer in enumerate(observers):
+        observer.reset((made.start_rotation[i], made.start_position[i]), made.start_covariance[i])
+    sent = observers[0].message()
+    sent = replace(sent, extra={**sent.extra, "factor": np.eye(6).astype(dtype)})
+    short = replace(sent, covariance=np.eye(3))  # of another observer
+    for k, message in ((1, sent), (2, short)):
+        target = made.landmarks.shape[1]
+        assert np.isfinite(observers[1].update(made.tick(k, 1, {target: Received(message, 0.0)})).covariance).all()

@@ -21,10 +21,11 @@ def test_it_is_consistent_for_any_correlation_of_the_dependent_parts(seed: int) 
     scale = np.diag(10.0 ** rng.uniform(-1, 1, 9))
     joint = scale @ spd(rng, 9) @ scale  # of both dependent parts, correlated in any way
     P_d, C, X = joint[:6, :6], joint[6:, 6:], joint[:6, 6:]
-    P_i, own = 10.0 ** rng.uniform(-2, 2) * spd(rng, 6), spd(rng, 2)
+    P_i, variance = 10.0 ** rng.uniform(-2, 2) * spd(rng, 6), 10.0 ** rng.uniform(-1, 1)
+    own = variance * np.eye(2)
     H, G = rng.normal(size=(2, 6)), rng.normal(size=(2, 3))
     R_d = G @ C @ G.T
-    w = best_weight(P_d, P_i, H, R_d, own)
+    w = best_weight(P_d, P_i, H, R_d + own, variance)
     if w == 1.0:
         return
     P_1, P_2 = P_d / w + P_i, R_d / (1 - w) + own
@@ -39,8 +40,8 @@ def test_it_is_consistent_for_any_correlation_of_the_dependent_parts(seed: int) 
 def test_without_dependent_parts_it_is_the_kalman_filter() -> None:
     """The first time that a follower hears its leader, nothing of its own is shared: w goes to its least."""
     rng = np.random.default_rng(0)
-    P, H, own, R_d = spd(rng, 6), rng.normal(size=(2, 6)), spd(rng, 2), spd(rng, 2)
-    w = best_weight(np.zeros((6, 6)), P, H, R_d, own)
+    P, H, R_d = spd(rng, 6), rng.normal(size=(2, 6)), spd(rng, 2)
+    w = best_weight(np.zeros((6, 6)), P, H, R_d + np.eye(2), 1.0)
     assert_allclose(R_d / (1 - w), R_d, rtol=0.03)
     made = small_record(1)
     split, plain = run("split_covariance_intersection", made), run("mekf_covariance", made)

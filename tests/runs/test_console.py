@@ -9,6 +9,7 @@ from time import sleep
 import pytest
 from rich.console import Console
 
+from coopenv.estimation import compiled
 from coopenv.runs import console as module
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.world import kernel_cache
@@ -126,3 +127,16 @@ def test_loading_what_is_in_the_cache_is_not_compiling(looks: list[set[str]]) ->
         while len(looks) < 10:
             sleep(0.001)
     assert text.getvalue() == ""
+
+
+def test_functions_of_observers_on_the_host_are_compiled_as_well(
+    looks: list[set[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text, fresh = io.StringIO(), ["found_before"]
+    monkeypatch.setattr(compiled, "fresh", fresh)
+    with compile_notice(Console(file=text)):
+        while len(looks) < 10:
+            sleep(0.001)
+        assert text.getvalue() == ""
+        fresh.append("new")
+        wait_for(text, "compiling kernels (once per machine) ...\n")

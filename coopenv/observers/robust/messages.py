@@ -3,12 +3,11 @@
 from typing import Any
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf
 
 from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import exp_so3, log_so3
-from coopenv.observers.checks import check_estimate
+from coopenv.observers.checks import check_estimate, is_definite
 from coopenv.observers.contract import Estimate, Message
 from coopenv.observers.robust.constants import MIN_VARIANCE
 from coopenv.scenario.base import LARGEST
@@ -55,5 +54,5 @@ def check_pose(message: Message) -> None:
         raise CoopenvError("message: no pose with a covariance")
     P = np.asarray(message.covariance, dtype=np.float64)
     check_estimate(Estimate(message.rotation, message.position, P))
-    if dpotrf(P)[1] != 0 or P.diagonal().min() < MIN_VARIANCE or not (np.abs(message.position) <= LARGEST).all():
-        raise CoopenvError("message: covariance or position")
+    if not is_definite(P, MIN_VARIANCE, LARGEST**2):
+        raise CoopenvError("message: covariance is not positive definite, or not plausible")

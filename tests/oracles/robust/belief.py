@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array, cholesky, solve
-from coopenv.estimation.rotations import exp_so3, lengths, log_so3, orthonormalise, skew, tangent_basis
+from coopenv.estimation.rotations import exp_so3, lengths, log_so3, orthonormalise, skew
 from coopenv.observers.contract import SensorNoise
 from coopenv.observers.mekf import LeftError
 from coopenv.observers.robust.constants import (
@@ -28,7 +28,7 @@ from coopenv.observers.robust.constants import (
     RELINEARISATION_ANGLE,
     SAME_TIME,
 )
-from tests.oracles.robust.matrices import solve_positive
+from tests.oracles.robust.matrices import solve_positive, tangent_basis
 from tests.oracles.robust.odometry import as_noise
 from tests.oracles.robust.sight import Sight
 

@@ -14,7 +14,6 @@ from itertools import combinations
 import numpy as np
 
 from coopenv.estimation.arrays import Array, solve
-from coopenv.estimation.rotations import tangent_basis
 from coopenv.observers.contract import Tick
 from coopenv.observers.robust.constants import (
     BEARING_GATE,
@@ -42,7 +41,7 @@ from coopenv.observers.robust.constants import (
 from tests.helpers.p3p import solve_one
 from tests.oracles.p3p import solve_p3p
 from tests.oracles.robust.belief import Belief
-from tests.oracles.robust.matrices import condition, invert_positive
+from tests.oracles.robust.matrices import condition, invert_positive, tangent_basis
 from tests.oracles.robust.sight import Sight
 from tests.oracles.robust.tracklets import left_error
 
