@@ -19,7 +19,7 @@ def place(M: Array, row: int, column: int, block: Array) -> None:
 
 @compiled(MATRIX, MATRIX)
 def product(A: Array, B: Array) -> Array:
-    """Return A B: for sizes up to about ten, for which calling BLAS takes longer."""
+    """Return A B (n, k) of A (n, m) and B (m, k)."""
     (n, m), k = A.shape, B.shape[1]
     C = np.zeros((n, k))
     for i in range(n):
@@ -31,7 +31,7 @@ def product(A: Array, B: Array) -> Array:
 
 @compiled(MATRIX, VECTOR)
 def transformed(A: Array, x: Array) -> Array:
-    """Return A x."""
+    """Return A x (n,) of A (n, m) and x (m,)."""
     y = np.zeros(len(A))
     for i in range(len(A)):
         for j in range(len(x)):
@@ -41,13 +41,13 @@ def transformed(A: Array, x: Array) -> Array:
 
 @compiled(MATRIX, MATRIX)
 def congruent(A: Array, P: Array) -> Array:
-    """Return A P A^T."""
+    """Return A P A^T (n, n) of A (n, m) and P (m, m)."""
     return product(product(A, P), A.T)
 
 
 @compiled(MATRIX, MATRIX)
 def eliminated(A: Array, B: Array) -> Array:
-    """Return A^-1 B, by Gaussian elimination with pivots; a LinAlgError says that A is singular."""
+    """Return A^-1 B (n, k), by Gaussian elimination with pivots; a LinAlgError says that A (n, n) is singular."""
     A, X, n = A.copy(), B.copy(), len(A)
     for k in range(n):
         pivot = k + np.argmax(np.abs(A[k:, k]))

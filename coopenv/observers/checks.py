@@ -115,7 +115,7 @@ def _check_extra(name: str, value: NDArray[Any]) -> None:
 
 
 def is_definite(P: Array, least: float, largest: float) -> bool:
-    """Return whether it is a positive definite covariance whose variances lie between the least and the largest."""
+    """Return whether P (n, n) is a positive definite covariance, of variances from the least on, none larger."""
     return bool(compiled_checks().is_covariance(P, least, largest))
 
 

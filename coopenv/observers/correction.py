@@ -28,7 +28,7 @@ Look = Callable[[Array], Stacked]
 
 @compiled(MATRIX, MATRIX, MATRIX, VECTOR)
 def gain(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array, float]:
-    """Return (K, dx, r^T S^-1 r) of a Kalman update with measurement covariance N."""
+    """Return (K (n, k), dx (n,), r^T S^-1 r) of a Kalman update of P (n, n) by k numbers of covariance N (k, k)."""
     n, m = len(P), len(residual)
     H, right = np.ascontiguousarray(H), np.empty((m, n + 1))
     HP = H.dot(np.ascontiguousarray(P.T))
@@ -44,7 +44,7 @@ def gain(P: Array, H: Array, N: Array, residual: Array) -> tuple[Array, Array, f
 
 @compiled(MATRIX, MATRIX, MATRIX, MATRIX)
 def joseph(P: Array, K: Array, H: Array, N: Array) -> Array:
-    """Return the covariance after an update with any gain K."""
+    """Return the covariance (n, n) after an update with any gain K (n, k)."""
     K = np.ascontiguousarray(K)
     A = np.eye(len(P)) - K.dot(np.ascontiguousarray(H))
     after: Array = A.dot(np.ascontiguousarray(P)).dot(A.T) + K.dot(np.ascontiguousarray(N)).dot(K.T)

@@ -53,7 +53,7 @@ def from_left(R: Array, p: Array) -> Array:
 def predicted(
     kind: int, R: Array, p: Array, P: Array, rotation: Array, translation: Array, noise: Array
 ) -> tuple[Array, Array, Array]:
-    """Return pose and covariance after an odometry increment of variances (6,)."""
+    """Return R (3, 3), p (3,) in m and P (6, 6) after an odometry increment of variances (6,), rad^2 and m^2."""
     R, p = orthonormalised(product(R, rotation)), p + transformed(R, translation)
     Q = np.diag(noise)
     if kind == RIGHT:

@@ -36,7 +36,10 @@ def stacked(kind: int, R: Array, p: Array, frame: Frame) -> tuple[Array, Array, 
 
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)
 def halfway_gain(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, Array, float]:
-    """Return (K, H, N, dx, r^T S^-1 r at the prediction) of a correction of a prediction of covariance P."""
+    """Return (K (6, 2m), H, N, dx (6,), r^T S^-1 r at the prediction) of the correction of a prediction.
+
+    H (2m, 6) and N (2m, 2m) are those half way; P (6, 6) is the prediction's covariance, over the error of that kind.
+    """
     residual, H, N = stacked(kind, R, p, frame)
     _, dx, nis = gain(P, H, N, residual)
     at = 0.5 * dx
@@ -49,7 +52,7 @@ def halfway_gain(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple
 
 @compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)
 def updated(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, float]:
-    """Return pose, covariance and r^T S^-1 r of a correction of a prediction of covariance P."""
+    """Return R (3, 3), p (3,) in m, P (6, 6) and r^T S^-1 r of the correction of a prediction of covariance P."""
     K, H, N, dx, nis = halfway_gain(kind, R, p, P, frame)
     R, p, P = corrected(kind, R, p, dx, joseph(P, K, H, N))
     return R, p, P, nis
