@@ -74,6 +74,9 @@ SEPARATION_GATE = 24.0  # of the squared distance of the belief from that: chi-s
 DISPUTE_MARGIN = 6.0
 """By how much less bearings to the others must cost without a sender for it to be wrong, and not the one that bearings
 contradict: odds of exp(-3)."""
+REVISION_MARGIN = 12.0
+"""By how much less bearings must cost without another sender than without those that are not believed, for these to be
+believed again: odds of exp(-6). Tuned: at 6 some vehicles change their minds often, at 18 some take long."""
 ENOUGH_LANDMARKS = 2  # in view, for what they say alone to outweigh several senders. Chosen
 NOT_AHEAD = 10.0  # rad, in place of the residual of a bearing whose target is behind the camera. It fits nothing
 CONSISTENT_QUANTILE = 3.09  # of a normal distribution, 0.999: what bearings may cost that agree

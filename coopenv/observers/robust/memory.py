@@ -88,6 +88,7 @@ class Word:
     slow_drift: Drift  # the same over a longer time
     missed_share: wp.float64  # mean share of bearings to it that do not fit
     fitted_time: wp.float64  # s for which they have
+    perjured: wp.int32  # whether it is not believed because it has contradicted itself
     offences: wp.int32  # how often it has not been believed
     barred_until: wp.int32  # the tick from which on it may be believed again
 
@@ -161,6 +162,7 @@ class Line:
     """A bearing of the frame as a measurement; scratch, see measurements.py."""
 
     member: wp.int32  # that it is to; 0: to a point in the map
+    teller: wp.int32  # the member who has told that point, see told/revision.py
     mounting: wp.int32  # see `Frame`
     bearing: vec3d  # body frame
     point: vec3d  # m, in the member's body or in the map

@@ -44,7 +44,7 @@ def rules_for(members: int) -> dict[str, Rule]:
     flags = (
         "search.active outbox.valid inbox.valid belief.has_sample member.has_twist member.distrusted "
         "member.considered member.untold outbox.news inbox.news member.report.news member.report.valid line.fits "
-        "belief.accused_followed"
+        "belief.accused_followed word.perjured"
     )
     ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick"
     large = (
@@ -65,7 +65,7 @@ def rules_for(members: int) -> dict[str, Rule]:
         "P": Rule("a covariance", lambda P, fields, model: are_joint(P, fields["observer_belief.members"]), axes=4),
         "anchor.estimate.P": COVARIANCE,
         "search.hypotheses": whole(0, MAX_HYPOTHESES),
-        "line.member": whole(0, members - 1),
+        **dict.fromkeys(("line.member", "line.teller"), whole(0, members - 1)),
         "line.mounting": whole(0, MOUNTING),
         **where("belief.members", {"member.pose.R": ROTATION, "member.vehicle": whole(0, "vehicles")}),
         **where("search.active", {"search.prior.pose.R": ROTATION, "search.prior.P": COVARIANCE}),

@@ -134,8 +134,10 @@ def judge(model: Any, memory: Any, world: int, i: int, n: int, tick: int, dt: An
     test_sender(memory, world, i, n, Estimate(report.pose, mat66d(report.P)), dt)
     if jumped or memory.member[world, i, n].distrusted == 1:
         distrust(model, memory, world, i, n, tick, wp.float64(0.0), False)
+        memory.word[world, i, sender].perjured = 1
     elif drift > wp.float64(0.0):
         distrust(model, memory, world, i, n, tick, drift, True)
+        memory.word[world, i, sender].perjured = 1
     return False
 
 

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from coopenv.observers import run
+from coopenv.observers import Tick, run
+from coopenv.observers.recording import Recording
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.builders import errors, reset, simulate
@@ -93,9 +94,16 @@ def test_who_is_honest_is_believed() -> None:
     assert world.memory.word.numpy()["offences"].sum() <= 1
 
 
+def assert_as_in_numpy(oracle: type[Spoken], recording: Recording) -> None:
+    """Assert that an oracle and the kernels estimate the same."""
+    expected, result = run(oracle, recording), run("robust", recording)
+    assert not result.failure
+    for name in ("position", "rotation", "nees", "nis"):
+        assert_allclose(getattr(result, name), getattr(expected, name), rtol=1e-7, atol=1e-9, err_msg=name)
+
+
 @pytest.mark.parametrize("lie", [{"kind": "jump"}, {"kind": "replay", "start": 2.0}, {"kind": "drift", "speed": 0.2}])
 def test_liars_are_judged_as_in_numpy(lie: dict[str, Any]) -> None:
-    recording = record(scene((1,), 6.0, **lie), 0)
     judged = []
 
     class Judge(Spoken):
@@ -103,11 +111,23 @@ def test_liars_are_judged_as_in_numpy(lie: dict[str, Any]) -> None:
             judged.append(self.vehicle)
             super()._distrust(*arguments)
 
-    expected, result = run(Judge, recording), run("robust", recording)
+    assert_as_in_numpy(Judge, record(scene((1,), 6.0, **lie), 0))
     assert judged
-    assert not result.failure
-    for name in ("position", "rotation", "nees", "nis"):
-        assert_allclose(getattr(result, name), getattr(expected, name), rtol=1e-7, atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("seed", [1217, 1417])
+def test_who_is_disputed_is_asked_about_again_as_in_numpy(seed: int) -> None:
+    """Worlds in which a vehicle fits its own pose to a liar's first words, and believes honest ones no more."""
+    restored: list[int] = []
+
+    class Doubter(Spoken):
+        def _revise(self, tick: Tick) -> None:
+            before = {sender for sender, contact in self.contacts.items() if not contact.trusted}
+            super()._revise(tick)
+            restored.extend(sender for sender in before if self.contacts[sender].trusted)
+
+    assert_as_in_numpy(Doubter, record(scene((1,), 2.0, kind="jump"), seed))
+    assert restored and 1 not in restored
 
 
 @pytest.mark.slow

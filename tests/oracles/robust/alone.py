@@ -20,7 +20,6 @@ from coopenv.observers.robust.constants import (
 from tests.oracles.robust.belief import Belief
 from tests.oracles.robust.odometry import as_noise
 from tests.oracles.robust.sight import Sight, View
-from tests.oracles.robust.tracklets import left_error
 
 
 class Alone:
@@ -65,12 +64,6 @@ class Alone:
             self.belief.settle(sight, noise, fits, look)
         self.lost = len(seen) > 0 and not fits.any()
         return int(fits.sum())
-
-    def separation(self, belief: Belief) -> float:
-        """Return how far a belief is from it, squared in its standard deviations."""
-        own = self.belief.own
-        e = left_error(own.R, own.p, belief.own.R, belief.own.p)
-        return float(e.dot(np.linalg.solve(self.belief.P, e)))
 
     def replace_own(self, belief: Belief) -> None:
         """Let a belief in oneself be this, which depends on nobody."""

@@ -41,9 +41,11 @@ from coopenv.observers.robust.constants import (
     LOST_SHARE,
     LOST_TIME,
     MAX_CORRELATIONS,
+    MAX_SPEED,
     MAX_TOLD_ANGLE,
     NEWS_TIME,
     RETURNING_SHARE,
+    REVISION_MARGIN,
     SAME_TIME,
     SEPARATION_GATE,
     SHARE_OF_CHANGE,
@@ -57,10 +59,14 @@ from tests.oracles.robust.belief import Member, recentring
 from tests.oracles.robust.common import Anchor, Common, Contact
 from tests.oracles.robust.eviction import room_for
 from tests.oracles.robust.odometry import as_noise
+from tests.oracles.robust.revision import Explanation, Told, explained, separation
 from tests.oracles.robust.sight import View
 from tests.oracles.robust.told import Correlations, factor, is_positive, is_same, regress
 from tests.oracles.robust.tracklets import Report, left_error, marker_jacobian, mask_of
 from tests.oracles.robust.words import Word, has_jumped, least_drift, share_of
+
+KEPT = ("drift", "slow_drift", "perjured", "offences", "barred_until")
+"""Of what is thought of a sender, what bearings have not told."""
 
 
 class Robust(Common):
@@ -212,6 +218,12 @@ class Robust(Common):
             belief.P[6 * n : 6 * n + 6, 6 * n : 6 * n + 6] -= np.diag(lasting)  # what that takes is no news
             self._step(n, report, steady and known and not report.depends_on_vehicle(self.vehicle))
             return
+        self._place(sender, report)
+
+    def _place(self, sender: int, report: Report) -> None:
+        """Put a member where its report says that it is, whatever was believed of it before."""
+        belief, n = self.belief, self.belief.place(sender)
+        assert n is not None
         member, block = belief.members[n], slice(6 * n, 6 * n + 6)
         member.considered = True
         belief.P[block], belief.P[:, block] = 0.0, 0.0
@@ -253,6 +265,8 @@ class Robust(Common):
                 self._judge_accused(tick, *accused)
             elif self.alone.is_due(tick.time):
                 self._judge_belief(tick)
+                if self.alone is not None:
+                    self._revise(tick)
 
     def _judge_accused(self, tick: Tick, sender: int, error: float, followed: bool) -> None:
         """Believe a sender no more that bearings contradict, or else the one that it contradicts: who landmarks do."""
@@ -273,13 +287,61 @@ class Robust(Common):
         if self.alone.lost:
             self.alone = None
             return
-        if fits == 0 or not self.exposed or self.alone.separation(self.belief) <= SEPARATION_GATE:
+        own = self.belief.own
+        if fits == 0 or not self.exposed or separation(self.alone.belief, own.R, own.p) <= SEPARATION_GATE:
             return
         costs = self._costs_without(tick)
         if fits >= ENOUGH_LANDMARKS or not costs or min(costs.values()) <= most_of_consistent(len(costs) - 1):
             self._stand_alone(tick, min(costs, key=costs.__getitem__, default=-1))
         else:
             self.alone = None
+
+    def _revise(self, tick: Tick) -> None:
+        """Believe others than so far where that explains this frame's bearings better."""
+        assert self.alone is not None
+        words = self._words_in_view(tick)
+        if not any(word.rejected for word in words):
+            return
+        setting = tick.lever_arm, self.variance + self.mounting[0]
+        now = explained(self.alone.belief, words, *setting)
+        best, liar = Explanation(np.inf, self.belief.own.R, self.belief.own.p), -1
+        for lying in words:
+            but = [word._replace(rejected=word is lying) for word in words]
+            found = explained(self.alone.belief, but, *setting)
+            if found.cost < best.cost:
+                best, liar = found, lying.vehicle
+        elsewhere = separation(self.belief, best.R, best.p) > SEPARATION_GATE
+        if not elsewhere or not now.cost - best.cost > REVISION_MARGIN:
+            return
+        for member in list(self.belief.members[self.belief.others :]):
+            if member.vehicle != liar and self._is_disputed(member.vehicle):
+                contact = self.contacts[member.vehicle]
+                self.words[member.vehicle] = Word()
+                contact.trusted = True
+                self.depends_on |= contact.last.depends_on
+                P = contact.last.P + self._by_clocks(member)
+                self._place(member.vehicle, replace(contact.last, P=P))
+        self._stand_alone(tick, liar)
+
+    def _is_disputed(self, sender: int) -> bool:
+        """Return whether a sender is not believed because of bearings."""
+        return not self.contacts[sender].trusted and not self._word(sender).perjured
+
+    def _words_in_view(self, tick: Tick) -> list[Told]:
+        """Return where members in view say to be that may be right."""
+        words = []
+        reports = {report.vehicles[0]: report for report in self._reports(tick)}
+        for target, bearing in zip(tick.targets[tick.valid], tick.bearings[tick.valid], strict=True):
+            sender = int(target) - self.landmarks
+            contact = self.contacts.get(sender)
+            if contact is None or sender not in reports or not (contact.trusted or self._is_disputed(sender)):
+                continue
+            report = reports[sender]
+            gone = MAX_SPEED * (tick.time - float(report.time[0]))
+            variance = float(report.P[3:6, 3:6].trace()) / 3.0 + gone**2
+            rejected = not contact.trusted or self._word(sender).missed > LOST_SHARE
+            words.append(Told(sender, bearing, report.p[0], variance, rejected))
+        return words
 
     def _costs_without(self, tick: Tick) -> dict[int, float]:
         """Return what bearings to believed senders cost without each of them, were one where landmarks alone say."""
@@ -335,8 +397,7 @@ class Robust(Common):
     def _forget_evidence(self) -> None:
         """Forget what bearings have said of others: they were taken from where the vehicle is not."""
         for sender, word in self.words.items():
-            drifts = {"drift": word.drift, "slow_drift": word.slow_drift}
-            self.words[sender] = Word(**drifts, offences=word.offences, barred_until=word.barred_until)
+            self.words[sender] = replace(Word(), **{name: getattr(word, name) for name in KEPT})
 
     def _word(self, sender: int) -> Word:
         """Return what is thought of a sender's word."""
@@ -355,10 +416,10 @@ class Robust(Common):
         if self._admits(report, dt):
             return True
         self._judge(contact, report, dt)
-        if jumped or not contact.trusted:
-            self._distrust(contact, time, 0.0, False)
-        elif drift > 0.0:
-            self._distrust(contact, time, drift, True)
+        if jumped or not contact.trusted or drift > 0.0:
+            error = 0.0 if jumped or not contact.trusted else drift
+            self._distrust(contact, time, error, error > 0.0)
+            self._word(report.vehicles[0]).perjured = True
         return False
 
     def _admits(self, report: Report, dt: float) -> bool:

@@ -56,6 +56,7 @@ class Word:
     slow_drift: Drift = field(default_factory=lambda: Drift(SLOW_DRIFT_TIME))
     missed: float = 0.0
     fitted: float = 0.0  # s
+    perjured: bool = False  # whether the sender is not believed because it has contradicted itself
     offences: int = 0
     barred_until: float = 0.0  # s
 

@@ -4,7 +4,8 @@ A second estimate of the vehicle's pose takes no message; of the odometry's erro
 is believed. It is vaguer than the belief, but hardly to be misled, and it shares all its information with a belief that
 is right: so the belief is nearly always within its covariance. Where it is not, and where bearings contradict one
 sender, every sender in view is left out in turn: the one without whom the bearings to the others agree best with
-landmarks is believed no more. Then the belief is that estimate again.
+landmarks is believed no more. Then the belief is that estimate again. As long as somebody is not believed because
+bearings contradicted him, it is asked again whether it was him.
 Source: separation of solutions, Brown and McBurney, Self-contained GPS integrity check using maximum solution
 separation, Navigation 35(1), 1988.
 """
@@ -18,11 +19,13 @@ from coopenv.observers.robust.algebra import between, carried, inverse_factor, l
 from coopenv.observers.robust.belief import own_estimate
 from coopenv.observers.robust.correction import correct_by_lines, iterated_update, store_poses
 from coopenv.observers.robust.measurements import TRACKING, innovation_squared, set_lines, time_between
-from coopenv.observers.robust.memory import Estimate, Frame, mat66d, vec2d
+from coopenv.observers.robust.memory import Estimate, Frame, Word, mat66d, vec2d
 from coopenv.observers.robust.mounting import mounting_variances
 from coopenv.observers.robust.odometry import begin_errors, increment_noise
 from coopenv.observers.robust.told.correlations import clear_told
+from coopenv.observers.robust.told.fusion import place
 from coopenv.observers.robust.told.memory import Alone
+from coopenv.observers.robust.told.revision import find_liar, is_disputed
 from coopenv.observers.robust.trust import distrust, forget_evidence
 from coopenv.observers.robust.update import set_anchor
 from coopenv.world.device_function import device_function
@@ -264,6 +267,24 @@ def judge_belief(model: Any, frame: Frame, memory: Any, world: int, i: int, tick
 
 
 @device_function
+def revise(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
+    """Believe others than so far where that explains this frame's bearings better, see told/revision.py."""
+    liar = find_liar(model, state, memory, world, i, now.tick, memory.alone[world, i].estimate)
+    if liar == 0:
+        return
+    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
+        if k != liar and is_disputed(memory, world, i, k):
+            memory.word[world, i, memory.member[world, i, k].vehicle] = Word()
+            memory.member[world, i, k].distrusted = 0
+            depends_on = memory.belief[world, i].depends_on | memory.member[world, i, k].report.depends_on
+            memory.belief[world, i].depends_on = depends_on
+            place(model, memory, world, i, k)
+    period = time_between(model, state, world, i, now)
+    frame = set_lines(model, state, memory, world, i, now.tick, period, TRACKING)
+    stand_alone(model, frame, memory, world, i, now.tick, liar)
+
+
+@device_function
 def note_exposure(memory: Any, world: int, i: int):
     """Note whether any sender is believed: then the belief may be misled."""
     for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
@@ -294,4 +315,6 @@ def separate(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
                 judge_accused(model, frame, memory, world, i, now.tick)
             else:
                 judge_belief(model, frame, memory, world, i, now.tick)
+                if memory.alone[world, i].begun == 1:
+                    revise(model, state, memory, world, i, now)
     memory.belief[world, i].accused = 0
