@@ -58,6 +58,13 @@ def own_estimate(memory: Any, world: int, i: int):
 
 
 @device_function
+def put_own(memory: Any, world: int, i: int, estimate: Estimate):
+    """Put the vehicle itself where an estimate says."""
+    memory.member[world, i, 0].pose = estimate.pose
+    memory.P[world, i, 0, 0] = estimate.P
+
+
+@device_function
 def propagate(memory: Any, world: int, i: int, n: int, step: Pose, noise: Any):
     """Carry a member through an increment of odometry with noise."""
     memory.member[world, i, n].pose = moved(memory.member[world, i, n].pose, step)

@@ -42,6 +42,7 @@ MESSAGE_GATE = 40.0
 AGREEMENT_TIME, AGREEMENT_DISTANCE = 1.0, 1.0
 """s and m: how long and how closely a distrusted sender must agree before it is trusted again. Chosen."""
 AGREEMENT_GATE = 16.8  # of the squared distance at which a distrusted sender agrees: chi-square of 6, 0.99
+MAX_REVISIONS = 2  # how often a sender that is not believed may be believed again because others explain less. Chosen
 MAX_OFFENCES = 7  # from which on a sender is not believed for a minute: 2^(n - 1) s. Chosen
 SILENCE_TIME = 0.5  # s, after which a sender may be elsewhere: who is lost says nothing. Chosen
 ADMISSION = 0.5  # by how much of its variance a sender must know less than before to admit an error. Chosen

@@ -88,7 +88,7 @@ class Word:
     slow_drift: Drift  # the same over a longer time
     missed_share: wp.float64  # mean share of bearings to it that do not fit
     fitted_time: wp.float64  # s for which they have
-    perjured: wp.int32  # whether it is not believed because it has contradicted itself
+    perjured: wp.int32  # whether it was believed no more because it had contradicted itself
     offences: wp.int32  # how often it has not been believed
     barred_until: wp.int32  # the tick from which on it may be believed again
 

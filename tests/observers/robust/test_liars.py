@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from coopenv.observers import Tick, run
+from coopenv.observers import run
 from coopenv.observers.recording import Recording
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
@@ -38,9 +38,12 @@ LIES: dict[str, tuple[tuple[int, ...], dict[str, Any]]] = {
 }
 
 
-def scene(liars: tuple[int, ...] = (), horizon: float = 50.0, **lie: Any) -> Scenario:
+def scene(
+    liars: tuple[int, ...] = (), horizon: float = 50.0, *, overrides: dict[str, Any] | None = None, **lie: Any
+) -> Scenario:
     """Return the five vehicles, of which some lie."""
-    made = load_scenario("busy_intersection_tracking", {"observer.name": "robust", "horizon": horizon})
+    changes = {"observer.name": "robust", "horizon": horizon, **(overrides or {})}
+    made = load_scenario("busy_intersection_tracking", changes)
     raw = made.model_dump()
     for vehicle, seen in zip(raw["vehicles"], SEEN, strict=True):
         vehicle["neighbours"] = seen
@@ -115,19 +118,32 @@ def test_liars_are_judged_as_in_numpy(lie: dict[str, Any]) -> None:
     assert judged
 
 
-@pytest.mark.parametrize("seed", [1217, 1417])
-def test_who_is_disputed_is_asked_about_again_as_in_numpy(seed: int) -> None:
+@pytest.mark.parametrize(
+    ("seed", "overrides"),
+    [
+        (1217, {}),
+        (1417, {}),
+        (1417, {"camera.extrinsics_error": 0.01745, "camera.extrinsics_position_error": 0.01}),
+        (1417, {"faults.clock_offset": 0.02}),
+    ],
+)
+def test_who_is_disputed_is_asked_about_again_as_in_numpy(seed: int, overrides: dict[str, Any]) -> None:
     """Worlds in which a vehicle fits its own pose to a liar's first words, and believes honest ones no more."""
     restored: list[int] = []
 
     class Doubter(Spoken):
-        def _revise(self, tick: Tick) -> None:
-            before = {sender for sender, contact in self.contacts.items() if not contact.trusted}
-            super()._revise(tick)
-            restored.extend(sender for sender in before if self.contacts[sender].trusted)
+        def _believe_again(self, sender: int) -> None:
+            restored.append(sender)
+            super()._believe_again(sender)
 
-    assert_as_in_numpy(Doubter, record(scene((1,), 2.0, kind="jump"), seed))
-    assert restored and 1 not in restored
+    assert_as_in_numpy(Doubter, record(scene((1,), 2.5, overrides=overrides, kind="jump"), seed))
+    assert restored and set(restored) != {1}
+
+
+def test_who_has_contradicted_himself_is_not_asked_about_again() -> None:
+    """Worlds in which two colluders, who jump at 15 s, would explain more than the two who are honest."""
+    found = mean_errors(scene((0, 1), kind="collude", start=15.0), range(1315, 1319), 20, 15.0)
+    assert (found[:, 4] < 0.3).all()
 
 
 @pytest.mark.slow

@@ -41,6 +41,7 @@ from coopenv.observers.robust.constants import (
     LOST_SHARE,
     LOST_TIME,
     MAX_CORRELATIONS,
+    MAX_REVISIONS,
     MAX_SPEED,
     MAX_TOLD_ANGLE,
     NEWS_TIME,
@@ -313,19 +314,31 @@ class Robust(Common):
         elsewhere = separation(self.belief, best.R, best.p) > SEPARATION_GATE
         if not elsewhere or not now.cost - best.cost > REVISION_MARGIN:
             return
-        for member in list(self.belief.members[self.belief.others :]):
-            if member.vehicle != liar and self._is_disputed(member.vehicle):
-                contact = self.contacts[member.vehicle]
-                self.words[member.vehicle] = Word()
-                contact.trusted = True
-                self.depends_on |= contact.last.depends_on
-                P = contact.last.P + self._by_clocks(member)
-                self._place(member.vehicle, replace(contact.last, P=P))
+        for word in words:
+            if word.vehicle != liar and not self.contacts[word.vehicle].trusted:
+                self._believe_again(word.vehicle)
         self._stand_alone(tick, liar)
+        if self.contacts[liar].trusted:
+            self._distrust(self.contacts[liar], tick.time, 0.0, False)
 
     def _is_disputed(self, sender: int) -> bool:
-        """Return whether a sender is not believed because of bearings."""
-        return not self.contacts[sender].trusted and not self._word(sender).perjured
+        """Return whether a sender is not believed because of bearings, and has not been so too often before."""
+        word = self._word(sender)
+        return not self.contacts[sender].trusted and not word.perjured and word.offences <= MAX_REVISIONS
+
+    def _believe_again(self, sender: int) -> None:
+        """Put a sender where it says to be."""
+        word, contact = self._word(sender), self.contacts[sender]
+        self.words[sender] = Word(drift=word.drift, slow_drift=word.slow_drift, offences=word.offences)
+        contact.trusted = True
+        self.depends_on |= contact.last.depends_on
+        self._place(sender, replace(contact.last, P=contact.last.P + self._clocks_of(sender)))
+
+    def _clocks_of(self, sender: int) -> Array:
+        """Return (6, 6) the covariance of how far a sender that has been met is off by clocks."""
+        n = self.belief.place(sender)
+        assert n is not None
+        return self._by_clocks(self.belief.members[n])
 
     def _words_in_view(self, tick: Tick) -> list[Told]:
         """Return where members in view say to be that may be right."""
@@ -338,7 +351,8 @@ class Robust(Common):
                 continue
             report = reports[sender]
             gone = MAX_SPEED * (tick.time - float(report.time[0]))
-            variance = float(report.P[3:6, 3:6].trace()) / 3.0 + gone**2
+            P = report.P + self._clocks_of(sender)
+            variance = float(P[3:6, 3:6].trace()) / 3.0 + gone**2 + float(self.mounting[3])
             rejected = not contact.trusted or self._word(sender).missed > LOST_SHARE
             words.append(Told(sender, bearing, report.p[0], variance, rejected))
         return words

@@ -15,17 +15,16 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import between, carried, inverse_factor, left_error, with_noise
-from coopenv.observers.robust.belief import own_estimate
+from coopenv.observers.robust.algebra import between, carried, with_noise
+from coopenv.observers.robust.belief import own_estimate, put_own
 from coopenv.observers.robust.correction import correct_by_lines, iterated_update, store_poses
 from coopenv.observers.robust.measurements import TRACKING, innovation_squared, set_lines, time_between
-from coopenv.observers.robust.memory import Estimate, Frame, Word, mat66d, vec2d
+from coopenv.observers.robust.memory import Estimate, Frame, mat66d, vec2d
 from coopenv.observers.robust.mounting import mounting_variances
 from coopenv.observers.robust.odometry import begin_errors, increment_noise
 from coopenv.observers.robust.told.correlations import clear_told
-from coopenv.observers.robust.told.fusion import place
 from coopenv.observers.robust.told.memory import Alone
-from coopenv.observers.robust.told.revision import find_liar, is_disputed
+from coopenv.observers.robust.told.revision import believe_again, find_liar, separation_squared
 from coopenv.observers.robust.trust import distrust, forget_evidence
 from coopenv.observers.robust.update import set_anchor
 from coopenv.world.device_function import device_function
@@ -104,21 +103,6 @@ def correct_alone(model: Any, frame: Frame, memory: Any, world: int, i: int, ela
     memory.belief[world, i].others = others
     put_own(memory, world, i, own)
     return fitting
-
-
-@device_function
-def put_own(memory: Any, world: int, i: int, estimate: Estimate):
-    """Put the vehicle itself where an estimate says."""
-    memory.member[world, i, 0].pose = estimate.pose
-    memory.P[world, i, 0, 0] = estimate.P
-
-
-@device_function
-def separation(memory: Any, world: int, i: int):
-    """Return the squared distance of the belief from the estimate, in standard deviations of that."""
-    alone = memory.alone[world, i].estimate
-    error = left_error(alone.pose, memory.member[world, i, 0].pose)
-    return wp.length_sq(inverse_factor(alone.P) * error)
 
 
 @device_function
@@ -257,7 +241,8 @@ def judge_belief(model: Any, frame: Frame, memory: Any, world: int, i: int, tick
     elapsed = follow_alone(model, memory, world, i, tick)
     landmarks = correct_alone(model, frame, memory, world, i, elapsed)
     exposed = memory.alone[world, i].exposed == 1
-    if exposed and landmarks > 0 and separation(memory, world, i) > wp.float64(constants.SEPARATION_GATE):
+    away = separation_squared(memory.alone[world, i].estimate, memory.member[world, i, 0].pose)
+    if exposed and landmarks > 0 and away > wp.float64(constants.SEPARATION_GATE):
         culprit, least, _, count = find_culprit(frame, memory, world, i, 0)
         alone = count == 0 or least <= consistent_cost(count - 1)
         if alone or landmarks >= constants.ENOUGH_LANDMARKS:
@@ -269,19 +254,18 @@ def judge_belief(model: Any, frame: Frame, memory: Any, world: int, i: int, tick
 @device_function
 def revise(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
     """Believe others than so far where that explains this frame's bearings better, see told/revision.py."""
-    liar = find_liar(model, state, memory, world, i, now.tick, memory.alone[world, i].estimate)
+    frame, liar = find_liar(model, state, memory, world, i, now.tick, memory.alone[world, i].estimate)
     if liar == 0:
         return
-    for k in range(memory.belief[world, i].others, memory.belief[world, i].members):
-        if k != liar and is_disputed(memory, world, i, k):
-            memory.word[world, i, memory.member[world, i, k].vehicle] = Word()
-            memory.member[world, i, k].distrusted = 0
-            depends_on = memory.belief[world, i].depends_on | memory.member[world, i, k].report.depends_on
-            memory.belief[world, i].depends_on = depends_on
-            place(model, memory, world, i, k)
+    for n in range(frame.lines):
+        k = memory.line[world, n].teller
+        if k != liar and memory.member[world, i, k].distrusted == 1:
+            believe_again(model, memory, world, i, k)
     period = time_between(model, state, world, i, now)
     frame = set_lines(model, state, memory, world, i, now.tick, period, TRACKING)
     stand_alone(model, frame, memory, world, i, now.tick, liar)
+    if memory.member[world, i, liar].distrusted == 0:
+        distrust(model, memory, world, i, liar, now.tick, wp.float64(0.0), False)
 
 
 @device_function
