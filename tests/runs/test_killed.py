@@ -29,7 +29,7 @@ def seed_of_run(folder: Path) -> int:
     final = [vehicle["final_position_error_m"] for vehicle in metrics["vehicles"]]
     assert np.array_equal(run.position_error[-1], final)
     names = {path.name for path in folder.iterdir()}
-    assert len(names) == 8 + ("notes.txt" in names)
+    assert len(names) == 10 and names <= set(result_names())
     pictures = {name: folder.joinpath(name).stat().st_mtime_ns for name in names if name.endswith(".png")}
     assert len(pictures) == 6
     for name in pictures:
@@ -76,6 +76,10 @@ COMMANDS: dict[str, tuple[Callable[[int], list[str]], str, Callable[[Path], int]
 }
 
 
+PAGES = {"record": ["result.html"]}
+"""Files beside a command's result."""
+
+
 def kill_at_random(command: str, kills: int, folder: Path) -> None:
     """Kill a command again and again while it replaces an earlier result."""
     arguments, name, read = COMMANDS[command]
@@ -95,7 +99,9 @@ def kill_at_random(command: str, kills: int, folder: Path) -> None:
     assert survived > 0, "never killed before the end"
     assert start((*COOPENV, *arguments(2)), folder).wait(120) == 0
     assert read(folder / name) == 2
-    assert [path.name for path in folder.iterdir()] == [name]
+    pages = PAGES.get(command, [])
+    assert all((folder / page).read_text().rstrip().endswith("</html>") for page in pages)
+    assert {path.name for path in folder.iterdir()} == {name, *pages}
 
 
 @pytest.mark.slow
