@@ -5,9 +5,6 @@ BIN := $(VENV)/bin
 APT := apt-get install --yes --no-install-recommends
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt
 
-# Tests start hundreds of processes; with this of a container each of them compiles all of the package anew.
-unexport PYTHONDONTWRITEBYTECODE
-
 .DEFAULT_GOAL := help
 .PHONY: help demo svea-demo test test-nats test-ros1 test-train agents test-all test-matrix test-browser docs notebooks lint format bench stages gpu schema pages clean
 
