@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 
 from coopenv.estimation.arrays import Array
-from coopenv.observers.contract import Estimate, Message, Setup, Tick
+from coopenv.observers.contract import Estimate, Setup, Tick
 from coopenv.observers.robust.constants import (
     ADMISSION,
     DISPUTE_MARGIN,
@@ -35,49 +35,45 @@ from coopenv.observers.robust.constants import (
     GROSS_TURN,
     KNOWN_ANGLE,
     KNOWN_POSITION,
-    LEAST_CHANGE,
     LEAST_FORGIVEN,
     LEAST_NEWS,
     LOST_SHARE,
     LOST_TIME,
-    MAX_CORRELATIONS,
     MAX_REVISIONS,
     MAX_SPEED,
     MAX_TOLD_ANGLE,
-    NEWS_TIME,
     RETURNING_SHARE,
     REVISION_MARGIN,
     SAME_TIME,
     SEPARATION_GATE,
-    SHARE_OF_CHANGE,
     SILENCE_TIME,
     STEP_GATE,
-    STEPS,
     WORD_GATE,
 )
 from tests.oracles.robust.alone import Alone, cost_of, most_of_consistent
 from tests.oracles.robust.belief import Member, recentring
-from tests.oracles.robust.common import Anchor, Common, Contact
+from tests.oracles.robust.clocks import by_clocks, changes_speed
+from tests.oracles.robust.common import Anchor, Contact
 from tests.oracles.robust.eviction import room_for
 from tests.oracles.robust.odometry import as_noise
 from tests.oracles.robust.revision import Explanation, Told, explained, separation
 from tests.oracles.robust.sight import View
-from tests.oracles.robust.told import Correlations, factor, is_positive, is_same, regress
-from tests.oracles.robust.tracklets import Report, left_error, marker_jacobian, mask_of
+from tests.oracles.robust.speaking import Speaking
+from tests.oracles.robust.told import Correlations, is_positive, regress
+from tests.oracles.robust.tracklets import Report, left_error, mask_of
 from tests.oracles.robust.words import Word, has_jumped, least_drift, share_of
 
 KEPT = ("drift", "slow_drift", "perjured", "offences", "barred_until")
 """Of what is thought of a sender, what bearings have not told."""
 
 
-class Robust(Common):
+class Robust(Speaking):
     """One vehicle's observer; messages hold pose and covariance (172 bytes), at times correlations (256 bytes)."""
 
     def __init__(self, setup: Setup) -> None:
         """Take what the vehicle knows before it starts."""
         super().__init__(setup)
         self.correlations = Correlations()
-        self.interval = -1
         self.words: dict[int, Word] = {}
         self.clock_std = setup.noise.clock_offset
 
@@ -99,45 +95,6 @@ class Robust(Common):
             self.correlations.hear(target - self.landmarks, received.message, tick.time - received.age)
         return super().update(tick)
 
-    def message(self) -> Message:
-        """Return pose, covariance, odometry and the correlations with members."""
-        message = super().message()
-        if message.position is None:
-            return message
-        extra = {"odometry": message.extra["odometry"].astype(np.float32)}
-        interval = int(np.floor((self.belief.own.time + SAME_TIME) / NEWS_TIME))
-        if interval != self.interval:
-            self.interval = interval
-            extra |= self._correlations()
-        return replace(message, extra={**message.extra, **extra})
-
-    def _correlations(self) -> dict[str, Array]:
-        """Return the correlations with some members, as they travel."""
-        P, J = self.belief.P, marker_jacobian(self.marker)
-        A = factor(J.dot(P[:6, :6]).dot(J.T))
-        told = self._told_of()
-        correlations = np.zeros((len(told), 6, 6), np.int8)
-        for k, n in enumerate(told):
-            block = slice(6 * n, 6 * n + 6)
-            C = np.linalg.solve(A, np.linalg.solve(factor(P[block, block]), J.dot(P[:6, block]).T).T)
-            correlations[k] = np.clip(np.rint(STEPS * C), -STEPS, STEPS)
-        members = [self.belief.members[n] for n in told]
-        return {
-            "told": np.array([member.vehicle for member in members], np.uint16),
-            "ages": np.array([self.belief.own.time - member.time for member in members], np.float32),
-            "correlations": correlations,
-        }
-
-    def _told_of(self) -> list[int]:
-        """Return which members are told of: those that depend on most others, to whom there are most ways."""
-        members = [n for n, m in enumerate(self.belief.members) if n and m.considered]
-
-        def order(n: int) -> tuple[int, int]:
-            vehicle = self.belief.members[n].vehicle
-            return self.contacts[vehicle].last.depends_on.bit_count(), vehicle
-
-        return sorted(members, key=order, reverse=True)[:MAX_CORRELATIONS]
-
     def _listen(self, tick: Tick) -> None:
         """Take in the messages of members that count, and those of others in view, leaders first."""
         in_view = {target - self.landmarks for target in tick.targets[tick.valid].tolist()}
@@ -147,28 +104,13 @@ class Robust(Common):
         last = {sender: float(contact.last.time[0]) + SAME_TIME for sender, contact in self.contacts.items()}
         pending = {s: r for s, r in news.items() if s in last and r.time[0] > last[s]}
         while pending:
-            s = min(pending, key=lambda s: (self._has_to_wait(s, pending), *pending[s].rank))
+            taken = {sender: float(contact.last.time[0]) for sender, contact in self.contacts.items()}
+            s = min(pending, key=lambda s: (self.correlations.has_to_wait(s, pending, taken), *pending[s].rank))
             self._hear(self.contacts[s], pending.pop(s), tick.time)
         for report in sorted(reports.values(), key=lambda report: report.rank):
             sender = report.vehicles[0]
             if sender in in_view and sender not in self.contacts and not self._is_barred(sender, tick.time):
                 self._meet(report, tick.time)
-
-    def _has_to_wait(self, sender: int, pending: dict[int, Report]) -> bool:
-        """Return whether a report has to wait for another one, so that all fit what is told of them.
-
-        It has to where it tells of another member's report that is not taken yet, and where another one's that is not
-        taken tells of the sender's report before.
-        """
-        for other in pending:
-            if other != sender:
-                told, theirs = self.correlations.of(sender, other), self.correlations.of(other, sender)
-                last = self.contacts[other].last.time[0]
-                if told is not None and told.time > last and not is_same(told.time, last):
-                    return True
-                if theirs is not None and is_same(theirs.time, self.contacts[sender].last.time[0]):
-                    return True
-        return False
 
     def _meet(self, report: Report, time: float) -> None:
         """Take in a sender that is new, if there is room."""
@@ -204,7 +146,7 @@ class Robust(Common):
         assert n is not None
         jumped = has_jumped(belief.members[n], step, dt, self.noise)
         belief.follow(n, report.odometry_turn[0], report.odometry_position[0], float(report.time[0]), self.noise)
-        steady = not self._changes_speed(n)
+        steady = not changes_speed(belief, n, self.clock_std)
         word = self._word(sender)
         word.step(last, report, self.noise, belief.errors_covariance, contact.trusted)
         drift = word.drifted(DRIFT_GATE, least_drift(report)) if contact.trusted else word.drifted(DRIFT_CLEAR, 0.0)
@@ -212,7 +154,7 @@ class Robust(Common):
         if not contact.trusted:
             return
         self.depends_on |= report.depends_on
-        report = replace(report, P=report.P + self._by_clocks(belief.members[n]))
+        report = replace(report, P=report.P + by_clocks(belief.members[n], self.clock_std))
         if not anew:
             lasting = as_noise(belief.errors_covariance, step, dt, ERRORS_TIME)
             known = bool((lasting <= self.noise.odometry(dt)).all())
@@ -231,25 +173,6 @@ class Robust(Common):
         belief.P[block, block] = report.P
         member.R, member.p = report.R[0], report.p[0]
         self._relate(n, report)
-
-    def _by_clocks(self, member: Member) -> Array:
-        """Return (6, 6) the covariance of how far a member is off by clocks, along its velocity."""
-        P = np.zeros((6, 6))
-        if member.dated is not None:
-            P[3:, 3:] = 2.0 * self.clock_std**2 * np.outer(member.dated, member.dated)
-        return P
-
-    def _changes_speed(self, n: int) -> bool:
-        """Let clocks count by a member's velocity where that has changed much; return whether it has."""
-        member, block = self.belief.members[n], slice(6 * n, 6 * n + 6)
-        dated = np.zeros(3) if member.dated is None else member.dated
-        assert member.v is not None
-        limit = SHARE_OF_CHANGE * float(np.linalg.norm(dated)) + LEAST_CHANGE
-        if self.clock_std == 0.0 or float(np.linalg.norm(member.v - dated)) <= limit:
-            return False
-        member.dated = member.v
-        self.belief.P[block, block] += self._by_clocks(member)
-        return True
 
     def _separate(self, tick: Tick) -> None:
         """Judge whom bearings contradict, and now and then the belief as a whole by what landmarks alone say."""
@@ -338,7 +261,7 @@ class Robust(Common):
         """Return (6, 6) the covariance of how far a sender that has been met is off by clocks."""
         n = self.belief.place(sender)
         assert n is not None
-        return self._by_clocks(self.belief.members[n])
+        return by_clocks(self.belief.members[n], self.clock_std)
 
     def _words_in_view(self, tick: Tick) -> list[Told]:
         """Return where members in view say to be that may be right."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -62,6 +63,21 @@ class Correlations:
     def of(self, sender: int, vehicle: int) -> Told | None:
         """Return what a sender has told of a vehicle."""
         return self.told.get(sender, {}).get(vehicle)
+
+    def has_to_wait(self, sender: int, pending: Iterable[int], taken: Mapping[int, float]) -> bool:
+        """Return whether a report has to wait for another one, so that all fit what is told of them.
+
+        It has to where it tells of another pending sender's report that is not taken yet, and where another one's
+        tells of the report that was taken of the sender last. `taken` are the times of those, s.
+        """
+        for other in pending:
+            if other != sender:
+                told, theirs = self.of(sender, other), self.of(other, sender)
+                if told is not None and told.time > taken[other] and not is_same(told.time, taken[other]):
+                    return True
+                if theirs is not None and is_same(theirs.time, taken[sender]):
+                    return True
+        return False
 
     def crosses(self, belief: Belief, n: int, after: Array, met: bool) -> Crosses:
         """Return the covariances (6, 6) of a sender's new error with those of other members."""

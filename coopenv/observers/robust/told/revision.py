@@ -16,7 +16,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import inverse_factor, left_error, position_variance
+from coopenv.observers.robust.algebra import distance_squared, position_variance
 from coopenv.observers.robust.belief import index_of, own_estimate, put_own
 from coopenv.observers.robust.correction import iterated_update
 from coopenv.observers.robust.measurements import (
@@ -26,7 +26,7 @@ from coopenv.observers.robust.measurements import (
     linearise,
     set_line,
 )
-from coopenv.observers.robust.memory import Estimate, Frame, Pose, Word, mat66d, vec3d
+from coopenv.observers.robust.memory import Estimate, Frame, Word, mat66d, vec3d
 from coopenv.observers.robust.mounting import mounting_variances
 from coopenv.observers.robust.told.clocks import by_clocks
 from coopenv.observers.robust.told.fusion import place
@@ -87,7 +87,7 @@ def set_told_lines(model: Any, state: Any, memory: Any, world: int, i: int, tick
                     memory.line[world, lines].teller = member
                     lines += 1
     variance = bearing_variance(model, i) + mounting[0]
-    once = wp.float64(constants.BEND_TIME)
+    once = wp.float64(constants.BEND_TIME)  # a period for which what linearisations leave out counts once
     return Frame(lines, 0, vec3d(model.camera[i].position), variance, once)
 
 
@@ -114,13 +114,7 @@ def cost_of(frame: Frame, memory: Any, world: int, i: int, alone: Estimate):
             if not linearise(frame, memory, world, i, n):
                 return wp.float64(wp.inf)
             cost += wp.length_sq(memory.line[world, n].residual) / memory.line[world, n].noise
-    return cost + separation_squared(alone, memory.member[world, i, 0].pose)
-
-
-@wp.func
-def separation_squared(estimate: Estimate, pose: Pose):
-    """Return the squared distance of a pose from an estimate, in standard deviations of that."""
-    return wp.length_sq(inverse_factor(estimate.P) * left_error(estimate.pose, pose))
+    return cost + distance_squared(alone, Estimate(memory.member[world, i, 0].pose, mat66d()))
 
 
 @device_function
@@ -164,6 +158,6 @@ def find_liar(model: Any, state: Any, memory: Any, world: int, i: int, tick: int
     memory.belief[world, i].members = members
     memory.belief[world, i].others = others
     put_own(memory, world, i, own)
-    elsewhere = separation_squared(own, pose) > wp.float64(constants.SEPARATION_GATE)
+    elsewhere = distance_squared(own, Estimate(pose, mat66d())) > wp.float64(constants.SEPARATION_GATE)
     convincing = cost - least > wp.float64(constants.REVISION_MARGIN)
     return frame, wp.where(elsewhere and convincing, liar, 0)

@@ -15,7 +15,7 @@ from typing import Any
 import warp as wp
 
 from coopenv.observers.robust import constants
-from coopenv.observers.robust.algebra import between, carried, with_noise
+from coopenv.observers.robust.algebra import between, carried, distance_squared, with_noise
 from coopenv.observers.robust.belief import own_estimate, put_own
 from coopenv.observers.robust.correction import correct_by_lines, iterated_update, store_poses
 from coopenv.observers.robust.measurements import TRACKING, innovation_squared, set_lines, time_between
@@ -24,7 +24,7 @@ from coopenv.observers.robust.mounting import mounting_variances
 from coopenv.observers.robust.odometry import begin_errors, increment_noise
 from coopenv.observers.robust.told.correlations import clear_told
 from coopenv.observers.robust.told.memory import Alone
-from coopenv.observers.robust.told.revision import believe_again, find_liar, separation_squared
+from coopenv.observers.robust.told.revision import believe_again, find_liar
 from coopenv.observers.robust.trust import distrust, forget_evidence
 from coopenv.observers.robust.update import set_anchor
 from coopenv.world.device_function import device_function
@@ -241,7 +241,8 @@ def judge_belief(model: Any, frame: Frame, memory: Any, world: int, i: int, tick
     elapsed = follow_alone(model, memory, world, i, tick)
     landmarks = correct_alone(model, frame, memory, world, i, elapsed)
     exposed = memory.alone[world, i].exposed == 1
-    away = separation_squared(memory.alone[world, i].estimate, memory.member[world, i, 0].pose)
+    pose = memory.member[world, i, 0].pose
+    away = distance_squared(memory.alone[world, i].estimate, Estimate(pose, mat66d()))
     if exposed and landmarks > 0 and away > wp.float64(constants.SEPARATION_GATE):
         culprit, least, _, count = find_culprit(frame, memory, world, i, 0)
         alone = count == 0 or least <= consistent_cost(count - 1)
