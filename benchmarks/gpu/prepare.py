@@ -18,7 +18,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-TRAINING = ("torch", "tyro", "tensorboard")
+TRAINING = ("torch", "tyro", "tensorboard", "tomlkit")
 """Packages of extras that the training needs; without one it is left out."""
 TESTS = ("pytest",)
 LINK = "of_the_interpreter.pth"
