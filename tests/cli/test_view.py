@@ -7,6 +7,7 @@ import signal
 import sys
 import urllib.request
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -151,7 +152,7 @@ def test_the_view_serves_on_loopback_until_it_is_ended(folder: Path) -> None:
     assert url.startswith("http://127.0.0.1:")
     with urllib.request.urlopen(url, timeout=20) as answer:
         assert b"<html" in answer.read(2000)
-    second = start((*COOPENV, "view", *SHORT, "--port", url.rpartition(":")[2]), folder)
+    second = start((*COOPENV, "view", *SHORT, "--port", str(urlsplit(url).port)), folder)
     out, errors = second.communicate(timeout=60)
     assert (second.returncode, out) == (2, "") and "somebody else listens there" in errors
     os.kill(process.pid, signal.SIGINT)

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import socket
+import urllib.error
+import urllib.request
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from time import monotonic
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -83,7 +86,7 @@ def test_what_cannot_be_changed_stays() -> None:
 def viewer() -> Iterator[Viewer]:
     reel = reel_of("urban_crossing")
     with serving("127.0.0.1", None) as (server, url):
-        assert url == f"http://127.0.0.1:{server.get_port()}"
+        assert url.startswith(f"http://127.0.0.1:{server.get_port()}/")
         yield Viewer(server, reel)
     reel.close()
 
@@ -161,6 +164,132 @@ def test_wrong_wishes_are_answered_and_the_view_goes_on(viewer: Viewer) -> None:
     assert "That cannot be: unknown observer" in viewer._panel._status.content
     wish(viewer, ("observer", "dead_reckoning"))
     assert "observer dead" in viewer._panel._head.content and not viewer._panel._status.visible
+
+
+def client(url: str, **more: Any) -> Any:
+    """Connect to the live view as a program; `more` are options of the WebSocket."""
+    import viser
+    from websockets.sync.client import connect
+
+    versions = [f"viser-v{viser.__version__}"]
+    return connect(url.replace("http", "ws"), subprotocols=versions, max_size=None, **more)
+
+
+def status_of(url: str, host: str) -> int:
+    """Return the status of a page that is asked for under a Host."""
+    try:
+        with urllib.request.urlopen(urllib.request.Request(url, headers={"Host": host}), timeout=20) as answer:
+            return int(answer.status)
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+@pytest.fixture
+def address() -> Iterator[str]:
+    with serving("127.0.0.1", None) as (_, url):
+        yield url
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:1", "null", "https://127.0.0.1"])
+def test_a_websocket_of_a_foreign_page_is_refused(origin: str, address: str) -> None:
+    from websockets.exceptions import InvalidStatus
+
+    with pytest.raises(InvalidStatus, match="403"):
+        client(address, origin=origin)
+    with client(address, origin=address.rpartition("/")[0]) as link:
+        assert link.recv(timeout=20)
+
+
+def test_without_the_token_nothing_is_served(address: str) -> None:
+    from websockets.exceptions import InvalidStatus
+
+    base, host = address.rpartition("/")[0], urlsplit(address).netloc
+    for path in ("", "/", "/index.html", "/x", "//", "/%2e%2e/", address.removeprefix(base)[:-1]):
+        assert status_of(base + path, host) == 403
+        with pytest.raises(InvalidStatus, match="403"):
+            client(base + path)
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:8080", "127.0.0.1.evil.example", "[", ""])
+def test_a_foreign_host_name_is_refused(host: str, address: str) -> None:
+    """A page whose name has been rebound to this computer sends that name."""
+    assert status_of(address, host) == 403
+
+
+@pytest.mark.parametrize("host", ["localhost:8080", "127.0.0.1", "[::1]:9000", "192.168.1.7:8080"])
+def test_an_address_or_localhost_is_served_behind_any_port(host: str, address: str) -> None:
+    assert status_of(address, host) == status_of(f"{address}/?initialCameraFov=1", host) == 200
+
+
+def test_what_viser_starts_unguarded_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    viser = pytest.importorskip("viser")
+
+    class Other:
+        def __init__(self, **unused: Any) -> None:
+            pass
+
+        def stop(self) -> None:
+            pass
+
+    monkeypatch.setattr(viser, "ViserServer", Other)
+    with pytest.raises(CoopenvError, match="would serve without checks"), serving("127.0.0.1", None):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("label", "value"),
+    [
+        ("Fault", "zzz"),
+        ("Observer", "../mine.py:Observer"),
+        ("Vehicle", "f99"),
+        ("Speed", "0"),
+        ("Speed", "nan"),
+        ("Speed", "inf"),
+        ("Time [s]", float("nan")),
+        ("Time [s]", 1e9),
+        ("Time [s]", -1.0),
+    ],
+)
+def test_a_value_that_was_not_offered_is_refused(label: str, value: Any) -> None:
+    import msgspec
+
+    reel = reel_of("urban_crossing")
+    with serving("127.0.0.1", None) as (server, url), client(url) as link:
+        shown = Viewer(server, reel)
+        wish(shown, ("play", None))
+        handles = server.gui._gui_input_handle_from_uuid
+        uuid = next(uuid for uuid, handle in handles.items() if getattr(handle, "label", "") == label)
+        camera = {"position": (float("nan"),) * 3, "look_at": (0.0, 0.0, 0.0), "up_direction": (0.0, 0.0, 1.0)}
+        size = {"fov": 1.0, "near": 0.1, "far": 10.0, "image_height": 10, "image_width": 10}
+        for message in (
+            {"type": "ViewerCameraMessage", "wxyz": (1.0, 0.0, 0.0, 0.0), **camera, **size},
+            {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}},
+        ):
+            link.send(msgspec.msgpack.encode(message))
+        end = monotonic() + 20.0
+        shown.run(lambda: "is not offered" not in shown._panel._status.content and monotonic() < end)
+        assert "That cannot be: " in shown._panel._status.content
+        assert (shown.playing, shown._speed, len(reel.frames)) == (False, 1.0, 1)
+        wish(shown, ("step", None))
+        assert len(reel.frames) == 2
+    reel.close()
+
+
+def test_any_error_of_a_wish_is_told_and_the_view_goes_on(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    wish(viewer, ("play", None), ("seek", 1.0))
+    kept = viewer._reel.frames
+
+    def fail(reel: EngineReel) -> bool:
+        raise RuntimeError("the observer fails")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(EngineReel, "more", fail)
+        wish(viewer, ("observer", "dead_reckoning"))
+    assert "That cannot be: RuntimeError: the observer fails" in viewer._panel._status.content.replace("\\", "")
+    assert viewer._reel.frames is kept and viewer._reel.source.observer == "robust"
+    before = len(kept)
+    wish(viewer, ("seek", 2.0))
+    assert len(viewer._reel.frames) > before
 
 
 def test_the_end_is_told(viewer: Viewer) -> None:

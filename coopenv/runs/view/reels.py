@@ -123,14 +123,19 @@ class EngineReel(Reel):
         watching = self._observer if observer is None else {"observer.name": observer}
         wrong = self._fault if fault is None else fault
         engine, policy, source = self._built({**watching, **wrong})
-        count = len(self.frames)
-        self.engine.close()
+        before = dict(vars(self))
         self._observer, self._fault = watching, wrong
         self.source, self.scenario = source, engine.backend.scenario
         self._begin(engine, policy)
         self.frames = []
-        while len(self.frames) < count and self.more():
-            pass
+        try:
+            while len(self.frames) < len(before["frames"]) and self.more():
+                pass
+        except BaseException:
+            vars(self).update(before)
+            engine.close()
+            raise
+        before["engine"].close()
 
     def close(self) -> None:
         """Close the engine."""

@@ -1,21 +1,20 @@
 """The server of the live view: where it listens, and which vehicle is meant."""
 
+import errno
 import socket
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from typing import Any
 
 from coopenv.errors import CoopenvError, listed, suggest
 from coopenv.scenario import Scenario
-from coopenv.viz.web.extra import viser_module
+from coopenv.viz.web.extra import guarded_server
 
 PORT, PORTS = 8080, 20
 """The first port that is tried where none is asked for, and how many."""
 
 
-@contextmanager
-def serving(host: str, port: int | None) -> Iterator[tuple[Any, str]]:
-    """Yield viser's server and its address.
+def serving(host: str, port: int | None) -> AbstractContextManager[tuple[Any, str]]:
+    """Return a context of viser's server and the address of its page, with the token that it needs.
 
     Args:
         host: address of this computer.
@@ -24,13 +23,7 @@ def serving(host: str, port: int | None) -> Iterator[tuple[Any, str]]:
     Raises:
         CoopenvError: the port is taken, or the address is none of this computer's.
     """
-    chosen = free_port(host, port)
-    server = viser_module().ViserServer(host=host, port=chosen, verbose=False)
-    try:
-        shown = "127.0.0.1" if host == "0.0.0.0" else f"[{host}]" if ":" in host else host
-        yield server, f"http://{shown}:{server.get_port()}"
-    finally:
-        server.stop()
+    return guarded_server(host, free_port(host, port))
 
 
 def free_port(host: str, port: int | None) -> int:
@@ -56,7 +49,7 @@ def _obstacle(host: str, port: int) -> str:
     except PermissionError:
         return "ports below 1024 are for the administrator; name another one"
     except OSError as error:
-        if isinstance(error, OSError) and error.errno == 99:  # EADDRNOTAVAIL
+        if error.errno == errno.EADDRNOTAVAIL:
             raise CoopenvError(f"--host {host}: is no address of this computer") from None
         return "somebody else listens there; name another one"
     return ""

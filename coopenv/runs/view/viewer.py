@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.errors import CoopenvError
+from coopenv.errors import CoopenvError, told
 from coopenv.runs.video import MAX_FPS
 from coopenv.runs.view.reels import FAULTS, Reel
 from coopenv.viz.scene import Frame, Stage
@@ -45,8 +45,9 @@ class Viewer:
         aim(server.initial_camera, self._stage)
         self._picture = Picture(server.scene, self._stage, reel.source, self._look)
         self._root = Sent(self._picture.ground.root)
+        vehicles = {i: i for i in range(self._stage.vehicles)}
         self._picture.actors.cars.handle.on_click(
-            lambda event: self._panel.wishes.put(("vehicle", event.instance_index))
+            lambda event: self._panel.wish("vehicle", event.instance_index, vehicles)
         )
         server.on_client_connect(self._welcome)
         self._history = History(reel.scenario.rates.camera)
@@ -155,15 +156,18 @@ class Viewer:
         client.camera.on_update(once)
 
     def _obey(self) -> bool:
-        """Do what the user has wished; return whether there was anything."""
+        """Do what the user has wished; return whether there was anything. An error is told in the panel."""
         any_wish = False
         while not self._panel.wishes.empty():
             name, value = self._panel.wishes.get()
             any_wish = True
-            if name.startswith("show "):
-                setattr(self._look, name.removeprefix("show "), value)
-            else:
-                getattr(self, f"_wish_{name}")(value)
+            try:
+                if name.startswith("show "):
+                    setattr(self._look, name.removeprefix("show "), value)
+                else:
+                    getattr(self, f"_wish_{name}")(value)
+            except Exception as error:  # a wish never ends the view
+                self._panel.tell(f"That cannot be: {error if isinstance(error, CoopenvError) else told(error)}")
         return any_wish
 
     def _set_playing(self, playing: bool) -> None:
@@ -173,6 +177,12 @@ class Viewer:
     def _wish_play(self, _: object) -> None:
         self._set_playing(not self.playing)
         self._panel.tell("")
+
+    def _wish_refused(self, words: str) -> None:
+        raise CoopenvError(words)
+
+    def _wish_go(self, action: str) -> None:
+        getattr(self, f"_wish_{action}")(None)
 
     def _wish_step(self, _: object) -> None:
         self._set_playing(False)
@@ -222,11 +232,7 @@ class Viewer:
         """Run the episode again up to here under changes."""
         self._panel.tell(f"{words} (kernels that are new here are compiled first) ...")
         self._server.flush()
-        try:
-            self._reel.change(**changes)
-        except CoopenvError as error:
-            self._panel.tell(f"That cannot be: {error}")
-            return
+        self._reel.change(**changes)
         self._k = min(self._k, len(self._reel.frames) - 1)
         self._history = History(self._reel.scenario.rates.camera)
         for frame in self._reel.frames[: self._k + 1]:

@@ -1,6 +1,6 @@
 """The panel beside the live scene: what can be switched, and what is told in numbers."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from queue import SimpleQueue
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from coopenv.errors import shown
 from coopenv.estimation.outcomes import Sight
 from coopenv.format import fixed
 from coopenv.viz.camera_image import camera_image
@@ -22,6 +23,9 @@ MAGNIFICATIONS = ("1", "10", "100")
 _CELL = "padding:2px 5px;text-align:right"
 NOBODY = "nobody"
 NO_FAULT = "none"
+REFUSED = "refused"
+"""Name of a wish for what was not offered; its value says which."""
+SWITCH = {False: False, True: True}
 TIME_EVERY, TEXTS_EVERY, PLOTS_EVERY = 0.1, 0.25, 0.5
 """s of real time between two positions of the slider, two tables, and two images and plots."""
 
@@ -63,7 +67,7 @@ class Panel:
         self._vehicles = gui.add_dropdown(
             "Vehicle", (NOBODY, *names), hint="Its camera, its plots; the view goes along."
         )
-        self._on(self._vehicles, "vehicle", lambda name: None if name == NOBODY else names.index(name))
+        self._on(self._vehicles, "vehicle", {NOBODY: None} | {name: i for i, name in enumerate(names)})
         tabs = gui.add_tab_group()
         with tabs.add_tab("Errors"):
             self._table = gui.add_html("")
@@ -76,14 +80,29 @@ class Panel:
             self._add_switches()
         self.tell_source(source)
 
-    def _on(self, handle: Any, name: str, value: Callable[[Any], Any] = lambda given: given) -> None:
+    def _on(self, handle: Any, name: str, offered: Mapping[Any, Any] | tuple[float, float]) -> None:
         """Let the user's changes of a control become wishes; what the program sets itself does not."""
 
         def changed(event: Any) -> None:
             if event.client is not None:
-                self.wishes.put((name, value(event.target.value)))
+                self.wish(name, event.target.value, offered)
 
         handle.on_update(changed)
+
+    def wish(self, name: str, given: Any, offered: Mapping[Any, Any] | tuple[float, float]) -> None:
+        """Put a wish into `wishes`, or that it is refused, because a client can send any value.
+
+        Args:
+            name: of the wish.
+            given: value of the control.
+            offered: by value what it means, or the lowest and the highest number.
+        """
+        if isinstance(offered, tuple):
+            low, high = offered
+            meant = [float(given)] if isinstance(given, int | float) and low <= given <= high else []
+        else:
+            meant = [meaning for value, meaning in offered.items() if value == given]
+        self.wishes.put((name, meant[0]) if meant else (REFUSED, f"{name} {shown(given)} is not offered"))
 
     def _button(self, name: str, label: str, **look: Any) -> Any:
         button = self._gui.add_button(label, **look)
@@ -95,12 +114,13 @@ class Panel:
             return
         self._playing = self._button("play", "Pause")
         group = self._gui.add_button_group("Go", ("Step", "Restart"))
-        group.on_click(lambda event: self.wishes.put((str(event.target.value).lower(), None)))
+        group.on_click(lambda event: self.wish("go", event.target.value, {"Step": "step", "Restart": "restart"}))
         speed = self._gui.add_dropdown("Speed", SPEEDS, initial_value="1", hint="Times real time.")
-        self._on(speed, "speed", float)
+        self._on(speed, "speed", {text: float(text) for text in SPEEDS})
         if self._abilities.seek:
-            self._time = self._gui.add_slider("Time [s]", 0.0, max(0.1, round(length, 2)), 0.01, 0.0)
-            self._on(self._time, "seek", float)
+            end = max(0.1, round(length, 2))
+            self._time = self._gui.add_slider("Time [s]", 0.0, end, 0.01, 0.0)
+            self._on(self._time, "seek", (0.0, end))
 
     def _add_world(self) -> None:
         able = self._abilities
@@ -109,26 +129,27 @@ class Panel:
             observer = self._gui.add_dropdown(
                 "Observer", tuple(able.observers), initial_value=able.observers[0], hint=hint
             )
-            self._on(observer, "observer")
+            self._on(observer, "observer", {name: name for name in able.observers})
         if able.faults:
             hint = "What goes wrong from this moment on."
             fault = self._gui.add_dropdown("Fault", (NO_FAULT, *able.faults), initial_value=NO_FAULT, hint=hint)
-            self._on(fault, "fault")
+            self._on(fault, "fault", {name: name for name in (NO_FAULT, *able.faults)})
 
     def _add_switches(self) -> None:
         gui, look = self._gui, self._look
         initial = f"{look.magnification:g}"
         magnified = gui.add_button_group("Ellipsoids x", MAGNIFICATIONS)
         magnified.value = initial if initial in MAGNIFICATIONS else "1"
-        magnified.on_click(lambda event: self.wishes.put(("magnification", float(event.target.value))))
+        sizes = {text: float(text) for text in MAGNIFICATIONS}
+        magnified.on_click(lambda event: self.wish("magnification", event.target.value, sizes))
         names = {"ellipsoids": "Ellipsoids", "estimates": "Estimates", "sight": "Lines of sight"}
         names |= {"views": "Fields of view", "messages": "V2X messages", "trails": "Trails", "names": "Names"}
         for name, label in names.items():
-            self._on(gui.add_checkbox(label, getattr(look, name)), f"show {name}")
+            self._on(gui.add_checkbox(label, getattr(look, name)), f"show {name}", SWITCH)
         alone = gui.add_checkbox("Lines of the picked vehicle alone", False)
-        self._on(alone, "alone")
+        self._on(alone, "alone", SWITCH)
         self._follow = gui.add_checkbox("Go along with the picked vehicle", True)
-        self._on(self._follow, "follow")
+        self._on(self._follow, "follow", SWITCH)
         self._legend = gui.add_html("")
 
     def tell_source(self, source: Source) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from coopenv.files import replace_text
 from coopenv.viz.scene import SceneRecord, Stage
-from coopenv.viz.web.extra import viser_module
+from coopenv.viz.web.extra import guarded_server
 from coopenv.viz.web.legend import legend_html
 from coopenv.viz.web.look import Look
 from coopenv.viz.web.picture import FIELD_OF_VIEW, Picture, first_camera, useful_magnification
@@ -54,8 +54,7 @@ def replay_html(
     stage = Stage(record.scenario)
     sigma = np.array([record.frame(k).three_sigma for k in range(0, len(record), max(1, len(record) // 20))])
     look = Look(magnification=useful_magnification(sigma, stage.side) if record.source.honest else 1.0)
-    server = viser_module().ViserServer(host=_LOOPBACK, port=0, verbose=False)
-    try:
+    with guarded_server(_LOOPBACK, 0) as (server, _):
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         aim(server.initial_camera, stage)
         picture = Picture(server.scene, stage, record.source, look)
@@ -66,8 +65,6 @@ def replay_html(
             picture.show(record.frame(k))
             on_progress(k / len(record))
         page = recording.as_html()
-    finally:
-        server.stop()
     return _dressed(page, record, stage, look, others or {})
 
 
