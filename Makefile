@@ -48,7 +48,7 @@ test: lint ## lint, type check and all tests but the slow ones
 
 test-nats: $(VENV)/.dev ## the tests that need a NATS broker (installs Debian's nats-server, as root)
 	@PATH="$$PATH:/usr/sbin"; command -v nats-server > /dev/null || $(APT) nats-server
-	@$(BIN)/python -m pytest -m nats tests/svea
+	@$(BIN)/python -m pytest -m nats tests/cars/link
 
 # ROS 1 is of the system's interpreter, which sees what Debian has installed.
 .venv-ros1/.dev: pyproject.toml constraints.txt
@@ -60,7 +60,7 @@ test-nats: $(VENV)/.dev ## the tests that need a NATS broker (installs Debian's 
 	@touch $@
 
 test-ros1: .venv-ros1/.dev ## the tests that need a ROS 1 master (installs Debian's rospy, as root)
-	@.venv-ros1/bin/python -m pytest -m ros1 tests/svea
+	@.venv-ros1/bin/python -m pytest -m ros1 tests/cars/link
 
 $(VENV)/.train: $(VENV)/.dev
 	@echo "Installing torch and Stable-Baselines3 into $(VENV) (once) ..."

@@ -7,7 +7,7 @@ import platform
 from pathlib import Path
 from typing import Any
 
-from coopenv.machine import available_cores
+from coopenv.base.installation import available_cores
 
 
 def machine() -> dict[str, Any]:

@@ -12,7 +12,7 @@ from functools import partial
 from time import monotonic, process_time, thread_time
 from typing import NamedTuple
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.runs.scenes import driver_of, open_source
 from coopenv.runs.view.reels import EngineReel
 from coopenv.runs.view.serving import serving

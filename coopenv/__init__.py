@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from coopenv.errors import (
+from coopenv.base.errors import (
     ActionError,
     CoopenvError,
     DataError,
@@ -22,8 +22,8 @@ from coopenv.errors import (
     ScenarioError,
     UnknownEnvironmentError,
 )
-from coopenv.seeds import EVALUATION_SEEDS, evaluation_seed
-from coopenv.shipped import list_envs
+from coopenv.base.installation import list_envs
+from coopenv.base.seeds import EVALUATION_SEEDS, evaluation_seed
 
 if TYPE_CHECKING:
     from coopenv.api.make import make_vec, parallel_env
@@ -52,7 +52,7 @@ else:
 
     def __getattr__(name):
         if name == "__version__":
-            from coopenv.shipped import version
+            from coopenv.base.installation import version
 
             value = version()
         elif name in _HOMES:

@@ -5,7 +5,7 @@ import os
 import sys
 from pathlib import Path
 
-from coopenv import interrupts
+from coopenv.base import interrupts
 
 
 def main() -> int:

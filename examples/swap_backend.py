@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import coopenv
-from coopenv.fake.fleet import fakes
+from coopenv.cars.fake.fleet import fakes
 from coopenv.policies import act, load_agent
 
 FLEET = Path(__file__).with_name("fleet") / "overtaking.toml"

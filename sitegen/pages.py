@@ -5,9 +5,9 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
 
+from coopenv.base.installation import list_agents, list_envs
 from coopenv.observers.zoo import ZOO
 from coopenv.runs.markdown import table
-from coopenv.shipped import list_agents, list_envs
 from sitegen.mirror import ROOT, examples_page, page_of, relinked
 from sitegen.observers import observers
 

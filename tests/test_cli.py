@@ -15,6 +15,7 @@ import pytest
 import coopenv
 from coopenv.api.registration import environment_id
 from coopenv.backends.mcap import write_recording
+from coopenv.base.installation import list_agents
 from coopenv.bench.observers.fault_knobs import KNOBS
 from coopenv.bench.observers.faults import FAULTS
 from coopenv.cli import main
@@ -24,7 +25,6 @@ from coopenv.observers.recording import Truth
 from coopenv.observers.registry import observer_names
 from coopenv.runs import table
 from coopenv.runs.recorder import record
-from coopenv.shipped import list_agents
 
 FILES = {"metrics.json", "trajectory.npz", "scene.npz"}
 FIGURES = {

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.codec import encode, make
+from coopenv.cars.fake.car import fault_topic
+from coopenv.cars.fake.fleet import fakes, free_port
+from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cli import app
 from coopenv.cli.svea.run import STOPPED
-from coopenv.errors import CoopenvError
-from coopenv.fake.car import fault_topic
-from coopenv.fake.fleet import fakes, free_port
-from coopenv.svea.codec import encode, make
-from coopenv.svea.transport.zenoh import open_zenoh
 from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, start, wait_until
 
 OVERTAKING = ROOT / "examples" / "fleet" / "overtaking.toml"

@@ -14,16 +14,14 @@ import pytest
 
 from coopenv.api.reward import FIELDS, OTHERS
 from coopenv.api.terms.layout import observation_layout
+from coopenv.cars.deployment import Car, Deployment, GateLink, Network, Remote, Safety, Security, Sensors, Tls
+from coopenv.cars.topics import TOPICS
 from coopenv.observers import registry, run
 from coopenv.observers.registry import find
 from coopenv.policies import load_agent
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
-from coopenv.svea.deployment import Car, Deployment, Safety, Security, Sensors
-from coopenv.svea.network import GateLink, Network, Tls
-from coopenv.svea.remote import Remote
-from coopenv.svea.topics import TOPICS
 
 DOCS = Path(__file__).parents[1] / "docs"
 

@@ -6,7 +6,7 @@ import pickle
 
 import pytest
 
-from coopenv.errors import MAX_MESSAGE, CoopenvError, DataError, check_memory, shown
+from coopenv.base.errors import MAX_MESSAGE, CoopenvError, DataError, check_memory, shown
 
 
 class Unspeakable:

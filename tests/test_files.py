@@ -16,16 +16,16 @@ from pathlib import Path
 
 import pytest
 
-from coopenv import staging
-from coopenv.errors import OutputError
-from coopenv.files import check_file, new_folder, replacing_file, replacing_folder, writing
+from coopenv.base import files
+from coopenv.base.errors import OutputError
+from coopenv.base.files import check_file, new_folder, replacing_file, replacing_folder, writing
 from tests.helpers.processes import small_disk
 
 NAMES = ("a.txt", "b.txt", "c.txt", "sometimes.txt")
 
 WRITER = """
 import sys
-from coopenv.files import replacing_file, replacing_folder
+from coopenv.base.files import replacing_file, replacing_folder
 from tests.test_files import write
 for generation in range(int(sys.argv[1]), 10**9):
     write("result", generation)
@@ -153,7 +153,7 @@ def test_a_run_killed_at_any_step_is_put_right_by_the_next(
         raise Killed
 
     with monkeypatch.context() as patched:
-        patched.setattr({"link": os, "rmdir": Path}.get(step, staging), step, killed)
+        patched.setattr({"link": os, "rmdir": Path}.get(step, files), step, killed)
         patched.setattr(shutil, "rmtree", lambda *_, **__: None)  # a dead process does not clean up
         with pytest.raises(Killed):
             write("result", 7)
@@ -168,7 +168,7 @@ def test_a_run_killed_at_any_step_is_put_right_by_the_next(
 
 @pytest.fixture
 def without_exchange(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(staging, "RENAME_EXCHANGE", 1 << 20)  # a flag that no system knows
+    monkeypatch.setattr(files, "RENAME_EXCHANGE", 1 << 20)  # a flag that no system knows
 
 
 @pytest.mark.usefixtures("without_exchange")
@@ -373,11 +373,11 @@ def test_a_limit_on_the_size_of_files_keeps_the_old_result(place: Path) -> None:
 
 
 def test_a_folder_that_is_held_is_waited_for_so_long(tmp_path: Path) -> None:
-    first = staging.lock(tmp_path)
+    first = files.lock(tmp_path)
     assert first is not None
-    assert staging.lock(tmp_path) is None and staging.lock(tmp_path, wait=0.1) is None
+    assert files.lock(tmp_path) is None and files.lock(tmp_path, wait=0.1) is None
     with ThreadPoolExecutor(1) as pool:
-        second = pool.submit(staging.lock, tmp_path, 60.0)
+        second = pool.submit(files.lock, tmp_path, 60.0)
         os.close(first)
         descriptor = second.result(timeout=60)
     assert descriptor is not None

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from coopenv.format import column, fixed, in_parentheses, number, seconds, with_error
+from coopenv.base.format import column, fixed, in_parentheses, number, seconds, with_error
 
 NAN = math.nan
 

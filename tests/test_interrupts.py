@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from coopenv import interrupts
+from coopenv.base import interrupts
 from tests.helpers.processes import COOPENV, DEADLOCK, group_of, start, wait_until, workers_of
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks at processes in /proc")
@@ -63,7 +63,7 @@ def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
 
 def script(folder: Path, text: str) -> tuple[str, str, int]:
     """Run a script with signals caught; return what it writes, what it complains of, and its exit status."""
-    first = "import ctypes, os, signal, threading\nfrom coopenv import files, interrupts, staging\n"
+    first = "import ctypes, os, signal, threading\nfrom coopenv.base import files, interrupts\n"
     first += "interrupts.install()\n"
     process = start((sys.executable, "-c", first + text), folder)
     out, errors = process.communicate(timeout=DEADLOCK)
@@ -100,9 +100,9 @@ def test_a_result_is_put_in_place_before_the_end(tmp_path: Path) -> None:
     (tmp_path / "result" / "a").write_text("old")
     _, errors, status = script(
         tmp_path,
-        "swap = staging.exchange\n"
+        "swap = files.exchange\n"
         "def slow(*paths): os.kill(os.getpid(), signal.SIGTERM); print('held', flush=True); swap(*paths)\n"
-        "staging.exchange = slow\n"
+        "files.exchange = slow\n"
         "try:\n"
         "    with files.replacing_folder('result', ['a']) as new: (new / 'a').write_text('new')\n"
         "    print('not reached')\n"

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.jsonable import json_text, jsonable
+from coopenv.base.format import json_text, jsonable
 
 
 @dataclass

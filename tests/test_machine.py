@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from coopenv.machine import available_cores, environment, versions
+from coopenv.base.installation import available_cores, environment, versions
 
 
 def test_variables_are_as_before_afterwards(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coopenv.backends.bags.topic_map import load_map
 from coopenv.bench.learning.study import read_study
+from coopenv.cars.bags.topic_map import load_map
 from coopenv.scenario import load_scenario, parse_scenario
 from coopenv.training.settings import Clone, Settings, read_settings
 from tests.helpers import bags, mrclam_files

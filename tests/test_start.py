@@ -53,7 +53,7 @@ def modules_after(statement: str) -> set[str]:
     "statement",
     [
         "import coopenv",
-        "import coopenv.errors",
+        "import coopenv.base.errors",
         "from coopenv.cli import main; main(['--help'])",
         "from coopenv.cli import main; main(['run', '--help'])",
         "from coopenv.cli import main; main(['--version'])",
@@ -62,7 +62,7 @@ def modules_after(statement: str) -> set[str]:
 )
 def test_start_loads_no_simulation(statement: str) -> None:
     loaded = modules_after(statement)
-    assert "coopenv.errors" in loaded
+    assert "coopenv.base.errors" in loaded
     assert not HEAVY & {name.partition(".")[0] for name in loaded}
     own = {name.removeprefix("coopenv.") for name in loaded if name.startswith("coopenv.")}
     assert own <= LIGHT

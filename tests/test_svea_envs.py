@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import coopenv
+from coopenv.cars.limits import HARDEST
 from coopenv.cli import main
 from coopenv.policies import load_agent
-from coopenv.svea.limits import HARDEST
 from tests.helpers.processes import ROOT
 
 NAMES = ("svea_crossing", "svea_overtaking")

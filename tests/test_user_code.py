@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from coopenv.errors import CoopenvError
-from coopenv.user_code import absolute, is_reference, load
+from coopenv.base.errors import CoopenvError
+from coopenv.base.user_code import absolute, is_reference, load
 
 SOURCE = """
 from dataclasses import dataclass

@@ -12,9 +12,9 @@ from pathlib import Path
 from benchmarks.gpu.plan import SIZES, plan
 from benchmarks.gpu.runner import failures, run
 from benchmarks.gpu.table import put, section
-from coopenv.errors import CoopenvError
-from coopenv.files import check_file, writing
-from coopenv.shipped import version
+from coopenv.base.errors import CoopenvError
+from coopenv.base.files import check_file, writing
+from coopenv.base.installation import version
 from coopenv.world.precision import check_device
 
 MINUTES = 8.5

@@ -14,8 +14,8 @@ from typing import Any
 
 from benchmarks.gpu.plan import Stage
 from benchmarks.gpu.work import MARK, ROOT
-from coopenv.files import replace_text
-from coopenv.jsonable import json_text
+from coopenv.base.files import replace_text
+from coopenv.base.format import json_text
 
 LEAST = 5.0
 """s that have to be left for a stage to begin."""

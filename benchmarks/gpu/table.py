@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from coopenv.errors import CoopenvError
-from coopenv.files import replace_text
-from coopenv.format import number
+from coopenv.base.errors import CoopenvError
+from coopenv.base.files import replace_text
+from coopenv.base.format import number
 from coopenv.runs.markdown import table
 
 BEGIN, END = "<!-- make gpu: begin -->", "<!-- make gpu: end -->"

@@ -18,8 +18,8 @@ import warp as wp
 from benchmarks import machine as host
 from benchmarks.speed.coopenv_cases import array_bytes
 from coopenv.api.engine import Engine
-from coopenv.errors import CoopenvError
-from coopenv.machine import versions
+from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import versions
 from coopenv.scenario import load_scenario
 from coopenv.world.precision import check_device
 

@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.planar.changes import blindfolded, changed, clocks, drifting, hidden, misread, odometry, part
 from benchmarks.planar.liars import Drifting, Replaying
 from coopenv.backends.mrclam import VARIANTS, Dataset, load_dataset, recording_of
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.observers.planar.plugin import PlanarEkf
 from coopenv.observers.planar.robust import LEAST_LOST_STD, PlanarRobust

@@ -10,7 +10,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from coopenv import interrupts
+from coopenv.base import interrupts
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -20,9 +20,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     from benchmarks.speed.report import FILES, show, write
     from benchmarks.speed.run import measured
+    from coopenv.base.errors import CoopenvError
+    from coopenv.base.files import replacing_folder
     from coopenv.cli.options import load, parse_overrides
-    from coopenv.errors import CoopenvError
-    from coopenv.files import replacing_folder
 
     out = Console(markup=False, highlight=False, emoji=False)
     try:

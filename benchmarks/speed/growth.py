@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.speed.cases import COOPENV, Case
 from benchmarks.speed.measure import Result
-from coopenv.errors import ScenarioWarning
+from coopenv.base.errors import ScenarioWarning
 from coopenv.scenario import Scenario, parse_scenario, scenario_path
 from coopenv.scenario.files import apply_vehicle_defaults
 

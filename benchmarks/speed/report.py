@@ -15,7 +15,7 @@ from benchmarks.speed.growth import Growth
 from benchmarks.speed.measure import Result
 from benchmarks.speed.startup import Startup
 from benchmarks.speed.tables import growth_table, memory_table, ratio_table, ratios, speed_table, startup_table
-from coopenv.files import replacing_file
+from coopenv.base.files import replacing_file
 
 JSON_FILE, SPEED_FILE, GROWTH_FILE = "speed.json", "speed.png", "growth.png"
 FILES = (JSON_FILE, SPEED_FILE, GROWTH_FILE)

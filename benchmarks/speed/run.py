@@ -16,8 +16,8 @@ from benchmarks.speed.measure import Result, measure, units_of_work
 from benchmarks.speed.peer_cases import PEERS, install_hint, installed, peer_cases
 from benchmarks.speed.report import Report
 from benchmarks.speed.workers import Workers
-from coopenv.errors import CoopenvError
-from coopenv.machine import versions
+from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import versions
 from coopenv.runs.console import Progress
 from coopenv.scenario import Scenario
 

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any
 
 from benchmarks.speed.cases import Case, Library
-from coopenv.machine import ONE_THREAD, environment
+from coopenv.base.installation import ONE_THREAD, environment
 
 VARIABLES = {**ONE_THREAD, "SDL_VIDEODRIVER": "dummy", "PYGAME_HIDE_SUPPORT_PROMPT": "1", "MPLBACKEND": "Agg"}
 """Environment variables under which libraries keep to one thread and open no window."""

@@ -19,8 +19,8 @@ from benchmarks.stages.against import HERE, Case, Side, compile_seconds
 from benchmarks.stages.peeled import Setting, peeling, stepper
 from benchmarks.stages.rounds import alternate, ratio
 from coopenv.api.engine import Engine
+from coopenv.base.errors import CoopenvError
 from coopenv.cli.options import load, parse_overrides
-from coopenv.errors import CoopenvError
 from coopenv.runs.console import Progress
 from coopenv.runs.table import number_table
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from coopenv.errors import CoopenvError
-from coopenv.machine import ONE_THREAD
+from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import ONE_THREAD
 
 HERE = Path(__file__).resolve().parents[2]
 SIDE = Path(__file__).with_name("side.py")

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.errors import ActionError, suggest
+from coopenv.base.errors import ActionError, suggest
 
 
 class ActionReader:

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.api.engine import Engine
-from coopenv.errors import ActionError, CoopenvError
+from coopenv.base.errors import ActionError, CoopenvError
 
 ArrayKind = Literal["numpy", "torch"]
 

@@ -4,7 +4,7 @@ from typing import Any
 
 from gymnasium.vector import AutoresetMode
 
-from coopenv.errors import CoopenvError, suggest
+from coopenv.base.errors import CoopenvError, suggest
 
 
 def check_choice(what: str, value: Any, allowed: tuple[Any, ...]) -> None:

@@ -15,9 +15,9 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import simulation_of
 from coopenv.backends.tick_world import open_world
-from coopenv.errors import CoopenvError, told
+from coopenv.base.errors import CoopenvError, told
+from coopenv.base.seeds import training_seed, world_keys
 from coopenv.scenario import Scenario
-from coopenv.seeds import training_seed, world_keys
 from coopenv.world.embedded import HOST
 from coopenv.world.saved_state import has_begun
 from coopenv.world.state import overwrite, state_fields

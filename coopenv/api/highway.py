@@ -14,7 +14,7 @@ import numpy as np
 from coopenv.api.engine import Engine
 from coopenv.backends.highway.followed import Followed, FollowedWorld
 from coopenv.backends.highway.simulation import flipped, poses_of
-from coopenv.errors import CoopenvError, checked_seed
+from coopenv.base.errors import CoopenvError, checked_seed
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario, load_scenario

@@ -13,7 +13,7 @@ from coopenv.api.reward import RewardFunction
 from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import open_backend, open_simulation
-from coopenv.errors import CoopenvError, ScenarioError
+from coopenv.base.errors import CoopenvError, ScenarioError
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import named
 

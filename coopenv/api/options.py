@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.errors import CoopenvError, shown, suggest
+from coopenv.base.errors import CoopenvError, shown, suggest
 from coopenv.scenario import Scenario
 from coopenv.scenario.randomness import LEVELS, PARAMETERS
 

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 
 from coopenv.backends.base import SensingWorld
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.observers.contract import Estimate
 from coopenv.observers.group import Group, ObserverError
 from coopenv.observers.interference import Interference, interference_of

@@ -11,7 +11,7 @@ import gymnasium
 import pettingzoo
 from pettingzoo import aec_registry, parallel_registry
 
-from coopenv.shipped import list_envs
+from coopenv.base.installation import list_envs
 
 if TYPE_CHECKING:
     from pettingzoo import AECEnv

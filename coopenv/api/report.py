@@ -11,7 +11,7 @@ from coopenv.api.step_results import results_struct
 from coopenv.api.terms.binding import bound_terms, own_places
 from coopenv.api.terms.kernels import check_own_terms, endings_kernel, results_kernel
 from coopenv.api.terms.layout import Layout
-from coopenv.errors import check_memory
+from coopenv.base.errors import check_memory
 from coopenv.scenario import Scenario
 from coopenv.world.launch import PerWorld
 from coopenv.world.precision import device_memory

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.errors import CoopenvError, shown, suggest, told
+from coopenv.base.errors import CoopenvError, shown, suggest, told
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario
 

@@ -11,7 +11,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from coopenv.api.make import parallel_env
 from coopenv.api.parallel_env import RENDER_MODES, CooperativeLocalisationEnv
-from coopenv.errors import CoopenvError, suggest
+from coopenv.base.errors import CoopenvError, suggest
 
 OtherPolicy = Callable[[str, Any], np.ndarray]
 """Maps another vehicle's name and observation to its action."""

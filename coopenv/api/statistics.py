@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorWrapper
 
 from coopenv.api.vector_env import CooperativeVectorEnv
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 
 
 class EpisodeSums:

@@ -18,9 +18,9 @@ from coopenv.api.options import SETTINGS, checked_options, world_mask, world_par
 from coopenv.api.pictures import Pictures
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
+from coopenv.base.seeds import world_keys
 from coopenv.scenario import Scenario
-from coopenv.seeds import world_keys
 
 INFO_FIELDS = (
     *("alive", "ended", "position_error", "orientation_error", "nees"),

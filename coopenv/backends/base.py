@@ -14,7 +14,7 @@ from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 
-from coopenv.errors import CoopenvError, shown, suggest
+from coopenv.base.errors import CoopenvError, shown, suggest
 from coopenv.estimation.arrays import Array
 from coopenv.observers.briefing import briefing_of
 from coopenv.observers.contract import Message

@@ -7,7 +7,7 @@ import numpy as np
 
 from coopenv.backends.moved_kernels import MOVED, moved_struct
 from coopenv.backends.simulated import SimulatedWorld
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.world.launch import PerWorld
 from coopenv.world.records import allocate, fields

@@ -10,13 +10,13 @@ from coopenv.backends.base import Backend
 from coopenv.backends.mcap.peek import metadata_names
 from coopenv.backends.replay import Replay
 from coopenv.backends.simulated import Simulated
-from coopenv.errors import CoopenvError, DataError, suggest
+from coopenv.base.errors import CoopenvError, DataError, suggest
+from coopenv.base.installation import list_envs
 from coopenv.observers.recording import Recording
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.shipped import list_envs
 
 if TYPE_CHECKING:
-    from coopenv.backends.bags import Bag
+    from coopenv.cars.bags import Bag
 
 BACKENDS = ("simulated", "highway", "replay", "svea")
 
@@ -145,7 +145,7 @@ def open_backend(
         overrides: dotted scenario keys.
         data: folder of the data sets.
         variant: of a data set.
-        cars: arguments of `coopenv.backends.svea.opening.open_svea`, which `backend="svea"` needs: `deployment`, and
+        cars: arguments of `coopenv.cars.backend.opening.open_svea`, which `backend="svea"` needs: `deployment`, and
             `car`, `record` and `connect`.
         topics: map of the topics of a ROS bag.
 
@@ -189,7 +189,7 @@ def _open_recorded(
 ) -> Backend:
     """Return the replay of a recording, or of a drive of cars."""
     if kind_of(name) is Kind.LOG:
-        from coopenv.backends.svea.drive import Drive, is_drive
+        from coopenv.cars.backend.drive import Drive, is_drive
 
         if is_drive(name):
             return Drive(name, overrides)
@@ -198,7 +198,7 @@ def _open_recorded(
 
 def _open_cars(name: str | Path, overrides: Mapping[str, Any], given: Mapping[str, Any]) -> Backend:
     """Return the cars of a deployment file: that which is given, or `name` itself."""
-    from coopenv.backends.svea.opening import open_svea
+    from coopenv.cars.backend.opening import open_svea
 
     for key in ("data", "variant", "topics"):
         if given[key] is not None:
@@ -225,6 +225,6 @@ def open_bags(
             raise CoopenvError(f"{what} is for recorded data sets, {where} is a ROS bag")
     if topics is None:
         raise DataError(f"{where}: a ROS bag, which needs a map of its topics, --map topics.toml (see docs/bags.md)")
-    from coopenv.backends.bags import Bag
+    from coopenv.cars.bags import Bag
 
     return Bag(names, topics, overrides)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation.validity import are_numbers, are_rotations, are_unit_vectors, everywhere
 from coopenv.observers.checks import check_message
 from coopenv.observers.contract import Message

@@ -10,7 +10,7 @@ import numpy as np
 from coopenv.backends.base import Backend, Command, Conversing, Repeating, SensingWorld, Told, WorldBackend
 from coopenv.backends.replay.kernels import BY_RADIO, RECORDED, record_struct, true_twists
 from coopenv.backends.tick_checks import MEASURED, check_tick, is_sound
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation.rotations import exp_se3
 from coopenv.observers.briefing import start_covariances
 from coopenv.observers.checks import compiled_checks

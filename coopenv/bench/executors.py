@@ -17,9 +17,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
-from coopenv.errors import CoopenvError
-from coopenv.interrupts import end_with_parent, held
-from coopenv.machine import ONE_THREAD, available_cores, environment
+from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import ONE_THREAD, available_cores, environment
+from coopenv.base.interrupts import end_with_parent, held
 
 T = TypeVar("T")
 R = TypeVar("R")

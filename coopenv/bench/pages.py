@@ -8,13 +8,13 @@ from typing import Any
 from PIL import Image
 
 from coopenv.api.engine import Engine
+from coopenv.base.files import check_file, replace_text, replacing_file, writing
+from coopenv.base.format import json_text
+from coopenv.base.seeds import world_keys
 from coopenv.bench.agents.dial import dial_text, measure_dial, read_dial
 from coopenv.bench.page_films import film_words, write_page_film
-from coopenv.files import check_file, replace_text, replacing_file, writing
-from coopenv.jsonable import json_text
 from coopenv.runs.page import index_text, page_text
 from coopenv.scenario import Scenario
-from coopenv.seeds import world_keys
 from coopenv.viz.topview import TopView
 
 INDEX = "README.md"

@@ -11,7 +11,9 @@ from typing import Annotated, Any
 
 import typer
 
-from coopenv import interrupts
+from coopenv.base import interrupts
+from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import version as installed_version
 from coopenv.cli import show
 from coopenv.cli.bags import import_command
 from coopenv.cli.bench import bench
@@ -25,8 +27,6 @@ from coopenv.cli.run import record_command, run
 from coopenv.cli.svea import svea
 from coopenv.cli.train import train
 from coopenv.cli.view import view
-from coopenv.errors import CoopenvError
-from coopenv.shipped import version as installed_version
 
 UsageError: Any = typer.BadParameter.__base__  # raised for every mistake in the options; it has no public name
 INTERRUPTED, PIPE_CLOSED = 130, 141  # exit statuses, 128 plus the number of the signal

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.cli import options
-from coopenv.errors import CoopenvError, OutputError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from coopenv.backends.bags.inventory import Row
+    from coopenv.cars.bags.log import Row
 
 
 WIDTH = 100
@@ -80,8 +80,8 @@ def _check(out: Path, force: bool) -> None:
 
 def _topics(bags: Sequence[Path]) -> tuple[Row, ...]:
     """Return what bags hold, without knowing what it is."""
-    from coopenv.backends.bags.files import BagFile
-    from coopenv.backends.bags.inventory import rows_of
+    from coopenv.cars.bags.files import BagFile
+    from coopenv.cars.bags.log import rows_of
 
     with ExitStack() as stack:
         return rows_of([stack.enter_context(BagFile(path)) for path in bags])

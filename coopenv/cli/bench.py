@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
+from coopenv.base.errors import CoopenvError
 from coopenv.cli import complete, options
-from coopenv.errors import CoopenvError
 
 bench = typer.Typer(help="Compare observers, study seeds.", no_args_is_help=True)
 First = Annotated[int, typer.Option(min=0, help="The first seed.")]
@@ -146,8 +146,8 @@ def bench_learning(
         from coopenv.bench.learning import command
     except ImportError as error:
         raise CoopenvError(f"coopenv bench learning needs the extra train: pip install '.[train]' ({error})") from None
+    from coopenv.base.installation import available_cores
     from coopenv.bench.learning.study import read_study
-    from coopenv.machine import available_cores
 
     words = [word.strip() for word in only.split(",") if word.strip()] if only else []
     whole, log = read_study(study), options.console(stderr=True)

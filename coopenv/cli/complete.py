@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 from typing import Any, get_args
 
-from coopenv.shipped import SCENES, list_agents, list_envs
+from coopenv.base.installation import SCENES, list_agents, list_envs
 
 
 def environments(incomplete: str) -> list[str]:

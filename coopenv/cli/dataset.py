@@ -34,11 +34,11 @@ def dataset(
     """Write episodes of a policy as a Minari dataset, one per vehicle."""
     import shlex
 
+    from coopenv.base.installation import list_envs
     from coopenv.policies import load_policy
     from coopenv.runs.console import Progress, compile_notice
     from coopenv.runs.driven import drive_vehicles
     from coopenv.runs.minari import dataset_place, write_dataset
-    from coopenv.shipped import list_envs
 
     name, log = Path(environment).stem, options.console(stderr=True)
     scenario = options.load(environment, options.parse_overrides(overrides))

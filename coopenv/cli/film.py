@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from coopenv.base.errors import CoopenvError
 from coopenv.cli import complete, options
-from coopenv.errors import CoopenvError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -54,7 +54,7 @@ def film(
     topics: options.TopicMap = None,
 ) -> None:
     """Film an episode from above: MP4, GIF or WebP."""
-    from coopenv.files import check_file
+    from coopenv.base.files import check_file
     from coopenv.runs.console import Progress
     from coopenv.runs.film import write_film
     from coopenv.runs.video import film_at

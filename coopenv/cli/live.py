@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
+from coopenv.base.errors import CoopenvError
 from coopenv.cli import complete, options
-from coopenv.errors import CoopenvError
 
 
 def watch(

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from coopenv.base.errors import CoopenvError, DataWarning, ScenarioWarning
 from coopenv.cli import complete
-from coopenv.errors import CoopenvError, DataWarning, ScenarioWarning
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -129,7 +129,7 @@ def console(stderr: bool = False) -> Console:
 
 def print_json(result: Any) -> None:
     """Print a result as JSON."""
-    from coopenv.jsonable import json_text
+    from coopenv.base.format import json_text
 
     sys.stdout.write(json_text(result))
 

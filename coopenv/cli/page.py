@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from coopenv.base.errors import CoopenvError
 from coopenv.cli import complete, options
-from coopenv.errors import CoopenvError
 
 if TYPE_CHECKING:
     from coopenv.runs.console import Progress
@@ -36,10 +36,10 @@ def page(
     worlds: Annotated[int, typer.Option(min=2, max=options.MOST_WORLDS, help="Held-out worlds to measure in.")] = 256,
 ) -> None:
     """Write the pages of environments: what they are, a picture, a film, what sensing is worth."""
+    from coopenv.base.installation import list_envs
     from coopenv.bench import pages
     from coopenv.bench.agents.dial import entrants, has_dial
     from coopenv.runs.console import Progress
-    from coopenv.shipped import list_envs
 
     if bool(environments) == everything:
         raise CoopenvError("name environments, or give --all for those that ship with coopenv")

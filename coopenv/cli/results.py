@@ -74,8 +74,8 @@ def export(
 
 def _export_layout(log: Path, out: Path) -> None:
     from coopenv.backends.mcap.topics import topics_of
-    from coopenv.errors import DataError
-    from coopenv.files import replace_text
+    from coopenv.base.errors import DataError
+    from coopenv.base.files import replace_text
     from coopenv.viz.foxglove.layout import layout_text
 
     topics = topics_of(log)

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from coopenv.base.errors import CoopenvError, DataWarning, OutputError
 from coopenv.cli import options
-from coopenv.errors import CoopenvError, DataWarning, OutputError
 
 if TYPE_CHECKING:
     from rich.console import Console

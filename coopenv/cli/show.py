@@ -16,8 +16,8 @@ def list_command(
     kind: Annotated[Kind, typer.Argument(help="What to list.")] = Kind.envs, as_json: options.AsJson = False
 ) -> None:
     """List environments, observers, agents, variants or scenes."""
+    from coopenv.base.installation import list_envs
     from coopenv.runs import listing
-    from coopenv.shipped import list_envs
 
     if kind is Kind.envs:
         rows = listing.environment_rows({name: options.load(name, {}) for name in list_envs()})
@@ -77,7 +77,7 @@ def scene(
 
     Scenes stand wherever an environment does: coopenv bench observers lane:20. `coopenv list scenes` lists them.
     """
-    from coopenv.files import replace_text
+    from coopenv.base.files import replace_text
     from coopenv.scenario.scenes import scene_text
 
     text = scene_text(name)
@@ -89,7 +89,7 @@ def scene(
 
 def schema(out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None) -> None:
     """Write the JSON schema of scenario files, for editors."""
-    from coopenv.files import replace_text
+    from coopenv.base.files import replace_text
     from coopenv.scenario.json_schema import schema_text
 
     if out is None:

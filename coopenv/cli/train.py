@@ -5,8 +5,8 @@ from typing import Annotated, Any
 
 import typer
 
+from coopenv.base.errors import CoopenvError
 from coopenv.cli import complete, options
-from coopenv.errors import CoopenvError
 
 Settings = Annotated[Path | None, typer.Option(help="TOML file of the settings (default: those of docs/trainers.md).")]
 Agent = Annotated[

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from coopenv.base.errors import CoopenvError
 from coopenv.cli import complete, options
 from coopenv.cli.film import Agent, ObserverName, refuse_for_saved
-from coopenv.errors import CoopenvError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -76,7 +76,10 @@ def _announce(url: str, host: str, log: "Console", no_browser: bool) -> None:
     """Say where the view is."""
     options.console().print(f"{url}  (Ctrl-C ends the view)", soft_wrap=True)
     if host not in ("127.0.0.1", "localhost", "::1"):
-        log.print(f"warning: everybody who has this address can watch, and switch what runs here; it is sent unencrypted", soft_wrap=True)
+        log.print(
+            f"warning: everybody who has this address can watch, and switch what runs here; it is sent unencrypted",
+            soft_wrap=True,
+        )
     if not no_browser:
         options.show_page(url)
 
@@ -133,7 +136,7 @@ def _cars(
     changes: dict[str, Any],
 ) -> "Reel":
     """Return the cars of a deployment, which are observed and not driven."""
-    from coopenv.backends.svea.opening import open_svea
+    from coopenv.cars.backend.opening import open_svea
     from coopenv.runs.view.reels import EngineReel
 
     if deployment is None:

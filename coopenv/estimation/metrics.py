@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation.guaranteed_rate import slowest_decay
 from coopenv.estimation.observability import Observability
 from coopenv.estimation.trajectory import Trajectory

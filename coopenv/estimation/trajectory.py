@@ -9,8 +9,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from coopenv.errors import DataError
-from coopenv.files import replacing_file
+from coopenv.base.errors import DataError
+from coopenv.base.files import replacing_file
 
 
 @dataclass(frozen=True)

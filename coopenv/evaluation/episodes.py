@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from coopenv.api.engine import Engine
+from coopenv.base.seeds import evaluation_seed, world_keys
 from coopenv.policies import Policy, decide, restart
 from coopenv.scenario import Scenario
-from coopenv.seeds import evaluation_seed, world_keys
 
 DIVERGED = 1e9  # m or deg: stands for an error that is not a number
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf
 
-from coopenv.errors import CoopenvError, shown
+from coopenv.base.errors import CoopenvError, shown
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.estimation.validity import MAX_BEND, MOST_LOPSIDED

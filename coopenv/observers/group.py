@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from coopenv.errors import CoopenvError, told
+from coopenv.base.errors import CoopenvError, told
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.observers.checks import check_estimate, check_message

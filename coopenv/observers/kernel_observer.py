@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 import warp as wp
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.estimation.outcomes import Sight

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.observers.checks import check_message, check_received
 from coopenv.observers.contract import Message, Received

@@ -106,7 +106,7 @@ def sealed(view: NDArray[Any]) -> NDArray[Any]:
 class Drawn:
     """What the draws of a simulated episode follow from: who was there, routes and goals, and later routes."""
 
-    key: int  # of the world's random streams, see `coopenv.seeds`
+    key: int  # of the world's random streams, see `coopenv.base.seeds`
     episode: int
     parameters: tuple[float, ...]  # factors, in the order of `coopenv.scenario.randomness.PARAMETERS`
 

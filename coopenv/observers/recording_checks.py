@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.errors import DataError, shown
+from coopenv.base.errors import DataError, shown
 from coopenv.estimation.validity import are_covariances, are_numbers, are_rotations, are_unit_vectors, everywhere
 from coopenv.observers.contract import Setup
 from coopenv.observers.recording import Recording, is_due

@@ -13,10 +13,10 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from coopenv.errors import CoopenvError, shown, suggest, told
+from coopenv.base.errors import CoopenvError, shown, suggest, told
+from coopenv.base.user_code import absolute, is_reference, load
 from coopenv.observers.contract import Factory
 from coopenv.observers.zoo import ZOO
-from coopenv.user_code import absolute, is_reference, load
 
 if TYPE_CHECKING:
     from coopenv.world.embedded import Embedded

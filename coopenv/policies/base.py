@@ -5,8 +5,8 @@ from typing import Protocol
 
 import numpy as np
 
-from coopenv import user_code
-from coopenv.errors import CoopenvError, shown
+from coopenv.base import user_code
+from coopenv.base.errors import CoopenvError, shown
 
 
 class Policy(Protocol):

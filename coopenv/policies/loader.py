@@ -9,12 +9,12 @@ from typing import Any, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from coopenv import user_code
-from coopenv.errors import CoopenvError, suggest, told
+from coopenv.base import user_code
+from coopenv.base.errors import CoopenvError, suggest, told
+from coopenv.base.installation import data_directory, list_agents
 from coopenv.policies.base import PLAIN, Policy
 from coopenv.policies.network import NetworkCard
 from coopenv.scenario import Scenario
-from coopenv.shipped import data_directory, list_agents
 
 Kind = Literal["learned", "scripted", "reference"]
 """Trained; written by hand; or a yardstick that says what is possible."""

@@ -13,7 +13,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load
 
 from coopenv.api.terms.layout import Layout, observation_layout, settings_of_meaning
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.scenario import Scenario
 
 ENTRY = f"{__name__}:Network"

@@ -9,11 +9,11 @@ from typing import Any
 from rich.console import Console
 
 from coopenv.backends.base import Repeating
-from coopenv.errors import CoopenvError, listed
+from coopenv.base.errors import CoopenvError, listed
+from coopenv.base.files import replace_text, replacing_folder
+from coopenv.base.format import json_text
 from coopenv.estimation.metrics import steady_start
 from coopenv.estimation.observability import analyse_observability
-from coopenv.files import replace_text, replacing_folder
-from coopenv.jsonable import json_text
 from coopenv.observers.registry import states_covariance
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.metrics import run_metrics, theory_rates, vehicle_metrics

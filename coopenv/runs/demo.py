@@ -10,20 +10,20 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from coopenv.backends.svea.backend import Svea
-from coopenv.backends.svea.opening import open_svea
-from coopenv.errors import CoopenvError, listed, suggest
-from coopenv.fake.fleet import fakes
-from coopenv.files import replacing_file, writing
-from coopenv.interrupts import also_kept
+from coopenv.base.errors import CoopenvError, listed, suggest
+from coopenv.base.files import replacing_file, writing
+from coopenv.base.installation import data_directory
+from coopenv.base.interrupts import also_kept
+from coopenv.cars.backend.backend import Svea
+from coopenv.cars.backend.opening import open_svea
+from coopenv.cars.fake.fleet import fakes
+from coopenv.cars.transport.zenoh import library
 from coopenv.runs.command import execute, report
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.links import STEADY_FROM, links_line, links_report
 from coopenv.runs.rollouts import Rollout
 from coopenv.runs.side_by_side import Episodes, side_by_side
 from coopenv.scenario import Scenario
-from coopenv.shipped import data_directory
-from coopenv.svea.transport.zenoh import library
 
 FLEETS = {"svea_overtaking": "overtaking.toml", "svea_crossing": "crossing.toml"}
 """Deployment files of the experiments, in `examples/fleet`."""

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.errors import listed
-from coopenv.format import number
+from coopenv.base.errors import listed
+from coopenv.base.format import number
 from coopenv.scenario.randomness import PARAMETERS
 from coopenv.scenario.schema import Scenario
 

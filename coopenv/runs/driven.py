@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
+from coopenv.base.seeds import world_keys
 from coopenv.evaluation.episodes import driven_vehicles
 from coopenv.policies import Policy, decide, restart
 from coopenv.scenario import Scenario
-from coopenv.seeds import world_keys
 
 KEPT = ("observation", "reward", "terminated", "truncated", "position_error")
 

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from coopenv.api.engine import Engine
+from coopenv.base.seeds import world_keys
 from coopenv.policies import Policy, decide, restart
-from coopenv.seeds import world_keys
 
 
 def play(

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from coopenv.files import replacing_file
+from coopenv.base.files import replacing_file
 from coopenv.runs.video import film_at
 from coopenv.viz.scene import SceneRecord
 from coopenv.viz.topview import TopView

@@ -5,8 +5,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from coopenv.backends.svea.backend import Svea
-from coopenv.errors import CoopenvError, listed
+from coopenv.base.errors import CoopenvError, listed
+from coopenv.cars.backend.backend import Svea
 
 STEADY_FROM = 2.0
 """s: cars know their places by then."""

@@ -6,11 +6,11 @@ from typing import Any
 from rich.table import Table
 
 from coopenv.api.registration import environment_id
+from coopenv.base.installation import list_agents
 from coopenv.observers.registry import find, observer_names, obstacle
 from coopenv.policies import find_agent
 from coopenv.runs.table import number_table
 from coopenv.scenario import Scenario
-from coopenv.shipped import list_agents
 
 COLUMNS = {
     "envs": ("name", "vehicles", "landmarks", "motion", "horizon_s"),

@@ -9,8 +9,8 @@ from rich.console import Console
 
 from coopenv.api.engine import Engine
 from coopenv.api.infos import outcome_words
-from coopenv.errors import CoopenvError
-from coopenv.files import replacing_folder
+from coopenv.base.errors import CoopenvError
+from coopenv.base.files import replacing_folder
 from coopenv.policies import Policy, agents_for, load_policy
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.episode import play

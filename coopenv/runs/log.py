@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 
 from coopenv.backends.mcap import write_recording
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.observers import run
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import find, named, states_covariance

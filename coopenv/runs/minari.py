@@ -12,12 +12,11 @@ import gymnasium
 
 from coopenv.api.registration import environment_id, register_all
 from coopenv.api.terms.layout import action_space, flat_space, observation_layout
-from coopenv.errors import CoopenvError, OutputError
-from coopenv.files import replacing_folder, writing
-from coopenv.machine import environment
+from coopenv.base.errors import CoopenvError, OutputError
+from coopenv.base.files import replacing_folder, writing
+from coopenv.base.installation import environment, version
 from coopenv.runs.driven import DrivenEpisode
 from coopenv.scenario import Scenario
-from coopenv.shipped import version
 
 FILES = ("main_data.hdf5", "metadata.json")
 """Of a dataset, in its folder `data`."""

@@ -4,7 +4,8 @@ from collections.abc import Iterator
 
 from coopenv.api.registration import environment_id
 from coopenv.api.terms.layout import observation_layout
-from coopenv.format import number
+from coopenv.base.format import number
+from coopenv.base.installation import list_envs
 from coopenv.runs import scenario_rows
 from coopenv.runs.describe import shown_sections
 from coopenv.runs.drawn_text import drawn, graded
@@ -12,7 +13,6 @@ from coopenv.runs.markdown import bullets, plain, table
 from coopenv.runs.summary import facts
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import REWARD_TERMS, TERMINATION_CONDITIONS, Term
-from coopenv.shipped import list_envs
 
 GLANCE = ("Vehicles", "Targets", "Camera", "Odometry", "V2X", "Observer", "Rates")
 """Facts that no table below repeats."""

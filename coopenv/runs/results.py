@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from coopenv.errors import CoopenvError, DataError
+from coopenv.base.errors import CoopenvError, DataError
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.command import METRICS_FILE, TRAJECTORY_FILE
 from coopenv.scenario import Scenario, load_scenario

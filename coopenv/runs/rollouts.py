@@ -9,7 +9,7 @@ import numpy as np
 from coopenv.api.engine import Engine
 from coopenv.api.infos import outcome_words
 from coopenv.backends.base import EPISODE_OVER, Backend
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.policies import Policy, load_policy

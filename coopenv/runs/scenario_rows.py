@@ -6,7 +6,7 @@ from typing import NamedTuple
 from pydantic import BaseModel
 
 from coopenv.api.terms.layout import observation_layout
-from coopenv.format import number
+from coopenv.base.format import number
 from coopenv.runs import scenario_text as words
 from coopenv.scenario.schema import Scenario
 from coopenv.scenario.sensing import Camera

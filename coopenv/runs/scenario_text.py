@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coopenv.format import number
+from coopenv.base.format import number
 from coopenv.scenario.bodies import (
     Body,
     ConstantMotion,

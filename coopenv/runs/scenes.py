@@ -11,13 +11,13 @@ from rich.console import Console
 from coopenv.api.engine import Engine
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import Kind, kind_of, open_backend
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import list_agents, list_envs
 from coopenv.policies import Policy, agents_for, find_agent, load_policy
 from coopenv.runs.console import Progress, compile_notice
 from coopenv.runs.episode import play
 from coopenv.runs.video import frame_stride
 from coopenv.scenario import Scenario
-from coopenv.shipped import list_agents, list_envs
 from coopenv.viz.scene import Frame, SceneRecord, SceneWriter, Source
 from coopenv.viz.scene.record import SCENE_FILE
 

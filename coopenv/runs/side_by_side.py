@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from coopenv.base.format import seconds
 from coopenv.estimation.metrics import live_ticks, summarise
-from coopenv.format import seconds
 from coopenv.runs.rollouts import Rollout
 from coopenv.runs.table import number_table
 

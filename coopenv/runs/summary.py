@@ -12,11 +12,11 @@ from rich.text import Text
 
 from coopenv.api.registration import environment_id
 from coopenv.api.terms.layout import observation_layout
-from coopenv.errors import listed
-from coopenv.format import number
+from coopenv.base.errors import listed
+from coopenv.base.format import number
+from coopenv.base.installation import list_envs
 from coopenv.scenario import Scenario
 from coopenv.scenario.sensing import Noise
-from coopenv.shipped import list_envs
 
 DESCRIPTION_LENGTH = 240  # characters of a scenario's description on the first screen
 

@@ -7,8 +7,8 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
+from coopenv.base.format import column, number, seconds
 from coopenv.estimation.metrics import CONVERGED, SETTLED
-from coopenv.format import column, number, seconds
 
 COLUMNS = (
     ("initial_position_error_m", "start\n[m]", column),

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from coopenv.base.files import replace_text, writing
 from coopenv.estimation.metrics import quaternion_wxyz
 from coopenv.estimation.trajectory import Trajectory
-from coopenv.files import replace_text, writing
 
 
 def write_tum(trajectory: Trajectory, folder: str | Path) -> list[Path]:

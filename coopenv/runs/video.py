@@ -9,8 +9,8 @@ from typing import Any, Self
 import numpy as np
 from PIL import Image
 
-from coopenv.errors import CoopenvError, OutputError
-from coopenv.files import writing
+from coopenv.base.errors import CoopenvError, OutputError
+from coopenv.base.files import writing
 from coopenv.scenario import Scenario
 
 MAX_FPS = 20.0

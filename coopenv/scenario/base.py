@@ -5,7 +5,7 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from coopenv.errors import shown
+from coopenv.base.errors import shown
 
 
 class Part(BaseModel):

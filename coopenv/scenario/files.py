@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from coopenv.errors import ScenarioError, UnknownEnvironmentError, shortened, shown, suggest
+from coopenv.base.errors import ScenarioError, UnknownEnvironmentError, shortened, shown, suggest
+from coopenv.base.installation import data_directory, list_envs
 from coopenv.scenario.landmarks import with_groups
 from coopenv.scenario.own_terms import located
 from coopenv.scenario.scenes import SCENES, is_scene, scene_text
 from coopenv.scenario.schema import Scenario
 from coopenv.scenario.validation import TOO_DEEP, one_line
-from coopenv.shipped import data_directory, list_envs
 
 DEFAULTS_KEY = "vehicle_defaults"
 """A table of the file whose entries every vehicle takes over unless it says otherwise."""

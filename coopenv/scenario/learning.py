@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, ConfigDict, Field, create_model, model_validator
 
-from coopenv.errors import suggest
+from coopenv.base.errors import suggest
 from coopenv.scenario.base import NonNegative, Number, Part, Positive
 from coopenv.scenario.terms import (
     GROUPS,

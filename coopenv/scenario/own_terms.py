@@ -7,8 +7,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from coopenv import user_code
-from coopenv.errors import CoopenvError, shown
+from coopenv.base import user_code
+from coopenv.base.errors import CoopenvError, shown
 from coopenv.scenario.terms import (
     GROUPS,
     OBSERVATION_FIELDS,

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from pydantic import field_validator, model_validator
 
-from coopenv.errors import ScenarioWarning, listed, shown, suggest
+from coopenv.base.errors import ScenarioWarning, listed, shown, suggest
 from coopenv.scenario.bodies import Landmark
 from coopenv.scenario.fields import ScenarioFields
 from coopenv.scenario.routes import followers

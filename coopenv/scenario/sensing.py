@@ -5,7 +5,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from coopenv.errors import shown
+from coopenv.base.errors import shown
 from coopenv.scenario.base import (
     Loss,
     NonNegative,

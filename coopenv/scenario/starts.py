@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from coopenv.errors import ScenarioWarning
+from coopenv.base.errors import ScenarioWarning
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.fields import ScenarioFields
 from coopenv.scenario.motion import path_heading

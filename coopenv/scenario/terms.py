@@ -10,8 +10,8 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 from pydantic import ConfigDict, Field, field_validator, model_validator
 from pydantic.json_schema import SkipJsonSchema
 
-from coopenv import user_code
-from coopenv.errors import CoopenvError, shown, suggest
+from coopenv.base import user_code
+from coopenv.base.errors import CoopenvError, shown, suggest
 from coopenv.scenario.base import Number, Part, Positive, Text
 from coopenv.scenario.term_rows import COLUMNS, CONDITIONS, FIELDS, REWARDS
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from graphlib import CycleError, TopologicalSorter
 
-from coopenv.errors import listed, shown, suggest
+from coopenv.base.errors import listed, shown, suggest
 from coopenv.scenario.fields import ScenarioFields
 
 

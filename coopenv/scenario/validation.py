@@ -5,7 +5,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from coopenv.errors import shortened, shown, suggest
+from coopenv.base.errors import shortened, shown, suggest
 
 TOO_DEEP = "lists or tables stand too deep in one another"
 

@@ -15,8 +15,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from coopenv.errors import CoopenvError
-from coopenv.files import replacing_file, writing
+from coopenv.base.errors import CoopenvError
+from coopenv.base.files import replacing_file, writing
 from coopenv.training.settings import Plan
 from coopenv.training.trainer import Trainer
 

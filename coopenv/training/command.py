@@ -5,16 +5,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from coopenv import interrupts
 from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
-from coopenv.errors import CoopenvError, OutputError
+from coopenv.base import interrupts
+from coopenv.base.errors import CoopenvError, OutputError
+from coopenv.base.files import check_file, new_folder, replacing_folder
+from coopenv.base.seeds import evaluation_seed
 from coopenv.evaluation import Result, drive, held_out_seeds, score
-from coopenv.files import check_file, new_folder, replacing_folder
 from coopenv.policies import load_agent
 from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE
 from coopenv.scenario import Scenario
-from coopenv.seeds import evaluation_seed
 from coopenv.training import checkpoint, settings_file
 from coopenv.training.environment_file import environment_file
 from coopenv.training.export import EXPORTED, check_onnx, export

@@ -15,13 +15,13 @@ from safetensors.numpy import save
 from torch import nn
 
 from coopenv.api.terms.layout import observation_layout, settings_of_meaning
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
+from coopenv.base.files import writing
+from coopenv.base.installation import version
 from coopenv.evaluation import Result
-from coopenv.files import writing
 from coopenv.policies.loader import AGENT_FILE
 from coopenv.policies.network import ENTRY, NetworkCard, layout_hash, layout_tables
 from coopenv.scenario import Scenario
-from coopenv.shipped import version
 from coopenv.training import settings_file
 from coopenv.training.settings import SETTINGS_FILE
 from coopenv.training.trainer import Trainer

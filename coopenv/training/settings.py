@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError, model_validator
 
-from coopenv.errors import CoopenvError, suggest
+from coopenv.base.errors import CoopenvError, suggest
 from coopenv.scenario.base import NonNegative, Part, Positive, Probability
 from coopenv.scenario.validation import one_line
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import tomlkit
 
-from coopenv.errors import CoopenvError, OutputError
-from coopenv.files import writing
+from coopenv.base.errors import CoopenvError, OutputError
+from coopenv.base.files import writing
 from coopenv.policies.loader import AGENT_FILE
 from coopenv.training.settings import SETTINGS_FILE, Plan, read_settings
 

@@ -14,7 +14,7 @@ from stable_baselines3.common.logger import Logger, configure
 from coopenv.api.trainers.sb3 import CooperativeSB3VecEnv
 from coopenv.api.trainers.sb3_buffer import ActingRowsBuffer
 from coopenv.api.vector_env import CooperativeVectorEnv
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.evaluation.episodes import driven_vehicles
 from coopenv.scenario import Scenario
 from coopenv.training.cloning import clone

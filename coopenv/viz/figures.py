@@ -5,10 +5,10 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from coopenv.errors import CoopenvError, suggest
+from coopenv.base.errors import CoopenvError, suggest
+from coopenv.base.files import writing
 from coopenv.estimation.observability import Observability, analyse_observability
 from coopenv.estimation.trajectory import Trajectory
-from coopenv.files import writing
 from coopenv.scenario import Scenario
 from coopenv.viz import FIGURE_NAMES, paper
 from coopenv.viz.consistency import consistency_figure

@@ -16,7 +16,7 @@ from matplotlib.font_manager import fontManager
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
-from coopenv.errors import CoopenvError, suggest
+from coopenv.base.errors import CoopenvError, suggest
 from coopenv.viz import style as house
 
 _MM = 1 / 25.4

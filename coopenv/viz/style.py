@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullFormatter
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
+from coopenv.base.files import replacing_file
 from coopenv.estimation.trajectory import Trajectory
-from coopenv.files import replacing_file
 from coopenv.viz import FORMATS
 
 # Okabe and Ito (2008), without the yellow that vanishes on white.

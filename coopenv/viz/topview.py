@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.colors import to_rgba_array
 from matplotlib.patheffects import withStroke
 
+from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Outcome
-from coopenv.format import fixed
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Body

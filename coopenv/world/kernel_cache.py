@@ -14,8 +14,8 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.errors import CoopenvError
-from coopenv.staging import lock
+from coopenv.base.errors import CoopenvError
+from coopenv.base.files import lock
 
 ATTEMPTS = 3
 """Attempts to load a module. The second builds it anew; a third is for two processes that mend the same one."""

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.errors import CoopenvError
-from coopenv.machine import available_cores
+from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import available_cores
 from coopenv.world import kernel_cache
 
 Function = Callable[..., None] | wp.Kernel

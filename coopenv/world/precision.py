@@ -5,7 +5,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.errors import DeviceError, suggest
+from coopenv.base.errors import DeviceError, suggest
 from coopenv.world.launch import start_warp
 
 

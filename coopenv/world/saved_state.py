@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.errors import CoopenvError, shown
+from coopenv.base.errors import CoopenvError, shown
 from coopenv.estimation.validity import are_covariances, are_rotations, are_unit_vectors, everywhere
 from coopenv.scenario.base import LARGEST
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.errors import CoopenvError, check_memory
+from coopenv.base.errors import CoopenvError, check_memory
 from coopenv.scenario import Scenario
 from coopenv.scenario.randomness import PARAMETERS
 from coopenv.world.build import build_model
@@ -38,8 +38,8 @@ Options = Mapping[str, Any] | None
 class World:
     """`worlds` copies of one scenario, stepped together.
 
-    What is drawn in a world depends on its key alone (`coopenv.seeds`): it is bit for bit the single world with that
-    key (on the same device).
+    What is drawn in a world depends on its key alone (`coopenv.base.seeds`): it is bit for bit the single world with
+    that key (on the same device).
     """
 
     source: Source = SIMULATED  # where its ticks come from

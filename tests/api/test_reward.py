@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 
 import coopenv
 from coopenv.api.reward import FIELDS, OTHERS, Step, check_function
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from tests.helpers.four_way import FOUR_WAY
 
 SHORT = {"horizon": 0.5, "observation.include": ["estimate", "quality"]}

@@ -17,12 +17,12 @@ import pytest
 from pettingzoo.test import parallel_api_test
 
 import coopenv
-from coopenv.backends.svea.opening import open_svea
-from coopenv.errors import CoopenvError
-from coopenv.svea.codec import decode
-from coopenv.svea.topics import TOPICS, Role, topic_of
-from coopenv.svea.transport.base import Arrival
-from coopenv.svea.transport.zenoh import open_zenoh
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend.opening import open_svea
+from coopenv.cars.codec import decode
+from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.transport.base import Arrival
+from coopenv.cars.transport.zenoh import open_zenoh
 from tests.helpers.cars import OVERTAKING, PATIENT, cars, fakes, write_fleet
 from tests.helpers.processes import COOPENV, start
 from tests.helpers.wire import free_port

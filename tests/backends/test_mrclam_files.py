@@ -9,7 +9,7 @@ import pytest
 
 from coopenv.backends.mrclam import load_dataset
 from coopenv.backends.mrclam.tables import find_folder
-from coopenv.errors import DataError, DataWarning
+from coopenv.base.errors import DataError, DataWarning
 from tests.helpers.mrclam_files import LANDMARKS, ORIGIN, command, pose, write
 
 

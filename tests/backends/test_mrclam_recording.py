@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from coopenv.backends.mrclam import load_dataset
 from coopenv.backends.mrclam.dataset import Truth
 from coopenv.backends.mrclam.recording import DRIFT_STD, MESSAGE_PERIOD_TICKS, START_STD, TICK_S, recording_of
-from coopenv.errors import DataError
+from coopenv.base.errors import DataError
 from coopenv.observers.planar.plugin import PlanarEkf
 from coopenv.observers.planar.robust import PlanarRobust
 from coopenv.observers.runner import run

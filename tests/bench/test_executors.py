@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
+from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import ONE_THREAD
 from coopenv.bench.executors import Local, find_executor, reach
-from coopenv.errors import CoopenvError
-from coopenv.machine import ONE_THREAD
 
 THREADS = list(ONE_THREAD)
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from coopenv.base.installation import list_envs
 from coopenv.bench.agents.dial import DRIVERS, METRICS, SETTINGS, dial_text, fingerprint, has_dial
 from coopenv.bench.pages import environment_page
 from coopenv.cli import main
 from coopenv.runs.page import index_text
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.shipped import list_envs
 from coopenv.viz.topview_ground import HEIGHT, WIDTH
 
 PAGES = Path(__file__).parents[2] / "docs" / "environments"

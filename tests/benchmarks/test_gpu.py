@@ -16,7 +16,7 @@ from benchmarks.gpu.plan import ENVIRONMENT, LEARNING, OBSERVERS, SIZES, Stage, 
 from benchmarks.gpu.prepare import requirements
 from benchmarks.gpu.runner import failures, run
 from benchmarks.gpu.table import BEGIN, END, put, section
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 
 HEAD = {"command": "python -m benchmarks.gpu", "coopenv": "1.2.3", "device": "cuda:0"}
 

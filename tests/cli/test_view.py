@@ -11,10 +11,10 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from coopenv.base.installation import data_directory
+from coopenv.cars.fake.fleet import fakes
 from coopenv.cli import main
 from coopenv.cli.options import has_display
-from coopenv.fake.fleet import fakes
-from coopenv.shipped import data_directory
 from tests.helpers.processes import COOPENV, start
 
 pytest.importorskip("viser", reason="needs the extra view")

@@ -61,7 +61,7 @@ VALUES: tuple[Any, ...] = (
 @cache
 def documents() -> list[tuple[str, dict[str, Any]]]:
     """Return text and contents of the shipped environments."""
-    from coopenv.shipped import data_directory
+    from coopenv.base.installation import data_directory
 
     paths = sorted(data_directory("envs").glob("*.toml"))
     return [(path.read_text(), tomllib.loads(path.read_text())) for path in paths]

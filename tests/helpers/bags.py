@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from coopenv.cars import codec
+from coopenv.cars.lens import distort
 from coopenv.estimation.rotations import log_so3
 from coopenv.observers import Recording
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from coopenv.scenario.sensing import ROTATION_OF_CAMERA
-from coopenv.svea import codec
-from coopenv.svea.lens import distort
 
 BEGIN = 1_700_000_000_000_000_000  # ns
 DISTORTION = (-0.352043, 0.137879, 0.001953, 0.000628, 0.0)

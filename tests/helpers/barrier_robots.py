@@ -77,7 +77,13 @@ def _command(rng: np.random.Generator, x: np.ndarray, t: float, scale: float) ->
     return np.array([0.0, w * (kind < 0.9)]), t + rng.uniform(0.5, 3)
 
 
-def _robot(rng: np.random.Generator, n: int, poses: np.ndarray, odometry: np.ndarray, walls: list) -> Robot:
+def _robot(
+    rng: np.random.Generator,
+    n: int,
+    poses: np.ndarray,
+    odometry: np.ndarray,
+    walls: list[tuple[np.ndarray, np.ndarray]],
+) -> Robot:
     """Return what robot n logged; poses are (5, K, 3)."""
     bias, seen = 0.008 * rng.standard_normal(), []
     frames = np.cumsum(rng.uniform(0.25, 0.6, 4 * poses.shape[1]))
@@ -91,7 +97,7 @@ def _robot(rng: np.random.Generator, n: int, poses: np.ndarray, odometry: np.nda
             if near and rng.random() < 0.6 and not any(_crosses(poses[n, k, :2], point, *wall) for wall in walls):
                 who = subject if rng.random() > MISREAD else int(rng.integers(6, 21))
                 seen.append((k * DT, who, math.hypot(dx, dy), bearing + bias + 0.013 * rng.standard_normal()))
-    t = DT * np.arange(poses.shape[1])
+    t = np.asarray(DT * np.arange(poses.shape[1]), dtype=np.float64)
     truth = Truth(t, poses[n, :, :2], np.unwrap(poses[n, :, 2]))
     return Robot(n + 1, odometry, np.array(seen).reshape(-1, 4), truth, 0)
 
@@ -104,7 +110,7 @@ def _crosses(p: np.ndarray, q: np.ndarray, a: np.ndarray, b: np.ndarray) -> bool
         return False
     s = ((a - p)[0] * v[1] - (a - p)[1] * v[0]) / det
     r = ((a - p)[0] * u[1] - (a - p)[1] * u[0]) / det
-    return 0 < s < 1 and 0 < r < 1
+    return bool(0 < s < 1 and 0 < r < 1)
 
 
 def carried_off(seed: int, robot: int, at: float, seconds: float = 150.0) -> Recording:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coopenv.backends.simulated import Simulated
-from coopenv.errors import ScenarioWarning
+from coopenv.base.errors import ScenarioWarning
 from coopenv.scenario import Scenario, parse_scenario
 from coopenv.world.world import World
 from tests.oracles import continuous

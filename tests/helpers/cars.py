@@ -8,13 +8,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from coopenv.backends.svea.backend import Svea
-from coopenv.backends.svea.opening import open_svea
-from coopenv.fake.car import Fake, fault_topic
-from coopenv.fake.process import open_fake, run
-from coopenv.svea.codec import encode, make
-from coopenv.svea.deployment import load_deployment
-from coopenv.svea.transport.local import Hub
+from coopenv.cars.backend.backend import Svea
+from coopenv.cars.backend.opening import open_svea
+from coopenv.cars.codec import encode, make
+from coopenv.cars.deployment import load_deployment
+from coopenv.cars.fake.car import Fake, fault_topic
+from coopenv.cars.fake.fleet import open_fake, run
+from coopenv.cars.transport.base import Hub
 
 PATIENT = """
 [safety] # a machine that runs many tests at once is slow

@@ -5,17 +5,16 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import Any
 
-from coopenv.backends.svea.binding import bind
-from coopenv.fake.car import Fake
+from coopenv.cars.actuation import Drive, to_manual
+from coopenv.cars.backend.binding import bind
+from coopenv.cars.codec import decode, encode, make
+from coopenv.cars.deployment import Car, Deployment, Sensors
+from coopenv.cars.fake.car import Fake
+from coopenv.cars.gate.codec import write_manual
+from coopenv.cars.gate.core import Clock
+from coopenv.cars.topics import RESET_TOPIC, TOPICS, Role, topic_of
+from coopenv.cars.transport.base import Arrival, Hub
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.svea.actuation import Drive, to_manual
-from coopenv.svea.codec import decode, encode, make
-from coopenv.svea.deployment import Car, Deployment, Sensors
-from coopenv.svea.gate.codec import write_manual
-from coopenv.svea.gate.terms import Clock
-from coopenv.svea.topics import RESET_TOPIC, TOPICS, Role, topic_of
-from coopenv.svea.transport.base import Arrival
-from coopenv.svea.transport.local import Hub
 
 MARKERS = {"SL1": 1, "SL2": 2, "SL4": 4, "SL5": 5}
 OVERTAKING = (Car(name="svea7", marker=7), Car(name="svea8", marker=6))

@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.backends.replay import Replay
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.observers import find, register, run
 from coopenv.observers.registry import find_embedded
 from coopenv.runs import record

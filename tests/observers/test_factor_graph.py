@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.observers import Coordinates, run
 from coopenv.observers.registry import ZOO, available_names, find, observer_names
 from tests.oracles.batch import small_record

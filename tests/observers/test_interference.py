@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 from coopenv.backends.replay.backend import Replay
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
+from coopenv.base.seeds import world_keys
 from coopenv.observers import Message, Recording, run
 from coopenv.observers.checks import check_received
 from coopenv.observers.contract import Tick
 from coopenv.observers.mekf_covariance import MekfCovariance
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.seeds import world_keys
 from tests.helpers.builders import simulate
 
 OTHER = "vehicles.vehicle_2.faults"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.observers import Estimate, Message, Received, Recording, Tick, find
 from coopenv.observers.kernel_observer import MOST_UNITS, UNITS_PER_TICK
 from tests.helpers.robust_scenes import small_errors

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import coopenv
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.observers import registry
 from coopenv.observers.dead_reckoning import DeadReckoning
 from coopenv.observers.registry import find, named, portable

@@ -10,12 +10,12 @@ import pytest
 
 import coopenv
 from coopenv.api.engine import Engine
+from coopenv.base.installation import data_directory, list_agents
 from coopenv.estimation.outcomes import Outcome
 from coopenv.evaluation import METRICS, drive
 from coopenv.policies import agents_for, decide, find_agent, load_agent, load_policy, restart
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.runs.rollouts import rollout
-from coopenv.shipped import data_directory, list_agents
 from tests.helpers.four_way import FOUR_WAY
 
 PAIRS = [(agent, env) for agent in list_agents() for env in find_agent(agent).environments]

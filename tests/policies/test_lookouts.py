@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from coopenv.api.engine import Engine
+from coopenv.base.installation import list_agents
 from coopenv.evaluation import drive, held_out_seeds, score
 from coopenv.policies import load_agent, restart
 from coopenv.policies.belief import Belief
@@ -16,7 +17,6 @@ from coopenv.policies.route_follower import RouteFollower, nearest
 from coopenv.policies.stop_when_lost import StopWhenLost
 from coopenv.policies.view import FieldOfView
 from coopenv.scenario import load_scenario
-from coopenv.shipped import list_agents
 from tests.helpers.square import GROUPS, square
 
 SCENARIO = square()

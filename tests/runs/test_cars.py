@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from coopenv.backends.svea.gates import Gates
-from coopenv.backends.svea.opening import open_svea
-from coopenv.errors import CoopenvError, DataWarning
+from coopenv.base.errors import CoopenvError, DataWarning
+from coopenv.cars.backend.gates import Gates
+from coopenv.cars.backend.opening import open_svea
+from coopenv.cars.codec import encode, header, make
+from coopenv.cars.limits import USUAL
+from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.transport.base import Hub
 from coopenv.runs.command import execute, report
 from coopenv.runs.links import links_line, links_report
 from coopenv.runs.rollouts import Rollout
-from coopenv.svea.codec import encode, header, make
-from coopenv.svea.limits import USUAL
-from coopenv.svea.topics import TOPICS, Role, topic_of
-from coopenv.svea.transport.local import Hub
 from coopenv.viz.trajectories import trajectory_figure_2d
 from tests.helpers.cars import OVERTAKING, cars, fakes, write_fleet
 

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.fake.fleet import free_port
 from coopenv.cli import app
-from coopenv.errors import CoopenvError
-from coopenv.fake.fleet import free_port
 from coopenv.runs.demo import FLEETS, Demo
 from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, mentioning, start, wait_until
 

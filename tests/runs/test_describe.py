@@ -15,6 +15,7 @@ from rich.console import Console
 
 import coopenv
 from coopenv.api.terms.layout import observation_layout
+from coopenv.base.installation import data_directory
 from coopenv.cli import main
 from coopenv.runs import scenario_text as words
 from coopenv.runs.describe import describe_scenario
@@ -22,7 +23,6 @@ from coopenv.runs.scenario_rows import settings
 from coopenv.scenario.bodies import ConstantMotion, InitialEstimate, SegmentMotion, TwistSegment, WaypointMotion
 from coopenv.scenario.files import apply_vehicle_defaults, parse_scenario
 from coopenv.scenario.json_schema import schema_text
-from coopenv.shipped import data_directory
 from tests.helpers.four_way import FOUR_WAY
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "scenario.schema.json"

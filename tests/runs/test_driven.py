@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import coopenv
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.policies import load_agent
 from coopenv.runs.driven import drive_vehicles
 from tests.helpers.four_way import FOUR_WAY

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from coopenv.fake.fleet import fakes
+from coopenv.cars.fake.fleet import fakes
 from tests.helpers.cars import write_fleet
 from tests.helpers.processes import COOPENV, DEADLOCK, start, wait_until
 

@@ -15,12 +15,12 @@ from PIL import Image
 from rich.console import Console
 
 import coopenv
-from coopenv.errors import CoopenvError, DeviceError
+from coopenv.base.errors import CoopenvError, DeviceError
+from coopenv.base.format import json_text
 from coopenv.estimation.metrics import CONVERGED, settling_time
 from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.trajectory import Trajectory
-from coopenv.jsonable import json_text
 from coopenv.runs import Rollout, rollout
 from coopenv.runs.metrics import outcome_line, run_metrics, theory_rates, vehicle_metrics
 from coopenv.runs.rollouts import Ending

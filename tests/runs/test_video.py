@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coopenv.errors import OutputError
+from coopenv.base.errors import OutputError
 from coopenv.runs.video import Mp4Film
 from tests.helpers.processes import small_disk
 

@@ -17,7 +17,7 @@ import pytest
 
 import coopenv
 from coopenv.api.engine import Engine
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.runs.scenes import driver_of, open_source, scene_of
 from coopenv.runs.view.reels import FAULTS, EngineReel, Reel, SavedReel
 from coopenv.runs.view.serving import free_port, serving, vehicle_index

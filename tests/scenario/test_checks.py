@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from coopenv.errors import ScenarioError, ScenarioWarning
+from coopenv.base.errors import ScenarioError, ScenarioWarning
 from coopenv.scenario import Scenario, parse_scenario
 from coopenv.scenario.topology import neighbour_sets, processing_order
 from tests.helpers import builders

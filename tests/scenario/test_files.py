@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from coopenv.errors import ScenarioError, ScenarioWarning, UnknownEnvironmentError
+from coopenv.base.errors import ScenarioError, ScenarioWarning, UnknownEnvironmentError
+from coopenv.base.installation import list_envs
 from coopenv.scenario import load_scenario, scenario_path
-from coopenv.shipped import list_envs
 
 MINIMAL = """
 title = "t"

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coopenv import shipped
-from coopenv.errors import CoopenvError
+from coopenv.base import installation
+from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import list_envs
 from coopenv.observers.bound import ancestors, cramer_rao_ancestors
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
@@ -19,7 +20,6 @@ from coopenv.scenario.motion import compile_motion
 from coopenv.scenario.scenes import SCENES, is_scene, scene_rows, scene_text
 from coopenv.scenario.scenes.request import MOST_VEHICLES
 from coopenv.scenario.topology import neighbour_sets
-from coopenv.shipped import list_envs
 from coopenv.training.environment_file import environment_file
 
 
@@ -121,7 +121,9 @@ def test_paths_are_no_scenes() -> None:
 
 
 def test_what_is_known_without_the_simulation_is_all_there_is() -> None:
-    assert tuple(SCENES) == shipped.SCENES and [row["name"] for row in scene_rows()] == [f"{kind}:N" for kind in SCENES]
+    assert tuple(SCENES) == installation.SCENES and [row["name"] for row in scene_rows()] == [
+        f"{kind}:N" for kind in SCENES
+    ]
     assert not set(SCENES) & set(list_envs())
 
 

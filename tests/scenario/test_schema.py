@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from coopenv.errors import ScenarioError
+from coopenv.base.errors import ScenarioError
 from coopenv.scenario import Scenario, load_scenario, parse_scenario
 from tests.helpers import builders
 

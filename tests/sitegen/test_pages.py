@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from coopenv.base.installation import list_agents, list_envs
 from coopenv.observers.zoo import ZOO
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
-from coopenv.shipped import list_agents, list_envs
 from sitegen import links, mirror, pages
 from tests.helpers.sessions import ROOT
 

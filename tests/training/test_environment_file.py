@@ -12,7 +12,7 @@ import coopenv
 from coopenv.policies import find_agent
 from coopenv.training.environment_file import environment_file
 
-FILE = coopenv.shipped.data_directory("envs") / "open_square.toml"
+FILE = coopenv.base.installation.data_directory("envs") / "open_square.toml"
 
 
 def test_a_shipped_environment_goes_by_its_name() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("tomlkit", reason="needs the extra 'train'")
 
-from coopenv.errors import OutputError
+from coopenv.base.errors import OutputError
 from coopenv.training import settings_file
 from coopenv.training.settings import Plan, read_settings
 

@@ -18,8 +18,8 @@ pytest.importorskip("stable_baselines3", reason="needs the extra 'train'")
 pytest.importorskip("tensorboard", reason="needs the extra 'train'")
 
 import coopenv
+from coopenv.base.errors import CoopenvError
 from coopenv.cli import main
-from coopenv.errors import CoopenvError
 from coopenv.policies import find_agent, load_agent
 from coopenv.policies.loader import read_card
 from coopenv.training.command import train
@@ -159,7 +159,7 @@ def test_a_training_that_diverges_says_so_and_keeps_its_checkpoint(
 @pytest.mark.slow
 def test_the_agent_of_a_file_of_ones_own_takes_it_along(here: Path) -> None:
     """Its environment is found, and the command on its card trains once more, when nothing but its folder is left."""
-    source = coopenv.shipped.data_directory("envs") / "open_square.toml"
+    source = coopenv.base.installation.data_directory("envs") / "open_square.toml"
     mine = here / "elsewhere" / "my_square.toml"
     mine.parent.mkdir()
     mine.write_text(source.read_text())
@@ -258,7 +258,7 @@ def test_a_full_disk_keeps_the_last_checkpoint(here: Path, reference: Path) -> N
 
 @pytest.mark.slow
 def test_an_environment_that_changed_since(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source = coopenv.shipped.data_directory("envs") / "urban_crossing.toml"
+    source = coopenv.base.installation.data_directory("envs") / "urban_crossing.toml"
     (here / "mine.toml").write_text(source.read_text())
     first = start((*COOPENV, "train", "mine.toml", "--settings", "train.toml", "--out", "agent"), here)
     wait_until(lambda: (here / "agent" / "checkpoint.safetensors").is_file() or first.poll() is not None)

@@ -14,7 +14,7 @@ from matplotlib.image import imread
 from matplotlib.lines import Line2D
 from scipy.stats import chi2
 
-from coopenv.errors import OutputError
+from coopenv.base.errors import OutputError
 from coopenv.estimation.metrics import summarise
 from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.outcomes import Sight

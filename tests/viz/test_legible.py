@@ -15,8 +15,8 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 
 import coopenv
+from coopenv.base.errors import CoopenvError
 from coopenv.cli.options import FigureColumn
-from coopenv.errors import CoopenvError
 from coopenv.viz import FIGURE_NAMES, WIDTHS, paper, style
 from coopenv.viz.contrast import LEAST, contrast, luminance
 from coopenv.viz.figures import draw_figure, save_figures

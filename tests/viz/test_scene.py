@@ -11,7 +11,7 @@ import pytest
 
 import coopenv
 from coopenv.api.engine import Engine
-from coopenv.errors import CoopenvError, DataError
+from coopenv.base.errors import CoopenvError, DataError
 from coopenv.estimation.outcomes import Sight
 from coopenv.policies import decide, load_policy
 from coopenv.runs.scenes import scene_of

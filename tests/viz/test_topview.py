@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 
 import coopenv
 from coopenv.api.engine import Engine
+from coopenv.base.format import fixed
 from coopenv.estimation.metrics import error_coordinates
 from coopenv.estimation.outcomes import Sight
-from coopenv.format import fixed
 from coopenv.scenario import load_scenario
 from coopenv.scenario.bodies import Obstacle
 from coopenv.scenario.sensing import Camera

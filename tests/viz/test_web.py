@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 import coopenv
 from coopenv.api.engine import Engine
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.runs.scenes import scene_of
 from coopenv.viz.scene import SceneRecord, Source, Stage
 from coopenv.viz.web.copies import placed, quaternions

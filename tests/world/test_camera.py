@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from coopenv.errors import ScenarioError
+from coopenv.base.errors import ScenarioError
 from coopenv.estimation.outcomes import Sight
 from coopenv.world import camera
 from coopenv.world.model import entry_struct

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from tests.helpers.builders import command, run, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES
 

@@ -18,7 +18,7 @@ import sys
 from typing import Any
 import numpy as np
 import warp as wp
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.world.launch import Launcher, start_warp
 
 def twice(x: wp.array(dtype=Any)):

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.replay import Replay
-from coopenv.errors import ScenarioError
+from coopenv.base.errors import ScenarioError
 from coopenv.estimation.outcomes import Sight
 from coopenv.observers.briefing import briefing_of
 from coopenv.runs import record

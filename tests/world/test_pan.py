@@ -17,7 +17,7 @@ from coopenv.backends.base import Command
 from coopenv.backends.mcap.reader import read_recording
 from coopenv.backends.mcap.writer import write_recording
 from coopenv.backends.replay import Replay
-from coopenv.errors import ActionError, ScenarioError
+from coopenv.base.errors import ActionError, ScenarioError
 from coopenv.estimation.outcomes import Sight
 from coopenv.policies.base import decide, random_policy, zero_policy
 from coopenv.runs import record

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coopenv.errors import DeviceError
+from coopenv.base.errors import DeviceError
 from coopenv.scenario import Scenario
 from coopenv.world.world import World
 from tests.helpers.builders import command, constant, reset, same_bits, scenario, simulate, start, vehicle

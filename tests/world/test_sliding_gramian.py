@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coopenv.api.engine import Engine
-from coopenv.errors import ScenarioError
+from coopenv.base.errors import ScenarioError
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import load_scenario
 from tests.helpers.four_way import FOUR_WAY

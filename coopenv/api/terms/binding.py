@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import warp as wp
 
-from coopenv import user_code
 from coopenv.api.terms.layout import Layout, entries_of, included_fields
-from coopenv.errors import CoopenvError
+from coopenv.base import user_code
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario import Scenario
 from coopenv.scenario.own_terms import record_count

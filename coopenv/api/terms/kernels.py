@@ -19,7 +19,7 @@ from coopenv.api.terms.map_view import MapLandmark, Nearest, map_record, next_ne
 from coopenv.api.terms.records import Ego, Neighbour, Target, Truth, neighbour_record, own_records, target_record
 from coopenv.api.terms.unrolled import unrolled
 from coopenv.api.terms.way import furthest_so_far, way_made
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.world import kernel_cache
 from coopenv.world.collision import UNDER_WAY
 from coopenv.world.launch import near_inlining

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from gymnasium import spaces
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import Dynamics
 from coopenv.scenario.term_rows import SETTINGS, SETTINGS_OF_ACTIONS

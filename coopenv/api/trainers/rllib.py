@@ -9,7 +9,7 @@ from gymnasium.vector import VectorWrapper
 from coopenv.api.make import make_rows, parallel_env
 from coopenv.api.trainers.numeric_infos import PlainInfos
 from coopenv.api.true_ends import TrueEnds
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 
 try:
     from ray.rllib.env.multi_agent_env import MultiAgentEnv

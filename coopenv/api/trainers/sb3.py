@@ -13,7 +13,7 @@ from coopenv.api.make import make_vec
 from coopenv.api.statistics import EpisodeSums
 from coopenv.api.terms.layout import Layout
 from coopenv.api.vector_env import CooperativeVectorEnv
-from coopenv.errors import CoopenvError, checked_seed
+from coopenv.base.errors import CoopenvError, checked_seed
 from coopenv.estimation.outcomes import Outcome
 
 try:

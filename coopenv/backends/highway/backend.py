@@ -10,7 +10,7 @@ from coopenv.backends.highway.roads import drawn_roads
 from coopenv.backends.highway.simulation import Simulation
 from coopenv.backends.moved import MovedWorld
 from coopenv.backends.simulated import Simulated
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.scenario import Scenario
 from coopenv.world.collision import UNDER_WAY
 from coopenv.world.command import SPEED, STEERING

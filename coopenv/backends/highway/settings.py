@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from coopenv.errors import CoopenvError, ScenarioError, listed, shown, suggest, told
+from coopenv.base.errors import CoopenvError, ScenarioError, listed, shown, suggest, told
 from coopenv.scenario import Scenario
 from coopenv.scenario.highway import Highway
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from coopenv.backends.highway.settings import make_environment, most_of_actions
 from coopenv.backends.moved import Poses
-from coopenv.errors import CoopenvError, ScenarioError, told
+from coopenv.base.errors import CoopenvError, ScenarioError, told
 from coopenv.estimation.arrays import Array
 from coopenv.scenario import Scenario
 from coopenv.world.command import ACCELERATION, SPEED, STEERING

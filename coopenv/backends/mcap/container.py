@@ -15,7 +15,7 @@ from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Messag
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from coopenv.backends.mcap.peek import CUT_OFF, MAGIC, MENDED
-from coopenv.errors import DataError, check_memory
+from coopenv.base.errors import DataError, check_memory
 
 MAX_CHUNK_BYTES = 16 * 2**20  # unpacked; writers make chunks of about 1 MiB
 MAX_EXPANSION = 50

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, ValidationError
 
-from coopenv.errors import DataError
-from coopenv.jsonable import jsonable
+from coopenv.base.errors import DataError
+from coopenv.base.format import jsonable
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Drawn, Recording
 from coopenv.scenario.base import Number, Part, Vector3

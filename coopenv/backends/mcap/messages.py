@@ -6,7 +6,7 @@ Standard ROS 2 messages are there for viewers; what is read back stands in messa
 from functools import cache
 from typing import Any
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 
 FORMAT = "coopenv recording 1"
 ATTACHMENT = "recording.json"

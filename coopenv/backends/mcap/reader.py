@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from coopenv.backends.mcap.header import Header
 from coopenv.backends.mcap.messages import ATTACHMENT, EXACT, FORMAT, LANDMARKS, LANDMARKS_TYPE, PAN, codec, topic
 from coopenv.backends.mcap.ticks import TickArrays
-from coopenv.errors import CoopenvError, DataError
+from coopenv.base.errors import CoopenvError, DataError
 from coopenv.observers.recording import Recording
 from coopenv.observers.recording_checks import check_recording
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.backends.mcap.messages import CONTENTS, EXACT, LANDMARKS, PAN, topic
-from coopenv.errors import check_memory
+from coopenv.base.errors import check_memory
 from coopenv.observers.recording import Truth
 from coopenv.observers.recording_checks import KINDS, SHAPES
 

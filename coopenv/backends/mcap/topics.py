@@ -4,7 +4,7 @@ from pathlib import Path
 
 from coopenv.backends.mcap.messages import codec
 from coopenv.backends.mcap.peek import CUT_OFF, MENDED, is_cut_off
-from coopenv.errors import DataError
+from coopenv.base.errors import DataError
 
 
 def topics_of(path: str | Path) -> list[str]:

@@ -24,11 +24,11 @@ from coopenv.backends.mcap.messages import (
     topic,
 )
 from coopenv.backends.mcap.view import Clock, View, ros_definition
-from coopenv.errors import OutputError
-from coopenv.files import check_file, replacing_file
+from coopenv.base.errors import OutputError
+from coopenv.base.files import check_file, replacing_file
+from coopenv.base.installation import version
 from coopenv.observers.recording import Recording
 from coopenv.observers.recording_checks import check_recording
-from coopenv.shipped import version
 
 
 def write_recording(recording: Recording, path: str | Path, *, views: Sequence[View] = (), start: float = 0.0) -> None:

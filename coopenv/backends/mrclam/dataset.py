@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.backends.mrclam.tables import MAX_LENGTH_S, Table, find_folder, timed
-from coopenv.errors import DataError, DataWarning
+from coopenv.base.errors import DataError, DataWarning
 from coopenv.estimation.arrays import Array
 
 ROBOTS = (1, 2, 3, 4, 5)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from coopenv.backends.mrclam.dataset import MAX_TRUTH_GAP_S, ROBOTS, Dataset, Robot
 from coopenv.backends.mrclam.odometry import HeldCommands
-from coopenv.errors import DataError, suggest
+from coopenv.base.errors import DataError, suggest
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Recording, Truth

@@ -11,7 +11,7 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.errors import DataError, suggest
+from coopenv.base.errors import DataError, suggest
 
 NAMES = tuple(f"mrclam_{number}" for number in range(1, 10))
 ENVIRONMENT_VARIABLE = "COOPENV_DATA"

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.errors import CoopenvError, DataError
+from coopenv.base.errors import CoopenvError, DataError
 from coopenv.observers.recording import Recording, is_due
 from coopenv.scenario import Scenario
 from coopenv.scenario.files import override, parse_scenario

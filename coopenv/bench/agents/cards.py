@@ -5,14 +5,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from coopenv.base.errors import CoopenvError
+from coopenv.base.files import check_file, replace_text
+from coopenv.base.format import json_text
+from coopenv.base.installation import version
 from coopenv.bench.agents.contest import IDEAL, Entrant, Evaluation
 from coopenv.bench.agents.seeds_section import seeds_section
 from coopenv.bench.agents.table import COLUMNS, EXPLANATIONS, cell
-from coopenv.errors import CoopenvError
-from coopenv.files import check_file, replace_text
-from coopenv.jsonable import json_text
 from coopenv.policies.loader import CARD_FILES
-from coopenv.shipped import version
 
 JSON_FILE, TEXT_FILE = CARD_FILES
 

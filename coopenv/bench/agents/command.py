@@ -7,16 +7,15 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
+from coopenv.base.errors import OutputError
+from coopenv.base.files import replace_text, replacing_folder
+from coopenv.base.format import json_text
+from coopenv.base.installation import version, versions
 from coopenv.bench.agents.contest import Entrant, Evaluation, contest, enter
 from coopenv.bench.agents.table import EXPLANATIONS, differences_table, results_table
-from coopenv.errors import OutputError
 from coopenv.evaluation import METRICS
-from coopenv.files import replace_text, replacing_folder
-from coopenv.jsonable import json_text
-from coopenv.machine import versions
 from coopenv.runs.command import REPLAY_FILE
 from coopenv.runs.console import Progress, compile_notice
-from coopenv.shipped import version
 from coopenv.viz import FORMATS
 
 JSON_FILE = "evaluation.json"

@@ -6,7 +6,7 @@ from typing import Any
 
 from coopenv.api.engine import Engine
 from coopenv.backends.sources import open_simulation
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.evaluation import Difference, Episodes, Result, compare_paired, drive, held_out_seeds, score
 from coopenv.policies import Agent, Policy, agents_for, find_agent
 from coopenv.scenario import Scenario

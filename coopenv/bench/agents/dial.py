@@ -6,13 +6,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from coopenv.base.errors import CoopenvError
+from coopenv.base.installation import version
 from coopenv.bench.agents.contest import Entrant, contest, enter
 from coopenv.bench.agents.table import COLUMNS, cell
-from coopenv.errors import CoopenvError
 from coopenv.policies import agents_for
 from coopenv.runs.markdown import plain, table
 from coopenv.scenario import Scenario
-from coopenv.shipped import version
 
 SETTINGS = ("ideal", "sensed", "blind")
 """The positions of the dial, the scenario's key `sensing`; all else is equal."""

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from coopenv.base.format import NONE
 from coopenv.bench.agents.contest import Evaluation
 from coopenv.evaluation import Difference, Result
-from coopenv.format import NONE
 from coopenv.runs.table import number_table
 
 COLUMNS = {

@@ -7,15 +7,15 @@ from typing import Any
 
 import tomlkit
 
+from coopenv.base.files import replace_text
+from coopenv.base.format import json_text
+from coopenv.base.installation import version
 from coopenv.bench.agents import cards
 from coopenv.bench.learning.judge import REPORTED, Judge
 from coopenv.bench.learning.study import Group, Run, Study
 from coopenv.bench.learning.work import is_finished
 from coopenv.evaluation import Difference, Result
-from coopenv.files import replace_text
-from coopenv.jsonable import json_text
 from coopenv.policies.loader import AGENT_FILE
-from coopenv.shipped import version
 from coopenv.training.settings import SETTINGS_FILE
 
 BASELINES = ("route_follower", "peek", "look_ahead")

@@ -5,6 +5,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from coopenv.base.files import replace_text
 from coopenv.bench.agents import cards, table
 from coopenv.bench.agents.seeds_section import percent
 from coopenv.bench.agents.table import cell
@@ -12,7 +13,6 @@ from coopenv.bench.learning.cards import COMPARED, relative
 from coopenv.bench.learning.judge import Judge
 from coopenv.bench.learning.study import Group
 from coopenv.evaluation import Difference
-from coopenv.files import replace_text
 
 PAGE_FILE = "README.md"
 BASE_ARM = "plain"

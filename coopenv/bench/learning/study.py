@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 
 from pydantic import Field, ValidationError
 
-from coopenv.errors import CoopenvError, suggest
+from coopenv.base.errors import CoopenvError, suggest
 from coopenv.scenario.base import Part
 from coopenv.scenario.validation import one_line
 from coopenv.training.settings import Plan, Settings, read_settings

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from coopenv.backends.sources import open_simulation
+from coopenv.base.errors import CoopenvError
 from coopenv.bench.learning.study import Run, Study
-from coopenv.errors import CoopenvError
 from coopenv.policies.loader import AGENT_FILE, CHECKPOINT_FILE, read_card
 from coopenv.training.checkpoint import read
 from coopenv.training.command import possible, train

@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
+from coopenv.base.errors import CoopenvError
+from coopenv.base.format import fixed
 from coopenv.bench.executors import Executor
 from coopenv.bench.observers.faults import changed
 from coopenv.bench.observers.sources import Source
-from coopenv.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.consistency import Interval, wilson_interval
 from coopenv.estimation.metrics import CONVERGED, settling_time
-from coopenv.format import fixed
 from coopenv.observers.contract import Factory
 from coopenv.observers.recording import Recording
 from coopenv.observers.registry import portable

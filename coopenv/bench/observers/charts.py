@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from coopenv.base.format import jsonable
 from coopenv.bench.observers.leaderboard import Leaderboard
 from coopenv.bench.observers.rows import mean_of
 from coopenv.bench.observers.samples import Sample
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.consistency import mean_bounds
-from coopenv.jsonable import jsonable
 from coopenv.viz.style import VEHICLE_COLOURS
 
 PLOTLY = "plotly-basic-4.1.1.min.js.gz"

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from coopenv.backends.sources import Kind, is_bag, kind_of
+from coopenv.base.errors import CoopenvError, suggest
 from coopenv.bench.observers.fault_knobs import KNOBS
 from coopenv.bench.observers.fault_variants import variants_with, with_world
 from coopenv.bench.observers.sources import Bags, LogFile, Robots, Simulated, Source
-from coopenv.errors import CoopenvError, suggest
 from coopenv.policies import load_policy
 from coopenv.scenario import Scenario, load_scenario
 

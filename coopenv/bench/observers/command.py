@@ -10,15 +10,15 @@ from typing import Any, NamedTuple
 
 from rich.console import Console
 
+from coopenv.base.errors import CoopenvError
+from coopenv.base.files import replace_text, replacing_folder
+from coopenv.base.format import json_text, jsonable
+from coopenv.base.installation import versions
 from coopenv.bench.executors import Executor
 from coopenv.bench.observers.basin import Basin, Draw, basin_failures, basin_table, basins_of, check_source, study_basin
 from coopenv.bench.observers.choice import ALL, find_source
 from coopenv.bench.observers.comparison import Comparison, Plan
 from coopenv.bench.observers.tables import csv_text
-from coopenv.errors import CoopenvError
-from coopenv.files import replace_text, replacing_folder
-from coopenv.jsonable import json_text, jsonable
-from coopenv.machine import versions
 from coopenv.observers.registry import observer_names, obstacle
 from coopenv.runs.console import Progress
 from coopenv.viz import FORMATS

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
+from coopenv.base.errors import CoopenvError, checked_seed, suggest
+from coopenv.base.files import replace_text
 from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables
 from coopenv.bench.observers.choice import find_source, variants_of
@@ -20,8 +22,6 @@ from coopenv.bench.observers.leaderboard import Leaderboard
 from coopenv.bench.observers.rows import Row
 from coopenv.bench.observers.sources import Source
 from coopenv.bench.observers.windows import EDGES, WindowRow, checked_edges
-from coopenv.errors import CoopenvError, checked_seed, suggest
-from coopenv.files import replace_text
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import available_names, find, named, portable
 from coopenv.runs.console import Progress

@@ -10,7 +10,7 @@ import math
 import re
 from dataclasses import dataclass
 
-from coopenv.errors import CoopenvError, shown
+from coopenv.base.errors import CoopenvError, shown
 
 GRAMMAR = "NAME=VALUE[@VEHICLE[:VEHICLE...]][,OPTION=VALUE...], several of them with + between"
 

@@ -4,10 +4,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from coopenv.base.errors import CoopenvError, listed, suggest
 from coopenv.bench.observers.fault_grammar import Part, number
 from coopenv.bench.observers.faults import LIE_STD, Lie, liar, with_delay, with_loss, with_wrong_association
 from coopenv.bench.observers.faults import without_landmarks as landmarks_lost
-from coopenv.errors import CoopenvError, listed, suggest
 from coopenv.observers.recording import Recording
 
 LIE_AMOUNTS = {"jump": "offset", "drift": "speed", "replay": "age", "collude": "offset"}

@@ -4,10 +4,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from coopenv.base.errors import CoopenvError, listed, suggest
 from coopenv.bench.observers.fault_grammar import Part, parts_of
 from coopenv.bench.observers.fault_knobs import knob_of
 from coopenv.bench.observers.faults import Lie
-from coopenv.errors import CoopenvError, listed, suggest
 from coopenv.observers.recording import Recording
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.scenario.topology import neighbour_sets, processing_order

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.observers.contract import Message
 from coopenv.observers.recording import Recording
 

@@ -11,12 +11,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
+from coopenv.base.format import number
 from coopenv.bench.observers.faults import NOMINAL
 from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
 from coopenv.bench.observers.rows import mean_of
 from coopenv.bench.observers.wording import FAILED, short_name
 from coopenv.estimation.consistency import mean_bounds
-from coopenv.format import number
 from coopenv.viz import style
 from coopenv.viz.contrast import contrast
 from coopenv.viz.labels import place_names

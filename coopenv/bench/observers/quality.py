@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 
+from coopenv.base.format import with_error
 from coopenv.bench.observers.leaderboard import Leaderboard
 from coopenv.bench.observers.rows import Measured, Row, standard_error
 from coopenv.bench.observers.samples import Sample
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.metrics import SETTLED
-from coopenv.format import with_error
 
 
 def quality(board: Leaderboard, variant: str, observer: str) -> dict[str, Any]:

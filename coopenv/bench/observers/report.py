@@ -11,6 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from coopenv.base.format import with_error
 from coopenv.bench.observers.basin import RADIUS, Basin, Draw, basin_failures
 from coopenv.bench.observers.basin_figure import basin_figure
 from coopenv.bench.observers.charts import chart_data, page_file, plotly
@@ -21,7 +22,6 @@ from coopenv.bench.observers.rows import Row
 from coopenv.bench.observers.tables import failures, honest_line
 from coopenv.bench.observers.windows import spread
 from coopenv.estimation.metrics import CONVERGED
-from coopenv.format import with_error
 
 MOST_BYTES = 1_950_000
 """Of a report: more than that mails badly and opens slowly on a phone."""

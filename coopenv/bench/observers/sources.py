@@ -13,9 +13,9 @@ from typing import Any, ClassVar
 
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import open_backend, open_recording
+from coopenv.base.errors import CoopenvError, DataWarning
 from coopenv.bench.observers.fault_variants import FaultVariant, check_recorded
 from coopenv.bench.observers.faults import FAULTS, NOMINAL, Fault, Lie, followers
-from coopenv.errors import CoopenvError, DataWarning
 from coopenv.estimation.metrics import STEADY_SHARE, steady_start
 from coopenv.observers.recording import Recording
 from coopenv.runs.recorder import record

@@ -8,6 +8,7 @@ from io import StringIO
 import numpy as np
 from rich.table import Table
 
+from coopenv.base.format import in_parentheses, jsonable, number
 from coopenv.bench.observers.basin import Draw
 from coopenv.bench.observers.faults import FAULTS, NOMINAL
 from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
@@ -16,8 +17,6 @@ from coopenv.bench.observers.sources import Robots
 from coopenv.bench.observers.window_tables import window_tables
 from coopenv.bench.observers.windows import WindowRow
 from coopenv.bench.observers.wording import FAILED, compact, short_name
-from coopenv.format import in_parentheses, number
-from coopenv.jsonable import jsonable
 from coopenv.runs.table import number_table
 
 WIDTH = 80

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 from rich.table import Table
 
+from coopenv.base.format import number
 from coopenv.bench.observers.leaderboard import Leaderboard
 from coopenv.bench.observers.windows import ERRORS, Spread, WindowRow, spread
 from coopenv.bench.observers.wording import FAILED, compact, short_name
-from coopenv.format import number
 from coopenv.runs.table import number_table
 
 MOST_OBSERVERS = 4  # of whom every vehicle is shown

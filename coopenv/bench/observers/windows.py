@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from coopenv.base.errors import CoopenvError, shown
 from coopenv.bench.observers.rows import grouped, mean_root, standard_error
 from coopenv.bench.observers.samples import Sample, Window
-from coopenv.errors import CoopenvError, shown
 from coopenv.estimation.arrays import Array
 
 EDGES = (5.0, 10.0, 20.0, 35.0)

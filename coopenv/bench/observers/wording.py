@@ -1,6 +1,6 @@
 """Words that tables share."""
 
-from coopenv.format import in_parentheses, number
+from coopenv.base.format import in_parentheses, number
 
 FAILED = "failed"
 

@@ -30,11 +30,11 @@ def fake(
     station: options.Station = None,
 ) -> None:
     """Let a fake car drive, see and send until it is interrupted; it says so when it can be seen."""
-    from coopenv import interrupts
-    from coopenv.fake.faults import parse_fault
-    from coopenv.fake.process import prepare_fake, run
-    from coopenv.svea.deployment import load_deployment
-    from coopenv.svea.transport.open import open_transport
+    from coopenv.base import interrupts
+    from coopenv.cars.deployment import load_deployment
+    from coopenv.cars.fake.faults import parse_fault
+    from coopenv.cars.fake.fleet import prepare_fake, run
+    from coopenv.cars.transport.open import open_transport
 
     faults = [parse_fault(text) for text in fault or ()]
     make = prepare_fake(deployment, car, gate, station)

@@ -44,10 +44,9 @@ def gate(
 
     Limits beyond 1.53 m/s, 0.5236 rad, 2 m/s^2 and 4 rad/s are refused.
     """
-    from coopenv import interrupts
-    from coopenv.svea.gate.core import Gate
-    from coopenv.svea.gate.process import CLOCK, Link, run
-    from coopenv.svea.gate.settings import Settings
+    from coopenv.base import interrupts
+    from coopenv.cars.gate.core import Gate
+    from coopenv.cars.gate.process import CLOCK, Link, Settings, run
 
     bounds = {"speed": max_speed, "steering": max_steering, "acceleration": max_acceleration}
     given = Settings.of(car, deployment).changed(

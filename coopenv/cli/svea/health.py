@@ -8,7 +8,7 @@ import typer
 from coopenv.cli import options
 
 if TYPE_CHECKING:
-    from coopenv.svea.transport.base import Transport
+    from coopenv.cars.transport.base import Transport
 
 MOST_WAITING = 16
 """Messages that are kept until they are looked at; a gate says five a second."""
@@ -25,9 +25,9 @@ def health(
 
     On the car it connects to where the gate does. From elsewhere: --connect ROUTER --off-board.
     """
-    from coopenv.errors import CoopenvError
-    from coopenv.svea.gate.settings import Settings
-    from coopenv.svea.topics import Role, topic_of
+    from coopenv.base.errors import CoopenvError
+    from coopenv.cars.gate.process import Settings
+    from coopenv.cars.topics import Role, topic_of
 
     given = Settings.of(car, deployment).changed({}, connect=connect and (connect,))
     given.check_place(off_board)
@@ -48,10 +48,10 @@ def next_status(transport: "Transport", topic: str, patience: float) -> Any | No
     from contextlib import suppress
     from queue import Empty, Full, Queue
 
-    from coopenv.errors import CoopenvError
-    from coopenv.svea.codec import MOST_BYTES, decode
-    from coopenv.svea.topics import TOPICS, Role
-    from coopenv.svea.transport.base import Arrival
+    from coopenv.base.errors import CoopenvError
+    from coopenv.cars.codec import MOST_BYTES, decode
+    from coopenv.cars.topics import TOPICS, Role
+    from coopenv.cars.transport.base import Arrival
 
     heard, until = Queue[bytes](MOST_WAITING), time.monotonic() + patience
 

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 
 
 def keys(
@@ -24,13 +24,13 @@ def keys(
     Give each car its own NAME.pem and public.toml, by a channel that you trust, and delete it here. Who has keys
     already keeps them.
     """
-    from coopenv.svea.keys import PUBLIC, make_keys
+    from coopenv.cars.keys import PUBLIC, make_keys
 
     if (deployment is None) == (names is None):
         raise CoopenvError("keys: name a deployment file, or identities with --names, and not both")
     folder, wanted = out or Path("keys"), [name.strip() for name in (names or "").split(",")]
     if deployment is not None:
-        from coopenv.svea.deployment import load_deployment
+        from coopenv.cars.deployment import load_deployment
 
         read = load_deployment(deployment)
         wanted = [*(car.name for car in read.cars), read.security.identity]

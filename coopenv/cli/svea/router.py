@@ -13,8 +13,8 @@ def router(
     ] = None,
 ) -> None:
     """Run a Zenoh router until it is interrupted; it says so when it can be reached."""
-    from coopenv import interrupts
-    from coopenv.svea.transport.zenoh import open_zenoh
+    from coopenv.base import interrupts
+    from coopenv.cars.transport.zenoh import open_zenoh
 
     endpoints = listen or ["tcp/127.0.0.1:7447"]
     transport = open_zenoh("router", listen=endpoints)

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
+from coopenv.base.errors import CoopenvError
 from coopenv.cli import options
-from coopenv.errors import CoopenvError
 
 STOPPED = 3
 """Status of a run that was stopped, by whom or what ever."""
@@ -44,8 +44,8 @@ def run(
 
     Without --arm no command is sent: run it beside the car that somebody else drives.
     """
-    from coopenv.backends.svea.opening import open_svea
-    from coopenv.interrupts import also_kept
+    from coopenv.base.interrupts import also_kept
+    from coopenv.cars.backend.opening import open_svea
     from coopenv.runs.command import execute, report
     from coopenv.runs.links import kept_drive, links_line, links_report, silence
     from coopenv.runs.rollouts import Rollout

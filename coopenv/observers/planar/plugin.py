@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
 from coopenv.observers.planar.commands import Step

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.errors import ActionError, ScenarioError, ScenarioWarning
+from coopenv.base.errors import ActionError, ScenarioError, ScenarioWarning
+from coopenv.base.seeds import world_keys
 from coopenv.observers.riccati import gradient_kernels as kernels
 from coopenv.scenario import Scenario
 from coopenv.scenario.topology import neighbour_sets, processing_order
-from coopenv.seeds import world_keys
 from coopenv.world import kernel_cache
 from coopenv.world.dynamics import LONGEST_SUBSTEP
 from coopenv.world.launch import kernel

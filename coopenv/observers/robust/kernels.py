@@ -1,6 +1,6 @@
 """The observer as the world is handed it, and as a plug-in."""
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.observers.contract import Observer, Setup
 from coopenv.observers.kernel_observer import KernelObserver

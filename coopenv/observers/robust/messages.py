@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import exp_so3, log_so3
 from coopenv.observers.checks import check_estimate, is_definite

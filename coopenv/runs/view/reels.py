@@ -6,7 +6,7 @@ from typing import Any
 
 from coopenv.api.engine import Engine
 from coopenv.backends.base import Backend
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.policies import Policy
 from coopenv.runs.episode import play
 from coopenv.runs.video import MAX_FPS

@@ -5,7 +5,7 @@ import socket
 from contextlib import AbstractContextManager
 from typing import Any
 
-from coopenv.errors import CoopenvError, listed, suggest
+from coopenv.base.errors import CoopenvError, listed, suggest
 from coopenv.scenario import Scenario
 from coopenv.viz.web.extra import guarded_server
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.errors import CoopenvError, told
+from coopenv.base.errors import CoopenvError, told
 from coopenv.runs.video import MAX_FPS
 from coopenv.runs.view.reels import FAULTS, Reel
 from coopenv.viz.scene import Frame, Stage

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-from coopenv.errors import UnknownEnvironmentError, listed, shown, suggest
+from coopenv.base.errors import UnknownEnvironmentError, listed, shown, suggest
 from coopenv.scenario.scenes import layouts
 from coopenv.scenario.scenes.layouts import Placed
 

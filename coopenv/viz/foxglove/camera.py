@@ -8,9 +8,9 @@ from foxglove import messages as fox
 from numpy.typing import NDArray
 from PIL import Image
 
+from coopenv.cars.lens import distort
 from coopenv.estimation.arrays import Array
 from coopenv.scenario.sensing import Camera
-from coopenv.svea.lens import distort
 from coopenv.viz.foxglove.shown import Shown, colour, colour_of
 from coopenv.viz.style import DARK_BLUE
 

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coopenv.backends.mcap.messages import codec
+from coopenv.base.format import jsonable
 from coopenv.estimation.map_covariance import covariance_in_map
-from coopenv.jsonable import jsonable
 from coopenv.viz.foxglove.shown import MAP, Shown, short
 from coopenv.viz.topview_geometry import SIGMAS
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

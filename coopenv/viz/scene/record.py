@@ -10,9 +10,9 @@ from typing import Any, Self
 import numpy as np
 from pydantic import ValidationError
 
-from coopenv.errors import CoopenvError, DataError
-from coopenv.files import replacing_file
-from coopenv.jsonable import jsonable
+from coopenv.base.errors import CoopenvError, DataError
+from coopenv.base.files import replacing_file
+from coopenv.base.format import jsonable
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.scenario.base import Part

@@ -11,7 +11,7 @@ from threading import Lock
 from typing import Any
 from urllib.parse import urlsplit
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 
 TOKEN_BYTES = 12
 """Random bytes of a page's address."""

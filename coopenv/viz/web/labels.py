@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Outcome
-from coopenv.format import fixed
 from coopenv.viz.scene import Frame, Stage
 from coopenv.viz.web.ground import ROOT
 from coopenv.viz.web.look import in_turn

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.errors import shown
+from coopenv.base.errors import shown
+from coopenv.base.format import fixed
 from coopenv.estimation.outcomes import Sight
-from coopenv.format import fixed
 from coopenv.viz.camera_image import camera_image
 from coopenv.viz.scene import Frame, Source, Stage
 from coopenv.viz.style import vehicle_colour

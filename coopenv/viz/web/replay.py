@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from coopenv.files import replace_text
+from coopenv.base.files import replace_text
 from coopenv.viz.scene import SceneRecord, Stage
 from coopenv.viz.web.extra import guarded_server
 from coopenv.viz.web.legend import legend_html

@@ -14,8 +14,8 @@ import warp as wp
 
 import coopenv
 from coopenv.api.terms.records import Ego, Target, Truth
+from coopenv.base.errors import CoopenvError, ScenarioError
 from coopenv.cli import main
-from coopenv.errors import CoopenvError, ScenarioError
 from coopenv.estimation.outcomes import Outcome
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.scenario.files import scenario_path

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from coopenv.base.installation import data_directory
 from coopenv.bench.agents.film import tiled
 from coopenv.bench.agents.table import shown
 from coopenv.cli import main
 from coopenv.evaluation import METRICS
-from coopenv.shipped import data_directory
 
 SHORT = ["urban_crossing", "--worlds", "3", "--set", "horizon=5.0"]
 OWN = """

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from coopenv.base.errors import CoopenvError
 from coopenv.bench.learning.study import Group, Run, Study, read_study
-from coopenv.errors import CoopenvError
 
 STUDY = """
 settings = "train.toml"

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from coopenv.base.errors import CoopenvError
 from coopenv.bench.executors import Local
 from coopenv.bench.observers import find_source
 from coopenv.bench.observers.basin import (
@@ -20,7 +21,6 @@ from coopenv.bench.observers.basin import (
     draw_starts,
     study_basin,
 )
-from coopenv.errors import CoopenvError
 from coopenv.observers import Estimate, Tick, find
 from coopenv.observers.dead_reckoning import DeadReckoning
 

@@ -18,10 +18,10 @@ from matplotlib.text import Text
 from rich.console import Console
 
 import coopenv
+from coopenv.base.errors import CoopenvError
+from coopenv.base.format import in_parentheses, with_error
 from coopenv.bench.observers.report import report_text
 from coopenv.bench.observers.rows import Row
-from coopenv.errors import CoopenvError
-from coopenv.format import in_parentheses, with_error
 from coopenv.observers import Estimate, Setup, Tick, registry
 from coopenv.observers.dead_reckoning import DeadReckoning
 from coopenv.viz.contrast import LEAST, contrast

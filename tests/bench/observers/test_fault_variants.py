@@ -12,6 +12,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from coopenv.backends.mcap.writer import write_recording
+from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers import compare
 from coopenv.bench.observers.choice import find_source
 from coopenv.bench.observers.command import figure_files, request_of
@@ -20,7 +21,6 @@ from coopenv.bench.observers.fault_knobs import KNOBS
 from coopenv.bench.observers.faults import with_loss
 from coopenv.bench.observers.sources import Simulated
 from coopenv.cli import main
-from coopenv.errors import CoopenvError
 from coopenv.observers.interference import Interference
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario

@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import binom
 
 import coopenv
+from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers.faults import (
     FAULTS,
     Lie,
@@ -20,7 +21,6 @@ from coopenv.bench.observers.faults import (
     with_wrong_association,
     without_landmarks,
 )
-from coopenv.errors import CoopenvError
 from coopenv.observers import Message, Recording, run
 from coopenv.observers.contract import Setup
 from coopenv.observers.mekf_covariance import MekfCovariance

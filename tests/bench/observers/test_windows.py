@@ -12,11 +12,11 @@ import pytest
 from numpy.testing import assert_allclose
 
 import coopenv
+from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers import compare, scene
 from coopenv.bench.observers.samples import Window, windows_of
 from coopenv.bench.observers.windows import EDGES, WindowRow, checked_edges, spread
 from coopenv.cli import main
-from coopenv.errors import CoopenvError
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.recording import Recording

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.observers.contract import Gains, Message, Received, SensorNoise, Setup, Tick
 from coopenv.observers.planar.plugin import PlanarEkf

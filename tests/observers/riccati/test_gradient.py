@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import coopenv
+from coopenv.base.seeds import world_keys
 from coopenv.observers.riccati.gradient import DifferentiableWorld, check_differentiable, tick_intervals
 from coopenv.scenario import Scenario
-from coopenv.seeds import world_keys
 from tests.helpers.builders import simulate
 from tests.helpers.four_way import FOUR_WAY
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers.basin import random_start
 from coopenv.bench.observers.faults import FAULTS, Lie, changed
-from coopenv.errors import CoopenvError
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
 from coopenv.observers.kernel_observer import KernelObserver

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.errors import CoopenvError
+from coopenv.base.errors import CoopenvError
 from coopenv.observers.contract import Message
 from coopenv.observers.robust.constants import MAX_TOLD, MIN_VARIANCE
 from coopenv.observers.robust.messages import from_six, read, six_of, write

@@ -1,5 +1,0 @@
-"""ROS bags of any laboratory as a backend: a map says which topic tells what of which car."""
-
-from coopenv.backends.bags.backend import Bag
-
-__all__ = ["Bag"]

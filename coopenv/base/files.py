@@ -1,0 +1,341 @@
+"""Results written whole: a file or folder is complete or not there."""
+
+import ctypes
+import os
+import secrets
+import shutil
+import stat
+import sys
+import threading
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager, suppress
+from functools import partial
+from glob import escape
+from math import inf
+from pathlib import Path
+from time import monotonic, sleep
+
+from coopenv.base.errors import OutputError
+from coopenv.base.interrupts import NOTHING, before_a_hard_end, held, note
+
+try:
+    import fcntl
+except ImportError:  # no POSIX: nobody can tell whether a hidden folder is still in use, so all of them stay
+    fcntl = None  # type: ignore[assignment]
+
+PART, OLD = ".part", ".old"  # suffixes of hidden folders: what is being written, and what has made room for it
+POLL = 0.02  # s between attempts to lock
+AT_FDCWD, RENAME_EXCHANGE = -100, 2  # linux/fcntl.h, linux/fs.h
+
+
+def new_part(place: Path) -> tuple[Path, int | None]:
+    """Return a new hidden folder beside a place, and the descriptor that holds it, if there are locks."""
+    while True:
+        part = place.with_name(f".{place.name}.{secrets.token_hex(4)}{PART}")
+        part.mkdir()
+        with suppress(FileNotFoundError):
+            descriptor = lock(part, wait=inf)
+            if part.exists():  # not taken for abandoned before it was locked
+                return part, descriptor
+            if descriptor is not None:
+                os.close(descriptor)
+
+
+def abandoned(place: Path, suffix: str) -> Iterator[Path]:
+    """Yield the hidden folders of a place that belong to no living process."""
+    for path in place.parent.glob(f".{escape(place.name)}.{'[0-9a-f]' * 8}{suffix}"):
+        try:
+            descriptor = lock(path)
+        except OSError:  # gone meanwhile
+            continue
+        if descriptor is not None:
+            try:
+                yield path
+            finally:
+                os.close(descriptor)
+
+
+def lock(folder: Path, wait: float = 0.0) -> int | None:
+    """Return a descriptor that holds a folder until it is closed, or None: no locks, or held by others for `wait` s."""
+    if fcntl is None:
+        return None
+    descriptor = os.open(folder, os.O_RDONLY)
+    end = monotonic() + wait
+    try:
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return descriptor
+            except BlockingIOError:
+                if monotonic() >= end:
+                    raise
+                sleep(POLL)
+    except OSError:
+        os.close(descriptor)
+        return None
+
+
+def put_in_place(part: Path, place: Path, names: Collection[str]) -> None:
+    """Put the folder `part` in its place, with what is there and not of `names`; after an OSError all is as it was."""
+    if not place.exists():
+        part.rename(place)
+        return
+    copy_owner(place, part)
+    for entry in place.iterdir():
+        if entry.name not in names and (entry.is_symlink() or not entry.is_dir()):
+            with suppress(OSError):  # a file system without links: moved over afterwards, like folders
+                os.link(entry, part / entry.name, follow_symlinks=False)
+    old = part.with_suffix(OLD)
+    exchange(part, place, old)
+    clear(old, place, names)
+
+
+def exchange(part: Path, place: Path, old: Path) -> None:
+    """Let `part` and the folder at `place` change places; the latter is then called `old`."""
+    part.rename(old)  # from now on nobody removes it unseen
+    rename = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
+    paths = os.fsencode(old), os.fsencode(place)
+    if rename is not None and rename(AT_FDCWD, paths[0], AT_FDCWD, paths[1], RENAME_EXCHANGE) == 0:
+        return
+    old.rename(part)
+    place.rename(old)
+    try:
+        part.rename(place)
+    except OSError:
+        old.rename(place)
+        raise
+
+
+def heal(place: Path, names: Collection[str]) -> None:
+    """Finish what a run that was killed had begun."""
+    for old in abandoned(place, OLD):
+        if not os.path.lexists(place):
+            old.rename(place)
+        elif any((place / name).exists() for name in names):
+            clear(old, place, names)
+        else:  # somebody has made an empty place since
+            clear(old, place, ())
+
+
+def clear(old: Path, place: Path, names: Collection[str]) -> None:
+    """Remove an old folder but for what is not of `names`, which goes to `place` unless something else is there."""
+    with suppress(OSError):
+        for entry in old.iterdir():
+            with suppress(OSError):
+                kept = place / entry.name
+                if entry.name in names or (os.path.lexists(kept) and os.path.samestat(entry.lstat(), kept.lstat())):
+                    entry.unlink()
+                elif not os.path.lexists(kept):
+                    entry.rename(kept)
+        old.rmdir()
+
+
+def copy_owner(old: Path, new: Path) -> None:
+    """Give what is new the mode and, where allowed, the owner of what it replaces."""
+    if os.name == "posix":
+        with suppress(OSError):
+            info = old.stat()
+            new.chmod(stat.S_IMODE(info.st_mode))
+            os.chown(new, info.st_uid, info.st_gid)
+
+
+def sync(path: Path) -> None:
+    """Wait until a file, or, where that can be asked for, a folder's list of names is on the disk; else OSError."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError:
+        if not path.is_dir():
+            raise
+
+
+PROBE_BYTES = 1 << 16  # written before the work begins, to find a disk that is full already
+LAST_WAIT = 0.5  # s to wait for a result that is being put in place, before the process is ended
+
+_replacing = threading.Lock()
+_under_way: list[Path] = []
+
+
+@contextmanager
+def writing(path: str | Path) -> Iterator[None]:
+    """Turn the system's refusal to write `path` into an `OutputError`."""
+    try:
+        yield
+    except FileExistsError:  # where a folder is to be made
+        raise OutputError(f"cannot write to {path}: it is not a folder") from None
+    except NotADirectoryError:
+        raise OutputError(f"cannot write to {path}: what stands above it is not a folder") from None
+    except OSError as error:
+        raise OutputError(f"cannot write to {path}: {error.strerror or error}") from None
+
+
+@contextmanager
+def replacing_file(path: str | Path) -> Iterator[Path]:
+    """Yield a path to write to; what stands there at the end takes the place of the file `path`.
+
+    Raises:
+        OutputError: it cannot be written; the old file is untouched.
+    """
+    with _staging(path, _check_file) as (place, part):
+        new = part / place.name
+        with writing(path):
+            yield new
+            sync(new)
+            copy_owner(place, new)
+            with held(), _replacing:
+                new.replace(place)
+                _written(path, place)
+            sync(place.parent)
+
+
+def replace_text(path: str | Path, text: str) -> None:
+    """Write a text that takes the place of the file `path`; an OutputError says why not, and the old one stays."""
+    with replacing_file(path) as new:
+        new.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def replacing_folder(folder: str | Path, names: Collection[str]) -> Iterator[Path]:
+    """Yield a new folder to write to; at the end it takes the place of `folder`, which is made if need be.
+
+    Args:
+        folder: may hold an older result, which goes as a whole, and other files and folders, which are kept.
+        names: of all files that such a result can have.
+
+    Raises:
+        OutputError: it cannot be written or replaced, which is found before anything is yielded where it can be known;
+            the old folder is untouched.
+    """
+    with _staging(folder, partial(_check_folder, names)) as (place, part):
+        try:
+            yield part
+        except OutputError as error:
+            raise OutputError(str(error).replace(str(part), str(folder))) from None
+        with writing(folder):
+            for path in part.rglob("*"):
+                sync(path)
+            sync(part)
+        with held(), _replacing:
+            try:
+                put_in_place(part, place, names)
+            except OSError as error:
+                rescued = place.with_name(part.stem.removeprefix("."))
+                with writing(folder):
+                    part.rename(rescued)
+                why = f"{error.strerror}; the new result is in {rescued}"
+                raise OutputError(f"cannot replace {folder}: {why}") from None
+            _written(folder, place)
+        sync(place.parent)
+
+
+@contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """Make a folder and those above it, where need be; if what follows fails, those that stayed empty are none again.
+
+    Raises:
+        OutputError: it cannot be made.
+    """
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        yield folder
+    except BaseException:
+        with suppress(OSError):
+            for place in made:
+                place.rmdir()
+        raise
+
+
+def check_file(path: str | Path) -> None:
+    """Find out before any work whether a file can be written. Raises OutputError: it cannot."""
+    with _staging(path, _check_file):
+        pass
+
+
+def _abandon() -> None:
+    """Remove what is unfinished; nothing is put in place any more."""
+    if _replacing.acquire(timeout=LAST_WAIT):
+        for part in list(_under_way):
+            shutil.rmtree(part, ignore_errors=True)
+
+
+before_a_hard_end(_abandon)
+
+
+def _written(path: str | Path, place: Path) -> None:
+    if place.parent not in _under_way:  # otherwise it is a part of a result
+        note(f"written: {path}")
+
+
+def _check_file(path: str | Path, place: Path) -> None:
+    reasons = {
+        f"{Path(path).parent} is not a folder": place.parent.exists() and not place.parent.is_dir(),
+        f"folder {Path(path).parent} does not exist": not place.parent.is_dir(),
+        "it is a folder": place.is_dir(),
+        "it is no plain file": os.path.lexists(place) and not place.is_file(),
+        "it is read-only": place.exists() and not os.access(place, os.W_OK),
+    }
+    for reason in (reason for reason, applies in reasons.items() if applies):
+        raise OutputError(f"cannot write to {path}: {reason}")
+
+
+def _check_folder(names: Collection[str], folder: str | Path, place: Path) -> None:
+    place.parent.mkdir(parents=True, exist_ok=True)
+    heal(place, names)
+    if not os.path.lexists(place):
+        return
+    if not place.is_dir():
+        raise OutputError(f"cannot write to {folder}: it is not a folder")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise OutputError(f"cannot write to {folder}: it is read-only")
+    folders = [entry for entry in place.iterdir() if entry.is_dir() and not entry.is_symlink()]
+    for entry in (entry for entry in folders if entry.name in names):
+        raise OutputError(f"cannot write to {Path(folder) / entry.name}: it is a folder")
+    fixed = [entry.name for entry in folders if os.path.ismount(entry) or not os.access(entry, os.W_OK)]
+    foreign = [entry.name for entry in folders if not any((place / name).exists() for name in names)]
+    reasons = {
+        "it is the current folder": place.samefile(os.curdir),
+        "it is a mount point": os.path.ismount(place),
+        f"the folder {''.join(fixed[:1])} in it cannot be moved": fixed,
+        f"it holds other folders (such as {''.join(foreign[:1])}) and no earlier result": foreign,
+    }
+    for reason in (reason for reason, applies in reasons.items() if applies):
+        raise OutputError(f"cannot replace {folder}: {reason}; name a folder within it")
+
+
+@contextmanager
+def _staging(path: str | Path, check: Callable[[str | Path, Path], None]) -> Iterator[tuple[Path, Path]]:
+    """Yield the place behind `path`, its symbolic links followed, and a hidden folder beside it, removed at the end.
+
+    The folder is locked for as long as this process lives: others that nobody holds are of runs that were killed.
+    """
+    with writing(path):
+        place = Path(os.path.realpath(path))
+        check(path, place)
+        if not os.access(place.parent, os.W_OK | os.X_OK):
+            raise OutputError(f"cannot write to {path}: folder {Path(path).parent} is read-only")
+        for left in abandoned(place, PART):
+            shutil.rmtree(left, ignore_errors=True)
+    if place.parent not in _under_way:
+        note(f"kept: {path} of an earlier run" if os.path.lexists(place) else NOTHING)
+    part = None
+    try:
+        with writing(path):
+            with held():
+                part, lock = new_part(place)
+                _under_way.append(part)
+            probe = part / "probe"
+            probe.write_bytes(bytes(PROBE_BYTES))
+            sync(probe)
+            probe.unlink()
+        yield place, part
+    finally:
+        if part is not None:
+            _under_way.remove(part)
+            shutil.rmtree(part, ignore_errors=True)
+            if lock is not None:
+                os.close(lock)

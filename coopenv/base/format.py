@@ -1,0 +1,84 @@
+"""Numbers for people, in tables and pictures; `-` where there is none."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from pydantic_core import to_json, to_jsonable_python
+
+NONE = "-"
+MOST_DECIMALS = 5
+FINEST_ERROR = 1e-3  # share of its number below which a standard error is no longer told by its first digit
+
+
+def number(value: float, digits: int = 4) -> str:
+    """Return a number with so many significant digits, and no decimals where these do not reach them."""
+    if math.isnan(value):
+        return NONE
+    if 10**digits <= abs(value) < 1e6:
+        return f"{value:.0f}"
+    return f"{value:z.{digits}g}"
+
+
+def fixed(value: float, decimals: int) -> str:
+    """Return a number whose decimals align with those of others below 10; fewer where it is large."""
+    if math.isnan(value):
+        return NONE
+    return f"{value:.{decimals}f}" if value < 10 else f"{value:.1f}" if value < 1e4 else f"{value:.0e}"
+
+
+def column(values: Sequence[float]) -> list[str]:
+    """Return the numbers of a column with equal decimals: two digits of the smallest, three of the largest."""
+    sizes = [abs(value) for value in values if math.isfinite(value) and 10.0**-MOST_DECIMALS <= abs(value) < 1e6]
+    decimals = 0
+    if sizes:
+        wanted = max(1 - math.floor(math.log10(min(sizes))), 2 - math.floor(math.log10(max(sizes))))
+        decimals = min(max(wanted, 0), MOST_DECIMALS)
+    return [_aligned(value, decimals) for value in values]
+
+
+def _aligned(value: float, decimals: int) -> str:
+    if math.isnan(value):
+        return NONE
+    lost = value != 0.0 and abs(value) < 0.5 * 10.0**-decimals
+    return f"{value:.0e}" if lost or abs(value) >= 1e6 else f"{value:z.{decimals}f}"
+
+
+def seconds(values: Sequence[float]) -> list[str]:
+    """Return a column of times, s, to a hundredth of a second; `never` for NaN."""
+    return ["never" if math.isnan(value) else f"{value:.2f}" for value in values]
+
+
+def with_error(value: float, error: float) -> tuple[str, str]:
+    """Return a number and its standard error to the same decimal, the first digit of the error; no error for NaN."""
+    if not (math.isfinite(value) and math.isfinite(error)):
+        return number(value, 3), ""
+    places = [_place(max(error, FINEST_ERROR * abs(value)))] + ([_place(value)] if value else [])
+    decimals = max(0, -min(places))
+    return f"{value:.{decimals}f}", f"{error:.{decimals}f}"
+
+
+def in_parentheses(value: float, error: float) -> str:
+    """Return a number with its standard error in units of the last digit: 0.0123(4) for 0.0123 and 0.0004."""
+    shown, spread = with_error(value, error)
+    return f"{shown}({spread.replace('.', '').lstrip('0') or 0})" if spread else shown
+
+
+def _place(value: float) -> int:
+    """Return the power of ten of the first digit of a number, rounded to that digit."""
+    return int(f"{value:.0e}".partition("e")[2]) if value else 0
+
+
+def json_text(value: Any) -> str:
+    """Return a result as JSON text; null for NaN and infinity."""
+    return to_json(value, indent=2, inf_nan_mode="null", fallback=_plain).decode() + "\n"
+
+
+def jsonable(value: Any) -> Any:
+    """Return a result as plain Python, as `json.dumps` takes it; None for NaN and infinity."""
+    return to_jsonable_python(value, inf_nan_mode="null", fallback=_plain)
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)

@@ -1,0 +1,1 @@
+"""Network cars: messages, transports, command gate, fake cars, recordings, backend. SVEA is the first make."""

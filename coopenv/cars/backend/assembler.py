@@ -1,0 +1,299 @@
+"""From samples of all cars to ticks.
+
+A tick has a row per car. What it says holds for one moment of that car, its *moment*: when the camera frame of the tick
+was exposed. Odometry is integrated over the real time from one moment to the next, so that a late frame corrects the
+pose that the car had when it was exposed, and not the one that it has when the frame arrives. Without a new frame the
+moment goes on with the clock, as far behind it as the last frame was, and nothing is in view. Estimates and truth of a
+tick are those of the moment as well; how long ago it was is the tick's `bearing_age`.
+"""
+
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend.binding import Binding
+from coopenv.cars.backend.neighbours import Hearsay
+from coopenv.cars.backend.tracks import Frames, Odometer, PoseTrack
+from coopenv.cars.codec import decode, stamp_of
+from coopenv.cars.deployment import Sensors
+from coopenv.cars.readings import read
+from coopenv.cars.samples import Calibration, Detections, Pose, Report, Sample, Twist
+from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.transport.base import Arrival
+from coopenv.estimation.arrays import Array
+from coopenv.observers.recording import Sensed, Truth, is_due, sealed
+from coopenv.scenario.sensing import Camera
+from coopenv.world.build_sensors import camera_to_body
+
+LATE = round((TOPICS[Role.DETECTIONS].max_age or 0.0) * 1e9)
+SILENT = round((TOPICS[Role.ODOMETRY].max_age or 0.0) * 1e9)
+"""ns without odometry after which nothing is said to have come from a car."""
+FUTURE = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
+NS = 1e-9
+
+
+class _Car:
+    """What has come from one car."""
+
+    def __init__(self) -> None:
+        self.odometer, self.frames, self.track = Odometer(), Frames(), PoseTrack()
+        self.moment: int | None = None
+        self.lag = 0  # ns by which the last frame was behind its tick
+        self.exposed: int | None = None  # when the last frame was
+
+
+class Assembler:
+    """Keeps what has come and makes ticks of it; what it gives follows from the order of calls alone."""
+
+    def __init__(self, binding: Binding, offsets: Mapping[str, int] | None = None) -> None:
+        """Begin with nothing.
+
+        Args:
+            binding: who is who.
+            offsets: ns to add to a car's stamps to have them on the receiver's clock (none: they are on it).
+        """
+        self.binding = binding
+        self._offsets = dict(offsets or {})
+        scenario = binding.scenario
+        self._period = round(1e9 / scenario.rates.camera)
+        self._ratio = (scenario.rates.observer or scenario.rates.camera) / scenario.rates.camera
+        self._to_body = [camera_to_body(camera) for camera in scenario.cameras]
+        self._cars = [_Car() for _ in scenario.vehicles]
+        self._begin = 0
+        self.refused: Counter[str] = Counter()
+        """Samples that were not used, by reason."""
+        self._hearsay = Hearsay(binding, self.refused)
+
+    def put(self, sample: Sample) -> None:
+        """Take a sample."""
+        stamp, value = sample.stamp + self._offsets.get(sample.car, 0), sample.value
+        if stamp > sample.received + FUTURE:
+            self.refused["stamp in the future"] += 1
+        elif sample.car in self.binding.leaders:
+            if isinstance(value, Pose) and sample.role in (Role.ESTIMATE, Role.POINT):
+                landmark = self.binding.leaders[sample.car]
+                self._hearsay.put_landmark(landmark, sample.role, stamp, sample.received - stamp, value)
+        elif sample.car not in self.binding.cars:
+            self.refused["unknown car"] += 1
+        else:
+            self._put_vehicle(self.binding.cars[sample.car], sample.role, stamp, value)
+
+    def _put_vehicle(self, vehicle: int, role: Role, stamp: int, value: object) -> None:
+        car = self._cars[vehicle]
+        if isinstance(value, Twist):
+            car.odometer.put(stamp, value)
+        elif isinstance(value, Detections):
+            self.refused["detections left out"] += value.dropped
+            car.frames.put(stamp, value)
+        elif role is Role.TRUTH and isinstance(value, Pose):
+            if not car.track.put(stamp, self._hearsay.on_map(value)):
+                self.refused["motion capture out of order"] += 1
+        elif isinstance(value, Pose | Report) and vehicle not in self.binding.local:
+            self._hearsay.put_vehicle(vehicle, role, stamp, value)
+
+    def _count(self) -> None:
+        """Count what odometers and queues of frames have left out since the last call."""
+        for car in self._cars:
+            odometer, frames = car.odometer, car.frames
+            counts = {
+                "odometry out of order": odometer.disordered,
+                "frame out of order": frames.disordered,
+                "frame left out": frames.skipped,
+            }
+            odometer.disordered = frames.disordered = frames.skipped = 0
+            self.refused.update({why: count for why, count in counts.items() if count})
+
+    def begin(self, now: int) -> Sensed:
+        """Return tick 0 at a time in ns; what came before says where the cars are now."""
+        self._begin = now
+        for car in self._cars:
+            while car.frames.take(-1, now) is not None:
+                pass
+            car.frames.skipped = 0  # nobody has asked for frames since the last episode
+            car.moment, car.lag, car.exposed = now - self._period, 0, None
+            car.odometer.increment(now - self._period, now - self._period)
+        self._hearsay.forget()
+        return self._sensed(0, now)
+
+    def tick(self, index: int, now: int) -> Sensed:
+        """Return tick number `index` at a time in ns."""
+        return self._sensed(index, now)
+
+    def moment(self, vehicle: int) -> int:
+        """Return the time in ns for which the present tick of a vehicle holds, on the receiver's clock."""
+        moment = self._cars[vehicle].moment
+        return self._begin if moment is None else moment
+
+    def _middle(self) -> int:
+        """Return the mean of the moments of the vehicles estimated here: when their frames were exposed."""
+        return sum(self.moment(i) for i in self.binding.local) // len(self.binding.local)
+
+    def truth(self, vehicle: int, now: int) -> tuple[Array, Array]:
+        """Return the rotation and position of a vehicle by motion capture, NaN where it is not known."""
+        return self._cars[vehicle].track.at(now)
+
+    def _sensed(self, index: int, now: int) -> Sensed:
+        N, T = len(self._cars), len(self.binding.scenario.target_names)
+        rotation, translation = np.tile(np.eye(3), (N, 1, 1)), np.zeros((N, 3))
+        velocity, angular_velocity = np.zeros((N, 3)), np.zeros((N, 3))
+        bearings, visible = np.full((N, T, 3), np.nan), np.zeros((N, T), bool)
+        odometry_age, bearing_age = np.full(N, np.inf), np.zeros(N)
+        missing, late = np.zeros(N, bool), np.zeros(N, bool)
+        truth = Truth(np.full((N, 3, 3), np.nan), np.full((N, 3), np.nan))
+        for i, car in enumerate(self._cars):
+            frame = self._advance(car, index, now, i, rotation, translation)
+            truth.rotation[i], truth.position[i] = car.track.at(car.moment or now)
+            if i not in self.binding.local:
+                missing[i] = True
+                continue
+            stamp = car.odometer.stamp
+            age = now - stamp if stamp is not None else None
+            missing[i] = age is None or age > SILENT
+            odometry_age[i] = np.inf if age is None else max(age, 0) * NS
+            velocity[i], angular_velocity[i] = car.odometer.twist
+            bearing_age[i] = (now - car.exposed) * NS if car.exposed is not None else (now - self._begin) * NS
+            if frame is not None:
+                late[i] = car.lag > LATE
+                self._see(i, frame, now, bearings[i], visible[i])
+        self._count()
+        return Sensed(
+            index=index,
+            dt=1.0 / self.binding.scenario.rates.camera,
+            due=bool(is_due(index, self._ratio)),
+            time=(now - self._begin) * NS,
+            rotation=rotation,
+            translation=translation,
+            velocity=velocity,
+            angular_velocity=angular_velocity,
+            bearings=bearings,
+            visible=visible,
+            landmarks=sealed(self._hearsay.places(now, self._middle())),
+            odometry_age=odometry_age,
+            bearing_age=bearing_age,
+            missing=missing,
+            late=late,
+            truth=truth if np.isfinite(truth.position).any() else None,
+            inbox_tick=np.full((N, N), -1, dtype=np.int64) if self.binding.remote else None,
+            messages=self._hearsay.messages(now),
+        )
+
+    def _advance(
+        self, car: _Car, index: int, now: int, i: int, rotation: Array, translation: Array
+    ) -> Detections | None:
+        """Move a car's moment to that of its next frame, or on with the clock; return the frame."""
+        before = car.moment if car.moment is not None else now
+        taken = car.frames.take(before, now) if index > 0 else None
+        if taken is not None:
+            moment, frame = taken
+            car.lag, car.exposed = now - moment, moment
+        else:  # half a period more, so that the frame that comes too late for this tick is after it
+            moment, frame = max(before, now - car.lag - self._period // 2), None
+        if index > 0:
+            rotation[i], translation[i] = car.odometer.increment(before, moment)
+        car.moment = moment
+        return frame
+
+    def _see(self, i: int, frame: Detections, now: int, bearings: Array, visible: NDArray[np.bool_]) -> None:
+        """Write a frame's bearings into a car's row, (T, 3) and (T,)."""
+        for marker, ray in zip(frame.markers, frame.bearings, strict=True):
+            target = self.binding.targets.get(marker)
+            if target is None or target == len(self.binding.scenario.landmarks) + i:
+                self.refused["unknown marker"] += 1
+            elif self._hearsay.is_lost(target, now):
+                self.refused["landmark of unknown position"] += 1
+            else:
+                bearings[target], visible[target] = self._to_body[i] @ ray, True
+
+
+WINDOW = 2_000_000_000  # ns over which the least delay is looked for
+
+SPOKEN = (Role.ESTIMATE, Role.POINT, Role.REPORT)
+"""What cars tell each other."""
+
+VELOCITY = {"wheel+imu": (Role.WHEEL, Role.IMU), "wheel": (Role.WHEEL,), "odometry": (Role.ODOMETRY,)}
+
+
+def roles_of(sensors: Sensors, local: bool) -> tuple[Role, ...]:
+    """Return what is read of a car that is estimated here, or of one that is not."""
+    heard: tuple[Role, ...] = (Role.TRUTH,) if sensors.truth else ()
+    if not local:
+        return (*heard, *SPOKEN)
+    return (*VELOCITY[sensors.odometry], Role(sensors.detections), *heard)
+
+
+@dataclass
+class ClockOffset:
+    """How much later than they were stamped a car's messages come, at least; times in ns."""
+
+    _least: deque[tuple[int, int]]  # when it was received, delay; increasing delays
+
+    @classmethod
+    def unknown(cls) -> "ClockOffset":
+        """Return one that has seen no message."""
+        return cls(deque())
+
+    def put(self, stamp: int, received: int) -> None:
+        """Take a message."""
+        delay = received - stamp
+        while self._least and self._least[-1][1] >= delay:
+            self._least.pop()
+        self._least.append((received, delay))
+        while self._least[0][0] < received - WINDOW:
+            self._least.popleft()
+
+    @property
+    def seconds(self) -> float | None:
+        """Offset of the car's clock behind the receiver's, the network's delay included, s; None: nothing has come."""
+        return self._least[0][1] * 1e-9 if self._least else None
+
+
+class Intake:
+    """Reads the messages of all cars."""
+
+    def __init__(self, binding: Binding, sensors: Sensors) -> None:
+        """Say which topics are read."""
+        self._topics: dict[str, tuple[str, Role, Calibration | None]] = {}
+        self._sensors = sensors
+        self.offsets = {name: ClockOffset.unknown() for name in binding.cars}
+        self.rejected: dict[str, Counter[str]] = {name: Counter() for name in (*binding.cars, *binding.leaders)}
+        """Messages that could not be used, by car and role."""
+        self.calibrations = {name: _calibration(binding.scenario.cameras[i]) for name, i in binding.cars.items()}
+        """Of the environment, by car."""
+        for name, vehicle in binding.cars.items():
+            for role in roles_of(sensors, vehicle in binding.local):
+                self._topics[topic_of(name, role)] = name, role, self.calibrations[name]
+        for name in binding.leaders:
+            for role in (Role.ESTIMATE, Role.POINT, *((Role.TRUTH,) if sensors.truth else ())):
+                self._topics[topic_of(name, role)] = name, role, None
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Names of the topics that are read."""
+        return tuple(self._topics)
+
+    def samples(self, arrival: Arrival) -> Iterator[Sample]:
+        """Yield what a message tells: one sample, or none where it is not what it should be."""
+        found = self._topics.get(arrival.topic)
+        if found is None:
+            return
+        car, role, calibration = found
+        try:
+            message = decode(arrival.payload, TOPICS[role].type)
+            stamp = stamp_of(message)
+            value = read(role, message, calibration, distorted=self._sensors.distorted)
+        except CoopenvError:
+            self.rejected[car][role.value] += 1
+            return
+        if isinstance(value, Twist) and role is Role.WHEEL and self._sensors.odometry == "wheel+imu":
+            value = Twist(value.linear, None)  # the IMU's turn rate alone counts
+        if car in self.offsets and role is not Role.TRUTH:
+            self.offsets[car].put(stamp, arrival.received)
+        yield Sample(car, role, stamp, arrival.received, value)
+
+
+def _calibration(camera: Camera) -> Calibration:
+    return Calibration(camera.image_size, camera.focal_length, camera.principal_point, camera.distortion)

@@ -1,0 +1,270 @@
+"""The SVEA backend: cars on a network in place of the simulated ones."""
+
+import gc
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from coopenv.backends.base import EPISODE_OVER, Capabilities, Command, Health, Told
+from coopenv.cars.backend.assembler import SPOKEN, VELOCITY, Assembler, Intake
+from coopenv.cars.backend.binding import Binding, wishes_of
+from coopenv.cars.backend.drive import Tape
+from coopenv.cars.backend.gates import Gates
+from coopenv.cars.backend.neighbours import checked, estimate_message, report_message
+from coopenv.cars.backend.start import Fleet, Start
+from coopenv.cars.backend.station import Pacer, Station
+from coopenv.cars.backend.status import StatusBoard
+from coopenv.cars.backend.watchdog import Trip, Vitals, Watchdog
+from coopenv.cars.codec import encode, warm_up
+from coopenv.cars.deployment import Deployment
+from coopenv.cars.keys import Signer, Verifier
+from coopenv.cars.topics import Role, presence_of, topic_of
+from coopenv.cars.transport.base import Arrival, Transport
+from coopenv.observers.recording import Sensed
+
+EXPECTED = ("reset", "closed", EPISODE_OVER)
+"""Reasons to stop that are no emergency."""
+
+
+@dataclass
+class LinkHealth(Health):
+    """What has come over the network as well."""
+
+    missed: int = 0  # decisions that came too late for their first tick
+    refused: dict[str, int] = field(default_factory=dict)  # samples that were not used, by reason
+
+
+class Svea:
+    """Cars as a source of ticks.
+
+    `reset(options={"arm": True})` lets them drive; without it everything happens but that commands are sent. An episode
+    ends early when the watchdog stops the cars; `notes` say why.
+    """
+
+    def __init__(
+        self,
+        deployment: Deployment,
+        binding: Binding,
+        transport: Transport,
+        signer: Signer | None = None,
+        verifier: Verifier | None = None,
+        tape: Tape | None = None,
+    ) -> None:
+        """Listen to the cars.
+
+        Args:
+            deployment: the fleet.
+            binding: who is who in it.
+            transport: how it is reached; closed with the backend.
+            signer: signs what is sent (None: nothing is signed).
+            verifier: knows the cars' keys (None: signatures do not count).
+            tape: writes down what ticks are made of, and why the cars were stopped.
+        """
+        self.deployment, self.binding, self.scenario = deployment, binding, binding.scenario
+        self._transport, self._signer = transport, signer
+        self.tape = tape
+        names = binding.names
+        self._local = {names[i]: i for i in binding.local}
+        self.capabilities = Capabilities(
+            truth=deployment.sensors.truth,
+            driven=True,
+            real_time=True,
+            ticks=None,
+            batched=False,
+            estimated=None if not binding.remote else binding.local,
+        )
+        self.link = LinkHealth()
+        self.health: Health = self.link
+        self.intake = Intake(binding, deployment.sensors)
+        own = deployment.security.identity
+        heard = (*binding.cars, *binding.leaders)
+        said = {topic_of(name, role): (name, own) for name in heard for role in SPOKEN}
+        self.station = Station(transport, self.intake.topics, verifier, said)
+        self.gates = Gates(transport, tuple(self._local), deployment.safety.limits, signer, verifier)
+        self.board = StatusBoard(transport, tuple(self._local), deployment.remote, deployment.conditions)
+        rates = self.scenario.rates
+        self._pacer = Pacer(1.0 / rates.camera, self.scenario.ticks_per_decision)
+        self._assembler = Assembler(binding)
+        self._origin = np.array(self.scenario.map.origin)
+        safety, self.vitals = deployment.safety, Vitals(deployment.safety.judge)
+        self._odometry = VELOCITY[deployment.sensors.odometry]
+        self._others = tuple(name for name in heard if name not in self._local)
+        self.watchdog = Watchdog(
+            safety,
+            self.station,
+            self.gates,
+            self.vitals,
+            tuple(self._local),
+            self._others,
+            self._odometry,
+            1.0 / rates.decision,
+        )
+        calibrations = {name: self.intake.calibrations[name] for name in self._local}
+        fleet = Fleet(deployment, calibrations, self.station, self.intake, self.board, self.vitals, self._others)
+        self._start = Start(fleet, transport, self.gates, self.watchdog, self._odometry, self._drain)
+        transport.watch(presence_of("*"), self._presence)
+        self.watchdog.happened = self.board.happened
+        self.watchdog.on_stop = self._write_down
+        self._armed, self._began, self._index = False, 0, 0
+        self._key, self._episode = 0, 0
+        self._presented = presence_of(deployment.security.identity)
+        transport.announce(self._presented)
+        self._closed = threading.Lock()
+        warm_up()
+
+    def _presence(self, key: str, there: bool) -> None:
+        name = key.rsplit("/", 1)[-1]
+        if name in self._local:
+            self.watchdog.set_present(name, there)
+
+    @property
+    def clock(self) -> float:
+        """Time since the reset, s."""
+        return (self._pacer.now() - self._began) * 1e-9 if self._began else 0.0
+
+    def reset(self, seed: int | None, options: Mapping[str, Any]) -> Sensed:
+        """Begin an episode; cars move only with the option `arm`.
+
+        Raises:
+            CoopenvError: an option is not known, or something is not as it has to be before wheels turn.
+        """
+        self._stop("reset")
+        wishes = wishes_of(options)
+        self._start.prepare(0 if seed is None else seed)
+        self.vitals.begin(self._pacer.now())
+        self._start.listen(wishes.arm)
+        self.station.dropped.clear()
+        if wishes.arm:
+            self._start.arm(wishes.release)
+            self._armed = True
+        self._drain()
+        self._began, self._index = self._pacer.start(), 0
+        self._key, self._episode = (self._key, self._episode + 1) if seed is None else (seed, 0)
+        if self.tape is not None:
+            self.tape.begin(self._began, self._key % 2**64, self._episode)
+        return self._counted(self._assembler.begin(self._began))
+
+    def advance(self, command: Command) -> Iterator[Sensed]:
+        """Send the commands and yield the ticks of one decision, each when it is due."""
+        self._pacer.decide()
+        self.link.missed = self._pacer.missed
+        self.watchdog.beat(self._pacer.in_a_row)
+        if self._armed:
+            self.gates.next()
+            for name, i in self._local.items():
+                speed, steering, acceleration = command.speed[i], command.steering[i], command.acceleration[i]
+                self.gates.command(name, float(speed), float(steering), float(acceleration))
+        for _ in range(self.scenario.ticks_per_decision):
+            if self._armed and self.watchdog.trip is not None:
+                self._armed = False
+                return
+            now = self._pacer.wait()
+            self._drain()
+            self._index += 1
+            if self.tape is not None:
+                self.tape.tick(self._index, now)
+            yield self._counted(self._assembler.tick(self._index, now))
+
+    def _drain(self) -> None:
+        arrivals = self.station.drain()
+        self.health.received += len(arrivals)
+        for arrival in arrivals:
+            self._take(arrival)
+        self.vitals.looked = self._pacer.now()
+
+    def _take(self, arrival: Arrival) -> None:
+        if self.tape is not None:
+            self.tape.write(arrival.topic, arrival.payload, arrival.received)
+        for sample in self.intake.samples(arrival):
+            self._assembler.put(sample)
+            self.vitals.put(sample)
+
+    def _counted(self, tick: Sensed) -> Sensed:
+        local = list(self.binding.local)
+        missing = np.asarray(tick.missing)[local]
+        self.health.ticks += 1
+        self.health.late += int(np.asarray(tick.late)[local].sum())
+        self.health.missing += int(missing.sum())
+        self.health.empty += int((~tick.visible[local].any(axis=-1) & ~missing).sum())
+        refused = self._assembler.refused + self.station.dropped
+        for counts in self.intake.rejected.values():
+            refused += counts
+        self.link.refused, self.health.rejected = dict(refused), sum(refused.values())
+        return tick
+
+    def tell(self, told: Sequence[Told]) -> None:
+        """Send what the vehicles estimated here have to say, as they believe to be at the present tick."""
+        for each in told:
+            name, moment = self.binding.names[each.vehicle], self._assembler.moment(each.vehicle)
+            if not checked(each):
+                continue
+            if self.deployment.safety.judge == "estimate":
+                self.vitals.place(name, each.position + self._origin, moment)
+            self._publish(name, Role.ESTIMATE, estimate_message(each, moment, self._origin))
+            report = report_message(each, moment, self._origin)
+            if report is not None:
+                self._publish(name, Role.REPORT, report)
+
+    def _publish(self, name: str, role: Role, message: Any) -> None:
+        topic, payload = topic_of(name, role), encode(message)
+        signature = b"" if self._signer is None else self._signer.sign(topic, payload)
+        self._transport.publish(topic, payload, signature)
+
+    def notes(self, vehicle: int) -> dict[str, Any]:
+        """Return what a vehicle's info tells of its car and of the network."""
+        name = self.binding.names[vehicle]
+        gate, trip = self.gates.states.get(name), self.watchdog.trip
+        offset = self.intake.offsets[name].seconds
+        return {
+            "name": name,
+            "armed": self._armed,
+            "stopped": "" if trip is None else trip.reason,
+            "stopped_by": "" if trip is None else trip.car or "",
+            "gate": "unknown" if gate is None else gate.state,
+            "gate_rejections": {} if gate is None else self.gates.refused(name),
+            "rejections": dict(self.link.refused),
+            "missed_deadlines": self.link.missed,
+            "lateness": self._pacer.lateness[-1] if self._pacer.lateness else 0.0,
+            "clock_offset": float("nan") if offset is None else offset,
+        }
+
+    @property
+    def delays(self) -> tuple[float, ...]:
+        """By how much each tick of this episode came after its time, s."""
+        return tuple(self._pacer.lateness)
+
+    def lateness(self, share: float) -> float:
+        """Return by how much at most that share of the ticks came after their time, s."""
+        return self._pacer.late(share)
+
+    def _write_down(self, trip: Trip) -> None:
+        if self.tape is not None:
+            self.tape.stopped(trip.reason, trip.car or "", self._pacer.now())
+
+    def stop(self, reason: str) -> None:
+        """Bring the cars to a stand at once and end the episode."""
+        self._stop(reason)
+
+    def _stop(self, reason: str) -> None:
+        if self._armed and reason in EXPECTED:
+            self.watchdog.disarm()
+            self.gates.end()
+        elif self._armed:
+            self.watchdog.stop(reason)
+        self._armed = False
+
+    def close(self) -> None:
+        """Stop, and leave the network. Raises OutputError: what comes and goes could not be written to the end."""
+        if not self._closed.acquire(blocking=False):
+            return
+        self._stop("closed")
+        self.watchdog.close()
+        try:
+            if self.tape is not None:
+                self.tape.close()
+        finally:
+            self._transport.close()
+            gc.unfreeze()

@@ -1,0 +1,373 @@
+"""A recorded drive of cars in their place: the same messages, the same ticks.
+
+The file is a ROS 2 bag that other tools read: every message stands under its own topic and type. What goes beyond that
+is the topic `coopenv/tick` and an attachment that says which fleet and environment it was; with both, a replay makes
+the same ticks again, bit for bit (`coopenv.cars.backend.drive`). `coopenv/stopped` tells why the watchdog stopped the
+cars.
+"""
+
+import json
+import queue
+import threading
+import time
+import warnings
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from coopenv.backends.base import Capabilities, Episode, TickGenerator
+from coopenv.backends.mcap.messages import codec
+from coopenv.backends.mcap.peek import CUT_OFF, metadata_names
+from coopenv.base.errors import CoopenvError, DataError, DataWarning, OutputError
+from coopenv.base.files import writing
+from coopenv.base.installation import version
+from coopenv.cars.backend.assembler import Assembler, Intake
+from coopenv.cars.backend.binding import OPTIONS, Binding, bind, wishes_of
+from coopenv.cars.codec import STOPPED, TICK, decode, encode, header, make, ros2, stamp_of
+from coopenv.cars.deployment import Deployment, parse_deployment
+from coopenv.cars.topics import STOPPED_TOPIC, TICK_TOPIC
+from coopenv.cars.transport.base import Arrival, Callback, Transport
+from coopenv.scenario.files import override, parse_scenario
+from coopenv.scenario.own_terms import without_own_terms
+
+if TYPE_CHECKING:
+    from coopenv.backends.mcap.container import Container
+
+FORMAT = "coopenv drive 1"
+NAME = "coopenv-drive"
+ATTACHMENT = "drive.json"
+
+FLUSH = 0.5
+"""s after which at the latest the system has what was written: so much is lost if the process is killed."""
+
+
+class Tape:
+    """A file under way; a thread of its own writes, so that no tick waits for a disk."""
+
+    def __init__(self, path: Path, head: bytes, types: Mapping[str, str]) -> None:
+        """Open a file.
+
+        Args:
+            path: of the file, which must not be there.
+            head: what the replay has to know.
+            types: type of every topic.
+
+        Raises:
+            OutputError: the file is there, or cannot be written.
+            CoopenvError: the extra is not installed.
+        """
+        try:
+            from mcap.writer import Writer
+        except ImportError:
+            raise CoopenvError("recording cars needs an extra: pip install '.[svea]'") from None
+        if path.suffix != ".mcap":
+            raise OutputError(f"{path}: the name must end in .mcap")
+        if path.exists():
+            raise OutputError(f"{path}: exists already")
+        self._path, self._types = path, {**types, TICK_TOPIC: TICK, STOPPED_TOPIC: STOPPED}
+        self.begun = False
+        """Whether an episode has begun: without one there is nothing to replay."""
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._sequence = 0
+        self._error: OSError | None = None
+        with writing(path):
+            self._stream = path.open("xb")
+            self._writer = Writer(self._stream)
+            self._writer.start(profile="ros2", library=f"coopenv {version()}")
+            self._writer.add_metadata(NAME, {"format": FORMAT, "version": version()})
+            self._writer.add_attachment(0, 0, ATTACHMENT, "application/json", head)
+            self._stream.flush()
+        _stopped("", "", 0)  # the first message of a type takes long, and this one must not
+        self._queue: queue.SimpleQueue[tuple[str, bytes, int] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._write_all, name="coopenv tape", daemon=True)
+        self._thread.start()
+
+    def begin(self, now: int, key: int, episode: int) -> None:
+        """Mark that tick 0 of an episode was made at a time in ns; key and episode fix what was drawn."""
+        self._mark(0, now, key, episode)
+        self.begun = True
+
+    def tick(self, index: int, now: int) -> None:
+        """Mark that a tick was made at a time in ns of what had come before."""
+        self._mark(index, now, 0, 0)
+
+    def _mark(self, index: int, now: int, key: int, episode: int) -> None:
+        message = make(TICK, header=header(now), index=index, key=key, episode=episode)
+        self._queue.put((TICK_TOPIC, encode(message), now))
+
+    def write(self, topic: str, payload: bytes, now: int) -> None:
+        """Write a message that came, or went, at a time in ns; of unknown topics none are."""
+        if topic in self._types:
+            self._queue.put((topic, payload, now))
+
+    def stopped(self, reason: str, car: str, now: int) -> None:
+        """Write why the watchdog stopped the cars at a time in ns, and whose fault it was; that cannot get lost."""
+        self._queue.put((STOPPED_TOPIC, _stopped(reason, car, now), now))
+
+    def close(self) -> None:
+        """Write what is left and close the file; one without an episode is removed.
+
+        Raises:
+            OutputError: it could not be written to the end; what stands in it can be replayed.
+        """
+        self._queue.put(None)
+        self._thread.join()
+        try:
+            with writing(self._path):
+                if self._error is not None:
+                    raise self._error
+                self._writer.finish()
+                self._stream.flush()
+        finally:
+            with suppress(OSError):
+                self._stream.close()
+            if not self.begun:
+                self._path.unlink(missing_ok=True)
+
+    def _write_all(self) -> None:
+        due = time.monotonic() + FLUSH
+        try:
+            while (item := self._next(due)) is not None:
+                topic, payload, now = item
+                if topic:
+                    self._sequence += 1
+                    self._writer.add_message(self._channel(topic), now, payload, now, self._sequence % 2**32)
+                if topic == STOPPED_TOPIC or time.monotonic() >= due:
+                    self._writer.flush()
+                    due = time.monotonic() + FLUSH
+        except OSError as error:  # the disk is full: nothing more is written, but nor does the memory fill
+            self._error = error
+            while self._queue.get() is not None:
+                pass
+
+    def _next(self, until: float) -> tuple[str, bytes, int] | None:
+        """Return what is to be written next; nothing, without a topic, where nothing comes until then."""
+        try:
+            return self._queue.get(timeout=max(0.0, until - time.monotonic()))
+        except queue.Empty:
+            return "", b"", 0
+
+    def _channel(self, topic: str) -> int:
+        if topic not in self._channels:
+            kind = self._types[topic]
+            if kind not in self._schemas:
+                text, _ = ros2().generate_msgdef(kind, ros_version=2)
+                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
+            self._channels[topic] = self._writer.register_channel(f"/{topic}", "cdr", self._schemas[kind])
+        return self._channels[topic]
+
+
+def _stopped(reason: str, car: str, now: int) -> bytes:
+    return encode(make(STOPPED, header=header(now), reason=reason, car=car))
+
+
+def head_of(deployment: Deployment, binding: Binding, only: str | None) -> bytes:
+    """Return what a tape says of the fleet: JSON."""
+    head = {
+        "deployment": deployment.model_dump(mode="json", exclude={"security", "network"}),
+        "scenario": binding.scenario.model_dump(mode="json"),
+        "only": only,
+    }
+    return json.dumps(head).encode()
+
+
+def is_drive(path: str | Path) -> bool:
+    """Return whether a file is a recorded drive; False where it cannot be read."""
+    return NAME in (metadata_names(path) or ())
+
+
+@dataclass(frozen=True)
+class Mark:
+    """That a tick was made, at a time in ns; the key of the draws and the number of the episode count at its start."""
+
+    index: int
+    time: int
+    key: int
+    episode: int
+
+
+@dataclass(frozen=True)
+class Stopped:
+    """That the watchdog stopped the cars."""
+
+    reason: str
+    time: int
+
+
+class Drive(TickGenerator):
+    """A drive as a backend: actions change nothing. Every reset goes on to its next episode, and round again.
+
+    Of one whose end is missing, as the process that wrote it was killed, what is whole is replayed.
+    """
+
+    options = OPTIONS
+
+    def __init__(self, path: str | Path, overrides: Mapping[str, Any] | None = None) -> None:
+        """Open a file that `coopenv svea run --record` has written.
+
+        Args:
+            path: the file.
+            overrides: dotted keys of its environment, for example another observer's name.
+
+        Raises:
+            DataError: it is none, or is damaged.
+            CoopenvError: an override is not valid, or the extra is missing.
+        """
+        codec()  # says which extra is missing
+        from coopenv.backends.mcap.container import Container
+
+        self._where = str(path)
+        try:
+            container = Container(Path(path), forgiving=True)
+            metadata, attachments = container.extras()
+        except OSError as error:
+            raise DataError(f"{path}: cannot be read ({error.strerror or error})") from None
+        except DataError:
+            raise
+        except Exception as error:  # whatever the libraries raise at bytes that make no sense
+            raise DataError(f"{path}: damaged MCAP file ({type(error).__name__})") from None
+        nothing = f"{path}: {f'{CUT_OFF}, and ' if container.cut_off else ''}no episode begins in it"
+        if container.cut_off and ATTACHMENT not in attachments:
+            raise DataError(nothing)
+        if metadata.get(NAME, {}).get("format") != FORMAT or ATTACHMENT not in attachments:
+            raise DataError(f"{path}: no recorded drive of coopenv (format '{FORMAT}')")
+        self._deployment, self.binding = self._read_head(attachments[ATTACHMENT], overrides or {})
+        self._messages = list(self._read(container))
+        indices = [message.index for message in self._messages if isinstance(message, Mark)]
+        if 0 not in indices:
+            raise DataError(nothing)
+        if container.cut_off:
+            self._warn()
+        self._episodes, self._next = indices.count(0), 0
+        self.drawn = (0, 0)
+        self.stopped = ""
+        local = self.binding.local if self.binding.remote else None
+        truth, ticks = self._deployment.sensors.truth, max(indices) + 1
+        super().__init__(
+            self.binding.scenario,
+            Capabilities(truth, False, False, ticks, batched=False, recorded=True, estimated=local),
+        )
+
+    def _read_head(self, text: bytes, overrides: Mapping[str, Any]) -> tuple[Deployment, Binding]:
+        try:
+            head = json.loads(text)
+            raw, given, only = head["scenario"], head["deployment"], head["only"]
+        except (ValueError, TypeError, LookupError):
+            raise DataError(f"{self._where}: {ATTACHMENT} is damaged") from None
+        raw = without_own_terms(raw)
+        for key, value in overrides.items():
+            override(raw, key, value)
+        scenario = parse_scenario(raw, f"{self._where}: {ATTACHMENT}")
+        deployment = parse_deployment(given, Path(self._where))
+        return deployment, bind(scenario, deployment.cars, deployment.markers, self._where, only)
+
+    def _warn(self) -> None:
+        """Say from where on the file is missing."""
+        times = [message.received if isinstance(message, Arrival) else message.time for message in self._messages]
+        seconds = (max(times) - min(times)) * 1e-9
+        warnings.warn(
+            f"{self._where}: {CUT_OFF}: of what came after {seconds:.1f} s nothing is replayed",
+            DataWarning,
+            stacklevel=3,
+        )
+
+    def _read(self, container: "Container") -> Iterator[Arrival | Mark | Stopped]:
+        try:
+            for channel, _, message in container.messages():
+                topic = channel.topic.lstrip("/")
+                if topic == TICK_TOPIC:
+                    mark = decode(message.data, TICK)
+                    yield Mark(int(mark.index), stamp_of(mark), int(mark.key), int(mark.episode))
+                elif topic == STOPPED_TOPIC:
+                    stop = decode(message.data, STOPPED)
+                    yield Stopped(stop.reason, stamp_of(stop))
+                else:
+                    yield Arrival(topic, bytes(message.data), message.log_time)
+        except CoopenvError as error:
+            raise DataError(f"{self._where}: {error}") from None
+        except Exception as error:
+            raise DataError(f"{self._where}: damaged MCAP file ({type(error).__name__})") from None
+
+    def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
+        """Go through the messages from the begin, giving the ticks of one episode; `arm` moves nobody."""
+        wishes_of(options)
+        wanted, self._next = self._next, (self._next + 1) % self._episodes
+        intake, assembler = Intake(self.binding, self._deployment.sensors), Assembler(self.binding)
+        number, self.stopped = -1, ""
+        for message in self._messages:
+            if isinstance(message, Arrival):
+                for sample in intake.samples(message):
+                    assembler.put(sample)
+                continue
+            if isinstance(message, Stopped):
+                self.stopped = message.reason if number == wanted else ""
+                continue
+            if message.index == 0:
+                number += 1
+                if number > wanted:
+                    return
+                self.drawn = message.key, message.episode
+                tick = assembler.begin(message.time)
+            else:
+                tick = assembler.tick(message.index, message.time)
+            if number == wanted:
+                yield tick
+
+
+PRESENCE = "std_msgs/msg/Bool"
+"""Type of what a tape says of who is there, under the names of their tokens."""
+
+
+class Taped:
+    """A transport whose messages are written to a tape, by whatever thread sends or receives them.
+
+    What ticks are made of is left to those who make them, as it has to stand on the tape in the order in which they
+    take it.
+    """
+
+    def __init__(
+        self, transport: Transport, tape: Tape, aside: Collection[str] = (), unread: Collection[str] = ()
+    ) -> None:
+        """Wrap a transport.
+
+        Args:
+            transport: the network.
+            tape: where everything that is sent is written, and who comes and goes.
+            aside: topics of which no ticks are made: what comes on them is written at once.
+            unread: topics that nobody here listens to and that belong on the tape all the same.
+        """
+        self._transport, self._tape, self._aside = transport, tape, frozenset(aside)
+        self.announce, self.close = transport.announce, transport.close
+        for topic in unread:
+            transport.subscribe(topic, self._write)
+
+    def publish(
+        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
+    ) -> None:
+        """Send, see `Transport`, and write down."""
+        self._transport.publish(topic, payload, attachment, urgent=urgent, reliable=reliable)
+        self._tape.write(topic, payload, time.time_ns())
+
+    def subscribe(self, pattern: str, callback: Callback) -> None:
+        """Subscribe, see `Transport`."""
+
+        def take(arrival: Arrival) -> None:
+            self._write(arrival)
+            callback(arrival)
+
+        self._transport.subscribe(pattern, take if pattern in self._aside else callback)
+
+    def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
+        """Watch, see `Transport`, and write down who comes and goes."""
+
+        def change(name: str, there: bool) -> None:
+            self._tape.write(name, encode(make(PRESENCE, data=there)), time.time_ns())
+            callback(name, there)
+
+        self._transport.watch(pattern, change)
+
+    def _write(self, arrival: Arrival) -> None:
+        self._tape.write(arrival.topic, arrival.payload, arrival.received)

@@ -1,0 +1,184 @@
+"""What cars say of where they are: moving landmarks, and vehicles that are estimated elsewhere."""
+
+from collections import Counter
+from dataclasses import replace
+from typing import Any, TypeVar, cast
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from coopenv.backends.base import Told
+from coopenv.cars.backend.binding import Binding
+from coopenv.cars.backend.tracks import PlaceTrack
+from coopenv.cars.codec import header, make
+from coopenv.cars.samples import Pose, Report
+from coopenv.cars.topics import TOPICS, Role
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.rotations import skew
+from coopenv.observers.contract import Message, Received
+from coopenv.observers.riccati_coordinates import left_covariance
+from coopenv.observers.robust.messages import from_six
+from coopenv.scenario.starts import rotation_of
+from coopenv.scenario.topology import neighbour_sets
+
+
+def message_of(value: Pose | Report, marker: Array) -> Message:
+    """Return what an observer reads of a sender whose marker is at `marker` (3,) in its body, m.
+
+    A position without an orientation gives the marker's height alone.
+    """
+    if isinstance(value, Report):
+        return Message(value.position, value.rotation, value.covariance, cast(dict[str, Array], value.extra))
+    if value.rotation is None:
+        return Message(value.position + np.array([0.0, 0.0, marker[2]]))
+    arm = value.rotation @ marker
+    covariance = None
+    if value.covariance is not None:
+        J = np.hstack([np.eye(3), -skew(arm)])  # of the marker's place by those of position and rotation
+        covariance = J @ value.covariance @ J.T
+    return Message(value.position + arm, value.rotation, covariance)
+
+
+def estimate_message(told: Told, stamp: int, origin: Array) -> Any:
+    """Return the PoseWithCovarianceStamped of an estimate; rotations of its covariance are about the map's axes.
+
+    `origin` (3,) is that of the map in the coordinates of the scenario's file, which are those on the wire.
+    """
+    P = left_covariance(told.rotation.T @ told.position, told.covariance)
+    turn = np.zeros((6, 6))
+    turn[:3, 3:] = turn[3:, :3] = told.rotation  # (theta, rho) in the body to (position, rotation) in the map
+    pose, covariance = _pose(told.rotation, told.position + origin), (turn @ P @ turn.T).ravel()
+    return make(
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        header=header(stamp, "map"),
+        pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance),
+    )
+
+
+def report_message(told: Told, stamp: int, origin: Array) -> Any | None:
+    """Return the RobustReport of a vehicle, `origin` as for `estimate_message`; None: its observer has no such ones.
+
+    Its dead reckoning is from where it began, and knows no map.
+    """
+    m = told.message
+    if m is None or (m.position is not None and not {"odometry", "depends_on"} <= set(m.extra)):
+        return None
+    valid = m.position is not None and m.rotation is not None and m.covariance is not None
+    pose, odometry, covariance, depends_on = _pose(np.eye(3), np.zeros(3)), _pose(np.eye(3), np.zeros(3)), np.eye(6), 0
+    if m.position is not None and m.rotation is not None and m.covariance is not None:
+        pose, covariance = _pose(m.rotation, m.position + origin), np.asarray(m.covariance, dtype=np.float64)
+        odometry, depends_on = _pose(*from_six(m.extra["odometry"])), int(m.extra["depends_on"][0])
+    return make(
+        "coopenv_msgs/msg/RobustReport",
+        header=header(stamp, "map"),
+        valid=valid,
+        pose=pose,
+        covariance=covariance.ravel(),
+        odometry=odometry,
+        depends_on=depends_on,
+    )
+
+
+def _pose(R: Array, p: Array) -> Any:
+    x, y, z, w = Rotation.from_matrix(np.array(R)).as_quat().tolist()
+    return make(
+        "geometry_msgs/msg/Pose",
+        position=make("geometry_msgs/msg/Point", x=float(p[0]), y=float(p[1]), z=float(p[2])),
+        orientation=make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+    )
+
+
+def checked(told: Told) -> bool:
+    """Return whether an estimate is one that others can read."""
+    numbers = np.concatenate([told.rotation.ravel(), told.position, told.covariance.ravel()])
+    return bool(np.isfinite(numbers).all())
+
+
+STALE = round((TOPICS[Role.ESTIMATE].max_age or 0.0) * 1e9)
+"""ns after which what another car has said no longer counts."""
+NS = 1e-9
+
+Placed = TypeVar("Placed", bound=Pose | Report)
+
+
+class Hearsay:
+    """Keeps what has been said; times in ns on the receiver's clock, positions on the scenario's map."""
+
+    def __init__(self, binding: Binding, refused: Counter[str]) -> None:
+        """Begin with nothing.
+
+        Args:
+            binding: who is who.
+            refused: where messages are counted that are not used, by reason.
+        """
+        self._binding, self._refused, scenario = binding, refused, binding.scenario
+        self._origin = np.array(scenario.map.origin)
+        places = [np.array(m.position) + rotation_of(m.yaw, None) @ np.array(m.marker) for m in scenario.landmarks]
+        self._landmarks = np.array(places).reshape(-1, 3) - self._origin
+        self._led = {landmark: PlaceTrack() for landmark in binding.leaders.values()}
+        self._hears = neighbour_sets(scenario)  # targets by vehicle
+        markers = [*(m.marker for m in scenario.landmarks), *(v.marker for v in scenario.vehicles)]
+        self._markers = [np.array(marker) for marker in markers]
+        self._heard: dict[int, dict[Role, tuple[int, Pose | Report]]] = {}  # since the last tick
+        self._said: dict[tuple[int, Role], int] = {}  # stamp of a target's last message
+
+    def on_map(self, told: Placed) -> Placed:
+        """Return what holds in the coordinates of the scenario's file as on its map."""
+        return told if told.position is None else replace(told, position=told.position - self._origin)
+
+    def put_landmark(self, landmark: int, role: Role, stamp: int, age: int, pose: Pose) -> None:
+        """Take what a moving landmark has said of itself; `age` is that with which it came."""
+        position = message_of(self.on_map(pose), self._markers[landmark]).position
+        if age > STALE:
+            self._refused["stale message"] += 1
+        elif position is not None and self._is_new(landmark, role, stamp):
+            self._led[landmark].put(stamp, position)  # unless it has said so in another role
+
+    def put_vehicle(self, vehicle: int, role: Role, stamp: int, told: Pose | Report) -> None:
+        """Take what a vehicle that is estimated elsewhere has said."""
+        if self._is_new(len(self._landmarks) + vehicle, role, stamp):
+            self._heard.setdefault(vehicle, {})[role] = stamp, self.on_map(told)
+
+    def _is_new(self, target: int, role: Role, stamp: int) -> bool:
+        """Return whether a message is newer than the last one of a target; count it where it is older, or replayed."""
+        if stamp <= self._said.get((target, role), 0):
+            self._refused["message out of order"] += 1
+            return False
+        self._said[target, role] = stamp
+        return True
+
+    def forget(self) -> None:
+        """Forget what vehicles have said."""
+        self._heard.clear()
+
+    def is_lost(self, target: int, now: int) -> bool:
+        """Return whether a target is a moving landmark of which nobody knows where it is now."""
+        return target in self._led and now - self._led[target].stamp > STALE
+
+    def places(self, now: int, when: int) -> Array:
+        """Return (L, 3) where the landmarks were at a time `when`; who is lost by now is where it has been last."""
+        places: Array = self._landmarks.copy()
+        for landmark, track in self._led.items():
+            if track.stamp >= 0:
+                places[landmark] = track.last if self.is_lost(landmark, now) else track.at(when)
+        return places
+
+    def messages(self, now: int) -> dict[tuple[int, int], Received]:
+        """Return what has come since the last call, by receiver and sender.
+
+        The environment says who hears whom; its delays and losses do not count, as the radio is a real one.
+        """
+        found, L = {}, len(self._landmarks)
+        for sender, by_role in self._heard.items():
+            receivers = [i for i in self._binding.local if L + sender in self._hears[i]]
+            newest = by_role.get(Role.REPORT) or by_role.get(Role.ESTIMATE) or by_role.get(Role.POINT)
+            if newest is None or not receivers:
+                continue
+            stamp, told = newest
+            if now - stamp > STALE:
+                self._refused["stale message"] += 1
+                continue
+            message = message_of(told, self._markers[L + sender])
+            found.update({(i, sender): Received(message, max(0, now - stamp) * NS) for i in receivers})
+        self._heard.clear()
+        return found

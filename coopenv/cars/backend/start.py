@@ -1,0 +1,175 @@
+"""The beginning of an episode of cars: they are heard, checked, and armed if that is asked for."""
+
+import gc
+import time
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend.assembler import VELOCITY, Intake
+from coopenv.cars.backend.gates import Gates
+from coopenv.cars.backend.station import Station
+from coopenv.cars.backend.status import StatusBoard
+from coopenv.cars.backend.watchdog import Vitals, Watchdog, misplaced
+from coopenv.cars.codec import encode, make
+from coopenv.cars.deployment import Deployment
+from coopenv.cars.samples import Calibration
+from coopenv.cars.topics import RESET_TOPIC, Role, topic_of
+from coopenv.cars.transport.base import Transport
+
+PIXELS = 2.0
+"""By which a camera's own calibration may differ from the environment's."""
+DISTORTION = 0.02  # likewise, each coefficient
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """What is checked."""
+
+    deployment: Deployment
+    calibrations: dict[str, Calibration]  # of the environment, by car
+    station: Station
+    intake: Intake
+    board: StatusBoard
+    vitals: Vitals
+    others: Collection[str]  # cars of the fleet that are not driven here
+
+
+def problems_of(fleet: Fleet) -> Iterator[str]:
+    """Yield what is not as it has to be, the first that one would look at first."""
+    safety, sensors = fleet.deployment.safety, fleet.deployment.sensors
+    for car in fleet.calibrations:
+        yield from _its_clock(fleet, car)  # by which all else is judged
+        for role in VELOCITY[sensors.odometry]:
+            topic = topic_of(car, role)
+            if (age := fleet.station.silence(topic)) > safety.odometry_age:
+                yield f"{car}: no odometry on {topic} {_since(age)}"
+            if (age := fleet.vitals.age(car, role)) > safety.odometry_age:
+                yield f"{car}: nothing new that could be used on {topic} {_since(age)}"
+        camera = topic_of(car, Role(sensors.detections))
+        if (age := fleet.station.silence(camera)) > safety.odometry_age:
+            yield f"{car}: no camera frames on {camera} {_since(age)}"
+        yield from _about_itself(fleet, car)
+    if safety.judge == "truth":  # what cars believe is not known before they drive
+        for car, wrong in misplaced(safety, fleet.vitals, fleet.calibrations, fleet.others):
+            yield f"{car}: {wrong}"
+
+
+def _its_clock(fleet: Fleet, car: str) -> Iterator[str]:
+    safety, offset = fleet.deployment.safety, fleet.intake.offsets[car].seconds
+    if offset is not None and abs(offset) > safety.max_clock_offset:
+        yield (
+            f"{car}: its clock is {abs(offset) * 1e3:.0f} ms {'behind' if offset > 0 else 'ahead of'} this computer's, "
+            f"{safety.max_clock_offset * 1e3:.0f} ms are allowed: let chrony or PTP synchronise them"
+        )
+
+
+def _about_itself(fleet: Fleet, car: str) -> Iterator[str]:
+    safety = fleet.deployment.safety
+    if obstacle := fleet.board.obstacle(car):
+        yield f"{car}: {obstacle}"
+    battery = fleet.board.battery(car)
+    if battery is None and fleet.deployment.conditions and safety.min_battery > 0.0:
+        yield f"{car}: its battery does not tell how much is left (safety.min_battery = 0 does without)"
+    if battery is not None and battery < safety.min_battery:
+        yield f"{car}: its battery is at {100 * battery:.0f} %, {100 * safety.min_battery:.0f} % are needed"
+    told, used = fleet.board.calibration(car), fleet.calibrations[car]
+    if told is not None and (difference := _difference(told, used)):
+        yield f"{car}: its camera says {difference}"
+
+
+def _difference(told: Calibration, used: Calibration) -> str:
+    """Return in which entry two calibrations differ, empty where they agree."""
+    for name, tolerance in (("image_size", 0.5), ("focal_length", PIXELS), ("principal_point", PIXELS)):
+        a, b = getattr(told, name), getattr(used, name)
+        if (np.abs(np.subtract(a, b)) > tolerance).any():
+            return f"{name} = {list(a)}, the environment says {list(b)}"
+    if (np.abs(np.subtract(told.distortion, used.distortion)) > DISTORTION).any():
+        return f"distortion = {list(told.distortion)}, the environment says {list(used.distortion)}"
+    return ""
+
+
+def _since(age: float) -> str:
+    return "(nothing has ever come)" if np.isinf(age) else f"for {age:.2f} s"
+
+
+FIRST_WORD = 3.0  # s that cars have to be heard in at the first reset
+CAMERA_WORD = 1.5  # s in which a camera has to say of itself what it is; some never do
+READY_WORD = 2.0  # s in which all has to be at once as arming wants it; cars tell of themselves once a second
+SETTLE = 0.5  # s that fakes have to stand where they were put
+
+
+class Start:
+    """Begins episodes."""
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        transport: Transport,
+        gates: Gates,
+        watchdog: Watchdog,
+        odometry: Collection[Role],
+        drain: Callable[[], None],
+    ) -> None:
+        """Say of what.
+
+        Args:
+            fleet: what is checked.
+            transport: the network.
+            gates: of the cars.
+            watchdog: looks after them.
+            odometry: what each car has to measure.
+            drain: takes what has come.
+        """
+        self._fleet, self._transport, self._gates, self._watchdog = fleet, transport, gates, watchdog
+        self._topics = [topic_of(name, role) for name in fleet.calibrations for role in odometry]
+        self._drain, self._heard_once = drain, False
+
+    def prepare(self, seed: int) -> None:
+        """Free memory now, as that would take longer than a decision may, and put fakes at the start of a seed."""
+        gc.unfreeze()
+        gc.collect()
+        gc.freeze()  # what is left is not looked through again while cars drive
+        if self._fleet.deployment.fakes:
+            signed = (seed + 2**63) % 2**64 - 2**63  # the same 64 bits
+            self._transport.publish(RESET_TOPIC, encode(make("std_msgs/msg/Int64", data=signed)), reliable=True)
+            time.sleep(SETTLE)
+
+    def listen(self, arm: bool) -> None:
+        """Wait until the cars have been heard, but not for ever: they need not be there as long as nobody drives."""
+        silence, board = self._fleet.station.silence, self._fleet.board
+        _wait(lambda: all(silence(topic) < 1.0 for topic in self._topics), 0 if self._heard_once else FIRST_WORD)
+        if arm:
+            _wait(lambda: all(board.calibration(name) is not None for name in self._fleet.calibrations), CAMERA_WORD)
+        self._heard_once = True
+        self._drain()
+
+    def arm(self, release: bool) -> None:
+        """Open the gates and look after the cars.
+
+        Args:
+            release: whether cars, too, that somebody else has stopped.
+
+        Raises:
+            CoopenvError: something is not as it has to be before wheels turn.
+        """
+        _wait(lambda: self._problem() is None, READY_WORD)
+        if found := self._problem():
+            raise CoopenvError(f"not armed: {found}")
+        self._watchdog.forget()
+        self._fleet.board.begin()
+        self._gates.begin(release or self._fleet.deployment.fakes)
+        self._watchdog.arm()
+
+    def _problem(self) -> str | None:
+        self._drain()
+        return next(problems_of(self._fleet), None)
+
+
+def _wait(ready: Callable[[], bool], patience: float) -> None:
+    """Wait for something to become true, s at most."""
+    until = time.monotonic() + patience
+    while time.monotonic() < until and not ready():
+        time.sleep(0.02)

@@ -1,0 +1,136 @@
+"""What cars say of themselves besides what their sensors measure: armed, driven by remote control, battery, camera."""
+
+import threading
+import time
+from dataclasses import dataclass, field, replace
+
+from coopenv.base.errors import CoopenvError, shown
+from coopenv.cars.codec import decode, stamp_of
+from coopenv.cars.deployment import Remote
+from coopenv.cars.readings import read
+from coopenv.cars.samples import Calibration, Status
+from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.transport.base import Arrival, Transport
+
+CONDITIONS = (Role.STATE, Role.REMOTE, Role.BATTERY)
+ROLES = (*CONDITIONS, Role.CAMERA_INFO)
+
+
+@dataclass(frozen=True)
+class Condition:
+    """What a car has said last of itself."""
+
+    said: Status = field(default_factory=Status)
+    stamps: dict[Role, int] = field(default_factory=dict)  # ns, clock of the car
+    since: dict[Role, float] = field(default_factory=dict)  # s, monotonic: when what was said held
+
+    def age(self, role: Role) -> float:
+        """Return how old the last word is, s; inf: there has been none."""
+        return time.monotonic() - self.since.get(role, float("-inf"))
+
+
+class StatusBoard:
+    """The last word of each car, and what has happened to it since arming."""
+
+    def __init__(self, transport: Transport, cars: tuple[str, ...], remote: Remote, needed: bool) -> None:
+        """Listen to the cars.
+
+        Args:
+            transport: the network.
+            cars: their names.
+            remote: channels of their remote controls.
+            needed: whether silence of a car about itself counts against it.
+        """
+        self._lock = threading.Lock()
+        self._remote, self._needed = remote, needed
+        self._topics = {topic_of(car, role): (car, role) for car in cars for role in ROLES}
+        self._conditions = {car: Condition() for car in cars}
+        self._begun: dict[str, Condition] = {}  # as it was at arming
+        self._happened: dict[str, str] = {}
+        self._calibration: dict[str, Calibration] = {}
+        for topic in self._topics:
+            transport.subscribe(topic, self._take)
+
+    def battery(self, car: str) -> float | None:
+        """Return the share of a car's battery that is left; None: it is not known."""
+        with self._lock:
+            return self._conditions[car].said.battery
+
+    def calibration(self, car: str) -> Calibration | None:
+        """Return what a car's camera says of itself; None: nothing yet."""
+        with self._lock:
+            return self._calibration.get(car)
+
+    def begin(self) -> None:
+        """Take the cars as they are now for as they have to stay."""
+        with self._lock:
+            self._begun, self._happened = dict(self._conditions), {}
+
+    def obstacle(self, car: str) -> str:
+        """Return why a car is not to be armed, by what it says of itself; empty: nothing stands against it."""
+        with self._lock:
+            now = self._conditions[car]
+        for role in CONDITIONS if self._needed else ():
+            if why := _silent(now, car, role):
+                return why
+        if self._remote.drives(now.said.pulses or ()):
+            return "is driven by remote control"
+        if not self._needed:
+            return ""
+        return self._remote.fault(now.said.pulses or ()) or ("" if now.said.armed else "its autopilot is not armed")
+
+    def happened(self, car: str) -> str:
+        """Return why a car that was armed is to be stopped, by what it has said of itself since; empty: no reason."""
+        with self._lock:
+            now, happened = self._conditions[car], self._happened.get(car, "")
+        return happened or (_silent(now, car, Role.REMOTE) if self._needed else "")
+
+    def _take(self, arrival: Arrival) -> None:
+        car, role = self._topics[arrival.topic]
+        try:
+            message = decode(arrival.payload, TOPICS[role].type)
+            value, stamp = read(role, message), stamp_of(message)
+        except CoopenvError:
+            return
+        delay = (arrival.received - stamp) * 1e-9
+        with self._lock:
+            if isinstance(value, Calibration):
+                self._calibration[car] = value
+            elif isinstance(value, Status) and abs(delay) <= (TOPICS[role].max_age or 0.0):
+                before = self._conditions[car]
+                if stamp > before.stamps.get(role, -1):
+                    since = {**before.since, role: time.monotonic() - max(delay, 0.0)}
+                    now = Condition(_joined(before.said, value, role), {**before.stamps, role: stamp}, since)
+                    self._conditions[car] = now
+                    if car in self._begun and (why := self._changed(self._begun[car].said, now.said)):
+                        self._happened.setdefault(car, why)
+
+    def _changed(self, then: Status, now: Status) -> str:
+        pulses = now.pulses or ()
+        if self._remote.drives(pulses):
+            return "is driven by remote control"
+        if self._needed and (fault := self._remote.fault(pulses)):
+            return fault
+        if self._remote.switched(pulses, then.pulses or ()):
+            return "the mode switch of its remote control was moved"
+        if now.armed is False and (self._needed or then.armed):
+            return "its autopilot is no longer armed"
+        if then.mode is not None and now.mode != then.mode:
+            return f"its autopilot went from mode {shown(then.mode)} to {shown(now.mode)}"
+        return ""
+
+
+def _joined(before: Status, value: Status, role: Role) -> Status:
+    """Return what a car has said with what it says in one role in place of that before."""
+    if role is Role.STATE:
+        return replace(before, armed=value.armed, mode=value.mode)
+    if role is Role.REMOTE:
+        return replace(before, pulses=value.pulses)
+    return replace(before, battery=value.battery)
+
+
+def _silent(condition: Condition, car: str, role: Role) -> str:
+    age, topic = condition.age(role), topic_of(car, role)
+    if age <= (TOPICS[role].max_age or 0.0):
+        return ""
+    return f"nothing of use has {'ever come' if age == float('inf') else f'come for {age:.2f} s'} on {topic}"

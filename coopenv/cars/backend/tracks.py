@@ -1,0 +1,211 @@
+"""Samples of one body at any time between: odometry, motion capture, moving landmarks, camera frames."""
+
+from bisect import bisect_right
+from collections import deque
+from itertools import islice
+
+import numpy as np
+
+from coopenv.cars.samples import Detections, Pose, Twist
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.rotations import exp_so3, log_so3, rigid_exp
+
+MOST_SAMPLES = 512
+"""Of which the car has been told no time yet: five seconds of an IMU."""
+
+
+class Odometer:
+    """Held twists of one car; times in ns on one clock."""
+
+    def __init__(self) -> None:
+        self._samples: deque[tuple[int, Array, Array]] = deque()  # since when, v m/s, omega rad/s
+        self._now: tuple[Array, Array] = (np.zeros(3), np.zeros(3))  # held at the last time asked for
+        self._newest: tuple[Array | None, Array | None] = (None, None)
+        self._stamps: dict[str, int] = {}
+        self.disordered = 0
+        """Samples that were older than one of the same kind before."""
+
+    @property
+    def stamp(self) -> int | None:
+        """When the older one of the last velocity and the last turn rate was taken; None: one has never come."""
+        return min(self._stamps.values()) if len(self._stamps) == 2 else None
+
+    @property
+    def twist(self) -> tuple[Array, Array]:
+        """The newest velocity, m/s, and turn rate, rad/s; zero where none has come."""
+        v, w = self._newest
+        return np.zeros(3) if v is None else v, np.zeros(3) if w is None else w
+
+    def put(self, stamp: int, twist: Twist) -> None:
+        """Take a sample of the velocity, of the turn rate, or of both."""
+        parts = {"linear": twist.linear, "angular": twist.angular}
+        known = [name for name, part in parts.items() if part is not None]
+        if any(stamp <= self._stamps.get(name, -1) for name in known):
+            self.disordered += 1
+            return
+        self._stamps.update(dict.fromkeys(known, stamp))
+        v, w = self._newest
+        self._newest = (v if twist.linear is None else twist.linear, w if twist.angular is None else twist.angular)
+        self._insert(stamp, twist)
+        if len(self._samples) > MOST_SAMPLES:
+            _, v, w = self._samples.popleft()
+            self._now = v, w
+
+    def _insert(self, stamp: int, twist: Twist) -> None:
+        """Keep the samples in order: those of two sensors come interleaved, later ones hold the new part as well."""
+        later = []
+        while self._samples and self._samples[-1][0] > stamp:
+            later.append(self._samples.pop())
+        _, v, w = self._samples[-1] if self._samples else (0, *self._now)
+        v, w = (v if twist.linear is None else twist.linear), (w if twist.angular is None else twist.angular)
+        self._samples.append((stamp, v, w))
+        for since, v, w in reversed(later):  # the other sensor's: its own part stands, this one's is the new one
+            part = (v if twist.linear is None else twist.linear), (w if twist.angular is None else twist.angular)
+            self._samples.append((since, *part))
+
+    def increment(self, begin: int, end: int) -> tuple[Array, Array]:
+        """Return the rotation (3, 3) and translation (3,) in m from `begin` to `end`, and forget what was before."""
+        R, p = np.eye(3), np.zeros(3)
+        now = begin
+        while self._samples and self._samples[0][0] <= end:
+            since, v, w = self._samples.popleft()
+            if since > now:
+                R, p = self._go(R, p, since - now)
+                now = since
+            self._now = v, w
+        if end > now:
+            R, p = self._go(R, p, end - now)
+        return R, p
+
+    def _go(self, R: Array, p: Array, duration: int) -> tuple[Array, Array]:
+        v, w = self._now
+        seconds = duration * 1e-9
+        turn, step = rigid_exp(w * seconds, v * seconds)
+        return R.dot(turn), p + R.dot(step)
+
+
+MOST_POSES = 256
+LONGEST_GAP = 100_000_000  # ns between two poses over which anything is interpolated, and beyond the last one
+UNKNOWN = (np.full((3, 3), np.nan), np.full(3, np.nan))
+
+
+class PoseTrack:
+    """The last poses of one body; times in ns on one clock."""
+
+    def __init__(self) -> None:
+        self._poses: deque[tuple[int, Array, Array]] = deque(maxlen=MOST_POSES)
+
+    @property
+    def stamp(self) -> int | None:
+        """When the last one was taken; None: there is none."""
+        return self._poses[-1][0] if self._poses else None
+
+    def put(self, stamp: int, pose: Pose) -> bool:
+        """Take a pose; return False where it is older than one before, or has no rotation."""
+        if pose.rotation is None or (self._poses and stamp <= self._poses[-1][0]):
+            return False
+        self._poses.append((stamp, pose.rotation, pose.position))
+        return True
+
+    def at(self, time: int) -> tuple[Array, Array]:
+        """Return the rotation (3, 3) and position (3,) at a time, NaN where too little is known about it."""
+        after = bisect_right(self._poses, time, key=lambda pose: pose[0])
+        if after == 0:
+            return UNKNOWN
+        before, R, p = self._poses[after - 1]
+        if after == len(self._poses):
+            near = time - before
+            if near > LONGEST_GAP:
+                return UNKNOWN
+            if after == 1 or near == 0:
+                return R, p
+            earlier, R0, p0 = self._poses[after - 2]  # goes on as it went
+            return self._between((earlier, R0, p0), (before, R, p), time)
+        return self._between((before, R, p), next(islice(self._poses, after, None)), time)
+
+    @staticmethod
+    def _between(first: tuple[int, Array, Array], second: tuple[int, Array, Array], time: int) -> tuple[Array, Array]:
+        (t0, R0, p0), (t1, R1, p1) = first, second
+        if t1 - t0 > LONGEST_GAP:
+            return UNKNOWN
+        share = (time - t0) / (t1 - t0)
+        return R0 @ exp_so3(share * log_so3(R0.T @ R1)), p0 + share * (p1 - p0)
+
+
+KEPT = 64  # positions: a second of them
+
+
+class PlaceTrack:
+    """The last positions of one landmark; times in ns on one clock."""
+
+    def __init__(self) -> None:
+        self._places: deque[tuple[int, Array]] = deque(maxlen=KEPT)
+
+    @property
+    def stamp(self) -> int:
+        """When it was at the last one; -1: it has told none."""
+        return self._places[-1][0] if self._places else -1
+
+    @property
+    def last(self) -> Array:
+        """(3,) where it has told last to be."""
+        return self._places[-1][1]
+
+    def put(self, stamp: int, position: Array) -> bool:
+        """Take a position (3,); return False where it is older than one before."""
+        if stamp <= self.stamp:
+            return False
+        self._places.append((stamp, position))
+        return True
+
+    def at(self, time: int) -> Array:
+        """Return the position (3,) at a time: between two on the straight line, and for a while beyond the last one.
+
+        Before the first one that is kept it is that one.
+        """
+        last, place = self._places[-1]
+        if time > last and len(self._places) > 1:
+            before, earlier = self._places[-2]
+            if last - before <= LONGEST_GAP:
+                going: Array = place + (place - earlier) * (min(time - last, LONGEST_GAP) / (last - before))
+                return going
+        stamps = np.array([stamp - time for stamp, _ in self._places], dtype=np.float64)
+        places = np.array([place for _, place in self._places])
+        return np.array([np.interp(0.0, stamps, axis) for axis in places.T])
+
+
+MOST_WAITING = 2
+"""Frames that may wait after a tick has taken one: clocks of cameras and ticks drift past each other, so that now and
+then two come within a tick. More mean that the computer lags behind, and the oldest are left out."""
+
+
+class Frames:
+    """The queue of one car; times in ns on one clock."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[tuple[int, Detections]] = deque()
+        self._newest = -1
+        self.disordered = 0
+        """Frames that were older than one before."""
+        self.skipped = 0
+        """Frames that were left out because too many waited."""
+
+    def put(self, stamp: int, frame: Detections) -> None:
+        """Take a frame."""
+        if stamp <= self._newest:
+            self.disordered += 1
+            return
+        self._newest = stamp
+        self._waiting.append((stamp, frame))
+        while len(self._waiting) > MOST_WAITING + 1:
+            self._waiting.popleft()
+            self.skipped += 1
+
+    def take(self, after: int, until: int) -> tuple[int, Detections] | None:
+        """Return the oldest frame exposed after a time and by another one; None: there is none."""
+        while self._waiting and self._waiting[0][0] <= after:
+            self._waiting.popleft()
+            self.disordered += 1
+        if not self._waiting or self._waiting[0][0] > until:
+            return None
+        return self._waiting.popleft()

@@ -1,0 +1,273 @@
+"""What stops the cars whatever the program that drives them does: a thread of its own."""
+
+import threading
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend.gates import OLD, Gates
+from coopenv.cars.backend.station import Station
+from coopenv.cars.deployment import Safety
+from coopenv.cars.limits import inside
+from coopenv.cars.samples import Pose, Report, Sample
+from coopenv.cars.topics import Role, topic_of
+from coopenv.estimation.arrays import Array
+
+AHEAD = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a car is."""
+
+    position: Array  # (3,) m, in the coordinates of the scenario's file
+    time: int  # ns, when that was known
+
+
+class Vitals:
+    """Kept by the step loop, read by the watchdog's thread; times are in ns on the receiver's clock.
+
+    Bytes that come are no sign of life: what counts is a message that can be read, with a stamp newer than all before.
+    """
+
+    def __init__(self, judge: Literal["truth", "estimate"]) -> None:
+        """Say by what places are judged: motion capture, or what the cars believe."""
+        self._judge = judge
+        self._stamps: dict[tuple[str, Role], int] = {}
+        self._told: dict[tuple[str, Role], int] = {}
+        self.places: Mapping[str, Place] = {}
+        """Replaced as a whole whenever one changes."""
+        self.looked = 0
+        """When messages were looked at last."""
+        self._begun = 0
+
+    def begin(self, now: int) -> None:
+        """Forget where the cars were."""
+        self.places, self.looked, self._begun = {}, now, now
+
+    def put(self, sample: Sample) -> None:
+        """Take a sample."""
+        key = sample.car, sample.role
+        if sample.stamp > sample.received + AHEAD or sample.stamp <= self._stamps.get(key, -1):
+            return
+        self._stamps[key] = sample.stamp
+        # Motion capture has a clock of its own, of which nobody knows how late it is.
+        self._told[key] = sample.received if sample.role is Role.TRUTH else min(sample.stamp, sample.received)
+        judging = (Role.TRUTH,) if self._judge == "truth" else (Role.ESTIMATE, Role.REPORT, Role.POINT)
+        if sample.role in judging and isinstance(sample.value, Pose | Report) and sample.value.position is not None:
+            self.place(sample.car, sample.value.position, self._told[key])
+
+    def place(self, car: str, position: Array, time: int) -> None:
+        """Say where a car is, m, and when that was known."""
+        if np.isfinite(position).all():
+            self.places = {**self.places, car: Place(position, time)}
+
+    def age(self, car: str, role: Role) -> float:
+        """Return how old a sensor's last word was when messages were looked at last, s; inf: it has never spoken."""
+        told = self._told.get((car, role))
+        return float("inf") if told is None else max(self.looked - told, 0) * 1e-9
+
+    def lost(self, car: str) -> float:
+        """Return for how long nobody had known where a car was when messages were looked at last, s."""
+        place = self.places.get(car)
+        return max(self.looked - (self._begun if place is None else place.time), 0) * 1e-9
+
+
+def misplaced(
+    safety: Safety, vitals: Vitals, cars: Collection[str], others: Collection[str]
+) -> Iterator[tuple[str, str]]:
+    """Yield the car and what is wrong with where it is, in words.
+
+    Args:
+        safety: fence, separation, and how old a place may be.
+        vitals: knows where the cars are.
+        cars: those that are driven here: each has to be inside the fence.
+        others: those that are not; the former have to be apart from all.
+    """
+    apart = safety.separation > 0.0
+    watched = [*cars, *others] if apart else [*cars] if safety.geofence else []
+    for car in watched:
+        never = car not in vitals.places
+        if vitals.lost(car) > safety.truth_age or (never and safety.judge == "truth"):
+            since = "is not known" if never else f"has not been known for {vitals.lost(car):.2f} s"
+            by = [
+                name for name, judged in (("fence", safety.geofence and car in cars), ("separation", apart)) if judged
+            ]
+            yield car, f"its place {since}: {' and '.join(by)} cannot be judged"
+    places = {car: vitals.places[car].position for car in watched if car in vitals.places}
+    for car in cars:
+        if safety.geofence and car in places:
+            x, y = float(places[car][0]), float(places[car][1])
+            if not inside(safety.geofence, x, y):
+                yield car, f"left the geofence at ({x:.2f}, {y:.2f}) m"
+    if safety.separation > 0.0:
+        yield from _too_close(safety.separation, places, cars)
+
+
+def _too_close(least: float, places: dict[str, Array], cars: Collection[str]) -> Iterator[tuple[str, str]]:
+    names = list(places)
+    for i, car in enumerate(names):
+        for other in names[i + 1 :]:
+            distance = float(np.linalg.norm(places[car][:2] - places[other][:2]))
+            if distance < least and (car in cars or other in cars):
+                yield car, f"{distance:.2f} m from {other}, {least:g} m is the least"
+
+
+PERIOD = 0.01  # s between looks
+REPEAT = 0.2  # s between emergency stops that are sent again
+STALL = 0.05  # s by which a look may come late: beyond that messages wait to be received, and silence says nothing yet
+OPEN = ("armed", "timed_out")
+"""States of a gate that takes commands: one that has timed out lets the car stand until the next one."""
+
+
+@dataclass(frozen=True)
+class Trip:
+    """Why the cars were stopped."""
+
+    reason: str
+    car: str | None = None  # whose fault it was; None: nobody's
+    time: float = 0.0  # monotonic, s
+
+
+class Watchdog:
+    """Looks after cars while they are armed; once it has stopped them they stay so until it is armed again."""
+
+    def __init__(
+        self,
+        safety: Safety,
+        station: Station,
+        gates: Gates,
+        vitals: Vitals,
+        cars: Collection[str],
+        others: Collection[str],
+        odometry: Collection[Role],
+        decision: float,
+    ) -> None:
+        """Begin to look.
+
+        Args:
+            safety: what is allowed.
+            station: where messages come.
+            gates: of the cars.
+            vitals: what the messages have told.
+            cars: those that are driven here.
+            others: the other ones of the fleet.
+            odometry: what each car has to measure.
+            decision: s between decisions.
+        """
+        self._safety, self._station, self._gates, self._vitals = safety, station, gates, vitals
+        self._cars, self._others, self._odometry, self._decision = cars, others, odometry, decision
+        self._lock = threading.Lock()
+        self._armed, self._closed = False, threading.Event()
+        self.trip: Trip | None = None
+        self.on_stop: Callable[[Trip], None] = lambda trip: None
+        self._beat: float | None = None  # of the last decision; None: there has been none
+        self._missed = 0
+        self._present: dict[str, bool] = {}
+        self.happened: Callable[[str], str] = lambda car: ""
+        """Returns why a car is to be stopped by what it says of itself; empty: for nothing."""
+        self._thread = threading.Thread(target=self._watch, name="coopenv watchdog", daemon=True)
+        self._thread.start()
+
+    def forget(self) -> None:
+        """Stop the cars no longer for what was before, so that they can be armed."""
+        with self._lock:
+            self.trip = None
+
+    def arm(self) -> None:
+        """Look after the cars from now on. Raises CoopenvError: nobody would."""
+        if not self._thread.is_alive():
+            raise CoopenvError("not armed: the watchdog has ended")
+        with self._lock:
+            self._armed, self._beat, self._missed = True, None, 0
+
+    def disarm(self) -> None:
+        """Look no longer: the cars stand."""
+        with self._lock:
+            self._armed = False
+
+    def beat(self, missed: int) -> None:
+        """Say that a decision has been made, after `missed` in a row that came late."""
+        self._beat, self._missed = time.monotonic(), missed
+
+    def set_present(self, car: str, there: bool) -> None:
+        """Say that a car's token has come or gone."""
+        self._present[car] = there
+
+    def stop(self, reason: str, car: str | None = None) -> None:
+        """Stop all cars at once; the first reason stands."""
+        with self._lock:
+            if not self._armed:
+                return
+            self._armed = False
+            self.trip = trip = Trip(reason, car, time.monotonic())
+        try:
+            self._gates.stop()
+            self.on_stop(trip)
+        finally:
+            self._gates.end()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._closed.set()
+        self._thread.join(timeout=1.0)
+
+    def _watch(self) -> None:
+        repeated, looked, stalled = 0.0, time.monotonic(), False
+        while not self._closed.wait(PERIOD):
+            before, looked = looked, time.monotonic()
+            stalled = not stalled and looked - before > PERIOD + STALL
+            if stalled:  # once: the next look tells, and comes so soon that no car gets further for it
+                continue
+            try:
+                if self._armed:
+                    self._look()
+                elif self.trip is not None and looked - repeated > REPEAT:
+                    repeated = looked
+                    self._gates.stop()
+            except Exception:  # of the network, while it is told to stop: it is told again
+                continue
+
+    def _look(self) -> None:
+        try:
+            found = next(self._problems(), None)
+        except Exception as error:  # a watchdog that fails has to stop the cars
+            found = Trip(f"the watchdog failed: {type(error).__name__}: {error}")
+        if found is not None:
+            self.stop(found.reason, found.car)
+
+    def _problems(self) -> Iterator[Trip]:
+        for car in self._cars:
+            yield from self._of_car(car)
+        for car, gate in self._gates.states.items():
+            if gate.age > OLD:
+                yield Trip(f"{car}: its gate is silent for {gate.age:.2f} s", car)
+            elif gate.state not in OPEN or gate.session != self._gates.session:
+                yield Trip(f"{car}: its gate is {gate.state}", car)
+        missed, beat = self._safety.missed_deadlines, self._beat
+        if self._missed >= missed:
+            yield Trip(f"{self._missed} decisions in a row came too late")
+        if beat is None:
+            return
+        if (age := time.monotonic() - beat) > (missed + 1) * self._decision:
+            yield Trip(f"no decision for {age:.2f} s")
+        for car, wrong in misplaced(self._safety, self._vitals, self._cars, self._others):
+            yield Trip(f"{car}: {wrong}", car)
+
+    def _of_car(self, car: str) -> Iterator[Trip]:
+        longest = self._safety.odometry_age
+        for role in self._odometry:
+            topic = topic_of(car, role)
+            if (age := self._station.silence(topic)) > longest:
+                yield Trip(f"{car}: no odometry on {topic} for {age:.2f} s", car)
+            # Only the step loop reads messages, so that this means nothing before the first step.
+            if self._beat is not None and (age := self._vitals.age(car, role)) > longest:
+                yield Trip(f"{car}: nothing new that could be used on {topic} for {age:.2f} s", car)
+        if self._present.get(car) is False:
+            yield Trip(f"{car}: is gone", car)
+        if why := self.happened(car):
+            yield Trip(f"{car}: {why}", car)

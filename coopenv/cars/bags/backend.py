@@ -1,0 +1,134 @@
+"""A ROS bag in the place of the simulated world."""
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from coopenv.backends.base import Capabilities, Episode, TickGenerator
+from coopenv.base.errors import CoopenvError, DataError, DataWarning, ScenarioWarning
+from coopenv.cars.backend.assembler import Assembler
+from coopenv.cars.backend.binding import OPTIONS, Binding, bind, wishes_of
+from coopenv.cars.bags.files import check_extra
+from coopenv.cars.bags.log import NS, Log, read_log
+from coopenv.cars.bags.topic_map import TopicMap, load_map
+from coopenv.cars.samples import Sample
+from coopenv.cars.topics import Role
+from coopenv.scenario import Scenario, load_scenario
+
+AHEAD = 100_000_000
+"""ns by which motion capture is read ahead of a tick, so that the truth lies between two of its poses."""
+
+OFF = 0.1
+"""Share by which the rate of a camera may differ from the environment's before somebody is told."""
+
+
+class Bag(TickGenerator):
+    """Bags as a backend. Ticks are the same in every episode; actions change nothing.
+
+    Tick 0 is one and a half camera periods after everything that is needed has begun to come, so that in what follows
+    a tick is half a period behind the frames of the camera that began last. Initial estimates and radio are those of
+    the environment: a seed draws them where they are random.
+    """
+
+    options = OPTIONS
+
+    def __init__(
+        self,
+        paths: Sequence[str | Path],
+        topics: str | Path | TopicMap,
+        overrides: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Read bags.
+
+        Args:
+            paths: of one recording; files or folders of ROS 1 or 2, for example one per car.
+            topics: the map, see docs/bags.md.
+            overrides: dotted keys of its environment, for example another observer's name; `horizon` shortens it.
+
+        Raises:
+            TopicMapError: the map is not valid.
+            DataError: a bag cannot be read, or something that is needed is missing.
+            CoopenvError: the environment or an override is not valid, or the extra is not installed.
+        """
+        check_extra()
+        self.map = topics if isinstance(topics, TopicMap) else load_map(topics)
+        changes = {**self.map.overrides, **(overrides or {})}
+        self.where = ", ".join(str(path) for path in paths)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ScenarioWarning)  # told below
+            self.binding = self._bind(load_scenario(self.map.environment_path, changes))
+        self.log = read_log([Path(path) for path in paths], self.map, self.binding)
+        self._begin, ticks = self._ticks()
+        scenario = self._scenario(changes, ticks)
+        self.binding = self._bind(scenario)
+        known = any(sample.role is Role.TRUTH for sample in self.log.samples)
+        super().__init__(scenario, Capabilities(known, False, False, ticks, batched=False, recorded=True))
+        for note in (*self.log.notes, *self._odd_rates()):
+            warnings.warn(f"{self.where}: {note}", DataWarning, stacklevel=2)
+
+    def _bind(self, scenario: Scenario) -> Binding:
+        return bind(scenario, self.map.cars, self.map.markers, self.map.path.name, None)
+
+    def _ticks(self) -> tuple[int, int]:
+        """Return when tick 0 is, ns, and how many ticks there are."""
+        needed = {(s.car, s.role) for s in self.log.samples if s.car in self.binding.cars and s.role is not Role.TRUTH}
+        spans = [self.log.span(car, role) for car, role in needed]
+        begin = max(first for first, _ in spans) + round(self.map.start * NS) + round(1.5 * NS / self._rate)
+        end = max(last for _, last in spans)
+        if self.map.duration is not None:
+            end = min(end, begin + round(self.map.duration * NS))
+        ticks = int((end - begin) * self._rate / NS + 0.5 + 1e-6) + 1  # the last one is half a period after its frame
+        if end < begin or ticks < 2:
+            span = max(0.0, (end - begin) / NS)
+            raise DataError(
+                f"{self.where}: {span:.3g} s in which everything that is needed comes, too few for two ticks"
+            )
+        return begin, ticks
+
+    @property
+    def _rate(self) -> float:
+        return float(self.binding.scenario.rates.camera)
+
+    def _scenario(self, changes: dict[str, Any], ticks: int) -> Scenario:
+        """Return the environment with the bag's length as its horizon."""
+        longest = (ticks - 1) / self._rate
+        asked = changes.get("horizon", longest)
+        scenario = load_scenario(self.map.environment_path, {**changes, "horizon": asked})
+        if scenario.horizon_ticks > ticks - 1:
+            raise CoopenvError(f"horizon: {scenario.horizon:g} s are more than {self.where} has ({longest:.4g} s)")
+        return scenario
+
+    def _odd_rates(self) -> Iterator[str]:
+        for row in self.log.rows:
+            if row.role in (Role.DETECTIONS, Role.BEARINGS) and row.rate and abs(row.rate / self._rate - 1.0) > OFF:
+                hint = f'say overrides = {{ "rates.camera" = {row.rate:.0f}.0 }} in the map'
+                yield f"{row.topic}: {row.rate:.1f} frames per second, the environment has {self._rate:g}: {hint}"
+
+    def episode(self, seed: int | None, options: Mapping[str, Any]) -> Episode:
+        """Go through the bags tick by tick; the option `arm` moves nobody."""
+        wishes_of(options)
+        assembler, feed = Assembler(self.binding), _Feed(self.log)
+        for k in range(self.scenario.horizon_ticks + 1):
+            now = self._begin + round(k * NS / self._rate)
+            for sample in feed.until(now):
+                assembler.put(sample)
+            yield assembler.begin(now) if k == 0 else assembler.tick(k, now)
+
+
+class _Feed:
+    """Samples in the order in which they are used."""
+
+    def __init__(self, log: Log) -> None:
+        self._samples = sorted(log.samples, key=_used)
+        self._next = 0
+
+    def until(self, now: int) -> Iterator[Sample]:
+        """Yield those for a tick at a time in ns that have not been yielded before."""
+        while self._next < len(self._samples) and _used(self._samples[self._next]) <= now:
+            yield self._samples[self._next]
+            self._next += 1
+
+
+def _used(sample: Sample) -> int:
+    return sample.stamp - AHEAD if sample.role is Role.TRUTH else sample.stamp

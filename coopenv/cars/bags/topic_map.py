@@ -1,0 +1,310 @@
+"""The map of a bag: which environment its cars drive in, which topic tells what, and how its clocks are read."""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from coopenv.base.errors import CoopenvError, DataError, listed, suggest
+from coopenv.cars.deployment import Car, Marker, Name, Number, Part, Positive, refuse_repeated
+from coopenv.cars.readings import READERS
+from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.scenario.validation import one_line
+
+READ = (
+    *(Role.DETECTIONS, Role.BEARINGS, Role.CAMERA_INFO, Role.WHEEL, Role.IMU, Role.ODOMETRY),
+    *(Role.ESTIMATE, Role.POINT, Role.TRUTH),
+)
+"""Roles that are of use in a bag."""
+
+PATTERNS: dict[str, dict[Role, tuple[str, ...]]] = {
+    "svea": {
+        **{role: (f"/{topic_of('{car}', role)}", f"/{{car}}/{TOPICS[role].suffix}") for role in READ if role in TOPICS},
+        Role.TRUTH: tuple(f"/{fleet}qualisys/{{body}}/{kind}" for fleet in ("fleet/", "") for kind in ("odom", "pose")),
+    },
+    "authors": {
+        Role.DETECTIONS: ("/{agent}/pixy_node/objectsInfo",),
+        Role.BEARINGS: ("/{agent}/pixy_landmark_detection/objectsBearing",),
+        Role.CAMERA_INFO: ("/{agent}/pixy_node/camera_info",),
+        Role.WHEEL: ("/{agent}/actuation_twist",),
+        Role.POINT: ("/{agent}/riccatiPoint",),
+        Role.TRUTH: ("/qualisys/{body}/pose", "/qualisys/{body}/odom"),
+    },
+    "none": {},
+}
+"""By name and role: the first of them that a bag has counts."""
+
+
+TopicName = Annotated[str, Field(max_length=256, pattern=r"^/[A-Za-z0-9_/~]+$")]
+
+
+class TopicMapError(CoopenvError):
+    """A file does not say what is in a bag."""
+
+
+class Topics(Part):
+    """Topics of one car, in place of those of the naming scheme."""
+
+    detections: TopicName | None = None
+    """pixy_camera/ObjectInfoArrayStamped: blocks in pixels."""
+    bearings: TopicName | None = None
+    """pixy_camera/ObjectBearingArrayStamped: unit vectors from the target to the camera, optical frame."""
+    camera_info: TopicName | None = None
+    """sensor_msgs/CameraInfo, in place of the environment's camera."""
+    wheel: TopicName | None = None
+    """geometry_msgs/TwistWithCovarianceStamped, TwistStamped or nav_msgs/Odometry: body twist by the wheels."""
+    imu: TopicName | None = None
+    """sensor_msgs/Imu: its turn rate."""
+    odometry: TopicName | None = None
+    """nav_msgs/Odometry, or a twist, of the car's own filter."""
+    estimate: TopicName | None = None
+    """geometry_msgs/PoseStamped, PoseWithCovarianceStamped or nav_msgs/Odometry: where a car is that is a landmark."""
+    point: TopicName | None = None
+    """geometry_msgs/PointStamped, likewise."""
+    truth: TopicName | None = None
+    """geometry_msgs/PoseStamped, PoseWithCovarianceStamped or nav_msgs/Odometry: motion capture."""
+
+    @property
+    def given(self) -> dict[Role, str]:
+        """What is set, by role."""
+        return {role: name for role in READ if (name := getattr(self, role.value)) is not None}
+
+
+class BagCar(Car):
+    """One car of the bag."""
+
+    body: Name | None = None
+    """{body} in the names of motion capture (default: its name)."""
+    topics: Topics = Topics()
+
+    @property
+    def names(self) -> dict[str, str]:
+        """What stands for it in the names of a scheme."""
+        agent = self.name if self.agent_number is None else f"agent{self.agent_number}"
+        return {"car": self.name, "agent": agent, "body": self.body or self.name}
+
+
+class Clocks(Part):
+    """How times are read."""
+
+    mode: Literal["auto", "stamps", "received"] = "auto"
+    """`auto`: stamps, moved by the offset of their clock where that is more than `tolerance`; `stamps`: stamps as they
+    are; `received`: when the recorder received a message, of sources without usable stamps."""
+    tolerance: Positive = 0.02
+    """s by which clocks may differ before stamps are moved: less is what networks need."""
+    offsets: dict[str, Number] = Field(default={}, max_length=64)
+    """s to add to the stamps of a car, or of `truth`, in place of the offset that was found."""
+
+
+class Frame(Part):
+    """Where the frame of positions in a bag is in the environment's coordinates."""
+
+    position: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
+    """Its origin, m."""
+    yaw: Number = 0.0
+    """By which it is turned to the left, rad."""
+
+
+class Frames(Part):
+    """Frames of the bag's positions."""
+
+    map: Frame = Frame()
+    """Of what cars say."""
+    truth: Frame | None = None
+    """Of motion capture (default: the same)."""
+
+
+class TopicMap(Part):
+    """What a bag holds."""
+
+    environment: str
+    """Name of an environment, or TOML file (relative to this file): landmarks, cameras, noise and observer."""
+    overrides: dict[str, Any] = Field(default={})
+    """Dotted keys of it."""
+    names: Literal["svea", "authors", "none"] = "svea"
+    """Scheme by which topics are named unless `cars.topics` says otherwise."""
+    cars: tuple[BagCar, ...] = Field(min_length=1, max_length=64)
+    markers: dict[str, Marker] = Field(default={})
+    """Numbers of the markers of landmarks, by name."""
+    odometry: Literal["auto", "wheel+imu", "wheel", "odometry"] = "auto"
+    """Where body twists come from; `auto`: the first of wheel+imu, odometry and wheel that the bag has."""
+    camera: Literal["auto", "detections", "bearings"] = "auto"
+    """What is read of the camera; `auto`: detections where the bag has them, or else bearings."""
+    distorted: bool = True
+    """Whether `bearings` were made of pixels whose distortion had not been removed, as the authors' are."""
+    start: float = Field(default=0.0, ge=0.0, le=1e6)
+    """s to leave out after the moment at which everything has begun to come."""
+    duration: Positive | None = None
+    """s to use after that (none: all)."""
+    clocks: Clocks = Clocks()
+    frames: Frames = Frames()
+    path: Path = Field(default=Path("topics.toml"), exclude=True)
+    """The file; set by `load_map`."""
+
+    @model_validator(mode="after")
+    def _nothing_is_used_twice(self) -> Self:
+        refuse_repeated(self.cars, self.markers)
+        known = {car.name for car in self.cars} | {"truth"}
+        for name in self.clocks.offsets:
+            if name not in known:
+                raise ValueError(f"clocks.offsets: {name!r} is none of {', '.join(sorted(known))}")
+        return self
+
+    @property
+    def environment_path(self) -> str:
+        """The environment as `load_scenario` takes it."""
+        beside = self.path.parent / self.environment
+        return str(beside) if self.environment.endswith(".toml") else self.environment
+
+
+def load_map(path: str | Path) -> TopicMap:
+    """Read the map of a bag.
+
+    Raises:
+        TopicMapError: it cannot be read, or one line says which field is not what it must be.
+    """
+    path = Path(path)
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise TopicMapError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except ValueError as error:
+        raise TopicMapError(f"{path}: not valid TOML: {error}") from None
+    try:
+        made = TopicMap.model_validate(raw)
+    except ValidationError as error:
+        raise TopicMapError(one_line(error, path.name, TopicMap)) from None
+    return made.model_copy(update={"path": path})
+
+
+VELOCITY = {"wheel+imu": (Role.WHEEL, Role.IMU), "odometry": (Role.ODOMETRY,), "wheel": (Role.WHEEL,)}
+"""Where body twists may come from, best first."""
+CAMERA = (Role.DETECTIONS, Role.BEARINGS)
+PLACE = (Role.ESTIMATE, Role.POINT)
+
+TRUTH = "truth"
+"""The source of motion capture, as the sources of other topics have the name of their car."""
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A topic that is read."""
+
+    topic: str
+    car: str
+    role: Role
+    leads: bool = False  # whether the car is a moving landmark
+
+    @property
+    def told_as(self) -> Role:
+        """As what ticks are told it: motion capture of a moving landmark is where that says it is."""
+        return Role.ESTIMATE if self.leads and self.role is Role.TRUTH else self.role
+
+    @property
+    def needed(self) -> bool:
+        """Whether there are no ticks without it."""
+        return self.leads or self.role not in (Role.CAMERA_INFO, Role.TRUTH)
+
+    @property
+    def source(self) -> str:
+        """Whose clock makes its stamps."""
+        return TRUTH if self.role is Role.TRUTH else self.car
+
+
+def select(given: TopicMap, topics: Mapping[str, str], where: str) -> list[Chosen]:
+    """Return the topics that are read.
+
+    Args:
+        given: the map.
+        topics: type of every topic that there is.
+        where: names the bag in errors.
+
+    Raises:
+        DataError: one that is needed is not there, or holds messages that cannot be read as what the map says.
+    """
+    chosen = []
+    for car in given.cars:
+        there = _there(given, car, topics, where)
+        roles = _place(car, there, given, topics, where) if car.landmark else _needed(car, there, given, topics, where)
+        chosen += [
+            Chosen(there[role], car.name, role, car.landmark is not None) for role in (*roles, *_of_use(car, there))
+        ]
+    return chosen
+
+
+def _there(given: TopicMap, car: BagCar, topics: Mapping[str, str], where: str) -> dict[Role, str]:
+    """Return the topics of a car that the bag has, by role; one that the map itself names has to be there."""
+    found = {}
+    for role, names in candidates(given, car).items():
+        for name in names:
+            if name in topics:
+                found[role] = name
+                break
+    for role, name in car.topics.given.items():
+        if name not in topics:
+            raise DataError(f"{given.path.name}: cars.{car.name}.topics.{role}: {_absent(name, topics, where)}")
+    for role, name in found.items():
+        if topics[name] not in READERS[role]:
+            kinds = f"{topics[name] or 'several types'}, {role} is one of {listed(list(READERS[role]))}"
+            raise DataError(f"{where}: topic {name} of {car.name} holds {kinds}")
+    return found
+
+
+def candidates(given: TopicMap, car: BagCar) -> dict[Role, tuple[str, ...]]:
+    """Return the names that topics of a car may have, by role."""
+    scheme = {
+        role: tuple(pattern.format(**car.names) for pattern in patterns)
+        for role, patterns in PATTERNS[given.names].items()
+    }
+    return scheme | {role: (name,) for role, name in car.topics.given.items()}
+
+
+def _needed(
+    car: BagCar, there: Mapping[Role, str], given: TopicMap, topics: Mapping[str, str], where: str
+) -> list[Role]:
+    """Return the roles of the odometry and the camera of a vehicle."""
+    ways = [VELOCITY[given.odometry]] if given.odometry != "auto" else list(VELOCITY.values())
+    way = next((way for way in ways if all(role in there for role in way)), None)
+    if way is None:
+        raise _missing(
+            "odometry", car, [role for way in ways for role in way if role not in there], given, topics, where
+        )
+    eyes = [Role(given.camera)] if given.camera != "auto" else list(CAMERA)
+    eye = next((role for role in eyes if role in there), None)
+    if eye is None:
+        raise _missing("camera", car, eyes, given, topics, where)
+    return [*way, eye]
+
+
+def _place(
+    car: BagCar, there: Mapping[Role, str], given: TopicMap, topics: Mapping[str, str], where: str
+) -> list[Role]:
+    """Return the role that tells where a moving landmark is; motion capture stands in where it does not say itself."""
+    for role in (*PLACE, Role.TRUTH):
+        if role in there:
+            return [role]
+    raise _missing("position", car, [*PLACE, Role.TRUTH], given, topics, where)
+
+
+def _of_use(car: BagCar, there: Mapping[Role, str]) -> list[Role]:
+    """Return the roles that are read where they are there."""
+    return [] if car.landmark else [role for role in (Role.CAMERA_INFO, Role.TRUTH) if role in there]
+
+
+def _missing(
+    what: str, car: BagCar, roles: list[Role], given: TopicMap, topics: Mapping[str, str], where: str
+) -> DataError:
+    """Return the error about a car of which the bag has nothing of a kind."""
+    names = [name for role in dict.fromkeys(roles) for name in candidates(given, car).get(role, ())]
+    if not names:
+        kinds = listed([role.value for role in dict.fromkeys(roles)])
+        return DataError(f"{given.path.name}: cars.{car.name}.topics: names no topic of its {what} ({kinds})")
+    return DataError(f"{car.name} has no {what}: {_absent(names[0], topics, where)}")
+
+
+def _absent(name: str, topics: Mapping[str, str], where: str) -> str:
+    known = listed(sorted(topics)) or "none at all"
+    return f"{where} has no topic {name}{suggest(name, topics)}; it has {known}"

@@ -1,0 +1,258 @@
+"""Bytes of messages: CDR of ROS 2, and the serialisation of ROS 1, both by rosbags."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.topics import TOPICS
+
+CAMERA = {
+    "pixy_camera/msg/ObjectInfo": """
+int32 signature
+int32 center_x
+int32 center_y
+int32 width
+int32 height
+int32 angle
+int32 index
+int32 age
+""",
+    "pixy_camera/msg/ObjectInfoArrayStamped": """
+std_msgs/Header header
+pixy_camera/ObjectInfo[] objects
+""",
+    "pixy_camera/msg/ObjectBearing": """
+int32 id
+float32 bearing_x
+float32 bearing_y
+float32 bearing_z
+""",
+    "pixy_camera/msg/ObjectBearingArrayStamped": """
+std_msgs/Header header
+pixy_camera/ObjectBearing[] bearing
+""",
+}
+"""Of the camera, in ROS 1 and ROS 2."""
+
+ROS_1 = {
+    **CAMERA,
+    "svea_msgs/msg/lli_ctrl": """
+int8 steering
+int8 velocity
+int8 trans_diff
+int8 ctrl
+""",
+    "svea_msgs/msg/lli_emergency": """
+bool emergency
+uint32 sender_id
+""",
+    "svea_msgs/msg/VehicleState": """
+std_msgs/Header header
+string child_frame_id
+float64 x
+float64 y
+float64 yaw
+float32 v
+float64[16] covariance
+""",
+}
+
+TICK = "coopenv_msgs/msg/Tick"
+"""Type of the marks in a file of a drive."""
+
+STOPPED = "coopenv_msgs/msg/Stopped"
+"""Type of the message that tells there why the watchdog stopped the cars."""
+
+ROS_2 = {
+    **CAMERA,
+    "mavros_msgs/msg/ManualControl": """
+std_msgs/Header header
+float32 x
+float32 y
+float32 z
+float32 r
+uint16 buttons
+uint16 buttons2
+uint8 enabled_extensions
+float32 s
+float32 t
+float32 aux1
+float32 aux2
+float32 aux3
+float32 aux4
+float32 aux5
+float32 aux6
+""",
+    "mavros_msgs/msg/State": """
+std_msgs/Header header
+bool connected
+bool armed
+bool guided
+bool manual_input
+string mode
+uint8 system_status
+""",
+    "mavros_msgs/msg/RCIn": """
+std_msgs/Header header
+uint8 rssi
+uint16[] channels
+""",
+    "ackermann_msgs/msg/AckermannDrive": """
+float32 steering_angle
+float32 steering_angle_velocity
+float32 speed
+float32 acceleration
+float32 jerk
+""",
+    "ackermann_msgs/msg/AckermannDriveStamped": """
+std_msgs/Header header
+ackermann_msgs/AckermannDrive drive
+""",
+    "coopenv_msgs/msg/RobustReport": """
+std_msgs/Header header  # frame_id: map
+bool valid  # false: the sender does not know where it is
+geometry_msgs/Pose pose  # of the body
+float64[36] covariance  # rotation (rad), then position (m); see docs/robust.md
+geometry_msgs/Pose odometry  # dead reckoning since the start
+uint64 depends_on  # a bit per vehicle whose information is in it
+""",
+    TICK: """
+std_msgs/Header header
+int64 index  # 0: an episode begins
+uint64 key  # of its random draws
+uint32 episode
+""",
+    STOPPED: """
+std_msgs/Header header
+string reason
+string car  # whose fault it was; empty: nobody's
+""",
+    "coopenv_msgs/msg/Arm": """
+std_msgs/Header header
+string session  # of which commands are to be accepted
+string nonce  # that the gate has shown last
+bool armed  # false: disarm
+""",
+    "coopenv_msgs/msg/GateStatus": """
+std_msgs/Header header
+string session  # empty: none
+string nonce
+string state  # disarmed, armed, timed_out, stopped
+uint64 accepted
+uint64 last_sequence
+string[] rejections  # reasons
+uint64[] counts  # how often each
+""",
+}
+
+
+MOST_BYTES = 65_536
+"""Of one message: a frame of a camera with 7 colours has hundreds of bytes, and nothing here has images."""
+
+
+@cache
+def ros2() -> Any:
+    """Return the store of ROS 2 types, ours and the cars' among them. Raises CoopenvError: no extra."""
+    return _store("ROS2_JAZZY", ROS_2)
+
+
+@cache
+def ros1() -> Any:
+    """Return the store of ROS 1 types, likewise."""
+    return _store("ROS1_NOETIC", ROS_1)
+
+
+def _store(name: str, definitions: dict[str, str]) -> Any:
+    try:
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError:
+        raise CoopenvError("messages of cars need an extra: pip install '.[svea]'") from None
+    store = get_typestore(Stores[name])
+    for kind, text in definitions.items():
+        store.register(get_types_from_msg(text, kind))
+    return store
+
+
+def make(kind: str, **fields: Any) -> Any:
+    """Return a ROS 2 message of a type by its fields."""
+    return ros2().types[kind](**fields)
+
+
+def header(stamp: int, frame: str = "") -> Any:
+    """Return a header with a stamp in ns."""
+    return make("std_msgs/msg/Header", stamp=make_time(stamp), frame_id=frame)
+
+
+def make_time(stamp: int) -> Any:
+    """Return a time in ns as a message."""
+    seconds, nanoseconds = divmod(stamp, 10**9)
+    return make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+
+
+def stamp_of(message: Any) -> int:
+    """Return the stamp in ns of a message with a header, of ROS 1 or 2."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def encode(message: Any) -> bytes:
+    """Return the CDR bytes of a message, its 4 bytes of encapsulation included."""
+    return bytes(ros2().serialize_cdr(message, message.__msgtype__))
+
+
+def decode(payload: bytes, kind: str) -> Any:
+    """Return the message of CDR bytes.
+
+    Raises:
+        CoopenvError: they are not a message of that type, or too long.
+    """
+    return _decoded(ros2().deserialize_cdr, payload, kind)
+
+
+def encode_ros1(message: Any) -> bytes:
+    """Return the ROS 1 bytes of a message."""
+    return bytes(ros1().serialize_ros1(message, message.__msgtype__))
+
+
+def decode_ros1(payload: bytes, kind: str) -> Any:
+    """Return the message of ROS 1 bytes; errors as for `decode`."""
+    return _decoded(ros1().deserialize_ros1, payload, kind)
+
+
+def _decoded(read: Any, payload: bytes, kind: str) -> Any:
+    if len(payload) > MOST_BYTES:
+        raise CoopenvError(f"{kind}: {len(payload)} bytes are over {MOST_BYTES}")
+    try:
+        return read(payload, kind)
+    except Exception as error:  # whatever the library raises at bytes that make no sense
+        raise CoopenvError(f"{kind}: cannot be read ({type(error).__name__})") from None
+
+
+@cache
+def warm_up() -> None:
+    """Encode and decode one message of every type."""
+    store = ros2()
+    for topic in TOPICS.values():
+        message = empty(topic.type)
+        store.deserialize_cdr(store.serialize_cdr(message, topic.type), topic.type)
+
+
+def empty(kind: str) -> Any:
+    """Return a ROS 2 message of a type whose fields are zero and empty."""
+    store = ros2()
+    return store.types[kind](**{name: _value(node) for name, node in store.fielddefs[kind][1]})
+
+
+def _value(node: Any) -> Any:
+    """Return the zero of a field, as rosbags describes it."""
+    kind, of = node
+    if kind.name == "NAME":
+        return empty(of)
+    if kind.name == "BASE":
+        return "" if of[0] == "string" else np.zeros(1, dtype=of[0])[0].item()
+    element, length = of[0], of[1] if kind.name == "ARRAY" else 0
+    if element[0].name == "BASE" and element[1][0] != "string":
+        return np.zeros(length, dtype=element[1][0])
+    return [_value(element) for _ in range(length)]

@@ -1,0 +1,383 @@
+"""The deployment file: which cars there are, how they are reached, and what they may do."""
+
+import tomllib
+from collections import Counter
+from collections.abc import Container, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from coopenv.base.errors import CoopenvError, listed, shown, suggest
+from coopenv.cars.limits import HARDEST, USUAL, Limits, Point, is_simple
+from coopenv.cars.transport.endpoints import SECURE, address_of
+
+
+class Part(BaseModel):
+    """A section of the file; unknown keys are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class Tls(Part):
+    """Certificates of the transport; paths are relative to the file."""
+
+    root_ca: Path
+    """Certificate of who signs the others'."""
+    certificate: Path | None = None
+    """Own certificate, where this end listens or the other one asks for it."""
+    key: Path | None = None
+    """Private key of it, which only its owner can read."""
+
+    @model_validator(mode="after")
+    def _both_or_none(self) -> Self:
+        if (self.certificate is None) != (self.key is None):
+            raise ValueError("certificate and key: give both or none")
+        return self
+
+
+def _endpoint(text: str) -> str:
+    """Refuse what is no endpoint such as tcp/127.0.0.1:7447."""
+    address_of(text)
+    return text
+
+
+Endpoint = Annotated[str, AfterValidator(_endpoint)]
+
+WIRES = {
+    "zenoh": ("tcp/127.0.0.1:7447", ("tcp", "tls", "quic", "udp")),
+    "nats": ("nats/127.0.0.1:4222", ("nats", "tcp", "tls")),
+    "ros1": ("tcp/127.0.0.1:11311", ("tcp",)),
+}
+"""Kinds of networks: where they are if nothing is said, and which protocols they have."""
+
+
+def refuse_foreign(kind: str, endpoints: tuple[str, ...]) -> None:
+    """Refuse endpoints of a protocol that a kind of network does not have, with a ValueError that says which."""
+    for endpoint in endpoints:
+        if address_of(endpoint).protocol not in WIRES[kind][1]:
+            raise ValueError(f"connect: {shown(endpoint)}: {kind} has {listed(WIRES[kind][1])}")
+
+
+class Network(Part):
+    """How the cars are reached."""
+
+    kind: Literal["zenoh", "nats", "ros1"] = "zenoh"
+    """`zenoh`: CDR under the keys of zenoh-bridge-ros2dds; `nats`: the authors' wire; `ros1`: topics of a ROS
+    master."""
+    connect: tuple[Endpoint, ...] = Field(
+        default_factory=lambda given: (WIRES[given.get("kind", "zenoh")][0],), min_length=1
+    )
+    """Where the router, the broker or the ROS master is (default: on this computer, at its usual port)."""
+    tls: Tls | None = None
+    """Needed by endpoints `tls/...`, and only by them."""
+
+    @model_validator(mode="after")
+    def _endpoints_fit(self) -> Self:
+        if self.kind == "ros1" and len(self.connect) > 1:
+            raise ValueError("connect: there is one ROS master, more than one endpoint is given")
+        refuse_foreign(self.kind, self.connect)
+        for endpoint in self.connect:
+            secure = address_of(endpoint).protocol in SECURE
+            if secure and self.tls is None:
+                raise ValueError(f"tls: is missing, {endpoint} needs at least its root_ca")
+            if not secure and self.tls is not None:
+                raise ValueError(f"connect: {endpoint} would go in the clear; with network.tls it is tls/...")
+        return self
+
+
+class GateLink(Part):
+    """Where the gate of a car connects to, whatever `network` says: no radio may stand between it and the wheels."""
+
+    connect: tuple[Endpoint, ...] | None = Field(default=None, min_length=1)
+    """The car's own router, bridge or ROS master, on its loopback (default: at its usual port)."""
+
+
+MOST_CHANNELS = 18
+NEUTRAL, MOVED = 1500, 100
+"""Pulse of a stick at rest, and by how much one has to change to count as moved, us."""
+SHORTEST, LONGEST = 800, 2200
+"""Pulses that are a signal, us."""
+
+Channel = Annotated[int, Field(ge=1, le=MOST_CHANNELS)]
+
+
+class Remote(Part):
+    """Channels of the remote control, as `mavros/rc/in` numbers them from 1 on; PX4's usual order."""
+
+    steering: Channel = 1
+    """Of the stick that steers."""
+    throttle: Channel = 3
+    """Of the stick that drives."""
+    mode_switch: int = Field(default=5, ge=0, le=MOST_CHANNELS)
+    """Of the switch that chooses the autopilot's mode (0: there is none)."""
+
+    @model_validator(mode="after")
+    def _each_has_its_own(self) -> Self:
+        if len({self.steering, self.throttle, self.mode_switch}) < 3:
+            raise ValueError("steering, throttle and mode_switch: two of them are on the same channel")
+        return self
+
+    def fault(self, pulses: tuple[int, ...]) -> str:
+        """Return why pulses, us, one per channel, tell nothing; empty where they do."""
+        for name in ("steering", "throttle", "mode_switch"):
+            channel = getattr(self, name)
+            if pulses and channel > len(pulses):
+                return f"its remote control has {len(pulses)} channels, remote.{name} is {channel}"
+            if not pulses or (channel and not SHORTEST <= pulses[channel - 1] <= LONGEST):
+                return "its remote control has no signal"
+        return ""
+
+    def drives(self, pulses: tuple[int, ...]) -> bool:
+        """Return whether a stick is moved; one without a signal is not."""
+        used = [pulses[channel - 1] for channel in (self.steering, self.throttle) if channel <= len(pulses)]
+        return any(SHORTEST <= pulse <= LONGEST and abs(pulse - NEUTRAL) > MOVED for pulse in used)
+
+    def switched(self, pulses: tuple[int, ...], before: tuple[int, ...]) -> bool:
+        """Return whether the switch is no longer where it was."""
+        if not 0 < self.mode_switch <= min(len(pulses), len(before)):
+            return False
+        return abs(pulses[self.mode_switch - 1] - before[self.mode_switch - 1]) > MOVED
+
+
+MARKERS = range(1, 8)
+"""Numbers of markers: the Pixy2 tells apart seven colour signatures."""
+
+Name = Annotated[str, Field(max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
+Marker = Annotated[int, Field(ge=0)]
+Agent = Annotated[int, Field(ge=0, le=9999)]
+Positive = Annotated[float, Field(gt=0.0, le=1e6)]
+Number = Annotated[float, Field(ge=-1e6, le=1e6)]
+Age = Annotated[float, Field(gt=0.0, le=2.0)]
+Corner = tuple[Number, Number]
+
+
+class DeploymentError(CoopenvError):
+    """A deployment file does not describe a fleet that can drive."""
+
+
+class Car(Part):
+    """One car."""
+
+    name: Name
+    """As in its topics, `fleet/NAME/...`."""
+    vehicle: str | None = None
+    """The vehicle of the environment that it is (default: the first one in the environment's order that no other car
+    names or, further up, has got)."""
+    landmark: str | None = None
+    """Or the moving landmark that it is: a car whose position is known and which nobody here drives."""
+    marker: Marker | None = None
+    """Number of the marker that it carries, 1..7 (none: no camera can tell it)."""
+    agent: Agent | None = None
+    """Its number in the authors' names, `agentN/...`, on `nats` and `ros1` (default: that of its marker)."""
+
+    @property
+    def agent_number(self) -> int | None:
+        """Its number in the authors' names; None: it has none."""
+        return self.marker if self.agent is None else self.agent
+
+
+def refuse_repeated(cars: Sequence[Car], markers: Mapping[str, int], numbers: Container[int] | None = None) -> None:
+    """Refuse a name, vehicle, landmark or marker of two, with a ValueError that says which.
+
+    Args:
+        cars: a fleet.
+        markers: numbers of the markers of landmarks, by name.
+        numbers: those that the camera knows (None: any).
+    """
+    given: dict[str, list[Any]] = {
+        "cars: the name": [car.name for car in cars],
+        "cars: the vehicle": [car.vehicle for car in cars if car.vehicle is not None],
+        "cars: the landmark": [car.landmark for car in cars if car.landmark is not None],
+        "markers: the number": [*markers.values(), *(c.marker for c in cars if c.marker is not None)],
+        "cars: the agent (or marker)": [c.agent_number for c in cars if c.agent_number is not None],
+    }
+    for what, values in given.items():
+        for value, times in Counter(values).items():
+            if times > 1:
+                raise ValueError(f"{what} {value!r} is used twice")
+    for what, number in [*markers.items(), *((c.name, c.marker) for c in cars if c.marker is not None)]:
+        if numbers is not None and number not in numbers:
+            raise ValueError(f"marker {number} of {what}: the camera knows {MARKERS[0]} to {MARKERS[-1]} only")
+    for i, car in enumerate(cars):
+        if car.vehicle is not None and car.landmark is not None:
+            raise ValueError(f"cars.{i}: is a vehicle or a landmark, not both")
+
+
+class Sensors(Part):
+    """Which topics are read."""
+
+    odometry: Literal["wheel+imu", "wheel", "odometry"] = "wheel+imu"
+    """Where the body twist comes from: speed of the wheels and turn rate of the IMU, the wheels alone, or the car's own
+    filter."""
+    detections: Literal["detections", "bearings"] = "detections"
+    """`detections`: pixels, from which distortion is removed here; `bearings`: unit vectors of the authors' node."""
+    distorted: bool = True
+    """Whether `bearings` were made of pixels whose distortion had not been removed, as the authors' are."""
+    truth: bool = True
+    """Whether motion capture is read: for infos, metrics and safety, never for observations."""
+
+
+class Safety(Part):
+    """What stops the cars. Limits above the hard ones of `coopenv.cars.limits` are refused."""
+
+    max_speed: float = Field(default=USUAL.speed, gt=0.0, le=HARDEST.speed)
+    """m/s"""
+    max_steering: float = Field(default=USUAL.steering, gt=0.0, le=HARDEST.steering)
+    """rad"""
+    max_acceleration: float = Field(default=USUAL.acceleration, gt=0.0, le=HARDEST.acceleration)
+    """m/s^2"""
+    max_steering_rate: float = Field(default=USUAL.steering_rate, gt=0.0, le=HARDEST.steering_rate)
+    """rad/s"""
+    reverse: bool = False
+    """Whether cars may drive backwards."""
+    odometry_age: Age = 0.15
+    """s without odometry after which all cars are stopped."""
+    truth_age: Age = 0.5
+    """s for which a car's place may not be known, where a geofence or a separation needs it."""
+    geofence: tuple[Corner, ...] = ()
+    """Corners of a polygon, m, in the coordinates of the environment's file, that no car may leave (none: no fence)."""
+    separation: float = Field(default=0.0, ge=0.0, le=100.0)
+    """Least distance between a car that is driven and any other car of the fleet, m (0: not watched)."""
+    judge: Literal["truth", "estimate"] = "truth"
+    """By what fence and separation are judged."""
+    missed_deadlines: int = Field(default=5, ge=1)
+    """Decisions in a row that may come late."""
+    min_battery: float = Field(default=0.1, ge=0.0, le=1.0)
+    """Share of the battery below which cars are not armed."""
+    conditions: bool | None = None
+    """Whether remote control, autopilot and battery have to be heard of before cars are armed, and the remote control
+    while they are (default: only with `zenoh`, as the authors' cars tell nothing of them)."""
+    max_clock_offset: Positive = 0.02
+    """s between clocks of cars and of this computer, beyond which nothing is armed."""
+
+    @field_validator("geofence")
+    @classmethod
+    def _encloses_something(cls, corners: tuple[Point, ...]) -> tuple[Point, ...]:
+        if corners and not is_simple(corners):
+            raise ValueError("expected at least 3 corners of a polygon whose edges do not cross")
+        return corners
+
+    @property
+    def limits(self) -> Limits:
+        """The limits of commands."""
+        speeds = (self.max_speed, self.max_steering, self.max_acceleration, self.max_steering_rate)
+        return Limits(*speeds, reverse=self.reverse)
+
+
+class Security(Part):
+    """Signatures of commands and of what cars tell each other."""
+
+    keys: Path | None = None
+    """Folder of keys, see `coopenv svea keys` (relative to this file); none: nothing is signed or checked."""
+    identity: Name = "station"
+    """Whose key this end signs with, where it is no car."""
+
+
+class Deployment(Part):
+    """A fleet and what it is used for."""
+
+    environment: str
+    """Name of an environment, or TOML file (relative to this file): who is there, how they sense, talk and estimate."""
+    overrides: dict[str, Any] = Field(default={})
+    """Dotted keys of it."""
+    cars: tuple[Car, ...] = Field(min_length=1, max_length=64)
+    markers: dict[str, Marker] = Field(default={})
+    """Numbers of the markers of landmarks, by name."""
+    network: Network = Network()
+    gate: GateLink = Field(default=GateLink(), exclude=True)  # matters on the car alone, and to no record of a drive
+    sensors: Sensors = Sensors()
+    safety: Safety = Safety()
+    remote: Remote = Remote()
+    security: Security = Security()
+    fakes: bool = False
+    """Whether the cars are fakes, which can be put where an episode begins."""
+    file: Path = Field(default=Path(), exclude=True)
+    """Where it stands; set by `load_deployment`."""
+
+    @model_validator(mode="after")
+    def _nothing_is_used_twice(self) -> Self:
+        refuse_repeated(self.cars, self.markers, MARKERS)
+        return self
+
+    @model_validator(mode="after")
+    def _gates_speak_like_the_cars(self) -> Self:
+        try:
+            refuse_foreign(self.network.kind, self.gate_connect)
+        except ValueError as error:
+            raise ValueError(f"gate.{error}") from None
+        return self
+
+    @property
+    def gate_connect(self) -> tuple[str, ...]:
+        """Where the gate of a car connects to: never to what is beyond the radio, unless the file says so."""
+        return self.gate.connect or (WIRES[self.network.kind][0],)
+
+    @property
+    def folder(self) -> Path:
+        """Where the file is."""
+        return self.file.parent
+
+    @property
+    def keys(self) -> Path | None:
+        """Where keys are; None: nothing is signed. Raises DeploymentError: there is nothing of that name."""
+        if self.security.keys is None:
+            return None
+        place = self.folder / self.security.keys
+        if not place.exists():
+            make = f"`coopenv svea keys {self.file}` makes it"
+            raise DeploymentError(f"{self.file.name}: security.keys: there is no folder '{place}'; {make}")
+        return place
+
+    @property
+    def conditions(self) -> bool:
+        """Whether cars have to tell of remote control, autopilot and battery."""
+        return self.network.kind == "zenoh" if self.safety.conditions is None else self.safety.conditions
+
+    @property
+    def driven(self) -> tuple[Car, ...]:
+        """The cars that are vehicles, in the order of the file."""
+        return tuple(car for car in self.cars if car.landmark is None)
+
+    def car(self, name: str) -> Car:
+        """Return a car by name. Raises DeploymentError: there is none."""
+        names = [car.name for car in self.cars]
+        if name not in names:
+            raise DeploymentError(f"unknown car {shown(name)}{suggest(name, names)}; known: {listed(names)}")
+        return self.cars[names.index(name)]
+
+
+def load_deployment(path: str | Path, connect: str | None = None) -> Deployment:
+    """Read a deployment file.
+
+    Args:
+        path: of the file.
+        connect: endpoint in place of the file's `network.connect`.
+
+    Raises:
+        DeploymentError: it cannot be read, or one line says which field is not what it must be.
+    """
+    path = Path(path)
+    try:
+        raw = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise DeploymentError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except ValueError as error:
+        raise DeploymentError(f"{path}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise DeploymentError(f"{path}: lists or tables stand too deep in one another") from None
+    network = raw.get("network", {})
+    if connect is not None and isinstance(network, dict):
+        raw["network"] = {**network, "connect": [connect]}
+    return parse_deployment(raw, path)
+
+
+def parse_deployment(raw: dict[str, Any], path: Path) -> Deployment:
+    """Validate plain data that stands, or could stand, in a file; errors as for `load_deployment`."""
+    try:
+        made = Deployment.model_validate(raw)
+    except ValidationError as error:
+        from coopenv.scenario.validation import one_line  # the gate of a car has no need of scenarios
+
+        raise DeploymentError(one_line(error, path.name, Deployment)) from None
+    return made.model_copy(update={"file": path})

@@ -1,0 +1,1 @@
+"""Fake cars: processes that publish and accept what real cars do."""

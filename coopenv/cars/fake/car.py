@@ -1,0 +1,248 @@
+"""A fake car: its room, sensors and wheels on one clock, and its end of the network."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.actuation import from_manual
+from coopenv.cars.backend.binding import Binding
+from coopenv.cars.codec import decode, warm_up
+from coopenv.cars.deployment import Deployment
+from coopenv.cars.fake.faults import Fault, Faults, Wire, end_process, fault_topic, parse_fault
+from coopenv.cars.fake.messages import Act, DriverVoice, Voice
+from coopenv.cars.fake.sensors import Pixy, Sensors, calibration_of
+from coopenv.cars.fake.world import Actuators, Neighbours, Room
+from coopenv.cars.gate.core import PERIOD, Clock, Gate
+from coopenv.cars.gate.process import Link
+from coopenv.cars.keys import Signer, Verifier
+from coopenv.cars.topics import RESET_TOPIC, TOPICS, Role, presence_of, topic_of
+from coopenv.cars.transport.base import Arrival, Transport
+
+JITTER = 0.05  # of a period, largest deviation to either side of a regular time
+LATE = 50_000_000
+"""ns: measurements that are overdue for longer than this are left out, as after a computer that stood still."""
+
+
+@dataclass
+class _Timer:
+    period: float  # ns
+    regular: float  # ns, the next time without jitter
+    due: int  # ns, with it
+
+
+class Schedule:
+    """Times of several sensors; in ns on one clock."""
+
+    def __init__(self, rates: Mapping[str, float], start: int, rng: np.random.Generator) -> None:
+        """Begin.
+
+        Args:
+            rates: Hz by name.
+            start: from when on.
+            rng: of phases and jitter.
+        """
+        self._rng, self._timers = rng, {}
+        for name, rate in rates.items():
+            period = 1e9 / rate
+            timer = _Timer(period, start + period * rng.uniform(0.1, 1.0), 0)
+            self._timers[name] = timer
+            self._draw(timer)
+
+    @property
+    def next(self) -> int:
+        """When something is due next."""
+        return min([timer.due for timer in self._timers.values()])
+
+    def until(self, now: int) -> Iterator[tuple[int, str]]:
+        """Yield (when, name) of all that is due up to now, in the order of time."""
+        while (due := self.next) <= now:
+            name, timer = next((name, timer) for name, timer in self._timers.items() if timer.due == due)
+            timer.regular += timer.period
+            self._draw(timer)
+            if due >= now - LATE:
+                yield due, name
+
+    def _draw(self, timer: _Timer) -> None:
+        timer.due = int(timer.regular + timer.period * JITTER * self._rng.uniform(-1.0, 1.0))
+
+
+REAL = Clock(time.time_ns, time.monotonic_ns)
+
+
+class Fake:
+    """One fake car, a vehicle or a moving landmark; `advance` does all that is due, in one thread."""
+
+    def __init__(
+        self,
+        deployment: Deployment,
+        binding: Binding,
+        name: str,
+        transport: Transport,
+        *,
+        seed: int = 0,
+        faults: Iterable[Fault] = (),
+        gate: bool = True,
+        signer: Signer | None = None,
+        verifier: Verifier | None = None,
+        clock: Clock = REAL,
+        die: Callable[[], None] = end_process,
+        complain: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        """Put the car at the start of a seed and let others see that it is there.
+
+        Args:
+            deployment: the fleet.
+            binding: who is who in it.
+            name: of the car.
+            transport: the network; stays the caller's.
+            seed: of where it starts and of its errors, which are those of the simulation with that key.
+            faults: that it has, by times from now on.
+            gate: whether commands come through a gate of its own; else it obeys ManualControl on the network.
+            signer: signs what the gate says, as the car (None: nothing is signed).
+            verifier: knows the station's key, for the gate (None: signatures do not count).
+            clock: wall and steady; the wall clock is that of motion capture.
+            die: what the fault `kill` does.
+            complain: told in one line of messages to the fake that make no sense.
+        """
+        self.name, self._clock, self._faults = name, clock, Faults()
+        self._die, self._complain = die, complain
+        scenario, self._drives = binding.scenario, name in binding.cars
+        leader = binding.leaders.get(name, 0)
+        agent = len(scenario.landmarks) + binding.cars[name] if self._drives else leader
+        self.room = Room(scenario, agent)
+        self._wire = Wire(transport, self._faults, clock.steady, seed)
+        self._inbox: deque[Callable[[], None]] = deque()
+        self._others = Neighbours(self.room, binding, name, transport)
+        self._acts: dict[str, Act] = {}
+        self._link: Link | None = None
+        self._build(binding, transport, deployment.sensors.odometry)
+        self.begin(seed)
+        self._warm_up()
+        transport.subscribe(RESET_TOPIC, self._hear_reset)
+        transport.subscribe(fault_topic(name), self._hear_fault)
+        rates = {name: rate for name, (rate, _) in self._voice.acts.items()}
+        self._acts = {name: act for name, (_, act) in self._voice.acts.items()}
+        if self._drives and gate:
+            car_clock = Clock(lambda: clock.wall() + self._faults.clock_error(clock.steady()), clock.steady)
+            decides = Gate(name, deployment.safety.limits, car_clock, verifier, deployment.security.identity)
+            self._link = Link(decides, name, self._wire, signer)  # which lets others see the car
+            rates["gate"], self._acts["gate"] = 1e9 / PERIOD, self._tick_gate
+        else:
+            if self._drives:
+                self._wire.subscribe(topic_of(name, Role.MANUAL), self._hear_manual)
+            transport.announce(presence_of(name))
+        self._schedule = Schedule(rates, clock.steady(), self._rng)
+        for fault in faults:
+            self._faults.add(fault, clock.steady())
+
+    def _build(self, binding: Binding, transport: Transport, odometry: str) -> None:
+        """Put sensors and wheels on the car; the wheels tell a turn rate only where there is no other one."""
+        whose = (self.name, self.room, self._wire, self._stamp, transport)
+        self._voice = Voice(*whose)
+        if self._drives:
+            vehicle, scenario = self.room.vehicle, self.room.scenario
+            carriers = {target: marker for marker, target in binding.targets.items()}
+            self._pixy = Pixy(self.room, calibration_of(scenario.cameras[vehicle]), carriers, self._faults)
+            self._sensors = Sensors(self.room, differential=odometry == "wheel")
+            self._wheels = Actuators(scenario.limits[vehicle].latency)
+            voice = DriverVoice(*whose, pixy=self._pixy, sensors=self._sensors, rng=lambda: self._rng)
+            voice.before_frame = self._others.place
+            self._voice = voice
+
+    def begin(self, seed: int) -> None:
+        """Go to the start of a seed; wheels and commands are as if nothing had been."""
+        self._began = self._moved = self._clock.steady()
+        self._rng = np.random.default_rng([seed % 2**64, self.room.agent])
+        self.room.begin(seed)
+        self._others.begin()
+        if self._drives:
+            self._wheels.clear()
+            self._sensors.begin()
+            self._pixy.begin()
+
+    def _warm_up(self) -> None:
+        """Do once what takes long at the first time: kernels and codecs are compiled, or loaded."""
+        warm_up()
+        if not self._drives:
+            self.room.follow(0.0)
+            return
+        self.room.drive(0.0, 0.0, 0.0)
+        self.room.look(0)
+
+    @property
+    def next(self) -> int:
+        """When something is due next, steady clock, ns."""
+        return self._schedule.next
+
+    def advance(self) -> None:
+        """Do all that is due by the clock."""
+        now = self._clock.steady()
+        if self._faults.value("kill", now):
+            self._die()
+            return
+        self._wire.flush()
+        self._take_inbox()
+        for due, name in self._schedule.until(now):
+            self._move(due)
+            self._acts[name](due, self._stamp(due) + self._faults.clock_error(due))
+        if self._link is not None and self._link.news.is_set():
+            self._link.tell()
+
+    def _take_inbox(self) -> None:
+        while self._inbox:
+            try:
+                self._inbox.popleft()()
+            except CoopenvError as error:
+                self._complain(f"{self.name}: {error}")
+
+    def close(self) -> None:
+        """Tell the wheels to stand, and forget what is under way."""
+        if self._link is not None:
+            self._link.neutral()
+        self._wire.close()
+
+    def _stamp(self, due: int) -> int:
+        """Return the wall clock's time, ns, at a time of the steady clock."""
+        return self._clock.wall() - self._clock.steady() + due
+
+    def _move(self, to: int) -> None:
+        """Carry the body to a time, unless it is there already."""
+        if not self._drives:
+            self.room.follow(max(to - self._began, 0) * 1e-9)
+        elif to > self._moved:
+            for duration, drive in self._wheels.pieces(self._moved, to):
+                self.room.drive(duration, drive.speed, drive.steering)
+            self._moved = to
+
+    def _tick_gate(self, due: int, _stamp: int) -> None:
+        """Let the gate say what the wheels are to do; a computer that stands still says nothing."""
+        if self._link is not None and not self._faults.value("freeze", due):
+            # The dead time of the scenario is that from a command to its effect, the gate's turn in it.
+            self._obey(self._link.tick(), max(self._link.commanded, due - PERIOD))
+
+    def _obey(self, payload: bytes, at: int) -> None:
+        manual = decode(payload, TOPICS[Role.MANUAL].type)
+        self._wheels.receive(from_manual(manual.y, manual.z, manual.aux3), at)
+
+    # Called in threads of the transport: they only keep what has come.
+
+    def _hear_manual(self, arrival: Arrival) -> None:
+        self._inbox.append(partial(self._obey, arrival.payload, self._clock.steady()))
+
+    def _hear_reset(self, arrival: Arrival) -> None:
+        def begin() -> None:
+            self.begin(int(decode(arrival.payload, "std_msgs/msg/Int64").data))
+
+        self._inbox.append(begin)
+
+    def _hear_fault(self, arrival: Arrival) -> None:
+        def add() -> None:
+            text = str(decode(arrival.payload, "std_msgs/msg/String").data)
+            self._faults.add(parse_fault(text), self._clock.steady())
+
+        self._inbox.append(add)

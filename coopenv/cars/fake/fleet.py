@@ -1,0 +1,211 @@
+"""A router and all the fake cars of a deployment, as processes of their own for as long as they are needed."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
+from pathlib import Path
+
+from coopenv.base.errors import CoopenvError
+from coopenv.base.interrupts import before_a_hard_end, held
+from coopenv.cars.backend.binding import bind
+from coopenv.cars.backend.opening import scenario_of
+from coopenv.cars.deployment import load_deployment
+from coopenv.cars.fake.car import REAL, Fake
+from coopenv.cars.fake.faults import Fault
+from coopenv.cars.gate.process import Settings
+from coopenv.cars.transport.base import Transport
+
+READY = 300.0
+"""s that fakes have until they can be seen: the first ones on a computer compile the simulation's kernels."""
+GRACE = 0.5  # s that processes have to end by themselves
+POLL = 0.02  # s
+LOOPBACK = "127.0.0.1"
+
+_running: list["Process"] = []
+
+
+class FakesError(CoopenvError):
+    """The router or a fake car does not run."""
+
+
+class Process:
+    """A command of coopenv, which leads a process group of its own."""
+
+    def __init__(self, name: str, command: Sequence[str], folder: Path) -> None:
+        """Start it.
+
+        Args:
+            name: in errors.
+            command: arguments of `coopenv`.
+            folder: where what it prints is kept.
+        """
+        self.name = name
+        self._said = folder / f"{name}.out", folder / f"{name}.err"
+        with held(), self._said[0].open("w") as out, self._said[1].open("w") as errors:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "coopenv", *command],
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=errors,
+                start_new_session=True,  # Ctrl-C is for who started it: cars are brought to a stand first
+            )
+            _running.append(self)
+
+    def wait_until_ready(self, until: float) -> None:
+        """Wait for the line that says so, at most until a time of the monotonic clock.
+
+        Raises:
+            FakesError: it has ended, or the time is over; the line quotes its last error.
+        """
+        while "ready" not in self._said[0].read_text(encoding="utf-8", errors="replace"):
+            status = self._process.poll()
+            if status is not None:
+                raise FakesError(f"{self.name} has ended with status {status}: {self._last_words()}")
+            if time.monotonic() > until:
+                raise FakesError(f"{self.name} is not ready in time: {self._last_words()}")
+            time.sleep(POLL)
+
+    def _last_words(self) -> str:
+        lines = self._said[1].read_text(encoding="utf-8", errors="replace").split("\n")
+        return next((line.removeprefix("error: ") for line in reversed(lines) if line.strip()), "it has said nothing")
+
+    def send(self, number: int) -> None:
+        """Send a signal to the process and to all that it has started."""
+        if self._process.poll() is None or number == signal.SIGKILL:
+            with suppress(ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, number)
+
+    def end(self, until: float) -> None:
+        """Wait for it to end, at most until a time of the monotonic clock; then it is ended by force."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(max(until - time.monotonic(), 0.0))
+        self.send(signal.SIGKILL)
+        self._process.wait()
+        _running.remove(self)
+
+
+@contextmanager
+def fakes(deployment: str | Path, port: int | None = None, seed: int = 0, patience: float = READY) -> Iterator[str]:
+    """Run a router on this computer and a fake of every car; yield the router's endpoint, and end them all afterwards.
+
+        with fakes("overtaking.toml") as router:
+            env = coopenv.parallel_env(
+                "svea_overtaking", backend="svea", deployment="overtaking.toml", connect=router
+            )
+
+    Args:
+        deployment: file of the fleet; its `network.connect` does not count here.
+        port: of the router (None: one that is free).
+        seed: of the fakes, see `coopenv.cars.fake.car.Fake`.
+        patience: s to wait for them.
+
+    Raises:
+        FakesError: one of them does not start; the line quotes its error.
+        CoopenvError: the file is not valid, or its cars are not fakes.
+    """
+    endpoint = f"tcp/{LOOPBACK}:{free_port() if port is None else port}"
+    fleet = load_deployment(deployment, endpoint)
+    if not fleet.fakes:
+        raise FakesError(f"{deployment}: fakes = true is missing, these are real cars")
+    given = ("--connect", endpoint, "--seed", str(seed))
+    started: list[Process] = []
+    until = time.monotonic() + patience
+    with tempfile.TemporaryDirectory(prefix="coopenv-fakes-") as place:
+        try:
+            started.append(Process("router", ("svea", "router", "--listen", endpoint), Path(place)))
+            started[0].wait_until_ready(until)
+            for car in fleet.cars:
+                command = ("svea", "fake", str(deployment), "--car", car.name, *given)
+                started.append(Process(car.name, command, Path(place)))
+            for process in started[1:]:
+                process.wait_until_ready(until)
+            yield endpoint
+        finally:
+            _end(started)
+
+
+def _end(started: list[Process]) -> None:
+    """End processes, the router last: the cars' gates take their leave."""
+    for some in (started[1:], started[:1]):
+        for process in some:
+            process.send(signal.SIGTERM)
+        until = time.monotonic() + GRACE
+        for process in some:
+            process.end(until)
+
+
+def free_port() -> int:
+    """Return a port of this computer that nobody listens at."""
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return int(probe.getsockname()[1])
+
+
+def _kill_all() -> None:
+    for process in list(_running):
+        process.send(signal.SIGKILL)
+
+
+before_a_hard_end(_kill_all)
+
+
+REST = 0.004
+"""s between two looks at the clock, at least: what falls due meanwhile is done together."""
+
+
+def open_fake(
+    path: str | Path,
+    car: str,
+    transport: Transport,
+    *,
+    seed: int = 0,
+    faults: Iterable[Fault] = (),
+    gate: bool = True,
+    station: str | None = None,
+    complain: Callable[[str], None] = lambda _: None,
+) -> Fake:
+    """Return a fake of a car of a deployment file; arguments as for `prepare_fake` and `Fake`."""
+    return prepare_fake(path, car, gate, station)(transport, seed=seed, faults=faults, complain=complain)
+
+
+def prepare_fake(path: str | Path, car: str, gate: bool = True, station: str | None = None) -> Callable[..., Fake]:
+    """Return what makes a fake of a network and further arguments of `Fake`: all that can be wrong without a network.
+
+    Args:
+        path: deployment file.
+        car: its name.
+        gate: as for `Fake`.
+        station: whose commands count at its gate (None: those of the file's `security.identity`).
+
+    Raises:
+        CoopenvError: the file or its environment is not valid, the car is unknown, or a key is missing or another's.
+    """
+    fleet = load_deployment(path)
+    fleet.car(car)
+    scenario = scenario_of(fleet, None, {})
+    if scenario.backend != "simulated":
+        raise CoopenvError(f"{path}: environment: backend '{scenario.backend}' has no fakes; known: simulated")
+    binding = bind(scenario, fleet.cars, fleet.markers, Path(path).name, None)
+    given = Settings.of(car, Path(path)).changed({}, station=station)
+    signer, verifier = given.identities() if gate else (None, None)
+    trusting = fleet.security.model_copy(update={"identity": given.station})
+    fleet = fleet.model_copy(update={"security": trusting})
+    return partial(Fake, fleet, binding, car, gate=gate, signer=signer, verifier=verifier)
+
+
+def run(fake: Fake, stop: threading.Event) -> None:
+    """Let a car live in real time until it is told to stop, or an exception such as a signal's ends it."""
+    try:
+        while not stop.is_set():
+            fake.advance()
+            stop.wait(max((fake.next - REAL.steady()) * 1e-9, REST))
+    finally:
+        fake.close()

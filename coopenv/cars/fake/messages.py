@@ -1,0 +1,269 @@
+"""What a fake car measures, as the messages of the real ones; stamps in ns."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from coopenv.cars.codec import encode, header, make
+from coopenv.cars.fake.sensors import FILTER_RATE, IMU_RATE, WHEEL_RATE, Block, Pixy, Sensors, bearings_of
+from coopenv.cars.fake.world import Room
+from coopenv.cars.samples import Calibration
+from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.transport.base import Transport
+from coopenv.estimation.arrays import Array
+
+GRAVITY = 9.81  # m/s^2
+
+
+def detections(stamp: int, blocks: list[Block]) -> Any:
+    """Return the ObjectInfoArrayStamped of a frame; one without blocks is a frame as well."""
+    objects = [
+        make(
+            "pixy_camera/msg/ObjectInfo",
+            signature=b.signature,
+            center_x=b.x,
+            center_y=b.y,
+            width=b.width,
+            height=b.height,
+            angle=0,
+            index=b.index,
+            age=b.age,
+        )
+        for b in blocks
+    ]
+    return make("pixy_camera/msg/ObjectInfoArrayStamped", header=header(stamp, "camera"), objects=objects)
+
+
+def bearings(stamp: int, blocks: list[Block], calibration: Calibration) -> Any:
+    """Return the ObjectBearingArrayStamped of a frame."""
+    unit = bearings_of(blocks, calibration).tolist()
+    entries = [
+        make("pixy_camera/msg/ObjectBearing", id=b.signature, bearing_x=x, bearing_y=y, bearing_z=z)
+        for b, (x, y, z) in zip(blocks, unit, strict=True)
+    ]
+    return make("pixy_camera/msg/ObjectBearingArrayStamped", header=header(stamp, "camera"), bearing=entries)
+
+
+def camera_info(stamp: int, c: Calibration) -> Any:
+    """Return the CameraInfo of a lens."""
+    (fx, fy), (cx, cy), (width, height) = c.focal_length, c.principal_point, c.image_size
+    region = make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    return make(
+        "sensor_msgs/msg/CameraInfo",
+        header=header(stamp, "camera"),
+        height=height,
+        width=width,
+        distortion_model="plumb_bob",
+        d=np.array(c.distortion),
+        k=np.array([fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        r=np.eye(3).ravel(),
+        p=np.array([fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
+        binning_x=0,
+        binning_y=0,
+        roi=region,
+    )
+
+
+def wheel(stamp: int, car: str, speed: float, turn_rate: float, variances: tuple[float, float]) -> Any:
+    """Return the TwistWithCovarianceStamped of the wheels; variances of speed and turn rate."""
+    covariance = np.diag([variances[0], 0.0, 0.0, 0.0, 0.0, variances[1]])
+    return make(
+        "geometry_msgs/msg/TwistWithCovarianceStamped",
+        header=header(stamp, f"{car}/base_link"),
+        twist=_twist_with_covariance((speed, 0.0, 0.0), (0.0, 0.0, turn_rate), covariance),
+    )
+
+
+def imu(stamp: int, car: str, turn_rates: Array, variance: float) -> Any:
+    """Return the Imu: turn rates, and the weight of a car on a plane; it knows no orientation."""
+    unknown = np.array([-1.0, *np.zeros(8)])
+    return make(
+        "sensor_msgs/msg/Imu",
+        header=header(stamp, f"{car}/imu"),
+        orientation=_quaternion(np.eye(3)),
+        orientation_covariance=unknown,
+        angular_velocity=_vector(turn_rates),
+        angular_velocity_covariance=(variance * np.eye(3)).ravel(),
+        linear_acceleration=_vector((0.0, 0.0, GRAVITY)),
+        linear_acceleration_covariance=np.zeros(9),
+    )
+
+
+def odometry(stamp: int, frames: tuple[str, str], pose: tuple[Array, Array], twist: tuple[Array, Array]) -> Any:
+    """Return an Odometry: pose (rotation, position) in the first frame, twist (velocity, turn rate) in the second."""
+    return make(
+        "nav_msgs/msg/Odometry",
+        header=header(stamp, frames[0]),
+        child_frame_id=frames[1],
+        pose=_pose_with_covariance(*pose),
+        twist=_twist_with_covariance(*twist, np.zeros((6, 6))),
+    )
+
+
+def estimate(stamp: int, rotation: Array, position: Array) -> Any:
+    """Return the PoseWithCovarianceStamped of a car whose pose is known, in the map."""
+    return make(
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        header=header(stamp, "map"),
+        pose=_pose_with_covariance(rotation, position),
+    )
+
+
+def state(stamp: int, armed: bool) -> Any:
+    """Return the State of the flight controller."""
+    more = {"connected": True, "guided": False, "manual_input": True, "mode": "MANUAL", "system_status": 4}
+    return make("mavros_msgs/msg/State", header=header(stamp), armed=armed, **more)
+
+
+def remote(stamp: int) -> Any:
+    """Return the RCIn of sticks that nobody moves."""
+    channels = np.full(8, 1500, dtype=np.uint16)
+    return make("mavros_msgs/msg/RCIn", header=header(stamp), rssi=200, channels=channels)
+
+
+def battery(stamp: int, share: float) -> Any:
+    """Return the BatteryState of a battery of which a share is left."""
+    amounts = {"voltage": 10.5 + 2.1 * share, "temperature": 25.0, "current": -1.0}
+    capacity = {"charge": 5.0 * share, "capacity": 5.0, "design_capacity": 5.0, "percentage": share}
+    status = {"power_supply_status": 2, "power_supply_health": 1, "power_supply_technology": 3, "present": True}
+    cells = {"cell_voltage": np.zeros(0, np.float32), "cell_temperature": np.zeros(0, np.float32)}
+    names = {"location": "", "serial_number": ""}
+    kind = "sensor_msgs/msg/BatteryState"
+    return make(kind, header=header(stamp), **amounts, **capacity, **status, **cells, **names)
+
+
+def _twist_with_covariance(linear: Any, angular: Any, covariance: Array) -> Any:
+    twist = make("geometry_msgs/msg/Twist", linear=_vector(linear), angular=_vector(angular))
+    return make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=covariance.ravel())
+
+
+def _pose_with_covariance(rotation: Array, position: Array) -> Any:
+    x, y, z = (float(value) for value in position)
+    place = make("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    pose = make("geometry_msgs/msg/Pose", position=place, orientation=_quaternion(rotation))
+    return make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
+
+
+def _quaternion(rotation: Array) -> Any:
+    """Return the quaternion of a rotation by its largest component; in plain numbers, as there are 200 a second."""
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    rows = (
+        (1.0 + a + e + i, h - f, c - g, d - b),
+        (h - f, 1.0 + a - e - i, b + d, c + g),
+        (c - g, b + d, 1.0 - a + e - i, f + h),
+        (d - b, c + g, f + h, 1.0 - a - e + i),
+    )  # 4 q q^T
+    largest = max(range(4), key=lambda k: rows[k][k])
+    scale = math.copysign(1.0 / math.sqrt(sum(v * v for v in rows[largest])), rows[largest][0] or 1.0)
+    w, x, y, z = (scale * v for v in rows[largest])
+    return make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def _vector(values: Any) -> Any:
+    x, y, z = (float(value) for value in values)
+    return make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+TRUTH_RATE, LEADER_RATE, CONDITION_RATE, CAMERA_INFO_RATE = 100.0, 60.0, 5.0, 1.0
+"""Hz: of motion capture, of what a moving landmark says, of what a car says of itself, and of its camera."""
+FULL = 0.9  # share of the battery that is left
+
+Act = Callable[[int, int], None]
+"""Called with when it was due, steady clock, and the stamp by the car's clock; ns."""
+
+
+class Voice:
+    """The messages of any car: motion capture, and those of a moving landmark."""
+
+    def __init__(self, name: str, room: Room, wire: Transport, room_clock: Callable[[int], int], outside: Transport):
+        """Say whose they are.
+
+        Args:
+            name: of the car.
+            room: where it is.
+            wire: its own link.
+            room_clock: returns the stamp of motion capture for a time of the steady clock.
+            outside: the network of motion capture, which has nothing to do with the car's.
+        """
+        self.name, self.room, self.wire = name, room, wire
+        self._room_clock, self._outside = room_clock, outside
+        self._origin = np.array(room.scenario.map.origin)
+
+    @property
+    def acts(self) -> dict[str, tuple[float, Act]]:
+        """Rates in Hz, and what is said, by name."""
+        return {"truth": (TRUTH_RATE, self._truth), "leader": (LEADER_RATE, self._leader)}
+
+    def say(self, role: Role, message: Any) -> None:
+        """Publish on the car's link."""
+        topic = TOPICS[role]
+        name = topic_of(self.name, role)
+        self.wire.publish(name, encode(message), urgent=topic.urgent, reliable=topic.reliable)
+
+    def _truth(self, due: int, _stamp: int) -> None:
+        R, p = self.room.pose(self.room.agent)
+        frames = ("mocap", self.name)
+        message = odometry(self._room_clock(due), frames, (R, p + self._origin), self.room.twist)
+        self._outside.publish(topic_of(self.name, Role.TRUTH), encode(message))
+
+    def _leader(self, _due: int, stamp: int) -> None:
+        R, p = self.room.pose(self.room.agent)
+        self.say(Role.ESTIMATE, estimate(stamp, R, p + self._origin))
+
+
+class DriverVoice(Voice):
+    """The messages of a car that is a vehicle."""
+
+    def __init__(self, *arguments: Any, pixy: Pixy, sensors: Sensors, rng: Callable[[], np.random.Generator]) -> None:
+        """Say whose they are, and what measures; `rng` returns the generator of the episode's noise."""
+        super().__init__(*arguments)
+        self._pixy, self._sensors, self._rng = pixy, sensors, rng
+        self.before_frame: Callable[[], None] = lambda: None
+        """Called before a camera frame is taken."""
+
+    @property
+    def acts(self) -> dict[str, tuple[float, Act]]:
+        """Rates in Hz, and what is said, by name."""
+        return {
+            "truth": (TRUTH_RATE, self._truth),
+            "camera": (self.room.scenario.rates.camera, self._camera),
+            "wheel": (WHEEL_RATE, self._wheel),
+            "imu": (IMU_RATE, self._imu),
+            "odometry": (FILTER_RATE, self._odometry),
+            "condition": (CONDITION_RATE, self._condition),
+            "camera_info": (CAMERA_INFO_RATE, self._camera_info),
+        }
+
+    def _camera(self, due: int, stamp: int) -> None:
+        self.before_frame()
+        blocks = self._pixy.frame(due, self._rng())
+        self.say(Role.DETECTIONS, detections(stamp, blocks))
+        self.say(Role.BEARINGS, bearings(stamp, blocks, self._pixy.calibration))
+
+    def _wheel(self, due: int, stamp: int) -> None:
+        s = self._sensors
+        speed, turn = s.wheel(due, self._rng())
+        variances = (s.wheel_std**2, s.wheel_turn_std**2)
+        self.say(Role.WHEEL, wheel(stamp, self.name, speed, turn, variances))
+
+    def _imu(self, due: int, stamp: int) -> None:
+        rates = self._sensors.gyro(due, self._rng())
+        self.say(Role.IMU, imu(stamp, self.name, rates, self._sensors.gyro_std**2))
+
+    def _odometry(self, due: int, stamp: int) -> None:
+        (x, y, heading), speed, turn = self._sensors.filtered(due)
+        c, s = np.cos(heading), np.sin(heading)
+        R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        twist = np.array([speed, 0.0, 0.0]), np.array([0.0, 0.0, turn])
+        frames = (f"{self.name}/odom", f"{self.name}/base_link")
+        self.say(Role.ODOMETRY, odometry(stamp, frames, (R, np.array([x, y, 0.0])), twist))
+
+    def _camera_info(self, _due: int, stamp: int) -> None:
+        self.say(Role.CAMERA_INFO, camera_info(stamp, self._pixy.calibration))
+
+    def _condition(self, _due: int, stamp: int) -> None:
+        self.say(Role.STATE, state(stamp, armed=True))
+        self.say(Role.REMOTE, remote(stamp))
+        self.say(Role.BATTERY, battery(stamp, FULL))

@@ -1,0 +1,206 @@
+"""The room as one fake car has it: it moves itself by the simulation's kernels, others are where they are heard."""
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.actuation import NEUTRAL, Drive
+from coopenv.cars.backend.binding import Binding
+from coopenv.cars.codec import decode
+from coopenv.cars.samples import rotation_of
+from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.transport.base import Arrival, Transport
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.outcomes import Sight
+from coopenv.scenario import Scenario
+from coopenv.world.camera import observe
+from coopenv.world.dynamics import drive, prescribe
+from coopenv.world.lasting_errors import drift
+from coopenv.world.launch import PerWorld
+from coopenv.world.model import PRESCRIBED
+from coopenv.world.world import World
+
+
+def drive_one(model: Any, state: Any, duration: wp.array(dtype=wp.float64), vehicle: int):
+    """Let one vehicle follow its command for a while, s."""
+    world = wp.tid()
+    drive(model, state, world, vehicle, state.command[world, vehicle], duration[world])
+
+
+def prescribe_one(model: Any, state: Any, time: wp.array(dtype=wp.float64), agent: int):
+    """Put one agent where its prescribed motion is at a time since the start, s."""
+    world = wp.tid()
+    prescribe(model, state, world, agent, time[world])
+
+
+def look_once(model: Any, state: Any, frame: wp.array(dtype=wp.int32), vehicle: int):
+    """Carry the lasting errors of one vehicle to a camera frame and take it; frames count from the start."""
+    world = wp.tid()
+    drift(model, state, world, vehicle, frame[world])
+    observe(model, state, world, vehicle, frame[world])
+
+
+class Room(World):
+    """One world, in which one agent is at home. Poses are in the map, from its origin."""
+
+    def __init__(self, scenario: Scenario, agent: int) -> None:
+        """Build it.
+
+        Args:
+            scenario: what it is a world of.
+            agent: index of the agent that this car is, a moving landmark or, after the landmarks, a vehicle.
+        """
+        super().__init__(scenario, 1, "float64", threads=1)
+        self.agent, self.vehicle = agent, agent - self.model.landmarks
+        self._acceleration = scenario.limits[self.vehicle].max_acceleration if self.vehicle >= 0 else 0.0
+        self._time, self._frame = wp.zeros(1, dtype=wp.float64), wp.zeros(1, dtype=wp.int32)
+        self._time_value, self._frame_value = self._time.numpy(), self._frame.numpy()
+
+    def _build_model(self) -> Any:
+        """Build the model; cameras see whoever carries a marker, and measure before pixels are rounded."""
+        model = super()._build_model()
+        camera = model.camera.numpy()  # on the CPU this and the others are views
+        camera["quantise"], camera["undistort"] = 0, 1
+        targets = np.tile(np.arange(model.agents), (model.vehicles, 1))
+        for vehicle in range(model.vehicles):
+            own = model.landmarks + vehicle
+            targets[vehicle] = [*(a for a in range(model.agents) if a != own), -1]
+        model.targets.numpy()[...] = targets
+        model.target_count.numpy()[...] = model.agents - 1
+        return model
+
+    def begin(self, seed: int) -> None:
+        """Go to the start that the simulation draws with a key; all stand, other vehicles are not there yet."""
+        self.reset([seed])
+        L = self.model.landmarks
+        self.view("present")[0, L:] = 0
+        self.view("present")[0, self.agent] = 1
+        self.view("ended")[0] = 0
+        for name in ("speed", "steering", "velocity", "angular_velocity"):
+            self.view(name)[0] = 0.0
+
+    def drive(self, duration: float, speed: float, steering: float) -> None:
+        """Move by the bicycle under a command, m/s and rad, for a while, s."""
+        self._time_value[0] = duration
+        self.view("command")[0, self.vehicle] = (speed, steering, self._acceleration, 0.0)
+        self._run("drive", drive_one, PerWorld(self._time), self.vehicle)
+
+    def follow(self, time: float) -> None:
+        """Move to where the prescribed motion is at a time since the start, s."""
+        self._time_value[0] = time
+        self._run("prescribe", prescribe_one, PerWorld(self._time), self.agent)
+
+    def look(self, frame: int) -> dict[int, Array]:
+        """Return the unit rays (3,), optical frame, at which the agents in view are seen, by agent."""
+        self._frame_value[0] = frame
+        self._run("look", look_once, PerWorld(self._frame), self.vehicle)
+        seen = np.flatnonzero(self.view("sight")[0, self.vehicle] == Sight.VISIBLE)
+        bearings = self.view("bearing")[0, self.vehicle]
+        return {int(agent): bearings[agent].copy() for agent in seen}
+
+    def put(self, agent: int, rotation: Array, position: Array) -> None:
+        """Put another agent somewhere."""
+        self.view("rotation")[0, agent], self.view("position")[0, agent] = rotation, position
+        self.view("present")[0, agent] = 1
+
+    def pose(self, agent: int) -> tuple[Array, Array]:
+        """Return the rotation (3, 3), body to map, and the position (3,), m, of an agent."""
+        return self.view("rotation")[0, agent], self.view("position")[0, agent]
+
+    def distance(self, agent: int) -> float:
+        """Return how far the body of another agent is, m."""
+        place = self.view("position")[0]
+        return math.dist(place[agent], place[self.agent])
+
+    @property
+    def twist(self) -> tuple[Array, Array]:
+        """The own velocity, m/s, and turn rate, rad/s, (3,) each, body axes."""
+        return self.view("velocity")[0, self.agent], self.view("angular_velocity")[0, self.agent]
+
+
+class Neighbours:
+    """Hears of the other cars; they are in the room from their first message on."""
+
+    def __init__(self, room: Room, binding: Binding, name: str, transport: Transport) -> None:
+        """Listen.
+
+        Args:
+            room: where they are put.
+            binding: who is who.
+            name: of the own car.
+            transport: the network.
+        """
+        L = room.model.landmarks
+        agents = {**binding.leaders, **{car: L + vehicle for car, vehicle in binding.cars.items()}}
+        self._room, self._origin = room, np.array(room.scenario.map.origin)
+        self._agents = {topic_of(car, Role.TRUTH): agent for car, agent in agents.items() if car != name}
+        self._heard: dict[str, bytes] = {}
+        self._moving = np.flatnonzero(room.model.motion.kind.numpy()[:L] == int(PRESCRIBED))
+        transport.subscribe(topic_of("*", Role.TRUTH), self._hear)  # one, as every subscription costs a thread
+
+    def _hear(self, arrival: Arrival) -> None:
+        if arrival.topic in self._agents:
+            self._heard[arrival.topic] = arrival.payload  # read when the camera looks: many are never looked at
+
+    def begin(self) -> None:
+        """Forget where they are; moving landmarks are cars as well, and not there without one."""
+        self._heard.clear()
+        for landmark in self._moving:
+            if landmark != self._room.agent:
+                self._room.view("present")[0, landmark] = 0
+
+    def place(self) -> None:
+        """Put them where they have been last."""
+        while self._heard:
+            try:
+                topic, payload = self._heard.popitem()
+                message = decode(payload, TOPICS[Role.TRUTH].type)
+                place = message.pose.pose.position
+                R = rotation_of(message.pose.pose.orientation, "orientation")
+            except CoopenvError:
+                continue  # whatever somebody else has sent
+            self._room.put(self._agents[topic], R, np.array([place.x, place.y, place.z]) - self._origin)
+
+
+TIMEOUT = 500_000_000  # ns without a command after which the flight controller (PX4) goes to neutral
+
+
+class Actuators:
+    """Commands in the order of time; times in ns on one clock. Lag, limits and dead band are the room's."""
+
+    def __init__(self, latency: float) -> None:
+        """Build them for a dead time in s."""
+        self._latency = round(latency * 1e9)
+        self._waiting: deque[tuple[int, Drive]] = deque()  # from when on
+        self._now = NEUTRAL
+        self._until = 0  # when the command that is followed becomes too old
+
+    def clear(self) -> None:
+        """Forget all commands."""
+        self._waiting.clear()
+        self._now = NEUTRAL
+
+    def receive(self, drive: Drive, at: int) -> None:
+        """Take a command that has come."""
+        self._waiting.append((at + self._latency, drive))
+
+    def pieces(self, begin: int, end: int) -> Iterator[tuple[float, Drive]]:
+        """Yield (how long in s, what is followed) from a time to a later one; each stretch is asked for once."""
+        now = begin
+        while now < end:
+            if self._waiting and self._waiting[0][0] <= now:
+                since, self._now = self._waiting.popleft()
+                self._until = since + TIMEOUT
+                continue
+            if self._now != NEUTRAL and now >= self._until:
+                self._now = NEUTRAL
+            stop = min(end, self._waiting[0][0] if self._waiting else end)
+            if self._now != NEUTRAL:
+                stop = min(stop, self._until)
+            yield (stop - now) * 1e-9, self._now
+            now = stop

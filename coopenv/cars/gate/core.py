@@ -1,0 +1,233 @@
+"""What the gate decides, without threads, clocks or a network of its own.
+
+It starts disarmed. An arming by the station names a session and the nonce that the gate has shown last; the nonce is a
+new one after every start, arming, disarming and stop, so that an arming counts once and only if whoever sent it knew of
+the latest stop. A disarming needs no nonce. Armed, the gate lets commands of that session through, each newer than all
+before it, not older than 0.15 s, finite, and inside the limits. Until the first one the car stands.
+
+Without another one for 0.2 s the car gets neutral: the gate has timed out. Newer commands of the same session may go on
+from there: what a stalled link delivers late is older than 0.15 s and moves nothing, and what has just been sent is
+what the station wants now. The car then starts from a stand, at the limited acceleration.
+
+A stop stays until the next arming. It needs no signature: whoever asks for it gets it, as the worst that can come of it
+is a car that stands. Its `false` does nothing.
+"""
+
+import math
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+
+from coopenv.cars.actuation import NEUTRAL, Drive, to_manual
+from coopenv.cars.gate.codec import (
+    Command,
+    Malformed,
+    Status,
+    read_arm,
+    read_bool,
+    read_command,
+    write_manual,
+    write_status,
+)
+from coopenv.cars.keys import Verifier, is_identity
+from coopenv.cars.limits import Limits
+from coopenv.cars.topics import TOPICS, Role, topic_of
+
+
+class State(StrEnum):
+    """Of the gate."""
+
+    DISARMED = "disarmed"
+    ARMED = "armed"
+    TIMED_OUT = "timed_out"
+    STOPPED = "stopped"
+
+
+class Reason(StrEnum):
+    """Why a message has been rejected."""
+
+    TOO_LONG = "too_long"
+    MALFORMED = "malformed"
+    NOT_ARMED = "not_armed"
+    SESSION = "session"
+    SEQUENCE = "sequence"
+    STALE = "stale"
+    FUTURE = "future"
+    SIGNATURE = "signature"
+    NOT_FINITE = "not_finite"
+    LIMITS = "limits"
+    NONCE = "nonce"
+
+
+class Rejected(Exception):  # noqa: N818
+    """A message is not accepted."""
+
+    def __init__(self, reason: Reason) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
+@dataclass(frozen=True)
+class Clock:
+    """What time it is."""
+
+    wall: Callable[[], int]  # ns, that of stamps
+    steady: Callable[[], int]  # ns, never set
+
+
+PERIOD = 50_000_000  # ns between outputs
+TIMEOUT = 200_000_000  # ns without a valid command after which the car gets neutral
+MOST_AGE = round(1e9 * (TOPICS[Role.COMMAND].max_age or 0.0))  # ns
+MOST_AHEAD = 50_000_000  # ns that a stamp may lie in the future
+MOST_BYTES = 512  # of a message to the gate; its own have less than 300
+MOST_DIGITS = 18  # of a sequence number
+
+
+class Gate:
+    """The gate of one car; calls from several threads are to be kept apart."""
+
+    def __init__(
+        self, car: str, limits: Limits, clock: Clock, verifier: Verifier | None = None, station: str = "station"
+    ) -> None:
+        """Start disarmed.
+
+        Args:
+            car: its name, as in its topics.
+            limits: of commands.
+            clock: clocks.
+            verifier: knows the station's public key; None: nothing is signed, and anybody can drive the car.
+            station: who may arm and command.
+        """
+        self._car, self._limits, self._clock = car, limits, clock
+        self._verifier, self._station = verifier, station
+        self._readers = {Role.COMMAND: self._command, Role.ARM: self._arm, Role.STOP: self._stop}
+        self._counts = dict.fromkeys(Reason, 0)
+        self._state, self._nonce = State.DISARMED, secrets.token_hex(8)
+        self._session, self._sequence, self._accepted = "", -1, 0
+        self._wanted: Drive | None = None  # by the last valid command, while it counts
+        self._commanded = self._ticked = clock.steady()
+        self._output = NEUTRAL
+
+    @property
+    def nonce(self) -> str:
+        """What the next arming has to name."""
+        return self._nonce
+
+    @property
+    def commanded(self) -> int:
+        """When the last valid command came, steady clock, ns."""
+        return self._commanded
+
+    @property
+    def state(self) -> State:
+        """The state at this instant."""
+        if self._wanted is not None and self._clock.steady() - self._commanded > TIMEOUT:
+            self._come_to_a_stand(State.TIMED_OUT)
+        return self._state
+
+    def arrive(self, role: Role, payload: bytes, attachment: bytes = b"") -> Reason | None:
+        """Take a message under COMMAND, ARM or STOP, whatever its bytes are; return why it was rejected, if it was."""
+        try:
+            if len(payload) > MOST_BYTES:
+                raise Rejected(Reason.TOO_LONG)
+            self._readers[role](payload, attachment)
+        except Malformed:
+            return self._count(Reason.MALFORMED)
+        except Rejected as rejected:
+            return self._count(rejected.reason)
+        return None
+
+    def tick(self) -> bytes:
+        """Return the ManualControl for the car now; to be called every 50 ms."""
+        now = self._clock.steady()
+        if self.state is State.ARMED and self._wanted is not None:
+            # After a late call it is as if it had been in time: no jump.
+            dt = min(now - self._ticked, PERIOD) / 1e9
+            before, wanted = self._output, self._wanted
+            speed, steering = self._limits.approach(
+                (before.speed, before.steering), (wanted.speed, wanted.steering), dt
+            )
+            self._output = Drive(steering, speed)
+        self._ticked = now
+        return write_manual(self._clock.wall(), to_manual(self._output))
+
+    def neutral(self) -> bytes:
+        """Close for good and return the ManualControl of a car that stands."""
+        self._come_to_a_stand(State.STOPPED)
+        return write_manual(self._clock.wall(), to_manual(NEUTRAL))
+
+    def status(self) -> bytes:
+        """Return the GateStatus now."""
+        state = self.state
+        session = self._session if state in (State.ARMED, State.TIMED_OUT) else ""
+        last, counts = max(self._sequence, 0), {str(reason): count for reason, count in self._counts.items()}
+        return write_status(Status(self._clock.wall(), session, self._nonce, state, self._accepted, last, counts))
+
+    def _command(self, payload: bytes, attachment: bytes) -> None:
+        command = read_command(payload)
+        if self.state not in (State.ARMED, State.TIMED_OUT):
+            raise Rejected(Reason.NOT_ARMED)
+        session, _, digits = command.frame.rpartition(":")
+        if session != self._session:
+            raise Rejected(Reason.SESSION)
+        if not (digits.isascii() and digits.isdigit() and len(digits) <= MOST_DIGITS):
+            raise Rejected(Reason.MALFORMED)
+        if int(digits) <= self._sequence:
+            raise Rejected(Reason.SEQUENCE)
+        self._check_stamp(command.stamp)
+        self._check_signature(Role.COMMAND, payload, attachment)
+        self._check_values(command)
+        self._sequence, self._accepted = int(digits), self._accepted + 1
+        self._wanted, self._commanded = Drive(command.steering, command.speed), self._clock.steady()
+        self._state = State.ARMED
+
+    def _arm(self, payload: bytes, attachment: bytes) -> None:
+        message = read_arm(payload)
+        self._check_stamp(message.stamp)
+        self._check_signature(Role.ARM, payload, attachment)
+        if not message.armed:
+            if self.state is not State.STOPPED:
+                self._come_to_a_stand(State.DISARMED)
+            return
+        if message.nonce != self._nonce:
+            raise Rejected(Reason.NONCE)
+        if not is_identity(message.session):
+            raise Rejected(Reason.SESSION)
+        if message.session != self._session:  # one that is armed again goes on counting: nothing of it comes twice
+            self._session, self._sequence = message.session, -1
+        self._come_to_a_stand(State.ARMED)
+
+    def _stop(self, payload: bytes, _attachment: bytes) -> None:
+        if read_bool(payload) and self._state is not State.STOPPED:
+            self._come_to_a_stand(State.STOPPED)
+
+    def _come_to_a_stand(self, state: State) -> None:
+        """Go on in a state with neutral output; unless it is a mere time-out, earlier armings are worth nothing."""
+        self._state, self._wanted, self._output = state, None, NEUTRAL
+        if state is not State.TIMED_OUT:
+            self._nonce = secrets.token_hex(8)
+
+    def _check_stamp(self, stamp: int) -> None:
+        age = self._clock.wall() - stamp
+        if age > MOST_AGE:
+            raise Rejected(Reason.STALE)
+        if age < -MOST_AHEAD:
+            raise Rejected(Reason.FUTURE)
+
+    def _check_signature(self, role: Role, payload: bytes, attachment: bytes) -> None:
+        known = self._verifier
+        if known is not None and known.signer(topic_of(self._car, role), payload, attachment) != self._station:
+            raise Rejected(Reason.SIGNATURE)
+
+    def _check_values(self, command: Command) -> None:
+        numbers = (command.steering, command.steering_rate, command.speed, command.acceleration, command.jerk)
+        if not all(map(math.isfinite, numbers)):
+            self._come_to_a_stand(State.TIMED_OUT)  # the station itself has lost its way
+            raise Rejected(Reason.NOT_FINITE)
+        if not self._limits.permit(command.speed, command.steering):
+            raise Rejected(Reason.LIMITS)
+
+    def _count(self, reason: Reason) -> Reason:
+        self._counts[reason] += 1
+        return reason

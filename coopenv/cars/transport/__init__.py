@@ -1,0 +1,1 @@
+"""Transports: one protocol, several networks."""

@@ -1,0 +1,200 @@
+"""The authors' names and types on the wire, those of `coopenv.cars.topics` for whoever uses it.
+
+What has a counterpart goes out under the authors' name as a ROS 1 message. If that loses something (an estimate becomes
+a position alone) or there is none, it goes out under our own name as well, as CDR, to be heard by other coopenv ends.
+"""
+
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.actuation import from_manual, to_lowlevel
+from coopenv.cars.codec import decode, decode_ros1, empty, encode, encode_ros1, make, ros1, ros2
+from coopenv.cars.deployment import Car, DeploymentError
+from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.transport.base import Arrival, Callback, Transport, matcher
+
+
+def to_ros1(message: Any) -> Any:
+    """Return a ROS 2 message as the ROS 1 message of the same type; its header's `seq` is 0."""
+    return _converted(ros1(), message, message.__msgtype__)
+
+
+def to_ros2(message: Any) -> Any:
+    """Return a ROS 1 message as the ROS 2 message of the same type."""
+    return _converted(ros2(), message, message.__msgtype__)
+
+
+def point_of(message: Any) -> Any:
+    """Return the position of a ROS 2 PoseWithCovarianceStamped as a ROS 1 PointStamped."""
+    position = message.pose.pose.position
+    return to_ros1(make("geometry_msgs/msg/PointStamped", header=message.header, point=position))
+
+
+def _converted(store: Any, message: Any, kind: str) -> Any:
+    values = {name: _value(store, node, _field(message, name)) for name, node in store.fielddefs[kind][1]}
+    return store.types[kind](**values)
+
+
+def _field(message: Any, name: str) -> Any:
+    """Return a field; ROS 1 writes the matrices of cameras large, ROS 2 small, and only ROS 1 counts headers."""
+    if name == "seq":
+        return 0
+    return getattr(message, name) if hasattr(message, name) else getattr(message, name.swapcase())
+
+
+def _value(store: Any, node: Any, value: Any) -> Any:
+    """Return a field's value in the types of a store; `node` is the field as rosbags describes it."""
+    kind, of = node
+    if kind.name == "NAME":
+        return _converted(store, value, of)
+    if kind.name == "BASE" or isinstance(value, np.ndarray):
+        return value
+    return [_value(store, of[0], element) for element in value]
+
+
+def low_level(message: Any) -> Any:
+    """Return a ManualControl as the lli_ctrl that does the same, steering to the left positive on both."""
+    wanted = to_lowlevel(from_manual(message.y, message.z, message.aux3))
+    numbers = (wanted.steering, wanted.velocity, wanted.trans_diff, wanted.ctrl)
+    return ros1().types["svea_msgs/msg/lli_ctrl"](*numbers)
+
+
+@dataclass(frozen=True)
+class Counterpart:
+    """A topic of the authors' that tells what one of ours does."""
+
+    name: str  # with {agent}, the agent's number, or {car}, the car's name
+    type: str  # of ROS 1
+    convert: Callable[[Any], Any] = to_ros1  # from our message to theirs
+    exact: bool = True  # nothing is lost, and the way back is `to_ros2`; else it is only for them
+
+
+COUNTERPARTS = {
+    Role.DETECTIONS: Counterpart("agent{agent}/pixy_node/objectsInfo", TOPICS[Role.DETECTIONS].type),
+    Role.BEARINGS: Counterpart("agent{agent}/pixy_landmark_detection/objectsBearing", TOPICS[Role.BEARINGS].type),
+    Role.CAMERA_INFO: Counterpart("agent{agent}/pixy_node/camera_info", TOPICS[Role.CAMERA_INFO].type),
+    Role.WHEEL: Counterpart("agent{agent}/actuation_twist", TOPICS[Role.WHEEL].type),
+    Role.TRUTH: Counterpart("qualisys/{car}/odom", TOPICS[Role.TRUTH].type),
+    Role.POINT: Counterpart("agent{agent}/riccatiPoint", TOPICS[Role.POINT].type),
+    Role.ESTIMATE: Counterpart("agent{agent}/riccatiPoint", TOPICS[Role.POINT].type, point_of, exact=False),
+    Role.MANUAL: Counterpart("agent{agent}/lli/ctrl_request", "svea_msgs/msg/lli_ctrl", low_level, exact=False),
+}
+"""By role. Commands are not among them: they go to the gate, and what the gate has let through to the low level."""
+
+
+@dataclass(frozen=True)
+class Route:
+    """A topic of one car and its counterpart."""
+
+    topic: str
+    ours: str  # ROS 2 type
+    name: str
+    theirs: Counterpart
+
+    def out(self, payload: bytes) -> bytes:
+        """Return ROS 1 bytes for CDR bytes. Raises CoopenvError: they are no such message."""
+        return encode_ros1(self.theirs.convert(decode(payload, self.ours)))
+
+    def back(self, payload: bytes) -> bytes:
+        """Return CDR bytes for ROS 1 bytes, likewise."""
+        return encode(to_ros2(decode_ros1(payload, self.theirs.type)))
+
+    def warm_up(self) -> None:
+        """Translate once, since the first time compiles and takes a tenth of a second."""
+        translated = self.out(encode(empty(self.ours)))
+        if self.theirs.exact:
+            self.back(translated)
+
+
+def routes_of(car: Car) -> tuple[Route, ...]:
+    """Return those of a car. Raises DeploymentError: it has no number."""
+    agent = car.agent_number
+    if agent is None:
+        raise DeploymentError(f"cars: {car.name}: agent is missing: the N of agentN in the authors' names (or marker)")
+    return tuple(
+        Route(topic_of(car.name, role), TOPICS[role].type, other.name.format(agent=agent, car=car.name), other)
+        for role, other in COUNTERPARTS.items()
+    )
+
+
+class Authors:
+    """A transport whose topics are translated on their way to and from another one.
+
+    Signatures count for the CDR bytes under our names. They go along with exact counterparts, whose bytes come back as
+    they were, and otherwise with the message under our own name.
+    """
+
+    def __init__(self, wire: Transport, routes: Iterable[Route]) -> None:
+        """Take a network with the authors' messages, which is closed with this, and what is translated."""
+        self._wire = wire
+        self._routes = {route.topic: route for route in routes}
+        self._names = {route.name for route in self._routes.values()}
+        self._lock = threading.Lock()
+        self.refused: Counter[str] = Counter()
+        """Messages that are not of their topic's type, by topic, ours or theirs."""
+        warmed = {(route.ours, route.theirs.type): route for route in self._routes.values()}
+        for route in warmed.values():
+            route.warm_up()
+
+    def publish(
+        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
+    ) -> None:
+        """Send, see `Transport`."""
+        route = self._routes.get(topic)
+        if route is None or not route.theirs.exact:
+            self._wire.publish(topic, payload, attachment, urgent=urgent, reliable=reliable)
+        if route is None:
+            return
+        translated = self._translated(route.out, payload, topic)
+        if translated is not None:
+            beside = attachment if route.theirs.exact else b""
+            self._wire.publish(route.name, translated, beside, urgent=urgent, reliable=reliable)
+
+    def subscribe(self, pattern: str, callback: Callback) -> None:
+        """Subscribe, see `Transport`."""
+        matches = matcher(pattern)
+        for route in self._routes.values():
+            if route.theirs.exact and matches(route.topic):
+                self._wire.subscribe(route.name, self._translating(route, callback))
+        if pattern in self._routes and self._routes[pattern].theirs.exact:
+            return
+
+        def pass_on(arrival: Arrival) -> None:
+            if arrival.topic not in self._names:
+                callback(arrival)
+
+        self._wire.subscribe(pattern, pass_on)
+
+    def _translating(self, route: Route, callback: Callback) -> Callback:
+        def arrive(arrival: Arrival) -> None:
+            payload = self._translated(route.back, arrival.payload, route.name)
+            if payload is not None:
+                callback(Arrival(route.topic, payload, arrival.received, arrival.attachment))
+
+        return arrive
+
+    def _translated(self, translate: Callable[[bytes], bytes], payload: bytes, name: str) -> bytes | None:
+        try:
+            return translate(payload)
+        except CoopenvError:
+            with self._lock:
+                self.refused[name] += 1
+            return None
+
+    def announce(self, name: str) -> None:
+        """Announce, see `Transport`."""
+        self._wire.announce(name)
+
+    def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
+        """Watch, see `Transport`."""
+        self._wire.watch(pattern, callback)
+
+    def close(self) -> None:
+        """End the connection."""
+        self._wire.close()

@@ -1,0 +1,355 @@
+"""NATS, as the authors' cars talk to each other: a topic's name with dots for slashes, the payload as it is."""
+
+import asyncio
+import base64
+import binascii
+import ssl
+import threading
+import time
+import uuid
+from collections import deque
+from collections.abc import Callable, Coroutine, Sequence
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.transport.base import Arrival, Callback, LinkError, matcher
+from coopenv.cars.transport.endpoints import Address, address_of, trouble_at
+from coopenv.cars.transport.zenoh import Certificates
+
+ATTACHMENT = "Coopenv-Attachment"
+"""Header, base64; the authors' connector looks at no headers."""
+
+
+def subject_of(topic: str) -> str:
+    """Return a topic's name on the wire."""
+    return topic.replace("/", ".")
+
+
+def topic_of(subject: str) -> str:
+    """Return the topic of a name on the wire."""
+    return subject.replace(".", "/")
+
+
+def subjects_of(pattern: str) -> tuple[str, ...]:
+    """Return subjects that hold at least what a pattern matches; NATS has no `**` but at the end, for one or more."""
+    parts = pattern.split("/")
+    if "**" not in parts:
+        return (subject_of(pattern),)
+    first = parts.index("**")
+    before = ".".join(parts[:first])
+    if not before:
+        return (">",)
+    alone = all(part == "**" for part in parts[first:])
+    return (before, f"{before}.>") if alone else (f"{before}.>",)
+
+
+def headers_of(attachment: bytes) -> dict[str, str] | None:
+    """Return the headers of a message (None: it needs none)."""
+    return {ATTACHMENT: base64.b64encode(attachment).decode()} if attachment else None
+
+
+def attachment_of(headers: dict[str, str] | None) -> bytes:
+    """Return what is beside a message; nothing, if its header is none of ours."""
+    try:
+        return base64.b64decode((headers or {}).get(ATTACHMENT, ""), validate=True)
+    except (binascii.Error, ValueError):
+        return b""
+
+
+PERIOD = 0.25  # s between two times
+LEASE = 1.0  # s of silence after which somebody counts as gone
+
+Change = Callable[[str, bool], None]
+
+
+class Presence:
+    """Names that this end announces, and those of others that it has heard."""
+
+    def __init__(self, say: Callable[[str, bytes], None]) -> None:
+        """Take what sends a heartbeat: (name, payload)."""
+        self._say = say
+        self._self = uuid.uuid4().bytes  # two ends may announce one name, of which one goes
+        self._own: list[str] = []
+        self._last: dict[tuple[str, bytes], float] = {}
+        self._watchers: list[tuple[Callable[[str], bool], Change]] = []
+        self._lock = threading.RLock()
+
+    def announce(self, name: str) -> None:
+        """Begin to say that `name` is there."""
+        with self._lock:
+            self._own.append(name)
+        self._say(name, b"+" + self._self)
+
+    def watch(self, pattern: str, callback: Change) -> None:
+        """Call back for every name that matches, now and when it comes or goes."""
+        matches = matcher(pattern)
+        with self._lock:
+            self._watchers.append((matches, callback))
+            for name in sorted({name for name, _ in self._last if matches(name)}):
+                callback(name, True)
+
+    def hear(self, name: str, payload: bytes) -> None:
+        """Take a heartbeat."""
+        who = name, payload[1:]
+        with self._lock:
+            if payload[:1] == b"+":
+                new = all(known != name for known, _ in self._last)
+                self._last[who] = time.monotonic()
+                if new:
+                    self._tell(name, True)
+            elif self._last.pop(who, None) is not None:
+                self._tell_if_gone(name)
+
+    def beat(self) -> None:
+        """Say what is to be said and see who has fallen silent; to be called every `PERIOD`."""
+        with self._lock:
+            own, late = list(self._own), time.monotonic() - LEASE
+            for who in [who for who, last in self._last.items() if last < late]:
+                del self._last[who]
+                self._tell_if_gone(who[0])
+        for name in own:
+            self._say(name, b"+" + self._self)
+
+    def leave(self) -> None:
+        """Say that this end goes."""
+        with self._lock:
+            own, self._own = self._own, []
+            self._watchers.clear()
+        for name in own:
+            self._say(name, b"-" + self._self)
+
+    def _tell_if_gone(self, name: str) -> None:
+        if all(known != name for known, _ in self._last):
+            self._tell(name, False)
+
+    def _tell(self, name: str, there: bool) -> None:
+        for matches, callback in self._watchers:
+            if matches(name):
+                callback(name, there)
+
+
+class Letter(NamedTuple):
+    """A message that waits."""
+
+    topic: str
+    payload: bytes
+    attachment: bytes
+
+
+class Outbox:
+    """Two queues; used from any thread."""
+
+    def __init__(self, most: int, patience: float) -> None:
+        """Make it.
+
+        Args:
+            most: messages of each queue; then the oldest is dropped.
+            patience: s that the sender of a reliable message waits before that.
+        """
+        self._most, self._patience = most, patience
+        self._urgent: deque[Letter] = deque()
+        self._other: deque[Letter] = deque()
+        self._changed = threading.Condition()
+
+    def put(self, letter: Letter, *, urgent: bool, patient: bool) -> None:
+        """Add a message; if there is no room, a patient sender waits for some, and then the oldest goes."""
+        queue = self._urgent if urgent else self._other
+        with self._changed:
+            if patient:
+                self._changed.wait_for(lambda: len(queue) < self._most, self._patience)
+            if len(queue) >= self._most:
+                queue.popleft()
+            queue.append(letter)
+
+    def take(self) -> Letter | None:
+        """Return the next message; None: there is none."""
+        with self._changed:
+            queue = self._urgent or self._other
+            if not queue:
+                return None
+            self._changed.notify_all()
+            return queue.popleft()
+
+
+HEARTBEATS = "presence/"
+"""Where announced names are said; no topic of anybody."""
+
+MOST_WAITING = 1024  # messages to send, and received ones per subscription; then the oldest, or the new ones, are lost
+PATIENCE = 1.0  # s
+PENDING_BYTES = 131_072  # that the library may hold: what waits longer than a broker's hiccup is of no use
+
+OPTIONS = {
+    "max_reconnect_attempts": -1,
+    "reconnect_time_wait": 0.2,
+    "ping_interval": 1,
+    "max_outstanding_pings": 2,
+    "pending_size": PENDING_BYTES,
+}
+
+
+class Nats:
+    """A connection to a broker as a transport; it lives in a thread of its own and comes back by itself."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="nats", daemon=True)
+        self._thread.start()
+        self._client: Any = None
+        self._outbox = Outbox(MOST_WAITING, PATIENCE)
+        self._wake = asyncio.Event()
+        self._presence = Presence(lambda name, payload: self.publish(HEARTBEATS + name, payload))
+        self._watching = False
+        self._closed = False
+
+    def open(self, connect: Callable[[], Coroutine[Any, Any, Any]], timeout: float) -> None:
+        """Connect within s; errors are the library's."""
+        self._client = self._wait(asyncio.wait_for(connect(), timeout), timeout + 5.0)
+        self._wait(self._start(), 5.0)
+
+    async def _start(self) -> None:
+        self._tasks = [asyncio.create_task(self._send()), asyncio.create_task(self._beat())]
+
+    def publish(
+        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
+    ) -> None:
+        """Send, see `Transport`."""
+        if self._closed:
+            return
+        patient = reliable and threading.current_thread() is not self._thread
+        self._outbox.put(Letter(topic, payload, attachment), urgent=urgent or reliable, patient=patient)
+        with suppress(RuntimeError):  # closed meanwhile
+            self._loop.call_soon_threadsafe(self._wake.set)
+
+    async def _send(self) -> None:
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            while (letter := self._outbox.take()) is not None:
+                if self._client.is_connected:  # else it is lost: nobody wants it later
+                    await self._post(letter)
+
+    async def _post(self, letter: Letter) -> None:
+        headers = headers_of(letter.attachment)
+        with suppress(Exception):  # whatever keeps it from being sent, it is lost
+            await self._client.publish(subject_of(letter.topic), letter.payload, headers=headers)
+
+    async def _beat(self) -> None:
+        while True:
+            await asyncio.sleep(PERIOD)
+            self._presence.beat()
+
+    def subscribe(self, pattern: str, callback: Callback) -> None:
+        """Subscribe, see `Transport`."""
+        matches = matcher(pattern)
+
+        async def arrive(message: Any) -> None:
+            topic = topic_of(message.subject)
+            if matches(topic) and not topic.startswith(HEARTBEATS):
+                callback(Arrival(topic, message.data, time.time_ns(), attachment_of(message.headers)))
+
+        self._listen(pattern, arrive)
+
+    def announce(self, name: str) -> None:
+        """Announce, see `Transport`."""
+        self._presence.announce(name)
+
+    def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
+        """Watch, see `Transport`."""
+        self._presence.watch(pattern, callback)
+        if not self._watching:
+            self._watching = True
+
+            async def hear(message: Any) -> None:
+                self._presence.hear(topic_of(message.subject).removeprefix(HEARTBEATS), message.data)
+
+            self._listen(HEARTBEATS + "**", hear)
+
+    def _listen(self, pattern: str, arrive: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
+        async def subscribe() -> None:
+            for subject in subjects_of(pattern):
+                await self._client.subscribe(subject, cb=arrive, pending_msgs_limit=MOST_WAITING)
+            await self._client.flush(PATIENCE)
+
+        with suppress(Exception):  # the broker is away: the library subscribes when it is back
+            self._wait(subscribe(), 2.0 * PATIENCE)
+
+    def _wait(self, work: Coroutine[Any, Any, Any], timeout: float) -> Any:
+        """Have the loop do something; wait for it, unless this is the loop's own thread."""
+        future = asyncio.run_coroutine_threadsafe(work, self._loop)
+        return None if threading.current_thread() is self._thread else future.result(timeout)
+
+    def close(self) -> None:
+        """End the connection and its thread."""
+        if self._closed:
+            return
+        self._presence.leave()
+        self._closed = True
+        with suppress(Exception):
+            self._wait(self._end(), 2.0 * PATIENCE)
+        with suppress(Exception):  # what still waits for a broker that says nothing
+            self._wait(self._cancel(), PATIENCE)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(PATIENCE)
+            if not self._thread.is_alive():
+                self._loop.close()
+
+    async def _cancel(self) -> None:
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        for task in others:
+            task.cancel()
+        await asyncio.gather(*others, return_exceptions=True)
+
+    async def _end(self) -> None:
+        if self._client is None:
+            return
+        for task in self._tasks:
+            task.cancel()
+        while (letter := self._outbox.take()) is not None and self._client.is_connected:
+            await self._post(letter)
+        await self._client.close()
+
+
+def open_nats(connect: Sequence[str], tls: Certificates | None = None, timeout: float = 2.0) -> Nats:
+    """Connect to a broker.
+
+    Args:
+        connect: endpoints of one or of several brokers of a cluster, e.g. "nats/127.0.0.1:4222" or "tls/broker:4222".
+        tls: certificates, for endpoints `tls/...`.
+        timeout: s to wait for one of them.
+
+    Raises:
+        CoopenvError: the extra is not installed, or an endpoint is not one.
+        LinkError: no broker answers.
+    """
+    addresses = [address_of(endpoint) for endpoint in connect]
+    try:
+        import nats
+    except ImportError:
+        raise CoopenvError("NATS needs an extra: pip install '.[nats]'") from None
+
+    last: list[Exception] = []
+
+    async def keep(error: Exception) -> None:
+        """Keep the library from printing what it will try again."""
+        last[:] = [error]
+
+    context = tls.context() if tls else None
+    servers = [f"{'tls' if address.protocol == 'tls' else 'nats'}://{address.authority}" for address in addresses]
+    made = Nats()
+    try:
+        made.open(lambda: nats.connect(servers, error_cb=keep, tls=context, **OPTIONS), timeout)
+    except Exception as error:  # the library's own, of the network, of TLS
+        made.close()
+        reason = _reason(last[0] if last else error, addresses)
+        raise LinkError(f"{', '.join(connect)}: no NATS broker there ({reason})") from None
+    return made
+
+
+def _reason(error: Exception, addresses: Sequence[Address]) -> str:
+    """Return why no broker has answered."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"its certificate is refused: {error.verify_message}"
+    troubles = (trouble_at(address, None, 1.0) for address in addresses)
+    return next(filter(None, troubles), str(error) or "no answer in the language of NATS")

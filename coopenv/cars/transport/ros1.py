@@ -1,0 +1,282 @@
+"""Topics of a ROS 1 master by rospy, for cars with ROS noetic; payloads are ROS 1 bytes."""
+
+import atexit
+import os
+import socket
+import struct
+import threading
+import time
+import xmlrpc.client
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import cache
+from http.client import HTTPConnection
+from typing import Any
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.codec import ros1
+from coopenv.cars.transport.base import Arrival, Callback, LinkError, matcher
+from coopenv.cars.transport.endpoints import Address, address_of, trouble_at
+from coopenv.cars.transport.nats import PERIOD, Presence
+
+ENVELOPE = "std_msgs/msg/UInt8MultiArray"
+"""Type of topics that the authors do not have: CDR bytes, with what is beside them before them."""
+
+CALLER = "/coopenv"
+
+_lock = threading.Lock()
+_master: str | None = None
+
+
+def rospy() -> Any:
+    """Return the library. Raises CoopenvError: it is not installed for this interpreter."""
+    try:
+        import rospy
+    except ImportError:
+        raise CoopenvError(
+            "ROS 1 needs rospy: install Debian's python3-rospy and python3-rosmaster, or ROS noetic, and use the "
+            "system's interpreter (/usr/bin/python3 -m venv --system-site-packages VENV)"
+        ) from None
+    return rospy
+
+
+class Master:
+    """The ROS master, asked with a time limit, which rospy's own proxy has not."""
+
+    def __init__(self, address: Address, timeout: float) -> None:
+        self.uri = f"http://{address.authority}"
+        self._proxy = xmlrpc.client.ServerProxy(self.uri, transport=_Timed(timeout))
+        self._lock = threading.Lock()
+
+    def ask(self, question: str, *arguments: str) -> Any:
+        """Return an answer; None: there is no such thing. Raises OSError: the master does not answer."""
+        with self._lock:
+            try:
+                code, _, value = getattr(self._proxy, question)(CALLER, *arguments)
+            except (xmlrpc.client.Error, ValueError, TypeError) as error:
+                raise OSError(f"no ROS master ({type(error).__name__})") from None
+        return value if code == 1 else None
+
+
+class _Timed(xmlrpc.client.Transport):
+    def __init__(self, timeout: float) -> None:
+        super().__init__()
+        self._timeout = timeout
+
+    def make_connection(self, host: Any) -> HTTPConnection:
+        return HTTPConnection(host, timeout=self._timeout)
+
+
+def join(address: Address, timeout: float) -> Master:
+    """Make this process a node of a master, once.
+
+    Raises:
+        LinkError: no master answers, or the process is a node of another one already.
+        CoopenvError: rospy is not installed.
+    """
+    global _master
+    library, master = rospy(), Master(address, timeout)
+    try:
+        master.ask("getPid")
+    except OSError as error:
+        reason = trouble_at(address, None, timeout) or error
+        raise LinkError(f"{address.protocol}/{address.authority}: no ROS master there ({reason})") from None
+    with _lock:
+        if _master not in (None, master.uri):
+            raise LinkError(f"{master.uri}: this process is a node of {_master} already, and can be one of one only")
+        if _master is None:
+            os.environ["ROS_MASTER_URI"] = master.uri
+            if not {"ROS_IP", "ROS_HOSTNAME"} & set(os.environ):
+                os.environ["ROS_IP"] = _own_address(address)  # else rospy listens on, and says, whatever it finds
+            options = {"disable_signals": True, "disable_rostime": True, "disable_rosout": True}
+            library.init_node("coopenv", argv=[], anonymous=True, **options)
+            atexit.register(library.signal_shutdown, "the process ends")
+            _master = master.uri
+    return master
+
+
+def _own_address(master: Address) -> str:
+    """Return the address of this computer as the master sees it; nothing is sent."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect((master.host, master.port))
+        return str(probe.getsockname()[0])
+
+
+@cache
+def raw_type(kind: str) -> Any:
+    """Return a message class of a ROS 1 type whose content is bytes; peers check its type as ever."""
+    text, checksum = ros1().generate_msgdef(kind)
+    named = {"_type": kind.replace("/msg/", "/"), "_md5sum": checksum, "_full_text": text, "__slots__": ["_buff"]}
+    return type("Raw", (rospy().AnyMsg,), named)
+
+
+def sealed(payload: bytes, attachment: bytes) -> bytes:
+    """Return both as a UInt8MultiArray without dimensions."""
+    content = struct.pack("<I", len(attachment)) + attachment + payload
+    return struct.pack("<III", 0, 0, len(content)) + content
+
+
+def opened(message: bytes) -> tuple[bytes, bytes] | None:
+    """Return payload and attachment of `sealed`; None: it is not one."""
+    if len(message) < 16:
+        return None
+    dimensions, offset, size, beside = struct.unpack_from("<4I", message)
+    if dimensions or offset or size != len(message) - 12 or beside > size - 4:
+        return None
+    return message[16 + beside :], message[16 : 16 + beside]
+
+
+PRESENCE = "coopenv/presence"
+MOST_WAITING = 256  # messages per topic and peer; then the oldest are lost
+PATIENCE = 0.5  # s that the first reliable message of a topic waits for somebody to hear it
+CHECKS = 4  # of the presence's beats until the master is looked at again
+
+
+class Ros1:
+    """The node of this process as a transport.
+
+    What is beside a message (its signature) travels only where the topic's type is our own: types of ROS 1 have no
+    place for it.
+    """
+
+    def __init__(self, master: Master, types: Mapping[str, str]) -> None:
+        """Take a master, and the ROS 1 types of topics that have one."""
+        self._master, self._types, self._rospy = master, dict(types), rospy()
+        self._lock = threading.RLock()
+        self._publishers: dict[str, Any] = {}
+        self._wanted: list[tuple[str, Callback]] = []
+        self._subscribers: dict[tuple[int, str], Any] = {}  # by place in `_wanted` and topic
+        self._presence = Presence(lambda name, payload: self.publish(PRESENCE, payload, name.encode()))
+        self._watching = False
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._beat, name="ros1", daemon=True)
+        self._thread.start()
+
+    def publish(
+        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
+    ) -> None:
+        """Send, see `Transport`."""
+        if self._ended.is_set():
+            return
+        kind = self._types.get(topic, ENVELOPE)
+        with suppress(Exception):  # whatever keeps it from being sent, it is lost
+            publisher = self._publisher(topic, kind, reliable)
+            message = raw_type(kind)()
+            message._buff = payload if topic in self._types else sealed(payload, attachment)
+            publisher.publish(message)
+
+    def _publisher(self, topic: str, kind: str, patient: bool) -> Any:
+        with self._lock:
+            found = self._publishers.get(topic)
+            if found is not None:
+                return found
+            made = self._rospy.Publisher(f"/{topic}", raw_type(kind), queue_size=MOST_WAITING)
+            self._publishers[topic] = made
+        give_up = time.monotonic() + (PATIENCE if patient else 0.0)
+        while time.monotonic() < give_up and not made.get_num_connections():
+            time.sleep(0.01)
+        return made
+
+    def subscribe(self, pattern: str, callback: Callback) -> None:
+        """Subscribe, see `Transport`; topics of a pattern are found as they appear, a moment later."""
+        with self._lock:
+            self._wanted.append((pattern, callback))
+            if "*" not in pattern:
+                self._hear(len(self._wanted) - 1, pattern)
+        with suppress(OSError):
+            self._discover()
+
+    def _hear(self, place: int, topic: str) -> None:
+        callback, typed = self._wanted[place][1], topic in self._types
+
+        def arrive(message: Any) -> None:
+            content = (message._buff, b"") if typed else opened(message._buff)
+            if content is not None and not self._ended.is_set():
+                callback(Arrival(topic, content[0], time.time_ns(), content[1]))
+
+        made = raw_type(self._types.get(topic, ENVELOPE))
+        self._subscribers[place, topic] = self._rospy.Subscriber(
+            f"/{topic}", made, arrive, queue_size=MOST_WAITING, tcp_nodelay=True
+        )
+
+    def _discover(self) -> None:
+        """Subscribe to new topics that match a pattern and are of the type that is expected of them."""
+        with self._lock:
+            patterns = [(i, matcher(pattern)) for i, (pattern, _) in enumerate(self._wanted) if "*" in pattern]
+        published = self._master.ask("getPublishedTopics", "") if patterns else []
+        for name, kind in published or ():
+            topic = name.removeprefix("/")
+            if topic == PRESENCE or kind != self._types.get(topic, ENVELOPE).replace("/msg/", "/"):
+                continue
+            with self._lock:
+                for place, matches in patterns:
+                    if matches(topic) and (place, topic) not in self._subscribers and not self._ended.is_set():
+                        self._hear(place, topic)
+
+    def announce(self, name: str) -> None:
+        """Announce, see `Transport`."""
+        self._presence.announce(name)
+
+    def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
+        """Watch, see `Transport`."""
+        self._presence.watch(pattern, callback)
+        with self._lock:
+            if not self._watching:
+                self._watching = True
+                self._wanted.append((PRESENCE, self._heartbeat))
+                self._hear(len(self._wanted) - 1, PRESENCE)
+
+    def _heartbeat(self, arrival: Arrival) -> None:
+        self._presence.hear(arrival.attachment.decode(errors="replace"), arrival.payload)
+
+    def _beat(self) -> None:
+        beats = 0
+        while not self._ended.wait(PERIOD):
+            self._presence.beat()
+            beats += 1
+            with suppress(OSError):  # the master is away: those who know each other go on
+                self._discover()
+                if beats % CHECKS == 0 and self._master.ask("lookupNode", self._rospy.get_name()) is None:
+                    self._register_again()
+
+    def _register_again(self) -> None:
+        """Tell a master that has been started anew what this node has; rospy itself does not."""
+        with self._lock:
+            if not self._publishers and not self._subscribers:
+                return
+            self._unregister()
+            for place, (pattern, _) in enumerate(self._wanted):
+                if "*" not in pattern:
+                    self._hear(place, pattern)
+
+    def _unregister(self) -> None:
+        for thing in (*self._publishers.values(), *self._subscribers.values()):
+            with suppress(Exception):  # whom nobody knows cannot be struck off
+                thing.unregister()
+        self._publishers.clear()
+        self._subscribers.clear()
+
+    def close(self) -> None:
+        """Take back what this transport has published and subscribed; the node itself ends with the process."""
+        if self._ended.is_set():
+            return
+        self._presence.leave()
+        time.sleep(0.05)  # rospy sends in threads of its own
+        self._ended.set()
+        with self._lock:
+            self._unregister()
+
+
+def open_ros1(endpoint: str, types: Mapping[str, str], timeout: float = 2.0) -> Ros1:
+    """Become a node of a ROS master.
+
+    Args:
+        endpoint: of the master, e.g. "tcp/127.0.0.1:11311".
+        types: ROS 1 type by topic, without its leading slash; what is not in it is only for other coopenv ends.
+        timeout: s to wait for the master.
+
+    Raises:
+        CoopenvError: rospy is not installed, or the endpoint is not one.
+        LinkError: no master answers.
+    """
+    return Ros1(join(address_of(endpoint), timeout), types)

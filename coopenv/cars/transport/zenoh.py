@@ -1,0 +1,201 @@
+"""Zenoh, under the keys of zenoh-bridge-ros2dds: a ROS name without its leading slash, the payload plain CDR."""
+
+import json
+import ssl
+import stat
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.transport.base import Arrival, Callback, LinkError
+from coopenv.cars.transport.endpoints import NO_ANSWER, SECURE, address_of, trouble_at
+
+FORBIDDEN = stat.S_IRWXG | stat.S_IRWXO
+
+
+@dataclass(frozen=True, slots=True)
+class Certificates:
+    """Files in PEM. Whoever listens with a certificate asks for one of those who connect (mutual TLS)."""
+
+    root_ca: Path  # who signs the others' certificates
+    certificate: Path | None = None  # own one
+    key: Path | None = None  # private key of it
+
+    def __post_init__(self) -> None:
+        """Refuse files that cannot be used. Raises CoopenvError: one line names the field and the file."""
+        if (self.certificate is None) != (self.key is None):
+            raise CoopenvError("tls.certificate, tls.key: give both or none")
+        _check("root_ca", self.root_ca)
+        if self.certificate is not None and self.key is not None:
+            _check("certificate", self.certificate)
+            _check("key", self.key)
+            if self.key.stat().st_mode & FORBIDDEN:
+                raise CoopenvError(f"tls.key: {self.key} can be read by others; run: chmod 600 {self.key}")
+        self.context()
+
+    def context(self) -> ssl.SSLContext:
+        """Return what Python connects with. Raises CoopenvError: the files do not hold what they should."""
+        try:
+            made = ssl.create_default_context(cafile=self.root_ca)
+        except (ssl.SSLError, OSError):
+            raise CoopenvError(f"tls.root_ca: {self.root_ca} holds no certificate in PEM") from None
+        if self.certificate is None or self.key is None:
+            return made
+        try:
+            made.load_cert_chain(self.certificate, self.key, password="")  # never ask at the terminal
+        except (ssl.SSLError, OSError):
+            files = f"{self.certificate} and {self.key}"
+            raise CoopenvError(
+                f"tls.certificate, tls.key: {files} are no certificate and its key, in PEM without a password"
+            ) from None
+        return made
+
+    def for_zenoh(self) -> dict[str, object]:
+        """Return the entries of Zenoh's `transport/link/tls`."""
+        entries: dict[str, object] = {"root_ca_certificate": str(self.root_ca)}
+        if self.certificate is not None:
+            for side in ("listen", "connect"):
+                entries |= {f"{side}_certificate": str(self.certificate), f"{side}_private_key": str(self.key)}
+            entries["enable_mtls"] = True
+        return entries
+
+
+def _check(field: str, path: Path) -> None:
+    try:
+        with path.open("rb"):
+            return
+    except OSError as error:
+        raise CoopenvError(f"tls.{field}: {path}: cannot be read ({error.strerror or error})") from None
+
+
+LEASE = 1000  # ms after which a process that has frozen no longer counts as present
+RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
+"""How often a lost router is tried again: a session goes on within a second or so of its being back."""
+
+
+class Zenoh:
+    """A Zenoh session as a transport."""
+
+    def __init__(self, session: Any, module: Any) -> None:
+        self._session, self._zenoh = session, module
+        self._kept: list[Any] = []  # what is declared ends when nobody holds it
+
+    def publish(
+        self, topic: str, payload: bytes, attachment: bytes = b"", *, urgent: bool = False, reliable: bool = False
+    ) -> None:
+        """Send, see `Transport`."""
+        z = self._zenoh
+        try:
+            self._session.put(
+                topic,
+                payload,
+                attachment=attachment or None,
+                express=urgent,
+                priority=z.Priority.REAL_TIME if urgent else z.Priority.DATA,
+                congestion_control=z.CongestionControl.BLOCK if reliable else z.CongestionControl.DROP,
+            )
+        except z.ZError:  # the session is closed
+            return
+
+    def subscribe(self, pattern: str, callback: Callback) -> None:
+        """Subscribe, see `Transport`."""
+
+        def arrive(sample: Any) -> None:
+            attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+            callback(Arrival(str(sample.key_expr), sample.payload.to_bytes(), time.time_ns(), attachment))
+
+        self._kept.append(self._session.declare_subscriber(pattern, arrive))
+
+    def announce(self, name: str) -> None:
+        """Announce, see `Transport`."""
+        self._kept.append(self._session.liveliness().declare_token(name))
+
+    def watch(self, pattern: str, callback: Callable[[str, bool], None]) -> None:
+        """Watch, see `Transport`."""
+
+        def change(sample: Any) -> None:
+            callback(str(sample.key_expr), sample.kind == self._zenoh.SampleKind.PUT)
+
+        self._kept.append(self._session.liveliness().declare_subscriber(pattern, change, history=True))
+
+    def close(self) -> None:
+        """End the session."""
+        self._kept.clear()
+        if not self._session.is_closed():
+            self._session.close()
+
+
+def library() -> Any:
+    """Return the library. Raises CoopenvError: the extra is not installed."""
+    try:
+        import zenoh
+    except ImportError:
+        raise CoopenvError("Zenoh needs an extra: pip install '.[svea]'") from None
+    return zenoh
+
+
+def open_zenoh(
+    mode: Literal["client", "peer", "router"],
+    connect: Sequence[str] = (),
+    listen: Sequence[str] = (),
+    tls: Certificates | None = None,
+    timeout: float = 2.0,
+) -> Zenoh:
+    """Open a session that uses the given endpoints and nothing else: nothing is looked for by multicast.
+
+    Args:
+        mode: "client" of a router, "peer" of other peers, or a "router" itself.
+        connect: endpoints to connect to, e.g. "tcp/127.0.0.1:7447" or "tls/car:7447".
+        listen: endpoints to listen at.
+        tls: certificates, which endpoints `tls/...` need; others are refused then, so that nothing goes in the clear.
+        timeout: s to wait for the endpoints to connect to.
+
+    Raises:
+        CoopenvError: the extra is not installed, or an endpoint is not one.
+        LinkError: an endpoint cannot be reached, or cannot be listened at.
+    """
+    for endpoint in (*connect, *listen):
+        if (address_of(endpoint).protocol in SECURE) != (tls is not None):
+            raise CoopenvError(f"{endpoint}: tls/... and certificates (tls) go together")
+    zenoh = library()
+    config = zenoh.Config()
+    entries: dict[str, Any] = {
+        "mode": mode,
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "connect/endpoints": list(connect),
+        "listen/endpoints": list(listen),
+        "connect/timeout_ms": int(timeout * 1000),
+        "connect/exit_on_failure": bool(connect),
+        "connect/retry": RETRY,
+        "transport/link/tx/lease": LEASE,
+        # How long a reliable message may keep its sender waiting, us, before the link counts as broken.
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": LEASE * 1000,
+        **{f"transport/link/tls/{key}": value for key, value in (tls.for_zenoh() if tls else {}).items()},
+    }
+    try:
+        for key, value in entries.items():
+            config.insert_json5(key, json.dumps(value))
+        return Zenoh(zenoh.open(config), zenoh)
+    except zenoh.ZError as error:
+        where = ", ".join([*connect, *listen]) or "no endpoints"
+        said = _reason(error, connect, tls)
+        if said is None:
+            raise LinkError(f"{where}: does not answer within {timeout:g} s") from None
+        raise LinkError(f"{where}: no Zenoh there ({said})") from None
+
+
+def _reason(error: Exception, connect: Sequence[str], tls: Certificates | None) -> str | None:
+    """Return why a connection fails where that can be found out, else the first sentence of Zenoh's error.
+
+    None: nobody answers, or somebody who takes a connection and says nothing, as a firewall may.
+    """
+    context = tls.context() if tls else None
+    for endpoint in connect:
+        if trouble := trouble_at(address_of(endpoint), context, 1.0):
+            return None if trouble == NO_ANSWER else trouble
+    said = str(error).split(" at /")[0].split("\n")[0][:120]
+    return None if connect and "Timeout" in said else said

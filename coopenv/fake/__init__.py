@@ -1,1 +1,0 @@
-"""Fake SVEA cars: processes that say and do on the network what the real ones would."""

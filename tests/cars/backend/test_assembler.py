@@ -1,0 +1,364 @@
+"""Ticks of samples: on a path that is known in closed form, with sensors that are not in step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend.assembler import LATE, SILENT, Assembler
+from coopenv.cars.backend.binding import Binding, bind
+from coopenv.cars.backend.neighbours import STALE
+from coopenv.cars.backend.tracks import LONGEST_GAP
+from coopenv.cars.deployment import Car
+from coopenv.cars.samples import Detections, Pose, Report, Sample, Twist, Value
+from coopenv.cars.topics import Role
+from coopenv.observers.recording import Sensed
+from coopenv.scenario import Scenario
+from tests.helpers.builders import landmark, scenario, vehicle
+from tests.helpers.paths import Path
+
+MS = 1_000_000
+START = 1_000_000_000_000
+LANDMARKS = {"A": (3.0, 1.0, 0.4), "B": (4.0, -1.0, 0.2), "C": (5.0, 0.5, 0.3)}
+MARKERS = {"A": 1, "B": 2, "C": 3}
+LEVER = np.array([0.3, 0.0, 0.2])
+TO_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def world(cars: int = 1, **sections: Any) -> Scenario:
+    vehicles = [vehicle((-k, 0.0, 0.0), 0.0, motion={"kind": "driven"}, marker=[0.1, 0, 0.2]) for k in range(cars)]
+    camera = {"model": "pinhole", "position": LEVER.tolist()}
+    given = {
+        "horizon": 5.0,
+        "landmarks": [landmark(name, place) for name, place in LANDMARKS.items()],
+        "topology": {"mode": "sensed"},
+        "rates": {"camera": 60.0, "odometry": 100.0, "decision": 20.0},
+        "camera": camera,
+    }
+    return scenario(vehicles, **{**given, **sections})
+
+
+def binding(cars: int = 1, only: str | None = None, **sections: Any) -> Binding:
+    fleet = [Car(name=f"car{k}", marker=5 + k) for k in range(cars)]
+    return bind(world(cars, **sections), fleet, MARKERS, "lab.toml", only)
+
+
+def sample(role: Role, stamp: int, value: Value, car: str = "car0", delay: int = 2 * MS) -> Sample:
+    return Sample(car, role, stamp, stamp + delay, value)
+
+
+class Senses:
+    """What the sensors of a car on a path tell, each at its own pace and with its own delay."""
+
+    def __init__(self, path: Path, until: float) -> None:
+        self.path = path
+        rng = np.random.default_rng(5)
+        self.samples = sorted(
+            (*self._twists(until), *self._frames(until, rng), *self._poses(until)), key=lambda s: s.received
+        )
+
+    def _twists(self, until: float) -> Iterator[Sample]:
+        for k in range(int(until * 1000)):  # so often that holding them does not matter
+            stamp = START + k * MS
+            v, w = self.path.twist(k * 1e-3 + 0.5e-3)
+            yield sample(Role.IMU, stamp, Twist(None, w))
+            yield sample(Role.WHEEL, stamp, Twist(v, None))
+
+    def _frames(self, until: float, rng: np.random.Generator) -> Iterator[Sample]:
+        for k in range(int(until * 60)):
+            t = k / 60 + rng.uniform(0.0, 3e-3)
+            R, p = self.path.pose(t)
+            rays = (np.array(list(LANDMARKS.values())) - p) @ R - LEVER
+            bearings = rays / np.linalg.norm(rays, axis=1, keepdims=True) @ TO_BODY
+            delay = int(rng.uniform(8, 14) * MS)
+            yield sample(Role.DETECTIONS, START + round(t * 1e9), Detections((1, 2, 3), bearings), delay=delay)
+
+    def _poses(self, until: float) -> Iterator[Sample]:
+        for k in range(int(until * 100)):
+            R, p = self.path.pose(k / 100)
+            yield sample(Role.TRUTH, START + k * 10 * MS, Pose(p, R))
+
+
+def ticks(assembler: Assembler, samples: list[Sample], first: float, count: int) -> Iterator[tuple[int, Sensed]]:
+    """Yield (time in ns, tick) from a time in s on, at 60 Hz."""
+    waiting = iter(samples)
+    following = next(waiting, None)
+    for k in range(count):
+        now = START + round((first + k / 60) * 1e9)
+        while following is not None and following.received <= now:
+            assembler.put(following)
+            following = next(waiting, None)
+        yield now, assembler.begin(now) if k == 0 else assembler.tick(k, now)
+
+
+def test_odometry_and_bearings_are_of_the_moment_when_the_frame_was_exposed() -> None:
+    path = Path(3.0)
+    assembler = Assembler(binding())
+    before = None
+    seen = 0
+    for _, tick in ticks(assembler, Senses(path, 3.0).samples, 0.5, 120):
+        t = (assembler.moment(0) - START) * 1e-9
+        R, p = path.pose(t)
+        if before is not None:
+            R0, p0 = before
+            np.testing.assert_allclose(tick.rotation[0], R0.T @ R, atol=2e-5)
+            np.testing.assert_allclose(tick.translation[0], R0.T @ (p - p0), atol=2e-5)
+        before = R, p
+        assert tick.truth is not None
+        np.testing.assert_allclose(tick.truth.position[0], p, atol=5e-4)  # between poses 10 ms apart
+        np.testing.assert_allclose(tick.truth.rotation[0], R, atol=1e-3)
+        if tick.visible[0, :3].all():
+            seen += 1
+            rays = (np.array(list(LANDMARKS.values())) - p) @ R - LEVER
+            np.testing.assert_allclose(
+                tick.bearings[0, :3], rays / np.linalg.norm(rays, axis=1, keepdims=True), atol=1e-6
+            )
+    assert seen > 110  # hardly a frame is lost to the drift of two clocks
+
+
+def test_a_moving_landmark_is_where_it_was_when_the_frame_was_exposed() -> None:
+    given = [landmark(name, place) for name, place in LANDMARKS.items()]
+    ml = landmark("ML", (3.0, 0.0, 0.0), motion={"kind": "constant", "linear": [0.5, 0, 0]}, marker=[0.0, 0.0, 0.3])
+    fleet = [Car(name="car0", marker=5), Car(name="lead", landmark="ML", marker=4)]
+    assembler = Assembler(bind(world(landmarks=[*given, ml]), fleet, MARKERS, "lab.toml", None))
+    said = [
+        sample(Role.ESTIMATE, START + k * 16 * MS, Pose(np.array([3.0 + 0.5 * 0.016 * k, 0, 0]), np.eye(3)), "lead")
+        for k in range(120)
+    ]
+    samples = sorted((*Senses(Path(3.0), 2.0).samples, *said), key=lambda s: s.received)
+    for now, tick in ticks(assembler, samples, 0.5, 60):
+        t = (assembler.moment(0) - START) * 1e-9
+        assert assembler.moment(0) < now
+        if tick.index > 1:
+            np.testing.assert_allclose(tick.landmarks[3], [3.0 + 0.5 * t, 0.0, 0.3], atol=1e-6)
+
+
+def test_frames_that_do_not_come_leave_a_tick_in_which_nothing_is_seen() -> None:
+    path = Path(3.0)
+    samples = Senses(path, 3.0).samples
+    dark = [s for s in samples if s.role is not Role.DETECTIONS or not 1.0 < (s.stamp - START) * 1e-9 < 1.5]
+    assembler = Assembler(binding())
+    travelled, ages = 0.0, []
+    for k, (now, tick) in enumerate(ticks(assembler, dark, 0.5, 90)):
+        travelled += float(np.linalg.norm(tick.translation[0]))
+        if 1.05 < (now - START) * 1e-9 < 1.45:
+            assert not tick.visible.any() and not np.asarray(tick.missing).any(), k
+            ages.append(float(np.asarray(tick.bearing_age)[0]))
+    assert ages == sorted(ages) and ages[-1] > 0.4
+    assert travelled == pytest.approx(0.4 * 89 / 60, abs=0.02)
+
+
+def test_without_odometry_nothing_has_come() -> None:
+    path = Path(3.0)
+    samples = [s for s in Senses(path, 3.0).samples if s.role is not Role.IMU or (s.stamp - START) * 1e-9 < 1.0]
+    missing = [
+        ((now - START) * 1e-9, bool(np.asarray(tick.missing)[0]))
+        for now, tick in ticks(Assembler(binding()), samples, 0.5, 90)
+    ]
+    limit = 1.0 + SILENT * 1e-9
+    assert all(gone == (t > limit) for t, gone in missing if abs(t - limit) > 0.01)
+
+
+def test_late_frames_are_used_and_marked() -> None:
+    assembler = Assembler(binding())
+    assembler.begin(START)
+    ray = np.array([[0.0, 0.0, 1.0]])
+    exposed = START + 10 * MS
+    assembler.put(sample(Role.DETECTIONS, exposed, Detections((1,), ray), delay=LATE))
+    tick = assembler.tick(1, exposed + LATE + 5 * MS)
+    assert np.asarray(tick.late)[0] and tick.visible[0, 0]
+    np.testing.assert_allclose(np.asarray(tick.bearing_age)[0], (LATE + 5 * MS) * 1e-9)
+
+
+def test_duplicates_and_older_frames_are_left_out() -> None:
+    assembler = Assembler(binding())
+    assembler.begin(START)
+    ray = np.array([[0.0, 0.0, 1.0]])
+    for stamp, marker in ((20, 1), (20, 2), (10, 3)):
+        assembler.put(sample(Role.DETECTIONS, START + stamp * MS, Detections((marker,), ray)))
+    tick = assembler.tick(1, START + 30 * MS)
+    assert tick.visible[0].tolist() == [True, False, False, False]
+    assert not assembler.tick(2, START + 50 * MS).visible.any()
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"car": "nobody"}, "unknown car"),
+        ({"stamp": START + 200 * MS, "received": START}, "stamp in the future"),
+    ],
+)
+def test_what_cannot_be_is_refused_and_counted(change: dict[str, Any], why: str) -> None:
+    assembler = Assembler(binding())
+    assembler.put(replace(sample(Role.WHEEL, START, Twist(np.ones(3), None)), **change))
+    assert assembler.refused == {why: 1}
+
+
+def test_own_and_unknown_markers_are_refused() -> None:
+    assembler = Assembler(binding())
+    assembler.begin(START)
+    rays = np.tile([0.0, 0.0, 1.0], (3, 1))
+    assembler.put(sample(Role.DETECTIONS, START + MS, Detections((1, 5, 7), rays)))
+    tick = assembler.tick(1, START + 10 * MS)
+    assert tick.visible[0].tolist() == [True, False, False, False]
+    assert assembler.refused["unknown marker"] == 2
+
+
+def heard(tick: Sensed) -> dict[tuple[int, int], tuple[np.ndarray, float]]:
+    return {pair: (np.asarray(received.message.position), received.age) for pair, received in tick.messages.items()}
+
+
+def test_other_cars_are_heard_where_one_is_estimated_alone() -> None:
+    assembler = Assembler(binding(2, only="car1"))
+    assembler.begin(START)
+    turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    said = Pose(np.array([1.0, 2.0, 0.0]), turned, np.diag([0.1, 0.2, 0.3, 0.0, 0.0, 0.04]))
+    assembler.put(sample(Role.ESTIMATE, START + MS, said, "car0"))
+    assembler.put(sample(Role.ESTIMATE, START + MS, said, "car1"))  # its own
+    tick = assembler.tick(1, START + 11 * MS)
+    [(pair, (position, age))] = heard(tick).items()
+    assert pair == (1, 0) and age == pytest.approx(0.01)
+    np.testing.assert_allclose(position, [1.0, 2.1, 0.2])  # the marker, 0.1 m ahead
+    covariance = tick.messages[1, 0].message.covariance
+    np.testing.assert_allclose(covariance, np.diag([0.1 + 0.04 * 0.01, 0.2, 0.3]), atol=1e-12)
+    assert np.asarray(tick.missing).tolist() == [True, True] and (np.asarray(tick.inbox_tick) == -1).all()
+    assert not heard(assembler.tick(2, START + 20 * MS))
+
+
+def test_the_observers_own_message_counts_before_the_pose() -> None:
+    assembler = Assembler(binding(2, only="car1"))
+    assembler.begin(START)
+    assembler.put(sample(Role.ESTIMATE, START + MS, Pose(np.zeros(3), np.eye(3)), "car0"))
+    report = Report(np.ones(3), np.eye(3), np.eye(6), {"odometry": np.zeros(6)})
+    assembler.put(sample(Role.REPORT, START + MS, report, "car0"))
+    assert set(assembler.tick(1, START + 5 * MS).messages[1, 0].message.extra) == {"odometry"}
+
+
+def test_stale_messages_are_dropped() -> None:
+    assembler = Assembler(binding(2, only="car1"))
+    assembler.begin(START)
+    assembler.put(sample(Role.ESTIMATE, START, Pose(np.zeros(3), np.eye(3)), "car0"))
+    assert not heard(assembler.tick(1, START + STALE + MS))
+    assert assembler.refused["stale message"] == 1
+
+
+def test_a_moving_landmark_counts_as_long_as_it_is_heard() -> None:
+    fleet = [Car(name="car0"), Car(name="lorry", landmark="C", marker=3)]
+    bound = bind(world(), fleet, {"A": 1, "B": 2}, "lab.toml", None)
+    assembler = Assembler(bound)
+    assembler.begin(START)
+
+    def look(k: int) -> Sensed:
+        stamp = START + k * 10 * MS
+        assembler.put(sample(Role.DETECTIONS, stamp, Detections((3,), np.array([[0.0, 0.0, 1.0]])), delay=MS))
+        return assembler.tick(k, stamp + 5 * MS)
+
+    assert not look(1).visible.any() and assembler.refused["landmark of unknown position"] == 1
+    assembler.put(sample(Role.ESTIMATE, START + 15 * MS, Pose(np.array([2.0, 2.0, 0.1]), np.eye(3)), "lorry"))
+    tick = look(2)
+    assert tick.visible[0, 2]
+    np.testing.assert_allclose(tick.landmarks[2], [2.0, 2.0, 0.1])
+    assert not look(40).visible.any()
+
+
+def test_what_a_moving_landmark_says_counts_once_and_not_for_long() -> None:
+    fleet = [Car(name="car0"), Car(name="lorry", landmark="C", marker=3)]
+    assembler = Assembler(bind(world(), fleet, {"A": 1, "B": 2}, "lab.toml", None))
+    assembler.begin(START)
+
+    def say(stamp: int, place: float, delay: int = MS) -> None:
+        assembler.put(
+            sample(Role.ESTIMATE, START + stamp, Pose(np.array([place, 2.0, 0.0]), np.eye(3)), "lorry", delay)
+        )
+
+    say(0, 2.0)
+    say(50 * MS, 3.0)
+    say(50 * MS, 9.0)  # again, with another place
+    say(20 * MS, 9.0)
+    assert assembler.refused == {"message out of order": 2}
+    say(60 * MS, 9.0, delay=STALE + MS)
+    assert assembler.refused["stale message"] == 1
+    np.testing.assert_allclose(assembler.tick(1, START + 70 * MS).landmarks[2, 0], 3.0, atol=0.5)
+    lost = assembler.tick(2, START + 50 * MS + STALE + MS)
+    np.testing.assert_allclose(lost.landmarks[2], [3.0, 2.0, 0.0])  # not where it would be if it had gone on
+
+
+def test_what_queues_leave_out_is_counted() -> None:
+    assembler = Assembler(binding())
+    ray = Detections((1,), np.array([[0.0, 0.0, 1.0]]))
+    for k in range(60):  # before anybody asks
+        assembler.put(sample(Role.DETECTIONS, START - (60 - k) * 16 * MS, ray))
+    assembler.begin(START)
+    assert not assembler.refused["frame left out"]
+    for stamp in (10, 5, 20, 30, 40, 50):
+        assembler.put(sample(Role.DETECTIONS, START + stamp * MS, ray))
+    for stamp in (20, 10, 20):
+        assembler.put(sample(Role.IMU, START + stamp * MS, Twist(None, np.ones(3))))
+    for stamp in (20, 10):
+        assembler.put(sample(Role.TRUTH, START + stamp * MS, Pose(np.zeros(3), np.eye(3))))
+    for k in (1, 2):
+        assembler.tick(k, START + (50 + k) * MS)
+    assert {why: count for why, count in assembler.refused.items() if count} == {
+        "frame out of order": 1,
+        "frame left out": 2,
+        "odometry out of order": 2,
+        "motion capture out of order": 1,
+    }
+
+
+@pytest.mark.parametrize(
+    ("topology", "hearing"),
+    [({"acyclic": True}, {1: {0}, 2: {0, 1}}), ({"acyclic": False}, {0: {1, 2}, 1: {0, 2}, 2: {0, 1}})],
+)
+def test_a_vehicle_hears_only_whom_the_environment_lets_it(topology: Any, hearing: dict[int, set[int]]) -> None:
+    for receiver in range(3):
+        assembler = Assembler(binding(3, only=f"car{receiver}", topology={"mode": "sensed", **topology}))
+        assembler.begin(START)
+        for sender in range(3):
+            assembler.put(sample(Role.ESTIMATE, START + MS, Pose(np.zeros(3), np.eye(3)), f"car{sender}"))
+        messages = assembler.tick(1, START + 5 * MS).messages
+        assert set(messages) == {(receiver, sender) for sender in hearing.get(receiver, set())}
+        assert not assembler.refused
+
+
+def test_the_truth_is_unknown_where_motion_capture_has_lost_the_body() -> None:
+    assembler = Assembler(binding())
+    for k in (0, 1, 30, 31):
+        assembler.put(sample(Role.TRUTH, START + k * 10 * MS, Pose(np.array([0.1 * k, 0.0, 0.0]), np.eye(3))))
+    known = [np.isfinite(assembler.truth(0, START + t * MS)[1]).all() for t in (5, 150, 305, 310)]
+    assert known == [True, False, True, True]
+    np.testing.assert_allclose(assembler.truth(0, START + 5 * MS)[1], [0.05, 0.0, 0.0])
+    assert not np.isfinite(assembler.truth(0, START + 310 * MS + LONGEST_GAP + MS)[1]).any()
+
+
+def test_origins_of_maps_are_taken_off() -> None:
+    bound = binding(map={"origin": [1.0, 2.0, 0.0]})
+    assembler = Assembler(bound)
+    assembler.put(sample(Role.TRUTH, START, Pose(np.array([1.5, 2.5, 0.0]), np.eye(3))))
+    np.testing.assert_allclose(assembler.truth(0, START)[1], [0.5, 0.5, 0.0])
+    np.testing.assert_allclose(assembler.begin(START).landmarks[0], np.array(LANDMARKS["A"]) - [1.0, 2.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("fleet", "markers", "why"),
+    [
+        ([Car(name="a"), Car(name="b")], {}, "2 of them are vehicles, the environment has 1"),
+        ([Car(name="a", vehicle="vehicle_2")], {}, "cars.a.vehicle: unknown name 'vehicle_2' (did you mean"),
+        ([Car(name="a")], {"Q": 1}, "markers: unknown name 'Q'"),
+        ([Car(name="a"), Car(name="b", landmark="Z")], {}, "cars.b.landmark: unknown name 'Z'"),
+    ],
+)
+def test_who_is_not_there_is_named(fleet: list[Car], markers: dict[str, int], why: str) -> None:
+    with pytest.raises(CoopenvError) as caught:
+        bind(world(), fleet, markers, "lab.toml", None)
+    assert str(caught.value).startswith("lab.toml: ") and why in str(caught.value)
+
+
+def test_a_camera_without_calibration_is_refused() -> None:
+    with pytest.raises(CoopenvError, match="the camera of vehicle_1 has no calibration"):
+        binding(camera={"model": "omnidirectional"})

@@ -1,0 +1,46 @@
+"""From messages to samples: what of a message counts, by where odometry is to come from."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coopenv.cars.backend.assembler import Assembler, Intake
+from coopenv.cars.backend.binding import bind
+from coopenv.cars.codec import encode
+from coopenv.cars.deployment import Car, Sensors
+from coopenv.cars.fake.messages import imu, wheel
+from coopenv.cars.topics import Role, topic_of
+from coopenv.cars.transport.base import Arrival
+from coopenv.scenario import load_scenario
+
+MS = 1_000_000
+START = 10**12
+CARS = [Car(name="svea7", marker=7), Car(name="svea1", marker=6)]
+MARKERS = {"SL1": 1, "SL2": 2, "SL4": 4, "SL5": 5}
+
+
+@pytest.mark.parametrize(
+    ("odometry", "turned"),
+    [("wheel+imu", 1.0), ("wheel", 0.6)],  # rad: 2 s of the gyro's 0.5 rad/s, or of the wheels' 0.3
+)
+def test_the_wheels_turn_rate_counts_only_without_a_gyro(odometry: Any, turned: float) -> None:
+    bound = bind(load_scenario("svea_overtaking"), CARS, MARKERS, "test", None)
+    intake, assembler = Intake(bound, Sensors(odometry=odometry)), Assembler(bound)
+    assembler.begin(START)
+    heading = 0.0
+    for k in range(2001):
+        now, spoken = START + k * MS, []
+        if k % 10 == 0:
+            spoken.append((Role.IMU, imu(now, "svea7", np.array([0.0, 0.0, 0.5]), 0.0)))
+        if k % 20 == 3:
+            spoken.append((Role.WHEEL, wheel(now, "svea7", 0.2, 0.3, (0.0, 0.0))))
+        for role, message in spoken:
+            for sample in intake.samples(Arrival(topic_of("svea7", role), encode(message), now)):
+                assembler.put(sample)
+        if k % 50 == 0 and k > 0:
+            R = assembler.tick(k // 50, now).rotation[0]
+            heading += float(np.arctan2(R[1, 0], R[0, 0]))
+    assert heading == pytest.approx(turned, abs=0.015)

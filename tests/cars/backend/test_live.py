@@ -1,0 +1,363 @@
+"""Cars as a backend: fakes in threads, with their gates, on a network within this process."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import coopenv
+from coopenv.api.parallel_env import CooperativeLocalisationEnv as Env
+from coopenv.api.terms.layout import observation_layout
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend.backend import Svea
+from coopenv.cars.backend.drive import Drive
+from coopenv.cars.codec import encode, header, make
+from coopenv.cars.fake.car import Fake
+from coopenv.cars.topics import Role, topic_of
+from coopenv.cars.transport.base import Arrival, Hub
+from tests.helpers.cars import OVERTAKING, PATIENT, cars, fakes, send_fault, write_fleet
+
+AHEAD = np.array([0.2, 0.0])  # 0.3 m/s of f1
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Hub, dict[str, Fake]]]:
+    path = write_fleet(tmp_path_factory.mktemp("lab"))
+    with fakes(path) as (hub, made):
+        yield path, hub, dict(made)
+
+
+def env_of(backend: Svea) -> Env:
+    return coopenv.parallel_env("cars", backend=backend, dtype="float64")
+
+
+def drive(env: Env, steps: int, action: np.ndarray = AHEAD) -> dict[str, Any]:
+    infos: dict[str, Any] = {}
+    for _ in range(steps):
+        if not env.agents:
+            break
+        infos = env.step(dict.fromkeys(env.agents, action))[-1]
+    return infos
+
+
+def place(made: dict[str, Fake], car: str) -> np.ndarray:
+    room = made[car].room
+    return np.array(room.pose(room.agent)[1])
+
+
+def listen(hub: Hub, topic: str) -> list[Arrival]:
+    heard: list[Arrival] = []
+    hub.connect().subscribe(topic, heard.append)
+    return heard
+
+
+def test_armed_cars_drive_and_know_where_they_are(lab: Any) -> None:
+    path, hub, made = lab
+    env = env_of(cars(path, hub))
+    try:
+        env.reset(seed=3, options={"arm": True})
+        before = {car: place(made, car) for car in made}
+        infos = drive(env, 40)
+        for agent, car in (("vehicle_1", "svea7"), ("vehicle_2", "svea1")):
+            assert infos[agent]["car"]["name"] == car and infos[agent]["car"]["armed"], infos[agent]["car"]
+            assert infos[agent]["car"]["gate"] in ("armed", "timed_out") and infos[agent]["car"]["stopped"] == ""
+            assert np.linalg.norm(place(made, car) - before[car]) > 0.2
+            assert infos[agent]["position_error"] < 0.15 and infos[agent]["orientation_error"] < 5.0
+    finally:
+        env.close()
+
+
+def test_nobody_drives_without_being_armed(lab: Any) -> None:
+    path, hub, made = lab
+    commands = listen(hub, topic_of("*", Role.COMMAND))
+    env = env_of(cars(path, hub))
+    try:
+        _, infos = env.reset(seed=3)
+        before = {car: place(made, car) for car in made}
+        assert not any(info["car"]["armed"] for info in infos.values())
+        infos = drive(env, 20)
+        assert infos["vehicle_1"]["position_error"] < 0.3  # observers run all the same
+        assert not commands
+        for car in made:
+            np.testing.assert_allclose(place(made, car), before[car], atol=1e-6)
+    finally:
+        env.close()
+
+
+def test_a_car_that_freezes_stops_all_and_arming_anew_recovers(lab: Any, tmp_path: Path) -> None:
+    _, hub, made = lab
+    path = write_fleet(tmp_path, safety="[safety]\nodometry_age = 1.0\nmissed_deadlines = 60\nmax_clock_offset = 0.5\n")
+    env = env_of(cars(path, hub))
+    try:
+        env.reset(seed=4, options={"arm": True})
+        drive(env, 20)
+        send_fault(hub, "svea1", "freeze=1@0+2.5")
+        infos = drive(env, 60)
+        assert not env.agents
+        for info in infos.values():
+            assert "svea1" in info["car"]["stopped"] and info["car"]["stopped_by"] == "svea1"
+        time.sleep(0.8)
+        standing = place(made, "svea7")
+        time.sleep(0.3)
+        np.testing.assert_allclose(place(made, "svea7"), standing, atol=1e-3)
+        time.sleep(2.0)
+        env.reset(seed=4, options={"arm": True})
+        before = place(made, "svea7")
+        infos = drive(env, 20)
+        assert env.agents and infos["vehicle_1"]["car"]["stopped"] == ""
+        assert np.linalg.norm(place(made, "svea7") - before) > 0.05
+    finally:
+        env.close()
+
+
+def test_what_is_recorded_is_replayed_bit_for_bit(lab: Any, tmp_path: Path) -> None:
+    path, hub, _ = lab
+    env = env_of(cars(path, hub, record=tmp_path / "drive.mcap"))
+    live = []
+    try:
+        env.reset(seed=7)
+        env.reset()  # another episode of that seed
+        observations, _ = env.reset(seed=5, options={"arm": True})
+        live.append(observations)
+        for _ in range(15):
+            live.append(env.step(dict.fromkeys(env.agents, AHEAD))[0])
+    finally:
+        env.close()
+    replay = coopenv.parallel_env(tmp_path / "drive.mcap", dtype="float64")
+    again: list[Any] = []
+    for _ in range(3):
+        observations, _ = replay.reset(seed=99)
+        again = [observations]
+        while replay.agents:
+            again.append(replay.step(dict.fromkeys(replay.agents, AHEAD))[0])  # observations tell one's own action
+    assert len(again) >= len(live)
+    for before, after in zip(live, again[: len(live)], strict=True):
+        for agent, values in before.items():
+            np.testing.assert_array_equal(values, after[agent])
+
+
+def test_other_observers_run_on_a_drive(lab: Any, tmp_path: Path) -> None:
+    path, hub, _ = lab
+    backend = cars(path, hub, record=tmp_path / "drive.mcap")
+    env = env_of(backend)
+    try:
+        env.reset(seed=5)
+        drive(env, 30)
+    finally:
+        env.close()
+    for observer in ("riccati", "mekf"):
+        replay = coopenv.parallel_env(tmp_path / "drive.mcap", observer=observer, dtype="float64")
+        replay.reset(seed=0)
+        infos: dict[str, Any] = {}
+        while replay.agents:
+            infos = replay.step(dict.fromkeys(replay.agents, np.zeros(2)))[-1]
+        assert all(info["position_error"] < 0.5 for info in infos.values()), observer
+    with pytest.raises(CoopenvError, match="exists already"):
+        cars(path, hub, record=tmp_path / "drive.mcap")
+
+
+def test_a_drive_that_is_none_is_refused(tmp_path: Path) -> None:
+    broken = tmp_path / "drive.mcap"
+    broken.write_bytes(b"\x89MCAP0\r\n" + b"x" * 50)
+    with pytest.raises(CoopenvError, match=r"drive\.mcap: "):
+        Drive(broken)
+    with pytest.raises(CoopenvError, match="cannot be read"):
+        Drive(tmp_path / "nowhere.mcap")
+
+
+def test_one_car_each_hears_the_other(lab: Any) -> None:
+    path, hub, _ = lab
+    backends = {car: cars(path, hub, car=car) for car in ("svea7", "svea1")}
+    envs = {car: env_of(backend) for car, backend in backends.items()}
+    assert [env.possible_agents for env in envs.values()] == [["vehicle_1"], ["vehicle_2"]]
+    results: dict[str, Any] = {}
+    mask = observation_layout(envs["svea7"].scenario)["message_mask"]
+    heard: dict[str, list[float]] = {car: [] for car in envs}
+
+    def live(car: str) -> None:
+        env = envs[car]
+        env.reset(seed=3)
+        for _ in range(40):
+            observations, *_, results[car] = env.step(dict.fromkeys(env.agents, AHEAD))
+            heard[car] += [float(mask.values(row[None]).mean()) for row in observations.values()]
+
+    threads = [threading.Thread(target=live, args=(car,)) for car in envs]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    try:
+        info = results["svea1"]["vehicle_2"]
+        assert info["position_error"] < 0.3 and list(results["svea1"]) == ["vehicle_2"]
+        follower = envs["svea1"].engine
+        leader = envs["svea7"].engine
+        assert int(follower.view("inbox_tick")[0, 1, 0]) > 50  # f2 has heard f1 until the end
+        assert np.mean(heard["svea1"]) > 0.5 and np.mean(heard["svea7"]) == 0.0  # f1 leads, and hears nobody
+        heard, own = (engine.view("estimate_rotation")[0, 0] for engine in (follower, leader))
+        np.testing.assert_allclose(heard, own, atol=0.05)
+    finally:
+        for env in envs.values():
+            env.close()
+
+
+def refuses(path: Path, hub: Hub, why: str) -> None:
+    env = env_of(cars(path, hub))
+    try:
+        with pytest.raises(CoopenvError, match=why):
+            env.reset(seed=0, options={"arm": True})
+        assert not env.agents
+    finally:
+        env.close()
+
+
+def test_nothing_is_armed_that_should_not_be(lab: Any, tmp_path: Path) -> None:
+    _, hub, _ = lab
+    strict = write_fleet(tmp_path, safety=PATIENT.replace("max_clock_offset = 0.5", "max_clock_offset = 0.02"))
+    send_fault(hub, "svea1", "clock_offset=0.2")
+    try:
+        refuses(strict, hub, r"not armed: svea1: its clock is \d+ ms ahead of this computer's")
+    finally:
+        send_fault(hub, "svea1", "clock_offset=0")
+
+
+def test_nothing_is_armed_where_nobody_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for patience in ("FIRST_WORD", "CAMERA_WORD", "READY_WORD"):
+        monkeypatch.setattr(f"coopenv.cars.backend.start.{patience}", 0.1)
+    refuses(write_fleet(tmp_path), Hub(), r"not armed: svea7: no odometry on fleet/svea7/mavros/wheel_odometry")
+
+
+def test_a_camera_of_another_calibration_is_not_trusted(lab: Any, tmp_path: Path) -> None:
+    _, hub, _ = lab
+    path = write_fleet(tmp_path, 'overrides = { "camera.focal_length" = [250.0, 250.0] }\n' + OVERTAKING)
+    refuses(path, hub, "its camera says focal_length = .* the environment says")
+
+
+FENCE = "geofence = [[-1, -4], [1, -4], [1, {}], [-1, {}]]\n"
+
+
+@pytest.mark.parametrize(
+    ("safety", "why"),
+    [(FENCE.format(-2.3, -2.3), "left the geofence"), ("separation = 0.7\n", "m from svea1, 0.7 m is the least")],
+)
+def test_cars_that_go_where_they_must_not_are_stopped(lab: Any, tmp_path: Path, safety: str, why: str) -> None:
+    _, hub, _ = lab
+    env = env_of(cars(write_fleet(tmp_path, safety=PATIENT + safety), hub))
+    try:
+        env.reset(seed=0, options={"arm": True})
+        infos: dict[str, Any] = {}
+        for _ in range(100):
+            if not env.agents:
+                break
+            infos = env.step({"vehicle_1": np.array([1.0, 0.0]), "vehicle_2": np.array([-1.0, 0.0])})[-1]
+        assert not env.agents and why in infos["vehicle_1"]["car"]["stopped"]
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("safety", "why"),
+    [
+        ("geofence = [[-9, -9], [9, -9], [9, -8], [-9, -8]]\n", "not armed: svea7: left the geofence"),
+        ("separation = 5.0\n", "not armed: svea7: .* m from svea1, 5 m is the least"),
+    ],
+)
+def test_cars_are_not_armed_where_they_must_not_be(lab: Any, tmp_path: Path, safety: str, why: str) -> None:
+    refuses(write_fleet(tmp_path, safety=PATIENT + safety), lab[1], why)
+
+
+def test_one_car_alone_keeps_its_distance_from_all(lab: Any, tmp_path: Path) -> None:
+    _, hub, _ = lab
+    path = write_fleet(tmp_path, safety=PATIENT + "separation = 5.0\n")
+    env = env_of(cars(path, hub, car="svea7"))
+    try:
+        with pytest.raises(CoopenvError, match=r"not armed: svea7: .* m from svea1, 5 m is the least"):
+            env.reset(seed=0, options={"arm": True})
+    finally:
+        env.close()
+
+
+def test_a_car_that_somebody_has_stopped_is_released_on_purpose(lab: Any, tmp_path: Path) -> None:
+    _, hub, _ = lab
+    env = env_of(cars(write_fleet(tmp_path, OVERTAKING.replace("fakes = true", "")), hub))
+    try:
+        env.reset(options={"arm": True, "release": True})
+        drive(env, 5)
+        hub.connect().publish(topic_of("svea1", Role.STOP), encode(make("std_msgs/msg/Bool", data=True)))
+        drive(env, 60)
+        assert not env.agents
+        for _ in range(2):
+            with pytest.raises(CoopenvError, match=r"not armed: svea1: somebody has stopped it.*--release"):
+                env.reset(options={"arm": True})
+        env.reset(options={"arm": True, "release": True})
+        infos = drive(env, 5)
+        assert infos["vehicle_2"]["car"]["gate"] in ("armed", "timed_out")
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("rssi", "pulses", "why"),
+    [
+        (100, [1500, 1500, 1800, 1500, 1500], "svea1: is driven by remote control"),
+        (100, [1500, 1500, 1500, 1500, 1900], "svea1: the mode switch of its remote control was moved"),
+        (0, [1500] * 8, "svea1: its remote control has no signal"),
+    ],
+)
+def test_who_takes_the_remote_control_drives_alone(lab: Any, rssi: int, pulses: list[int], why: str) -> None:
+    path, hub, _ = lab
+    env = env_of(cars(path, hub))
+    try:
+        env.reset(seed=0, options={"arm": True})
+        drive(env, 5)
+        channels = np.array(pulses, dtype=np.uint16)
+        moved = make("mavros_msgs/msg/RCIn", header=header(time.time_ns()), rssi=rssi, channels=channels)
+        hub.connect().publish(topic_of("svea1", Role.REMOTE), encode(moved))
+        infos = drive(env, 40)
+        assert not env.agents and infos["vehicle_2"]["car"]["stopped"] == why
+    finally:
+        env.close()
+
+
+def test_an_emergency_stop_of_anybody_ends_the_episode(lab: Any) -> None:
+    path, hub, _ = lab
+    env = env_of(cars(path, hub))
+    try:
+        env.reset(seed=0, options={"arm": True})
+        drive(env, 5)
+        hub.connect().publish(topic_of("svea7", Role.STOP), encode(make("std_msgs/msg/Bool", data=True)))
+        infos = drive(env, 60)
+        assert not env.agents and infos["vehicle_1"]["car"]["stopped"] == "svea7: its gate is stopped"
+    finally:
+        env.close()
+
+
+def test_an_error_between_steps_stops_the_cars(lab: Any) -> None:
+    path, hub, _ = lab
+    backend = cars(path, hub)
+    env = env_of(backend)
+    try:
+        env.reset(seed=0, options={"arm": True})
+        drive(env, 10)
+        with pytest.raises(coopenv.ActionError):
+            env.step({"vehicle_1": np.array([np.nan, 0.0]), "vehicle_2": AHEAD})
+        time.sleep(0.5)
+        assert {state.state for state in backend.gates.states.values()} == {"stopped"}
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize("options", [{"arms": True}, {"arm": 1}])
+def test_options_that_are_none(lab: Any, options: dict[str, Any]) -> None:
+    path, hub, _ = lab
+    env = env_of(cars(path, hub))
+    try:
+        with pytest.raises(CoopenvError, match="option"):
+            env.reset(seed=0, options=options)
+    finally:
+        env.close()

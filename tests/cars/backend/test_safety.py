@@ -1,0 +1,281 @@
+"""What watchdog, gates and the checks before arming make of cars that are blind, lost, or stopped by somebody."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend.gates import LATE, Gates
+from coopenv.cars.backend.station import Station
+from coopenv.cars.backend.watchdog import Vitals, Watchdog, misplaced
+from coopenv.cars.codec import MOST_BYTES, encode, make
+from coopenv.cars.deployment import Safety
+from coopenv.cars.gate.core import Clock, Gate
+from coopenv.cars.gate.process import Link
+from coopenv.cars.limits import USUAL
+from coopenv.cars.samples import Pose, Sample, Twist
+from coopenv.cars.topics import Role, topic_of
+from coopenv.cars.transport.base import Arrival, Hub
+from tests.helpers.processes import wait_until
+
+WHEEL = topic_of("a", Role.WHEEL)
+MS = 1_000_000
+BEGIN = 10**15
+
+
+def sample(car: str, role: Role, stamp: int, value: Any = None, received: int | None = None) -> Sample:
+    return Sample(car, role, stamp, stamp if received is None else received, value)
+
+
+def at(x: float, y: float = 0.0) -> Pose:
+    return Pose(np.array([x, y, 0.0]))
+
+
+def test_only_newer_messages_are_signs_of_life() -> None:
+    vitals, still = Vitals("truth"), Twist(np.zeros(3), np.zeros(3))
+    assert vitals.age("a", Role.WHEEL) == float("inf")
+    vitals.put(sample("a", Role.WHEEL, BEGIN, still))
+    for k in range(1, 20):  # the same bytes again and again, and one from far in the future
+        vitals.put(sample("a", Role.WHEEL, BEGIN, still, received=BEGIN + 10 * k * MS))
+    vitals.put(sample("a", Role.WHEEL, BEGIN + 10_000 * MS, still, received=BEGIN + 200 * MS))
+    vitals.looked = BEGIN + 200 * MS
+    assert vitals.age("a", Role.WHEEL) == pytest.approx(0.2)
+    vitals.put(sample("a", Role.WHEEL, BEGIN + 190 * MS, still, received=BEGIN + 195 * MS))
+    assert vitals.age("a", Role.WHEEL) == pytest.approx(0.01)
+    assert vitals.age("a", Role.IMU) == float("inf") and vitals.age("b", Role.WHEEL) == float("inf")
+
+
+def test_places_come_from_what_judges() -> None:
+    for judge, role in (("truth", Role.TRUTH), ("estimate", Role.ESTIMATE)):
+        vitals = Vitals(judge)  # type: ignore[arg-type]
+        vitals.begin(BEGIN)
+        vitals.put(sample("a", Role.TRUTH, BEGIN + MS, at(1.0)))
+        vitals.put(sample("a", Role.ESTIMATE, BEGIN + MS, at(2.0)))
+        vitals.put(sample("a", role, BEGIN, at(9.0)))  # older
+        assert vitals.places["a"].position[0] == (1.0 if role is Role.TRUTH else 2.0)
+        vitals.place("a", np.array([np.nan, 0.0, 0.0]), BEGIN + 400 * MS)
+        vitals.looked = BEGIN + 401 * MS
+        assert vitals.lost("a") == pytest.approx(0.4), "not a number is no place"
+
+
+CORNERS = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("places", "judge", "found"),
+    [
+        ({"a": 0.0, "b": 0.5}, "truth", []),
+        ({"a": 1.5, "b": 0.5}, "truth", ["a: left the geofence at (1.50, 0.00) m"]),
+        ({"a": 0.4, "b": 0.5}, "truth", ["a: 0.10 m from b, 0.3 m is the least"]),
+        ({"a": 0.0, "b": 3.0}, "truth", []),  # who does not drive here may be outside
+        ({"a": 0.0}, "truth", ["b: its place is not known: separation cannot be judged"]),
+        ({"b": 0.0}, "truth", ["a: its place is not known: fence and separation cannot be judged"]),
+        ({"b": 0.0}, "estimate", []),  # for a moment after the start
+    ],
+)
+def test_fence_and_separation(places: dict[str, float], judge: Any, found: list[str]) -> None:
+    vitals = Vitals(judge)
+    vitals.begin(BEGIN)
+    vitals.looked = BEGIN + 100 * MS
+    for car, x in places.items():
+        vitals.place(car, np.array([x, 0.0, 0.0]), BEGIN + 90 * MS)
+    safety = Safety(geofence=CORNERS, separation=0.3, judge=judge)
+    assert [f"{car}: {wrong}" for car, wrong in misplaced(safety, vitals, ("a",), ("b",))] == found
+    vitals.looked = BEGIN + 700 * MS
+    lost = [wrong for _, wrong in misplaced(safety, vitals, ("a",), ("b",))]
+    assert len(lost) >= 2 and all("judged" in wrong for wrong in lost[:2]), "old places are none"
+
+
+@pytest.mark.parametrize(
+    "corners", [[(0, 0), (1, 0)], [(0, 0), (1, 1), (1, 0), (0, 1)], [(0, 0), (1, 0), (2, 0)], [(0, 0)] * 4]
+)
+def test_a_fence_that_encloses_nothing_is_refused(corners: Any) -> None:
+    with pytest.raises(ValueError, match="at least 3 corners of a polygon"):
+        Safety(geofence=corners)
+
+
+def test_a_station_keeps_no_message_that_is_too_long() -> None:
+    hub = Hub()
+    station = Station(hub.connect(), [WHEEL], None, {})
+    hub.connect().publish(WHEEL, b"x" * (MOST_BYTES + 1))
+    hub.connect().publish(WHEEL, b"x" * 100)
+    wait_until(lambda: station.silence(WHEEL) < 10.0)
+    assert station.dropped["too long"] == 1 and [len(a.payload) for a in station.drain()] == [100]
+
+
+class Yard:
+    """Gates of two cars in this process, and the station's side of them."""
+
+    def __init__(self) -> None:
+        self.hub = Hub()
+        self.clock = Clock(time.time_ns, time.monotonic_ns)
+        self.links = {car: Link(Gate(car, USUAL, self.clock), car, self.hub.connect(), None) for car in ("a", "b")}
+        self.gates = Gates(self.hub.connect(), ("a", "b"), USUAL, None)
+        self.tell()
+
+    def tell(self) -> None:
+        for link in self.links.values():
+            link.tell()
+
+    def stop(self, car: str) -> None:
+        self.hub.connect().publish(topic_of(car, Role.STOP), encode(make("std_msgs/msg/Bool", data=True)))
+
+
+@pytest.fixture
+def yard(monkeypatch: pytest.MonkeyPatch) -> Yard:
+    made = Yard()
+    monkeypatch.setattr("coopenv.cars.backend.gates.time", Ticking(made.tell))
+    return made
+
+
+class Ticking:
+    """The module `time`, in whose sleep the gates go on speaking."""
+
+    def __init__(self, during: Callable[[], None]) -> None:
+        self.during, self.monotonic, self.time_ns = during, time.monotonic, time.time_ns
+
+    def sleep(self, seconds: float) -> None:
+        time.sleep(seconds)
+        self.during()
+
+
+def states(yard: Yard) -> list[str]:
+    return [state.state for state in yard.gates.states.values()]
+
+
+def test_gates_open(yard: Yard) -> None:
+    yard.gates.begin()
+    assert states(yard) == ["armed", "armed"]
+
+
+def test_an_emergency_stop_during_arming_holds(yard: Yard, monkeypatch: pytest.MonkeyPatch) -> None:
+    slow = yard.links.pop("b")
+    slow.tell()
+    pressed: list[bool] = []
+
+    def during() -> None:
+        yard.tell()
+        slow.tell()
+        if states(yard)[0] == "armed" and not pressed:
+            pressed.append(True)
+            yard.stop("a")
+
+    arm = yard.gates._arm
+    monkeypatch.setattr("coopenv.cars.backend.gates.time", Ticking(during))
+    monkeypatch.setattr(
+        yard.gates, "_arm", lambda car, on, nonce: arm(car, on, nonce) if car == "a" or not on else None
+    )
+    with pytest.raises(CoopenvError, match="a: was stopped while it was being armed"):
+        yard.gates.begin()
+    yard.tell()
+    assert pressed and states(yard)[0] == "stopped"
+
+
+def test_who_has_stopped_a_car_is_known(yard: Yard) -> None:
+    yard.gates.begin()
+    yard.gates.stop()
+    yard.tell()
+    assert states(yard) == ["stopped", "stopped"] and not yard.gates.stopped_by_others
+    yard.gates.begin()
+    yard.stop("b")
+    yard.tell()
+    assert yard.gates.stopped_by_others == {"b"}
+    with pytest.raises(CoopenvError, match="b: somebody has stopped it"):
+        yard.gates.begin()
+    yard.gates.begin(release=True)
+    assert not yard.gates.stopped_by_others and states(yard) == ["armed", "armed"]
+
+
+def test_what_a_gate_has_said_before_is_not_believed_again(yard: Yard) -> None:
+    heard: list[Arrival] = []
+    yard.hub.connect().subscribe(topic_of("a", Role.GATE), heard.append)
+    yard.gates.begin()
+    yard.tell()
+    first, topic = heard[0], topic_of("a", Role.GATE)
+    before = yard.gates.states["a"]
+    yard.hub.connect().publish(topic, first.payload)
+    assert yard.gates.states["a"] == before and yard.gates.dropped["a"]["out of order"] == 1
+    time.sleep(LATE * 1e-9 + 0.1)
+    yard.hub.connect().publish(topic, heard[-1].payload)
+    assert yard.gates.states["a"] == before and yard.gates.dropped["a"]["stale"] == 1
+    yard.hub.connect().publish(topic, b"\x00\x01\x00\x00 nonsense")
+    assert yard.gates.dropped["a"]["malformed"] == 1
+
+
+def test_a_gate_that_does_not_open_says_why(yard: Yard) -> None:
+    yard.links["b"]._gate._check_signature = refuse  # type: ignore[method-assign]
+    with pytest.raises(CoopenvError, match=r"b: its gate refuses this end's signature: .*--station"):
+        yard.gates.begin()
+    yard.tell()
+    assert states(yard) == ["disarmed", "disarmed"]
+
+
+def refuse(role: Role, payload: bytes, attachment: bytes) -> None:
+    from coopenv.cars.gate.core import Reason, Rejected
+
+    raise Rejected(Reason.SIGNATURE)
+
+
+@pytest.fixture
+def guard(yard: Yard) -> Iterator[tuple[Yard, Watchdog, Vitals]]:
+    vitals, station = Vitals("truth"), Station(yard.hub.connect(), [WHEEL], None, {})
+    made = Watchdog(Safety(odometry_age=0.3), station, yard.gates, vitals, ("a",), (), (Role.WHEEL,), 10.0)
+    yield yard, made, vitals
+    made.close()
+
+
+def live(yard: Yard, guard: Watchdog, vitals: Vitals, seconds: float, usable: bool) -> None:
+    """Let wheels be heard for a time, and be understood or not."""
+    wire, until = yard.hub.connect(), time.monotonic() + seconds
+    while time.monotonic() < until and guard.trip is None:
+        wire.publish(WHEEL, b"whatever")
+        vitals.looked = time.time_ns()
+        if usable:
+            vitals.put(sample("a", Role.WHEEL, vitals.looked, Twist(np.zeros(3), None)))
+        yard.tell()
+        guard.beat(0)
+        time.sleep(0.01)
+
+
+def test_bytes_alone_do_not_keep_a_car_going(guard: tuple[Yard, Watchdog, Vitals]) -> None:
+    yard, dog, vitals = guard
+    yard.gates.begin()
+    yard.hub.connect().publish(WHEEL, b"whatever")
+    dog.arm()
+    live(yard, dog, vitals, 0.6, usable=True)
+    assert dog.trip is None
+    live(yard, dog, vitals, 5.0, usable=False)
+    assert dog.trip is not None and "nothing new that could be used on fleet/a/mavros/wheel" in dog.trip.reason
+    yard.tell()
+    assert states(yard) == ["stopped", "stopped"]
+
+
+def test_a_network_that_fails_does_not_end_the_watchdog(
+    guard: tuple[Yard, Watchdog, Vitals], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    yard, dog, _ = guard
+    yard.gates.begin()
+    calls: list[float] = []
+
+    def broken() -> None:
+        calls.append(time.monotonic())
+        raise OSError("no network")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(yard.gates, "stop", broken)
+        dog.arm()  # nothing has ever been heard of the wheels
+        wait_until(lambda: len(calls) > 2)
+    wait_until(lambda: (yard.tell(), states(yard) == ["stopped", "stopped"])[1])
+    dog.forget()
+    dog.arm()
+
+
+def test_nothing_is_armed_without_a_watchdog(guard: tuple[Yard, Watchdog, Vitals]) -> None:
+    guard[1].close()
+    with pytest.raises(CoopenvError, match="not armed: the watchdog has ended"):
+        guard[1].arm()

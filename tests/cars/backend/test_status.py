@@ -1,0 +1,140 @@
+"""What a car says of itself, before it is armed and while it is."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from coopenv.cars.backend import status
+from coopenv.cars.backend.status import StatusBoard
+from coopenv.cars.codec import encode, header, make
+from coopenv.cars.deployment import Remote
+from coopenv.cars.fake import messages
+from coopenv.cars.topics import Role, topic_of
+from coopenv.cars.transport.base import Hub
+
+CAR = "svea7"
+
+
+class Talk:
+    """A car and the board of its station."""
+
+    def __init__(self, needed: bool = True) -> None:
+        self.hub = Hub()
+        self.board = StatusBoard(self.hub.connect(), (CAR,), Remote(), needed)
+        self.network = self.hub.connect()
+
+    def say(self, role: Role, message: Any) -> None:
+        self.network.publish(topic_of(CAR, role), encode(message))
+
+    def remote(self, *pulses: int, rssi: int = 200, age: float = 0.0) -> None:
+        channels = np.array(pulses or (1500,) * 8, dtype=np.uint16)
+        stamp = time.time_ns() - round(age * 1e9)
+        self.say(Role.REMOTE, make("mavros_msgs/msg/RCIn", header=header(stamp), rssi=rssi, channels=channels))
+
+    def state(self, mode: str = "MANUAL", armed: bool = True, age: float = 0.0) -> None:
+        message = messages.state(time.time_ns() - round(age * 1e9), armed)
+        message.mode = mode
+        self.say(Role.STATE, message)
+
+    def battery(self, share: float = 0.8, age: float = 0.0) -> None:
+        self.say(Role.BATTERY, messages.battery(time.time_ns() - round(age * 1e9), share))
+
+    def all_is_well(self) -> None:
+        self.remote()
+        self.state()
+        self.battery()
+
+
+@pytest.fixture
+def armed() -> Talk:
+    talk = Talk()
+    talk.all_is_well()
+    assert talk.board.obstacle(CAR) == ""
+    talk.board.begin()
+    return talk
+
+
+def silent(role: Role) -> str:
+    return f"nothing of use has ever come on {topic_of(CAR, role)}"
+
+
+@pytest.mark.parametrize("left_out", [Role.REMOTE, Role.STATE, Role.BATTERY])
+def test_a_car_that_has_not_told_of_itself_is_not_armed(left_out: Role) -> None:
+    for old in ({}, {"age": 2.5}, {"age": -2.5}):  # silent, old, or of a clock that is far ahead
+        talk = Talk()
+        for role, say in ((Role.REMOTE, talk.remote), (Role.STATE, talk.state), (Role.BATTERY, talk.battery)):
+            if role is not left_out:
+                say()
+            elif old:
+                say(**old)
+        assert talk.board.obstacle(CAR) == silent(left_out)
+
+
+def test_what_has_been_said_counts_for_two_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    talk, now = Talk(), time.monotonic()
+    talk.all_is_well()
+    talk.board.begin()
+    monkeypatch.setattr(status.time, "monotonic", lambda: now + 1.5)
+    assert talk.board.obstacle(CAR) == talk.board.happened(CAR) == ""
+    monkeypatch.setattr(status.time, "monotonic", lambda: now + 2.5)
+    assert talk.board.obstacle(CAR).endswith(f"s on {topic_of(CAR, Role.STATE)}")
+    assert talk.board.happened(CAR).startswith("nothing of use has come for 2.")
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda talk: talk.remote(rssi=0), "its remote control has no signal"),
+        (lambda talk: talk.remote(*(0,) * 8), "its remote control has no signal"),
+        (lambda talk: talk.remote(1500, 1500), "its remote control has 2 channels, remote.throttle is 3"),
+        (lambda talk: talk.remote(1500, 1500, 1800, 1500, 1500), "is driven by remote control"),
+        (lambda talk: talk.state(armed=False), "its autopilot is not armed"),
+    ],
+)
+def test_a_car_in_another_state_is_not_armed(change: Any, why: str) -> None:
+    talk = Talk()
+    talk.all_is_well()
+    change(talk)
+    assert talk.board.obstacle(CAR) == why
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (lambda talk: talk.remote(1300, *(1500,) * 7), "is driven by remote control"),
+        (lambda talk: talk.remote(1500, 1500, 1700, *(1500,) * 5), "is driven by remote control"),
+        (lambda talk: talk.remote(*(1500,) * 4, 1900), "the mode switch of its remote control was moved"),
+        (lambda talk: talk.remote(rssi=0), "its remote control has no signal"),
+        (lambda talk: talk.remote(*(0,) * 8), "its remote control has no signal"),
+        (lambda talk: talk.state(armed=False), "its autopilot is no longer armed"),
+        (lambda talk: talk.state(mode="HOLD"), "its autopilot went from mode 'MANUAL' to 'HOLD'"),
+    ],
+)
+def test_what_happens_to_an_armed_car_is_noticed_and_not_forgotten(armed: Talk, change: Any, why: str) -> None:
+    armed.all_is_well()
+    assert armed.board.happened(CAR) == ""
+    change(armed)
+    armed.all_is_well()
+    assert armed.board.happened(CAR) == why
+    armed.board.begin()
+    assert armed.board.happened(CAR) == ""
+
+
+def test_old_words_neither_stop_a_car_nor_keep_it_going(armed: Talk) -> None:
+    armed.remote(1300, *(1500,) * 7, age=2.5)
+    armed.remote(1300, *(1500,) * 7, age=1.0)  # younger ones have come
+    assert armed.board.happened(CAR) == ""
+
+
+def test_cars_that_cannot_tell_are_armed_all_the_same() -> None:
+    talk = Talk(needed=False)
+    assert talk.board.obstacle(CAR) == ""
+    talk.board.begin()
+    talk.remote(rssi=0)
+    assert talk.board.happened(CAR) == ""
+    talk.remote(1300, *(1500,) * 7)
+    assert talk.board.happened(CAR) == "is driven by remote control"

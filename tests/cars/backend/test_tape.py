@@ -1,0 +1,223 @@
+"""Drives on tape, as other tools read them."""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+import threading
+from collections import Counter
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from mcap.exceptions import EndOfFile
+from mcap.reader import make_reader
+from mcap.records import Channel, Message
+from mcap.stream_reader import StreamReader
+from rosbags.highlevel import AnyReader
+
+from coopenv.base.errors import OutputError
+from coopenv.cars.backend.drive import ATTACHMENT, NAME, PRESENCE, Tape, Taped
+from coopenv.cars.codec import TICK, empty, encode, header, make
+from coopenv.cars.topics import STOPPED_TOPIC, TICK_TOPIC, TOPICS, Role, topic_of
+from coopenv.cars.transport.base import Hub
+from tests.helpers.processes import DEADLOCK, start
+
+WHEEL, FRAMES = topic_of("svea7", Role.WHEEL), topic_of("svea7", Role.DETECTIONS)
+TYPES = {WHEEL: TOPICS[Role.WHEEL].type, FRAMES: TOPICS[Role.DETECTIONS].type}
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Path:
+    tape = Tape(tmp_path / "drive.mcap", json.dumps({"cars": 1}).encode(), TYPES)
+    tape.begin(10**9, 2**64 - 1, 3)
+    for k in range(20):
+        now = 10**9 + k * 10**7
+        twist = make(
+            TYPES[WHEEL], header=header(now - 5, "base_link"), twist=empty("geometry_msgs/msg/TwistWithCovariance")
+        )
+        twist.twist.twist.linear.x = 0.1 * k
+        tape.write(WHEEL, encode(twist), now)
+        frame = make(TYPES[FRAMES], header=header(now), objects=[empty("pixy_camera/msg/ObjectInfo")] * (k % 3))
+        tape.write(FRAMES, encode(frame), now)
+        tape.write("fleet/nobody/knows", b"123", now)
+        tape.tick(k + 1, now)
+    tape.close()
+    return tmp_path / "drive.mcap"
+
+
+def test_rosbags_reads_it_as_a_bag_of_ros_2(written: Path) -> None:
+    with AnyReader([written]) as reader:
+        found = {c.topic: c.msgtype for c in reader.connections}
+        assert found == {f"/{WHEEL}": TYPES[WHEEL], f"/{FRAMES}": TYPES[FRAMES], f"/{TICK_TOPIC}": TICK}
+        messages = [(c.topic, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]
+    speeds = [m.twist.twist.linear.x for topic, _, m in messages if topic == f"/{WHEEL}"]
+    assert speeds == [0.1 * k for k in range(20)]
+    assert [len(m.objects) for topic, _, m in messages if topic == f"/{FRAMES}"] == [k % 3 for k in range(20)]
+    first = next(m for topic, _, m in messages if topic == f"/{TICK_TOPIC}")
+    assert (first.index, first.key, first.episode) == (0, 2**64 - 1, 3)
+
+
+def test_the_mcap_library_reads_it(written: Path) -> None:
+    with written.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        assert summary.statistics.message_count == 61
+        assert {s.encoding for s in summary.schemas.values()} == {"ros2msg"}
+        assert {c.message_encoding for c in summary.channels.values()} == {"cdr"}
+        assert [a.name for a in reader.iter_attachments()] == [ATTACHMENT]
+        assert [m.name for m in reader.iter_metadata()] == [NAME]
+        times = [message.log_time for _, _, message in reader.iter_messages(topics=[f"/{WHEEL}"])]
+    assert times == [10**9 + k * 10**7 for k in range(20)]
+
+
+def test_what_goes_out_comes_aside_or_is_there_is_on_tape(tmp_path: Path) -> None:
+    hub, heard, read = Hub(), [], []
+    hub.connect().subscribe(WHEEL, heard.append)
+    state, stop, wheels = (topic_of("svea7", role) for role in (Role.STATE, Role.STOP, Role.WHEEL))
+    types = {**TYPES, state: TOPICS[Role.STATE].type, stop: TOPICS[Role.STOP].type, "fleet/alive/svea7": PRESENCE}
+    tape = Tape(tmp_path / "drive.mcap", b"{}", types)
+    taped = Taped(hub.connect(), tape, {state}, {stop})
+    for topic in (state, wheels):
+        taped.subscribe(topic, read.append)
+    taped.watch("fleet/alive/*", lambda name, there: None)
+    tape.begin(1, 0, 0)
+    others = hub.connect()
+    for name in ("svea7", "stranger"):
+        others.announce(f"fleet/alive/{name}")
+    others.publish(state, encode(empty(types[state])))
+    others.publish(stop, encode(make(types[stop], data=True)))
+    others.publish(WHEEL, encode(empty(TYPES[WHEEL])))  # for ticks: whoever makes them writes it down
+    others.close()
+    taped.publish(WHEEL, encode(empty(TYPES[WHEEL])), b"signature")
+    tape.close()
+    assert [arrival.attachment for arrival in heard] == [b"", b"signature"] and len(read) == 3
+    with AnyReader([tmp_path / "drive.mcap"]) as reader:
+        messages = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()]
+    assert Counter(topic for topic, _ in messages) == {
+        f"/{TICK_TOPIC}": 1,
+        f"/{WHEEL}": 1,
+        f"/{state}": 1,
+        f"/{stop}": 1,
+        "/fleet/alive/svea7": 2,
+    }
+    assert [m.data for topic, m in messages if topic == "/fleet/alive/svea7"] == [True, False]
+
+
+def test_why_the_cars_were_stopped_is_there_for_everybody(tmp_path: Path) -> None:
+    tape = Tape(tmp_path / "drive.mcap", b"{}", TYPES)
+    tape.begin(10**9, 0, 0)
+    tape.stopped("svea7: is gone", "svea7", 3 * 10**9 + 5)
+    tape.close()
+    with AnyReader([tmp_path / "drive.mcap"]) as reader:
+        (connection,) = (c for c in reader.connections if c.topic == f"/{STOPPED_TOPIC}")
+        ((_, time, raw),) = reader.messages([connection])
+        message = reader.deserialize(raw, connection.msgtype)
+    assert (message.reason, message.car, time) == ("svea7: is gone", "svea7", 3 * 10**9 + 5)
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (3, 5)
+
+
+def test_threads_write_what_they_like_and_the_order_of_each_is_kept(tmp_path: Path) -> None:
+    tape, each, writers = Tape(tmp_path / "drive.mcap", b"{}", TYPES), 500, 4
+    frame = encode(empty(TYPES[FRAMES]))
+
+    def write(number: int) -> None:
+        for k in range(each):
+            tape.write(FRAMES, frame, number * each + k)
+
+    threads = [threading.Thread(target=write, args=(number,)) for number in range(writers)]
+    for thread in threads:
+        thread.start()
+    tape.begin(1, 0, 0)
+    for k in range(1, each):
+        tape.tick(k, k)
+    for thread in threads:
+        thread.join()
+    tape.close()
+    with (tmp_path / "drive.mcap").open("rb") as stream:
+        found = [(c.topic, m.log_time) for _, c, m in make_reader(stream).iter_messages(log_time_order=False)]
+    frames = [time for topic, time in found if topic == f"/{FRAMES}"]
+    for number in range(writers):
+        assert [t for t in frames if t // each == number] == [*range(number * each, (number + 1) * each)]
+    assert [time for topic, time in found if topic == f"/{TICK_TOPIC}"] == [1, *range(1, each)]
+
+
+WRITER = f"""
+import os, resource, sys, time
+from pathlib import Path
+from coopenv.cars.backend.drive import FLUSH, Tape
+from coopenv.cars.codec import encode
+from coopenv.cars.codec import empty
+tape = Tape(Path("drive.mcap"), b"{{}}", {{"frames": "{TYPES[FRAMES]}"}})
+tape.begin(1, 0, 0)
+frame = encode(empty("{TYPES[FRAMES]}"))
+"""
+KILLED = """
+tape.write("frames", frame, 2)
+time.sleep(4 * FLUSH)
+tape.tick(1, 3)
+tape.stopped("told at once", "", 4)
+time.sleep(0.3)
+os.kill(os.getpid(), 9)
+"""
+FULL = """
+import os
+resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
+for k in range(3000):
+    tape.write("frames", frame + os.urandom(200), k)
+    time.sleep(0.001)
+try:
+    tape.close()
+except Exception as error:
+    print(type(error).__name__, error)
+"""
+
+
+def whole(path: Path) -> list[tuple[str, int]]:
+    """Return topic and time of the messages that the library finds in a file before it comes upon its end."""
+    channels, found = {}, []
+    with path.open("rb") as stream, suppress(EndOfFile, struct.error):
+        for record in StreamReader(stream, validate_crcs=True).records:
+            if isinstance(record, Channel):
+                channels[record.id] = record.topic
+            elif isinstance(record, Message):
+                found.append((channels[record.channel_id], record.log_time))
+    return found
+
+
+def test_who_is_killed_leaves_what_came_before_the_last_flush(tmp_path: Path) -> None:
+    process = start((sys.executable, "-c", WRITER + KILLED), tmp_path)
+    assert process.wait(DEADLOCK) == -9
+    expected = [(f"/{TICK_TOPIC}", 1), ("/frames", 2), (f"/{TICK_TOPIC}", 3), (f"/{STOPPED_TOPIC}", 4)]
+    assert whole(tmp_path / "drive.mcap") == expected
+
+
+def test_a_full_disk_is_one_line_and_what_is_written_can_be_read(tmp_path: Path) -> None:
+    process = start((sys.executable, "-c", WRITER + FULL), tmp_path)
+    printed, errors = process.communicate(timeout=DEADLOCK)
+    assert printed == "OutputError cannot write to drive.mcap: File too large\n", errors
+    frames = [time for topic, time in whole(tmp_path / "drive.mcap") if topic == "/frames"]
+    assert 0 < len(frames) < 3000 and frames == [*range(len(frames))]
+
+
+def test_without_an_episode_there_is_nothing_to_keep(tmp_path: Path) -> None:
+    tape = Tape(tmp_path / "drive.mcap", b"{}", TYPES)
+    tape.write(FRAMES, encode(empty(TYPES[FRAMES])), 1)
+    tape.close()
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("name", "why"), [("drive.bag", r"must end in \.mcap"), ("no/drive.mcap", "cannot write to")])
+def test_where_none_can_be_written_is_said(tmp_path: Path, name: str, why: str) -> None:
+    with pytest.raises(OutputError, match=why):
+        Tape(tmp_path / name, b"{}", TYPES)
+
+
+def test_nothing_is_overwritten(written: Path) -> None:
+    before = written.read_bytes()
+    with pytest.raises(OutputError, match="exists already"):
+        Tape(written, b"{}", TYPES)
+    assert written.read_bytes() == before

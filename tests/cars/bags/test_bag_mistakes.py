@@ -1,0 +1,283 @@
+"""Bags and maps with something wrong: one line that names what."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import warnings
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from coopenv import CoopenvError, DataError
+from coopenv.backends.mcap.peek import metadata_names
+from coopenv.backends.sources import Kind, is_bag, kind_of
+from coopenv.base.errors import DataWarning
+from coopenv.cars.bags import Bag
+from coopenv.cars.bags.log import Row
+from coopenv.cars.bags.topic_map import TopicMapError, load_map
+from coopenv.cars.samples import Detections
+from coopenv.cli import main
+from coopenv.cli.bags import _print
+from coopenv.scenario import load_scenario
+from tests.helpers import bags
+from tests.helpers.bags import MAP
+
+pytest.importorskip("rosbags", reason="needs the extra 'log'")
+
+SHORT = [m for m in bags.messages(bags.drive()) if m.stamp < 500_000_000]
+
+
+def opened(tmp_path: Path, text: str, drive: list[bags.Message] | None = None, form: str = "ros1") -> Bag:
+    (tmp_path / "topics.toml").write_text(text, encoding="utf-8")
+    path = bags.write(tmp_path / "drive", SHORT if drive is None else drive, form)
+    return Bag([path], tmp_path / "topics.toml")
+
+
+def without(topic: str) -> list[bags.Message]:
+    return [m for m in SHORT if m.topic != topic]
+
+
+@pytest.mark.parametrize(
+    ("topic", "line"),
+    [
+        (
+            "/agent8/actuation_twist",
+            r"svea3 has no odometry: .* has no topic /agent8/actuation_twist .*; it has ",
+        ),
+        ("/agent8/pixy_node/objectsInfo", r"svea3 has no camera: .* has no topic /agent8/pixy_node/objectsInfo"),
+        ("/agent7/riccatiPoint", r"svea1 has no position: .* has no topic /agent7/riccatiPoint"),
+    ],
+)
+def test_a_missing_topic_is_named(topic: str, line: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=line):
+        opened(tmp_path, MAP, without(topic))
+
+
+def test_a_bag_without_truth_is_one(tmp_path: Path) -> None:
+    bag = opened(tmp_path, MAP, without("/qualisys/svea3/pose"))
+    assert not bag.capabilities.truth
+    assert all(tick.truth is None for tick in bag.episode(None, {}))
+
+
+@pytest.mark.parametrize("form", ["ros1", "sqlite3", "mcap"])
+def test_an_empty_bag_says_so(form: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"has no topic .*; it has none at all"):
+        opened(tmp_path, MAP, [], form)
+
+
+def test_a_bag_of_one_frame_is_too_short(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="too few for two ticks"):
+        opened(tmp_path, MAP, [m for m in SHORT if m.stamp == 0])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("form", ["ros1", "sqlite3", "mcap"])
+def test_a_truncated_bag_is_one_line_or_what_could_be_read(form: str, share: float, tmp_path: Path) -> None:
+    (tmp_path / "topics.toml").write_text(MAP, encoding="utf-8")
+    whole = bags.write(tmp_path / "whole", SHORT, form)
+    file = whole if whole.is_file() else next(whole.glob("whole*.*"))
+    cut = tmp_path / f"cut{file.suffix}"
+    cut.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            bag = Bag([cut], tmp_path / "topics.toml")
+        except CoopenvError as error:
+            assert re.search(r"cut\.\w+: ", str(error)) and "\n" not in str(error)
+            return
+    complete = len(bag.log.samples) == len(SHORT)  # only what lies behind the data is lost
+    assert complete or any(issubclass(w.category, DataWarning) and "damaged" in str(w.message) for w in caught)
+    assert len(list(bag.episode(None, {}))) >= 2
+
+
+@pytest.mark.parametrize("form", ["ros1", "mcap"])
+def test_bytes_that_changed_are_one_line_or_what_could_be_read(form: str, tmp_path: Path) -> None:
+    (tmp_path / "topics.toml").write_text(MAP, encoding="utf-8")
+    whole = bags.write(tmp_path / "whole", SHORT, form)
+    file = whole if whole.is_file() else next(whole.glob("whole*.*"))
+    data, generator = bytearray(file.read_bytes()), np.random.default_rng(5)
+    for number in range(12):
+        changed = bytearray(data)
+        for place in generator.integers(0, len(data), 4):
+            changed[place] = int(generator.integers(256))
+        path = tmp_path / f"changed{number}{file.suffix}"
+        path.write_bytes(changed)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            try:
+                Bag([path], tmp_path / "topics.toml")
+            except CoopenvError as error:
+                assert "\n" not in str(error)
+
+
+MISTAKES: list[tuple[Callable[[str], str], str]] = [
+    (lambda t: t.replace("SL2 = 2", "SL2 = 1"), "markers: the number 1 is used twice"),
+    (lambda t: t.replace("marker = 3", "marker = 7"), "markers: the number 7 is used twice"),
+    (lambda t: t.replace('"svea1"', '"svea3"'), "cars: the name 'svea3' is used twice"),
+    (lambda t: t.replace("SL2 = 2", "SL3 = 2"), "markers: unknown name 'SL3'"),
+    (lambda t: t.replace('"ML"', '"MX"'), "cars.svea1.landmark: unknown name 'MX'"),
+    (lambda t: t.replace("agent =", "agnt ="), "agnt: unknown key .did you mean 'agent'"),
+    (lambda t: t + '[cars.topics]\npont = "/a"\n', "pont: unknown key .did you mean 'point'"),
+    (lambda t: t + '[cars.topics]\npoint = "/agent7/riccatiPoin"\n',
+     r"cars\.svea1\.topics\.point: .* has no topic /agent7/riccatiPoin .did you mean '/agent7/riccatiPoint'"),
+    (lambda t: t + '[cars.topics]\npoint = "/agent8/pixy_node/objectsInfo"\n',
+     "objectsInfo of svea1 holds pixy_camera/msg/ObjectInfoArrayStamped, point is one of geometry_msgs/msg/Point"),
+    (lambda t: t.replace('"authors"', '"none"'), r"cars\.svea3\.topics: names no topic of its odometry"),
+    (lambda t: t.replace('"authors"', '"author"'), "names: Input should be 'svea', 'authors' or 'none'"),
+    (lambda t: t.replace('"crossing_path"', '"crossing_pth"'), "did you mean 'crossing_path'"),
+    (lambda t: t.replace('"crossing_path"', '"there.toml"'), "there.toml"),
+    (lambda t: t + "[clocks]\noffsets = { svea2 = 1.0 }\n", "clocks.offsets: 'svea2' is none of svea1, svea3, truth"),
+    (lambda t: 'start = 99.0\n' + t, "too few for two ticks"),
+    (lambda t: t + "[", "not valid TOML"),
+    (lambda t: t.replace("[overrides]", '[overrides]\n"noise.enabld" = true'), "did you mean 'enabled'"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "line"), MISTAKES)
+def test_a_mistake_in_a_map_is_one_line(change: Callable[[str], str], line: str, tmp_path: Path) -> None:
+    with pytest.raises(CoopenvError, match=line) as caught:
+        opened(tmp_path, change(MAP))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_map_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(TopicMapError, match=r"nowhere\.toml: cannot be read"):
+        load_map(tmp_path / "nowhere.toml")
+
+
+@pytest.mark.parametrize("name", ["nowhere.bag", "nowhere.db3", "nowhere.mcap", "nofolder"])
+def test_a_bag_that_is_not_there(name: str, tmp_path: Path) -> None:
+    (tmp_path / "topics.toml").write_text(MAP, encoding="utf-8")
+    with pytest.raises(DataError, match=f"no such bag: .*{name}"):
+        Bag([tmp_path / name], tmp_path / "topics.toml")
+
+
+def test_a_folder_that_is_no_bag_is_told_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "topics.toml").write_text(MAP, encoding="utf-8")
+    (tmp_path / "empty").mkdir()
+    for command in ("run", "import"):
+        assert main([command, str(tmp_path / "empty"), "--map", str(tmp_path / "topics.toml")]) == 2
+        assert "empty: a folder without metadata.yaml, which a bag of ROS 2 has" in capsys.readouterr().err
+
+
+def test_tables_of_topics_are_folded_and_not_cut(capsys: pytest.CaptureFixture[str]) -> None:
+    name = "/fleet/" + "a_car_with_a_long_name/" * 4 + "mavros/wheel_odometry/velocity"
+    kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
+    for row in (Row(name, kind, 12345, 59.9), Row(name, kind, 12345, 59.9, "a_car", "detections", 12300, 1.2, 3, 0.1)):
+        _print([row], False)
+        lines = capsys.readouterr().out.splitlines()
+        assert max(map(len, lines)) <= 100
+        assert "".join(line[:20] for line in lines[2:]).replace(" ", "").startswith("─" * 20 + name[:20])
+        assert sum(line.count("a_car_with") for line in lines) >= 2 and "…" not in "".join(lines)
+
+
+def test_a_topic_of_which_nothing_is_of_use(tmp_path: Path) -> None:
+    nothing = bags.vector("Vector3", [np.nan] * 3)
+    twist = ("geometry_msgs/msg/Twist", {"linear": nothing, "angular": nothing})
+    lost = {"twist": ("geometry_msgs/msg/TwistWithCovariance", {"twist": twist, "covariance": np.zeros(36)})}
+    drive = [replace(m, fields=lost) if "twist" in m.topic else m for m in SHORT]
+    with pytest.raises(
+        DataError, match=r"actuation_twist of svea3: none of 30 messages is of use: wheel: twist.linear"
+    ):
+        opened(tmp_path, MAP, drive)
+
+
+def test_files_of_others_are_told_from_ours(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    foreign = bags.write(tmp_path / "foreign", SHORT, "mcap")
+    shutil.copy(next(foreign.glob("*.mcap")), tmp_path / "foreign.mcap")
+    assert metadata_names(tmp_path / "foreign.mcap") == frozenset() and kind_of(tmp_path / "foreign.mcap") is Kind.BAG
+    assert kind_of(foreign) is Kind.BAG
+    assert main(["run", str(tmp_path / "foreign.mcap")]) == 2
+    assert "foreign.mcap: a ROS bag, which needs a map" in capsys.readouterr().err
+    (tmp_path / "text.mcap").write_bytes(b"no log")
+    assert metadata_names(tmp_path / "text.mcap") is None and kind_of(tmp_path / "text.mcap") is Kind.LOG
+    assert is_bag(tmp_path / "text.mcap", "topics.toml") and not is_bag("a\0b") and not is_bag("crossing_path")
+
+
+def test_the_camera_tells_its_own_calibration(tmp_path: Path) -> None:
+    roi = ("sensor_msgs/msg/RegionOfInterest",
+           {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False})  # fmt: skip
+    matrices = {"k": np.array([400.0, 0, 160, 0, 410.0, 100, 0, 0, 1]), "r": np.eye(3).ravel(), "p": np.zeros(12)}
+    sizes = {"height": 208, "width": 316, "binning_x": 0, "binning_y": 0, "roi": roi}
+    fields: dict[str, Any] = {**matrices, **sizes, "distortion_model": "plumb_bob", "d": np.zeros(5)}
+    told = bags.Message("/agent8/pixy_node/camera_info", "sensor_msgs/msg/CameraInfo", 0, 0, fields)
+    bag = opened(tmp_path, MAP, [*SHORT, told], "mcap")
+    frame = next(sample.value for sample in bag.log.samples if isinstance(sample.value, Detections))
+    blocks = next(m for m in SHORT if "objectsInfo" in m.topic).fields["objects"]
+    largest = {b["signature"]: b for _, b in blocks if b["width"] == 9}
+    assert frame.markers == tuple(sorted(largest))
+    for marker, ray in zip(frame.markers, frame.bearings, strict=True):
+        block = largest[marker]
+        assert_allclose(ray[0] / ray[2], (block["center_x"] - 160.0) / 400.0)
+        assert_allclose(ray[1] / ray[2], (block["center_y"] - 100.0) / 410.0)
+
+
+def test_the_authors_bearings_stand_in_for_pixels(tmp_path: Path) -> None:
+    """Their node's vectors, of pixels whose distortion it leaves, give what the pixels give."""
+    drive = []
+    for m in SHORT:
+        if "objectsInfo" not in m.topic:
+            drive.append(m)
+            continue
+        bearing = []
+        for _, b in m.fields["objects"]:
+            ray = np.array([(b["center_x"] - 154.841998) / 213.161906, (b["center_y"] - 114.98398) / 213.521038, 1.0])
+            x, y, z = (-ray / np.linalg.norm(ray)).tolist()
+            fields = {"id": b["signature"], "bearing_x": x, "bearing_y": y, "bearing_z": z}
+            bearing.append(("pixy_camera/msg/ObjectBearing", fields))
+        name, kind = "/agent8/pixy_landmark_detection/objectsBearing", "pixy_camera/msg/ObjectBearingArrayStamped"
+        drive.append(replace(m, topic=name, kind=kind, fields={"bearing": bearing}))
+    (tmp_path / "vectors").mkdir()
+    vectors, pixels = opened(tmp_path / "vectors", MAP, drive), opened(tmp_path, MAP)
+    for a, b in zip(vectors.episode(None, {}), pixels.episode(None, {}), strict=True):
+        assert_allclose(a.bearings, b.bearings, atol=1e-5)
+
+
+def test_the_imu_tells_turns_where_there_is_one(tmp_path: Path) -> None:
+    imu = []
+    for m in SHORT:
+        if "twist" in m.topic:
+            none, turning = bags.vector("Vector3", [0, 0, 9.8]), bags.vector("Vector3", [0.0, 0.0, 0.7])
+            rest = {f"{name}_covariance": np.zeros(9) for name in ("orientation", "angular_velocity")}
+            _, pose = bags.pose(np.eye(3), np.zeros(3))
+            fields = {"orientation": pose["orientation"], "angular_velocity": turning, "linear_acceleration": none,
+                      "linear_acceleration_covariance": np.zeros(9), **rest}  # fmt: skip
+            imu.append(replace(m, topic="/imu", kind="sensor_msgs/msg/Imu", fields=fields))
+    text = MAP.replace("agent = 8", 'agent = 8\ntopics = { imu = "/imu" }')
+    *_, last = opened(tmp_path, text, [*SHORT, *imu], "mcap").episode(None, {})
+    assert_allclose(last.angular_velocity, [[0.0, 0.0, 0.7]])
+
+
+def test_frames_of_the_laboratory_become_the_environments(tmp_path: Path) -> None:
+    (tmp_path / "turned").mkdir()
+    frames = "[frames]\nmap = { position = [1.0, 2.0, 0.5] }\ntruth = { yaw = 1.5707963267948966 }\n"
+    plain, turned = opened(tmp_path, MAP), opened(tmp_path / "turned", MAP + frames)
+    for a, b in zip(plain.episode(None, {}), turned.episode(None, {}), strict=True):
+        assert_allclose(b.landmarks[4], a.landmarks[4] + [1.0, 2.0, 0.5])
+        assert a.truth is not None and b.truth is not None
+        x, y, z = a.truth.position[0]
+        assert_allclose(b.truth.position[0], [-y, x, z], atol=1e-12)
+        x, y, z = a.truth.rotation[0, :, 0]
+        assert_allclose(b.truth.rotation[0, :, 0], [-y, x, z], atol=1e-12)
+
+
+def test_the_map_of_the_page_is_one(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[3] / "docs" / "bags.md").read_text(encoding="utf-8")
+    first, *others = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    assert opened(tmp_path, "\n".join([first, *others])).capabilities.truth
+
+
+def test_a_camera_with_another_rate_is_told(tmp_path: Path) -> None:
+    with pytest.warns(DataWarning, match=r'60\.0 frames per second, the environment has 30: .* "rates.camera" = 60\.0'):
+        opened(tmp_path, MAP.replace("[overrides]", '[overrides]\n"rates.camera" = 30.0\n"rates.observer" = 30.0'))
+
+
+def test_a_bag_is_no_scenario() -> None:
+    with pytest.raises(CoopenvError, match=r"drive\.bag: a ROS bag is no scenario; .* run BAG --map topics.toml"):
+        load_scenario("drive.bag")

@@ -1,0 +1,280 @@
+"""Bags of ROS 1 and 2: they give the ticks of the drive that they are of, and observers do as well on them."""
+
+from __future__ import annotations
+
+import sqlite3
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+import coopenv
+from coopenv import CoopenvError, DataError
+from coopenv.backends.mcap import read_recording
+from coopenv.backends.sources import Kind, kind_of, open_recording
+from coopenv.base.errors import DataWarning
+from coopenv.cars.backend.drive import Tape
+from coopenv.cars.bags import Bag
+from coopenv.cli import main
+from coopenv.observers import run
+from coopenv.observers.recording import Sensed
+from coopenv.runs.recorder import record
+from coopenv.scenario import load_scenario
+from tests.helpers import bags
+
+pytest.importorskip("rosbags", reason="needs the extra 'log'")
+
+FORMS = ("ros1", "sqlite3", "mcap")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the same drive in every form, and its map."""
+    folder = tmp_path_factory.mktemp("bags")
+    (folder / "topics.toml").write_text(bags.MAP, encoding="utf-8")
+    for form in FORMS:
+        bags.write(folder / form, bags.messages(bags.drive()), form)
+    return folder
+
+
+def path_of(folder: Path, form: str) -> Path:
+    return folder / {"ros1": "ros1.bag"}.get(form, form)
+
+
+def open_bag(path: Path, folder: Path, text: str = bags.MAP) -> Bag:
+    given = folder / "own.toml"
+    given.write_text(text, encoding="utf-8")
+    return Bag([path], given)
+
+
+def ticks_of(bag: Bag) -> list[Sensed]:
+    return list(bag.episode(None, {}))
+
+
+def assert_same(first: list[Sensed], second: list[Sensed], atol: float = 0.0) -> None:
+    assert len(first) == len(second)
+    for a, b in zip(first, second, strict=True):
+        for name in ("rotation", "translation", "velocity", "bearings", "visible", "landmarks", "bearing_age"):
+            assert_allclose(getattr(a, name), getattr(b, name), atol=atol, rtol=0.0, err_msg=f"{name}, tick {a.index}")
+        assert a.truth is not None and b.truth is not None
+        assert_allclose(a.truth.position, b.truth.position, atol=atol, rtol=0.0)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_ticks_are_those_of_the_drive(form: str, folder: Path) -> None:
+    made, bag = bags.drive(), Bag([path_of(folder, form)], folder / "topics.toml")
+    ticks = ticks_of(bag)
+    assert len(ticks) == bag.capabilities.ticks == made.ticks - 1  # the first frame is before tick 0
+    assert made.visible[:, 0].any(axis=0).tolist() == [True] * 5 + [False]
+    for k in range(2, len(ticks)):
+        tick = ticks[k]
+        assert_array_equal(tick.visible, made.visible[k + 1])
+        for name in ("bearings", "rotation", "translation", "landmarks"):
+            assert_allclose(getattr(tick, name), getattr(made, name)[k + 1], atol=1e-8, err_msg=f"{name}, tick {k}")
+        assert tick.truth is not None
+        assert_allclose(tick.truth.position, made.truth.position[k + 1], atol=1e-9)
+        assert_allclose(tick.truth.rotation, made.truth.rotation[k + 1], atol=1e-9)
+
+
+def test_ros_1_and_ros_2_give_the_same_ticks(folder: Path) -> None:
+    first, *others = (ticks_of(Bag([path_of(folder, form)], folder / "topics.toml")) for form in FORMS)
+    for other in others:
+        assert_same(first, other)
+
+
+@pytest.mark.parametrize("inside", ["sqlite3/sqlite3.db3", "mcap/mcap.mcap"])
+def test_bare_files_are_as_good_as_their_folders(inside: str, folder: Path) -> None:
+    assert kind_of(folder / inside) is Kind.BAG
+    assert_same(
+        ticks_of(Bag([folder / inside], folder / "topics.toml")),
+        ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")),
+    )
+
+
+@pytest.mark.parametrize("observer", ["riccati", "robust", "ukf"])
+def test_observers_do_as_well_as_in_the_simulation(observer: str, folder: Path) -> None:
+    recording = record(Bag([folder / "ros1.bag"], folder / "topics.toml"))
+    simulated, replayed = run(observer, bags.drive()), run(observer, recording)
+    assert not replayed.failure
+    expected, found = (r.position_rmse(2.8)[0] for r in (simulated, replayed))
+    assert expected < 0.05 and abs(found - expected) < 0.2 * expected + 1e-3
+    before, after = replayed.position_error[0, 0], replayed.position_error[-1, 0]
+    assert before > 0.2 and after < 0.05
+
+
+def test_an_imported_bag_is_a_recording(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out, given = folder / "imported.mcap", str(folder / "topics.toml")
+    line = ["import", str(folder / "sqlite3"), "--map", given, "--out", str(out)]
+    assert main(line) == 0
+    printed = capsys.readouterr().out
+    assert "/agent8/pixy_node/objectsInfo" in printed and "svea3 detections" in printed and "240 ticks" in printed
+    assert kind_of(out) is Kind.LOG
+    recording, direct = read_recording(out), record(Bag([folder / "sqlite3"], given))
+    for name in ("rotation", "translation", "bearings", "visible", "start_position"):
+        assert_array_equal(getattr(recording, name), getattr(direct, name))
+    assert main(line) == 2
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_topics_are_listed_without_a_map(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["import", str(folder / "ros1.bag")]) == 0
+    printed = capsys.readouterr().out
+    assert "/agent8/actuation_twist" in printed and "geometry_msgs/msg/TwistWithCovarianceStamped" in printed
+
+
+def test_commands_take_a_bag_with_its_map(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag, given = str(folder / "mcap"), ["--map", str(folder / "topics.toml")]
+    assert main(["run", bag, *given, "--no-figures", "--steps", "2", "--out", str(folder / "out"), "--seed", "1"]) == 0
+    assert main(["describe", bag, *given]) == 0
+    bench = ["bench", "observers", bag, *given, "--observers", "dead_reckoning", "--seeds", "1", "--jobs", "1"]
+    assert main(bench) == 0
+    assert "dead_reckoning" in capsys.readouterr().out
+    assert main(["record", bag, *given, "--out", str(folder / "recorded.mcap")]) == 0
+    assert read_recording(folder / "recorded.mcap").ticks == 240
+    assert main(["run", bag]) == 2
+    assert "needs a map of its topics, --map topics.toml" in capsys.readouterr().err
+    assert main(["run", "crossing_path", *given]) == 2
+    assert "is for ROS bags" in capsys.readouterr().err
+
+
+def test_the_python_interface_takes_a_bag(folder: Path) -> None:
+    overrides = {"horizon": 1.0}
+    env: Any = coopenv.parallel_env(
+        folder / "ros1.bag", topics=folder / "topics.toml", observer="ukf", overrides=overrides
+    )
+    observations, _ = env.reset(seed=0)
+    steps = 0
+    while env.agents:
+        observations, _, _, _, infos = env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+        steps += 1
+    assert steps == 10 and all(np.isfinite(o).all() for o in observations.values())
+    assert np.isfinite(infos["vehicle_1"]["truth"]["position"]).all()
+    with pytest.raises(CoopenvError, match=r"horizon: 60 s are more than .*ros1\.bag has"):
+        Bag([folder / "ros1.bag"], folder / "topics.toml", {"horizon": 60.0})
+    with pytest.raises(DataError, match="coopenv import"):
+        open_recording(folder / "ros1.bag")
+
+
+def test_definitions_that_a_bag_lacks_are_known(folder: Path, tmp_path: Path) -> None:
+    path = tmp_path / "old.db3"
+    path.write_bytes((folder / "sqlite3" / "sqlite3.db3").read_bytes())
+    with sqlite3.connect(path) as database:
+        database.execute("delete from message_definitions")
+    database.close()
+    assert_same(ticks_of(open_bag(path, tmp_path)), ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")))
+
+
+def test_two_files_with_clocks_apart_are_as_one(folder: Path, tmp_path: Path) -> None:
+    drive = bags.messages(bags.drive())
+    captured = [m for m in drive if m.topic.startswith("/qualisys")]
+    first = [m for m in drive if m.topic.startswith("/agent8")] + captured
+    second = [m for m in drive if m.topic.startswith("/agent7")]
+    apart = bags.later(second, stamps=0.5, received=0.5) + bags.later(captured, received=0.5)
+    a, b = bags.write(tmp_path / "a", first, "ros1"), bags.write(tmp_path / "b", apart, "sqlite3")
+    with pytest.warns(DataWarning, match=r"clock of svea1: stamps are -0\.500 s behind, and were moved"):
+        two = Bag([a, b], folder / "topics.toml")
+    assert_same(ticks_of(two), ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")))
+    offsets = {row.topic: row.offset for row in two.log.rows}
+    assert offsets["/agent7/riccatiPoint"] == pytest.approx(-0.5) and offsets["/qualisys/svea3/pose"] == 0.0
+
+
+def test_a_cars_clock_that_is_behind_is_moved_within_a_file(folder: Path, tmp_path: Path) -> None:
+    drive = bags.later(bags.messages(bags.drive()), received=0.004)
+    path = bags.write(tmp_path / "behind", bags.later(drive, stamps=-3.0, topics="/agent8"), "mcap")
+    with pytest.warns(DataWarning, match=r"clock of svea3: stamps are \+3\.004 s behind"):
+        moved = ticks_of(Bag([path], folder / "topics.toml"))
+    believed = ticks_of(open_bag(path, tmp_path, bags.MAP + '[clocks]\nmode = "auto"\noffsets = { svea3 = 3.0 }\n'))
+    assert_same(believed, ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")), atol=1e-12)
+    same = ("visible", "bearings", "rotation")
+    assert all(
+        np.allclose(getattr(moved[k], n), getattr(believed[k], n), equal_nan=True) for k in (5, 90) for n in same
+    )
+
+
+def test_messages_without_stamps_count_when_received(folder: Path, tmp_path: Path) -> None:
+    unstamped = [replace(m, stamp=-bags.BEGIN) if "twist" in m.topic else m for m in bags.messages(bags.drive())]
+    path = bags.write(tmp_path / "unstamped", unstamped, "ros1")
+    with pytest.warns(DataWarning, match="actuation_twist: messages without stamps count when they were received"):
+        bag = Bag([path], folder / "topics.toml")
+    assert_same(ticks_of(bag), ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")))
+
+
+def test_messages_that_make_no_sense_are_left_out(folder: Path, tmp_path: Path) -> None:
+    drive = bags.messages(bags.drive())
+    nowhere = {"pose": bags.pose(np.eye(3), np.full(3, np.nan))}
+    broken = [replace(m, fields=nowhere) if m.kind.endswith("PoseStamped") and m.stamp % 7 == 0 else m for m in drive]
+    path = bags.write(tmp_path / "broken", broken, "mcap")
+    with pytest.warns(DataWarning, match=r"svea3/pose: \d+ of 241 messages left out: truth: pose.position"):
+        bag = Bag([path], folder / "topics.toml")
+    assert_same(ticks_of(bag), ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")), atol=1e-3)
+
+
+TWO_CARS = """
+environment = "overtaking"
+markers = { SL1 = 1, SL2 = 2, SL4 = 4, SL5 = 5 }
+overrides = { "rates.odometry" = 60.0 }
+
+[[cars]]
+name = "svea7"
+vehicle = "vehicle_2"
+marker = 7
+
+[[cars]]
+name = "svea8"
+vehicle = "vehicle_1"
+marker = 6
+"""
+
+
+def test_two_cars_that_recorded_themselves_see_each_other(tmp_path: Path) -> None:
+    """Each on its own computer and in its own way, half a second apart; motion capture is in both files."""
+    drive = [{"duration": 0.3}, {"duration": 9.0, "linear": [0.26, 0.0, 0.0]}]
+    moving = {f"vehicles.{i}.motion": {"kind": "segments", "segments": drive} for i in (0, 1)}
+    ahead = {
+        "vehicles.0.initial_pose.position": [0.0, -1.2, 0.0],
+        "vehicles.0.initial_estimate.position": [0.1, -1.2, 0],
+    }
+    made = record(load_scenario("overtaking", {"horizon": 1.0, "rates.odometry": 60.0, **moving, **ahead}))
+    assert made.visible[:, 1, 4].all()  # vehicle_2 sees the other one
+    numbers, found = {0: 1, 1: 2, 2: 4, 3: 5, 4: 6, 5: 7}, []
+    for i, car in enumerate(("svea8", "svea7")):
+        own = {"blocks": f"/fleet/{car}/pixy/objects_info", "twist": f"/{car}/mavros/wheel_odometry/velocity"}
+        found.append(bags.of_vehicle(made, i, {**own, "truth": f"/qualisys/{car}/pose"}, numbers, (0.0,) * 5))
+    truth = [m for m in found[0] + found[1] if m.topic.startswith("/qualisys")]
+    first = bags.later(found[1] + truth, received=0.003)
+    second = bags.later([m for m in found[0] if m not in truth], stamps=0.5) + truth
+    paths = [
+        bags.write(tmp_path / "svea7", first, "mcap"),
+        bags.write(tmp_path / "svea8", bags.later(second, received=0.503), "ros1"),
+    ]
+    (tmp_path / "topics.toml").write_text(TWO_CARS, encoding="utf-8")
+    with pytest.warns(DataWarning, match=r"clock of svea8: stamps are -0\.497 s behind"):
+        bag = Bag(paths, tmp_path / "topics.toml")
+    ticks = ticks_of(bag)
+    assert len(ticks) > 55
+    for k in range(2, len(ticks) - 1):
+        assert_array_equal(ticks[k].visible, made.visible[k + 1])
+        assert_allclose(ticks[k].bearings, made.bearings[k + 1], atol=1e-8)
+        assert_allclose(ticks[k].translation, made.translation[k + 1], atol=2e-3)
+    replayed = run("robust", record(bag))
+    assert not replayed.failure and (replayed.bytes_per_second > 0.0).any()
+
+
+def test_a_tape_of_cars_is_a_bag_too(folder: Path, tmp_path: Path) -> None:
+    names = {"/agent8/pixy_node/objectsInfo": "fleet/svea3/pixy/objects_info",
+             "/agent8/actuation_twist": "fleet/svea3/mavros/wheel_odometry/velocity",
+             "/qualisys/svea3/pose": "fleet/qualisys/svea3/pose",
+             "/agent7/riccatiPoint": "fleet/svea1/point"}  # fmt: skip
+    drive = bags.messages(bags.drive())
+    path = tmp_path / "tape.mcap"
+    tape = Tape(path, b"{}", {names[m.topic]: m.kind for m in drive})
+    tape.begin(bags.BEGIN, 0, 0)  # a tape in which nothing begins leaves no file
+    for number, m in enumerate(drive):
+        tape.write(names[m.topic], bags.payload(m, number), bags.BEGIN + m.received)
+    tape.close()
+    assert kind_of(path) is Kind.LOG  # which is replayed as it was
+    text = bags.MAP.replace('"authors"', '"svea"') + '[cars.topics]\npoint = "/fleet/svea1/point"\n'
+    assert_same(ticks_of(open_bag(path, tmp_path, text)), ticks_of(Bag([folder / "ros1.bag"], folder / "topics.toml")))

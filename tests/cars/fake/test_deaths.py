@@ -1,0 +1,178 @@
+"""Processes that die, freeze and come back: a router, fake cars with their gates, and an environment, over Zenoh."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import coopenv
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend.opening import open_svea
+from coopenv.cars.codec import decode
+from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.transport.base import Arrival
+from coopenv.cars.transport.zenoh import open_zenoh
+from tests.helpers.cars import OVERTAKING
+from tests.helpers.processes import COOPENV, start, wait_until
+from tests.helpers.wire import free_port
+
+pytestmark = pytest.mark.slow
+
+AHEAD = np.array([0.2, 0.0], dtype=np.float32)
+NEUTRAL = 500.0  # z of a ManualControl that asks for no speed
+DRIVER = """
+import sys
+import numpy as np
+import coopenv
+env = coopenv.parallel_env(sys.argv[1], backend="svea")
+env.reset(seed=0, options={"arm": True})
+print("driving", flush=True)
+while env.agents:
+    env.step(dict.fromkeys(env.agents, np.array([0.2, 0.0])))
+"""
+
+
+class Fleet:
+    """A router and two fake cars, and an ear on what the gates let through."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self.folder, self._stack, self.port = folder, stack, free_port()
+        self.endpoint = f"tcp/127.0.0.1:{self.port}"
+        self.file = folder / "fleet.toml"
+        self.file.write_text(OVERTAKING + f'[network]\nconnect = ["{self.endpoint}"]\n')
+        self.router = self.launch_router()
+        self.cars = {
+            car: self.launch(*COOPENV, "svea", "fake", str(self.file), "--car", car) for car in ("svea7", "svea1")
+        }
+        for process in self.cars.values():
+            assert process.stdout is not None and "ready" in process.stdout.readline()
+        self.ear = open_zenoh("client", [self.endpoint])
+        stack.callback(self.ear.close)
+        self.manual: dict[str, list[tuple[float, float]]] = {car: [] for car in self.cars}
+        self.commands: list[float] = []
+        for car in self.cars:
+            self.ear.subscribe(topic_of(car, Role.MANUAL), lambda arrival, car=car: self._keep(car, arrival))  # type: ignore[misc]
+            self.ear.subscribe(topic_of(car, Role.COMMAND), lambda _: self.commands.append(time.monotonic()))
+
+    def launch(self, *command: str) -> Any:
+        process = start(command, self.folder)
+        self._stack.callback(process.wait)
+        self._stack.callback(process.kill)
+        return process
+
+    def launch_router(self) -> Any:
+        process = self.launch(*COOPENV, "svea", "router", "--listen", self.endpoint)
+        assert process.stdout is not None and "ready" in process.stdout.readline()
+        return process
+
+    def _keep(self, car: str, arrival: Arrival) -> None:
+        z = float(decode(arrival.payload, TOPICS[Role.MANUAL].type).z)
+        self.manual[car].append((time.monotonic(), z))
+
+    def moves(self, car: str) -> bool:
+        return bool(self.manual[car]) and self.manual[car][-1][1] < NEUTRAL - 1.0
+
+    def neutral_since(self, car: str) -> float:
+        """Return when the neutral commands began that a car has been getting since, monotonic, s."""
+        driven = [t for t, z in self.manual[car] if abs(z - NEUTRAL) > 0.5]
+        return min(t for t, _ in self.manual[car] if t > driven[-1])
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Iterator[Fleet]:
+    with ExitStack() as stack:
+        yield Fleet(tmp_path, stack)
+
+
+def armed(fleet: Fleet) -> coopenv.CooperativeLocalisationEnv:
+    env = coopenv.parallel_env(fleet.file, backend="svea")
+    env.reset(seed=0, options={"arm": True})
+    return env
+
+
+def drive(env: coopenv.CooperativeLocalisationEnv, seconds: float) -> dict[str, Any]:
+    infos: dict[str, Any] = {}
+    until = time.monotonic() + seconds
+    while env.agents and time.monotonic() < until:
+        infos = env.step(dict.fromkeys(env.agents, AHEAD))[-1]
+    return infos
+
+
+def test_an_environment_that_is_killed_leaves_standing_cars(fleet: Fleet) -> None:
+    driver = fleet.launch(COOPENV[0], "-c", DRIVER, str(fleet.file))
+    assert "driving" in driver.stdout.readline()
+    wait_until(lambda: all(fleet.moves(car) for car in fleet.cars))
+    driver.send_signal(signal.SIGKILL)
+    wait_until(lambda: not any(fleet.moves(car) for car in fleet.cars))
+    last = fleet.commands[-1]
+    for car in fleet.cars:
+        taken = fleet.neutral_since(car) - last
+        print(f"{car}: neutral {1e3 * taken:.0f} ms after the last command")
+        assert taken < 0.35
+
+
+def test_a_car_that_freezes_is_noticed_and_the_others_stop(fleet: Fleet) -> None:
+    env = armed(fleet)
+    try:
+        drive(env, 1.0)
+        assert fleet.moves("svea7")
+        os.kill(fleet.cars["svea1"].pid, signal.SIGSTOP)
+        frozen = time.monotonic()
+        infos = drive(env, 3.0)
+        assert not env.agents and "svea1" in infos["vehicle_2"]["car"]["stopped"]
+        backend = env.engine.backend
+        assert backend.watchdog.trip is not None  # type: ignore[attr-defined]
+        noticed = backend.watchdog.trip.time - frozen  # type: ignore[attr-defined]
+        wait_until(lambda: not fleet.moves("svea7"))
+        print(f"noticed after {1e3 * noticed:.0f} ms, svea7 neutral {fleet.neutral_since('svea7') - frozen:.3f} s")
+        assert noticed < 0.4
+    finally:
+        os.kill(fleet.cars["svea1"].pid, signal.SIGCONT)
+        env.close()
+
+
+def test_a_router_that_dies_stops_all_and_arming_again_goes_on(fleet: Fleet) -> None:
+    env = armed(fleet)
+    try:
+        drive(env, 1.0)
+        fleet.router.kill()
+        infos = drive(env, 5.0)
+        assert not env.agents and infos["vehicle_1"]["car"]["stopped"]
+        fleet.router.wait()
+        fleet.router = fleet.launch_router()
+        time.sleep(3.0)
+        env.reset(seed=0, options={"arm": True})
+        infos = drive(env, 1.0)
+        assert env.agents and infos["vehicle_1"]["car"]["stopped"] == ""
+        wait_until(lambda: fleet.moves("svea7"))
+    finally:
+        env.close()
+
+
+def test_old_commands_of_a_stalled_station_move_nothing(fleet: Fleet) -> None:
+    """The station freezes for 2 s and goes on: the cars stand, and drive again only by what is sent then."""
+    driver = fleet.launch(COOPENV[0], "-c", DRIVER, str(fleet.file))
+    assert "driving" in driver.stdout.readline()
+    wait_until(lambda: all(fleet.moves(car) for car in fleet.cars))
+    driver.send_signal(signal.SIGSTOP)
+    time.sleep(1.0)
+    assert not any(fleet.moves(car) for car in fleet.cars)
+    time.sleep(1.0)
+    driver.send_signal(signal.SIGCONT)
+    time.sleep(0.1)
+    assert driver.poll() is None or not any(fleet.moves(car) for car in fleet.cars)
+
+
+def test_an_unreachable_router_is_one_clear_error(tmp_path: Path) -> None:
+    file = tmp_path / "fleet.toml"
+    file.write_text(OVERTAKING + f'[network]\nconnect = ["tcp/127.0.0.1:{free_port()}"]\n')
+    with pytest.raises(CoopenvError, match="no Zenoh there"):
+        open_svea(file)

@@ -1,0 +1,148 @@
+"""Faults: how they are asked for, and what they do to what a car says and obeys."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from coopenv.cars.codec import encode, make, stamp_of
+from coopenv.cars.fake.faults import KINDS, Fault, FaultError, Faults, fault_topic, parse_fault
+from coopenv.cars.topics import Role, topic_of
+from tests.helpers.fakes import EXACT, OVERTAKING, Stage
+
+
+@given(
+    kind=st.sampled_from(["loss", "delay", "duplicate_blocks"]),
+    value=st.floats(0, 1),
+    start=st.floats(0, 1e5),
+    duration=st.floats(0, 1e5) | st.none(),
+)
+def test_what_is_written_is_read(kind: str, value: float, start: float, duration: float | None) -> None:
+    text = f"{kind}={value!r}@{start!r}" + ("" if duration is None else f"+{duration!r}")
+    found = parse_fault(text)
+    assert found == Fault(kind, value, start, float("inf") if duration is None else duration)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("loose=0.1", r"unknown fault 'loose' \(did you mean 'loss'\?\); known: .*swapped_signatures"),
+        ("loss", r"fault loss: needs a value, loss=NUMBER"),
+        ("loss=1.5", r"fault loss: value '1.5' must be a number from 0 to 1"),
+        ("loss=nan", r"fault loss: value 'nan' must be a number"),
+        ("freeze@x", r"fault freeze: start 'x' must be a number"),
+        ("freeze@1+-2", r"fault freeze: duration '-2' must be a number"),
+        ("=3", r"fault '=3': expected KIND\[=VALUE\]\[@START\[\+DURATION\]\]"),
+    ],
+)
+def test_what_is_no_fault_is_one_line(text: str, said: str) -> None:
+    with pytest.raises(FaultError, match=said) as caught:
+        parse_fault(text)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_fault_begins_and_ends() -> None:
+    faults = Faults()
+    faults.add(parse_fault("delay=0.2@1+2"), 10**9)
+    faults.add(parse_fault("delay=0.5@2+0.5"), 10**9)
+    times = [1.9, 2.0, 2.9, 3.1, 3.6, 3.9, 4.1]
+    assert [faults.value("delay", int(t * 1e9)) for t in times] == [0.0, 0.2, 0.2, 0.5, 0.2, 0.2, 0.0]
+
+
+def ask(stage: Stage, text: str, car: str = "svea7") -> None:
+    stage.network.publish(fault_topic(car), encode(make("std_msgs/msg/String", data=text)))
+    stage.run(0.001)
+
+
+@pytest.fixture
+def stage() -> Stage:
+    made = Stage("svea_overtaking", OVERTAKING, EXACT)
+    made.run(0.3)
+    return made
+
+
+def test_a_frozen_car_says_nothing_and_stops_where_nobody_commands_it(stage: Stage) -> None:
+    stage.drive("svea7", 0.3, 0.0, 2.0)
+    ask(stage, "freeze@0+2")
+    stage.forget()
+    stage.drive("svea7", 0.3, 0.0, 1.9)
+    assert not stage.arrivals("svea7", Role.WHEEL) and not stage.arrivals("svea7", Role.DETECTIONS)
+    speeds = [m.twist.twist.linear.x for m in stage.arrivals("svea7", Role.TRUTH)]
+    assert speeds[20] > 0.29 and abs(speeds[-1]) < 1e-3  # motion capture goes on; the flight controller went neutral
+    assert stage.arrivals("svea8", Role.WHEEL)
+    stage.drive("svea7", 0.3, 0.0, 1.0)
+    assert stage.arrivals("svea7", Role.WHEEL)[-1].twist.twist.linear.x > 0.25
+
+
+def test_kill_ends_the_process(stage: Stage) -> None:
+    ask(stage, "kill@0.1")
+    assert not stage.died
+    stage.run(0.15)
+    assert set(stage.died) == {"svea7"}
+
+
+def test_loss_and_delay(stage: Stage) -> None:
+    stage.forget()
+    ask(stage, "loss=0.3@0+4")
+    stage.run(4.0)
+    assert 0.55 < len(stage.arrivals("svea7", Role.IMU)) / 400 < 0.85
+    assert len(stage.arrivals("svea8", Role.IMU)) > 390
+    ask(stage, "delay=0.25")
+    stage.run(0.5)
+    stage.forget()
+    stage.run(0.5)
+    stamps = [stamp_of(m) for m in stage.arrivals("svea7", Role.IMU)]
+    assert len(stamps) > 45
+    assert (stage.wall + stage.now - max(stamps)) * 1e-9 == pytest.approx(0.255, abs=0.012)
+
+
+def test_the_cars_clock_is_wrong_and_that_of_motion_capture_is_not(stage: Stage) -> None:
+    ask(stage, "clock_offset=0.5")
+    ask(stage, "clock_drift=0.01")
+    stage.run(2.0)
+    stage.forget()
+    stage.run(0.1)
+    ahead = [stamp_of(m) - stage.wall - stage.now for m in stage.arrivals("svea7", Role.WHEEL)]
+    assert ahead[-1] * 1e-9 == pytest.approx(0.521, abs=0.03)
+    truth = [stamp_of(m) - stage.wall - stage.now for m in stage.arrivals("svea7", Role.TRUTH)]
+    assert -0.02 < truth[-1] * 1e-9 <= 0.0
+
+
+def frames(stage: Stage, seconds: float) -> list[list[tuple[int, int, int]]]:
+    stage.forget()
+    stage.run(seconds)
+    found = stage.arrivals("svea8", Role.DETECTIONS)
+    return [[(b.signature, b.center_x, b.center_y) for b in m.objects] for m in found]
+
+
+def test_blocks_that_are_false_doubled_or_swapped(stage: Stage) -> None:
+    before = frames(stage, 0.5)[-1]
+    numbers = sorted(n for n, _, _ in before)
+    assert set(numbers) == {1, 2, 4, 5}
+    ask(stage, "duplicate_blocks@0+1", "svea8")
+    doubled = frames(stage, 0.9)[-1]
+    assert sorted(n for n, _, _ in doubled) == sorted(numbers * 2)
+    stage.run(0.2)
+    ask(stage, "swapped_signatures@0+1", "svea8")
+    swapped = frames(stage, 0.9)[-1]
+    assert sorted(n for n, _, _ in swapped) == numbers
+    assert {(x, y) for _, x, y in swapped} == {(x, y) for _, x, y in before} and set(swapped) != set(before)
+    stage.run(0.2)
+    ask(stage, "false_blocks=30@0+4", "svea8")
+    extra = [len(frame) - len(before) for frame in frames(stage, 3.9)]
+    assert sum(extra) == pytest.approx(30 * 3.9, rel=0.4)
+
+
+def test_every_kind_can_be_asked_for_and_nonsense_is_told(stage: Stage) -> None:
+    for name, kind in KINDS.items():
+        ask(stage, f"{name}={kind.high:g}@1000")
+    assert not stage.complaints
+    ask(stage, "melt")
+    stage.network.publish(fault_topic("svea7"), b"\1\2")
+    stage.network.publish(topic_of("svea7", Role.MANUAL), b"nonsense")
+    stage.run(0.01)
+    assert len(stage.complaints) == 3
+    assert "unknown fault 'melt'" in stage.complaints[0]
+    assert np.isfinite(stage.cars["svea7"].room.pose(stage.cars["svea7"].room.agent)[1]).all()

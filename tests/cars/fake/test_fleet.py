@@ -1,0 +1,113 @@
+"""A router and fake cars as processes: they are there when asked for, and gone whatever happens."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend.binding import bind
+from coopenv.cars.backend.opening import scenario_of
+from coopenv.cars.deployment import DeploymentError, load_deployment
+from coopenv.cars.fake.fleet import FakesError, fakes, free_port
+from coopenv.cars.topics import presence_of
+from coopenv.cars.transport.zenoh import open_zenoh
+from coopenv.cli import app
+from tests.helpers.processes import ROOT, mentioning, wait_until
+
+FLEETS = sorted((ROOT / "examples" / "fleet").glob("*.toml"))
+OVERTAKING = ROOT / "examples" / "fleet" / "overtaking.toml"
+
+
+@pytest.mark.parametrize("path", FLEETS, ids=lambda path: path.stem)
+def test_the_shipped_fleets_are_those_of_their_environments(path: Path) -> None:
+    fleet = load_deployment(path)
+    scenario = scenario_of(fleet, None, {})
+    binding = bind(scenario, fleet.cars, fleet.markers, path.name, None)
+    landmarks = len(scenario.landmarks)
+    marked = {landmarks + binding.cars[car.name] for car in fleet.cars if car.marker and car.name in binding.cars}
+    assert set(binding.targets.values()) == marked | set(range(landmarks))
+    assert len(fleet.cars) == len(scenario.vehicles) + len(binding.leaders)
+    assert fleet.fakes and fleet.network.connect == ("tcp/127.0.0.1:7447",)
+    commands = [line.removeprefix("#").split() for line in path.read_text().splitlines() if "coopenv svea" in line]
+    assert any("demo" in command for command in commands)
+    for command in commands:
+        for name in command:
+            assert not name.endswith(".toml") or name == str(path.relative_to(ROOT))
+
+
+def test_an_endpoint_takes_the_place_of_the_files() -> None:
+    assert load_deployment(OVERTAKING, "tcp/10.0.0.1:1").network.connect == ("tcp/10.0.0.1:1",)
+    with pytest.raises(DeploymentError, match=r"network\.connect.*is no endpoint"):
+        load_deployment(OVERTAKING, "nonsense")
+
+
+def test_cars_come_and_go() -> None:
+    with pytest.raises(ZeroDivisionError), fakes(OVERTAKING) as endpoint:
+        here, there = open_zenoh("client", [endpoint]), set()
+        try:
+            here.watch(presence_of("*"), lambda key, present: (there.add if present else there.discard)(key))
+            wait_until(lambda: there == {presence_of("svea7"), presence_of("svea1")})
+            assert len(mentioning(endpoint)) == 3
+            command = ["svea", "health", str(OVERTAKING), "--connect", endpoint, "--car"]
+            said = CliRunner().invoke(app, [*command, "svea7"])
+            assert said.output == "svea7: gate disarmed, 0 commands accepted, 0 messages refused\n"
+        finally:
+            here.close()
+        raise ZeroDivisionError
+    assert not mentioning(endpoint)
+
+
+def test_a_gate_that_is_not_there_is_not_well() -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    router = open_zenoh("router", listen=[endpoint])
+    try:
+        command = ["svea", "health", str(OVERTAKING), "--connect", endpoint, "--patience", "0.2", "--car"]
+        found = CliRunner().invoke(app, [*command, "svea7"])
+        assert isinstance(found.exception, CoopenvError)
+        assert "svea7: its gate has said nothing for 0.2 s on fleet/svea7/coopenv/gate" in str(found.exception)
+    finally:
+        router.close()
+
+
+def test_health_is_asked_where_the_gate_is_and_not_beyond_the_radio(tmp_path: Path) -> None:
+    endpoint, file = f"tcp/127.0.0.1:{free_port()}", tmp_path / "fleet.toml"
+    text = OVERTAKING.read_text().replace("tcp/127.0.0.1:7447", "tcp/192.0.2.1:7447")
+    file.write_text(f'{text}\n[gate]\nconnect = ["{endpoint}"]\n')
+    router = open_zenoh("router", listen=[endpoint])
+    try:
+        command = ["svea", "health", str(file), "--patience", "0.2", "--car", "svea7"]
+        found = CliRunner().invoke(app, command)
+        assert "svea7: its gate has said nothing" in str(found.exception)  # so it has got there
+    finally:
+        router.close()
+    for there in ("tcp/192.0.2.1:7447", "tcp/lab:7447"):
+        refused = CliRunner().invoke(app, [*command, "--connect", there])
+        assert str(refused.exception).startswith(f"{there}: is not on this computer")
+    tried = CliRunner().invoke(app, [*command, "--connect", "tcp/nowhere.invalid:7447", "--off-board"])
+    assert str(tried.exception).startswith("tcp/nowhere.invalid:7447: no Zenoh there")
+
+
+def test_who_cannot_start_says_why() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(FakesError, match=rf"router has ended with status 2: tcp/127.0.0.1:{port}: no Zenoh there"):
+            fakes(OVERTAKING, port).__enter__()
+    assert not mentioning(f"tcp/127.0.0.1:{port}")
+
+
+def test_who_is_slow_is_not_waited_for() -> None:
+    port = free_port()
+    with pytest.raises(FakesError, match="router is not ready in time: it has said nothing"):
+        fakes(OVERTAKING, port, patience=0.05).__enter__()
+    assert not mentioning(f"tcp/127.0.0.1:{port}")
+
+
+def test_real_cars_have_no_fakes(tmp_path: Path) -> None:
+    file = tmp_path / "cars.toml"
+    file.write_text(OVERTAKING.read_text().replace("fakes = true", "fakes = false"))
+    with pytest.raises(CoopenvError, match=r"cars\.toml: fakes = true is missing"):
+        fakes(file).__enter__()

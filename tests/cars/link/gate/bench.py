@@ -1,0 +1,81 @@
+"""A gate with clocks that stand still until they are told, and a station that signs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+from coopenv.cars.actuation import Drive, from_manual
+from coopenv.cars.codec import decode, stamp_of
+from coopenv.cars.gate.core import PERIOD, Clock, Gate, Reason
+from coopenv.cars.keys import Signer, Verifier
+from coopenv.cars.limits import Limits
+from coopenv.cars.topics import TOPICS, Role, topic_of
+from tests.cars.link.gate import messages
+
+CAR = "svea7"
+KEYS = {name: Ed25519PrivateKey.from_private_bytes(bytes([i]) * 32) for i, name in enumerate(("station", CAR))}
+VERIFIER = Verifier({name: key.public_key() for name, key in KEYS.items()})
+STATION, OTHER = (Signer(name, key) for name, key in KEYS.items())
+LIMITS = Limits(speed=0.5, steering=0.5, acceleration=1.0, steering_rate=2.0)
+START = 1_700_000_000 * 10**9  # ns
+MS = 1_000_000  # ns
+
+
+class Bench:
+    """One gate, its clocks and its station."""
+
+    def __init__(self, limits: Limits = LIMITS, signed: bool = True) -> None:
+        self.wall, self.steady = START, 7
+        self.gate = Gate(CAR, limits, Clock(lambda: self.wall, lambda: self.steady), VERIFIER if signed else None)
+        self.session, self.sequence = "", 0
+
+    def wait(self, duration: int) -> None:
+        """Let time pass, ns."""
+        self.wall += duration
+        self.steady += duration
+
+    def send(self, role: Role, payload: bytes, signer: Signer | None = STATION) -> Reason | None:
+        attachment = b"" if signer is None else signer.sign(topic_of(CAR, role), payload)
+        return self.gate.arrive(role, payload, attachment)
+
+    def arm(self, session: str = "s1", nonce: str | None = None, armed: bool = True, age: int = 0) -> Reason | None:
+        self.session = session
+        shown = self.status().nonce if nonce is None else nonce
+        return self.send(Role.ARM, messages.arm(self.wall - age, session, shown, armed))
+
+    def command(
+        self,
+        steering: float = 0.1,
+        speed: float = 0.2,
+        age: int = 0,
+        sequence: int | None = None,
+        signer: Any = STATION,
+    ) -> Reason | None:
+        """Send a command of the armed session, by default the next one."""
+        if sequence is None:
+            self.sequence = sequence = self.sequence + 1
+        payload = messages.command(self.wall - age, self.session, sequence, steering, speed)
+        return self.send(Role.COMMAND, payload, signer)
+
+    def stop(self, value: bool = True) -> Reason | None:
+        return self.send(Role.STOP, messages.stop(value), None)
+
+    def status(self) -> Any:
+        return decode(self.gate.status(), TOPICS[Role.GATE].type)
+
+    def tick(self) -> Drive:
+        """Return what the car is told after one more period."""
+        self.wait(PERIOD)
+        message = decode(self.gate.tick(), TOPICS[Role.MANUAL].type)
+        assert stamp_of(message) == self.wall
+        return from_manual(float(message.y), float(message.z), float(message.aux3))
+
+    def drive(self, ticks: int, **fields: Any) -> Drive:
+        """Return what the car is told after some commands, one per tick."""
+        told = Drive()
+        for _ in range(ticks):
+            assert self.command(**fields) is None
+            told = self.tick()
+        return told

@@ -1,0 +1,134 @@
+"""A gate in a process of its own, a router, and the station that talks to it."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+from coopenv.cars.actuation import Drive, from_manual
+from coopenv.cars.codec import decode
+from coopenv.cars.keys import Signer
+from coopenv.cars.topics import TOPICS, Role, presence_of, topic_of
+from coopenv.cars.transport.base import Arrival, Transport
+from tests.cars.link.gate import messages
+from tests.cars.link.gate.bench import CAR
+from tests.helpers.processes import COOPENV, start, wait_until
+
+ROUTER = """
+import sys, time
+from coopenv.cars.transport.zenoh import open_zenoh
+held = open_zenoh("router", listen=[sys.argv[1]])
+print("up", flush=True)
+time.sleep(600)
+"""
+
+
+def free_endpoint() -> str:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+
+
+def start_router(endpoint: str, folder: Path) -> subprocess.Popen[str]:
+    process = start((sys.executable, "-c", ROUTER, endpoint), folder)
+    assert process.stdout is not None and process.stdout.readline() == "up\n"
+    return process
+
+
+def start_gate(endpoint: str, folder: Path, *options: str) -> subprocess.Popen[str]:
+    process = start((*COOPENV, "svea", "gate", "--car", CAR, "--connect", endpoint, *options), folder)
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    assert "ready" in line, process.communicate()
+    return process
+
+
+def end(*processes: subprocess.Popen[str]) -> None:
+    for process in processes:
+        if process.poll() is None:
+            process.send_signal(signal.SIGCONT)
+            process.kill()
+        process.communicate(timeout=10)
+
+
+class Station:
+    """Hears a gate and drives through it."""
+
+    def __init__(self, transport: Transport, signer: Signer | None) -> None:
+        self._transport, self._signer = transport, signer
+        self._lock = threading.Lock()
+        self.status: Any = None
+        self.statuses, self.outputs, self.stops = 0, deque[tuple[float, Drive]](maxlen=1000), 0
+        self.present = False
+        self.session, self.sequence = "", 0
+        transport.subscribe(topic_of(CAR, Role.GATE), self._hear)
+        transport.subscribe(topic_of(CAR, Role.MANUAL), self._see)
+        transport.subscribe(topic_of(CAR, Role.STOP), self._halt)
+        transport.watch(presence_of("*"), self._watch)
+
+    def _hear(self, arrival: Arrival) -> None:
+        self.status, self.statuses = decode(arrival.payload, TOPICS[Role.GATE].type), self.statuses + 1
+
+    def _see(self, arrival: Arrival) -> None:
+        message = decode(arrival.payload, TOPICS[Role.MANUAL].type)
+        with self._lock:
+            self.outputs.append((time.monotonic(), from_manual(float(message.y), float(message.z))))
+
+    def _halt(self, _arrival: Arrival) -> None:
+        self.stops += 1
+
+    def _watch(self, name: str, there: bool) -> None:
+        if name == presence_of(CAR):
+            self.present = there
+
+    def since(self, when: float) -> list[Drive]:
+        """Return what the car has been told since an instant of the monotonic clock."""
+        with self._lock:
+            return [drive for at, drive in self.outputs if at >= when]
+
+    def count(self, reason: str) -> int:
+        return int(dict(zip(self.status.rejections, self.status.counts, strict=True))[reason])
+
+    def send(self, role: Role, payload: bytes) -> None:
+        topic = topic_of(CAR, role)
+        attachment = b"" if self._signer is None else self._signer.sign(topic, payload)
+        self._transport.publish(topic, payload, attachment, urgent=TOPICS[role].urgent, reliable=TOPICS[role].reliable)
+
+    def send_raw(self, role: Role, payload: bytes, attachment: bytes) -> None:
+        self._transport.publish(topic_of(CAR, role), payload, attachment, reliable=True)
+
+    def arm(self, session: str) -> None:
+        """Arm the gate, and wait until it says that it is."""
+        self.session, self.sequence = session, 0
+
+        def is_armed() -> bool:
+            if self.status is not None and (self.status.state, self.status.session) == ("armed", session):
+                return True
+            if self.status is not None:
+                self.send(Role.ARM, messages.arm(time.time_ns(), session, self.status.nonce))
+            time.sleep(0.05)
+            return False
+
+        wait_until(is_armed)
+
+    def command(self, speed: float = 0.3) -> None:
+        self.sequence += 1
+        self.send(Role.COMMAND, messages.command(time.time_ns(), self.session, self.sequence, 0.1, speed))
+
+    def drive(self) -> None:
+        """Send commands until the car is told to move."""
+        begun = time.monotonic()
+
+        def moves() -> bool:
+            self.command()
+            time.sleep(0.04)
+            return any(drive.speed > 0.01 for drive in self.since(begun))
+
+        wait_until(moves)

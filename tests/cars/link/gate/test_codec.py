@@ -1,0 +1,117 @@
+"""The gate's own codec reads and writes the bytes that rosbags does."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, astuple
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.actuation import Manual
+from coopenv.cars.codec import decode, encode, header, make
+from coopenv.cars.gate.codec import (
+    Malformed,
+    Status,
+    read_arm,
+    read_bool,
+    read_command,
+    write_bool,
+    write_manual,
+    write_status,
+)
+from coopenv.cars.topics import TOPICS, Role
+from tests.cars.link.gate.messages import arm, framed_command, stop
+
+TEXT = st.text(st.characters(codec="utf-8"), max_size=12)
+STAMP = st.integers(0, 2**31 * 10**9 - 1)
+FLOAT = st.floats(width=32)
+COUNT = st.integers(0, 2**64 - 1)
+
+
+@given(STAMP, TEXT, st.tuples(FLOAT, FLOAT, FLOAT, FLOAT, FLOAT))
+def test_commands_are_read_as_they_were_written(stamp: int, frame: str, fields: Any) -> None:
+    read = read_command(framed_command(stamp, frame, fields))
+    assert (read.stamp, read.frame) == (stamp, frame)
+    assert np.array_equal(astuple(read)[2:], fields, equal_nan=True)
+
+
+@given(STAMP, TEXT, TEXT, TEXT, st.booleans())
+def test_armings_are_read_as_they_were_written(stamp: int, frame: str, session: str, nonce: str, armed: bool) -> None:
+    message = make(TOPICS[Role.ARM].type, header=header(stamp, frame), session=session, nonce=nonce, armed=armed)
+    assert astuple(read_arm(encode(message))) == (stamp, frame, session, nonce, armed)
+
+
+@pytest.mark.parametrize("value", [True, False])
+def test_stops_are_those_of_rosbags(value: bool) -> None:
+    assert write_bool(value) == stop(value)
+    assert read_bool(stop(value)) is value
+
+
+@given(STAMP, st.lists(FLOAT, min_size=12, max_size=12), st.integers(0, 2**16 - 1), st.integers(0, 255))
+def test_manual_control_is_that_of_rosbags(stamp: int, numbers: list[float], buttons: int, extensions: int) -> None:
+    fields = Manual(*numbers[:4], buttons, buttons // 2, extensions, *numbers[4:])
+    payload = write_manual(stamp, fields)
+    assert payload == encode(make(TOPICS[Role.MANUAL].type, header=header(stamp), **asdict(fields)))
+    read = decode(payload, TOPICS[Role.MANUAL].type)
+    assert all(math.isnan(v) or getattr(read, k) == v for k, v in asdict(fields).items())
+
+
+@given(STAMP, TEXT, TEXT, TEXT, COUNT, COUNT, st.dictionaries(TEXT, COUNT, max_size=5))
+def test_the_status_is_that_of_rosbags(
+    stamp: int, session: str, nonce: str, state: str, accepted: int, last: int, counts: dict[str, int]
+) -> None:
+    payload = write_status(Status(stamp, session, nonce, state, accepted, last, counts))
+    fields: dict[str, Any] = {"session": session, "nonce": nonce, "state": state}
+    fields |= {"accepted": accepted, "last_sequence": last}
+    fields |= {"rejections": list(counts), "counts": np.array(list(counts.values()), dtype=np.uint64)}
+    assert payload == encode(make(TOPICS[Role.GATE].type, header=header(stamp), **fields))
+    read = decode(payload, TOPICS[Role.GATE].type)
+    assert dict(zip(read.rejections, read.counts.tolist(), strict=True)) == counts
+
+
+WHOLE = [
+    (read_command, Role.COMMAND, framed_command(5, "abc:1", (0.1, 0.2, 0.3, 0.4, 0.5))),
+    (read_arm, Role.ARM, arm(7, "abc", "nonce")),
+    (read_bool, Role.STOP, stop()),
+]
+
+
+@pytest.mark.parametrize(("read", "role", "payload"), WHOLE)
+def test_every_other_length_is_refused(read: Callable[[bytes], Any], role: Role, payload: bytes) -> None:
+    for length in range(len(payload)):
+        with pytest.raises(Malformed):
+            read(payload[:length])
+        with pytest.raises(CoopenvError):
+            decode(payload[:length], TOPICS[role].type)
+    for more in range(1, 4):  # padding that some writers add
+        assert read(payload + bytes(more)) == read(payload)
+    with pytest.raises(Malformed, match="too long"):
+        read(payload + bytes(4))
+
+
+@given(st.sampled_from(WHOLE), st.binary(max_size=80), st.booleans())
+def test_bytes_are_read_as_rosbags_reads_them_or_refused(what: Any, raw: bytes, plausible: bool) -> None:
+    read, role, _ = what
+    payload = b"\0\1\0\0" + raw if plausible else raw
+    try:
+        found = read(payload)
+    except Malformed:
+        return
+    other = decode(payload, TOPICS[role].type)
+    if role is Role.STOP:
+        assert found is bool(other.data)
+    else:
+        assert found.frame == other.header.frame_id
+
+
+def test_stamps_and_texts_that_make_no_sense_are_refused() -> None:
+    good = framed_command(5, "abc:1", (0.0,) * 5)
+    for place, byte in ((11, 0xFF), (12, 0xFF), (15, 0x7F), (16, 0xC3), (21, 0x31), (1, 0)):
+        with pytest.raises(Malformed):
+            read_command(good[:place] + bytes([byte]) + good[place + 1 :])

@@ -1,0 +1,250 @@
+"""The command `coopenv svea gate` in a process of its own, over real Zenoh."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from coopenv.cars.actuation import NEUTRAL
+from coopenv.cars.keys import load_signer, load_verifier, make_keys
+from coopenv.cars.topics import Role
+from coopenv.cars.transport.zenoh import LEASE, open_zenoh
+from coopenv.cli import main
+from tests.cars.link.gate import messages
+from tests.cars.link.gate.bench import CAR
+from tests.cars.link.gate.hostile import messages_of_strangers
+from tests.cars.link.gate.station import Station, end, free_endpoint, start_gate, start_router
+from tests.helpers.processes import start, wait_until
+
+pytest.importorskip("zenoh", reason="needs the extra 'svea'")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="signals and modes of files")
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("keys")
+    make_keys(folder, [CAR, "station", "other"])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    where = free_endpoint()
+    router = start_router(where, tmp_path_factory.mktemp("router"))
+    yield where
+    end(router)
+
+
+@pytest.fixture
+def gate(endpoint: str, keys: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    process = start_gate(endpoint, tmp_path, "--keys", str(keys))
+    yield process
+    end(process)
+
+
+@pytest.fixture
+def station(endpoint: str, keys: Path, gate: subprocess.Popen[str]) -> Iterator[Station]:
+    transport = open_zenoh("client", [endpoint])
+    yield Station(transport, load_signer(keys, "station"))
+    transport.close()
+
+
+def test_a_station_arms_drives_and_stops(station: Station) -> None:
+    wait_until(lambda: station.present and station.outputs and station.status)
+    assert station.status.state == "disarmed"
+    begun = time.monotonic()
+    time.sleep(0.6)
+    told, most = station.since(begun), 20.0 * (time.monotonic() - begun) + 3
+    assert 3 <= len(told) <= most and set(told) == {NEUTRAL}  # 20 Hz, on a machine that has other things to do
+    station.arm("a")
+    station.drive()
+    wait_until(lambda: station.status.state == "timed_out")
+    assert station.outputs[-1][1] == NEUTRAL
+    station.drive()
+    station.send(Role.STOP, messages.stop())
+    wait_until(lambda: station.status.state == "stopped" and station.stops >= 3)  # repeated for who comes late
+    station.command()
+    wait_until(lambda: station.count("not_armed") > 0)
+    assert station.outputs[-1][1] == NEUTRAL
+    station.arm("b")
+    time.sleep(0.5)  # its own repetitions of the stop must not come back to stop it again
+    station.drive()
+    assert station.status.state == "armed"
+
+
+def test_bad_messages_leave_it_working(station: Station, keys: Path) -> None:
+    station.arm("a")
+    station.drive()
+    wait_until(lambda: station.status.state == "timed_out")
+    accepted, begun = station.status.accepted, time.monotonic()
+    signers = load_signer(keys, "station"), load_signer(keys, "other")
+    bad = messages_of_strangers(Random(3), *signers, "a", station.sequence, time.time_ns)
+    for i in range(3000):
+        station.send_raw(*next(bad))
+        if i % 50 == 0:
+            time.sleep(0.01)
+    wait_until(lambda: sum(station.status.counts) >= 3000)
+    assert station.status.accepted == accepted
+    assert set(station.since(begun)) == {NEUTRAL}
+    station.sequence += 10
+    station.drive()
+
+
+@pytest.mark.parametrize("duration", [0.2, 2.0])
+def test_what_comes_while_it_is_frozen_moves_nothing(
+    station: Station, gate: subprocess.Popen[str], duration: float
+) -> None:
+    station.arm("a")
+    station.drive()
+    frozen = time.monotonic()
+    gate.send_signal(signal.SIGSTOP)
+    time.sleep(0.05)
+    sent = station.sequence
+    while time.monotonic() < frozen + duration:
+        station.command(0.5)
+        time.sleep(0.05)
+    time.sleep(0.2)  # the youngest is older than it may be, too
+    resumed = time.monotonic()
+    gate.send_signal(signal.SIGCONT)
+    wait_until(lambda: len(station.since(resumed)) > 10)
+    if (
+        resumed - frozen < 0.6 * LEASE / 1000
+    ):  # after a longer while Zenoh has given the session up, with what was under way
+        wait_until(lambda: station.count("stale") > 0)
+    assert set(station.since(resumed)) == {NEUTRAL}
+    assert station.status.state == "timed_out" and station.status.last_sequence <= sent
+    station.drive()
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGHUP, 143)])
+def test_a_signal_leaves_the_car_in_neutral(
+    station: Station, gate: subprocess.Popen[str], number: signal.Signals, status: int
+) -> None:
+    station.arm("a")
+    station.drive()
+    gate.send_signal(number)
+    _, errors = gate.communicate(timeout=10)
+    assert (gate.returncode, errors) == (status, f"interrupted; {CAR} is in neutral\n")
+    wait_until(lambda: [drive for _, drive in station.outputs][-5:] == [NEUTRAL] * 5)
+    wait_until(lambda: not station.present)
+
+
+def test_a_router_that_comes_back_finds_the_gate(keys: Path, tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    router = start_router(endpoint, tmp_path)
+    gate = start_gate(endpoint, tmp_path, "--keys", str(keys))
+    transport = open_zenoh("client", [endpoint])
+    try:
+        station = Station(transport, load_signer(keys, "station"))
+        station.arm("a")
+        station.drive()
+        end(router)
+        time.sleep(0.5)
+        router = start_router(endpoint, tmp_path)
+        heard = station.statuses
+        wait_until(lambda: station.statuses > heard + 1)
+        assert station.status.state == "timed_out"
+        station.drive()  # the session goes on
+        wait_until(lambda: station.present)
+        end(router)
+        time.sleep(0.5)
+        assert gate.poll() is None
+        gate.terminate()  # ends without a router as well
+        assert gate.wait(timeout=10) == 143
+    finally:
+        transport.close()
+        end(gate, router)
+
+
+def test_the_status_is_signed_by_the_car(endpoint: str, keys: Path, gate: subprocess.Popen[str]) -> None:
+    transport, heard, verifier = open_zenoh("client", [endpoint]), [], load_verifier(keys)
+    transport.subscribe("fleet/*/coopenv/gate", heard.append)
+    wait_until(lambda: heard)
+    transport.close()
+    assert verifier.signer(heard[0].topic, heard[0].payload, heard[0].attachment) == CAR
+
+
+def test_a_deployment_file_tells_it_all(endpoint: str, keys: Path, tmp_path: Path) -> None:
+    lines = [
+        'environment = "none of its business"',
+        f'cars = [{{name = "{CAR}"}}]',
+        # Of the station: the gate does not go there, and on its own computer it needs no certificate.
+        'network = {connect = ["tls/192.0.2.1:7447"], tls = {root_ca = "not_on_the_car.pem"}}',
+        f'gate.connect = ["{endpoint}"]',
+    ]
+    lines += [f'security = {{keys = "{keys}", identity = "other"}}', "safety.max_speed = 0.2"]
+    (tmp_path / "fleet.toml").write_text("\n".join(lines))
+    gate = start((sys.executable, "-m", "coopenv", "svea", "gate", "fleet.toml", "--car", CAR), tmp_path)
+    transport = open_zenoh("client", [endpoint])
+    try:
+        station = Station(transport, load_signer(keys, "other"))
+        station.arm("a")
+        station.command(speed=0.3)
+        wait_until(lambda: station.count("limits") == 1)
+    finally:
+        transport.close()
+        end(gate)
+
+
+def test_without_keys_it_warns(endpoint: str, tmp_path: Path) -> None:
+    gate = start_gate(endpoint, tmp_path)
+    transport = open_zenoh("client", [endpoint])
+    station = Station(transport, None)
+    station.arm("a")
+    station.drive()
+    transport.close()
+    gate.terminate()
+    assert gate.communicate(timeout=10)[1].startswith("warning: without --keys whoever")
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--car", "a/b"], "--car 'a/b': expected"),
+        (["--car", CAR, "--max-speed", "2"], "limit of speed: must be above 0, at most 1.53"),
+        (["--car", CAR, "--max-acceleration", "nan"], "limit of acceleration"),
+        (["--car", CAR, "--keys", "nowhere"], "nowhere: cannot be read as a file of keys"),
+        (["--car", CAR, "--connect", "nonsense"], "'nonsense' is no endpoint"),
+        (["--car", CAR, "--connect", "tcp/10.0.0.1:7447"], "tcp/10.0.0.1:7447: is not on this computer"),
+        (["away.toml", "--car", CAR], "tcp/lab:7447: is not on this computer"),
+        (["mixed.toml", "--car", CAR], "svea7.pem: is not the key of svea7 in keys/public.toml"),
+        (["nothing.toml", "--car", CAR], "nothing.toml: cannot be read"),
+        (["fleet.toml", "--car", "svea8"], "unknown car 'svea8'"),
+        ([], "Missing option '--car'"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(
+    options: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    fleet = f'environment = "x"\ncars = [{{name = "{CAR}"}}]\n'
+    Path("fleet.toml").write_text(fleet)
+    Path("away.toml").write_text(fleet + 'gate.connect = ["tcp/lab:7447"]\n')
+    Path("mixed.toml").write_text(fleet + 'security.keys = "keys"\n')
+    make_keys("keys", [CAR, "station"])
+    Path("keys/station.pem").replace(f"keys/{CAR}.pem")
+    assert main(["svea", "gate", *options]) == 2
+    error = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("warning: without --keys")]
+    assert len(error) == 1 and told in error[0]
+
+
+def test_it_loads_neither_the_simulation_nor_numpy() -> None:
+    code = (
+        "import sys; sys.argv[0] = 'coopenv'\n"  # the package does not register environments for its own command
+        "import coopenv.cars.gate.process, coopenv.cars.gate.process, coopenv.cars.keys\n"
+        "import coopenv.cars.deployment, coopenv.cars.transport.zenoh\n"
+        "print(*sys.modules)"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ}
+    )
+    loaded = {name.partition(".")[0] for name in result.stdout.split()}
+    assert not {"numpy", "warp", "scipy", "matplotlib", "rosbags", "gymnasium"} & loaded

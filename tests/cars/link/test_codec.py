@@ -1,0 +1,111 @@
+"""Bytes of messages, against bytes put together by hand."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from coopenv.base.errors import CoopenvError
+from coopenv.cars.codec import (
+    MOST_BYTES,
+    decode,
+    decode_ros1,
+    encode,
+    encode_ros1,
+    header,
+    make,
+    make_time,
+    ros1,
+    stamp_of,
+)
+
+ENCAPSULATION = bytes.fromhex("00010000")
+MANUAL = "mavros_msgs/msg/ManualControl"
+ODOMETRY = "nav_msgs/msg/Odometry"
+POINT = "geometry_msgs/msg/PointStamped"
+
+
+def manual(frame: str, y: float = 0.0, z: float = 500.0) -> Any:
+    aux = {f"aux{i}": float(value) for i, value in enumerate((-1000, -1000, 1000, 0, 0, 0), start=1)}
+    axes = {"x": 0.0, "y": y, "z": z, "r": 0.0, "s": 0.0, "t": 0.0}
+    bits = {"buttons": 0, "buttons2": 0, "enabled_extensions": 252}
+    return make(MANUAL, header=header(3_000_000_004, frame), **axes, **bits, **aux)
+
+
+def odometry(frame: str, child: str) -> Any:
+    def of(kind: str, **fields: Any) -> Any:
+        return make(f"geometry_msgs/msg/{kind}", **fields)
+
+    turned = of("Quaternion", x=0.0, y=0.0, z=0.6, w=0.8)
+    pose = of("Pose", position=of("Point", x=1.0, y=2.0, z=3.0), orientation=turned)
+    speed = of("Twist", linear=of("Vector3", x=0.5, y=0.0, z=0.0), angular=of("Vector3", x=0.0, y=0.0, z=0.1))
+    return make(
+        ODOMETRY,
+        header=header(1_000_000_002, frame),
+        child_frame_id=child,
+        pose=of("PoseWithCovariance", pose=pose, covariance=np.arange(36.0)),
+        twist=of("TwistWithCovariance", twist=speed, covariance=np.zeros(36)),
+    )
+
+
+def test_a_manual_control_is_these_bytes() -> None:
+    stamp = struct.pack("<iI", 3, 4)
+    frame = struct.pack("<I", 1) + b"\0" + bytes(3)
+    axes = struct.pack("<4f", 0.0, -286.48, 382.35, 0.0)
+    bits = struct.pack("<HHB", 0, 0, 252) + bytes(3)
+    rest = struct.pack("<8f", 0.0, 0.0, -1000.0, -1000.0, 1000.0, 0.0, 0.0, 0.0)
+    assert encode(manual("", -286.48, 382.35)) == ENCAPSULATION + stamp + frame + axes + bits + rest
+
+
+@pytest.mark.parametrize(("frame", "size"), [("", 76), ("svea7/base_link", 88)])
+def test_sizes_of_manual_controls(frame: str, size: int) -> None:
+    assert len(encode(manual(frame))) == size
+
+
+def test_size_of_an_odometry() -> None:
+    assert len(encode(odometry("svea7/odom", "svea7/base_link"))) == 732
+
+
+def test_an_odometry_comes_back_as_it_was() -> None:
+    sent = encode(odometry("svea7/odom", "svea7/base_link"))
+    back = decode(sent, ODOMETRY)
+    assert stamp_of(back) == 1_000_000_002
+    np.testing.assert_array_equal(back.pose.covariance, np.arange(36.0))
+    assert encode(back) == sent
+
+
+def test_a_point_of_ros1_is_these_43_bytes() -> None:
+    stored = ros1().types
+    head = stored["std_msgs/msg/Header"](seq=7, stamp=make_time(3_000_000_004), frame_id="map")
+    where = stored["geometry_msgs/msg/Point"](x=1.5, y=-2.0, z=0.25)
+    payload = encode_ros1(stored[POINT](header=head, point=where))
+    assert payload == struct.pack("<III", 7, 3, 4) + struct.pack("<I", 3) + b"map" + struct.pack("<3d", 1.5, -2.0, 0.25)
+    assert len(payload) == 43
+    assert stamp_of(decode_ros1(payload, POINT)) == 3_000_000_004
+
+
+@pytest.mark.parametrize("read", [decode, decode_ros1])
+@pytest.mark.parametrize("payload", [b"", b"\0\1\0\0", bytes(MOST_BYTES + 1)])
+def test_bytes_that_are_no_message_are_refused_in_one_line(read: Any, payload: bytes) -> None:
+    with pytest.raises(CoopenvError, match=r"^nav_msgs/msg/Odometry: [^\n]+$"):
+        read(payload, ODOMETRY)
+
+
+@given(cut=st.integers(0, 731))
+def test_a_message_that_is_cut_off_is_refused(cut: int) -> None:
+    with pytest.raises(CoopenvError):
+        decode(encode(odometry("svea7/odom", "svea7/base_link"))[:cut], ODOMETRY)
+
+
+@given(payload=st.binary(max_size=200))
+def test_random_bytes_are_refused_or_read(payload: bytes) -> None:
+    for read in (decode, decode_ros1):
+        try:
+            assert read(payload, MANUAL if read is decode else POINT) is not None
+        except CoopenvError as error:
+            assert "\n" not in str(error)

@@ -1,0 +1,134 @@
+"""Deployment files: what is wrong with one is said in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from coopenv.cars.deployment import DeploymentError, load_deployment
+
+GOOD = """
+environment = "crossing_path"
+[markers]
+SL1 = 1
+[[cars]]
+name = "svea7"
+marker = 7
+[[cars]]
+name = "svea8"
+agent = 8
+[[cars]]
+name = "leader"
+landmark = "ML"
+marker = 5
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "lab.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_good_file_is_read(tmp_path: Path) -> None:
+    fleet = load_deployment(written(tmp_path, GOOD))
+    assert [car.name for car in fleet.driven] == ["svea7", "svea8"]
+    assert [car.agent_number for car in fleet.cars] == [7, 8, 5]
+    assert fleet.network.connect == ("tcp/127.0.0.1:7447",)
+    assert fleet.folder == tmp_path
+    assert fleet.car("svea8").marker is None
+
+
+def test_each_kind_of_network_has_its_usual_place(tmp_path: Path) -> None:
+    usual = {"zenoh": "tcp/127.0.0.1:7447", "nats": "nats/127.0.0.1:4222", "ros1": "tcp/127.0.0.1:11311"}
+    for kind, endpoint in usual.items():
+        network = load_deployment(written(tmp_path, GOOD + f'[network]\nkind = "{kind}"')).network
+        assert network.connect == (endpoint,)
+
+
+def test_authors_cars_need_not_tell_of_themselves(tmp_path: Path) -> None:
+    for kind, safety, needed in (
+        ("zenoh", "", True),
+        ("nats", "", False),
+        ("ros1", "", False),
+        ("zenoh", "[safety]\nconditions = false", False),
+        ("nats", "[safety]\nconditions = true", True),
+    ):
+        fleet = load_deployment(written(tmp_path, GOOD + f'[network]\nkind = "{kind}"\n{safety}'))
+        assert fleet.conditions is needed
+
+
+def test_a_gate_stays_on_its_car_wherever_the_network_is(tmp_path: Path) -> None:
+    away = '[network]\nconnect = ["tcp/192.0.2.1:7447"]\n'
+    assert load_deployment(written(tmp_path, GOOD + away)).gate_connect == ("tcp/127.0.0.1:7447",)
+    told = load_deployment(written(tmp_path, GOOD + away + '[gate]\nconnect = ["tcp/[::1]:1"]'))
+    assert told.gate_connect == ("tcp/[::1]:1",)
+    ros = load_deployment(written(tmp_path, GOOD + '[network]\nkind = "ros1"'))
+    assert ros.gate_connect == ("tcp/127.0.0.1:11311",)
+
+
+BAD = {
+    "an unknown key": ('[network]\nconect = ["tcp/a:1"]', "network.conect: unknown key (did you mean 'connect'?)"),
+    "an unknown kind": ('[network]\nkind = "mqtt"', "network.kind: Input should be 'zenoh', 'nats' or 'ros1'"),
+    "no protocol": ('[network]\nconnect = ["127.0.0.1:7447"]', "network.connect.0: '127.0.0.1:7447' is no endpoint"),
+    "no port": ('[network]\nconnect = ["tcp/127.0.0.1"]', "'tcp/127.0.0.1' is no endpoint, expected for example tcp/"),
+    "no host": ('[network]\nconnect = ["tcp/:7447"]', "'tcp/:7447' is no endpoint"),
+    "a port too large": ('[network]\nconnect = ["tcp/a:70000"]', "'tcp/a:70000' is no endpoint"),
+    "no endpoints": ("[network]\nconnect = []", "network.connect: List should have at least 1 item"),
+    "a wire's protocol": ('[network]\nconnect = ["nats/a:1"]', "network.connect: 'nats/a:1': zenoh has tcp, tls"),
+    "a gate's endpoint": ('[gate]\nconnect = ["there"]', "gate.connect.0: 'there' is no endpoint"),
+    "no gate's endpoint": ("[gate]\nconnect = []", "gate.connect: List should have at least 1 item"),
+    "a gate's wire": ('[gate]\nconnect = ["nats/127.0.0.1:1"]', "gate.connect: 'nats/127.0.0.1:1': zenoh has tcp, tls"),
+    "TLS without it": (
+        '[network]\nconnect = ["tls/a:1"]',
+        "network.tls: is missing, tls/a:1 needs at least its root_ca",
+    ),
+    "TLS in the clear": (
+        '[network.tls]\nroot_ca = "ca.pem"',
+        "network.connect: tcp/127.0.0.1:7447 would go in the clear",
+    ),
+    "half an identity": (
+        '[network]\nconnect = ["tls/a:1"]\ntls = {root_ca = "ca.pem", key = "k"}',
+        "network.tls: certificate and key: give both or none",
+    ),
+    "a marker over 7": ('[[cars]]\nname = "c"\nmarker = 9', "marker 9 of c: the camera knows 1 to 7 only"),
+    "a marker of two": ('[[cars]]\nname = "c"\nmarker = 1', "markers: the number 1 is used twice"),
+    "a name of two": ('[[cars]]\nname = "svea7"', "cars: the name 'svea7' is used twice"),
+    "an agent of two": ('[[cars]]\nname = "c"\nagent = 7', "cars: the agent (or marker) 7 is used twice"),
+    "a name no topic can have": ('[[cars]]\nname = "a/b"', "cars.3.name: String should match"),
+    "two things at once": ('[[cars]]\nname = "c"\nvehicle = "v"\nlandmark = "L"', "cars.3: is a vehicle or a landmark"),
+    "too fast": ("[safety]\nmax_speed = 2.0", "safety.max_speed: Input should be less than or equal to 1.53, got 2.0"),
+    "a channel of two": ("[remote]\nthrottle = 1", "remote: steering, throttle and mode_switch: two of them are on"),
+    "no such channel": ("[remote]\nsteering = 0", "remote.steering: Input should be greater than or equal to 1"),
+    "not a number": ("[safety]\nmax_speed = nan", "safety.max_speed: "),
+    "text for a number": ('[safety]\nmax_speed = "fast"', "safety.max_speed: Input should be a valid number"),
+    "no TOML": ("[network", "not valid TOML: "),
+    "too deep": (f"overrides = {'[' * 5000}", "not valid TOML|too deep"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_is_wrong_is_said_in_one_line(tmp_path: Path, case: str) -> None:
+    added, said = BAD[case]
+    with pytest.raises(DeploymentError) as caught:
+        load_deployment(written(tmp_path, GOOD + added))
+    line = str(caught.value)
+    assert "lab.toml: " in line
+    assert any(part in line for part in said.split("|")), line
+    assert "\n" not in line
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    (tmp_path / "latin.toml").write_bytes(b'environment = "\xff"')
+    for name, why in (("none.toml", "No such file"), (".", "Is a directory"), ("latin.toml", "not valid TOML")):
+        with pytest.raises(DeploymentError, match=why) as caught:
+            load_deployment(tmp_path / name)
+        assert "\n" not in str(caught.value)
+
+
+def test_an_unknown_car_is_answered_by_those_there_are(tmp_path: Path) -> None:
+    with pytest.raises(
+        DeploymentError, match=r"unknown car 'svea9' \(did you mean 'svea[78]'\?\); known: svea7, svea8"
+    ):
+        load_deployment(written(tmp_path, GOOD)).car("svea9")

@@ -1,0 +1,177 @@
+"""Files of keys: made once, kept, and refused when others can get at them."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from coopenv.cars.keys import PUBLIC, KeyFileError, check_known, load_signer, load_verifier, make_keys
+from coopenv.cars.transport import zenoh
+from coopenv.cli import main
+from tests.helpers.processes import ROOT
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="modes of files")
+NAMES = ("svea7", "svea8", "station")
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    assert make_keys(tmp_path / "keys", NAMES) == (list(NAMES), [])
+    return tmp_path / "keys"
+
+
+def test_keys_sign_and_verify(folder: Path) -> None:
+    verifier = load_verifier(folder)
+    assert set(verifier.identities) == set(NAMES)
+    for name in NAMES:
+        for place in (folder, folder / f"{name}.pem"):
+            assert verifier.signer("t", b"p", load_signer(place, name).sign("t", b"p")) == name
+    assert load_verifier(folder / PUBLIC).signer("t", b"p", load_signer(folder, "svea7").sign("t", b"p")) == "svea7"
+    check_known(verifier, "station", folder)
+    with pytest.raises(KeyFileError, match="no public key of 'svea9'"):
+        check_known(verifier, "svea9", folder)
+
+
+def test_a_private_file_of_another_is_refused_by_the_names_of_both_files(folder: Path) -> None:
+    (folder / "svea8.pem").replace(folder / "svea7.pem")
+    with pytest.raises(KeyFileError) as refused:
+        load_signer(folder, "svea7")
+    for part in (str(folder / "svea7.pem"), str(folder / PUBLIC), "coopenv svea keys", "--force"):
+        assert part in str(refused.value)
+    load_signer(folder / "svea7.pem", "svea8")  # a file alone says nothing of whose it is
+    (folder / PUBLIC).write_text("[keys]\n")
+    with pytest.raises(KeyFileError, match=r"public\.toml: no public key of 'station'"):
+        load_signer(folder, "station")
+
+
+def test_nobody_else_can_read_private_files(folder: Path) -> None:
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    for name in NAMES:
+        assert stat.S_IMODE((folder / f"{name}.pem").stat().st_mode) == 0o600
+    assert sorted(path.name for path in folder.iterdir()) == sorted([*(f"{name}.pem" for name in NAMES), PUBLIC])
+
+
+def test_the_mode_does_not_depend_on_the_umask(tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        make_keys(tmp_path / "keys", ["a"])
+    finally:
+        os.umask(before)
+    load_signer(tmp_path / "keys", "a")
+    load_verifier(tmp_path / "keys")
+
+
+def test_existing_keys_are_kept_unless_forced(folder: Path) -> None:
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    (folder / "svea8.pem").unlink()  # it has been moved to its car
+    assert make_keys(folder, [*NAMES, "svea9"]) == (["svea9"], list(NAMES))
+    for name in ("svea7.pem", "station.pem"):
+        assert (folder / name).read_bytes() == before[name]
+    assert not (folder / "svea8.pem").exists()
+    old = load_verifier(folder)
+    assert set(old.identities) == {*NAMES, "svea9"}
+    assert make_keys(folder, ["svea7"], force=True) == (["svea7"], [])
+    attachment = load_signer(folder, "svea7").sign("t", b"p")
+    assert old.signer("t", b"p", attachment) is None
+    assert load_verifier(folder).signer("t", b"p", attachment) == "svea7"
+
+
+def test_a_lost_public_file_is_made_again(folder: Path) -> None:
+    before = (folder / PUBLIC).read_bytes()
+    (folder / PUBLIC).unlink()
+    make_keys(folder, NAMES)
+    assert (folder / PUBLIC).read_bytes() == before
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o601])
+def test_a_private_file_open_to_others_is_refused(folder: Path, mode: int) -> None:
+    path = folder / "svea7.pem"
+    path.chmod(mode)
+    with pytest.raises(KeyFileError, match=f"chmod 600 {path}"):
+        load_signer(folder, "svea7")
+
+
+def test_public_keys_that_others_can_change_are_refused(folder: Path) -> None:
+    (folder / PUBLIC).chmod(0o664)
+    with pytest.raises(KeyFileError, match="chmod go-w"):
+        load_verifier(folder)
+
+
+def test_a_file_of_another_user_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, stranger = folder / "svea7.pem", os.geteuid() + 4711
+    if os.geteuid() == 0:
+        os.chown(path, stranger, -1)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: stranger)
+    with pytest.raises(KeyFileError, match="belongs to another user"):
+        load_signer(folder, "svea7")
+
+
+def test_what_is_no_plain_file_is_refused(folder: Path) -> None:
+    for name, make in (("pipe", os.mkfifo), ("folder", os.mkdir)):
+        make(folder / f"{name}.pem", 0o600)
+        with pytest.raises(KeyFileError, match="no plain file"):
+            load_signer(folder, name)
+    with pytest.raises(KeyFileError, match=r"nobody\.pem: cannot be read .*coopenv svea keys"):
+        load_signer(folder, "nobody")
+
+
+@pytest.mark.parametrize("text", ["", "-----BEGIN PRIVATE KEY-----\nsecret\n-----END PRIVATE KEY-----\n", "\0\xff"])
+def test_what_is_no_key_is_refused_without_quoting_it(folder: Path, text: str) -> None:
+    (folder / "svea7.pem").write_text(text)
+    with pytest.raises(KeyFileError, match="no private key") as raised:
+        load_signer(folder, "svea7")
+    assert "secret" not in str(raised.value)
+    assert raised.value.__cause__ is None
+
+
+@pytest.mark.parametrize("text", ["", "keys = 3", "[keys]\nsvea7 = 3", "[keys]\n'a/b' = 'x'", "[keys", "[keys]\na='!'"])
+def test_what_is_no_public_file_is_refused(folder: Path, text: str) -> None:
+    (folder / PUBLIC).write_text(text)
+    with pytest.raises(KeyFileError, match=r"public\.toml: (expected|keys\.a: expected)"):
+        load_verifier(folder)
+
+
+@pytest.mark.parametrize("command", [["gate", "--car", "svea7"], ["fake", "--car", "svea7"], ["run"]])
+def test_who_has_anothers_key_does_not_even_look_for_the_network(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zenoh, "open_zenoh", lambda *_, **__: pytest.fail("the network is touched"))
+    shipped = ROOT / "examples" / "fleet" / "overtaking.toml"
+    (tmp_path / "fleet.toml").write_text(shipped.read_text() + '[security]\nkeys = "keys"\n')
+    make_keys(tmp_path / "keys", ["svea7", "svea1", "station", "other"])
+    mixed = "station" if command == ["run"] else "svea7"
+    (tmp_path / "keys" / "other.pem").replace(tmp_path / "keys" / f"{mixed}.pem")
+    assert main(["svea", command[0], str(tmp_path / "fleet.toml"), *command[1:]]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{mixed}.pem: is not the key of {mixed} in {tmp_path / 'keys' / PUBLIC}; copy both anew" in line
+
+
+DEPLOYMENT = """
+environment = "busy_intersection"
+cars = [{name = "svea7"}, {name = "svea8"}]
+[security]
+keys = "secrets"
+identity = "desk"
+"""
+
+
+def test_the_command_makes_keys_of_a_deployment(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "fleet.toml").write_text(DEPLOYMENT)
+    assert main(["svea", "keys", str(tmp_path / "fleet.toml")]) == 0
+    assert set(load_verifier(tmp_path / "secrets").identities) == {"svea7", "svea8", "desk"}
+    assert "desk.pem" in capsys.readouterr().out
+    assert main(["svea", "keys", str(tmp_path / "fleet.toml")]) == 0
+    assert capsys.readouterr().out.count("is kept") == 3
+
+
+def test_the_command_takes_names_and_says_what_is_wrong(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ["--out", str(tmp_path / "k")]
+    assert main(["svea", "keys", "--names", "svea7, station", *out]) == 0
+    assert set(load_verifier(tmp_path / "k").identities) == {"svea7", "station"}
+    for wrong in (["--names", "../x"], ["--names", ""], [], ["x.toml", "--names", "a"]):
+        assert main(["svea", "keys", *wrong, *out]) == 2
+        assert len(capsys.readouterr().err.splitlines()) == 1
