@@ -1,4 +1,4 @@
-"""The observer `robust` behind the faces: embedded where it can be, and no different from the one in NumPy."""
+"""The observer `robust` behind the faces: embedded where it can be, and no different as a plug-in."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from pettingzoo.test import parallel_api_test
 import coopenv
 import coopenv.observers.registry as registry
 from coopenv.api.engine import Engine
-from coopenv.observers import register
+from coopenv.observers import find, register
 from tests.helpers import mrclam_files
 from tests.helpers.four_way import FOUR_WAY
-from tests.oracles.robust.observer import Robust
 
 CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "the paper's start": ("busy_intersection", {"horizon": 3.0}),
@@ -32,14 +31,14 @@ SAME = ("estimate_rotation", "estimate_position", "inbox_rotation", "inbox_posit
 @pytest.fixture(autouse=True)
 def plugins(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(registry, "_registered", {})
-    register("robust_numpy", Robust)
+    register("robust_on_the_host", find("robust"))
     yield
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_embedded_and_plugged_in_are_the_same(case: str) -> None:
     name, overrides = CASES[case]
-    names = ("robust", "robust_numpy")
+    names = ("robust", "robust_on_the_host")
     engines = [Engine(coopenv.load_scenario(name, {**overrides, "observer.name": n}), 1, "float64") for n in names]
     embedded, plugin = engines
     assert embedded.plugins is None and plugin.plugins is not None

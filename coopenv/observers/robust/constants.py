@@ -1,4 +1,4 @@
-"""Every number that is a choice, and why it is what it is; the oracle in the tests reads the same."""
+"""Every number that is a choice, and why it is what it is."""
 
 # Belief
 

@@ -9,41 +9,12 @@ from hypothesis import strategies as st
 
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
-from coopenv.observers.contract import Received
+from coopenv.observers.contract import Message, Received
 from coopenv.observers.robust.constants import FORGET_TIME
 from tests.helpers.robust_observers import OpenJoint, OpenRobust
 from tests.helpers.robust_scenes import crowd, small_errors
-from tests.oracles.robust.belief import Belief, Member
-from tests.oracles.robust.eviction import room_for
-from tests.oracles.robust.joint import RobustJoint
 
 VEHICLES = 12
-
-
-def belief(seen: list[float]) -> Belief:
-    """Vehicle 0 and others, by when they were last seen."""
-    result = Belief(0, np.eye(3), np.zeros(3), np.eye(6))
-    members = [Member(n, np.eye(3), np.zeros(3), seen=t) for n, t in enumerate(seen, 1)]
-    result.add(members, np.eye(6 * len(members)))
-    return result
-
-
-def test_those_unseen_for_longest_go_and_no_more_than_needed():
-    b = belief([3.0, 1.0, 9.0, 2.0])
-    assert room_for(b, {7}, 6, 10.0) == set()
-    assert room_for(b, {7}, 5, 10.0) == {2}
-    assert room_for(b, {7, 8}, 5, 10.0) == {2, 4}
-    assert room_for(b, {7, 8, 9}, 5, 10.0) == {2, 4, 1}
-    assert room_for(b, {7, 2}, 5, 10.0) == {4}  # who comes in again does not go
-    assert [m.vehicle for m in b.members] == [0, 1, 2, 3, 4]
-
-
-def test_nobody_goes_if_that_is_not_enough_or_too_early():
-    b = belief([3.0, 1.0, 9.0, 2.0])
-    assert room_for(b, {6, 7, 8, 9}, 5, 10.0) is None
-    assert room_for(b, {7}, 5, 1.0 + FORGET_TIME) is None
-    assert room_for(b, {7}, 5, 1.01 + FORGET_TIME) == {2}
-    assert room_for(belief([]), {1, 2}, 2, 10.0) is None
 
 
 @pytest.mark.parametrize(
@@ -74,20 +45,28 @@ def test_those_in_view_are_met_when_others_are_gone(kind, leaders, gone, telling
     assert result.position_rmse(4.0)[leaders] < 3.0 * cramer_rao_ancestors(record).position_rms(4.0)[leaders]
 
 
-class Sender(RobustJoint):
-    """One that stands still and believes in whomever it is told to."""
-
-    def believe(self, others: list[int]) -> None:
-        self.reset((np.eye(3), place(self.vehicle)), 1e-2 * np.eye(6))
-        self.belief.add(
-            [Member(v, np.eye(3), place(v), odometry=(np.eye(3), np.zeros(3))) for v in others],
-            1e-2 * np.eye(6 * len(others)),
-        )
-        self.depends_on = 0
-
-
 def place(vehicle: int) -> np.ndarray:
     return 5.0 * np.array([np.cos(vehicle), np.sin(2.0 * vehicle), np.cos(3.0 * vehicle)])
+
+
+def told(kind: type, vehicle: int, others: list[int]) -> Message:
+    """Return what a vehicle says that stands still: its place, and those of others or how it correlates with two."""
+    extra = {"odometry": np.zeros(6), "depends_on": np.zeros(1, np.uint64)}
+    if kind is OpenRobust:
+        extra["odometry"] = np.zeros(6, np.float32)
+        others = others[:2]
+        extra["correlations"] = np.tile(np.diag(np.full(6, 60)).astype(np.int8), (len(others), 1, 1))
+        extra["told"] = np.array(others, np.uint16)
+    else:
+        n = 6 * (1 + len(others[:3]))
+        others = others[:3]
+        extra["poses"] = np.array([[0.0, 0.0, 0.0, *place(v)] for v in others]).reshape(-1, 6)
+        extra["odometries"] = np.zeros((len(others), 6))
+        extra["factor"] = (0.1 * np.eye(n))[np.tril_indices(n)].astype(np.float32)
+        extra["complete"] = np.ones(1, np.uint8)
+        extra["vehicles"] = np.array(others, np.uint16)
+    extra["ages"] = np.zeros(len(others), np.float32)
+    return Message(place(vehicle), np.eye(3), 1e-2 * np.eye(6, dtype=np.float32), extra)
 
 
 some = st.sets(st.integers(1, VEHICLES - 1), max_size=7)
@@ -114,11 +93,7 @@ def test_any_meetings_leave_a_belief_in_order(kind, frames):
         time += dt
         messages = {}
         for v, others in heard.items():
-            sender = Sender(replace(setup, vehicle=v))
-            sender.believe([o for o in others if o != v])
-            for member in sender.belief.members:
-                member.time = time
-            messages[L + v] = Received(sender.message(), 0.0)
+            messages[L + v] = Received(told(kind, v, [o for o in others if o != v]), 0.0)
         valid = np.isin(np.arange(1, VEHICLES), list(in_view))
         observer.update(
             replace(
@@ -141,8 +116,8 @@ def test_any_meetings_leave_a_belief_in_order(kind, frames):
         assert P.shape == (6 * len(members), 6 * len(members))
         np.testing.assert_array_equal(P, P.T)
         assert np.linalg.eigvalsh(P)[0] > 0.0
-        for v, told in observer.told.items():
-            assert v in told and told <= set(members)
+        for v, of in observer.told.items():
+            assert v in of and of <= set(members)
         room = kind.most_members - len(members)
         for v in in_view & set(heard) if kind is OpenRobust else ():
             assert v in members or room == 0

@@ -1,4 +1,4 @@
-"""Functions of the embedded observer `robust` against SciPy, NumPy and the perspective solver in NumPy."""
+"""Functions of the embedded observer `robust` against SciPy and NumPy."""
 
 from __future__ import annotations
 
@@ -12,10 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.observers.robust.algebra import inverse6, is_regular, left_error, log_so3, transition
 from coopenv.observers.robust.memory import Pose, mat33d, mat66d, vec3d, vec6d
-from coopenv.observers.robust.p3p import solve_p3p
 from coopenv.world.launch import start_warp
-from tests.helpers.p3p import solve_one
-from tests.oracles.p3p import solve_p3p as oracle
 
 start_warp()
 
@@ -97,23 +94,3 @@ def test_regularity_is_that_of_the_spectrum(algebra: dict[str, np.ndarray]) -> N
     clear = np.abs(np.log(condition / 1e6)) > 1e-3
     assert (algebra["regular"] == (condition < 1e6))[clear].all()
     assert 0 < algebra["regular"].sum() < 200 and clear.sum() > 190
-
-
-def test_distances_to_three_points_are_those_of_the_solver_in_numpy() -> None:
-    """Every solution, and no other, in the same order."""
-    rng = np.random.default_rng(9)
-    z = rng.uniform(-10, 10, (400, 3, 3))
-    R, c = Rotation.random(400, rng).as_matrix(), rng.uniform(-15, 15, (400, 3))
-    lines = z - c[:, None]
-    b = np.einsum("nji,nkj->nki", R, lines / np.linalg.norm(lines, axis=2, keepdims=True))
-    turns, cameras, mask = solve_p3p(b, z)
-    counts = np.zeros(400, int)
-    for n in range(400):
-        found = np.linalg.norm(z[n] - cameras[n, mask[n], None], axis=2)
-        rotations, places = solve_one(b[n], z[n], oracle)
-        assert_allclose(turns[n, mask[n]], rotations, rtol=0, atol=1e-6)
-        expected = np.linalg.norm(z[n] - places[:, None], axis=2)
-        counts[n] = len(expected)
-        assert_allclose(found, expected, rtol=0, atol=1e-6)
-        assert np.abs(expected - np.linalg.norm(lines[n], axis=1)).max(axis=1).min() < 1e-6
-    assert counts.min() >= 1 and counts.max() == 4

