@@ -77,7 +77,7 @@ def _announce(url: str, host: str, log: "Console", no_browser: bool) -> None:
     options.console().print(f"{url}  (Ctrl-C ends the view)", soft_wrap=True)
     if host not in ("127.0.0.1", "localhost", "::1"):
         log.print(
-            f"warning: everybody who has this address can watch, and switch what runs here; it is sent unencrypted",
+            "warning: everybody who has this address can watch, and switch what runs here; it is sent unencrypted",
             soft_wrap=True,
         )
     if not no_browser:

@@ -98,7 +98,7 @@ def refusal(path: str, headers: Any, token: str, names: set[str]) -> tuple[str, 
     if any(origin != f"http://{hosts[0]}" for origin in origins):
         return "this Origin is not served here", ""
     route, question, query = path.partition("?")
-    first, slash, rest = route.removeprefix("/").partition("/")
+    first, _, rest = route.removeprefix("/").partition("/")
     if not compare_digest(first.encode(), token.encode()):
         return "the address lacks the token that the terminal shows", ""
     return "", f"/{rest}{question}{query}"
