@@ -1,4 +1,4 @@
-# The command gate of one car, and nothing else; see docs/cars.md.
+# The command gate of one car, and nothing else; see docs/cars_safety.md.
 #
 #   docker build -f docker/car.Dockerfile -t coopenv-gate .
 #

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping
 
 from coopenv.base.installation import list_agents, list_envs
 from coopenv.observers.zoo import ZOO
-from coopenv.runs.markdown import table
 from sitegen.mirror import ROOT, examples_page, page_of, relinked
 from sitegen.observers import observers
 
@@ -22,7 +21,6 @@ LISTED: dict[str, Callable[[], list[dict[str, str]]]] = {
 def generated() -> Iterator[tuple[str, str]]:
     """Yield path and Markdown text of every page."""
     yield "reference/command_line.md", command_line()
-    yield "reference/observation.md", observation()
     yield "files/examples.md", examples_page()
     yield from observers()
     for file, page in mirrored().items():
@@ -55,29 +53,3 @@ def _listed_whole(part: str, about: Mapping[str, str]) -> str:
         return f"* `{match[1]}`: {about.get(group + match[1], match[2])}"
 
     return re.sub(r"^\* `([a-z0-9-]+)`: (.+)$", row, part, flags=re.MULTILINE)
-
-
-SCALES = {"targets": "number of targets", "steering": "angle at action 1", "pan": "angle at action 1"}
-"""What the scales that are no setting of `[observation]` are."""
-
-
-def observation() -> str:
-    """Return the page that says what every entry of an observation and every term of the reward means."""
-    from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
-
-    parts = [(ROOT / "sitegen" / "observation.md").read_text(encoding="utf-8").strip()]
-    parts += [", ".join(f"[`{name}`](../environments/{name}.md#observation)" for name in list_envs()) + "."]
-    groups: dict[str, list[tuple[str, ...]]] = {}
-    for name, field in OBSERVATION_FIELDS.built_in.items():
-        planar = "" if field.planar is None else str(len(field.planar))
-        scale = SCALES.get(str(field.scale), str(field.scale))
-        row = (f"`{name}`", field.meaning, field.unit, scale, field.per, str(field.size), planar)
-        groups.setdefault(field.group, []).append(row)
-    for group, rows in groups.items():
-        parts += [f"## {group}", table(("field", "meaning", "unit", "scale", "one per", "entries", "planar"), rows)]
-    rewards = [
-        (f"`{name}`", term.meaning + (" (uses the truth)" if term.privileged else ""), term.unit)
-        for name, term in REWARD_TERMS.built_in.items()
-    ]
-    parts += ["## Terms of the reward", "`reward.weights.NAME` in a scenario weighs them; each counts per decision."]
-    return "\n\n".join([*parts, table(("term", "meaning", "unit"), rewards)]) + "\n"

@@ -23,11 +23,11 @@ class Tls(Part):
     """Certificates of the transport; paths are relative to the file."""
 
     root_ca: Path
-    """Certificate of who signs the others'."""
+    """Certificate of the authority that signs the others."""
     certificate: Path | None = None
-    """Own certificate, where this end listens or the other one asks for it."""
+    """Own certificate, if this end listens or the other one asks for it."""
     key: Path | None = None
-    """Private key of it, which only its owner can read."""
+    """Private key of the certificate, readable by its owner alone."""
 
     @model_validator(mode="after")
     def _both_or_none(self) -> Self:
@@ -63,14 +63,14 @@ class Network(Part):
     """How the cars are reached."""
 
     kind: Literal["zenoh", "nats", "ros1"] = "zenoh"
-    """`zenoh`: CDR under the keys of zenoh-bridge-ros2dds; `nats`: the authors' wire; `ros1`: topics of a ROS
+    """`zenoh`: CDR under the keys of zenoh-bridge-ros2dds; `nats`: the authors' format; `ros1`: topics of a ROS
     master."""
     connect: tuple[Endpoint, ...] = Field(
         default_factory=lambda given: (WIRES[given.get("kind", "zenoh")][0],), min_length=1
     )
-    """Where the router, the broker or the ROS master is (default: on this computer, at its usual port)."""
+    """Endpoints of the router, the broker or the ROS master (default: on this computer, at its usual port)."""
     tls: Tls | None = None
-    """Needed by endpoints `tls/...`, and only by them."""
+    """Certificates, needed for endpoints `tls/...` and only for them."""
 
     @model_validator(mode="after")
     def _endpoints_fit(self) -> Self:
@@ -90,7 +90,8 @@ class GateLink(Part):
     """Where the gate of a car connects to, whatever `network` says: no radio may stand between it and the wheels."""
 
     connect: tuple[Endpoint, ...] | None = Field(default=None, min_length=1)
-    """The car's own router, bridge or ROS master, on its loopback (default: at its usual port)."""
+    """Endpoint, on the car, of its own bridge, router or ROS master for its gate and `coopenv svea health` (default: on
+    the loopback, at its usual port)."""
 
 
 MOST_CHANNELS = 18
@@ -106,11 +107,11 @@ class Remote(Part):
     """Channels of the remote control, as `mavros/rc/in` numbers them from 1 on; PX4's usual order."""
 
     steering: Channel = 1
-    """Of the stick that steers."""
+    """Channel of the stick that steers, from 1 on."""
     throttle: Channel = 3
-    """Of the stick that drives."""
+    """Channel of the stick that drives."""
     mode_switch: int = Field(default=5, ge=0, le=MOST_CHANNELS)
-    """Of the switch that chooses the autopilot's mode (0: there is none)."""
+    """Channel of the switch that chooses the autopilot's mode (0: there is none)."""
 
     @model_validator(mode="after")
     def _each_has_its_own(self) -> Self:
@@ -160,16 +161,16 @@ class Car(Part):
     """One car."""
 
     name: Name
-    """As in its topics, `fleet/NAME/...`."""
+    """Name of the car in its topics, `fleet/NAME/...`."""
     vehicle: str | None = None
-    """The vehicle of the environment that it is (default: the first one in the environment's order that no other car
-    names or, further up, has got)."""
+    """Vehicle of the environment (default: the first one, in the environment's order, that no other car names and no
+    earlier car has taken)."""
     landmark: str | None = None
-    """Or the moving landmark that it is: a car whose position is known and which nobody here drives."""
+    """Moving landmark of the environment, instead of a vehicle: its position is known, and this end does not drive it."""
     marker: Marker | None = None
-    """Number of the marker that it carries, 1..7 (none: no camera can tell it)."""
+    """Number of the marker on the car, 1 to 7 (none: cameras cannot identify the car)."""
     agent: Agent | None = None
-    """Its number in the authors' names, `agentN/...`, on `nats` and `ros1` (default: that of its marker)."""
+    """Number of the car in the authors' names, `agentN/...`, on `nats` and `ros1` (default: that of its marker)."""
 
     @property
     def agent_number(self) -> int | None:
@@ -208,48 +209,49 @@ class Sensors(Part):
     """Which topics are read."""
 
     odometry: Literal["wheel+imu", "wheel", "odometry"] = "wheel+imu"
-    """Where the body twist comes from: speed of the wheels and turn rate of the IMU, the wheels alone, or the car's own
+    """Source of the body twist: speed of the wheels and turn rate of the IMU, the wheels alone, or the car's own
     filter."""
     detections: Literal["detections", "bearings"] = "detections"
-    """`detections`: pixels, from which distortion is removed here; `bearings`: unit vectors of the authors' node."""
+    """`detections`: pixels, from which distortion is removed on this computer; `bearings`: unit vectors of the authors'
+    node."""
     distorted: bool = True
-    """Whether `bearings` were made of pixels whose distortion had not been removed, as the authors' are."""
+    """Whether `bearings` come from pixels with distortion, as the authors' do."""
     truth: bool = True
-    """Whether motion capture is read: for infos, metrics and safety, never for observations."""
+    """Whether motion capture is read. It serves infos, metrics and safety, never observations."""
 
 
 class Safety(Part):
     """What stops the cars. Limits above the hard ones of `coopenv.cars.limits` are refused."""
 
     max_speed: float = Field(default=USUAL.speed, gt=0.0, le=HARDEST.speed)
-    """m/s"""
+    """Largest speed, m/s."""
     max_steering: float = Field(default=USUAL.steering, gt=0.0, le=HARDEST.steering)
-    """rad"""
+    """Largest steering angle, rad."""
     max_acceleration: float = Field(default=USUAL.acceleration, gt=0.0, le=HARDEST.acceleration)
-    """m/s^2"""
+    """Largest acceleration, m/s^2."""
     max_steering_rate: float = Field(default=USUAL.steering_rate, gt=0.0, le=HARDEST.steering_rate)
-    """rad/s"""
+    """Largest rate of the steering angle, rad/s."""
     reverse: bool = False
     """Whether cars may drive backwards."""
     odometry_age: Age = 0.15
-    """s without odometry after which all cars are stopped."""
+    """Time without odometry after which all cars are stopped, s."""
     truth_age: Age = 0.5
-    """s for which a car's place may not be known, where a geofence or a separation needs it."""
+    """Time for which a car's position may be unknown, if a geofence or a separation needs it, s."""
     geofence: tuple[Corner, ...] = ()
-    """Corners of a polygon, m, in the coordinates of the environment's file, that no car may leave (none: no fence)."""
+    """Corners of a polygon that no car may leave, m, in the coordinates of the environment's file (none: no fence)."""
     separation: float = Field(default=0.0, ge=0.0, le=100.0)
-    """Least distance between a car that is driven and any other car of the fleet, m (0: not watched)."""
+    """Least distance between a driven car and any other car of the fleet, m (0: not watched)."""
     judge: Literal["truth", "estimate"] = "truth"
-    """By what fence and separation are judged."""
+    """Source of the positions for geofence and separation."""
     missed_deadlines: int = Field(default=5, ge=1)
-    """Decisions in a row that may come late."""
+    """Late decisions in a row after which all cars are stopped."""
     min_battery: float = Field(default=0.1, ge=0.0, le=1.0)
     """Share of the battery below which cars are not armed."""
     conditions: bool | None = None
-    """Whether remote control, autopilot and battery have to be heard of before cars are armed, and the remote control
-    while they are (default: only with `zenoh`, as the authors' cars tell nothing of them)."""
+    """Whether arming needs messages of remote control, autopilot and battery, and an armed car those of the remote
+    control (default: only with `zenoh`, as the authors' cars do not send them)."""
     max_clock_offset: Positive = 0.02
-    """s between clocks of cars and of this computer, beyond which nothing is armed."""
+    """Largest offset between the clocks of a car and of this computer for arming, s."""
 
     @field_validator("geofence")
     @classmethod
@@ -266,22 +268,23 @@ class Safety(Part):
 
 
 class Security(Part):
-    """Signatures of commands and of what cars tell each other."""
+    """Signatures of commands and of messages between cars."""
 
     keys: Path | None = None
     """Folder of keys, see `coopenv svea keys` (relative to this file); none: nothing is signed or checked."""
     identity: Name = "station"
-    """Whose key this end signs with, where it is no car."""
+    """Name of the key with which this end signs, if it is not a car."""
 
 
 class Deployment(Part):
-    """A fleet and what it is used for."""
+    """A fleet and its use."""
 
     environment: str
-    """Name of an environment, or TOML file (relative to this file): who is there, how they sense, talk and estimate."""
+    """Name of an environment, or TOML file (relative to this file): vehicles, sensors, radio and observer."""
     overrides: dict[str, Any] = Field(default={})
-    """Dotted keys of it."""
+    """Dotted keys of the environment with other values."""
     cars: tuple[Car, ...] = Field(min_length=1, max_length=64)
+    """One table `[[cars]]` per car."""
     markers: dict[str, Marker] = Field(default={})
     """Numbers of the markers of landmarks, by name."""
     network: Network = Network()
@@ -291,7 +294,7 @@ class Deployment(Part):
     remote: Remote = Remote()
     security: Security = Security()
     fakes: bool = False
-    """Whether the cars are fakes, which can be put where an episode begins."""
+    """Whether the cars are fakes, which are moved to the start of each episode."""
     file: Path = Field(default=Path(), exclude=True)
     """Where it stands; set by `load_deployment`."""
 

@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 
 from coopenv.base.installation import list_agents, list_envs
+from coopenv.cars.deployment import Car, Deployment, GateLink, Network, Remote, Safety, Security, Sensors, Tls
 from coopenv.observers.zoo import ZOO
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
-from sitegen import links, mirror, pages
+from sitegen import links, mirror, pages, reference
 from tests.helpers.sessions import ROOT
 
 LINK = re.compile(r"\]\(([^)]+)\)")
@@ -57,15 +58,36 @@ def test_pages_of_observers_say_where_they_come_from(made: dict[str, str]) -> No
     assert "Runs in Python on the host." in made["reference/observers/mekf_.md"]
 
 
-def test_the_page_on_observations_explains_every_entry(made: dict[str, str]) -> None:
-    page = made["reference/observation.md"]
-    assert "| targets | number of targets | vehicle |" in page and "| rad | angle at action 1 | vehicle |" in page
-    assert not re.search(r"\| (targets|steering|pan) \| vehicle \|", page)
+@pytest.mark.parametrize("name", reference.PAGES)
+def test_pages_made_from_docstrings_are_up_to_date(name: str) -> None:
+    text = (ROOT / "docs" / "reference" / name).read_text(encoding="utf-8")
+    assert text == reference.PAGES[name](), "write it with: python -m sitegen.reference"
+
+
+def test_the_page_on_observations_explains_every_entry() -> None:
+    page = reference.observation()
+    assert (
+        "| targets | number of targets | 0 | vehicle |" in page and "| rad | angle at action 1 | 0 | vehicle |" in page
+    )
+    assert not re.search(r"\| (targets|steering|pan) \| 0 \| vehicle \|", page)
     assert all(
         f"| `{name}` | {field.meaning} | {field.unit} |" in page for name, field in OBSERVATION_FIELDS.built_in.items()
     )
     assert all(f"| `{name}` |" in page and f"| {term.unit} |" in page for name, term in REWARD_TERMS.built_in.items())
     assert all(f"(../environments/{name}.md#observation)" in page for name in list_envs())
+
+
+def test_the_page_on_deployment_files_has_every_key() -> None:
+    page = reference.deployment()
+    rows = [line for line in page.splitlines() if line.startswith("| `")]
+    found = {row.split("`")[1]: [cell.strip() for cell in row.split("|")[2:5]] for row in rows}
+    parts = {"": Deployment, "cars.": Car, "network.": Network, "network.tls.": Tls}
+    parts |= {"gate.": GateLink, "sensors.": Sensors, "safety.": Safety, "remote.": Remote, "security.": Security}
+    sections = {part.partition(".")[0] for part in parts if part} - {"cars"}
+    wanted = {f"{prefix}{name}" for prefix, part in parts.items() for name in part.model_fields} - sections - {"file"}
+    assert found.keys() == wanted and all(meaning for _, _, meaning in found.values())
+    assert found["safety.max_speed"][:2] == ["0.5", "above 0, at most 1.53"]
+    assert found["network.connect"][0] == "`tcp/127.0.0.1:7447`" and found["cars.name"][0] == "required"
 
 
 def test_the_page_of_the_command_line_has_every_command(made: dict[str, str]) -> None:

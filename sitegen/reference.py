@@ -1,0 +1,125 @@
+"""Pages of the reference that are made from docstrings: `python -m sitegen.reference` writes them to docs/reference."""
+
+from collections.abc import Iterator
+from typing import Any, Literal, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from coopenv.base.installation import list_envs
+from coopenv.cars.deployment import Deployment
+from coopenv.runs.markdown import table
+from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
+from sitegen.mirror import ROOT
+
+OBSERVATION = """# What each observation entry means
+
+<!-- Written by `python -m sitegen.reference`. -->
+
+An observation holds what one vehicle knows: its own estimate, the measurements of its camera, and received messages. No
+entry uses the truth. An entry is (value - center) / scale, clipped to [-1, 1], or to [0, 1] if it cannot be negative.
+`observation.scales.NAME` and `observation.centers.NAME` change both for one field.
+
+`coopenv describe ENV` prints the layout of an environment. In a program:
+
+```python
+import coopenv
+from coopenv.api.terms.layout import observation_layout
+
+layout = observation_layout(coopenv.load_scenario("open_square"))
+goal = layout["goal"]
+print(layout.size, goal.start, goal.stop, goal.unit, goal.meaning)
+```
+
+With `parallel_env(name, observation="dict")` an observation is a dictionary by field name instead of one vector.
+
+The tables below hold every field by group. *One per*: the vehicle itself, every target (landmarks, then vehicles),
+every neighbour, or each of the nearest landmarks of the map. *Planar* is the number of entries that
+`observation.planar = true` keeps. `observation.include` of a scenario chooses groups or single fields.
+[Terms](../terms.md) shows how to add a field of your own.
+
+The layout of each environment, with sizes, scales and centers:
+"""
+
+DEPLOYMENT = """# Deployment file
+
+<!-- Written by `python -m sitegen.reference`. -->
+
+A deployment file lists the cars of a fleet, their network and their limits. [Cars](../cars.md) shows how to use one;
+[`examples/fleet`](../../examples/fleet) has three. Paths are relative to the file. Unknown keys are refused.
+
+`--connect ENDPOINT` of `coopenv svea run` and `fake`, and `connect=` of `parallel_env`, replace `network.connect`;
+that of `coopenv svea gate` and `health` replaces `gate.connect`. `[[cars]]` is one table per car, `cars.name` a key of it.
+"""
+
+
+def deployment() -> str:
+    """Return the page of the keys of a deployment file, from the docstrings of its fields."""
+    rows = [
+        (f"`{key}`", _default(field), _values(field), " ".join((field.description or "").split()))
+        for key, field in _keys(Deployment)
+    ]
+    return f"{DEPLOYMENT}\n{table(('key', 'default', 'values', 'meaning'), rows)}\n"
+
+
+def _keys(part: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """Yield the dotted keys of a section and of those in it, each with its field."""
+    for name, field in part.model_fields.items():
+        if field.description and (prefix, name) != ("", "file"):
+            yield f"{prefix}{name}", field
+        for kind in (field.annotation, *get_args(field.annotation)):
+            if isinstance(kind, type) and issubclass(kind, BaseModel):
+                yield from _keys(kind, f"{prefix}{name}.")
+
+
+def _default(field: FieldInfo) -> str:
+    if field.is_required():
+        return "required"
+    value: Any = field.get_default(call_default_factory=True, validated_data={})
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float | int):
+        return f"{value:.4g}"
+    return "" if value is None or value in ((), {}) else f"`{value[0] if isinstance(value, tuple) else value}`"
+
+
+def _values(field: FieldInfo) -> str:
+    """Return the bounds of a number in words, or the values to choose from."""
+    if get_origin(field.annotation) is Literal:
+        return ", ".join(f"`{value}`" for value in get_args(field.annotation))
+    words = {"gt": "above", "ge": "at least", "le": "at most"}
+    found = [(words[name], getattr(rule, name)) for rule in field.metadata for name in words if hasattr(rule, name)]
+    return ", ".join(f"{word} {value:.4g}" for word, value in found)
+
+
+SCALES = {"targets": "number of targets", "steering": "angle at action 1", "pan": "angle at action 1"}
+"""Scales that are no setting of `[observation]`."""
+COLUMNS = ("field", "meaning", "unit", "scale", "center", "one per", "entries", "planar")
+
+
+def observation() -> str:
+    """Return the page that says what every entry of an observation and every term of the reward means."""
+    parts = [OBSERVATION.strip()]
+    parts += [", ".join(f"[`{name}`](../environments/{name}.md#observation)" for name in list_envs()) + "."]
+    groups: dict[str, list[tuple[str, ...]]] = {}
+    for name, field in OBSERVATION_FIELDS.built_in.items():
+        planar = "" if field.planar is None else str(len(field.planar))
+        scale = SCALES.get(str(field.scale), str(field.scale))
+        row = (f"`{name}`", field.meaning, field.unit, scale, f"{field.center:.4g}", field.per, str(field.size), planar)
+        groups.setdefault(field.group, []).append(row)
+    for group, rows in groups.items():
+        parts += [f"## {group}", table(COLUMNS, rows)]
+    rewards = [
+        (f"`{name}`", term.meaning + (" (uses the truth)" if term.privileged else ""), term.unit)
+        for name, term in REWARD_TERMS.built_in.items()
+    ]
+    parts += ["## Terms of the reward", "`reward.weights.NAME` in a scenario weighs them; each counts per decision."]
+    return "\n\n".join([*parts, table(("term", "meaning", "unit"), rewards)]) + "\n"
+
+
+PAGES = {"deployment.md": deployment, "observation.md": observation}
+"""Files in docs/reference, and their texts."""
+
+if __name__ == "__main__":
+    for name, page in PAGES.items():
+        (ROOT / "docs" / "reference" / name).write_text(page(), encoding="utf-8")
