@@ -49,7 +49,7 @@ A deployment file lists the cars of a fleet, their network and their limits. [Ca
 [`examples/fleet`](../../examples/fleet) has three. Paths are relative to the file. Unknown keys are refused.
 
 `--connect ENDPOINT` of `coopenv svea run` and `fake`, and `connect=` of `parallel_env`, replace `network.connect`;
-that of `coopenv svea gate` and `health` replaces `gate.connect`. `[[cars]]` is one table per car, `cars.name` a key of it.
+that of `coopenv svea gate` and `health` replaces `gate.connect`. `[[cars]]` is one table per car; `cars.name` is a key.
 """
 
 

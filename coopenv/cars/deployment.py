@@ -166,7 +166,7 @@ class Car(Part):
     """Vehicle of the environment (default: the first one, in the environment's order, that no other car names and no
     earlier car has taken)."""
     landmark: str | None = None
-    """Moving landmark of the environment, instead of a vehicle: its position is known, and this end does not drive it."""
+    """Moving landmark of the environment, instead of a vehicle: its position is known, and it is not driven."""
     marker: Marker | None = None
     """Number of the marker on the car, 1 to 7 (none: cameras cannot identify the car)."""
     agent: Agent | None = None
