@@ -1,5 +1,6 @@
 """Where everybody starts, and whether there is room."""
 
+import math
 import warnings
 from collections.abc import Sequence
 from itertools import product
@@ -7,13 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from coopenv.base.errors import ScenarioWarning
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.fields import ScenarioFields
-from coopenv.scenario.motion import path_heading
 from coopenv.scenario.routes import Route, route_points
 
 SAME_PLACE = 1e-6  # m
@@ -23,11 +21,20 @@ BLOCK = 200_000  # pairs that are compared at a time; each takes some 400 bytes
 
 def rotation_of(yaw: float | None, quaternion_wxyz: Any) -> np.ndarray:
     """Return the rotation (3, 3) that a file gives as a quaternion or a yaw."""
-    if quaternion_wxyz is not None:
-        rotation = Rotation.from_quat(quaternion_wxyz, scalar_first=True)
+    if quaternion_wxyz is None:
+        w, x, y, z = math.cos((yaw or 0.0) / 2), 0.0, 0.0, math.sin((yaw or 0.0) / 2)
     else:
-        rotation = Rotation.from_euler("z", yaw or 0.0)
-    return np.asarray(rotation.as_matrix())
+        w, x, y, z = quaternion_wxyz
+        length = math.sqrt(x * x + y * y + z * z + w * w)
+        w, x, y, z = w / length, x / length, y / length, z / length
+    ww, xx, yy, zz = w * w, x * x, y * y, z * z
+    return np.array(
+        [
+            [xx - yy - zz + ww, 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), -xx + yy - zz + ww, 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), -xx - yy + zz + ww],
+        ]
+    )
 
 
 def start_of(agent: Landmark | Vehicle, routes: Sequence[Route]) -> tuple[np.ndarray, np.ndarray]:
@@ -36,8 +43,9 @@ def start_of(agent: Landmark | Vehicle, routes: Sequence[Route]) -> tuple[np.nda
     Of a vehicle with routes it is on the first of them.
     """
     if agent.motion.kind == "waypoints":
-        heading = Rotation.from_euler("z", path_heading(agent.motion)).as_matrix()
-        return np.array(agent.motion.waypoints[0].position), heading
+        from coopenv.scenario.motion import path_heading  # here, as loading SciPy takes 0.3 s
+
+        return np.array(agent.motion.waypoints[0].position), rotation_of(path_heading(agent.motion), None)
     if isinstance(agent, Landmark):
         return np.array(agent.position), rotation_of(agent.yaw, None)
     if agent.routes:
@@ -124,7 +132,7 @@ def _spread_boxes(vehicle: Vehicle, position: np.ndarray, rotation: np.ndarray) 
     turn = pose.yaw_spread if pose else 0.0
     corners = [(0, 0, 0, 0), *(product((-1, 1), repeat=4) if spread.any() or turn else ())]
     signs = np.array(corners, dtype=float)
-    rotations = rotation @ Rotation.from_rotvec(np.outer(signs[:, 3] * turn, (0.0, 0.0, 1.0))).as_matrix()
+    rotations = rotation @ np.array([rotation_of(sign * turn, None) for sign in signs[:, 3]])
     positions = position + (signs[:, :3] * spread) @ rotation.T
     center, size = (vehicle.body.center, vehicle.body.size) if vehicle.body else (np.zeros(3), np.zeros(3))
     return Boxes(positions + rotations @ np.array(center), rotations, np.tile(np.array(size) / 2, (len(signs), 1)))
@@ -141,8 +149,8 @@ def check_room(scenario: ScenarioFields) -> None:
     if not fixed:
         return
     starts = np.array([start_of(scenario.vehicles[i], scenario.routes)[0] for i in fixed])
-    if same := cKDTree(starts).query_pairs(SAME_PLACE):
-        second, first = min(pair[::-1] for pair in same)
+    near = np.linalg.norm(starts[:, None] - starts, axis=-1) <= SAME_PLACE
+    for second, first in np.argwhere(np.tril(near, -1))[:1].tolist():
         raise ValueError(_in_place(fixed[second], fixed[first]))
     nominal = Boxes(*(np.array([part[0] for part in parts]) for parts in zip(*(boxes[i] for i in fixed), strict=True)))
     overlaps = overlapping_pairs(nominal, nominal)
