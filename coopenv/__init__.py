@@ -9,7 +9,6 @@ start quickly.
 """
 
 import sys
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +22,7 @@ from coopenv.base.errors import (
     UnknownEnvironmentError,
 )
 from coopenv.base.installation import list_envs
+from coopenv.base.lazy import lazy_names
 from coopenv.base.seeds import EVALUATION_SEEDS, evaluation_seed
 
 if TYPE_CHECKING:
@@ -35,35 +35,22 @@ if TYPE_CHECKING:
 
     __version__: str
 else:
-    _HOMES = {
-        "CooperativeLocalisationEnv": "coopenv.api.parallel_env",
-        "CooperativeVectorEnv": "coopenv.api.vector_env",
-        "Comparison": "coopenv.bench.observers.comparison",
-        "Scenario": "coopenv.scenario",
-        "compare": "coopenv.bench.observers.comparison",
-        "load_scenario": "coopenv.scenario",
-        "make_vec": "coopenv.api.make",
-        "parallel_env": "coopenv.api.make",
-        "register_observation": "coopenv.scenario.own_terms",
-        "register_reward": "coopenv.scenario.own_terms",
-        "register_termination": "coopenv.scenario.own_terms",
-    }
-    """Module of each name that is loaded when it is first used."""
+    _lazy, __dir__ = lazy_names(
+        __name__,
+        {
+            "coopenv.api.make": ["make_vec", "parallel_env"],
+            "coopenv.api.parallel_env": ["CooperativeLocalisationEnv"],
+            "coopenv.api.vector_env": ["CooperativeVectorEnv"],
+            "coopenv.bench.observers.comparison": ["Comparison", "compare"],
+            "coopenv.scenario": ["Scenario", "load_scenario"],
+            "coopenv.scenario.own_terms": ["register_observation", "register_reward", "register_termination"],
+        },
+    )
 
     def __getattr__(name):
-        if name == "__version__":
-            from coopenv.base.installation import version
+        from coopenv.base.installation import version
 
-            value = version()
-        elif name in _HOMES:
-            value = getattr(import_module(_HOMES[name]), name)
-        else:
-            raise AttributeError(f"module 'coopenv' has no attribute '{name}'")
-        globals()[name] = value
-        return value
-
-    def __dir__():
-        return sorted({*globals(), *_HOMES, "__version__"})
+        return version() if name == "__version__" else _lazy(name)
 
 
 __all__ = [
@@ -79,6 +66,7 @@ __all__ = [
     "Scenario",
     "ScenarioError",
     "UnknownEnvironmentError",
+    "__version__",
     "compare",
     "evaluation_seed",
     "list_envs",

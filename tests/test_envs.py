@@ -14,7 +14,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import coopenv
-from coopenv.api.registration import environment_id
+from coopenv.base.installation import environment_id
 from tests.helpers.env_suite import CHECKS, Env, Make, assert_equal, random_actions, rollout
 
 ENVS = coopenv.list_envs()

@@ -11,17 +11,12 @@ import gymnasium
 import pettingzoo
 from pettingzoo import aec_registry, parallel_registry
 
-from coopenv.base.installation import list_envs
+from coopenv.base.installation import environment_id, list_envs
 
 if TYPE_CHECKING:
     from pettingzoo import AECEnv
 
     from coopenv.api.parallel_env import CooperativeLocalisationEnv
-
-
-def environment_id(name: str) -> str:
-    """Return the registered id of an environment: busy_intersection -> coopenv/BusyIntersection-v0."""
-    return f"coopenv/{name.title().replace('_', '')}-v0"
 
 
 def make_parallel(name: str, max_cycles: int | None = None, **options: Any) -> CooperativeLocalisationEnv:

@@ -1,22 +1,25 @@
-"""Sources of ticks by name: the only place that knows what a name means."""
+"""Sources of ticks by name: the only place that knows what a name means.
+
+A wrong name is an error before any of the simulation is loaded.
+"""
+
+from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
-from coopenv.backends.base import Backend
-from coopenv.backends.mcap.peek import metadata_names
-from coopenv.backends.replay import Replay
-from coopenv.backends.simulated import Simulated
 from coopenv.base.errors import CoopenvError, DataError, suggest
 from coopenv.base.installation import list_envs
-from coopenv.observers.recording import Recording
-from coopenv.scenario import Scenario, load_scenario
 
 if TYPE_CHECKING:
+    from coopenv.backends.base import Backend
+    from coopenv.backends.simulated import Simulated
     from coopenv.cars.bags import Bag
+    from coopenv.observers.recording import Recording
+    from coopenv.scenario import Scenario
 
 BACKENDS = ("simulated", "highway", "replay", "svea")
 
@@ -58,6 +61,8 @@ def is_bag(name: str | Path, topics: str | Path | None = None) -> bool:
     if str(name).endswith(BAG_SUFFIXES):
         return True
     if str(name).endswith(LOG_SUFFIX):
+        from coopenv.backends.mcap.peek import metadata_names
+
         metadata = metadata_names(name)
         if metadata is None or DRIVE in metadata:
             return topics is not None
@@ -112,6 +117,8 @@ def open_simulation(name_or_path: str | Path, overrides: Mapping[str, Any] | Non
     """
     if is_recorded(name_or_path):
         raise CoopenvError(f"'{name_or_path}' is recorded, which is one world: replay it with parallel_env")
+    from coopenv.scenario import load_scenario
+
     return load_scenario(name_or_path, overrides)
 
 
@@ -122,6 +129,8 @@ def simulation_of(scenario: Scenario) -> Simulated:
         CoopenvError: an extra is missing, or the section of the backend is not valid.
     """
     if scenario.backend == "simulated":
+        from coopenv.backends.simulated import Simulated
+
         return Simulated(scenario)
     from coopenv.backends.highway import Highway
 
@@ -155,7 +164,7 @@ def open_backend(
     given = {key: value for key, value in (cars or {}).items() if value is not None}
     if backend == "svea":
         return _open_cars(name_or_path, overrides, {**given, "data": data, "variant": variant, "topics": topics})
-    if isinstance(backend, Backend):
+    if _is_backend(backend):
         for key, value in {**overrides, **given, "data": data, "variant": variant, "topics": topics}.items():
             if value is not None:
                 raise CoopenvError(f"{key}: {type(backend).__name__} has its scenario already, choose it there")
@@ -172,13 +181,23 @@ def open_backend(
     for what, value in (("data", data), ("variant", variant)):
         if value is not None:
             raise CoopenvError(f"{what} is for recorded data, '{name_or_path}' is simulated")
+    from coopenv.scenario import load_scenario
+
     scenario = load_scenario(name_or_path, overrides)
     if backend not in (None, scenario.backend):
         raise CoopenvError(f"backend '{backend}': {name_or_path} says backend = \"{scenario.backend}\"")
     return simulation_of(scenario)
 
 
-def _check_backend(backend: str | None) -> None:
+def _is_backend(given: str | Backend | None) -> TypeGuard[Backend]:
+    if given is None or isinstance(given, str):  # so that names are looked up before the simulation is loaded
+        return False
+    from coopenv.backends.base import Backend
+
+    return isinstance(given, Backend)
+
+
+def _check_backend(backend: object) -> None:
     if backend is not None and backend not in BACKENDS:
         known = f"{suggest(str(backend), BACKENDS)}; known: {', '.join(BACKENDS)}"
         raise CoopenvError(f"unknown backend '{backend}'{known}")
@@ -193,6 +212,8 @@ def _open_recorded(
 
         if is_drive(name):
             return Drive(name, overrides)
+    from coopenv.backends.replay import Replay
+
     return Replay(open_recording(name, data, variant), Path(name).name, overrides)
 
 
@@ -217,7 +238,7 @@ def open_bags(
     overrides: Mapping[str, Any] | None = None,
     data: str | Path | None = None,
     variant: str | None = None,
-) -> "Bag":
+) -> Bag:
     """Return ROS bags of one drive as a backend; arguments and errors as for `open_backend`."""
     where = ", ".join(str(name) for name in names)
     for what, value in (("data", data), ("variant", variant)):

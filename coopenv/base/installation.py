@@ -8,8 +8,13 @@ from functools import cache
 from importlib import metadata
 from pathlib import Path
 
+from coopenv.base.errors import UnknownEnvironmentError, shortened, shown, suggest
+
 SCENES = ("lane", "roots", "tree", "random", "ring")
 """Kinds of scenes that are made to measure, `lane:20`; see `coopenv.scenario.scenes`."""
+
+EXPECTED = "expected a scenario (.toml), a log file (.mcap) or a ROS bag (.bag, .db3, a folder with metadata.yaml)"
+BAGS = (".db3", ".bag")  # suffixes of ROS bags, which are taken for log files by mistake
 
 
 @cache
@@ -26,6 +31,47 @@ def data_directory(kind: str) -> Path:
 def list_envs() -> list[str]:
     """Return the names of the environments that ship with coopenv: the file stems of `envs/`."""
     return sorted(path.stem for path in data_directory("envs").glob("*.toml"))
+
+
+def environment_id(name: str) -> str:
+    """Return the registered id of an environment: busy_intersection -> coopenv/BusyIntersection-v0."""
+    return f"coopenv/{name.title().replace('_', '')}-v0"
+
+
+def is_scene(text: str) -> bool:
+    """Return whether a text is the name of a scene, be it right or wrong in what follows the colon."""
+    head, colon, rest = text.partition(":")
+    return bool(colon) and head in SCENES and not rest.endswith(".toml") and "/" not in rest
+
+
+def scenario_path(name_or_path: str | Path) -> Path:
+    """Return the file behind an environment name or a path; a folder that is called like an environment is ./NAME.
+
+    Raises:
+        UnknownEnvironmentError: there is no such environment or file.
+    """
+    text = str(name_or_path)
+    if text in list_envs():
+        return data_directory("envs") / f"{text}.toml"
+    if text.endswith((".toml", *BAGS)) or "/" in text or "\\" in text or os.path.isdir(text):  # noqa: PTH112 (never raises)
+        try:
+            path = Path(text).expanduser()
+            there, is_bag = path.is_file(), path.suffix in BAGS or (path / "metadata.yaml").is_file()
+        except (OSError, RuntimeError, ValueError) as error:  # too long, nobody's home, a null character
+            reason = getattr(error, "strerror", None) or error
+            raise UnknownEnvironmentError(f"no such scenario file: {shown(text)} ({reason})") from None
+        if is_bag:
+            raise UnknownEnvironmentError(
+                f"{path}: a ROS bag is no scenario; it runs with a map of its topics: coopenv run BAG --map topics.toml"
+            )
+        if not there:
+            found = f"{shortened(str(path), 200)}: a folder; {EXPECTED}" if os.path.isdir(path) else ""  # noqa: PTH112
+            raise UnknownEnvironmentError(found or f"no such scenario file: {shortened(str(path), 200)}")
+        return path
+    if os.path.isfile(text):  # noqa: PTH113 (never raises)
+        raise UnknownEnvironmentError(f"unknown environment {shown(text)}: a file of an unknown kind; {EXPECTED}")
+    known = f"{suggest(text, list_envs())}; known: {', '.join([*list_envs(), *(f'{kind}:N' for kind in SCENES)])}"
+    raise UnknownEnvironmentError(f"unknown environment {shown(text)}{known}")
 
 
 def list_agents() -> list[str]:

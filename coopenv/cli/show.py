@@ -16,12 +16,9 @@ def list_command(
     kind: Annotated[Kind, typer.Argument(help="What to list.")] = Kind.envs, as_json: options.AsJson = False
 ) -> None:
     """List environments, observers, agents, variants or scenes."""
-    from coopenv.base.installation import list_envs
     from coopenv.runs import listing
 
-    if kind is Kind.envs:
-        rows = listing.environment_rows({name: options.load(name, {}) for name in list_envs()})
-    elif kind is Kind.variants:
+    if kind is Kind.variants:
         from coopenv.bench.observers.choice import variant_rows
 
         rows = variant_rows()
@@ -30,7 +27,13 @@ def list_command(
 
         rows = scene_rows()
     else:
-        rows = listing.observer_rows() if kind is Kind.observers else listing.agent_rows()
+        makers = {
+            Kind.envs: listing.environment_rows,
+            Kind.observers: listing.observer_rows,
+            Kind.agents: listing.agent_rows,
+        }
+        with options.warned():
+            rows = makers[kind]()
     if as_json:
         options.print_json(rows)
     else:
@@ -47,12 +50,18 @@ def describe(
     topics: options.TopicMap = None,
 ) -> None:
     """Say what an environment is: vehicles, sensors, observer."""
+    from coopenv.backends.sources import is_recorded, simulation_of
     from coopenv.runs.describe import describe_scenario
     from coopenv.runs.summary import document, summary
 
-    name = Path(environment).stem
-    backend = options.open_source(environment, options.parse_overrides(overrides), data, variant, topics)
-    scenario, recorded = backend.scenario, backend.capabilities.recorded
+    name, changes = Path(environment).stem, options.parse_overrides(overrides)
+    if is_recorded(environment) or any(option is not None for option in (data, variant, topics)):
+        backend = options.open_source(environment, changes, data, variant, topics)
+        scenario, recorded = backend.scenario, backend.capabilities.recorded
+    else:
+        scenario, recorded = options.load(environment, changes), False
+        if scenario.backend != "simulated":  # the roads of highway-env are drawn by highway-env itself
+            scenario = simulation_of(scenario).scenario
     if as_json:
         options.print_json(document(name, scenario))
         return

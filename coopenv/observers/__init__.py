@@ -1,20 +1,45 @@
 """Observers of one's own, the zoo that they are compared with, and the runner that judges them."""
 
-from coopenv.estimation.coordinates import Coordinates
-from coopenv.observers.contract import (
-    Estimate,
-    Gains,
-    JointObserver,
-    Message,
-    Observer,
-    Received,
-    SensorNoise,
-    Setup,
-    Tick,
-)
-from coopenv.observers.recording import Recording
+from typing import TYPE_CHECKING
+
+from coopenv.base.lazy import lazy_names
 from coopenv.observers.registry import find, observer_names, register
-from coopenv.observers.runner import Run, run
+
+if TYPE_CHECKING:
+    from coopenv.estimation.coordinates import Coordinates
+    from coopenv.observers.contract import (
+        Estimate,
+        Gains,
+        JointObserver,
+        Message,
+        Observer,
+        Received,
+        SensorNoise,
+        Setup,
+        Tick,
+    )
+    from coopenv.observers.recording import Recording
+    from coopenv.observers.runner import Run, run
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__,
+        {
+            "coopenv.estimation.coordinates": ["Coordinates"],
+            "coopenv.observers.contract": [
+                "Estimate",
+                "Gains",
+                "JointObserver",
+                "Message",
+                "Observer",
+                "Received",
+                "SensorNoise",
+                "Setup",
+                "Tick",
+            ],
+            "coopenv.observers.recording": ["Recording"],
+            "coopenv.observers.runner": ["Run", "run"],
+        },
+    )
 
 __all__ = [
     "Coordinates",

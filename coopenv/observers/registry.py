@@ -6,6 +6,8 @@ A package offers its own under the entry point group `coopenv.observers`. What i
 is named by its place: `mine.py:Mine` or `package.module:Mine`.
 """
 
+from __future__ import annotations
+
 import re
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
@@ -15,10 +17,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from coopenv.base.errors import CoopenvError, shown, suggest, told
 from coopenv.base.user_code import absolute, is_reference, load
-from coopenv.observers.contract import Factory
 from coopenv.observers.zoo import ZOO
 
 if TYPE_CHECKING:
+    from coopenv.observers.contract import Factory
     from coopenv.world.embedded import Embedded
 
 GROUP = "coopenv.observers"
@@ -30,14 +32,14 @@ class Registered(NamedTuple):
     """What a program has registered under a name, as a class or function, with kernels, or both."""
 
     factory: Factory | None
-    embedded: "Embedded | None"
+    embedded: Embedded | None
 
 
 _registered: dict[str, Registered] = {}
 _places: dict[str, str] = {}  # where those of `_registered` stand that are named by their place
 
 
-def register(name: str, factory: Factory | None = None, *, embedded: "Embedded | None" = None) -> None:
+def register(name: str, factory: Factory | None = None, *, embedded: Embedded | None = None) -> None:
     """Make an observer known by name in this program.
 
     Args:
@@ -127,6 +129,21 @@ def states_covariance(name: str) -> bool:
     return name not in ZOO or ZOO[name].covariance
 
 
+def description(name: str) -> str:
+    """Return what a known observer is in one line, or why it cannot be used here."""
+    if reason := obstacle(name):
+        return reason
+    if name in ZOO:
+        return ZOO[name].about
+    return " ".join((find(name).__doc__ or "").split()).partition(". ")[0].rstrip(".")
+
+
+def check_known(name: str) -> None:
+    """Refuse an unknown name without loading what is behind one. Raises CoopenvError: unknown, with the names known."""
+    if not is_reference(name) and name not in (names := observer_names()):
+        raise CoopenvError(f"unknown observer '{name}'{suggest(name, names)}; known: {', '.join(names)}")
+
+
 def obstacle(name: str) -> str:
     """Return why a known observer cannot be used here, in one line; empty where it can."""
     if name in ZOO:
@@ -161,7 +178,7 @@ def find(name: str | Factory) -> Factory:
     return row.factory or _attribute("kernel_observer:KernelFactory")(row.embedded)
 
 
-def find_embedded(name: str, planar: bool = False) -> "Embedded | None":
+def find_embedded(name: str, planar: bool = False) -> Embedded | None:
     """Return the kernels of an observer by name, None where it has none; errors are those of `find`.
 
     `planar` is for robots on a plane whose odometry is their commands.
@@ -191,10 +208,8 @@ def _found(observer: str | Factory) -> Registered:
         return _row(_loaded(observer))
     if observer in _registered:
         return _registered[observer]
-    point = _installed().get(observer)
-    if point is None:
-        names = observer_names()
-        raise CoopenvError(f"unknown observer '{observer}'{suggest(observer, names)}; known: {', '.join(names)}")
+    check_known(observer)
+    point = _installed()[observer]
     try:
         return _row(point.load())
     except (Exception, SystemExit) as error:  # anybody's code

@@ -8,6 +8,7 @@ class Entry:
     """Where an observer stands in this package; nothing is loaded before it is asked for."""
 
     plugin: str  # module and class, or function of a setup
+    about: str  # one line for tables
     kernels: str = ""  # module and `Embedded`; empty: it runs on the host only
     needs: str = ""  # module of the extra `bench` without which it does not run
     in_space: bool = True  # whether it is meant for vehicles in space
@@ -18,32 +19,62 @@ class Entry:
 
 
 ZOO = {
-    "dead_reckoning": Entry("dead_reckoning:DeadReckoning", "riccati.dead_reckoning:DEAD_RECKONING"),
+    "dead_reckoning": Entry(
+        "dead_reckoning:DeadReckoning", "Adds up odometry and sends nothing", "riccati.dead_reckoning:DEAD_RECKONING"
+    ),
     # on a plane bearings to three points say more than a pose needs
-    "p3p": Entry("single_frame:PerspectivePoints", on_a_plane=False),
-    "riccati": Entry("riccati.kernels:riccati", "riccati.kernels:RICCATI", covariance=False),
-    "hamel_samson": Entry("hamel_samson:HamelSamson", covariance=False),
-    "mekf": Entry("mekf:Mekf"),
-    "mekf_covariance": Entry("mekf_covariance:MekfCovariance"),
-    "mekf_covariance_ungated": Entry("mekf_covariance:MekfCovarianceUngated"),
-    "covariance_intersection": Entry("covariance_intersection:CovarianceIntersection"),
-    "split_covariance_intersection": Entry("split_covariance_intersection:SplitCovarianceIntersection"),
-    "pairwise": Entry("pairwise:Pairwise"),
-    "schmidt_kalman": Entry("schmidt_kalman:SchmidtKalman"),
-    "iterated_ekf": Entry("iterated_ekf:IteratedEkf"),
-    "left_invariant": Entry("left_invariant:LeftInvariant"),
-    "right_invariant": Entry("right_invariant:RightInvariant"),
-    "ukf": Entry("ukf:Ukf"),
-    "factor_graph": Entry("factor_graph:FactorGraph", needs="gtsam"),
-    "planar_ekf": Entry("planar.plugin:PlanarEkf", in_space=False),
-    "planar_robust": Entry("planar.robust:PlanarRobust", in_space=False),
-    "robust": Entry("robust.kernels:robust", "robust.kernels:ROBUST", on_a_plane=False, kernels_on_a_plane=False),
+    "p3p": Entry("single_frame:PerspectivePoints", "A pose per frame from three bearings, no memory", on_a_plane=False),
+    "riccati": Entry(
+        "riccati.kernels:riccati",
+        "The paper's observer, with the scenario's gains",
+        "riccati.kernels:RICCATI",
+        covariance=False,
+    ),
+    "hamel_samson": Entry("hamel_samson:HamelSamson", "The paper's observer with landmarks alone", covariance=False),
+    "mekf": Entry("mekf:Mekf", "Error-state filter; takes received positions as exact"),
+    "mekf_covariance": Entry(
+        "mekf_covariance:MekfCovariance", "Error-state filter; weighs received positions by covariance"
+    ),
+    "mekf_covariance_ungated": Entry(
+        "mekf_covariance:MekfCovarianceUngated", "Error-state filter that accepts every bearing"
+    ),
+    "covariance_intersection": Entry(
+        "covariance_intersection:CovarianceIntersection", "Kalman filter; neighbours by covariance intersection"
+    ),
+    "split_covariance_intersection": Entry(
+        "split_covariance_intersection:SplitCovarianceIntersection", "Kalman filter; neighbours by split intersection"
+    ),
+    "pairwise": Entry("pairwise:Pairwise", "Keeps cross-covariances pair by pair"),
+    "schmidt_kalman": Entry("schmidt_kalman:SchmidtKalman", "Considers neighbours with cross-covariances"),
+    "iterated_ekf": Entry(
+        "iterated_ekf:IteratedEkf", "Error-state filter that iterates corrections; sends covariances"
+    ),
+    "left_invariant": Entry("left_invariant:LeftInvariant", "Invariant filter, left error; sends covariances"),
+    "right_invariant": Entry("right_invariant:RightInvariant", "Invariant filter, right error; sends covariances"),
+    "ukf": Entry("ukf:Ukf", "Unscented (sigma-point) filter; sends covariances"),
+    "factor_graph": Entry(
+        "factor_graph:FactorGraph", "Factor graph smoothed at key frames; sends covariances", needs="gtsam"
+    ),
+    "planar_ekf": Entry("planar.plugin:PlanarEkf", "Extended Kalman filter of x, y and heading", in_space=False),
+    "planar_robust": Entry(
+        "planar.robust:PlanarRobust",
+        "Calibrates its odometry online; fuses neighbours by split covariance intersection",
+        in_space=False,
+    ),
+    "robust": Entry(
+        "robust.kernels:robust",
+        "This project's observer for vehicles in space: several hypotheses, gates",
+        "robust.kernels:ROBUST",
+        on_a_plane=False,
+        kernels_on_a_plane=False,
+    ),
     "robust_joint": Entry(
         "robust.joint.kernels:robust_joint",
+        "The robust observer with larger, joint messages, for vehicles in space",
         "robust.joint.kernels:ROBUST_JOINT",
         on_a_plane=False,
         kernels_on_a_plane=False,
     ),
-    "centralised": Entry("centralised:Centralised"),
+    "centralised": Entry("centralised:Centralised", "One filter over all vehicles and all measurements"),
 }
 """By name."""

@@ -1,11 +1,13 @@
 """Find and load drivers: a folder of `agents/`, a folder anywhere, or a place in code."""
 
+from __future__ import annotations
+
 import shlex
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -13,8 +15,9 @@ from coopenv.base import user_code
 from coopenv.base.errors import CoopenvError, suggest, told
 from coopenv.base.installation import data_directory, list_agents
 from coopenv.policies.base import PLAIN, Policy
-from coopenv.policies.network import NetworkCard
-from coopenv.scenario import Scenario
+
+if TYPE_CHECKING:
+    from coopenv.scenario import Scenario
 
 Kind = Literal["learned", "scripted", "reference"]
 """Trained; written by hand; or a yardstick that says what is possible."""
@@ -25,6 +28,43 @@ CHECKPOINT_FILE = "checkpoint.safetensors"
 """What stands in its place while an agent is trained."""
 LATER_FIELDS = {"center", "settings"}
 """Of a learned agent's tables: what the first versions did not write, and cannot be guessed."""
+
+
+class Entry(BaseModel):
+    """A field of the observation or of the action that a network was trained with."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    start: int
+    stop: int
+    low: float
+    high: float
+    scale: float
+    center: float
+    unit: str
+
+    def told(self) -> dict[str, float | str]:
+        """Return what must be the same wherever the field stands."""
+        return {"size": self.stop - self.start, **self.model_dump(exclude={"start", "stop"})}
+
+
+class NetworkCard(BaseModel):
+    """The table `network` of an `agent.toml`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    weights: str
+    """File in the agent's folder."""
+    sha256: str
+    """Of the file."""
+    layout: str
+    """`layout_hash` of the three tables below."""
+    clip: float
+    """Normalised observations are clipped to it."""
+    observation: dict[str, Entry]
+    action: dict[str, Entry]
+    settings: dict[str, float]
+    """Of the scenario, by dotted key: those that say what the entries mean beside these tables."""
 
 
 class AgentCard(BaseModel):

@@ -8,53 +8,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 from safetensors import SafetensorError
 from safetensors.numpy import load
 
 from coopenv.api.terms.layout import Layout, observation_layout, settings_of_meaning
 from coopenv.base.errors import CoopenvError
+from coopenv.policies.loader import Entry, NetworkCard
 from coopenv.scenario import Scenario
 
 ENTRY = f"{__name__}:Network"
 """The `entry` of learned agents."""
-
-
-class Entry(BaseModel):
-    """A field of the observation or of the action that a network was trained with."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    start: int
-    stop: int
-    low: float
-    high: float
-    scale: float
-    center: float
-    unit: str
-
-    def told(self) -> dict[str, float | str]:
-        """Return what must be the same wherever the field stands."""
-        return {"size": self.stop - self.start, **self.model_dump(exclude={"start", "stop"})}
-
-
-class NetworkCard(BaseModel):
-    """The table `network` of an `agent.toml`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    weights: str
-    """File in the agent's folder."""
-    sha256: str
-    """Of the file."""
-    layout: str
-    """`layout_hash` of the three tables below."""
-    clip: float
-    """Normalised observations are clipped to it."""
-    observation: dict[str, Entry]
-    action: dict[str, Entry]
-    settings: dict[str, float]
-    """Of the scenario, by dotted key: those that say what the entries mean beside these tables."""
 
 
 def layout_tables(layout: Layout) -> tuple[dict[str, Entry], dict[str, Entry]]:

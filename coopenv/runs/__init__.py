@@ -1,6 +1,15 @@
 """One run of an environment: simulate it, judge it, write it down."""
 
-from coopenv.runs.recorder import record
-from coopenv.runs.rollouts import Rollout, rollout
+from typing import TYPE_CHECKING
+
+from coopenv.base.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from coopenv.runs.recorder import record
+    from coopenv.runs.rollouts import Rollout, rollout
+else:
+    __getattr__, __dir__ = lazy_names(
+        __name__, {"coopenv.runs.recorder": ["record"], "coopenv.runs.rollouts": ["Rollout", "rollout"]}
+    )
 
 __all__ = ["Rollout", "record", "rollout"]

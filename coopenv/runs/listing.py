@@ -3,14 +3,12 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rich import box
 from rich.table import Table
 
-from coopenv.api.registration import environment_id
-from coopenv.base.installation import list_agents
-from coopenv.observers.registry import find, observer_names, obstacle
+from coopenv.base.installation import environment_id, list_agents, list_envs
+from coopenv.observers.registry import description, observer_names
 from coopenv.policies import find_agent
-from coopenv.runs.table import number_table
-from coopenv.scenario import Scenario
 
 COLUMNS = {
     "envs": ("name", "vehicles", "landmarks", "motion", "horizon_s"),
@@ -22,26 +20,30 @@ COLUMNS = {
 """What the tables show of the rows."""
 
 
-def environment_rows(scenarios: Mapping[str, Scenario]) -> list[dict[str, Any]]:
-    """Return what `list envs` says of every environment."""
-    return [
-        {
-            "name": name,
-            "title": scenario.title,
-            "id": environment_id(name),
-            "vehicles": len(scenario.vehicles),
-            "landmarks": len(scenario.landmarks),
-            "motion": "driven" if scenario.driven else "prescribed",
-            "horizon_s": scenario.horizon,
-        }
-        for name, scenario in scenarios.items()
-    ]
+def environment_rows() -> list[dict[str, Any]]:
+    """Return what `list envs` says of every environment that ships with coopenv."""
+    from coopenv.scenario import load_scenario
+
+    rows = []
+    for name in list_envs():
+        scenario = load_scenario(name)
+        rows.append(
+            {
+                "name": name,
+                "title": scenario.title,
+                "id": environment_id(name),
+                "vehicles": len(scenario.vehicles),
+                "landmarks": len(scenario.landmarks),
+                "motion": "driven" if scenario.driven else "prescribed",
+                "horizon_s": scenario.horizon,
+            }
+        )
+    return rows
 
 
 def observer_rows() -> list[dict[str, Any]]:
     """Return what `list observers` says of every observer."""
-    names = observer_names()
-    return [{"name": name, "about": obstacle(name) or _sentence(find(name).__doc__ or "")} for name in names]
+    return [{"name": name, "about": description(name)} for name in observer_names()]
 
 
 def agent_rows() -> list[dict[str, Any]]:
@@ -62,14 +64,12 @@ def _sentence(text: str) -> str:
 
 
 def list_table(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> Table:
-    """Return one line per row; what does not fit into the width is cut off at the end of the last column."""
-    table = number_table((), ())
+    """Return one row per entry; texts of the last column that do not fit into the width are wrapped."""
+    table = Table(box=box.HORIZONTALS, padding=(0, 1, 0, 0), pad_edge=False, show_edge=False)
     for key in columns:
-        cells = [_text(row[key]) for row in rows]
         heading = key.removesuffix("_s") + (" [s]" if key.endswith("_s") else "")
         number = bool(rows) and isinstance(rows[0][key], int | float)
-        width = None if key == columns[-1] else max(map(len, [heading, *cells]))
-        table.add_column(heading, justify="right" if number else "left", no_wrap=True, min_width=width)
+        table.add_column(heading, justify="right" if number else "left", no_wrap=key != columns[-1])
     for row in rows:
         table.add_row(*(_text(row[key]) for key in columns))
     return table

@@ -10,11 +10,11 @@ from typing import Any
 
 import gymnasium
 
-from coopenv.api.registration import environment_id, register_all
+from coopenv.api.registration import register_all
 from coopenv.api.terms.layout import action_space, flat_space, observation_layout
 from coopenv.base.errors import CoopenvError, OutputError
 from coopenv.base.files import replacing_folder, writing
-from coopenv.base.installation import environment, version
+from coopenv.base.installation import environment, environment_id, version
 from coopenv.runs.driven import DrivenEpisode
 from coopenv.scenario import Scenario
 

@@ -2,10 +2,9 @@
 
 from collections.abc import Iterator
 
-from coopenv.api.registration import environment_id
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.format import number
-from coopenv.base.installation import list_envs
+from coopenv.base.installation import environment_id, list_envs
 from coopenv.runs import scenario_rows
 from coopenv.runs.describe import shown_sections
 from coopenv.runs.drawn_text import drawn, graded

@@ -10,11 +10,10 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from coopenv.api.registration import environment_id
 from coopenv.api.terms.layout import observation_layout
 from coopenv.base.errors import listed
 from coopenv.base.format import number
-from coopenv.base.installation import list_envs
+from coopenv.base.installation import environment_id, list_envs
 from coopenv.scenario import Scenario
 from coopenv.scenario.sensing import Noise
 

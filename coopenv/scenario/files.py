@@ -1,7 +1,6 @@
 """Find, read, override and validate scenario files."""
 
 import json
-import os
 import tomllib
 import warnings
 from collections.abc import Iterable, Mapping
@@ -11,11 +10,11 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from coopenv.base.errors import ScenarioError, UnknownEnvironmentError, shortened, shown, suggest
-from coopenv.base.installation import data_directory, list_envs
+from coopenv.base.errors import ScenarioError, shown
+from coopenv.base.installation import is_scene, scenario_path
 from coopenv.scenario.landmarks import with_groups
 from coopenv.scenario.own_terms import located
-from coopenv.scenario.scenes import SCENES, is_scene, scene_text
+from coopenv.scenario.scenes import scene_text
 from coopenv.scenario.schema import Scenario
 from coopenv.scenario.validation import TOO_DEEP, one_line
 
@@ -26,40 +25,6 @@ OVERRIDES = "overrides (--set)"
 """Where a field stands that an override has made wrong."""
 
 MOST_BYTES = 8 * 2**20  # of a file; 20,000 landmarks take one or two million
-
-
-EXPECTED = "expected a scenario (.toml), a log file (.mcap) or a ROS bag (.bag, .db3, a folder with metadata.yaml)"
-BAGS = (".db3", ".bag")  # suffixes of ROS bags, which are taken for log files by mistake
-
-
-def scenario_path(name_or_path: str | Path) -> Path:
-    """Return the file behind an environment name or a path; a folder that is called like an environment is ./NAME.
-
-    Raises:
-        UnknownEnvironmentError: there is no such environment or file.
-    """
-    text = str(name_or_path)
-    if text in list_envs():
-        return data_directory("envs") / f"{text}.toml"
-    if text.endswith((".toml", *BAGS)) or "/" in text or "\\" in text or os.path.isdir(text):  # noqa: PTH112 (never raises)
-        try:
-            path = Path(text).expanduser()
-            there, is_bag = path.is_file(), path.suffix in BAGS or (path / "metadata.yaml").is_file()
-        except (OSError, RuntimeError, ValueError) as error:  # too long, nobody's home, a null character
-            reason = getattr(error, "strerror", None) or error
-            raise UnknownEnvironmentError(f"no such scenario file: {shown(text)} ({reason})") from None
-        if is_bag:
-            raise UnknownEnvironmentError(
-                f"{path}: a ROS bag is no scenario; it runs with a map of its topics: coopenv run BAG --map topics.toml"
-            )
-        if not there:
-            found = f"{shortened(str(path), 200)}: a folder; {EXPECTED}" if os.path.isdir(path) else ""  # noqa: PTH112
-            raise UnknownEnvironmentError(found or f"no such scenario file: {shortened(str(path), 200)}")
-        return path
-    if os.path.isfile(text):  # noqa: PTH113 (never raises)
-        raise UnknownEnvironmentError(f"unknown environment {shown(text)}: a file of an unknown kind; {EXPECTED}")
-    known = f"{suggest(text, list_envs())}; known: {', '.join([*list_envs(), *(f'{kind}:N' for kind in SCENES)])}"
-    raise UnknownEnvironmentError(f"unknown environment {shown(text)}{known}")
 
 
 def load_scenario(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scenario:

@@ -7,11 +7,10 @@ from typing import NamedTuple
 
 import tomlkit
 
-from coopenv.base.installation import list_envs
+from coopenv.base.installation import is_scene, list_envs, scenario_path
 from coopenv.policies.loader import AGENT_FILE
-from coopenv.scenario.files import scenario_path
 from coopenv.scenario.own_terms import SECTIONS, located
-from coopenv.scenario.scenes import is_scene, scene_text
+from coopenv.scenario.scenes import scene_text
 from coopenv.training.settings import SETTINGS_FILE
 
 

@@ -19,8 +19,8 @@ from coopenv.base.errors import CoopenvError
 from coopenv.base.files import writing
 from coopenv.base.installation import version
 from coopenv.evaluation import Result
-from coopenv.policies.loader import AGENT_FILE
-from coopenv.policies.network import ENTRY, NetworkCard, layout_hash, layout_tables
+from coopenv.policies.loader import AGENT_FILE, NetworkCard
+from coopenv.policies.network import ENTRY, layout_hash, layout_tables
 from coopenv.scenario import Scenario
 from coopenv.training import settings_file
 from coopenv.training.settings import SETTINGS_FILE

@@ -14,7 +14,8 @@ from safetensors.numpy import save
 import coopenv
 from coopenv.api.terms.layout import observation_layout, settings_of_meaning
 from coopenv.policies import find_agent, load_agent
-from coopenv.policies.network import Network, NetworkCard, layout_hash, layout_tables
+from coopenv.policies.loader import NetworkCard
+from coopenv.policies.network import Network, layout_hash, layout_tables
 from tests.helpers.four_way import FOUR_WAY
 
 ENV = FOUR_WAY

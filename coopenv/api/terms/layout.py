@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from gymnasium import spaces
 
 from coopenv.base.errors import CoopenvError
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import Dynamics
 from coopenv.scenario.term_rows import SETTINGS, SETTINGS_OF_ACTIONS
 from coopenv.scenario.terms import GROUPS, OBSERVATION_FIELDS, ObservationField
-from coopenv.world.command import STEERING
+
+if TYPE_CHECKING:
+    from gymnasium import spaces
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,7 @@ def _scale(row: ObservationField, scenario: Scenario) -> float:
     if row.scale == "targets":
         return float(len(scenario.target_names))
     if row.scale == "steering":
-        return float(max(action_fields(scenario, limits)[STEERING].high for limits in scenario.limits))
+        return float(max(scenario.action.steering or limits.max_steering for limits in scenario.limits))
     if row.scale == "pan":
         return 1.0 if scenario.action.pan is None else scenario.action.pan.limit
     return float(getattr(scenario.observation, row.scale) if isinstance(row.scale, str) else row.scale)
@@ -182,12 +184,16 @@ def settings_of_meaning(scenario: Scenario, fields: Iterable[str]) -> dict[str, 
 
 def flat_space(layout: Mapping[str, Field]) -> spaces.Box:
     """Return the flat float32 Box."""
+    from gymnasium import spaces
+
     low = np.concatenate([np.full(f.stop - f.start, f.low, dtype=np.float32) for f in layout.values()])
     return spaces.Box(low, np.ones_like(low), dtype=np.float32)
 
 
 def dict_space(layout: Mapping[str, Field]) -> spaces.Dict:
     """Return a one-level Dict of one-dimensional boxes, one per field."""
+    from gymnasium import spaces
+
     return spaces.Dict(
         {name: spaces.Box(f.low, 1.0, shape=(f.stop - f.start,), dtype=np.float32) for name, f in layout.items()}
     )
@@ -195,4 +201,6 @@ def dict_space(layout: Mapping[str, Field]) -> spaces.Dict:
 
 def action_space(scenario: Scenario) -> spaces.Box:
     """Return the action: (speed or acceleration, steering; positive turns left), and pan if any, each in [-1, 1]."""
+    from gymnasium import spaces
+
     return spaces.Box(-1.0, 1.0, shape=(scenario.action.size,), dtype=np.float32)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from coopenv.base.errors import CoopenvError, DataWarning, ScenarioError, listed
+from coopenv.base.installation import scenario_path
 from coopenv.cars.backend.backend import Svea
 from coopenv.cars.backend.binding import Binding, bind
 from coopenv.cars.backend.drive import PRESENCE, Tape, Taped, head_of
@@ -16,7 +17,7 @@ from coopenv.cars.topics import RESET_TOPIC, TOPICS, Role, presence_of, topic_of
 from coopenv.cars.transport.base import Transport
 from coopenv.cars.transport.open import open_transport
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.scenario.files import OVERRIDES, scenario_path
+from coopenv.scenario.files import OVERRIDES
 
 
 def open_svea(

@@ -91,12 +91,6 @@ def _briefly(option: tuple[str, Option]) -> str:
     return f"{least}..{most} {name}" if most < 1000 else name
 
 
-def is_scene(text: str) -> bool:
-    """Return whether a text is the name of a scene, be it right or wrong in what follows the colon."""
-    head, colon, rest = text.partition(":")
-    return bool(colon) and head in SCENES and not rest.endswith(".toml") and "/" not in rest
-
-
 def read_request(text: str) -> Request:
     """Return what a name asks for; what it does not say is as usual.
 
