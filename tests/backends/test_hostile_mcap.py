@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from coopenv import DataError
+from coopenv.backends import unpacking
 from coopenv.backends.mcap import read_recording, write_recording
 from coopenv.backends.replay import Replay
 from tests.helpers.four_way import FOUR_WAY
@@ -278,15 +279,16 @@ def test_a_chunk_that_unpacks_to_more_than_fits_is_not_unpacked(
     bomb(written, path, 1536 * 2**20, claimed)
     assert path.stat().st_size < 300_000
     tracemalloc.start()
-    refused(path, r"damaged MCAP file \(a chunk of \d+ bytes would unpack to 1610612736, more than 16777216\)")
+    refused(path, r"damaged MCAP file \(a chunk of \d+ bytes would unpack to 1610612736, more than 33554432\)")
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < 20e6
 
 
-def test_many_chunks_that_unpack_to_much(written: Path, tmp_path: Path) -> None:
+def test_many_chunks_that_unpack_to_much(written: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, more = tmp_path / "hostile.mcap", tmp_path / "more.mcap"
     bomb(written, path, 9 * 2**20)  # a million records of 9 bytes
+    monkeypatch.setattr(unpacking, "AT_ONCE", 16 * 2**20)
     bomb(path, more, 9 * 2**20)
     refused(more, r"would unpack to 9437184, more than [89]\d{6}\b")  # the limit is for both
 

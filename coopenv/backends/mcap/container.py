@@ -9,17 +9,12 @@ from io import BytesIO
 from itertools import takewhile
 from pathlib import Path
 
-import zstandard
-from lz4.frame import LZ4FrameDecompressor
 from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Message, MessageIndex, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from coopenv.backends.mcap.peek import CUT_OFF, MAGIC, MENDED
+from coopenv.backends.unpacking import Allowance
 from coopenv.base.errors import DataError, check_memory
-
-MAX_CHUNK_BYTES = 16 * 2**20  # unpacked; writers make chunks of about 1 MiB
-MAX_EXPANSION = 50
-"""Times that a whole file may grow when it is unpacked, beyond one such chunk; recordings expand 3 to 10 times."""
 
 
 class Container:
@@ -77,31 +72,14 @@ class Container:
 
     def _unpacked(self) -> Iterator[McapRecord]:
         """Yield the records inside and outside of chunks."""
-        allowance = MAX_CHUNK_BYTES + MAX_EXPANSION * self._size
+        allowance = Allowance(self._size)
         for record in self._records:
             if isinstance(record, Chunk):
-                data = _unpack(record, min(MAX_CHUNK_BYTES, allowance))
-                allowance -= len(data)
+                data = allowance.unpack(record.compression, record.data, record.uncompressed_size)
+                if len(data) != record.uncompressed_size:
+                    raise ValueError(
+                        f"a chunk unpacks to {len(data)} bytes, not to {record.uncompressed_size} as it says"
+                    )
                 yield from breakup_chunk(replace(record, compression="", data=data), validate_crc=True)
             else:
                 yield record
-
-
-def _unpack(chunk: Chunk, limit: int) -> bytes:
-    """Return the records of a chunk; what it claims to unpack to is checked before any memory is taken."""
-    size = chunk.uncompressed_size
-    if chunk.compression == "zstd":  # whose frames have a say of their own
-        size = max(size, zstandard.frame_content_size(chunk.data))
-    if size > limit:
-        raise ValueError(f"a chunk of {len(chunk.data)} bytes would unpack to {size}, more than {limit}")
-    if chunk.compression == "zstd":
-        data = zstandard.decompress(chunk.data, max_output_size=size)
-    elif chunk.compression == "lz4":
-        data = LZ4FrameDecompressor().decompress(chunk.data, max_length=size)
-    elif not chunk.compression:
-        data = chunk.data
-    else:
-        raise ValueError(f"unknown compression {chunk.compression!r:.20}")
-    if len(data) != chunk.uncompressed_size:
-        raise ValueError(f"a chunk unpacks to {len(data)} bytes, not to {chunk.uncompressed_size} as it says")
-    return data

@@ -1,4 +1,4 @@
-"""Bags as files: ROS 1 `.bag`, ROS 2 folders, bare `.db3` and `.mcap`, all through rosbags."""
+"""Bags as files: ROS 1 `.bag`, ROS 2 folders, bare `.db3` and `.mcap`, all through rosbags, within limits."""
 
 import warnings
 from collections.abc import Callable, Collection, Iterator
@@ -49,11 +49,17 @@ class BagFile:
         if path.suffix == ".mcap" and is_cut_off(path):
             raise DataError(f"{path}: {CUT_OFF}; {MENDED}")
         self._stack = ExitStack()
+        parts = [path] if path.is_file() else [part for part in path.iterdir() if part.is_file()]
+        self._bytes = sum(part.stat().st_size for part in parts)
         from rosbags.highlevel import AnyReader
 
+        from coopenv.backends.unpacking import Allowance
+        from coopenv.cars.bags.limits import limited
+
         try:
-            reader = AnyReader([path], default_typestore=codec.ros1() if path.suffix == ".bag" else codec.ros2())
-            self._reader = self._stack.enter_context(reader)
+            with limited(Allowance(self._bytes)):
+                reader = AnyReader([path], default_typestore=codec.ros1() if path.suffix == ".bag" else codec.ros2())
+                self._reader = self._stack.enter_context(reader)
             self._complete_types()
             self.topics = {name: info.msgtype or "" for name, info in self._reader.topics.items()}
             """Type of every topic; empty where messages of several types came on it."""
@@ -62,7 +68,7 @@ class BagFile:
             """Between its first and its last message."""
         except Exception as error:  # whatever the library raises at files that make no sense
             self._stack.close()
-            raise self._unreadable(error) from None
+            raise error if isinstance(error, CoopenvError) else self._unreadable(error) from None
 
     def __enter__(self) -> Self:
         """Return the bag."""
@@ -85,17 +91,21 @@ class BagFile:
         Where the file breaks off, or a part of it is damaged, the messages before it have been yielded, and a
         DataWarning says so.
         """
+        from coopenv.backends.unpacking import Allowance
+        from coopenv.cars.bags.limits import each_limited, is_too_large
+
         connections = [c for c in self._reader.connections if c.topic in topics]
         last, first = None, None
         try:
-            for connection, received, data in self._reader.messages(connections) if connections else ():
+            found = iter(self._reader.messages(connections) if connections else ())
+            for connection, received, data in each_limited(found, Allowance(self._bytes)):
                 first = received if first is None else first
                 last = received
                 yield Raw(connection.topic, connection.msgtype, received, self._decoder(connection, data))
         except GeneratorExit:
             raise
         except Exception as error:
-            if last is None or first is None:
+            if last is None or first is None or is_too_large(error):
                 raise self._unreadable(error) from None
             read = (last - first) * 1e-9
             warnings.warn(
@@ -116,6 +126,10 @@ class BagFile:
         return decode
 
     def _unreadable(self, error: Exception) -> DataError:
+        from coopenv.cars.bags.limits import is_too_large
+
+        if is_too_large(error):
+            return DataError(f"{self.path}: {error}")
         repair = REPAIRS.get(self.path.suffix)
         hint = f"; if its recording was cut off, `{repair}` mends it" if repair else ""
         return DataError(f"{self.path}: cannot be read as a ROS bag ({told(error)}){hint}")
