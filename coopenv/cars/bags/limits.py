@@ -52,9 +52,10 @@ def _guard_rosbags() -> None:
     try:
         import apsw
         from rosbags.rosbag1.reader import decompressors
-        from rosbags.rosbag2 import reader
+        from rosbags.rosbag2 import reader as rosbag2_reader
         from rosbags.rosbag2.storage_mcap import DECOMPRESSORS
 
+        reader: Any = rosbag2_reader
         unpack_message, open_file = reader.zstd.decompress, reader.zstd.open
     except (ImportError, AttributeError):
         raise CoopenvError(
@@ -82,7 +83,8 @@ def _guard_rosbags() -> None:
             database.limit(apsw.SQLITE_LIMIT_LENGTH, AT_ONCE)
 
     reader.zstd = SimpleNamespace(decompress=message, open=file)
-    for table, limited_form in ((DECOMPRESSORS, chunk), (decompressors, ros1_chunk)):
+    tables: tuple[tuple[Any, Any], ...] = ((DECOMPRESSORS, chunk), (decompressors, ros1_chunk))
+    for table, limited_form in tables:
         table.update({name: partial(limited_form, original, name) for name, original in table.items()})
     apsw.connection_hooks.append(connected)
 
