@@ -26,11 +26,13 @@ def test_cars_that_say_nothing_are_named(tmp_path: Path, monkeypatch: pytest.Mon
     router = open_zenoh("router", listen=[endpoint])
     try:
         command = ["svea", "run", str(OVERTAKING), "--connect", endpoint, "--steps", "3", "--no-figures"]
-        result = CliRunner().invoke(app, command)
+        result = CliRunner().invoke(app, [*command, "--steady-from", "0"])
+        too_short = CliRunner().invoke(app, command)
     finally:
         router.close()
     assert isinstance(result.exception, CoopenvError)
     assert str(result.exception).startswith(f"nothing has come from svea7, svea1 by {endpoint}")
+    assert str(too_short.exception).startswith("steady_from 2 is not within the run of ")
 
 
 @pytest.mark.slow

@@ -35,6 +35,10 @@ def result_names() -> list[str]:
     return [METRICS_FILE, TRAJECTORY_FILE, SCENE_FILE, REPLAY_FILE, *figures, *VIDEO_FILES]
 
 
+class NoTruthError(CoopenvError):
+    """At no two ticks of a run are the true poses of all vehicles known."""
+
+
 def execute(
     name: str,
     run: Rollout,
@@ -53,6 +57,7 @@ def execute(
     of `coopenv.viz.paper`; None: a page's. `describe` says what is shown beside the bar meanwhile.
 
     Raises:
+        NoTruthError: no true poses are known.
         CoopenvError: an argument is not valid, or the results cannot be written.
     """
     scenario = run.scenario
@@ -69,7 +74,7 @@ def execute(
         trajectory = run.trajectory()
         judged, endings = trajectory.of_vehicles(run.vehicles).where_truth_is_known(), run.endings()
         if len(judged.t) < 2:
-            raise CoopenvError(f"{name}: no true poses are known, so there are no errors to show")
+            raise NoTruthError(f"{name}: no true poses are known, so there are no errors to show")
         observability = analyse_observability(judged)
         rates = theory_rates(run, judged)
         vehicles = vehicle_metrics(judged, observability, endings, steady, rates)

@@ -18,9 +18,9 @@ from coopenv.cars.backend.backend import Svea
 from coopenv.cars.backend.opening import open_svea
 from coopenv.cars.fake.fleet import fakes
 from coopenv.cars.transport.zenoh import library
-from coopenv.runs.command import execute, report
+from coopenv.runs.command import NoTruthError, execute, report
 from coopenv.runs.console import Progress, compile_notice
-from coopenv.runs.links import STEADY_FROM, links_line, links_report
+from coopenv.runs.links import STEADY_FROM, links_line, links_report, truth_report
 from coopenv.runs.rollouts import Rollout
 from coopenv.runs.side_by_side import Episodes, side_by_side
 from coopenv.scenario import Scenario
@@ -70,11 +70,12 @@ class Punctuality:
     missed: int = 0
     delays: list[float] = field(default_factory=list)  # s, of each tick
 
-    def count(self, backend: Svea, run: Rollout) -> None:
-        """Add the episode that is over."""
+    def count(self, backend: Svea, run: Rollout, known: bool = True) -> None:
+        """Add the episode that is over; all its deadlines are missed where no true pose is known in time."""
         self.time += run.ticks_recorded / run.scenario.rates.camera
-        self.decisions += -(-run.ticks_recorded // run.scenario.ticks_per_decision)
-        self.missed += backend.link.missed
+        decisions = -(-run.ticks_recorded // run.scenario.ticks_per_decision)
+        self.decisions += decisions
+        self.missed += backend.link.missed if known else decisions
         self.delays.extend(backend.delays)
 
     def line(self) -> str:
@@ -86,8 +87,8 @@ class Punctuality:
         )
 
 
-def run_demo(demo: Demo, port: int | None, log: Console, out: Console) -> None:
-    """Start everything, drive, report, and end everything.
+def run_demo(demo: Demo, port: int | None, log: Console, out: Console) -> bool:
+    """Start everything, drive, report, and end everything. Return whether the cars drove without being stopped.
 
     Args:
         demo: what is shown.
@@ -96,11 +97,12 @@ def run_demo(demo: Demo, port: int | None, log: Console, out: Console) -> None:
         out: results.
 
     Raises:
-        CoopenvError: the extra is missing, a process does not start, the cars cannot be armed, or results cannot be
-            written.
+        CoopenvError: the extra is missing, a process does not start, the cars cannot be armed, results cannot be
+            written, or no true poses are known; the drive is kept in the last case.
     """
     library()
     fleet, kept, driven = demo.fleet, Punctuality(), Episodes(STEADY_FROM)
+    no_truth: CoopenvError | None = None
     with writing(demo.drive.parent):
         demo.drive.parent.mkdir(parents=True, exist_ok=True)
     with ExitStack() as stack:
@@ -110,7 +112,10 @@ def run_demo(demo: Demo, port: int | None, log: Console, out: Console) -> None:
         environment = None if demo.deployment else demo.environment
         backend = open_svea(fleet, environment, demo.overrides, record=tape, connect=router)
         stack.callback(backend.close)
-        whole = _drive_or_keep(demo, backend, kept, driven, log, out)
+        try:
+            whole = _drive_or_keep(demo, backend, kept, driven, log, out)
+        except NoTruthError:
+            whole, no_truth = True, CoopenvError(f"{demo.environment}: {truth_report(backend)}")
     if not whole:
         raise KeyboardInterrupt
     backends = {"fakes": driven}
@@ -123,6 +128,9 @@ def run_demo(demo: Demo, port: int | None, log: Console, out: Console) -> None:
         out.print("Hidden: frames in which a static landmark is not seen.")
     out.print(kept.line(), soft_wrap=True)
     out.print(f"The drive, bit for bit: coopenv run {demo.drive} --steady-from {STEADY_FROM:g}", soft_wrap=True)
+    if no_truth is not None:
+        raise no_truth
+    return backend.watchdog.trip is None
 
 
 def _drive_or_keep(demo: Demo, backend: Svea, kept: Punctuality, driven: Episodes, log: Console, out: Console) -> bool:
@@ -145,7 +153,12 @@ def _drive(demo: Demo, backend: Svea, kept: Punctuality, driven: Episodes, log: 
     run = Rollout(backend.scenario, demo.seed, policy=demo.policy, backend=backend, options={"arm": True})
     watched = partial(links_line, backend)
     name, changes = demo.environment, dict(demo.overrides)
-    result = execute(name, run, demo.out, log, changes, STEADY_FROM, "png", False, watched)
+    try:
+        result = execute(name, run, demo.out, log, changes, STEADY_FROM, "png", False, watched)
+    except NoTruthError:
+        kept.count(backend, run, known=False)
+        links_report(backend, out)
+        raise
     kept.count(backend, run)
     report(run, result, demo.out, out)
     links_report(backend, out)
@@ -160,7 +173,8 @@ def _drive(demo: Demo, backend: Svea, kept: Punctuality, driven: Episodes, log: 
         kept.count(backend, run)
         ends = ", ".join(f"{ending.outcome} at {ending.time:.1f} s" for ending in run.endings())
         out.print(f"seed {run.seed}: {ends}", soft_wrap=True)
-    out.print(f"Stopped: {backend.watchdog.trip.reason}", soft_wrap=True)
+        if backend.watchdog.trip is not None:
+            out.print(f"Stopped: {backend.watchdog.trip.reason}", soft_wrap=True)
 
 
 def _simulate(demo: Demo, scenario: Scenario, episodes: int, log: Console) -> Episodes:

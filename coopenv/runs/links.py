@@ -1,12 +1,14 @@
 """What a run on cars says of its links: what came, what was refused, and how well time was kept."""
 
+from math import isfinite
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
-from coopenv.base.errors import CoopenvError, listed
+from coopenv.base.errors import listed
 from coopenv.cars.backend.backend import Svea
+from coopenv.cars.topics import Role, topic_of
 
 STEADY_FROM = 2.0
 """s: cars know their places by then."""
@@ -55,9 +57,15 @@ def links_report(backend: Svea, out: Console) -> None:
         out.print(f"Stopped: {trip.reason}", soft_wrap=True)
 
 
-def silence(backend: Svea) -> CoopenvError | None:
-    """Return what is wrong where no car has said anything, None if one has."""
-    if backend.health.received:
-        return None
-    names, where = listed(list(backend.binding.cars)), ", ".join(backend.deployment.network.connect)
-    return CoopenvError(f"nothing has come from {names} by {where}: are they on, and are their names fleet/NAME/...?")
+def truth_report(backend: Svea) -> str:
+    """Return why no tick has true poses: no car sends, or by topic of motion capture what came."""
+    names = list(backend.binding.cars)
+    if not backend.health.received:
+        where = ", ".join(backend.deployment.network.connect)
+        return f"nothing has come from {listed(names)} by {where}: are they on, and are their names fleet/NAME/...?"
+    topics = [topic_of(name, Role.TRUTH) for name in names]
+    came = [topic for topic in topics if isfinite(backend.station.silence(topic))]
+    silent = [topic for topic in topics if topic not in came]
+    parts = [f"nothing came on {listed(silent)}"] if silent else []
+    parts += [f"messages on {listed(came)} came too late for the ticks"] if came else []
+    return "no true poses are known, so there are no errors to show: " + "; ".join(parts)

@@ -6,14 +6,19 @@ import json
 import os
 import signal
 import subprocess
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from coopenv.base.errors import CoopenvError
+from coopenv.cars.backend.station import Pacer
 from coopenv.cars.fake.fleet import free_port
 from coopenv.cli import app
+from coopenv.cli.svea.run import STOPPED
+from coopenv.estimation.trajectory import Trajectory
 from coopenv.runs.demo import FLEETS, Demo
 from tests.helpers.processes import COOPENV, DEADLOCK, ROOT, mentioning, start, wait_until
 
@@ -34,9 +39,9 @@ def test_the_demo_drives_and_can_be_run_again(environment: str, tmp_path: Path) 
         port = free_port()
         process = demo(tmp_path, port, "--environment", environment)
         printed, errors = process.communicate(timeout=4 * DEADLOCK)
-        assert process.returncode == 0, errors
+        assert process.returncode == (STOPPED if "Stopped: " in printed else 0), errors
         assert not mentioning(f"127.0.0.1:{port}")
-        if "Stopped: " not in printed:
+        if process.returncode == 0:
             break
     assert "RMSE" in printed and "vehicle_1: arrived at" in printed and "deadlines missed" in printed
     assert {path.name for path in (tmp_path / "out" / environment).iterdir()} > RESULTS
@@ -84,14 +89,68 @@ def test_a_fleet_of_ones_own_is_driven(tmp_path: Path) -> None:
     for _ in range(ATTEMPTS):
         process = demo(tmp_path, free_port(), "--fleet", "mine.toml", "--set", "horizon=3")
         printed, errors = process.communicate(timeout=4 * DEADLOCK)
-        assert process.returncode == 0, errors
-        if "Stopped: " not in printed:
+        assert process.returncode == (STOPPED if "Stopped: " in printed else 0), errors
+        if process.returncode == 0:
             break
     assert "horizon reached at 3 s" in printed
     assert (tmp_path / "out" / "mine" / "metrics.json").exists() and (tmp_path / "out" / "mine.mcap").exists()
     mine.write_text(mine.read_text().replace("fakes = true", ""))
     refused = CliRunner().invoke(app, ["svea", "demo", "--fleet", str(mine)])
     assert refused.exit_code != 0 and "fakes = true is missing" in str(refused.exception)
+
+
+@pytest.fixture
+def fleet_of_my_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], list[str]]:
+    """Return the command of a demo whose deployment has further settings."""
+    monkeypatch.chdir(tmp_path)
+
+    def command(settings: str) -> list[str]:
+        text = (ROOT / "examples" / "fleet" / "overtaking.toml").read_text()
+        Path("mine.toml").write_text(text.replace("[safety]\n", f"[safety]\n{settings}\n"))
+        return ["svea", "demo", "--fleet", "mine.toml", "--set", "horizon=3"]
+
+    return command
+
+
+@pytest.mark.slow
+def test_cars_that_are_stopped_end_the_demo_with_a_status_of_its_own(
+    fleet_of_my_own: Callable[[str], list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(pacer: Pacer) -> None:
+        decide(pacer)
+        pacer.in_a_row = 1000 * (pacer.now() - begun > 1e9)
+
+    decide, begun = Pacer.decide, 0
+    start_pacer = Pacer.start
+
+    def started(pacer: Pacer) -> int:
+        nonlocal begun
+        begun = start_pacer(pacer)
+        return begun
+
+    monkeypatch.setattr(Pacer, "start", started)
+    monkeypatch.setattr(Pacer, "decide", stop)
+    result = CliRunner().invoke(app, fleet_of_my_own(""))
+    assert result.exit_code == STOPPED, (result.output, result.exception)
+    assert result.output.count("Stopped: ") == 1
+
+
+@pytest.mark.slow
+def test_without_true_poses_the_drive_is_kept_and_the_topics_are_told(
+    fleet_of_my_own: Callable[[str], list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none_known(trajectory: Trajectory) -> Trajectory:
+        return replace(trajectory, t=trajectory.t[:0])
+
+    monkeypatch.setattr(Trajectory, "where_truth_is_known", none_known)
+    result = CliRunner().invoke(app, fleet_of_my_own(""))
+    assert isinstance(result.exception, CoopenvError)
+    told = str(result.exception)
+    assert told.startswith("mine: no true poses are known") and "svea7" in told and "too late for the ticks" in told
+    (line,) = (line for line in result.output.splitlines() if "deadlines missed" in line)
+    missed, _, decisions = line.split(" s driven, ")[1].split()[:3]
+    assert missed == decisions != "0"
+    assert Path("out/mine.mcap").exists() and "The drive, bit for bit: coopenv run out/mine.mcap" in result.output
 
 
 def test_other_environments_have_no_demo() -> None:

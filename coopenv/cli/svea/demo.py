@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from coopenv.cli import options
+from coopenv.cli.svea.run import STOPPED
 
 
 def demo(
@@ -35,7 +36,8 @@ def demo(
     """Let fake cars drive an experiment in real time: table, figures, and a drive that can be run again.
 
     A router and a process per car run on this computer's loopback for as long as it takes, half a minute. The first
-    time kernels are compiled, which takes a minute or two more.
+    time kernels are compiled, which takes a minute or two more. The exit status is 3 where the watchdog stopped the
+    cars.
     """
     from coopenv.runs.demo import Demo, run_demo
 
@@ -43,4 +45,5 @@ def demo(
     changes, folder = options.parse_overrides(overrides), out or Path("out") / name
     chosen = Demo(name, folder, policy, seed, changes, seconds, beside, fleet)
     with options.warned():
-        run_demo(chosen, port, options.console(stderr=True), options.console())
+        if not run_demo(chosen, port, options.console(stderr=True), options.console()):
+            raise typer.Exit(STOPPED)

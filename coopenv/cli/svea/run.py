@@ -46,8 +46,8 @@ def run(
     """
     from coopenv.base.interrupts import also_kept
     from coopenv.cars.backend.opening import open_svea
-    from coopenv.runs.command import execute, report
-    from coopenv.runs.links import kept_drive, links_line, links_report, silence
+    from coopenv.runs.command import NoTruthError, execute, report
+    from coopenv.runs.links import kept_drive, links_line, links_report, truth_report
     from coopenv.runs.rollouts import Rollout
 
     changes, log = options.parse_overrides(overrides), options.console(stderr=True)
@@ -61,8 +61,8 @@ def run(
         figures = None if no_figures else "png"
         watched = partial(links_line, backend)
         result = execute(config.stem, rollout, folder, log, changes, steady_from, figures, False, watched)
-    except CoopenvError as error:
-        raise silence(backend) or error from None
+    except NoTruthError:
+        raise CoopenvError(truth_report(backend)) from None
     finally:
         backend.close()
     if as_json:
