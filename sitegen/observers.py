@@ -16,7 +16,7 @@ MORE = {
     "riccati": "../../method.md",
     "robust": "../../robust.md",
     "robust_joint": "../../robust.md#what-a-message-adds",
-    "planar_robust": "../../data.md#observers",
+    "planar_robust": "../../planar_robust.md",
 }
 """Where the documents explain an observer."""
 HEAD = """# Observers

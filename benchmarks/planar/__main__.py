@@ -1,4 +1,4 @@
-"""`python -m benchmarks.planar`: the planar observers on changed recordings, behind barriers, and among liars."""
+"""`python -m benchmarks.planar`: the planar observers on changed recordings, behind barriers, and with lying senders."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.planar.changes import blindfolded, changed, clocks, drifting, hidden, misread, odometry, part
-from benchmarks.planar.liars import Drifting, Replaying
+from benchmarks.planar.lies import Drifting, Replaying
 from coopenv.backends.mrclam import VARIANTS, Dataset, load_dataset, recording_of
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.arrays import Array
@@ -37,7 +37,7 @@ LIES: dict[str, Callable[[list[int]], Drifting | Replaying]] = {
     "replay 1 s": lambda who: Replaying(who, 10),
 }
 CARRIED = 2  # the robot that is
-LIED_FROM = 15.0  # s, from when on errors count among liars
+LIED_FROM = 15.0  # s, from when on errors count with a lying sender
 WAYS: dict[str, tuple[Callable[[Dataset], Recording], int]] = {
     "all see landmarks, 1 lies": (lambda d: recording_of(d, "landmarks+robots"), 0),
     "1 to 3 see landmarks, 1 lies": (lambda d: recording_of(blindfolded(d, 4, 5), "landmarks+robots"), 0),
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     asked = parser().parse_args(arguments)
     warnings.simplefilter("ignore")
     try:
-        {"changed": changes, "barriers": barriers, "liars": liars, "carried": carried}[asked.what](asked)
+        {"changed": changes, "barriers": barriers, "lies": lies, "carried": carried}[asked.what](asked)
     except CoopenvError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -61,9 +61,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     found = argparse.ArgumentParser(prog="python -m benchmarks.planar", description=__doc__)
-    found.add_argument("what", choices=("changed", "barriers", "liars", "carried"))
+    found.add_argument("what", choices=("changed", "barriers", "lies", "carried"))
     found.add_argument(
-        "--data", type=Path, metavar="DIR", help="where mrclam_6 is (`changed`; `liars`: else simulated)"
+        "--data", type=Path, metavar="DIR", help="where mrclam_6 is (`changed`; `lies`: else simulated)"
     )
     found.add_argument("--start", type=float, default=0.0, help="of the part of mrclam_6, s (default: 0)")
     found.add_argument("--seconds", type=float, default=250.0, help="how long (default: 250)")
@@ -90,7 +90,7 @@ def barriers(asked: argparse.Namespace) -> None:
         _compare(f"seed {seed}, turns {asked.turns}", barrier_robots(seed, asked.seconds, asked.turns))
 
 
-def liars(asked: argparse.Namespace) -> None:
+def lies(asked: argparse.Namespace) -> None:
     """Print what lies cost the honest ones: their error over what it is without."""
     for seed in asked.seeds:
         if asked.data is None:

@@ -1,4 +1,4 @@
-"""Changed recordings and liars, as `python -m benchmarks.planar` makes them."""
+"""Changed recordings and lying senders, as `python -m benchmarks.planar` makes them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.planar.__main__ import main
 from benchmarks.planar.changes import blindfolded, changed, clocks, drifting, hidden, misread, odometry, part
-from benchmarks.planar.liars import Drifting, Replaying
+from benchmarks.planar.lies import Drifting, Replaying
 from coopenv.backends.mrclam import recording_of
 from coopenv.observers.contract import Message
 from tests.helpers.barrier_robots import barrier_robots

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.planar.changes import blindfolded
-from benchmarks.planar.liars import Drifting
+from benchmarks.planar.lies import Drifting
 from coopenv.backends.mrclam import recording_of
 from coopenv.observers.planar.bearing import misfit
 from coopenv.observers.planar.robust import PlanarRobust

@@ -13,7 +13,7 @@ class Drifting:
     """Some robots broadcast places that are off and, if asked, drift on, and are sure of them to a centimetre."""
 
     def __init__(self, who: Sequence[int], jump: float, drift: float, since: float = 15.0) -> None:
-        """Take the liars, counted from 0, m, m/s, and from when on, s."""
+        """Take the lying senders, counted from 0, m, m/s, and from when on, s."""
         self.who, self.jump, self.drift, self.since, self._now = who, jump, drift, since, 0.0
 
     def applies(self, vehicle: int, time: float) -> bool:
