@@ -41,7 +41,6 @@ NOT_YET = {
     "docs/replay.md",
     "docs/results.md",
     "docs/robust.md",
-    "docs/trainers.md",
     "docs/tutorials/first_steps.md",
     "docs/tutorials/index.md",
     "docs/tutorials/logs.md",

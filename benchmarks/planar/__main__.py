@@ -1,4 +1,4 @@
-"""`python -m benchmarks.planar`: the planar observers on changed recordings, behind barriers, and with lying senders."""
+"""`python -m benchmarks.planar`: planar observers on changed recordings, behind barriers, with lying senders."""
 
 from __future__ import annotations
 
@@ -62,9 +62,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     found = argparse.ArgumentParser(prog="python -m benchmarks.planar", description=__doc__)
     found.add_argument("what", choices=("changed", "barriers", "lies", "carried"))
-    found.add_argument(
-        "--data", type=Path, metavar="DIR", help="where mrclam_6 is (`changed`; `lies`: else simulated)"
-    )
+    found.add_argument("--data", type=Path, metavar="DIR", help="where mrclam_6 is (`changed`; `lies`: else simulated)")
     found.add_argument("--start", type=float, default=0.0, help="of the part of mrclam_6, s (default: 0)")
     found.add_argument("--seconds", type=float, default=250.0, help="how long (default: 250)")
     found.add_argument("--seeds", type=lambda text: [int(n) for n in text.split(",")], default=[0], help="with commas")

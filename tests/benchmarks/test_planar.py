@@ -57,7 +57,7 @@ class Speaker:
         return message
 
 
-def test_what_liars_tell():
+def test_messages_of_lying_senders():
     honest = Message(position=np.zeros(3), covariance=np.eye(3))
     liar = Drifting([1], jump=1.0, drift=0.5, since=10.0)
     assert not liar.applies(0, 20.0) and not liar.applies(1, 9.0) and liar.applies(1, 12.0)
@@ -73,7 +73,7 @@ def test_what_liars_tell():
 
 
 def test_the_command_prints_a_row_per_lie_and_one_line_about_a_mistake(capsys, tmp_path):
-    assert main(["liars", "--seeds", "1", "--seconds", "20", "--only", "all see"]) == 0
+    assert main(["lies", "--seeds", "1", "--seconds", "20", "--only", "all see"]) == 0
     rows = capsys.readouterr().out.splitlines()
     assert len(rows) == 4 and all(row.startswith("seed 1, all see landmarks, 1 lies, ") for row in rows)
     assert main(["changed", "--data", str(tmp_path)]) == 2

@@ -27,7 +27,7 @@ class CooperativeTask(TaskClass):
         options = {k: v for k, v in self.config.items() if k != "env"}
         seeds: Iterator[int | None] = repeat(None) if seed is None else count(seed)
         return lambda: PettingZooWrapper(
-            PlainInfos(parallel_env(self.config["env"], **options), everybody=True),
+            PlainInfos(parallel_env(self.config["env"], **options), with_absent=True),
             done_on_any=False,
             use_mask=True,
             return_state=True,

@@ -19,22 +19,22 @@ class PlainInfos(BaseParallelWrapper[str, Any, np.ndarray]):
     keeps infos for whole episodes. Truth is left out, so that no policy can be built on it by accident.
     """
 
-    def __init__(self, env: CooperativeLocalisationEnv, everybody: bool = False) -> None:
+    def __init__(self, env: CooperativeLocalisationEnv, with_absent: bool = False) -> None:
         """Wrap a world.
 
         Args:
             env: the world.
-            everybody: whether a reset also returns zeros for vehicles that are absent in the episode, which are in
+            with_absent: whether a reset also returns zeros for vehicles that are absent in the episode, which are in
                 `possible_agents` and not in `agents`. TorchRL's wrapper asks for them.
         """
         super().__init__(env)
         self.state_space = env.state_space
-        self.everybody = everybody
+        self.with_absent = with_absent
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         observations, infos = self.env.reset(seed=seed, options=options)
         infos = {agent: plain(info) for agent, info in infos.items()}
-        for agent in self.possible_agents if self.everybody else ():
+        for agent in self.possible_agents if self.with_absent else ():
             if agent not in infos:
                 space = self.observation_space(agent)
                 observations[agent] = unflatten(space, np.zeros(flatdim(space), dtype=np.float32))

@@ -50,10 +50,10 @@ def absent_at(env: PlainInfos) -> int:
 
 
 @pytest.mark.parametrize("observation", ["flat", "dict"])
-def test_a_reset_has_everybody_where_that_is_asked(observation: str) -> None:
+def test_a_reset_has_absent_vehicles_on_request(observation: str) -> None:
     plain, full = (
-        PlainInfos(coopenv.parallel_env("urban_crossing", observation=observation), everybody=everybody)
-        for everybody in (False, True)
+        PlainInfos(coopenv.parallel_env("urban_crossing", observation=observation), with_absent=with_absent)
+        for with_absent in (False, True)
     )
     seed = absent_at(plain)
     expected, (observations, infos) = plain.reset(seed=seed), full.reset(seed=seed)

@@ -33,7 +33,7 @@ def crossing(**overrides: Any) -> PettingZooWrapper:
 
 def test_vehicles_may_be_absent() -> None:
     """In `urban_crossing` they are, in some episodes; their rows are masked."""
-    world = PlainInfos(coopenv.parallel_env("urban_crossing"), everybody=True)
+    world = PlainInfos(coopenv.parallel_env("urban_crossing"), with_absent=True)
     absent = 0
     for seed in range(4):
         env = PettingZooWrapper(world, done_on_any=False, use_mask=True, return_state=True, seed=seed)
