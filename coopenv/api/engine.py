@@ -10,8 +10,8 @@ import warp as wp
 from coopenv.api.plugins import PlugIns
 from coopenv.api.report import Report
 from coopenv.api.reward import RewardFunction
-from coopenv.api.step_results import MEMORY
 from coopenv.api.terms.layout import observation_layout
+from coopenv.api.terms.results import MEMORY
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import simulation_of
 from coopenv.backends.tick_world import open_world

@@ -156,13 +156,15 @@ GROUPS = tuple(FIELDS)
 """Groups of fields of coopenv, in their order in an observation."""
 USUAL_GROUPS = ("estimate", "quality", "bearings", "odometry", "messages", "goal")
 """Those of a scenario that does not name any."""
-FUNCTIONS = "coopenv.api.terms.functions"
-"""Where the functions of coopenv's fields and reward terms stand, under the names of their rows."""
+VALUES = "coopenv.api.terms.values"
+"""Module that computes the values of the built-in fields and reward terms, in the order of their rows."""
 
 OBSERVATION_FIELDS = Registry(
     "observation field",
     {
-        name: ObservationField(function=f"{FUNCTIONS}:{name}", group=group, **dict(zip(COLUMNS, row, strict=False)))
+        name: ObservationField(
+            function=f"{VALUES}:{row[0]}_values", group=group, **dict(zip(COLUMNS, row, strict=False))
+        )
         for group, rows in FIELDS.items()
         for name, *row in rows
     },
@@ -170,7 +172,7 @@ OBSERVATION_FIELDS = Registry(
 REWARD_TERMS = Registry(
     "reward term",
     {
-        name: Term(function=f"{FUNCTIONS}:{name}", unit=unit, privileged=privileged, meaning=about)
+        name: Term(function=f"{VALUES}:reward_values", unit=unit, privileged=privileged, meaning=about)
         for name, unit, privileged, about in REWARDS
     },
 )

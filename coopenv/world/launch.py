@@ -99,11 +99,11 @@ class PerWorld:
     def part(self, start: int, stop: int) -> Any:
         """Return the argument for worlds start..stop-1, sharing memory."""
         if isinstance(self.value, wp.array):
-            return self.value[start:stop]
+            return self.value[start:stop] if self.value.size > 0 else self.value  # Warp cannot slice what is empty
         part = type(self.value)()
         for name in self.value._cls.vars:
             value = getattr(self.value, name)
-            cut = isinstance(value, wp.array) and value.size > 0  # Warp cannot slice what is empty
+            cut = isinstance(value, wp.array) and value.size > 0
             setattr(part, name, value[start:stop] if cut else value)
         return part
 

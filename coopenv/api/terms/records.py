@@ -1,17 +1,16 @@
-"""What the functions of terms are given: small records of one vehicle at the end of a decision.
+"""Records from which terms are computed: one vehicle at the end of a decision.
 
-Numbers are float32, as observations and rewards are, whatever the precision of the world. A field of the observation
-gets `Ego`, and `Target` or `Neighbour`: nothing in them depends on the truth but through what the vehicle measures,
-hears and does. Only rewards and terminations may ask for `Truth` too, and are then privileged. A term that keeps to its
-arguments therefore cannot leak truth into an observation.
+Numbers are float32 in worlds of either precision. A field of the observation takes `Ego`, and `Target`, `Neighbour` or
+`MapLandmark`. These depend on the truth only through measurements, received messages and actions. Only reward terms and
+terminations may take `Truth`, and are then privileged. Observations therefore cannot leak truth.
 """
 
 from typing import Any
 
 import warp as wp
 
-from coopenv.api.terms.way import metres, seen_from_estimate
-from coopenv.world.camera import VISIBLE, body_bearing
+from coopenv.api.terms.geometry import Nearest, expected_in_view, metres, route_from_estimate
+from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.collision import UNDER_WAY
 from coopenv.world.command import ACCELERATION, SPEED, STEERING
 from coopenv.world.device_function import device_function
@@ -20,7 +19,7 @@ from coopenv.world.route import goal_distance, route_length
 from coopenv.world.v2x import fresh
 
 NEVER = wp.constant(wp.float64(1.0e9))
-"""Age of what has never been measured or heard, s."""
+"""Age without any measurement or message, s."""
 
 LOG10_E = wp.constant(0.4342944819032518)
 
@@ -29,7 +28,7 @@ mat66 = wp.types.matrix((6, 6), wp.float32)
 
 @wp.struct
 class Ego:
-    """What the vehicle itself knows."""
+    """The vehicle's own estimate, odometry, action and route."""
 
     time: wp.float32  # s since the reset
     elapsed: wp.float32  # s since the last decision
@@ -44,10 +43,10 @@ class Ego:
     heading_std: wp.float32  # rad, of the turn about the body's z axis
     uncertainty_threshold: wp.float32  # m, of [reward]
     uncertainty_cap: wp.float32  # m, of [reward]
-    metres_gained: wp.float32  # of its way in this decision, beyond the farthest point so far, by the estimate
-    metres_missed: wp.float32  # of its way never driven, in the step that ends its episode without an arrival; else 0
+    metres_gained: wp.float32  # of its route in this decision, beyond the furthest point so far, by the estimate
+    metres_missed: wp.float32  # of its route never driven, in the step that ends its episode without an arrival; else 0
     gramian_min_eigenvalue: wp.float32  # of the sliding observability Gramian
-    soft_observability: wp.float32  # log10 of the floor + that
+    soft_observability: wp.float32  # log10 of the floor + that eigenvalue
     observability_floor: wp.float32  # log10 of the floor, of [reward]
     observability_level: wp.float32  # log10, of [reward]
     targets_in_view: wp.int32
@@ -57,14 +56,14 @@ class Ego:
     odometry_age: wp.float32  # s
     action: wp.vec3  # of this decision, [-1, 1]; the third entry is 0 where cameras do not pan
     effort: wp.float32  # |action|^2
-    command: wp.vec3  # what it asked for: speed m/s, steering rad, acceleration m/s^2
+    command: wp.vec3  # the action as speed m/s, steering rad, acceleration m/s^2
     steering: wp.float32  # rad, positive to the left
     pan: wp.float32  # of the camera, rad, positive to the left
     time_left: wp.float32  # share of the horizon
-    route_offset: wp.float32  # m to the left of its way, by the estimate
-    route_heading: wp.float32  # rad, estimated heading less that of its way
-    route_left: wp.float32  # m of its way to the goal
-    route_ahead: wp.vec4  # rad to the left, where its way is 1, 2, 4 and 8 steps ahead
+    route_offset: wp.float32  # m to the left of its route, by the estimate
+    route_heading: wp.float32  # rad, estimated heading minus the heading of its route
+    route_left: wp.float32  # m along its route to the goal
+    route_ahead: wp.vec4  # rad to the left, directions of its route 1, 2, 4 and 8 steps ahead
     route_step: wp.float32  # m
     top_speed: wp.float32  # m/s
     goal: wp.vec3  # m, seen from the estimate, body; 0 without a goal
@@ -74,7 +73,7 @@ class Ego:
 
 @wp.struct
 class Truth:
-    """What only a simulation knows; NaN (numbers: 0) where a recording does not."""
+    """The true state; NaN (numbers: 0) in a recording without it."""
 
     position: wp.vec3  # m, map
     rotation: wp.mat33  # body to map
@@ -84,13 +83,13 @@ class Truth:
     orientation_error: wp.float32  # deg, geodesic
     nees: wp.float32
     goal_distance: wp.float32  # m, horizontal
-    progress: wp.float32  # m less way to the goal, along a drawn route, than at the last decision; 0 without a goal
+    progress: wp.float32  # decrease of the remaining route in this decision, m; 0 without a goal
     contact: wp.bool  # touching a building or another body now
 
 
 @wp.struct
 class Target:
-    """What the vehicle knows of a landmark or another vehicle by its camera."""
+    """A landmark or another vehicle as measured by the camera."""
 
     index: wp.int32  # landmarks first, then vehicles
     bearing: wp.vec3  # unit vector camera to target, optical frame, last measured; 0: never
@@ -100,16 +99,30 @@ class Target:
 
 @wp.struct
 class Neighbour:
-    """What the vehicle knows of another vehicle by its messages, 0 where none is at hand, and by its camera."""
+    """Another vehicle by its last message (0 without one) and as measured by the camera."""
 
     index: wp.int32  # of the vehicle
-    heard: wp.bool  # a message is at hand and not stale
-    position: wp.vec3  # m, sender's estimate seen from one's own, body
-    rotation: wp.mat33  # sender's body to one's own estimated body
+    received: wp.bool  # there is a message and it is not stale
+    position: wp.vec3  # m, sender's estimate relative to the vehicle's own, body
+    rotation: wp.mat33  # sender's body to the vehicle's own estimated body
     age: wp.float32  # s since it was sent
     bearing: wp.vec3  # unit vector camera to the vehicle, body, last measured; 0: never
     in_view: wp.bool  # measured in this frame
     bearing_age: wp.float32  # s since measured
+
+
+@wp.struct
+class MapLandmark:
+    """One of the landmarks nearest to the vehicle's own estimate; 0 beyond the end of the map."""
+
+    index: wp.int32  # of the landmark; -1: there is none
+    exists: wp.bool
+    position: wp.vec3  # m, relative to the estimate, body
+    distance: wp.float32  # m, horizontal, from the estimate
+    expected: wp.bool  # visible from the estimate: in range, in the image, not occluded
+    in_view: wp.bool  # measured in this frame
+    bearing: wp.vec3  # unit vector camera to landmark, body, last measured; 0: never
+    age: wp.float32  # s since measured
 
 
 @wp.func
@@ -119,14 +132,14 @@ def log10(value: wp.float32) -> wp.float32:
 
 
 @wp.func
-def known(value: Any) -> wp.float32:
-    """Return a quantity of truth, 0 where a recording does not know it."""
+def zero_if_unknown(value: Any) -> wp.float32:
+    """Return a quantity of the truth, 0 in a recording without it."""
     return wp.where(wp.isfinite(value), wp.float32(value), 0.0)
 
 
 @wp.func
 def seconds_since(now: int, then: int, rate: wp.float64) -> wp.float32:
-    """Return the age in s of a measurement or message by its tick; very old if there is none."""
+    """Return the age in s of a measurement or message by its tick; `NEVER` without one."""
     return wp.float32(wp.where(then < 0, NEVER, wp.float64(now - then) / rate))
 
 
@@ -138,11 +151,11 @@ def odometry_age(samples: int, time: wp.float64, rate: wp.float64) -> wp.float32
 
 
 @device_function
-def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, way: Any):
-    """Return the records of a vehicle: what it knows, and what is true.
+def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, remaining: Any, route: bool):
+    """Return the records `Ego` and `Truth` of a vehicle.
 
-    `results` holds how good its estimate is, and what was so after the last decision; `way` is left to its goal, m.
-    One function for both, as model, state and results are handed over by value, over which compilers take their time.
+    `results` holds the quality of its estimate and the values after the last decision; `remaining` is the length of its
+    route that is left, m. Without `route`, the fields `route_offset` to `route_ahead` stay 0.
     """
     ego = Ego()
     tick = state.tick[world]
@@ -190,11 +203,12 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     ego.pan = wp.float32(state.pan[world, vehicle])
     ego.steering = wp.float32(state.steering[world, vehicle])
     ego.time_left = 1.0 - wp.float32(tick) / wp.float32(model.horizon_ticks)
-    offset, turn, left, ahead = seen_from_estimate(model, state, world, vehicle)
-    ego.route_offset = wp.float32(offset)
-    ego.route_heading = wp.float32(turn)
-    ego.route_left = wp.float32(left)
-    ego.route_ahead = ahead
+    if route:
+        offset, turn, left, ahead = route_from_estimate(model, state, world, vehicle)
+        ego.route_offset = wp.float32(offset)
+        ego.route_heading = wp.float32(turn)
+        ego.route_left = wp.float32(left)
+        ego.route_ahead = ahead
     ego.route_step = wp.float32(model.route_step)
     ego.top_speed = wp.max(wp.float32(model.dynamics[vehicle].max_speed), 1.0e-3)
     if model.scene.goal_radius[vehicle] > p.dtype(0.0):
@@ -209,15 +223,15 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     truth.rotation = wp.mat33(state.rotation[world, agent])
     truth.velocity = wp.vec3(state.velocity[world, agent])
     truth.angular_velocity = wp.vec3(state.angular_velocity[world, agent])
-    truth.position_error = known(results.position_error[world, vehicle])
-    truth.orientation_error = known(results.orientation_error[world, vehicle])
-    truth.nees = known(results.nees[world, vehicle])
-    truth.goal_distance = known(goal_distance(model, state, world, vehicle))
+    truth.position_error = zero_if_unknown(results.position_error[world, vehicle])
+    truth.orientation_error = zero_if_unknown(results.orientation_error[world, vehicle])
+    truth.nees = zero_if_unknown(results.nees[world, vehicle])
+    truth.goal_distance = zero_if_unknown(goal_distance(model, state, world, vehicle))
     if model.scene.goal_radius[vehicle] > p.dtype(0.0):
-        progress = results.last_way[world, vehicle] - way
-        if ego.arrived > 0 and ego.outcome == UNDER_WAY:  # on a new route now, the old one is done
+        progress = results.last_remaining[world, vehicle] - remaining
+        if ego.arrived > 0 and ego.outcome == UNDER_WAY:  # on a new route now
             progress += route_length(state, world, vehicle)
-        truth.progress = known(progress)
+        truth.progress = zero_if_unknown(progress)
     truth.contact = state.collided[world, vehicle] != 0
     return ego, truth
 
@@ -239,9 +253,9 @@ def neighbour_record(model: Any, state: Any, world: int, vehicle: int, sender: i
     neighbour = Neighbour()
     now = state.tick[world]
     neighbour.index = sender
-    neighbour.heard = fresh(model, state, world, vehicle, sender, now)
+    neighbour.received = fresh(model, state, world, vehicle, sender, now)
     neighbour.age = wp.float32(NEVER)
-    if neighbour.heard:
+    if neighbour.received:
         Rt = wp.transpose(state.estimate_rotation[world, vehicle])
         p = state.estimate_position[world, vehicle]
         neighbour.position = wp.vec3(Rt * state.inbox_position[world, vehicle, sender] - p)
@@ -252,3 +266,23 @@ def neighbour_record(model: Any, state: Any, world: int, vehicle: int, sender: i
     neighbour.in_view = state.sight[world, vehicle, target] == VISIBLE
     neighbour.bearing_age = seconds_since(now, state.bearing_tick[world, vehicle, target], model.camera_rate)
     return neighbour
+
+
+@device_function
+def map_record(model: Any, state: Any, world: int, vehicle: int, place: Nearest) -> MapLandmark:
+    """Return the record of a landmark of the map."""
+    landmark = MapLandmark()
+    landmark.index = place.index
+    landmark.age = wp.float32(NEVER)
+    if place.index >= 0:
+        point = marker_position(model, state, world, place.index)
+        Rt = wp.transpose(state.estimate_rotation[world, vehicle])
+        landmark.exists = True
+        landmark.position = wp.vec3(Rt * point - state.estimate_position[world, vehicle])
+        landmark.distance = place.distance
+        landmark.expected = expected_in_view(model, state, world, vehicle, point)
+        landmark.in_view = state.sight[world, vehicle, place.index] == VISIBLE
+        landmark.bearing = wp.vec3(body_bearing(model, state, world, vehicle, place.index))
+        then = state.bearing_tick[world, vehicle, place.index]
+        landmark.age = seconds_since(state.tick[world], then, model.camera_rate)
+    return landmark

@@ -163,7 +163,7 @@ def nearest(ego, target):
     return target.age
 
 def heard(ego, neighbour):
-    return neighbour.heard
+    return neighbour.received
 
 def late(ego):
     return ego.time > 0.25

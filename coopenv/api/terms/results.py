@@ -1,0 +1,305 @@
+"""The results of a step: observation, reward, flags, quality of the estimate; one kernel per precision.
+
+The kernel computes the values of all built-in terms and reads from a table which of them an observation holds. User
+terms have kernels of their own (`own.py`), which read the records that this kernel writes for them.
+"""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from coopenv.api.terms.geometry import Nearest, estimated_progress, furthest_so_far, next_nearest
+from coopenv.api.terms.layout import Layout, entries_of, included_fields
+from coopenv.api.terms.records import (
+    Ego,
+    MapLandmark,
+    Neighbour,
+    Target,
+    Truth,
+    map_record,
+    neighbour_record,
+    own_records,
+    target_record,
+)
+from coopenv.api.terms.values import (
+    DEGREES,
+    SOURCES,
+    landmark_values,
+    neighbour_values,
+    reward_values,
+    target_values,
+    vehicle_values,
+)
+from coopenv.estimation.so3 import rotation_angle
+from coopenv.scenario import Scenario
+from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
+from coopenv.world.collision import UNDER_WAY
+from coopenv.world.device_function import device_function
+from coopenv.world.launch import near_inlining
+from coopenv.world.precision import Precision
+from coopenv.world.quality import (
+    cholesky_of,
+    gramian_smallest_eigenvalue,
+    log_determinant,
+    normalised_error_squared,
+    observer_error,
+    position_variance,
+    targets_in_view,
+)
+from coopenv.world.records import array
+from coopenv.world.route import remaining_way
+from coopenv.world.saved_state import FLAG, NUMBER, whole
+
+
+@cache
+def results_struct(p: Precision) -> Any:
+    """Return the Warp struct of step results in one precision."""
+    scalar = p.scalar
+
+    @wp.struct
+    class StepResults:
+        """W worlds, N vehicles, D observation entries, K reward terms."""
+
+        observation: array("WND", wp.float32)
+        terms: array("WNK", wp.float32)
+        reward: array("WN", wp.float32)  # 0 for vehicles that had ended before, and right after a reset
+        alive: array("WN", wp.bool)  # had not ended before this step
+        terminated: array("WN", wp.bool)  # ended in this step
+        truncated: array("WN", wp.bool)  # the world is over and this vehicle has not just terminated
+        over: array("W", wp.int32)  # 1: at the horizon, or every vehicle has ended
+        position_error: array("WN", scalar)  # m
+        orientation_error: array("WN", scalar)  # deg
+        nees: array("WN", scalar)
+        log_determinant: array("WN", scalar)  # of P
+        position_std: array("WN", scalar)  # m, sqrt of the trace of the position's covariance in the map
+        gramian_min_eigenvalue: array("WN", scalar)
+        targets_in_view: array("WN", wp.int32)
+        last_remaining: array("WN", scalar)  # m of the route to the goal, at the last step
+        last_ended: array("WN", wp.int32)  # at the last step
+        last_tick: array("WN", wp.int32)  # of the last step
+        last_arrivals: array("WN", wp.int32)  # at the last step
+        last_log_determinant: array("WN", scalar)  # at the last step
+        furthest: array("WN", scalar)  # m, largest estimated progress along the route
+
+    return StepResults
+
+
+MEMORY = {
+    "last_remaining": NUMBER._replace(of_truth=True),
+    "last_ended": whole(-1, "last_outcome"),
+    "last_arrivals": whole(0, 10**8),
+    "last_tick": whole(0, "tick"),
+    "last_log_determinant": NUMBER,
+    "furthest": NUMBER,
+    "over": FLAG,
+}
+"""Fields that carry over from one step to the next, and their rules in a saved state."""
+
+
+@wp.struct
+class Records:
+    """The records that user terms read; without such terms the arrays are empty."""
+
+    ego: array("WN", Ego)
+    truth: array("WN", Truth)
+    target: array("WNT", Target)
+    neighbour: array("WNM", Neighbour)
+    landmark: array("WNL", MapLandmark)
+
+
+@wp.struct
+class Entry:
+    """One number of an observation that a built-in field computes."""
+
+    source: wp.int32  # its place among the values of its kind of record
+    place: wp.int32  # in the observation, for the first target, neighbour or landmark
+    stride: wp.int32  # between the places for one and for the next
+    center: wp.float32  # the value that reads 0
+    factor: wp.float32  # 1 / scale
+
+
+@wp.struct
+class Table:
+    """The built-in terms of a scenario; user terms need records only."""
+
+    vehicle: wp.array(dtype=Entry)
+    target: wp.array(dtype=Entry)
+    neighbour: wp.array(dtype=Entry)
+    landmark: wp.array(dtype=Entry)
+    weights: wp.array(dtype=wp.float32)  # of the built-in reward terms
+    route: wp.bool  # whether anything needs the route as seen from the estimate
+    clearance: wp.bool  # whether the closest approach to neighbours is asked for
+    targets: wp.int32  # number of records of each kind that are needed
+    neighbours: wp.int32
+    landmarks: wp.int32
+
+
+def results_table(scenario: Scenario, layout: Layout, device: str) -> Any:
+    """Return the table of the built-in terms of a scenario; fields of the user only mark the records they need."""
+    entries: dict[str, list[tuple[float, ...]]] = {"vehicle": [], "target": [], "neighbour": [], "landmark": []}
+    needed = dict.fromkeys(entries, 0)
+    groups, own = set(), False
+    for name, row in included_fields(scenario).items():
+        field, kept = layout[name], entries_of(row, scenario)
+        needed[row.per] = field.shape[0] if row.per != "vehicle" else 0
+        groups.add(field.group)
+        if name not in OBSERVATION_FIELDS.built_in:
+            own = True
+            continue
+        entries[row.per] += [
+            (SOURCES[name] + entry, field.start + k, len(kept), field.center, 1.0 / field.scale)
+            for k, entry in enumerate(kept)
+        ]
+    weights = scenario.reward.by_name
+    own = own or bool(scenario.termination.own) or len(weights) > len(REWARD_TERMS.built_in)
+    table = Table()
+    for per, rows in entries.items():
+        setattr(table, per, wp.array(np.array(rows, dtype=Entry.numpy_dtype()), dtype=Entry, device=device))
+    built_in = [weights[name] for name in REWARD_TERMS.built_in]
+    table.weights = wp.array(built_in, dtype=wp.float32, device=device)
+    table.clearance = "clearance" in groups
+    table.route = own or table.clearance or "route" in groups
+    table.targets, table.neighbours, table.landmarks = (needed[per] for per in ("target", "neighbour", "landmark"))
+    return table
+
+
+@device_function
+def store_for_next_step(state: Any, results: Any, world: int, vehicle: int, remaining: Any, furthest: Any, tick: int):
+    """Keep what the next step compares with; `assess` comes before."""
+    results.last_arrivals[world, vehicle] = state.arrivals[world, vehicle]
+    results.last_log_determinant[world, vehicle] = results.log_determinant[world, vehicle]
+    results.furthest[world, vehicle] = furthest
+    results.last_remaining[world, vehicle] = remaining
+    results.last_ended[world, vehicle] = state.ended[world, vehicle]
+    results.last_tick[world, vehicle] = tick
+
+
+@device_function
+def assess(model: Any, state: Any, results: Any, world: int, vehicle: int):
+    """Compare the estimate with the truth and with its own covariance."""
+    agent = model.landmarks + vehicle
+    R = state.rotation[world, agent]
+    position = state.position[world, agent]
+    R_hat = state.estimate_rotation[world, vehicle]
+    p_hat = state.estimate_position[world, vehicle]
+    angle = rotation_angle(wp.transpose(R_hat) * R)
+    results.position_error[world, vehicle] = wp.length(position - R_hat * p_hat)
+    results.orientation_error[world, vehicle] = angle * type(angle)(DEGREES)
+    I11, L21, I22 = cholesky_of(state.covariance[world, vehicle])
+    e1, e2 = observer_error(R, position, R_hat, p_hat)
+    results.nees[world, vehicle] = normalised_error_squared(I11, L21, I22, e1, e2)
+    results.log_determinant[world, vehicle] = log_determinant(I11, I22)
+    results.position_std[world, vehicle] = wp.sqrt(position_variance(state.covariance[world, vehicle], p_hat))
+    results.gramian_min_eigenvalue[world, vehicle] = gramian_smallest_eigenvalue(model, state, world, vehicle)
+    results.targets_in_view[world, vehicle] = targets_in_view(model, state, world, vehicle)
+
+
+@device_function
+def is_over(model: Any, state: Any, world: int) -> bool:
+    """Return whether a world is at its horizon, without further ticks, or has no vehicle under way."""
+    if state.tick[world] >= model.horizon_ticks or state.exhausted[world] != 0:
+        return True
+    for vehicle in range(model.vehicles):
+        if state.ended[world, vehicle] == UNDER_WAY:
+            return False
+    return True
+
+
+@device_function
+def set_flags(results: Any, world: int, vehicle: int, ended: int, over: bool, horizon_ticks: int):
+    """Write which vehicles were under way and which have just ended, and whether the world is over."""
+    # Over since the last step: no reward before a reset (each thread reads the memory of its own vehicle only).
+    waiting = results.last_tick[world, vehicle] >= horizon_ticks
+    alive = results.last_ended[world, vehicle] == UNDER_WAY and not waiting
+    terminated = alive and ended != UNDER_WAY
+    results.alive[world, vehicle] = alive
+    results.terminated[world, vehicle] = terminated
+    results.truncated[world, vehicle] = over and not terminated
+    if vehicle == 0:
+        results.over[world] = wp.where(over, 1, 0)
+
+
+@wp.func
+def write_entries(
+    out: wp.array3d(dtype=wp.float32), world: int, vehicle: int, n: int, entries: wp.array(dtype=Entry), values: Any
+):
+    """Write the entries of the n-th record, (value - center) / scale, clipped to [-1, 1]."""
+    for k in range(entries.shape[0]):
+        entry = entries[k]
+        scaled = (values[entry.source] - entry.center) * entry.factor
+        out[world, vehicle, entry.place + n * entry.stride] = wp.clamp(scaled, -1.0, 1.0)
+
+
+def step_results(
+    model: Any,
+    state: Any,
+    table: Table,
+    records: Records,
+    results: Any,
+    fresh: wp.array(dtype=wp.int32),
+    chosen: wp.array(dtype=wp.int32),
+):
+    """Fill the results of every vehicle of the chosen worlds, one thread per (world, vehicle).
+
+    `fresh` marks worlds that have just been reset: their memory of the last episode is cleared, and the reward is 0.
+    """
+    world, vehicle = wp.tid()
+    if chosen[world] == 0:
+        return
+    remaining = remaining_way(model, state, world, vehicle)
+    assess(model, state, results, world, vehicle)
+    if fresh[world] != 0:
+        progress, _ = estimated_progress(model, state, world, vehicle)
+        store_for_next_step(state, results, world, vehicle, remaining, progress, 0)
+    set_flags(results, world, vehicle, state.ended[world, vehicle], is_over(model, state, world), model.horizon_ticks)
+    ego, truth = own_records(model, state, results, world, vehicle, remaining, table.route)
+    furthest = furthest_so_far(state, results, world, vehicle) + type(remaining)(ego.metres_gained)
+    store_for_next_step(state, results, world, vehicle, remaining, furthest, state.tick[world])
+    if records.ego.shape[1] > 0:
+        records.ego[world, vehicle] = ego
+        records.truth[world, vehicle] = truth
+
+    terms = reward_values(ego, truth)
+    total = float(0.0)
+    for k in range(table.weights.shape[0]):
+        results.terms[world, vehicle, k] = terms[k]
+        total += table.weights[k] * terms[k]
+    earns = results.alive[world, vehicle] and fresh[world] == 0
+    results.reward[world, vehicle] = wp.where(earns, total, 0.0)
+
+    write_entries(results.observation, world, vehicle, 0, table.vehicle, vehicle_values(ego))
+    for n in range(table.targets):
+        target = target_record(model, state, world, vehicle, n)
+        write_entries(results.observation, world, vehicle, n, table.target, target_values(target))
+        if records.target.shape[2] > 0:
+            records.target[world, vehicle, n] = target
+    for n in range(table.neighbours):
+        sender = wp.where(n >= vehicle, n + 1, n)
+        neighbour = neighbour_record(model, state, world, vehicle, sender)
+        values = neighbour_values(ego, neighbour, table.clearance)
+        write_entries(results.observation, world, vehicle, n, table.neighbour, values)
+        if records.neighbour.shape[2] > 0:
+            records.neighbour[world, vehicle, n] = neighbour
+    nearest = Nearest(-1, -1.0)
+    for n in range(table.landmarks):
+        nearest = next_nearest(model, state, world, vehicle, nearest)
+        landmark = map_record(model, state, world, vehicle, nearest)
+        write_entries(results.observation, world, vehicle, n, table.landmark, landmark_values(landmark))
+        if records.landmark.shape[2] > 0:
+            records.landmark[world, vehicle, n] = landmark
+
+
+def write_records(model: Any, state: Any, records: Records, results: Any):
+    """Write the records `Ego` and `Truth` before the user's conditions are checked, one thread per (world, vehicle)."""
+    world, vehicle = wp.tid()
+    assess(model, state, results, world, vehicle)
+    remaining = remaining_way(model, state, world, vehicle)
+    ego, truth = own_records(model, state, results, world, vehicle, remaining, True)
+    records.ego[world, vehicle] = ego
+    records.truth[world, vehicle] = truth
+
+
+for _kernel in (step_results, write_records):
+    _kernel.options = near_inlining()  # type: ignore[attr-defined]
