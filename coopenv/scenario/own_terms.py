@@ -77,7 +77,7 @@ def register_observation(
     Args:
         name: an identifier.
         function: of the record `Ego`, and of `Target`, `Neighbour` or `MapLandmark` if there is one value for each of
-            these (`coopenv.api.terms.records`, `map_view`); returns a number, or a vector of `size`. A Warp function,
+            these (`coopenv.api.terms.records`); returns a number, or a vector of `size`. A Warp function,
             or a plain one that Warp can compile. No truth is at hand in these records.
         per: "vehicle": one value; "target": one for every landmark and vehicle; "neighbour": one for every other
             vehicle; "landmark": one for each of the landmarks of the map that are nearest by the vehicle's estimate.
