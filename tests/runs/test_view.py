@@ -330,7 +330,7 @@ def test_a_port_that_is_taken_is_told() -> None:
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        with pytest.raises(CoopenvError, match=f"--port {port}: somebody else listens there"):
+        with pytest.raises(CoopenvError, match=f"--port {port}: another program listens there"):
             free_port("127.0.0.1", port)
     assert free_port("127.0.0.1", port) == port
     with pytest.raises(CoopenvError, match=r"--host 192\.0\.2\.1: is no address of this computer"):

@@ -51,7 +51,7 @@ def _obstacle(host: str, port: int) -> str:
     except OSError as error:
         if error.errno == errno.EADDRNOTAVAIL:
             raise CoopenvError(f"--host {host}: is no address of this computer") from None
-        return "somebody else listens there; name another one"
+        return "another program listens there; name another one"
     return ""
 
 
