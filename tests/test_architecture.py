@@ -31,26 +31,31 @@ ROOMS = (
 )
 """From the ground up: a room imports from those below it and from itself. `docs/architecture.md` shows the same."""
 
-MODULES = sorted(PACKAGE.rglob("*.py"))
-
-
 def name_of(path: Path) -> str:
     """Return a file's module, a package's being that of its `__init__`."""
     parts = ["coopenv", *path.relative_to(PACKAGE).with_suffix("").parts]
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
+MODULES = {name_of(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+
+
 def imports_of(path: Path) -> set[str]:
     """Return every module of the package that a file imports, inside functions and for typing too."""
-    known = {name_of(module) for module in MODULES}
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             whole = {f"{node.module}.{alias.name}" for alias in node.names}
-            found |= {name if name in known else node.module for name in whole}
+            found |= {name if name in MODULES else node.module for name in whole}
     return {name for name in found if name.split(".")[0] == "coopenv"}
+
+
+@pytest.fixture(scope="module")
+def imports() -> dict[str, set[str]]:
+    """What every module imports."""
+    return {name: imports_of(path) for name, path in MODULES.items()}
 
 
 def floor_of(module: str) -> int:
@@ -63,13 +68,16 @@ def floor_of(module: str) -> int:
     return max(fitting)[1]
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_imports_point_downwards(path: Path) -> None:
-    here = name_of(path)
-    above = sorted(other for other in imports_of(path) if floor_of(other) > floor_of(here))
-    assert not above, f"{here} imports from a room above it: {', '.join(above)}"
+def test_imports_point_downwards(imports: dict[str, set[str]]) -> None:
+    floors = {module: floor_of(module) for module in imports}
+    upwards = [
+        f"{here} imports {other} from a room above it"
+        for here, found in imports.items()
+        for other in sorted(found)
+        if (floors[other] if other in floors else floor_of(other)) > floors[here]
+    ]
+    assert not upwards, upwards
 
 
-def test_no_module_imports_itself_through_others() -> None:
-    known = {name_of(path) for path in MODULES}
-    TopologicalSorter({name_of(path): imports_of(path) & known for path in MODULES}).prepare()
+def test_no_module_imports_itself_through_others(imports: dict[str, set[str]]) -> None:
+    TopologicalSorter({name: found & MODULES.keys() for name, found in imports.items()}).prepare()
