@@ -31,6 +31,7 @@ ROOMS = (
 )
 """From the ground up: a room imports from those below it and from itself. `docs/architecture.md` shows the same."""
 
+
 def name_of(path: Path) -> str:
     """Return a file's module, a package's being that of its `__init__`."""
     parts = ["coopenv", *path.relative_to(PACKAGE).with_suffix("").parts]

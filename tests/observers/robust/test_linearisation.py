@@ -23,8 +23,8 @@ from tests.helpers.robust_ticks import (
 )
 
 AT: Pose = displaced((np.eye(3), np.zeros(3)), np.array([0.3, -0.2, 1.1, 0.5, -0.4, 0.2]))
-SLOW = 20.0
-"""s between frames: no error is the same for two of them."""
+SLOW = 0.15
+"""s between frames: no error is the same for two of them, and landmarks alone are not solved for at the first."""
 
 
 def left_out(pose: Pose, point: np.ndarray, V: np.ndarray) -> float:
@@ -56,13 +56,13 @@ def noise_of(P: np.ndarray, dt: float = SLOW) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_variance_of_what_is_not_linear_counts_as_noise(seed: int) -> None:
-    """The bound s^2 t^2 / d^4 of it: at least what there is; more where the errors along and across correlate."""
+    """It is counted as s^2 t^2 / d^4 of deviations s along and t across: to leading order of independent ones."""
     P = covariance(np.random.default_rng(seed), 1e-4, 0.3)
     expected = np.array([left_out(AT, point, P[3:, 3:]) for point in LANDMARKS])
     P[3:, 3:] -= NOISE.odometry(SLOW)[3] * np.eye(3)  # what is added before the frame
     P[:3, 3:] = P[3:, :3] = 0.0
     ratio = noise_of(P) / expected
-    assert (ratio > 1.0).all() and (ratio < 16.0).all() and np.median(ratio) < 4.0, ratio
+    assert (ratio > 0.6).all() and (ratio < 1.5).all(), ratio
 
 
 def test_it_grows_with_the_fourth_power_of_the_uncertainty() -> None:
@@ -88,5 +88,6 @@ def test_that_of_a_sender_counts_by_the_errors_of_both() -> None:
         b = direction(AT, there[1] + there[0] @ MARKER)
         observer.update(tick(observer, 1, bearings={6: b}, messages={1: (sender.message(), 0.0)}))
         noise.append(observer.memory.line["noise"][0] - NOISE.bearing**2)
+    assert noise[0] > 0.0
     assert_allclose(noise[1], noise[0], rtol=0.05)
     assert_allclose(noise[2], 4.0 * noise[0], rtol=0.05)
