@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from scipy.stats import ortho_group
 
 from coopenv.estimation import linalg
-from tests.helpers.warp_calls import DTYPES, EPSILON, call
+from tests.helpers.warp_calls import DTYPES, EPSILON, WIDE, call
 
 SPECTRA = {
     "random": np.random.default_rng(0).uniform(0.1, 10.0, (60, 6)),
@@ -69,7 +69,7 @@ REPEATED = {
 }
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 @pytest.mark.parametrize("name", REPEATED)
 def test_repeated_eigenvalues_of_many_matrices(name: str, dtype: str) -> None:
     """20,000 matrices per spectrum; a solver that turns within a cluster for ever fails for 1 to 10 of 10,000."""
@@ -95,7 +95,7 @@ def test_eigenvalues_of_matrices_with_zeros() -> None:
     assert_allclose(np.sort(np.diagonal(D, axis1=1, axis2=2), axis=1), np.linalg.eigvalsh(M), atol=1e-15, rtol=1e-14)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 @pytest.mark.parametrize("name", SPECTRA)
 def test_smallest_eigenvalue(name: str, dtype: str) -> None:
     M = matrices(name, dtype)

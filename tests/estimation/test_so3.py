@@ -11,7 +11,7 @@ from scipy.integrate import quad_vec
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import so3
-from tests.helpers.warp_calls import DTYPES, EPSILON, call
+from tests.helpers.warp_calls import DTYPES, EPSILON, WIDE, call
 
 ANGLES = np.concatenate(
     [
@@ -104,7 +104,7 @@ def test_angle_between_near_rotations() -> None:
         assert_allclose(between, angle, atol=1e-14 if angle < 1 else 1e-12, rtol=1e-5)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_quaternion_vector_near_half_turns(dtype: str) -> None:
     angles = np.concatenate([ANGLES, 2 * np.arccos([0.1 + 1e-9, 0.1 - 1e-9, 0.09, 0.11])])
     w, angle = turns(angles)
@@ -129,7 +129,7 @@ def test_quaternion_vector_is_scipys(q: tuple[float, float, float, float]) -> No
     assert near < 1e-14
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_orthonormalise_removes_the_first_order(dtype: str) -> None:
     rng = np.random.default_rng(2)
     R = Rotation.random(100, rng).as_matrix()

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike
 from coopenv.world.launch import start_warp
 
 DTYPES = ("float64", "float32")
+WIDE = ("float64",)
+"""Of what a file holds against an oracle one test takes both precisions, the others this one."""
 EPSILON = {"float64": np.finfo(np.float64).eps, "float32": np.finfo(np.float32).eps}
 
 start_warp()

@@ -18,7 +18,7 @@ from coopenv.world import camera
 from coopenv.world.model import entry_struct
 from coopenv.world.precision import precision
 from tests.helpers.builders import landmark, quaternion_wxyz, run, scenario, start, vehicle
-from tests.helpers.warp_calls import DTYPES, call
+from tests.helpers.warp_calls import DTYPES, WIDE, call
 from tests.oracles import geometry, philox
 
 PIXY = {"fx": 213.161906, "fy": 213.521038, "cx": 154.841998, "cy": 114.98398}
@@ -335,7 +335,7 @@ def bearings(noise: dict[str, Any], worlds: int = 200, ticks: int = 50, dtype: s
     return b, place / np.linalg.norm(place, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_isotropic_noise(dtype: str) -> None:
     sigma = 0.005
     b, true = bearings({"model": "isotropic", "scale": sigma}, dtype=dtype)
@@ -380,7 +380,7 @@ def test_paper_noise_draw_by_draw(axis: tuple[float, float, float]) -> None:
             assert_allclose(state["bearing"][0, 0, j], expected / np.linalg.norm(expected), atol=1e-13)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_paper_noise_in_the_plane_of_the_axis_is_finite(dtype: str) -> None:
     """A target across the optical axis: the formula divides by zero there."""
     places = [(3.0, 0.0, 0.0), (0.0, -2.0, 0.0), (1.0, 1.0, 1e-9), (1.0, 2.0, -1e-9)]

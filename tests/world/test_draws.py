@@ -15,7 +15,7 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario
 from coopenv.scenario.randomness import PARAMETERS
 from tests.helpers.builders import constant, estimated_position, landmark, raw, reset, run, scenario, start, vehicle
-from tests.helpers.warp_calls import DTYPES
+from tests.helpers.warp_calls import DTYPES, WIDE
 
 WORLDS = 3000
 CELLS = 16
@@ -83,7 +83,7 @@ def test_held_out_routes_share_no_cell_with_those_for_training() -> None:
         assert_array_equal(parity(alone), expected)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_groups_fill_their_areas_and_lines_uniformly(dtype: str) -> None:
     made = scenario([vehicle()], landmark_groups=GROUPS, map={"origin": [1.0, 0.0, 0.0]})
     assert made.target_names[4:] == ["area_1", "area_2", "kerb_1", "vehicle_1"]
@@ -145,7 +145,7 @@ def test_one_vehicle_is_always_left_and_it_is_driven() -> None:
     assert (field(alone, "present")[:, -3:].sum(axis=1) == 1).all()
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_pace_scales_motion_twist_and_odometry(dtype: str) -> None:
     """A half turn of radius 1 m in 4 s at pace 1, then a rest."""
     turn = {

@@ -15,7 +15,7 @@ from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.estimation.outcomes import Sight
 from coopenv.world.state import LASTING_ERRORS
 from tests.helpers.builders import constant, run, same_bits, scenario, start, vehicle
-from tests.helpers.warp_calls import DTYPES
+from tests.helpers.warp_calls import DTYPES, WIDE
 
 WORLDS = 2000
 SPREAD = 4 / np.sqrt(2 * WORLDS)  # four standard errors of a standard deviation, relative
@@ -80,7 +80,7 @@ def test_slips_come_and_go() -> None:
     assert stats.kstest(angle / 0.4 + 0.5, "uniform").pvalue > 1e-4
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_odometry_reads_the_twist_with_its_errors(dtype: str) -> None:
     states = run(start(scenario([vehicle(motion=TURNING)], noise=ALL), range(40), dtype), 90)
     for before, after in pairwise(states):
@@ -108,7 +108,7 @@ def test_white_noise_is_the_same_with_and_without_lasting_errors() -> None:
     assert same_bits(biased["bearing"], plain["bearing"])
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_camera_looks_from_where_it_truly_is(dtype: str) -> None:
     place = [0.3, 0.0, 0.2]
     state = drawn({}, 20, dtype, position=place, **{**MISPLACED, "extrinsics_error": 0.3})
@@ -123,7 +123,7 @@ def test_camera_looks_from_where_it_truly_is(dtype: str) -> None:
         assert_allclose(seen, line / np.linalg.norm(line, axis=1, keepdims=True), atol=2e-6)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_a_longer_focal_length_spreads_the_image(dtype: str) -> None:
     """Pixels are f (1 + e) x, bearings are computed from them with f: the tangents to the optical axis are wider."""
     state = drawn({}, 20, dtype, focal_length_error=0.1)

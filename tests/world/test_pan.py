@@ -24,7 +24,7 @@ from coopenv.runs import record
 from coopenv.scenario import load_scenario
 from tests.helpers.builders import run, same_bits, scenario, simulate, start, vehicle
 from tests.helpers.four_way import FOUR_WAY
-from tests.helpers.warp_calls import DTYPES
+from tests.helpers.warp_calls import DTYPES, WIDE
 
 PAN = {"limit": 1.2, "rate": 0.9}
 DRIVEN = {"kind": "driven"}
@@ -75,7 +75,7 @@ def test_dead_time_holds_for_it_too() -> None:
     assert_allclose(angles, 0.9 / 60 * np.array([0, 0, 0, 0, 1, 2, 3]), atol=1e-12)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_it_sees_as_a_camera_that_is_mounted_so(dtype: str) -> None:
     """Same sights, and the same bearings in the body frame, distortion, pixels and mounting error included."""
     camera = {

@@ -9,7 +9,7 @@ from coopenv.base.errors import DeviceError
 from coopenv.scenario import Scenario
 from coopenv.world.world import World
 from tests.helpers.builders import command, constant, reset, same_bits, scenario, simulate, start, vehicle
-from tests.helpers.warp_calls import DTYPES
+from tests.helpers.warp_calls import DTYPES, WIDE
 
 State = dict[str, np.ndarray]
 
@@ -84,7 +84,7 @@ def test_large_seeds_differ_in_their_upper_half() -> None:
     assert not np.allclose(low["position"], high["position"])
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_reset_by_mask_touches_the_masked_only(dtype: str) -> None:
     world = start(noisy(), range(8), dtype)
     before = played(world, 60)
@@ -125,7 +125,7 @@ def test_the_next_episode_differs_and_is_reproducible() -> None:
     assert same_bits(twin.get_state()["estimate_position"], second["estimate_position"])
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_saved_state_continues_as_if_nothing_happened(dtype: str) -> None:
     world = start(noisy(), [1, 2], dtype)
     played(world, 90)
@@ -191,7 +191,7 @@ def test_a_world_that_was_reset_advances() -> None:
     assert world.get_state()["tick"].tolist() == [3, 3]
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_threads_change_nothing(dtype: str) -> None:
     found = []
     for threads in (1, 2, 5):

@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from tests.helpers.builders import errors, estimated_position, quaternion_wxyz, scenario, start, vehicle
-from tests.helpers.warp_calls import DTYPES
+from tests.helpers.warp_calls import DTYPES, WIDE
 
 WORLDS = 4000
 
@@ -41,7 +41,7 @@ def test_position_is_uniform_in_a_ball(dtype: str) -> None:
     assert abs(np.corrcoef(radius, direction[:, 2])[0, 1]) < 0.07
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_orientation_angle_is_uniform_in_its_range(dtype: str) -> None:
     w = turns(drawn({"orientation_angle": 0.8}, dtype)).as_rotvec()
     angle = np.linalg.norm(w, axis=1)
@@ -51,7 +51,7 @@ def test_orientation_angle_is_uniform_in_its_range(dtype: str) -> None:
         assert stats.kstest((w @ axis / angle + 1) / 2, "uniform").pvalue > 1e-3
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_uniform_orientation_is_haar(dtype: str) -> None:
     """The angle of a Haar rotation has the distribution (a - sin a) / pi; its axis is uniform; so are its columns."""
     turn = turns(drawn({"orientation_angle": "uniform"}, dtype))

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 import coopenv
 from tests.helpers.four_way import FOUR_WAY
 from tests.helpers.route_calls import places, points
-from tests.helpers.warp_calls import DTYPES, EPSILON
+from tests.helpers.warp_calls import DTYPES, EPSILON, WIDE
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -27,7 +27,7 @@ def test_a_straight_line_and_its_prolongations(dtype: str) -> None:
         assert_allclose(found[:, 2], angle, atol=1e-5)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_an_arc(dtype: str) -> None:
     """A chord of 1/20 of a radius is within 1/3200 of it from the arc; s is then right to within half of a chord."""
     radius, turn = 2.0, 3.0
@@ -46,7 +46,7 @@ def test_an_arc(dtype: str) -> None:
     assert_allclose(heading, at, atol=2.5e-3)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_the_place_is_the_nearest_one_of_a_crooked_line(dtype: str) -> None:
     """Against 20,000 points of the line; the place and the offset say where the point is nearest."""
     rng = np.random.default_rng(2)
@@ -64,7 +64,7 @@ def test_the_place_is_the_nearest_one_of_a_crooked_line(dtype: str) -> None:
     assert_allclose(np.linalg.norm(there - xy[inside], axis=1), distance[inside], atol=2e-3)
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_points_and_places_are_inverse(dtype: str) -> None:
     angles = np.linspace(0.0, 2.0, 40)
     line = 5.0 * np.column_stack([np.sin(angles), 1.0 - np.cos(angles)])
@@ -76,7 +76,7 @@ def test_points_and_places_are_inverse(dtype: str) -> None:
     assert_allclose(again[:, 2], on[:, 2], atol=1e3 * EPSILON[dtype])
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", WIDE)
 def test_no_route(dtype: str) -> None:
     nothing = np.zeros((0, 2))
     assert_allclose(places(dtype, nothing, np.array([[3.0, 4.0]])), 0.0)

@@ -105,7 +105,7 @@ def test_how_far_a_bearing_is_off_is_as_drawn():
 
 @pytest.fixture(scope="module")
 def nominal():
-    record = recording_of(barrier_robots(31, 70.0, 0.8), "landmarks+robots")
+    record = recording_of(barrier_robots(31, 40.0, 0.8), "landmarks+robots")
     return record, run(PlanarRobust, record)
 
 
@@ -122,7 +122,7 @@ def test_a_liar_costs_the_honest_ones_at_most_twice_their_error(nominal, jump, d
 def test_robots_that_see_no_landmark_shun_whom_two_others_contradict():
     """Robots 4 and 5 see none; of the others the first drifts away by 15 cm/s."""
     Watched.all = []
-    record = recording_of(blindfolded(barrier_robots(32, 50.0, 0.8), 4, 5), "landmarks+robots")
+    record = recording_of(blindfolded(barrier_robots(32, 30.0, 0.8), 4, 5), "landmarks+robots")
     assert not run(Watched, record, Drifting([0], 0.0, 0.15, since=5.0)).failure
     believed = np.array([[one.believes(target) for target in range(15, 20)] for one in Watched.all])
     np.testing.assert_array_equal(believed[1:], np.tile([False, True, True, True, True], (4, 1)))

@@ -67,47 +67,43 @@ def watch(world: World, ticks: int, every: int) -> None:
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_stiff_gain_over_ten_minutes_of_random_visibility(dtype: str) -> None:
-    watch(start(circling(k=80.0), range(3), dtype), 36000, 60)
+def test_stiff_gain_over_minutes_of_random_visibility(dtype: str) -> None:
+    watch(start(circling(k=80.0), range(3), dtype), 12000, 60)
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("k", [0.6, 1.0, 80.0, 1000.0])
-def test_any_gain_over_a_minute_tick_by_tick(k: float, dtype: str) -> None:
-    world = start(circling(k=k), range(4), dtype)
+def test_any_gain_over_a_minute_tick_by_tick(k: float) -> None:
+    world = start(circling(k=k), range(4), "float32")
     watch(world, 600, 1)
-    for _ in range(50):
+    for _ in range(25):
         world.advance(60)
         assert_healthy(world)
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("k", [1.0, 80.0])
-def test_almost_never_a_target_in_view(k: float, dtype: str) -> None:
-    watch(start(circling(miss=0.999, k=k), range(4), dtype), 12000, 30)
+def test_almost_never_a_target_in_view(k: float) -> None:
+    watch(start(circling(miss=0.999, k=k), range(4), "float32"), 6000, 30)
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("k", [1.0, 80.0])
-def test_nothing_in_view_then_everything(k: float, dtype: str) -> None:
+def test_nothing_in_view_then_everything(k: float) -> None:
     """Ten minutes blind, then every target at once."""
-    world = start(circling(miss=1.0, k=k), range(4), dtype)
+    world = start(circling(miss=1.0, k=k), range(4), "float32")
     watch(world, 36000, 6000)
     growth = 600.0 * np.array([0.1] * 3 + [1.0] * 3)
     P = world.get_state()["covariance"]
     np.testing.assert_allclose(
         np.diagonal(P, axis1=-2, axis2=-1), np.broadcast_to([1.0] * 3 + [100.0] * 3 + growth, (4, 3, 6)), rtol=2e-3
     )
-    seeing = start(circling(miss=0.0, k=k), range(4), dtype)
+    seeing = start(circling(miss=0.0, k=k), range(4), "float32")
     seeing.set_state(world.get_state())
     for _ in range(300):
         seeing.advance(1)
         assert_healthy(seeing)
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
 @pytest.mark.parametrize("k", [1.0, 80.0])
-def test_one_landmark_only(k: float, dtype: str) -> None:
+def test_one_landmark_only(k: float) -> None:
     """Unobservable for ever: P grows along what one bearing cannot tell."""
     made = scenario(
         [vehicle(motion=constant([0.2, 0, 0]), initial_estimate=MIXED_ERRORS[0])],
@@ -115,13 +111,12 @@ def test_one_landmark_only(k: float, dtype: str) -> None:
         noise=NOISE,
         observer={"k": k, "q": 25.0},
     )
-    watch(start(made, range(4), dtype), 6000, 20)
+    watch(start(made, range(4), "float32"), 3000, 20)
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_tiny_and_huge_initial_covariances(dtype: str) -> None:
+def test_tiny_and_huge_initial_covariances() -> None:
     for p0 in ([1e-6, 1e-6], [1e3, 1e5], [1e-6, 1e4]):
-        watch(start(circling(k=80.0, P0=p0), range(4), dtype), 300, 1)
+        watch(start(circling(k=80.0, P0=p0), range(4), "float32"), 300, 1)
 
 
 def test_far_origin_in_float32() -> None:
@@ -133,4 +128,4 @@ def test_far_origin_in_float32() -> None:
         noise=NOISE,
         observer={"k": 80.0, "q": 25.0},
     )
-    watch(start(made, range(4), "float32"), 3600, 10)
+    watch(start(made, range(4), "float32"), 1800, 10)
