@@ -90,6 +90,35 @@ def test_looking_around_loads_no_simulation(command: list[str]) -> None:
     assert not (HEAVY | {"gymnasium", "pettingzoo"}) & {name.partition(".")[0] for name in loaded}
 
 
+@pytest.mark.parametrize(
+    ("command", "modules"),
+    [
+        (["run", "nosuch"], {"pydantic", "numpy"}),
+        (["run", "buzy_intersection"], {"pydantic", "numpy"}),
+        (["run", "tre:5"], {"pydantic", "numpy"}),
+        (["run", "lane:x"], set()),
+        (["run", "facade", "--policy", "nosuch"], set()),
+        (["run", "facade", "--set", "noise.enabledd=false"], set()),
+        (["run", "facade", "--set", "horizon=-1"], set()),
+        (["record", "nosuch", "--out", "x.mcap"], {"pydantic", "numpy"}),
+        (["record", "facade", "--out", "x.mcap", "--observer", "nosuch"], {"pydantic", "numpy"}),
+        (["view", "nosuch"], {"pydantic", "numpy"}),
+        (["film", "nosuch", "--out", "x.mp4"], {"pydantic", "numpy"}),
+        (["film", "facade", "--out", "x.mp4", "--observer", "nosuch"], {"pydantic", "numpy"}),
+        (["page", "nosuch"], {"pydantic", "numpy"}),
+        (["train", "nosuch"], {"pydantic", "numpy"}),
+        (["watch", "nosuch"], set()),
+        (["evaluate", "facade", "--agents", "peek,nosuch"], set()),
+        (["bench", "seeds", "nosuch"], {"pydantic", "numpy"}),
+        (["bench", "observers", "facade", "--observers", "riccati,nosuch"], {"pydantic", "numpy"}),
+    ],
+)
+def test_a_wrong_name_is_refused_before_anything_is_loaded(command: list[str], modules: set[str]) -> None:
+    as_command = "import sys; sys.orig_argv[1:3] = ['-m', 'coopenv']"  # so that nothing is registered with Gymnasium
+    loaded = modules_after(f"{as_command}\nfrom coopenv.cli import main; assert main({command}) == 2")
+    assert not (HEAVY | {"gymnasium", "pettingzoo"} | modules) & {name.partition(".")[0] for name in loaded}
+
+
 def test_make_finds_environments_after_the_import_alone() -> None:
     loaded = modules_after(
         "import coopenv, gymnasium\nassert gymnasium.make('coopenv/UrbanCrossing-v0').unwrapped.reset(seed=0)"

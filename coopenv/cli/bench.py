@@ -46,7 +46,7 @@ def bench_observers(
         typer.Option(
             help="Names of observers with commas between, or where classes stand, mine.py:Mine or package.module:Mine "
             "(default: all that suit).",
-            autocompletion=complete.observers,
+            **complete.OBSERVERS,
         ),
     ] = None,
     variants: Annotated[
@@ -66,7 +66,7 @@ def bench_observers(
     ] = None,
     policy: Annotated[
         str | None,
-        typer.Option("--policy", help="Agent or policy that drives in the records.", autocompletion=complete.policies),
+        typer.Option("--policy", help="Agent or policy that drives in the records.", **complete.POLICY),
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Number of seeds.")] = 5,
     first: First = 0,

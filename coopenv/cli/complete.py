@@ -1,9 +1,13 @@
-"""What the shell completes: environments, drivers, observers, keys of a scenario. None of it loads the simulation."""
+"""Names on the command line: how the shell completes them, and which are refused. None of it loads the simulation."""
 
+import os
 from collections.abc import Iterable, Iterator
 from typing import Any, get_args
 
-from coopenv.base.installation import SCENES, list_agents, list_envs
+from coopenv.base.installation import SCENES, is_scene, list_agents, list_envs, scenario_path
+
+PLAIN = ("zero", "random")
+"""Policies without an agent."""
 
 
 def environments(incomplete: str) -> list[str]:
@@ -23,7 +27,7 @@ def agent_lists(incomplete: str) -> list[str]:
 
 def policies(incomplete: str) -> list[str]:
     """Return what `--policy` takes and begins so."""
-    return _matching(["zero", "random", *list_agents()], incomplete)
+    return _matching([*PLAIN, *list_agents()], incomplete)
 
 
 def observers(incomplete: str) -> list[str]:
@@ -31,6 +35,58 @@ def observers(incomplete: str) -> list[str]:
     from coopenv.observers.registry import observer_names
 
     return _lists(observer_names(), incomplete)
+
+
+def known_environment(name: str | None) -> str | None:
+    """Return the name of an environment, a file or a recording. Raises UnknownEnvironmentError: there is none."""
+    from coopenv.backends.sources import is_recorded
+
+    if name is not None and not (os.path.exists(name) or is_scene(name) or is_recorded(name)):  # noqa: PTH110 (never raises)
+        scenario_path(name)
+    return name
+
+
+def known_environments(names: list[str] | None) -> list[str] | None:
+    """Return names of which each is known, see `known_environment`."""
+    for name in names or ():
+        known_environment(name)
+    return names
+
+
+def known_policy(name: str | None) -> str | None:
+    """Return the name of a policy, a folder or a place in code. Raises CoopenvError: there is no such policy."""
+    if name is not None and name not in PLAIN:
+        from coopenv.policies.loader import check_agent
+
+        check_agent(name, "policy", PLAIN)
+    return name
+
+
+def known_agents(names: str | None) -> str | None:
+    """Return agents with commas between. Raises CoopenvError: there is no such agent."""
+    if names is not None:
+        from coopenv.policies.loader import check_agent
+
+        for name in filter(None, map(str.strip, names.split(","))):
+            check_agent(name)
+    return names
+
+
+def known_observers(names: str | None) -> str | None:
+    """Return observers with commas between. Raises CoopenvError: there is no such observer."""
+    if names:
+        from coopenv.observers.registry import check_known
+
+        for name in names.split(","):
+            check_known(name.strip())
+    return names
+
+
+ENVIRONMENT: dict[str, Any] = {"autocompletion": environments, "callback": known_environment}
+POLICY: dict[str, Any] = {"autocompletion": policies, "callback": known_policy}
+AGENTS: dict[str, Any] = {"autocompletion": agent_lists, "callback": known_agents}
+OBSERVERS: dict[str, Any] = {"autocompletion": observers, "callback": known_observers}
+"""Completion and check of an argument or option."""
 
 
 def override_keys(incomplete: str) -> list[str]:

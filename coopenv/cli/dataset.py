@@ -15,7 +15,7 @@ def dataset(
         typer.Option(
             "--policy",
             help="Who drives: random, the name of an agent, its folder, or mine.py:Mine.",
-            autocompletion=complete.policies,
+            **complete.POLICY,
         ),
     ] = "route_follower",
     worlds: Annotated[
@@ -34,14 +34,14 @@ def dataset(
     """Write episodes of a policy as a Minari dataset, one per vehicle."""
     import shlex
 
+    name, log = Path(environment).stem, options.console(stderr=True)
+    scenario = options.load(environment, options.parse_overrides(overrides))
     from coopenv.base.installation import list_envs
     from coopenv.policies import load_policy
     from coopenv.runs.console import Progress, compile_notice
     from coopenv.runs.driven import drive_vehicles
     from coopenv.runs.minari import dataset_place, write_dataset
 
-    name, log = Path(environment).stem, options.console(stderr=True)
-    scenario = options.load(environment, options.parse_overrides(overrides))
     driver = load_policy(policy, scenario, seed)
     own = Path(policy.rpartition(":")[2] or policy).name
     identity = identity or f"coopenv/{name}/{own}-v0"

@@ -16,7 +16,7 @@ def evaluate(
         typer.Option(
             help="Agents with commas between: names, folders, or mine.py:Mine or package.module:Mine (default: every "
             "agent of agents/ that was made for ENV).",
-            autocompletion=complete.agent_lists,
+            **complete.AGENTS,
         ),
     ] = None,
     worlds: Annotated[

@@ -18,12 +18,16 @@ Agent = Annotated[
     typer.Option(
         help="Who drives: zero, random, the name of an agent, its folder, or mine.py:Mine (default: route_follower, "
         "where it can drive).",
-        autocompletion=complete.policies,
+        **complete.POLICY,
     ),
 ]
 ObserverName = Annotated[
     str | None,
-    typer.Option(help="Observer by name or as mine.py:Mine (default: that of the environment).", show_default=False),
+    typer.Option(
+        help="Observer by name or as mine.py:Mine (default: that of the environment).",
+        show_default=False,
+        **complete.OBSERVERS,
+    ),
 ]
 SceneSource = Annotated[
     str,
@@ -31,7 +35,7 @@ SceneSource = Annotated[
         metavar="ENV|FILE.mcap|BAG|RUN",
         help="Environment (name or TOML file), a log file, a ROS bag, recorded robots (mrclam_1 .. mrclam_9), or the "
         "folder of a run.",
-        autocompletion=complete.environments,
+        **complete.ENVIRONMENT,
     ),
 ]
 

@@ -16,6 +16,7 @@ def watch(
             metavar="AGENT",
             help="Name of an agent, its folder, or where its class stands, mine.py:Mine or package.module:Mine.",
             autocompletion=complete.agents,
+            callback=complete.known_agents,
         ),
     ],
     environment: Annotated[
@@ -23,7 +24,7 @@ def watch(
         typer.Option(
             "--env",
             help="Name or TOML file of the environment (default: the first that the agent was made for).",
-            autocompletion=complete.environments,
+            **complete.ENVIRONMENT,
         ),
     ] = None,
     seed: options.Seed = 0,
@@ -33,13 +34,14 @@ def watch(
 ) -> None:
     """Watch an agent drive, in a window or as a film."""
     from coopenv.policies import find_agent
-    from coopenv.runs import live
 
     found, log = find_agent(agent), options.console(stderr=True)
     name = environment or next(iter(found.environments), None)
     if name is None:
         raise CoopenvError(f"{agent} does not say for which environment it was made; name one with --env")
     scenario = options.load(name, options.parse_overrides(overrides))
+    from coopenv.runs import live
+
     policy = found.policy(scenario)
     if out is not None:
         stage = live.film(scenario, policy, seed, out, log)
@@ -56,16 +58,16 @@ def play(
         str | None,
         typer.Option(
             help="Policy of the other vehicles (default: route_follower where it can drive).",
-            autocompletion=complete.policies,
+            **complete.POLICY,
         ),
     ] = None,
     seed: options.Seed = 0,
     overrides: options.Overrides = None,
 ) -> None:
     """Drive a vehicle by the arrow keys."""
+    scenario, log = options.load(environment, options.parse_overrides(overrides)), options.console(stderr=True)
     from coopenv.runs import live
 
-    scenario, log = options.load(environment, options.parse_overrides(overrides)), options.console(stderr=True)
     index = live.vehicle_index(scenario, vehicle)
     policy = live.others_of(scenario, Path(environment).stem, others, seed)
     stage = live.drive_by_hand(scenario, index, policy, seed, log)

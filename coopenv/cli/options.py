@@ -37,7 +37,7 @@ FigureWidth = Annotated[
         show_default=False,
     ),
 ]
-_source = partial(typer.Argument, autocompletion=complete.environments)
+_source = partial(typer.Argument, **complete.ENVIRONMENT)
 Environment = Annotated[
     str,
     _source(metavar="ENV", help="Name of an environment (see `coopenv list`), a scene (lane:20) or a TOML file."),
@@ -61,7 +61,7 @@ PolicyName = Annotated[
         "--policy",
         help="Policy of the driven vehicles: zero, random, the name of an agent, its folder, or where its class "
         "stands, mine.py:Mine or package.module:Mine.",
-        autocompletion=complete.policies,
+        **complete.POLICY,
     ),
 ]
 DataFolder = Annotated[
@@ -102,7 +102,7 @@ LogObserver = Annotated[
     typer.Option(
         "--observer",
         help="Whose estimates are shown: a name, or mine.py:Mine (default: the scenario's own).",
-        autocompletion=complete.observers,
+        **complete.OBSERVERS,
         show_default=False,
     ),
 ]

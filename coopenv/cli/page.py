@@ -21,6 +21,7 @@ def page(
             help="Names of environments or TOML files.",
             show_default=False,
             autocompletion=complete.environments,
+            callback=complete.known_environments,
         ),
     ] = None,
     everything: Annotated[bool, typer.Option("--all", help="Every environment that ships with coopenv.")] = False,

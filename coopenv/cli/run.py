@@ -40,13 +40,13 @@ def run(
     topics: options.TopicMap = None,
 ) -> None:
     """Run an environment; write metrics, arrays, figures and a page that plays the episode."""
+    changes, name = options.parse_overrides(overrides), Path(environment).stem
+    refuse_for_recordings(environment, seed=seed, policy=policy)
+    backend = options.open_source(environment, changes, data, variant, topics)
     from coopenv.runs.command import REPLAY_FILE, execute, report
     from coopenv.runs.console import compile_notice
     from coopenv.runs.rollouts import Rollout
 
-    changes, name = options.parse_overrides(overrides), Path(environment).stem
-    refuse_for_recordings(environment, seed=seed, policy=policy)
-    backend = options.open_source(environment, changes, data, variant, topics)
     folder, form, log = out or Path("out") / name, None if no_figures else figures.value, options.console(stderr=True)
     with compile_notice(log):
         rollout = Rollout(backend.scenario, seed, steps, dtype, device, policy, backend)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -172,9 +172,8 @@ def find_agent(name_or_place: str | Path) -> Agent:
     name, names = str(name_or_place), list_agents()
     if name not in names and user_code.is_reference(name):
         return Agent(name.rpartition(":")[2], user_code.absolute(name))
+    check_agent(name)
     folder = data_directory("agents") / name if name in names else Path(name)
-    if not (folder / AGENT_FILE).is_file():
-        raise _not_found("agent", name, names)
     card = read_card(folder)
     if not user_code.is_reference(card.entry):
         raise CoopenvError(f"{folder / AGENT_FILE}: entry: expected file.py:Class or package.module:Class")
@@ -186,6 +185,17 @@ def find_agent(name_or_place: str | Path) -> Agent:
     if card.network is not None:
         known["options"] |= {"folder": folder, "network": card.network}
     return Agent(folder.resolve().name, entry, folder=folder, **known)
+
+
+def check_agent(name: str, what: str = "agent", others: Iterable[str] = ()) -> None:
+    """Refuse a name behind which there is no driver, without loading any; `others` are names that are known as well.
+
+    Raises:
+        CoopenvError: there is none, which `what` was to be.
+    """
+    names = [*others, *list_agents()]
+    if name not in names and not user_code.is_reference(name) and not (Path(name) / AGENT_FILE).is_file():
+        raise _not_found(what, name, names)
 
 
 def _not_found(what: str, name: str, known: Sequence[str]) -> CoopenvError:
@@ -219,6 +229,5 @@ def load_policy(name: str, scenario: Scenario, seed: int) -> Policy:
     """
     if name in PLAIN:
         return PLAIN[name](seed, scenario.action.size)
-    if name not in list_agents() and not user_code.is_reference(name) and not (Path(name) / AGENT_FILE).is_file():
-        raise _not_found("policy", name, [*PLAIN, *list_agents()])
+    check_agent(name, "policy", PLAIN)
     return load_agent(name, scenario)
