@@ -49,7 +49,7 @@ def start_of(agent: Landmark | Vehicle, routes: Sequence[Route]) -> tuple[np.nda
     if isinstance(agent, Landmark):
         return np.array(agent.position), rotation_of(agent.yaw, None)
     if agent.routes:
-        return _on_route(_routes_of(agent, routes)[0], 0.0, 0.0)
+        return _beside(route_points(_routes_of(agent, routes)[0], np.zeros(1))[0], 0.0)
     pose = agent.initial_pose
     if pose is None or pose.position is None:  # the backend draws it
         return np.zeros(3), np.eye(3)
@@ -61,9 +61,9 @@ def _routes_of(vehicle: Vehicle, routes: Sequence[Route]) -> list[Route]:
     return [by_name[name] for name in vehicle.routes]
 
 
-def _on_route(route: Route, s: float, aside: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pose at an arc length of a route as designed, and so far to its left."""
-    x, y, heading = route_points(route, np.array([s]))[0]
+def _beside(point: np.ndarray, aside: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pose at a distance (m) to the left of a point of a route, (x, y, heading) in m and rad."""
+    x, y, heading = point
     position = np.array([x - aside * np.sin(heading), y + aside * np.cos(heading), 0.0])
     return position, rotation_of(heading, None)
 
@@ -121,7 +121,8 @@ def possible_boxes(vehicle: Vehicle, routes: Sequence[Route]) -> Boxes:
     nominal = [start_of(vehicle, routes)]
     for route in _routes_of(vehicle, routes):
         spread = {0.0, route.lateral_spread, -route.lateral_spread}
-        nominal += [_on_route(route, s, aside) for s in {0.0, route.start_spread} for aside in spread]
+        points = route_points(route, np.array([*{0.0, route.start_spread}]))
+        nominal += [_beside(point, aside) for point in points for aside in spread]
     parts = [_spread_boxes(vehicle, *pose) for pose in nominal]
     return Boxes(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
@@ -132,7 +133,8 @@ def _spread_boxes(vehicle: Vehicle, position: np.ndarray, rotation: np.ndarray) 
     turn = pose.yaw_spread if pose else 0.0
     corners = [(0, 0, 0, 0), *(product((-1, 1), repeat=4) if spread.any() or turn else ())]
     signs = np.array(corners, dtype=float)
-    rotations = rotation @ np.array([rotation_of(sign * turn, None) for sign in signs[:, 3]])
+    turned = {sign: rotation @ rotation_of(sign * turn, None) for sign in (-1.0, 0.0, 1.0)}
+    rotations = np.array([turned[sign] for sign in signs[:, 3]])
     positions = position + (signs[:, :3] * spread) @ rotation.T
     center, size = (vehicle.body.center, vehicle.body.size) if vehicle.body else (np.zeros(3), np.zeros(3))
     return Boxes(positions + rotations @ np.array(center), rotations, np.tile(np.array(size) / 2, (len(signs), 1)))
