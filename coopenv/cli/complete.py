@@ -46,6 +46,11 @@ def known_environment(name: str | None) -> str | None:
     return name
 
 
+def known_source(name: str) -> str | None:
+    """Return the name of what can be shown, an episode's `.npz` included; errors as for `known_environment`."""
+    return name if name.endswith(".npz") else known_environment(name)
+
+
 def known_environments(names: list[str] | None) -> list[str] | None:
     """Return names of which each is known, see `known_environment`."""
     for name in names or ():

@@ -35,7 +35,8 @@ SceneSource = Annotated[
         metavar="ENV|FILE.mcap|BAG|RUN",
         help="Environment (name or TOML file), a log file, a ROS bag, recorded robots (mrclam_1 .. mrclam_9), or the "
         "folder of a run.",
-        **complete.ENVIRONMENT,
+        autocompletion=complete.environments,
+        callback=complete.known_source,
     ),
 ]
 

@@ -20,11 +20,6 @@ CARS = "svea"
 """The source that stands for the cars of a deployment."""
 
 
-def known_source(name: str) -> str | None:
-    """Return what is to be watched. Raises CoopenvError: there is no such environment."""
-    return name if name == CARS else complete.known_environment(name)
-
-
 def view(
     source: Annotated[
         str,
@@ -33,7 +28,7 @@ def view(
             help="Environment (name or TOML file), a log file, a ROS bag, recorded robots (mrclam_1 .. mrclam_9), the "
             "folder of a run, or svea: the cars of --deployment.",
             autocompletion=complete.environments,
-            callback=known_source,
+            callback=lambda name: name if name == CARS else complete.known_source(name),
         ),
     ],
     agent: Agent = None,
