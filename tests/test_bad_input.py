@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
+import coopenv
 from coopenv.cli import main
+from coopenv.runs.rollouts import rollout
 
 AGENTS = """
 import numpy as np
@@ -86,3 +88,30 @@ def test_one_line_and_nothing_is_left(
 def test_a_folder_that_cannot_be_made(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*arguments, "--out", "/proc/nobody"]) == 2
     assert "error: cannot write to /proc/nobody" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "command",
+    ["run {}", "bench observers {}", "view {}", "film {} --out film.gif", "record {} --out a.mcap", "import {}"],
+)
+@pytest.mark.parametrize("name", ["nosuch.bag", "nosuch.db3"])
+def test_a_bag_that_does_not_exist_is_told_so(command: str, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command.format(name).split()) == 2
+    told = capsys.readouterr().err
+    assert f"no such bag: {name}" in told and "map" not in told and told.count("\n") == 1
+
+
+def test_a_scenario_goes_where_a_name_goes() -> None:
+    scenario = coopenv.load_scenario("overtaking", {"horizon": 1.0})
+    env = coopenv.parallel_env(scenario, overrides={"noise.enabled": False}, observer="dead_reckoning")
+    made = env.engine.backend.scenario
+    assert made.observer.name == "dead_reckoning" and not made.noise.enabled
+    assert env.metadata["name"] == f"{scenario.title}_v0"
+    assert len(rollout(scenario, steps=2).t) == len(rollout("overtaking", steps=2).t)
+    batch = coopenv.make_vec(scenario, num_worlds=2, overrides={"horizon": 0.5})
+    assert batch.num_envs == 2 * len(scenario.vehicles)
+    assert coopenv.load_scenario(scenario) is scenario
+    with pytest.raises(coopenv.CoopenvError, match=r"^overrides \(--set\): noise\.enabeld: unknown key .*did you mean"):
+        coopenv.parallel_env(scenario, overrides={"noise.enabeld": False})
+    with pytest.raises(coopenv.CoopenvError, match=r"^environment: expected a name or a path, got a Scenario"):
+        coopenv.compare(["riccati"], scenario, seeds=1)  # type: ignore[arg-type]

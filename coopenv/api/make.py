@@ -12,14 +12,15 @@ from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.reward import RewardFunction
 from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.backends.base import Backend
-from coopenv.backends.sources import open_backend, open_simulation
+from coopenv.backends.sources import open_backend, open_simulation, simulation_of
 from coopenv.base.errors import CoopenvError, ScenarioError
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import named
+from coopenv.scenario import Scenario, load_scenario
 
 
 def parallel_env(
-    name_or_path: str | Path,
+    name_or_path: str | Path | Scenario,
     *,
     render_mode: str | None = None,
     observer: str | Factory | None = None,
@@ -43,7 +44,8 @@ def parallel_env(
 
     Args:
         name_or_path: for example "busy_intersection"; "mrclam_6", "drive.mcap" or "drive.bag" replay what was
-            recorded. Where `backend` is an object, any name for the environment.
+            recorded. A scenario of `coopenv.load_scenario` is simulated. Where `backend` is an object, any name for
+            the environment.
         render_mode: None, "rgb_array" or "human".
         observer: estimator that every vehicle runs, embedded or a plug-in: a name, a class, or where one stands
             (`mine.py:Mine`, `package.module:Mine`); None: as the scenario says.
@@ -68,17 +70,20 @@ def parallel_env(
         ScenarioError: the file or an override is not valid.
         CoopenvError: another argument is not valid.
     """
+    changes = _with_observer(overrides, observer)
+    if isinstance(name_or_path, Scenario) and backend in (None, name_or_path.backend):
+        backend, changes = simulation_of(load_scenario(name_or_path, changes)), {}
     return CooperativeLocalisationEnv(
         open_backend(
-            name_or_path,
+            _name_of(name_or_path),
             backend,
-            _with_observer(overrides, observer),
+            changes,
             data,
             variant,
             {"deployment": deployment, "car": car, "record": record, "connect": connect},
             topics,
         ),
-        Path(str(name_or_path)).stem,
+        Path(_name_of(name_or_path)).stem,
         render_mode=render_mode,
         observation=observation,
         device=device,
@@ -88,7 +93,7 @@ def parallel_env(
 
 
 def make_vec(
-    name_or_path: str | Path,
+    name_or_path: str | Path | Scenario,
     *,
     num_worlds: int,
     device: str = "cpu",
@@ -105,7 +110,7 @@ def make_vec(
     """Return a batch of worlds as a Gymnasium `VectorEnv` with num_worlds x vehicles rows.
 
     Args:
-        name_or_path: environment or TOML file.
+        name_or_path: environment, TOML file, or scenario of `coopenv.load_scenario`.
         num_worlds: how many worlds.
         device: "cpu" or a CUDA device.
         dtype: precision of the worlds; observations and rewards are float32.
@@ -122,9 +127,11 @@ def make_vec(
     Raises:
         CoopenvError: any argument is not valid.
     """
+    changes = _with_observer(overrides, observer)
+    made = isinstance(name_or_path, Scenario)
     return CooperativeVectorEnv(
-        open_simulation(name_or_path, _with_observer(overrides, observer)),
-        Path(str(name_or_path)).stem,
+        load_scenario(name_or_path, changes) if made else open_simulation(str(name_or_path), changes),
+        Path(_name_of(name_or_path)).stem,
         num_worlds=num_worlds,
         device=device,
         dtype=dtype,
@@ -157,6 +164,11 @@ def make_rows(
             f"of {name_or_path}"
         )
     return make_vec(name_or_path, num_worlds=int(num_envs) // vehicles, **options)
+
+
+def _name_of(name_or_path: str | Path | Scenario) -> str:
+    """Return the name of an environment; of a scenario its title."""
+    return name_or_path.title if isinstance(name_or_path, Scenario) else str(name_or_path)
 
 
 def _with_observer(overrides: Mapping[str, Any] | None, observer: str | Factory | None) -> dict[str, Any]:

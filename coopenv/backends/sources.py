@@ -244,6 +244,9 @@ def open_bags(
     for what, value in (("data", data), ("variant", variant)):
         if value is not None:
             raise CoopenvError(f"{what} is for recorded data sets, {where} is a ROS bag")
+    missing = [str(name) for name in names if not Path(name).exists()]
+    if missing:
+        raise DataError(f"no such bag: {', '.join(missing)}")
     if topics is None:
         raise DataError(f"{where}: a ROS bag, which needs a map of its topics, --map topics.toml (see docs/bags.md)")
     from coopenv.cars.bags import Bag

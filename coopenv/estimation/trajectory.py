@@ -1,16 +1,14 @@
 """The record of one run: what was true, what was estimated, and what was in view."""
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Self
-from zipfile import BadZipFile
 
 import numpy as np
 
-from coopenv.base.errors import DataError
 from coopenv.base.files import replacing_file
+from coopenv.base.npz import read_npz
 
 
 @dataclass(frozen=True)
@@ -73,18 +71,24 @@ class Trajectory:
         """Read a file written by `save`.
 
         Raises:
-            DataError: the file is no such record, or arrays are missing.
+            DataError: the file is no such record, an array is missing or of another shape, or it is too large.
         """
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                missing = [f.name for f in fields(cls) if f.name not in data]
-                if missing:
-                    raise DataError(f"{path}: not a trajectory, arrays missing: {', '.join(missing)}")
-                return cls(**{f.name: data[f.name] for f in fields(cls)})
-        except DataError:
-            raise
-        except (BadZipFile, EOFError, zlib.error):
-            raise DataError(f"{path}: not a readable .npz file: it is cut off or damaged, or was never one") from None
-        except (OSError, ValueError) as error:
-            why = getattr(error, "strerror", None) or error
-            raise DataError(f"{path}: not a readable .npz file ({why})") from None
+        return cls(**read_npz(path, "trajectory", _TABLE))
+
+
+_TABLE = {
+    "t": "f K",
+    **dict.fromkeys(("position", "position_estimate", "velocity", "angular_velocity"), "f K N 3"),
+    **dict.fromkeys(("rotation", "rotation_estimate"), "f K N 3 3"),
+    **dict.fromkeys(("position_error", "orientation_error", "nees"), "f K N"),
+    "covariance": "f K N 6 6",
+    "target_position": "f K T 3",
+    "visible": "b K N T",
+    "sight": "iu K N T",
+    "reward_terms": "f K N R",
+    "terms": "U R",
+    "vehicles": "U N",
+    "targets": "U T",
+    "target_moving": "b T",
+}
+"""By field the kinds of its dtype and its axes, as `Trajectory` names them."""

@@ -1,6 +1,7 @@
 """Run one world by decisions of a policy and record it at every camera tick."""
 
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.policies import Policy, load_policy
 from coopenv.runs.episode import Views, estimated_here, play
-from coopenv.scenario import Scenario
+from coopenv.scenario import Scenario, load_scenario
 
 RECORDED = (
     *("position", "rotation", "velocity", "angular_velocity", "estimate_rotation", "estimate_position"),
@@ -126,7 +127,7 @@ class Rollout:
 
 
 def rollout(
-    scenario: Scenario,
+    scenario: Scenario | str | Path,
     seed: int = 0,
     steps: int | None = None,
     dtype: str = "float64",
@@ -139,7 +140,7 @@ def rollout(
         trajectory = rollout(coopenv.load_scenario("busy_intersection"), seed=3)
 
     Args:
-        scenario: the world.
+        scenario: the world, or the name or the TOML file of one.
         seed: of all that is drawn: starts, noise, losses, and the actions of the policy "random".
         steps: decisions (None: up to the horizon, where a run ends in any case).
         dtype: "float32" or "float64".
@@ -151,7 +152,7 @@ def rollout(
     Raises:
         CoopenvError: an argument is not valid.
     """
-    run = Rollout(scenario, seed, steps, dtype, device, policy)
+    run = Rollout(load_scenario(scenario), seed, steps, dtype, device, policy)
     for tick in run.play():
         if on_tick is not None:
             on_tick(run.engine, tick)

@@ -27,21 +27,23 @@ OVERRIDES = "overrides (--set)"
 MOST_BYTES = 8 * 2**20  # of a file; 20,000 landmarks take one or two million
 
 
-def load_scenario(name_or_path: str | Path, overrides: Mapping[str, Any] | None = None) -> Scenario:
+def load_scenario(name_or_path: str | Path | Scenario, overrides: Mapping[str, Any] | None = None) -> Scenario:
     """Read a scenario and apply dotted overrides such as `{"noise.enabled": False}`.
 
     Args:
-        name_or_path: file stem of `envs/`, a scene such as `lane:20`, or the path of a TOML file.
+        name_or_path: file stem of `envs/`, a scene such as `lane:20`, the path of a TOML file, or a scenario.
         overrides: dotted key to value; list entries by index or `*` for all (`vehicles.*.goal.radius`).
 
     Raises:
         UnknownEnvironmentError: no such environment.
         ScenarioError: the file or an override does not describe a possible world.
     """
-    made = is_scene(str(name_or_path))
-    path = Path(str(name_or_path)) if made else scenario_path(name_or_path)
     if overrides is not None and not isinstance(overrides, Mapping):
         raise ScenarioError(f"overrides must map dotted keys to values, got {type(overrides).__name__}")
+    if isinstance(name_or_path, Scenario):
+        return _changed(name_or_path, overrides or {})
+    made = is_scene(str(name_or_path))
+    path = Path(str(name_or_path)) if made else scenario_path(name_or_path)
     try:
         raw = tomllib.loads(scene_text(str(name_or_path))) if made else located(_read(path), path.parent)
         for key, value in (overrides or {}).items():
@@ -55,6 +57,16 @@ def load_scenario(name_or_path: str | Path, overrides: Mapping[str, Any] | None 
         if overrides and str(error).startswith(of_file) and _is_sound(name_or_path):
             raise ScenarioError(f"{OVERRIDES}: {str(error).removeprefix(of_file)}") from None
         raise
+
+
+def _changed(scenario: Scenario, overrides: Mapping[str, Any]) -> Scenario:
+    """Return a scenario under overrides; arguments and errors as for `load_scenario`."""
+    if not overrides:
+        return scenario
+    raw = scenario.model_dump(exclude_unset=True)
+    for key, value in overrides.items():
+        override(raw, str(key), value)
+    return parse_scenario(located(raw, Path.cwd()), OVERRIDES)
 
 
 def _is_sound(name_or_path: str | Path) -> bool:

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, ConfigDict, Field, create_model, model_validator
 
-from coopenv.base.errors import suggest
+from coopenv.base.errors import listed, suggest
 from coopenv.scenario.base import NonNegative, Number, Part, Positive
 from coopenv.scenario.terms import (
     GROUPS,
@@ -68,7 +68,7 @@ class Observation(Part):
         ):
             for name in names:
                 if name not in allowed:
-                    near = suggest(name, allowed) or f"; known: {', '.join(sorted(allowed))}"
+                    near = suggest(name, allowed) or f"; known: {listed(sorted(allowed))}"
                     raise ValueError(f"{key} '{name}'{near}")
         return self
 

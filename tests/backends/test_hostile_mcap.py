@@ -254,6 +254,11 @@ def test_swapped_and_renamed_channels(written: Path, tmp_path: Path) -> None:
     refused(path, r"holds .*, expected")
 
 
+def test_a_long_format_is_shortened(written: Path, tmp_path: Path) -> None:
+    edit(written, tmp_path / "hostile.mcap", metadata={"format": 600 * "x"})
+    assert len(refused(tmp_path / "hostile.mcap", r"format 'x+\.\.\.x+' is not known")) < 250 + len(str(tmp_path))
+
+
 # Sizes
 
 

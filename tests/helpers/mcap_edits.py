@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,6 +28,7 @@ def edit(
     encoding: str = "cdr",
     schema_name: Callable[[str], str] = lambda name: name,
     schema_encoding: str = "ros2msg",
+    metadata: Mapping[str, str] | None = None,
 ) -> None:
     """Copy a recording, its header (`recording.json`), messages and descriptions of channels changed on the way."""
     from mcap.reader import make_reader
@@ -41,7 +42,7 @@ def edit(
         text = changed if isinstance(changed, bytes) else json.dumps(changed).encode()
         writer = Writer(output)
         writer.start(profile="ros2")
-        writer.add_metadata("coopenv", {**about, "sha256": hashlib.sha256(text).hexdigest()})
+        writer.add_metadata("coopenv", {**about, "sha256": hashlib.sha256(text).hexdigest(), **(metadata or {})})
         writer.add_attachment(0, 0, ATTACHMENT, "application/json", text)
         channels: dict[str, int] = {}
         for schema, channel, message in reader.iter_messages(log_time_order=False):

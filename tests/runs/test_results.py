@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import tracemalloc
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -75,11 +77,29 @@ def test_what_is_no_run_is_one_line(folder: Path, tmp_path: Path, capsys: pytest
     (tmp_path / "other" / "metrics.json").write_text(json.dumps(metrics))
     assert "vehicles are not those of trajectory.npz" in said("other")
     (tmp_path / "other" / "trajectory.npz").write_text("no archive")
-    assert "trajectory.npz: not a readable .npz file" in said("other")
+    assert "trajectory.npz: not a readable trajectory" in said("other")
     whole = (folder / "trajectory.npz").read_bytes()
     for broken in (whole[:300], whole[: len(whole) // 2], whole[:400] + bytes(400) + whole[800:]):
         (tmp_path / "other" / "trajectory.npz").write_bytes(broken)
-        assert "trajectory.npz: not a readable .npz file: it is cut off or damaged" in said("other")
+        assert "trajectory.npz: not a readable trajectory: it is cut off or damaged" in said("other")
+    with np.load(folder / "trajectory.npz") as data:
+        arrays = dict(data)
+    for change, why in (
+        ({"nees": np.zeros(3)}, r"trajectory.npz: nees: float64 (3,) is not of kind f and shape ("),
+        ({"position": arrays["position"].astype(np.complex64)}, "position: complex64"),
+        ({"sight": arrays["sight"][:-1]}, "sight: uint8"),
+        ({"vehicles": np.array([{}] * len(arrays["vehicles"]), object)}, "vehicles: object"),
+    ):
+        np.savez(tmp_path / "other" / "trajectory.npz", allow_pickle=True, **{**arrays, **change})
+        assert why in said("other")
     (tmp_path / "other" / "trajectory.npz").unlink()
-    assert "trajectory.npz: not a readable .npz file (No such file or directory)" in said("other")
+    assert "trajectory.npz: not a readable trajectory (No such file or directory)" in said("other")
+    shutil.copy(folder / "trajectory.npz", tmp_path / "other")
+    with zipfile.ZipFile(tmp_path / "other" / "trajectory.npz", "a") as archive:
+        archive.writestr("more.npy", b"")
+        archive.filelist[-1].file_size = 2**31  # of a file of zeros
+    tracemalloc.start()
+    assert "trajectory.npz: unpacks to more than 2 GiB" in said("other")
+    assert tracemalloc.get_traced_memory()[1] < 20e6
+    tracemalloc.stop()
     assert "metrics.json: a file; expected a folder that `coopenv run` has written" in said("other/metrics.json")

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from coopenv.base.errors import ScenarioError, ScenarioWarning
-from coopenv.scenario import Scenario, parse_scenario
+from coopenv.scenario import Scenario, load_scenario, parse_scenario
 from coopenv.scenario.topology import neighbour_sets, processing_order
 from tests.helpers import builders
 from tests.helpers.builders import errors, landmark, run, start, vehicle
@@ -230,3 +230,9 @@ def test_a_far_origin_warns() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         parse_scenario(builders.raw(map={"origin": [40.0, 0, 0]}), "here")
+
+
+def test_an_unknown_field_is_told_without_the_names_of_all_fields() -> None:
+    with pytest.raises(ScenarioError, match=r"unknown field 'a'; known: .*\.\.\. \(\d+ in all\)$") as caught:
+        load_scenario("overtaking", {"observation.scales": {"a": 1.0}})
+    assert len(str(caught.value)) < 400

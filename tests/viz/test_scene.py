@@ -89,7 +89,8 @@ def edited(path: Path, to: Path, **changes: Any) -> Path:
     ("changes", "message"),
     [
         ({"sight": None}, "not a scene, missing: sight"),
-        ({"rotation": np.zeros((31, 2, 3, 3), np.float32)}, "rotation: shape"),
+        ({"rotation": np.zeros((31, 2, 3, 3), np.float32)}, "rotation: float32 (31, 2, 3, 3) is not of"),
+        ({"frames": 10**9}, "tick: int32 (31,) is not of"),
         ({"ended": np.zeros((1, 4), np.float32)}, "ended: float32"),
         ({"nees": np.zeros((7, 4), np.float32)}, "nees: float32 (7, 4) is not of"),
         ({"frames": "many"}, "not a scene: header"),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from coopenv.backends.mcap.header import Header
 from coopenv.backends.mcap.messages import ATTACHMENT, EXACT, FORMAT, LANDMARKS, LANDMARKS_TYPE, PAN, codec, topic
 from coopenv.backends.mcap.ticks import TickArrays
-from coopenv.base.errors import CoopenvError, DataError
+from coopenv.base.errors import CoopenvError, DataError, shown
 from coopenv.observers.recording import Recording
 from coopenv.observers.recording_checks import check_recording
 
@@ -76,7 +76,7 @@ def _header(container: Container, where: str) -> Header:
     if found is None:
         raise DataError(f"{where}: an MCAP file, but no recording of coopenv (metadata 'coopenv' is missing)")
     if found.get("format") != FORMAT:
-        raise DataError(f"{where}: format '{found.get('format')}' is not known; known: {FORMAT}")
+        raise DataError(f"{where}: format {shown(found.get('format'))} is not known; known: {FORMAT}")
     if ATTACHMENT not in attachments:
         raise DataError(f"{where}: attachment '{ATTACHMENT}' is missing")
     if hashlib.sha256(attachments[ATTACHMENT]).hexdigest() != found.get("sha256"):

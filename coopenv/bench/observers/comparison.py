@@ -182,6 +182,9 @@ def compare(
     Raises:
         CoopenvError: an argument is not valid, or names what does not exist.
     """
+    if not isinstance(environment, str | Path):
+        kind = type(environment).__name__
+        raise CoopenvError(f"environment: expected a name or a path, got a {kind}; give its name and overrides={{...}}")
     folder, bag_map = (None if path is None else Path(path) for path in (data, topics))
     source = find_source(str(environment), overrides, folder, bag_map, faults, policy)
     source.check()

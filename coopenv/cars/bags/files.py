@@ -14,7 +14,7 @@ from coopenv.cars import codec
 SUFFIXES = (".bag", ".db3", ".mcap")
 METADATA = "metadata.yaml"
 
-REPAIRS = {".bag": "rosbag reindex", ".mcap": REPAIR}
+REPAIRS = {".bag": "rosbag reindex", ".mcap": REPAIR, ".db3": "sqlite3 FILE .recover"}
 """By suffix, the tool that mends a file whose recording was cut off."""
 
 
@@ -46,11 +46,12 @@ class BagFile:
             raise DataError(f"{path}: a folder without {METADATA}, which a bag of ROS 2 has")
         if path.is_file() and path.suffix not in SUFFIXES:
             raise DataError(f"{path}: no bag, expected a folder or one of {', '.join(SUFFIXES)}")
-        if path.suffix == ".mcap" and is_cut_off(path):
-            raise DataError(f"{path}: {CUT_OFF}; {MENDED}")
         self._stack = ExitStack()
-        parts = [path] if path.is_file() else [part for part in path.iterdir() if part.is_file()]
-        self._bytes = sum(part.stat().st_size for part in parts)
+        self._parts = [path] if path.is_file() else [part for part in sorted(path.iterdir()) if part.is_file()]
+        self._bytes = sum(part.stat().st_size for part in self._parts)
+        for part in self._parts:
+            if part.suffix == ".mcap" and is_cut_off(part):
+                raise DataError(f"{part}: {CUT_OFF}; {MENDED}")
         from rosbags.highlevel import AnyReader
 
         from coopenv.backends.unpacking import Allowance
@@ -130,7 +131,7 @@ class BagFile:
 
         if is_too_large(error):
             return DataError(f"{self.path}: {error}")
-        repair = REPAIRS.get(self.path.suffix)
+        repair = next((REPAIRS[part.suffix] for part in self._parts if part.suffix in REPAIRS), None)
         hint = f"; if its recording was cut off, `{repair}` mends it" if repair else ""
         return DataError(f"{self.path}: cannot be read as a ROS bag ({told(error)}){hint}")
 

@@ -1,8 +1,6 @@
 """Frames of an episode, kept in one file: `scene.npz`, from which pages and films are made again."""
 
 import json
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -13,6 +11,7 @@ from pydantic import ValidationError
 from coopenv.base.errors import CoopenvError, DataError
 from coopenv.base.files import replacing_file
 from coopenv.base.format import jsonable
+from coopenv.base.npz import read_npz
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.scenario.base import Part
@@ -22,7 +21,6 @@ from coopenv.scenario.validation import one_line
 from coopenv.viz.scene.frame import FIELDS, WHOLE_FIELDS, Frame, Shown
 
 SCENE_FILE = "scene.npz"
-_LARGEST = 2**31  # bytes that a file may unpack to
 _HEADER = "header"
 
 
@@ -114,57 +112,46 @@ class SceneRecord:
         Raises:
             DataError: there is no such file, or it is no scene.
         """
+        header = read_npz(path, "scene", {_HEADER: "u B"})[_HEADER]
         try:
-            with zipfile.ZipFile(path) as archive:
-                if sum(part.file_size for part in archive.infolist()) > _LARGEST:
-                    raise DataError(f"{path}: unpacks to more than {_LARGEST >> 30} GiB")
-            with np.load(path, allow_pickle=False) as data:
-                missing = [name for name in (_HEADER, *FIELDS) if name not in data]
-                if missing:
-                    raise DataError(f"{path}: not a scene, missing: {', '.join(missing)}")
-                header = json.loads(data[_HEADER].tobytes())
-                fields = {name: data[name] for name in FIELDS}
-        except CoopenvError:
-            raise
-        except (zipfile.BadZipFile, EOFError, zlib.error):
-            raise DataError(f"{path}: not a readable scene: it is cut off or damaged, or was never one") from None
-        except (OSError, ValueError, KeyError) as error:
-            why = getattr(error, "strerror", None) or error
-            raise DataError(f"{path}: not a readable scene ({why})") from None
-        return cls._checked(path, header, fields)
-
-    @classmethod
-    def _checked(cls, path: Path, header: Any, fields: dict[str, np.ndarray]) -> Self:
-        try:
-            count, source = int(header["frames"]), Source.model_validate(header["source"])
-            scenario = parse_scenario(header["scenario"], str(path))
+            facts = json.loads(header.tobytes())
+            count, source = int(facts["frames"]), Source.model_validate(facts["source"])
+            scenario = parse_scenario(facts["scenario"], str(path))
         except ValidationError as error:
             raise DataError(one_line(error, str(path), Source)) from None
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
             if isinstance(error, CoopenvError):
                 raise
             raise DataError(f"{path}: not a scene: header: {error}") from None
-        shapes, whole = _shapes(scenario, source), {}
-        for name, values in fields.items():
-            kind, to = ("i", np.int64) if name in WHOLE_FIELDS else ("f", np.float64)
-            wanted = shapes.get(name, values.shape[1:])
-            if values.dtype.kind != kind or not values.ndim or len(values) not in (1, count) or count < 1:
-                raise DataError(f"{path}: {name}: {values.dtype} {values.shape} is not of {count} frames")
-            if values.shape[1:] != wanted:
-                raise DataError(f"{path}: {name}: shape {values.shape} does not fit to its scenario, {wanted}")
-            whole[name] = np.broadcast_to(values.astype(to), (count, *values.shape[1:]))
-        return cls(scenario, source, whole)
+        if count < 1:
+            raise DataError(f"{path}: not a scene: header: {count} frames")
+        n = len(scenario.vehicles)
+        lengths = {"F": (count,), "K": (1, count), "N": (n,), "A": (n + len(scenario.landmarks),)}
+        lengths["R"] = (len(source.terms),)
+        fields = {}
+        for name, values in read_npz(path, "scene", _TABLE, lengths).items():
+            whole = values.astype(np.int64 if name in WHOLE_FIELDS else np.float64)
+            fields[name] = np.broadcast_to(whole, (count, *values.shape[1:]))
+        return cls(scenario, source, fields)
 
 
-def _shapes(scenario: Scenario, source: Source) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of a frame's fields, but for those of routes and traffic."""
-    n = len(scenario.vehicles)
-    a = n + len(scenario.landmarks)
-    shapes: dict[str, tuple[int, ...]] = {"tick": (), "rotation": (a, 3, 3), "position": (a, 3)}
-    shapes |= {"estimate_rotation": (n, 3, 3), "position_covariance": (n, 3, 3), "estimate_position": (n, 3)}
-    shapes |= dict.fromkeys(("position_error", "orientation_error", "nees", "pan", "ended"), (n,))
-    shapes |= dict.fromkeys(("route_count", "route_drawn"), (n,))
-    return {**shapes, "sight": (n, a), "inbox_tick": (n, n), "terms": (n, len(source.terms)), "goal": (n, 3)}
+_AXES = {
+    "tick": "F",
+    "rotation": "K A 3 3",
+    "position": "K A 3",
+    **dict.fromkeys(("estimate_rotation", "position_covariance"), "K N 3 3"),
+    **dict.fromkeys(("estimate_position", "goal"), "K N 3"),
+    **dict.fromkeys(("position_error", "orientation_error", "nees", "pan", "ended"), "K N"),
+    **dict.fromkeys(("route_count", "route_drawn"), "K N"),
+    "sight": "K N A",
+    "inbox_tick": "K N N",
+    "terms": "K N R",
+    "route": "K N P 3",
+    "traffic_rotation": "K Z 3 3",
+    **dict.fromkeys(("traffic_position", "traffic_half"), "K Z 3"),
+}
+"""By field of a frame its axes; F: all frames, K: all of them, or one where nothing changes."""
+_TABLE = {name: f"{'i' if name in WHOLE_FIELDS else 'f'} {axes}" for name, axes in _AXES.items()}
 
 
 class SceneWriter:

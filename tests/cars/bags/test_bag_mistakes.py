@@ -19,6 +19,7 @@ from coopenv.backends.mcap.peek import metadata_names
 from coopenv.backends.sources import Kind, is_bag, kind_of
 from coopenv.base.errors import DataWarning
 from coopenv.cars.bags import Bag
+from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.log import Row
 from coopenv.cars.bags.topic_map import TopicMapError, load_map
 from coopenv.cars.samples import Detections
@@ -94,6 +95,16 @@ def test_a_truncated_bag_is_one_line_or_what_could_be_read(form: str, share: flo
     complete = len(bag.log.samples) == len(SHORT)  # only what lies behind the data is lost
     assert complete or any(issubclass(w.category, DataWarning) and "damaged" in str(w.message) for w in caught)
     assert len(list(bag.episode(None, {}))) >= 2
+
+
+@pytest.mark.parametrize(("form", "tool"), [("sqlite3", "sqlite3 FILE .recover"), ("mcap", "mcap recover")])
+def test_a_folder_whose_file_is_cut_off_names_the_tool_that_mends_it(form: str, tool: str, tmp_path: Path) -> None:
+    folder = bags.write(tmp_path / "drive", SHORT, form)
+    file = next(folder.glob("drive*.*"))
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 3])
+    assert main(["import", str(folder)]) == 2
+    with pytest.raises(DataError, match=re.escape(f"`{tool}` mends it")):
+        BagFile(folder)
 
 
 @pytest.mark.parametrize("form", ["ros1", "mcap"])
