@@ -1,15 +1,17 @@
 """Pages of the reference that are made from docstrings: `python -m sitegen.reference` writes them to docs/reference."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from coopenv.base.installation import list_envs
+from coopenv.cars.bags.topic_map import TopicMap
 from coopenv.cars.deployment import Deployment
 from coopenv.runs.markdown import table
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
+from coopenv.training.settings import Settings
 from sitegen.mirror import ROOT
 
 OBSERVATION = """# What each observation entry means
@@ -41,7 +43,7 @@ every neighbour, or each of the nearest landmarks of the map. *Planar* is the nu
 The layout of each environment, with sizes, scales and centers:
 """
 
-DEPLOYMENT = """# Deployment file
+DEPLOYMENT = """# Deployment file of cars
 
 <!-- Written by `python -m sitegen.reference`. -->
 
@@ -53,19 +55,38 @@ that of `coopenv svea gate` and `health` replaces `gate.connect`. `[[cars]]` is 
 """
 
 
-def deployment() -> str:
-    """Return the page of the keys of a deployment file, from the docstrings of its fields."""
+BAG_MAP = """# Map of a ROS bag
+
+<!-- Written by `python -m sitegen.reference`. -->
+
+A map gives the environment of a bag, its cars, and their topics. [ROS bags](../bags.md) shows how to use one. Unknown
+keys are refused. `[[cars]]` is one table per car; `cars.name` is a key.
+
+"""
+
+TRAINING = """# Settings of a training
+
+<!-- Written by `python -m sitegen.reference`. -->
+
+Settings of `coopenv train` are a TOML file ([trainers](../trainers.md#coopenv-train)). Unknown keys are refused.
+`[clone]` is optional: without it the policy starts at random.
+
+"""
+
+
+def _reference(part: type[BaseModel]) -> str:
+    """Return the table of the keys of a file, from the docstrings of its fields."""
     rows = [
         (f"`{key}`", _default(field), _values(field), " ".join((field.description or "").split()))
-        for key, field in _keys(Deployment)
+        for key, field in _keys(part)
     ]
-    return f"{DEPLOYMENT}\n{table(('key', 'default', 'values', 'meaning'), rows)}\n"
+    return table(("key", "default", "values", "meaning"), rows) + "\n"
 
 
 def _keys(part: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
     """Yield the dotted keys of a section and of those in it, each with its field."""
     for name, field in part.model_fields.items():
-        if field.description and (prefix, name) != ("", "file"):
+        if field.description and f"{prefix}{name}" not in ("file", "path"):
             yield f"{prefix}{name}", field
         for kind in (field.annotation, *get_args(field.annotation)):
             if isinstance(kind, type) and issubclass(kind, BaseModel):
@@ -79,17 +100,21 @@ def _default(field: FieldInfo) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float | int):
-        return f"{value:.4g}"
-    return "" if value is None or value in ((), {}) else f"`{value[0] if isinstance(value, tuple) else value}`"
+        return f"{value:.4g}" if isinstance(value, float) else str(value)
+    if isinstance(value, BaseModel):
+        return ""
+    if isinstance(value, tuple):
+        value = ", ".join(map(str, value))
+    return f"`{value}`" if value else ""
 
 
 def _values(field: FieldInfo) -> str:
     """Return the bounds of a number in words, or the values to choose from."""
     if get_origin(field.annotation) is Literal:
         return ", ".join(f"`{value}`" for value in get_args(field.annotation))
-    words = {"gt": "above", "ge": "at least", "le": "at most"}
+    words = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
     found = [(words[name], getattr(rule, name)) for rule in field.metadata for name in words if hasattr(rule, name)]
-    return ", ".join(f"{word} {value:.4g}" for word, value in found)
+    return ", ".join(f"{word} {value:.4g}" for word, value in found if abs(value) < 1e6)
 
 
 SCALES = {"targets": "number of targets", "steering": "angle at action 1", "pan": "angle at action 1"}
@@ -117,7 +142,12 @@ def observation() -> str:
     return "\n\n".join([*parts, table(("term", "meaning", "unit"), rewards)]) + "\n"
 
 
-PAGES = {"deployment.md": deployment, "observation.md": observation}
+PAGES: dict[str, Callable[[], str]] = {
+    "bag_map.md": lambda: BAG_MAP + _reference(TopicMap),
+    "deployment.md": lambda: DEPLOYMENT + _reference(Deployment),
+    "observation.md": observation,
+    "training.md": lambda: TRAINING + _reference(Settings),
+}
 """Files in docs/reference, and their texts."""
 
 if __name__ == "__main__":

@@ -87,7 +87,7 @@ def test_the_programs_on_agents_run(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 def test_the_page_on_topics_lists_every_topic() -> None:
     rows = [
-        line for line in (DOCS / "cars_topics.md").read_text(encoding="utf-8").splitlines() if line.startswith("| `")
+        line for line in (DOCS / "cars_records.md").read_text(encoding="utf-8").splitlines() if line.startswith("| `")
     ]
     for topic in TOPICS.values():
         (row,) = (row for row in rows if row.startswith(f"| `{topic.suffix}` | `{topic.type.replace('/msg/', '/')}` |"))

@@ -9,7 +9,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-GENERATED = [DOCS / "environments", *(DOCS / "reference" / name for name in ("api", "deployment.md", "observation.md"))]
+GENERATED = [
+    DOCS / "environments",
+    *(DOCS / "reference" / name for name in ("api", "bag_map.md", "deployment.md", "observation.md", "training.md")),
+]
 """Pages that `coopenv page` and `python -m sitegen.reference` write, and those that `mkdocstrings` fills."""
 PAGES = {
     page.relative_to(ROOT).as_posix(): page.read_text(encoding="utf-8")

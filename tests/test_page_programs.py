@@ -13,7 +13,7 @@ import pytest
 from coopenv.bench.learning.study import read_study
 from coopenv.cars.bags.topic_map import load_map
 from coopenv.scenario import load_scenario, parse_scenario
-from coopenv.training.settings import Clone, Settings, read_settings
+from coopenv.training.settings import Clone, read_settings
 from tests.helpers import bags, mrclam_files
 from tests.test_docs import DOCS, python_blocks
 
@@ -147,16 +147,14 @@ def test_the_tables_of_terms() -> None:
     assert load_scenario("urban_crossing", overrides).observation.map_size == 6
 
 
-def test_the_settings_of_training_are_the_defaults(tmp_path: Path) -> None:
+def test_the_settings_of_training(tmp_path: Path) -> None:
     settings, study = tables("trainers.md")
     path = tmp_path / "train.toml"
     path.write_text(settings, encoding="utf-8")
     said = read_settings(path)
-    assert said == Settings(steps=2_000_000)
-    commented = re.search(r"# \[clone\].*?\n\n", settings, re.DOTALL)
-    assert commented
-    path.write_text(re.sub(r"^# ", "", commented[0], flags=re.MULTILINE), encoding="utf-8")
-    assert read_settings(path).clone == Clone(agent="route_follower")
+    assert (said.steps, said.ppo.hidden, said.clone) == (500_000, (64, 64), Clone(agent="route_follower"))
+    assert read_settings(path, environment="facade").ppo.hidden == (128, 128)
+    assert read_settings(path, "plain", "facade").scenario == {"observation.planar": False}
     (tmp_path / "study.toml").write_text(study, encoding="utf-8")
     path.write_text("[arms.quality]\n[arms.plain]\n", encoding="utf-8")
     assert len(list(read_study(tmp_path / "study.toml").runs)) == 12

@@ -22,21 +22,21 @@ class Ppo(Part):
     """Proximal policy optimisation (Schulman et al. 2017) with parameters shared over vehicles."""
 
     vehicles: Count = 512
-    """Driven vehicles side by side: as many worlds as hold so many, so that every environment's batch is alike."""
+    """Driven vehicles in parallel, in as many worlds as hold them: every environment has the same batch size."""
     decisions: Count = 64
-    """Decision steps of a rollout, after each of which the policy is updated."""
+    """Decision steps of a rollout, between two updates of the policy."""
     minibatches: Count = 16
     """Gradient steps per pass over a rollout."""
     epochs: Count = 4
     """Passes over each rollout."""
     learning_rate: Positive = 1e-3
-    """Of Adam at the start; falls linearly to zero."""
+    """Initial learning rate of Adam; falls linearly to zero."""
     gamma: Share = 0.99
     """Discount per decision."""
     gae_lambda: Probability = 0.95
-    """Of the generalised advantage estimate (Schulman et al. 2016)."""
+    """Lambda of the generalised advantage estimate (Schulman et al. 2016)."""
     clip: Positive = 0.2
-    """Of the probability ratio."""
+    """Clipping range of the probability ratio."""
     entropy: NonNegative = 0.0
     """Weight of the entropy bonus."""
     value_weight: NonNegative = 0.5
@@ -44,13 +44,13 @@ class Ppo(Part):
     max_gradient: Positive = 0.5
     """Norm at which gradients are clipped."""
     reward_scale: Positive = 0.1
-    """Rewards are multiplied by it, which makes values of order one."""
+    """Factor of rewards, for values of order one."""
     initial_std: Positive = 0.5
-    """Standard deviation of the exploration at the start; actions reach from -1 to 1."""
+    """Initial standard deviation of the exploration; actions reach from -1 to 1."""
     hidden: tuple[Count, ...] = Field(default=(128, 128), min_length=1)
-    """Widths of the hidden layers, tanh, of the policy and of the value."""
+    """Widths of the hidden layers (tanh) of policy and value."""
     observation_clip: Positive = 6.0
-    """Observations are normalised by their running mean and standard deviation and clipped to this."""
+    """Bound of observations after normalisation by running mean and standard deviation."""
 
     @model_validator(mode="after")
     def _check_rollout(self) -> "Ppo":
@@ -63,36 +63,37 @@ class Clone(Part):
     """A start from the behaviour of another driver, whose actions and returns are learnt by regression first."""
 
     agent: str
-    """By what `coopenv.policies.find_agent` takes."""
+    """Agent whose actions and returns are learnt by regression before training: name, folder or `file.py:Class`."""
     episodes: Count = 64
-    """Worlds, of one episode each, in which it is watched."""
+    """Recorded worlds, one episode each."""
     epochs: Count = 20
-    """Passes over what was seen."""
+    """Passes over the recorded actions."""
     learning_rate: Positive = 1e-3
+    """Learning rate of Adam."""
     noise: NonNegative = 0.1
-    """Standard deviation of what is added to its actions, so that it is also seen mending deviations."""
+    """Standard deviation of noise added to the agent's actions, so that corrections are recorded, too."""
 
 
 class Evaluation(Part):
     """Judging the mean action on held-out maps."""
 
     every: Count = 250_000
-    """Decisions of vehicles between two of them; a checkpoint is written after each."""
+    """Decisions of vehicles between two evaluations; a checkpoint is written after each."""
     worlds: Count = 32
-    """One episode each, while training."""
+    """Held-out worlds of an evaluation during training, one episode each."""
     final_worlds: Count = 256
-    """One episode each, for the results in `agent.toml`."""
+    """Held-out worlds of the last evaluation, for the results in `agent.toml`."""
 
 
 class Settings(Part):
     """Everything that decides how a training goes, but for environment and seed."""
 
     steps: Count | None = None
-    """Decisions of vehicles to collect (none: 2 million), or ..."""
+    """Length of the training, decisions of vehicles (default: 2 million)."""
     minutes: Positive | None = None
-    """... how long to train."""
+    """Length of the training, min, instead of `steps`."""
     scenario: dict[str, Any] = Field(default={})
-    """Overrides of the environment's scenario, as tables or dotted keys."""
+    """Overrides of the scenario, as tables or dotted keys, as with `--set`."""
     ppo: Ppo = Ppo()
     evaluation: Evaluation = Evaluation()
     clone: Clone | None = None

@@ -78,7 +78,7 @@ def test_the_page_on_observations_explains_every_entry() -> None:
 
 
 def test_the_page_on_deployment_files_has_every_key() -> None:
-    page = reference.deployment()
+    page = reference.PAGES["deployment.md"]()
     rows = [line for line in page.splitlines() if line.startswith("| `")]
     found = {row.split("`")[1]: [cell.strip() for cell in row.split("|")[2:5]] for row in rows}
     parts = {"": Deployment, "cars.": Car, "network.": Network, "network.tls.": Tls}

@@ -1,4 +1,4 @@
-"""The map of a bag: which environment its cars drive in, which topic tells what, and how its clocks are read."""
+"""The map of a bag: the environment of its cars, their topics, and the treatment of its clocks."""
 
 import tomllib
 from collections.abc import Mapping
@@ -53,19 +53,21 @@ class Topics(Part):
     bearings: TopicName | None = None
     """pixy_camera/ObjectBearingArrayStamped: unit vectors from the target to the camera, optical frame."""
     camera_info: TopicName | None = None
-    """sensor_msgs/CameraInfo, in place of the environment's camera."""
+    """sensor_msgs/CameraInfo: calibration, instead of the environment's."""
     wheel: TopicName | None = None
     """geometry_msgs/TwistWithCovarianceStamped, TwistStamped or nav_msgs/Odometry: body twist by the wheels."""
     imu: TopicName | None = None
-    """sensor_msgs/Imu: its turn rate."""
+    """sensor_msgs/Imu: turn rate, instead of the wheels'."""
     odometry: TopicName | None = None
-    """nav_msgs/Odometry, or a twist, of the car's own filter."""
+    """nav_msgs/Odometry or a twist: body twist by the car's own filter."""
     estimate: TopicName | None = None
-    """geometry_msgs/PoseStamped, PoseWithCovarianceStamped or nav_msgs/Odometry: where a car is that is a landmark."""
+    """geometry_msgs/PoseStamped, PoseWithCovarianceStamped or nav_msgs/Odometry: pose broadcast by a moving
+    landmark."""
     point: TopicName | None = None
-    """geometry_msgs/PointStamped, likewise."""
+    """geometry_msgs/PointStamped: position broadcast by a moving landmark."""
     truth: TopicName | None = None
-    """geometry_msgs/PoseStamped, PoseWithCovarianceStamped or nav_msgs/Odometry: motion capture."""
+    """geometry_msgs/PoseStamped, PoseWithCovarianceStamped or nav_msgs/Odometry: motion capture, for errors
+    only, never observed."""
 
     @property
     def given(self) -> dict[Role, str]:
@@ -77,7 +79,7 @@ class BagCar(Car):
     """One car of the bag."""
 
     body: Name | None = None
-    """{body} in the names of motion capture (default: its name)."""
+    """Name of the car in motion capture (default: its name)."""
     topics: Topics = Topics()
 
     @property
@@ -91,28 +93,28 @@ class Clocks(Part):
     """How times are read."""
 
     mode: Literal["auto", "stamps", "received"] = "auto"
-    """`auto`: stamps, moved by the offset of their clock where that is more than `tolerance`; `stamps`: stamps as they
-    are; `received`: when the recorder received a message, of sources without usable stamps."""
+    """`auto`: stamps, shifted by the offset of their clock if that exceeds `tolerance`; `stamps`: unchanged stamps;
+    `received`: times of reception, for sources without usable stamps."""
     tolerance: Positive = 0.02
-    """s by which clocks may differ before stamps are moved: less is what networks need."""
+    """Offset of a clock above which its stamps are shifted, s."""
     offsets: dict[str, Number] = Field(default={}, max_length=64)
-    """s to add to the stamps of a car, or of `truth`, in place of the offset that was found."""
+    """Time added to the stamps of a car, or of `truth`, instead of the estimated offset, s."""
 
 
 class Frame(Part):
     """Where the frame of positions in a bag is in the environment's coordinates."""
 
     position: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
-    """Its origin, m."""
+    """Origin of the frame in the environment's coordinates, m."""
     yaw: Number = 0.0
-    """By which it is turned to the left, rad."""
+    """Rotation of the frame to the left, rad."""
 
 
 class Frames(Part):
     """Frames of the bag's positions."""
 
     map: Frame = Frame()
-    """Of what cars say."""
+    """Of the cars' messages."""
     truth: Frame | None = None
     """Of motion capture (default: the same)."""
 
@@ -123,22 +125,23 @@ class TopicMap(Part):
     environment: str
     """Name of an environment, or TOML file (relative to this file): landmarks, cameras, noise and observer."""
     overrides: dict[str, Any] = Field(default={})
-    """Dotted keys of it."""
+    """Dotted keys of the environment with other values."""
     names: Literal["svea", "authors", "none"] = "svea"
-    """Scheme by which topics are named unless `cars.topics` says otherwise."""
+    """Scheme of topic names, unless `cars.topics` gives others."""
     cars: tuple[BagCar, ...] = Field(min_length=1, max_length=64)
+    """One table `[[cars]]` per car."""
     markers: dict[str, Marker] = Field(default={})
     """Numbers of the markers of landmarks, by name."""
     odometry: Literal["auto", "wheel+imu", "wheel", "odometry"] = "auto"
-    """Where body twists come from; `auto`: the first of wheel+imu, odometry and wheel that the bag has."""
+    """Source of body twists; `auto`: the first of wheel+imu, odometry and wheel in the bag."""
     camera: Literal["auto", "detections", "bearings"] = "auto"
-    """What is read of the camera; `auto`: detections where the bag has them, or else bearings."""
+    """Source of bearings; `auto`: detections if the bag has them, or else bearings."""
     distorted: bool = True
-    """Whether `bearings` were made of pixels whose distortion had not been removed, as the authors' are."""
+    """Whether `bearings` come from pixels with distortion, as the authors' do."""
     start: float = Field(default=0.0, ge=0.0, le=1e6)
-    """s to leave out after the moment at which everything has begun to come."""
+    """Time left out after all needed topics have begun, s."""
     duration: Positive | None = None
-    """s to use after that (none: all)."""
+    """Time used after that, s (default: all)."""
     clocks: Clocks = Clocks()
     frames: Frames = Frames()
     path: Path = Field(default=Path("topics.toml"), exclude=True)

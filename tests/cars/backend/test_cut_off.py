@@ -149,7 +149,7 @@ def test_other_files_that_are_cut_off_name_what_mends_them(recorded: Any, tmp_pa
 
 
 def test_rewards_of_own_actions_alone_are_not_those_of_the_drive(recorded: Any) -> None:
-    """What docs/cars_topics.md says: `control` and `last_action` are those of whoever acts at the replay."""
+    """What docs/cars_records.md says: `control` and `last_action` are those of whoever acts at the replay."""
     outcomes = []
     for action in (np.zeros(2), np.array([0.5, -0.5])):
         env = coopenv.parallel_env(recorded[0], dtype="float64", overrides={"reward.weights.control": 1.0})
