@@ -26,12 +26,21 @@ FAR = wp.constant(4.0)
 
 
 @device_function
-def estimated_progress(model: Any, state: Any, world: int, vehicle: int):
-    """Return (arc length of the estimated position along the route, length of the route), m; (0, 0) without a goal."""
+def estimate_on_route(state: Any, world: int, vehicle: int):
+    """Return the place of a route nearest to the estimate; 0 without a goal.
+
+    Returns:
+        Arc length (m), offset of the estimate to the left (m), heading of the route (rad).
+    """
     p = state.estimate_rotation[world, vehicle] * state.estimate_position[world, vehicle]
-    s, _, _ = place_on_route(state, world, vehicle, p[0], p[1])
-    length = route_length(state, world, vehicle)
-    return wp.clamp(s, p.dtype(0.0), length), length
+    s, offset, heading = place_on_route(state, world, vehicle, p[0], p[1])
+    return s, offset, heading
+
+
+@device_function
+def estimated_progress(state: Any, world: int, vehicle: int, s: Any):
+    """Return an arc length within the ends of a route, m."""
+    return wp.clamp(s, s - s, route_length(state, world, vehicle))
 
 
 @wp.func
@@ -41,28 +50,23 @@ def turn_between(first: Any, second: Any):
 
 
 @device_function
-def route_from_estimate(model: Any, state: Any, world: int, vehicle: int):
-    """Return the route relative to the estimated pose; 0 without a goal.
+def route_from_estimate(model: Any, state: Any, world: int, vehicle: int, s: Any, along: Any):
+    """Return the route relative to the estimated pose, from its nearest arc length `s` (m) and heading `along` (rad).
 
     Returns:
-        Offset to the left of the route (m), heading minus the heading of the route (rad), remaining arc length (m),
-        and the directions of the route 1, 2, 4 and 8 steps ahead, in rad from the body's x axis to the left.
+        Heading minus the heading of the route (rad), remaining arc length (m), and the directions of the route 1, 2, 4
+        and 8 steps ahead, in rad from the body's x axis to the left.
     """
     R = state.estimate_rotation[world, vehicle]
     p = R * state.estimate_position[world, vehicle]
-    length = route_length(state, world, vehicle)
-    zero = length - length
-    ahead = wp.vec4()
-    if length <= zero:
-        return zero, zero, zero, ahead
-    s, offset, along = place_on_route(state, world, vehicle, p[0], p[1])
     heading = wp.atan2(R[1, 0], R[0, 0])
+    ahead = wp.vec4()
     step = model.route_step
     for k in range(4):
         x, y, _ = point_on_route(state, world, vehicle, s + step)
         ahead[k] = wp.float32(turn_between(wp.atan2(y - p[1], x - p[0]), heading))
         step = step + step
-    return offset, turn_between(heading, along), wp.max(length - s, zero), ahead
+    return turn_between(heading, along), wp.max(route_length(state, world, vehicle) - s, s - s), ahead
 
 
 @device_function
@@ -78,12 +82,11 @@ def furthest_so_far(state: Any, results: Any, world: int, vehicle: int):
 
 
 @device_function
-def metres(model: Any, state: Any, results: Any, world: int, vehicle: int, elapsed: wp.float64):
+def metres(model: Any, state: Any, results: Any, world: int, vehicle: int, progress: Any, elapsed: wp.float64):
     """Return the metres of its route that a vehicle gains in this decision, and those that it misses.
 
     The missed metres are the rest of the route in the step that ends the episode without an arrival, otherwise 0.
     """
-    progress, length = estimated_progress(model, state, world, vehicle)
     zero = progress - progress
     last = furthest_so_far(state, results, world, vehicle)
     most = model.dynamics[vehicle].max_speed * type(progress)(FASTEST * elapsed)
@@ -91,7 +94,7 @@ def metres(model: Any, state: Any, results: Any, world: int, vehicle: int, elaps
     missed = zero
     ends = results.terminated[world, vehicle] or results.truncated[world, vehicle]
     if ends and results.alive[world, vehicle] and state.ended[world, vehicle] != ARRIVED:
-        missed = wp.max(length - last - gained, zero)
+        missed = wp.max(route_length(state, world, vehicle) - last - gained, zero)
     return gained, missed
 
 

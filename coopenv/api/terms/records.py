@@ -9,7 +9,14 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.api.terms.geometry import Nearest, expected_in_view, metres, route_from_estimate
+from coopenv.api.terms.geometry import (
+    Nearest,
+    estimate_on_route,
+    estimated_progress,
+    expected_in_view,
+    metres,
+    route_from_estimate,
+)
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.collision import UNDER_WAY
 from coopenv.world.command import ACCELERATION, SPEED, STEERING
@@ -178,7 +185,9 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     ego.heading_std = wp.float32(wp.sqrt(wp.max(state.covariance[world, vehicle][2, 2], p.dtype(0.0))))
     ego.uncertainty_threshold = wp.float32(model.judgement.uncertainty_threshold)
     ego.uncertainty_cap = wp.float32(model.judgement.uncertainty_cap)
-    gained, missed = metres(model, state, results, world, vehicle, wp.float64(ego.elapsed))
+    s, offset, along = estimate_on_route(state, world, vehicle)
+    progress = estimated_progress(state, world, vehicle, s)
+    gained, missed = metres(model, state, results, world, vehicle, progress, wp.float64(ego.elapsed))
     ego.metres_gained = wp.float32(gained)
     ego.metres_missed = wp.float32(missed)
     ego.gramian_min_eigenvalue = wp.float32(results.gramian_min_eigenvalue[world, vehicle])
@@ -203,8 +212,8 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     ego.pan = wp.float32(state.pan[world, vehicle])
     ego.steering = wp.float32(state.steering[world, vehicle])
     ego.time_left = 1.0 - wp.float32(tick) / wp.float32(model.horizon_ticks)
-    if route:
-        offset, turn, left, ahead = route_from_estimate(model, state, world, vehicle)
+    if route and route_length(state, world, vehicle) > p.dtype(0.0):
+        turn, left, ahead = route_from_estimate(model, state, world, vehicle, s, along)
         ego.route_offset = wp.float32(offset)
         ego.route_heading = wp.float32(turn)
         ego.route_left = wp.float32(left)
@@ -228,10 +237,10 @@ def own_records(model: Any, state: Any, results: Any, world: int, vehicle: int, 
     truth.nees = zero_if_unknown(results.nees[world, vehicle])
     truth.goal_distance = zero_if_unknown(goal_distance(model, state, world, vehicle))
     if model.scene.goal_radius[vehicle] > p.dtype(0.0):
-        progress = results.last_remaining[world, vehicle] - remaining
+        nearer = results.last_remaining[world, vehicle] - remaining
         if ego.arrived > 0 and ego.outcome == UNDER_WAY:  # on a new route now
-            progress += route_length(state, world, vehicle)
-        truth.progress = zero_if_unknown(progress)
+            nearer += route_length(state, world, vehicle)
+        truth.progress = zero_if_unknown(nearer)
     truth.contact = state.collided[world, vehicle] != 0
     return ego, truth
 

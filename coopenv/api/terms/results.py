@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.api.terms.geometry import Nearest, estimated_progress, furthest_so_far, next_nearest
+from coopenv.api.terms.geometry import Nearest, estimate_on_route, estimated_progress, furthest_so_far, next_nearest
 from coopenv.api.terms.layout import Layout, entries_of, included_fields
 from coopenv.api.terms.records import (
     Ego,
@@ -251,7 +251,8 @@ def step_results(
     remaining = remaining_way(model, state, world, vehicle)
     assess(model, state, results, world, vehicle)
     if fresh[world] != 0:
-        progress, _ = estimated_progress(model, state, world, vehicle)
+        s, _, _ = estimate_on_route(state, world, vehicle)
+        progress = estimated_progress(state, world, vehicle, s)
         store_for_next_step(state, results, world, vehicle, remaining, progress, 0)
     set_flags(results, world, vehicle, state.ended[world, vehicle], is_over(model, state, world), model.horizon_ticks)
     ego, truth = own_records(model, state, results, world, vehicle, remaining, table.route)
