@@ -23,10 +23,10 @@ def page_text(name: str, scenario: Scenario, measured: str = "", film: str = "")
     """Return the page of an environment.
 
     Args:
-        name: of the environment; the picture beside the page is called so, too.
-        scenario: what the page is about.
-        measured: a part with figures that were measured, if there are any.
-        film: what the film beside the page shows, if there is one; it is called as the picture is.
+        name: of the environment and of the picture beside the page.
+        scenario: the environment.
+        measured: a part with measured figures, if there are any.
+        film: caption of the film beside the page, if there is one; it has the name of the picture.
     """
     return (
         "\n\n".join([*_head(name, scenario, film), *_scene(scenario), *_learning(scenario), *_end(name, measured)])
@@ -35,11 +35,7 @@ def page_text(name: str, scenario: Scenario, measured: str = "", film: str = "")
 
 
 def _head(name: str, scenario: Scenario, film: str) -> Iterator[str]:
-    shipped = name in list_envs()
     yield f"# {plain(scenario.title)}"
-    file = f"[`envs/{name}.toml`](../../envs/{name}.toml), " if shipped else ""
-    known = f"`{environment_id(name)}`, " if shipped else ""
-    yield f"`{name}`: {file}{known}this page by `coopenv page {name}`."
     for text in (scenario.description, scenario.source and f"Source: {scenario.source}"):
         if text:
             yield plain(text)
@@ -54,7 +50,7 @@ def _head(name: str, scenario: Scenario, film: str) -> Iterator[str]:
 
 def _scene(scenario: Scenario) -> Iterator[str]:
     yield "## Drawn at every reset"
-    yield bullets(drawn(scenario)) or "Nothing: every episode begins alike, only noise differs."
+    yield bullets(drawn(scenario)) or "Nothing: episodes differ in their noise only."
     if lines := list(graded(scenario)):
         yield f"With the difficulty (here {number(scenario.difficulty.number)}; [draws](../draws.md)):"
         yield bullets(lines)
@@ -84,8 +80,7 @@ def _learning(scenario: Scenario) -> Iterator[str]:
     if scenario.driven:
         yield "## Action"
         driven = next(i for i, vehicle in enumerate(scenario.vehicles) if vehicle.motion.kind == "driven")
-        who = f"`{scenario.vehicle_names[driven]}`, the first driven vehicle"
-        yield f"Entries in [-1, 1] span what follows, here of {who}."
+        yield f"Ranges of the entries, for `{scenario.vehicle_names[driven]}`, the first driven vehicle."
         yield table(
             ("entry", "at -1", "at 1", "unit"),
             [(entry.name, number(entry.low), number(entry.high), entry.unit) for entry in layout.actions[driven]],
@@ -105,7 +100,7 @@ def _meaning(term: Term) -> str:
 
 def _endings(scenario: Scenario) -> Iterator[str]:
     steps, end = round(scenario.horizon * scenario.rates.decision), scenario.termination
-    yield f"for all after {number(scenario.horizon)} s, {steps} decisions"
+    yield f"all vehicles after {number(scenario.horizon)} s, {steps} decisions"
     known = TERMINATION_CONDITIONS.known(end.custom)
     causes = [name for name in ("collision", "arrival") if scenario.driven and getattr(end, name)]
     for name in (*causes, *end.own):
@@ -113,8 +108,8 @@ def _endings(scenario: Scenario) -> Iterator[str]:
     if end.off_route:
         yield f"`off_route`: being farther than {number(end.off_route)} m from its route, or beyond an end of it"
     if scenario.driven and end.arrival:
-        after = {"park": "stands where it is", "leave": "is gone from the next camera tick on"}
-        yield f"who has arrived {after.get(end.after_arrival, 'draws a new route and goes on')}"
+        after = {"park": "stands there", "leave": "is removed from the next camera tick on"}
+        yield f"a vehicle that has arrived {after.get(end.after_arrival, 'draws a new route and continues')}"
 
 
 def _end(name: str, measured: str) -> Iterator[str]:
@@ -123,6 +118,9 @@ def _end(name: str, measured: str) -> Iterator[str]:
         yield measured
     yield "## To try it"
     yield f"```\ncoopenv describe {name} --all\ncoopenv run {name} --seed 0\n```"
+    if name in list_envs():
+        file = f"[`envs/{name}.toml`](../../envs/{name}.toml)"
+        yield f"Gymnasium and PettingZoo: `{environment_id(name)}`. Made by `coopenv page {name}` from {file}."
 
 
 def index_text(scenarios: dict[str, Scenario]) -> str:
