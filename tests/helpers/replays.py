@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -22,20 +21,14 @@ class Played(NamedTuple):
     world: World
 
 
-def replayed(
-    recording: Recording,
-    meddle: Callable[[World, int], None] = lambda world, tick: None,
-    dtype: str = "float64",
-    observer: str = "robust",
-) -> Played:
-    """Replay a record; `meddle` may change what is on the air after each tick."""
+def replayed(recording: Recording, dtype: str = "float64", observer: str = "robust") -> Played:
+    """Replay a record."""
     world = Replay(recording, "record", {"observer.name": observer}).world(1, dtype, "cpu", 1)
     world.reset([0])
     rows = []
     for tick in range(recording.ticks):
         if tick > 0:
             world.advance(1)
-        meddle(world, tick)
         R = world.view("estimate_rotation")[0].astype(float)
         p = (R @ world.view("estimate_position")[0].astype(float)[..., None])[..., 0]
         P = world.view("covariance")[0].astype(float)

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.observers import Recording, Tick
-from coopenv.observers.recording import Truth
+from coopenv.observers import Recording
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 
@@ -59,21 +58,6 @@ def everybody_sees_everybody(horizon: float) -> Recording:
 def noise_free(horizon: float, name: str = "busy_intersection") -> Recording:
     """The paper's start without noise."""
     return record(load_scenario(name, {"noise.enabled": False, "horizon": horizon}))
-
-
-def shifted(recording: Recording, by: np.ndarray) -> Recording:
-    """The same record on a map whose origin is elsewhere."""
-    return replace(
-        recording,
-        landmarks=recording.landmarks + by,
-        start_position=recording.start_position + by,
-        truth=Truth(recording.truth.rotation, recording.truth.position + by),
-    )
-
-
-def first_tick(recording: Recording, vehicle: int = 0, k: int = 1) -> Tick:
-    """What a vehicle senses at a tick, without messages."""
-    return recording.tick(k, vehicle, {})
 
 
 @cache

@@ -70,7 +70,9 @@ def test_it_runs_in_an_environment(observer: str | Embedded) -> None:
 
 
 def test_batch_replay_and_saved_states_keep_its_memory() -> None:
-    rows = coopenv.make_vec("busy_intersection", num_worlds=3, overrides={"observer.name": "toy_counter"})
+    rows = coopenv.make_vec(
+        "busy_intersection", num_worlds=3, dtype="float64", overrides={"observer.name": "toy_counter"}
+    )
     rows.reset(seed=0)
     rows.step(rows.action_space.sample())
     assert (rows.engine.world.memory.ticks.numpy() == rows.engine.world.model.ticks_per_decision).all()

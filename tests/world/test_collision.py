@@ -30,7 +30,7 @@ def overlap(ca: np.ndarray, Ra: np.ndarray, ha: np.ndarray, cb: np.ndarray, Rb: 
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_upright_boxes_against_a_linear_programme(dtype: str) -> None:
     rng = np.random.default_rng(0)
-    count = 1500
+    count = 750
     ca, cb = rng.uniform(-1.5, 1.5, (2, count, 3)) * [1, 1, 0.7]
     yaw = rng.uniform(-np.pi, np.pi, (2, count))
     yaw[:, :200] = np.pi / 2 * rng.integers(0, 4, (2, 200))  # parallel faces
