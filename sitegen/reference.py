@@ -9,6 +9,7 @@ from pydantic.fields import FieldInfo
 from coopenv.base.installation import list_envs
 from coopenv.cars.bags.topic_map import TopicMap
 from coopenv.cars.deployment import Deployment
+from coopenv.cars.topics import TOPICS, Role
 from coopenv.runs.markdown import table
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from coopenv.training.settings import Settings
@@ -55,6 +56,42 @@ that of `coopenv svea gate` and `health` replaces `gate.connect`. `[[cars]]` is 
 """
 
 
+TOPIC = """# Topics of cars
+
+<!-- Written by `python -m sitegen.reference`. -->
+
+Topics are below `fleet/CAR/`, in CDR as zenoh-bridge-ros2dds sends it: the Zenoh key is the ROS name without its
+leading slash. Motion capture is `fleet/qualisys/CAR/odom`. Presence is a Zenoh liveliness token, `fleet/alive/NAME`.
+Rates are those of [fake cars](../fake_cars.md). Messages above the maximal age are not used. Bearings in messages point
+from the target to the camera, in the optical frame.
+
+`network.kind = "nats"` or `"ros1"` is for the authors' cars with their names: `agentN.riccatiPoint`,
+`/agentN/pixy_node/objectsInfo`, `/agentN/actuation_twist`, `/qualisys/CAR/odom`, `/agentN/lli/ctrl_request`.
+
+"""
+
+TOPIC_ROWS = {
+    Role.DETECTIONS: ("car", "60", "blocks of the Pixy, pixels; also frames without blocks"),
+    Role.BEARINGS: ("car", "60", "the authors' unit vectors, instead of pixels"),
+    Role.CAMERA_INFO: ("car", "1", "calibration, compared with the environment's before arming"),
+    Role.ODOMETRY: ("car", "20", 'the car\'s own filter; its twist is used with `odometry = "odometry"`'),
+    Role.WHEEL: ("car", "50", "wheel speed"),
+    Role.IMU: ("car", "100", "turn rate"),
+    Role.ESTIMATE: ("station, car", "20, 60", "estimated pose of a vehicle; position of a moving landmark, 60 Hz"),
+    Role.REPORT: ("station", "20", "message of the observer `robust`"),
+    Role.POINT: ("car", "60", "position alone, the authors' `riccatiPoint`"),
+    Role.STATE: ("car", "5", "whether PX4 is armed; its mode"),
+    Role.REMOTE: ("car", "5", "remote control"),
+    Role.BATTERY: ("car", "5", "remaining share"),
+    Role.COMMAND: ("station", "20", "steering angle, speed, acceleration; `frame_id` is SESSION:NUMBER"),
+    Role.ARM: ("station", "once", "arms and disarms the gate"),
+    Role.GATE: ("gate", "5", "state, nonce, refused commands by reason"),
+    Role.STOP: ("any", "-", "emergency stop"),
+    Role.MANUAL: ("gate", "20", "command to PX4: `y` = -10 % steering, `z` = 500 - 5 % speed"),
+    Role.TRUTH: ("motion capture", "100", "true pose, for infos, metrics and safety, never for observations"),
+}
+"""Sender, rate (of fake cars, Hz) and content of the topics of a car."""
+
 BAG_MAP = """# Map of a ROS bag
 
 <!-- Written by `python -m sitegen.reference`. -->
@@ -72,6 +109,16 @@ Settings of `coopenv train` are a TOML file ([trainers](../trainers.md#coopenv-t
 `[clone]` is optional: without it the policy starts at random.
 
 """
+
+
+def topics() -> str:
+    """Return the page of the topics of a car."""
+    rows = []
+    for role, (sender, rate, content) in TOPIC_ROWS.items():
+        topic = TOPICS[role]
+        age = "" if topic.max_age is None else f"{topic.max_age:g}"
+        rows.append((f"`{topic.suffix}`", f"`{topic.type.replace('/msg/', '/')}`", sender, rate, age, content))
+    return f"{TOPIC}{table(('topic', 'type', 'from', 'Hz', 'max. age, s', 'content'), rows)}\n"
 
 
 def _reference(part: type[BaseModel]) -> str:
@@ -146,6 +193,7 @@ PAGES: dict[str, Callable[[], str]] = {
     "bag_map.md": lambda: BAG_MAP + _reference(TopicMap),
     "deployment.md": lambda: DEPLOYMENT + _reference(Deployment),
     "observation.md": observation,
+    "topics.md": topics,
     "training.md": lambda: TRAINING + _reference(Settings),
 }
 """Files in docs/reference, and their texts."""

@@ -11,7 +11,10 @@ ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 GENERATED = [
     DOCS / "environments",
-    *(DOCS / "reference" / name for name in ("api", "bag_map.md", "deployment.md", "observation.md", "training.md")),
+    *(
+        DOCS / "reference" / name
+        for name in ("api", "bag_map.md", "deployment.md", "observation.md", "topics.md", "training.md")
+    ),
 ]
 """Pages that `coopenv page` and `python -m sitegen.reference` write, and those that `mkdocstrings` fills."""
 PAGES = {
