@@ -18,6 +18,7 @@ from coopenv.world.collision import referee
 from coopenv.world.dynamics import move
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Source, sense_simulation
 from coopenv.world.odometry import measure_odometry
+from coopenv.world.v2x import transmit
 from coopenv.world.world import World
 
 NEVER = 1 << 30
@@ -32,6 +33,7 @@ def without_camera(model: Any, state: Any, record: Any, world: int, tick: int) -
         measure_odometry(model, state, world, vehicle, tick)
     for vehicle in range(model.vehicles):
         referee(model, state, world, vehicle)
+    transmit(model, state, world, tick)
 
 
 @wp.func
@@ -56,11 +58,6 @@ def without_motion(model: Any, state: Any, record: Any, world: int, tick: int) -
     """Do nothing."""
 
 
-@wp.func
-def deliver_nothing(model: Any, state: Any, record: Any, world: int, vehicle: int, tick: int) -> None:
-    """Receive nothing."""
-
-
 @dataclass(frozen=True)
 class Setting:
     """A tick with some of its stages."""
@@ -68,7 +65,6 @@ class Setting:
     observer: Embedded | None = None
     """What estimates; None: the scenario's observer."""
     sense: Any = sense_simulation
-    deliver: Any = SIMULATED.deliver
     overrides: Mapping[str, Any] | None = None
     """Changes of the scenario."""
     visibility: bool = True
@@ -80,9 +76,10 @@ class Setting:
         scenario = load_scenario(environment, {**overrides, **(self.overrides or {})})
         observer = self.observer or find_embedded(scenario.observer.name) or HOST
         world = World(scenario, worlds, dtype, "cpu", 1, observer, start_covariances(scenario))
-        name = "simulated" if self.deliver is SIMULATED.deliver else "simulated_without_radio"
-        suffix = "" if self.sense is sense_simulation else f"_{self.sense.key}"
-        world.source = Source(name + suffix, SIMULATED.begin, self.sense, self.deliver)
+        if self.sense is not sense_simulation:
+            world.source = Source(
+                f"simulated_{self.sense.key}", SIMULATED.begin, self.sense, SIMULATED.record, fused=True
+            )
         if not self.visibility:
             world.model.sensed = 0
         if not self.sending:
@@ -106,7 +103,7 @@ STAGES: tuple[tuple[str, dict[str, Any]], ...] = (
     ("noise and initial errors", {"overrides": {"noise.enabled": False}}),
     ("visibility (view, occlusion)", {"visibility": False}),
     ("bearings", {"sense": without_camera}),
-    ("radio", {"deliver": deliver_nothing, "sending": False}),
+    ("radio", {"sending": False}),
     ("Gramian", {"gramian": False}),
     ("prediction of the estimate", {"observer": HOST}),
     ("odometry", {"sense": without_odometry}),

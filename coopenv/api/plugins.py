@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from coopenv.backends.base import SensingWorld
 from coopenv.base.errors import CoopenvError
@@ -36,7 +35,7 @@ class PlugIns:
         briefing = world.briefing
         self.groups = [Group(factory, briefing) for _ in range(world.worlds)]
         self._order: Sequence[int] = briefing.order
-        self._active = wp.zeros(world.worlds, dtype=wp.int32, device=world.device)
+        self._ticking = np.zeros(world.worlds, dtype=bool)  # worlds that are in the tick under way
         self._failures: dict[int, str] = {}
 
     def start(self, worlds: np.ndarray) -> None:
@@ -57,13 +56,15 @@ class PlugIns:
 
     def load(self) -> None:
         """Load the kernels of the stages, see `World.load`."""
-        self._active.zero_()
-        self._world.restart()
-        self._world.decide()
-        self._world.sense(self._active)
-        self._world.deliver(self._active, 0)
-        self._world.broadcast(self._active, 0)
-        self._world.finish(self._active)
+        world = self._world
+        world.restart()
+        world.mask.fill_(1)
+        world.decide()
+        world.sense()
+        world.receive(0)
+        world.broadcast(0)
+        world.finish()
+        world.mask.zero_()
 
     def advance(self, ticks: int) -> None:
         """Run camera ticks, stopping each world at its horizon; worlds in the world's mask stay as they are.
@@ -83,8 +84,8 @@ class PlugIns:
         for w in worlds:
             if w in self._failures:
                 raise CoopenvError(f"{self._failures[w]} (reset starts anew)")
-        self._active.numpy()[...] = active
-        world.sense(self._active)
+        self._ticking = active
+        world.sense()
         sensed = {w: world.sensed(w, int(world.view("tick")[w]) + 1) for w in worlds}
         joint = self.groups[0].joint
         if joint:
@@ -92,11 +93,11 @@ class PlugIns:
                 for i, estimate in enumerate(self._ask(w, None, sensed[w])):
                     self._write(w, i, estimate)
         for vehicle in self._order:
-            world.deliver(self._active, vehicle)
+            world.receive(vehicle)
             for w in [] if joint else worlds:
                 self._write(w, vehicle, self._ask(w, vehicle, sensed[w])[0])
-            world.broadcast(self._active, vehicle)
-        world.finish(self._active)
+            world.broadcast(vehicle)
+        world.finish()
 
     def _ask(self, w: int, vehicle: int | None, sensed: Sensed) -> list[Estimate]:
         group = self.groups[w]
@@ -118,7 +119,7 @@ class PlugIns:
     def _failed(self, failure: ObserverError) -> CoopenvError:
         """Return the error, and remember it for the worlds that were in this tick: it has no end."""
         message = f"observer '{self.name}' {failure}"
-        self._failures.update(dict.fromkeys(np.flatnonzero(self._active.numpy()).tolist(), message))
+        self._failures.update(dict.fromkeys(np.flatnonzero(self._ticking).tolist(), message))
         return CoopenvError(message)
 
     def _write(self, w: int, vehicle: int, estimate: Estimate) -> None:

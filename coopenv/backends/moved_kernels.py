@@ -8,12 +8,13 @@ import warp as wp
 from coopenv.world.camera import observe
 from coopenv.world.collision import ARRIVED, COLLIDED, UNDER_WAY, depart, referee
 from coopenv.world.dynamics import prescribe
-from coopenv.world.embedded import Source, deliver_simulation
+from coopenv.world.embedded import Source
 from coopenv.world.model import PRESCRIBED
 from coopenv.world.odometry import measure_odometry
 from coopenv.world.precision import Precision
 from coopenv.world.records import array
 from coopenv.world.reset import begin_sensing, place_everybody
+from coopenv.world.v2x import transmit
 
 
 @cache
@@ -118,7 +119,8 @@ def sense_moved(model: Any, state: Any, moved: Any, world: int, tick: int):
         judge(model, state, moved, world, vehicle)
     for vehicle in range(model.vehicles):
         observe(model, state, world, vehicle, tick)
+    transmit(model, state, world, tick)
 
 
-MOVED = Source("moved", begin_moved, sense_moved, deliver_simulation)
+MOVED = Source("moved", begin_moved, sense_moved, moved_struct)
 """Ticks of vehicles that a program on the host moves."""

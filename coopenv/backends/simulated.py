@@ -6,7 +6,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import warp as wp
 
 from coopenv.backends.base import Capabilities, Episode, SensingWorld, TickGenerator
 from coopenv.estimation.outcomes import Sight
@@ -106,14 +105,13 @@ class Simulated(TickGenerator):
             self._world = self.kind(self.scenario, 1, "float64", threads=1)
         world = self._world
         world.reset(None if seed is None else [seed])
-        active = wp.ones(1, dtype=wp.int32, device=world.device)
         command = yield world.told(0)
         for k in range(1, self.scenario.horizon_ticks + 1):
             world.view("command")[0] = command.rows
             world.fetch()
-            world.sense(active)
+            world.sense()
             for vehicle in world.briefing.order:
-                world.deliver(active, vehicle)
-                world.broadcast(active, vehicle)
-            world.finish(active)
+                world.receive(vehicle)
+                world.broadcast(vehicle)
+            world.finish()
             command = yield world.told(k)

@@ -99,7 +99,6 @@ class TickWorld(SensingWorld):
         super().load()
         compiled_checks()
         self.mask.fill_(1)  # so that nothing moves: in real time the first tick must not wait for its launch
-        super().advance(1)
         self.decide()
         self.mask.zero_()
 
@@ -112,10 +111,10 @@ class TickWorld(SensingWorld):
             super().advance(1)
             self._end_tick()
 
-    def finish(self, active: Any) -> None:
+    def finish(self) -> None:
         """End the tick, see `World.finish`."""
-        super().finish(active)
-        if active.numpy()[0] != 0:
+        super().finish()
+        if self.mask.numpy()[0] == 0:
             self._end_tick()
 
     def fetch(self) -> bool:

@@ -5,7 +5,7 @@ vehicle, one row stands for all; truth is not a number.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -25,7 +25,7 @@ from coopenv.world.launch import Launcher
 from coopenv.world.precision import precision
 from coopenv.world.records import allocate, fields
 from coopenv.world.state import allocate_state, state_fields, state_sizes
-from coopenv.world.step import estimate_kernel, send_kernel, start_kernel
+from coopenv.world.step import observer_kernels
 
 PRECISION = "float64"
 UNITS_PER_TICK = 64
@@ -82,7 +82,7 @@ class KernelObserver:
         self._set_clock(None, self.setup.noise.odometry_period)
         self._heard.clear()
         self.ignored_messages = 0
-        self._run("start", start_kernel)
+        self._run("start_one")
 
     def update(self, tick: Tick) -> Estimate:
         """Take one camera tick; a CoopenvError says that the kernels cannot count its time."""
@@ -95,7 +95,7 @@ class KernelObserver:
             view[0] = value
         self._sense(tick, now)
         self._receive(tick.messages, now)
-        self._run("estimate", estimate_kernel, *self._now)
+        self._run("estimate_one", *self._now)
         s, coordinates = self.state, self._kernels.coordinates
         R, p, P = s.estimate_rotation.copy(), s.estimate_position.copy(), s.covariance.copy()
         if coordinates is Coordinates.LEFT:
@@ -105,7 +105,7 @@ class KernelObserver:
 
     def message(self) -> Message:
         """Return what the kernels put on the air."""
-        self._run("send", send_kernel, self._now[0])
+        self._run("send_one", self._now[0])
         return cast(Message, self._messages.write(self))
 
     def _sense(self, tick: Tick, now: int) -> None:
@@ -152,8 +152,9 @@ class KernelObserver:
         self._model.camera_period, self._model.camera_rate = self.unit, 1.0 / self.unit
         self._launch = Launcher(1, "cpu", PRECISION)
 
-    def _run(self, key: str, factory: Callable[[Embedded], Any], *moving: Any) -> None:
-        self._launch(key, factory(self._kernels), [self._model, *self._records, self.setup.vehicle, *moving])
+    def _run(self, name: str, *moving: Any) -> None:
+        kernel = observer_kernels(self._kernels, precision(PRECISION))[name]
+        self._launch(name, kernel, [self._model, *self._records, self.setup.vehicle, *moving])
 
     def _all_views(self) -> list[Any]:
         return [*vars(self.state).values(), *vars(self.memory).values(), *self._now_views, self._start_covariance]

@@ -1,6 +1,6 @@
 """What the world is handed: an observer, and a source of ticks, each as a few Warp functions.
 
-The world knows neither; `coopenv.world.step` fuses what it is given into one loop over the ticks of a decision.
+The world knows neither; `coopenv.world.step` makes kernels of them.
 """
 
 from collections.abc import Callable, Mapping
@@ -15,9 +15,10 @@ from coopenv.world.collision import depart, referee
 from coopenv.world.device_function import device_function
 from coopenv.world.dynamics import move
 from coopenv.world.odometry import measure_odometry
+from coopenv.world.precision import Precision
 from coopenv.world.reset import reset_world
 from coopenv.world.saved_state import Rule
-from coopenv.world.v2x import deliver
+from coopenv.world.v2x import transmit
 
 
 @wp.struct
@@ -104,6 +105,14 @@ class Embedded:
     """In which it states its covariance on the host; in the state it is over (2 lambda, p)."""
     options: Mapping[str, Any] = field(default_factory=dict, hash=False)
     """Options of the Warp module that it is compiled in."""
+    fused: bool = False
+    """Whether simulated worlds run it in one kernel with the simulation: faster for small observers, and compiled once
+    more for it."""
+
+    @property
+    def starts(self) -> bool:
+        """Whether anything of it happens where an episode begins."""
+        return self.start is not start_nothing or self.send is not send_nothing
 
 
 @dataclass(frozen=True)
@@ -112,9 +121,12 @@ class Source:
 
     name: str
     begin: Any  # (model, state, record, world): go to the start of an episode
-    sense: Any  # (model, state, record, world, tick): write everything that is sensed at a tick, and the truth
-    deliver: Any  # (model, state, record, world, vehicle, tick): write the messages that a vehicle receives at a tick
+    sense: Any
+    """(model, state, record, world, tick): write everything that is sensed at a tick, the truth, and which messages
+    arrive at whom (`state.arriving`, see `coopenv.world.v2x`); `begin` does so for the first frame."""
+    record: Callable[[Precision], Any]  # returns the Warp struct of the record that both read
     knows_truth: bool = True  # the truth is always there; otherwise it may be NaN
+    fused: bool = False  # whether small observers run in one kernel with it, see `Embedded.fused`
 
 
 @device_function
@@ -153,13 +165,13 @@ def sense_simulation(model: Any, state: Any, record: Any, world: int, tick: int)
         referee(model, state, world, vehicle)
     for vehicle in range(model.vehicles):
         observe(model, state, world, vehicle, tick)
+    transmit(model, state, world, tick)
 
 
-@device_function
-def deliver_simulation(model: Any, state: Any, record: Any, world: int, vehicle: int, tick: int):
-    """Receive what the radio lets through."""
-    deliver(model, state, world, vehicle, tick)
+def nothing_recorded(p: Precision) -> Any:
+    """Return the record of a source that needs none."""
+    return Nothing
 
 
-SIMULATED = Source("simulated", begin_simulation, sense_simulation, deliver_simulation)
+SIMULATED = Source("simulated", begin_simulation, sense_simulation, nothing_recorded, fused=True)
 """Ticks that are computed."""

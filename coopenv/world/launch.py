@@ -5,7 +5,7 @@ whatever else a program uses; a generic kernel in a shared module would be rebui
 """
 
 import os
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
@@ -19,8 +19,11 @@ import warp as wp
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import available_cores
 from coopenv.world import kernel_cache
+from coopenv.world.warp_internals import replay_of
 
 Function = Callable[..., None] | wp.Kernel
+Call = tuple[wp.Kernel, list[Any]]  # a kernel with its arguments
+WORLDS_PER_BLOCK = 16  # that go through a decision together, so that their state stays in the cache
 WORLDS_PER_THREAD = 32  # smaller shares are not worth the handing over between threads
 
 
@@ -61,6 +64,22 @@ def kernel(function: Function, precision_name: str, differentiable: bool = False
     return wp.Kernel(func=function, key=function.__name__, module=module)
 
 
+def module_kernels(name: str, p: Any, *functions: Callable[..., None], **options: Any) -> dict[str, wp.Kernel]:
+    """Return functions, whose arguments have Warp types, as the kernels of one module, by name.
+
+    Args:
+        name: of the module, besides the precision.
+        p: the `Precision` that it serves.
+        functions: as for `wp.kernel`.
+        options: of the module; "inline_threshold" is the compiler's, see `inlining`.
+    """
+    module = wp.get_module(f"coopenv.{name}.{p.name}")
+    threshold = options.pop("inline_threshold", None)
+    module.options.update({} if threshold is None else inlining(threshold))
+    module.options.update(options, enable_backward=False)
+    return {function.__name__: wp.Kernel(func=function, key=function.__name__, module=module) for function in functions}
+
+
 def inlining(threshold: int) -> dict[str, Any]:
     """Return options of kernels in which functions up to a cost are inlined: Warp's 9000 takes long to compile.
 
@@ -74,10 +93,11 @@ def inlining(threshold: int) -> dict[str, Any]:
 
 
 def near_inlining() -> dict[str, Any]:
-    """Return options of kernels that gain nothing from Warp's far inlining: compiled in half the time without it."""
-    flags = (wp.config.cpu_compiler_flags or "").split()
-    kept = " ".join(flag for flag in flags if not flag.startswith("-mllvm"))
-    return {"cpu_compiler_flags": kept} if len(kept.split()) < len(flags) else {}
+    """Return options of kernels that gain nothing from Warp's far inlining, which takes long to compile.
+
+    They are those of the large observers: the compiler parses Warp's headers once for all modules of the same flags.
+    """
+    return {"optimization_level": 3, **inlining(1000)}
 
 
 def default_threads(worlds: int, device: str) -> int:
@@ -118,28 +138,50 @@ class Launcher:
 
     def __init__(self, worlds: int, device: str, precision_name: str, threads: int = 1) -> None:
         self._device, self._precision = device, precision_name
-        bounds = np.linspace(0, worlds, threads + 1).round().astype(int).tolist()
-        self._shares = [(a, b) for a, b in pairwise(bounds) if b > a]
-        self._recorded: dict[Hashable, list[Any]] = {}
+        self._shares = _split(0, worlds, threads)
+        self._recorded: dict[Hashable, list[list[Callable[[], Any]]]] = {}
         self._pool: ThreadPoolExecutor | None = None
         self._pool_owner = 0
 
     def __call__(self, key: Hashable, function: Function, arguments: list[Any], inner: tuple[int, ...] = ()) -> None:
         """Run a kernel over the grid (worlds, *inner)."""
         if key not in self._recorded:
-            self._recorded[key] = [
-                kernel_cache.launch(
-                    kernel(function, self._precision),
-                    dim=(stop - start, *inner),
-                    inputs=[a.part(start, stop) if isinstance(a, PerWorld) else a for a in arguments],
-                    device=self._device,
-                    record_cmd=True,
-                )
-                for start, stop in self._shares
-            ]
-        first, *rest = self._recorded[key]
-        others = [self._workers().submit(command.launch) for command in rest]
-        first.launch()
+            self._recorded[key] = [[self._record(function, arguments, share, inner)] for share in self._shares]
+        self._run(self._recorded[key])
+
+    def decision(self, key: Hashable, ticks: int, first: Call, *tick: Call) -> None:
+        """Run a kernel, and then others in turn, a number of times; on the CPU a few worlds at a time."""
+        if key not in self._recorded:
+            self._recorded[key] = [self._record_decision(ticks, first, tick, share) for share in self._shares]
+        self._run(self._recorded[key])
+
+    def _record_decision(
+        self, ticks: int, first: Call, tick: Sequence[Call], share: tuple[int, int]
+    ) -> list[Callable[[], Any]]:
+        blocks = (share[1] - share[0]) // WORLDS_PER_BLOCK if self._device == "cpu" else 1
+        launches = []
+        for block in _split(*share, max(1, blocks)):
+            launches.append(self._record(*first, block))
+            launches.extend([self._record(*call, block) for call in tick] * ticks)
+        return launches
+
+    def _record(
+        self, function: Function, arguments: list[Any], share: tuple[int, int], inner: tuple[int, ...] = ()
+    ) -> Callable[[], Any]:
+        """Return the recorded launch of a kernel for a share of the worlds."""
+        command = kernel_cache.launch(
+            kernel(function, self._precision),
+            dim=(share[1] - share[0], *inner),
+            inputs=[a.part(*share) if isinstance(a, PerWorld) else a for a in arguments],
+            device=self._device,
+            record_cmd=True,
+        )
+        return replay_of(command)
+
+    def _run(self, shares: list[list[Callable[[], Any]]]) -> None:
+        first, *rest = shares
+        others = [self._workers().submit(_run_all, launches) for launches in rest]
+        _run_all(first)
         for other in others:
             other.result()
 
@@ -154,3 +196,14 @@ class Launcher:
         if self._pool is not None and self._pool_owner == os.getpid():
             self._pool.shutdown(wait=False)
         self._pool = None
+
+
+def _split(start: int, stop: int, parts: int) -> list[tuple[int, int]]:
+    """Return the ranges of indices into which a range is split, empty ones left out."""
+    bounds = np.linspace(start, stop, parts + 1).round().astype(int).tolist()
+    return [(a, b) for a, b in pairwise(bounds) if b > a]
+
+
+def _run_all(launches: list[Callable[[], Any]]) -> None:
+    for launch in launches:
+        launch()

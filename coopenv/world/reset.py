@@ -1,4 +1,4 @@
-"""Start an episode: draw poses and initial estimates, take the first frame, send the first messages."""
+"""Start an episode: draw poses and initial estimates, take the first frame."""
 
 from typing import Any
 
@@ -29,7 +29,7 @@ from coopenv.world.random import (
     unit_vector,
 )
 from coopenv.world.route import has_routes
-from coopenv.world.v2x import broadcast, deliver
+from coopenv.world.v2x import transmit
 
 ATTEMPTS = wp.constant(16)
 """How often the start of a vehicle with routes is drawn until it touches nothing that is there already."""
@@ -235,17 +235,15 @@ def place_everybody(model: Any, state: Any, world: int):
 
 @wp.func
 def begin_sensing(model: Any, state: Any, world: int):
-    """Draw initial estimates and lasting errors, look for contact, take the first frame, send the first messages."""
+    """Draw initial estimates and lasting errors, look for contact, take the first frame."""
     for vehicle in range(model.vehicles):
         believe(model, state, world, vehicle)
         draw_errors(model, state, world, vehicle)
         draw_faults(model, state, world, vehicle)
         state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
-    for place in range(model.vehicles):
-        vehicle = model.order[place]
+    for vehicle in range(model.vehicles):
         observe(model, state, world, vehicle, 0)
-        deliver(model, state, world, vehicle, 0)
-        broadcast(model, state, world, vehicle, 0)
+    transmit(model, state, world, 0)
 
 
 @wp.func

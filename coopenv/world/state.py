@@ -109,6 +109,7 @@ def state_struct(p: Precision) -> Any:
         outbox_rotation: array("WNS", mat33)  # Rhat as sent
         outbox_position: array("WNS", vec3)  # Rhat phat as sent, map
         outbox_tick: array("WNS", wp.int32)  # -1: nothing sent in this slot
+        arriving: array("WNN", wp.int32)  # per receiver and sender: tick of sending of what arrives now; -1: nothing
         inbox_rotation: array("WNN", mat33)  # per receiver and sender
         inbox_position: array("WNN", vec3)  # map
         inbox_tick: array("WNN", wp.int32)  # tick of sending; -1: never heard
@@ -168,6 +169,7 @@ VALID: dict[str, Rule] = {
     "sight": whole(min(Sight), max(Sight)),
     "outbox_rotation": ROTATION,
     "outbox_tick": TICK,
+    "arriving": TICK,
     "inbox_rotation": ROTATION,
     "inbox_tick": TICK,
     "inbox_stamp": TICK,

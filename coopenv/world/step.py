@@ -1,27 +1,39 @@
-"""The pipeline of one camera tick, fused into kernels for a given source of ticks and a given observer.
+"""The pipeline of one camera tick as kernels: those of a source of ticks, and those of an observer.
 
-Each kernel is a closure over the Warp functions that it is made of. Its Warp module is named after the source and the
-observer, so that a pair is compiled once per precision and machine.
+A decision is `decide`, then per tick `sense` (the source) and `follow` (the observer: receive, estimate, send). Neither
+knows the other, so that each is compiled once per precision. For a small observer of simulated worlds
+(`Embedded.fused`) one kernel of its own, `advance`, runs all ticks of a decision without leaving a world.
 """
 
-from collections.abc import Callable
 from functools import cache
 from typing import Any
 
 import warp as wp
 
-from coopenv.world.command import decide
+from coopenv.world.command import decide as make_commands
+from coopenv.world.device_function import device_function
 from coopenv.world.embedded import Embedded, Now, Source, regular_tick
 from coopenv.world.faults import forget_everything
-from coopenv.world.launch import near_inlining
+from coopenv.world.launch import module_kernels, near_inlining
+from coopenv.world.model import model_struct
+from coopenv.world.precision import Precision
 from coopenv.world.quality import sample_gramian
-from coopenv.world.v2x import broadcast
+from coopenv.world.state import state_struct
+from coopenv.world.v2x import broadcast as broadcast_estimate
+from coopenv.world.v2x import deliver
 
-Kernel = Callable[..., None]
+Kernels = dict[str, wp.Kernel]
+"""By name."""
 
 
-@wp.func
-def finish(model: Any, state: Any, world: int, tick: int):
+@device_function
+def is_active(model: Any, state: Any, hold: Any, world: int) -> bool:
+    """Return whether a world takes part in the next tick: it is not marked in `hold`, nor at its horizon."""
+    return hold[world] == 0 and state.tick[world] < model.horizon_ticks
+
+
+@device_function
+def finish_tick(model: Any, state: Any, world: int, tick: int):
     """Put a decision that is over on record, and count the tick."""
     if tick % model.ticks_per_decision == 0 or tick == model.horizon_ticks:
         for vehicle in range(model.vehicles):
@@ -29,73 +41,93 @@ def finish(model: Any, state: Any, world: int, tick: int):
     state.tick[world] = tick
 
 
-def _named(kernel: Kernel, *parts: str, **options: Any) -> Kernel:
-    """Name a kernel after what it is made of, and keep the options of its module (see `launch.kernel`)."""
-    kernel.__name__ = "_".join((kernel.__name__, *parts))
-    kernel.options = options  # type: ignore[attr-defined]
-    return kernel
+@cache
+def _follow_tick(observer: Embedded) -> Any:
+    """Return the Warp function of a tick that has been sensed: receive, estimate, send, leaders before followers."""
+    estimate, send = observer.estimate, observer.send
+
+    @device_function
+    def follow_tick(model: Any, state: Any, memory: Any, world: int, tick: int):
+        """Run the observers of one world."""
+        now = regular_tick(model, tick)
+        for place in range(model.vehicles):
+            vehicle = model.order[place]
+            deliver(model, state, world, vehicle, tick)
+            estimate(model, state, memory, world, vehicle, now)
+            sample_gramian(model, state, world, vehicle, tick)
+            broadcast_estimate(model, state, world, vehicle, tick)
+            send(model, state, memory, world, vehicle, tick)
+        finish_tick(model, state, world, tick)
+
+    return follow_tick
 
 
 @cache
-def advance_kernel(source: Source, observer: Embedded) -> Kernel:
-    """Return the kernel that runs whole ticks: sense -> receive -> estimate -> send, leaders before followers."""
-    sense, deliver, estimate, send = source.sense, source.deliver, observer.estimate, observer.send
+def begin_kernel(source: Source, p: Precision) -> wp.Kernel:
+    """Return the kernel that starts the next episode in every world whose mask is set; the observer starts then."""
+    Model, State, Record, begin_episode = model_struct(p), state_struct(p), source.record(p), source.begin
 
-    def advance(
-        model: Any,
-        state: Any,
-        memory: Any,
-        record: Any,
-        actions: wp.array3d(dtype=Any),
-        hold: wp.array(dtype=wp.int32),
-        ticks: int,
-    ):
-        """Advance by up to `ticks` camera ticks, not beyond the horizon; worlds marked in `hold` stay as they are."""
-        world = wp.tid()
-        count = wp.where(hold[world] == 0, wp.min(ticks, model.horizon_ticks - state.tick[world]), 0)
-        if count > 0:
-            decide(model, state, actions, world)
-        for _ in range(count):
-            tick = state.tick[world] + 1
-            now = regular_tick(model, tick)
-            sense(model, state, record, world, tick)
-            for place in range(model.vehicles):
-                vehicle = model.order[place]
-                deliver(model, state, record, world, vehicle, tick)
-                estimate(model, state, memory, world, vehicle, now)
-                sample_gramian(model, state, world, vehicle, tick)
-                broadcast(model, state, world, vehicle, tick)
-                send(model, state, memory, world, vehicle, tick)
-            finish(model, state, world, tick)
-
-    return _named(advance, source.name, observer.name, **observer.options)
-
-
-@cache
-def restart_kernel(source: Source, observer: Embedded) -> Kernel:
-    """Return the kernel that starts the next episode."""
-    begin, start, send = source.begin, observer.start, observer.send
-
-    def restart(model: Any, state: Any, memory: Any, record: Any, mask: wp.array(dtype=wp.int32)):
-        """Start the next episode in every world whose mask is set."""
+    def begin(model: Model, state: State, record: Record, mask: wp.array(dtype=wp.int32)):
+        """Begin, and send the first pose estimates. One thread per world."""
         world = wp.tid()
         if mask[world] != 0:
             state.episode[world] = state.episode[world] + wp.uint32(1)
-            begin(model, state, record, world)
+            begin_episode(model, state, record, world)
             for place in range(model.vehicles):
                 vehicle = model.order[place]
-                start(model, state, memory, world, vehicle)
-                send(model, state, memory, world, vehicle, 0)
+                deliver(model, state, world, vehicle, 0)
+                broadcast_estimate(model, state, world, vehicle, 0)
 
-    return _named(restart, source.name, observer.name, **{**near_inlining(), **observer.options})
+    return module_kernels(f"begin_{source.name}", p, begin, max_unroll=1, **near_inlining())["begin"]
 
 
 @cache
-def revive_kernel(observer: Embedded) -> Kernel:
-    """Return the kernel that lets vehicles lose all and start anew; it runs before a decision, where any may."""
-    start = observer.start
+def source_kernels(source: Source, p: Precision) -> Kernels:
+    """Return `decide` and `sense`, the stages before the observers; worlds marked in `hold` stay as they are."""
+    Model, State, Record, Hold = model_struct(p), state_struct(p), source.record(p), wp.array(dtype=wp.int32)
+    sense_tick = source.sense
 
-    def revive(model: Any, state: Any, memory: Any, hold: wp.array(dtype=wp.int32), ticks: int):
+    def decide(model: Model, state: State, actions: wp.array3d(dtype=p.scalar), hold: Hold):
+        """Make commands of actions. One thread per world."""
+        world = wp.tid()
+        if is_active(model, state, hold, world):
+            make_commands(model, state, actions, world)
+
+    def sense(model: Model, state: State, record: Record, hold: Hold):
+        """Move to the next tick and measure. One thread per world."""
+        world = wp.tid()
+        if is_active(model, state, hold, world):
+            sense_tick(model, state, record, world, state.tick[world] + 1)
+
+    return module_kernels(f"sense_{source.name}", p, decide, sense, max_unroll=1, **near_inlining())
+
+
+@cache
+def observer_kernels(observer: Embedded, p: Precision) -> Kernels:
+    """Return the stages of an embedded observer: `follow`, `start` and `revive`; and in float64 those of one vehicle.
+
+    The latter serve observers that are plug-ins (`coopenv.observers.kernel_observer`).
+    """
+    Model, State, Memory, Hold = model_struct(p), state_struct(p), observer.memory, wp.array(dtype=wp.int32)
+    follow_tick, estimate_pose = _follow_tick(observer), observer.estimate
+    start_vehicle, send_message = observer.start, observer.send
+
+    def follow(model: Model, state: State, memory: Memory, hold: Hold):
+        """Let every vehicle receive, estimate and send. One thread per world."""
+        world = wp.tid()
+        if is_active(model, state, hold, world):
+            follow_tick(model, state, memory, world, state.tick[world] + 1)
+
+    def start(model: Model, state: State, memory: Memory, mask: Hold):
+        """Start the observers of the worlds whose episode has just begun. One thread per world."""
+        world = wp.tid()
+        if mask[world] != 0:
+            for place in range(model.vehicles):
+                vehicle = model.order[place]
+                start_vehicle(model, state, memory, world, vehicle)
+                send_message(model, state, memory, world, vehicle, 0)
+
+    def revive(model: Model, state: State, memory: Memory, hold: Hold, ticks: int):
         """Start the observers anew whose vehicle's restart falls into the next ticks. One thread per world."""
         world = wp.tid()
         if hold[world] == 0:
@@ -106,73 +138,22 @@ def revive_kernel(observer: Embedded) -> Kernel:
                 if begun > tick and begun <= tick + ticks:
                     state.restart_tick[world, vehicle] = tick + 1
                     forget_everything(model, state, world, vehicle)
-                    start(model, state, memory, world, vehicle)
+                    start_vehicle(model, state, memory, world, vehicle)
 
-    return _named(revive, observer.name, **{**near_inlining(), **observer.options})
-
-
-def decide_kernel(model: Any, state: Any, actions: wp.array3d(dtype=Any), hold: wp.array(dtype=wp.int32)):
-    """Make commands of actions, where `advance` would. One thread per world."""
-    world = wp.tid()
-    if hold[world] == 0 and state.tick[world] < model.horizon_ticks:
-        decide(model, state, actions, world)
-
-
-@cache
-def sense_kernel(source: Source) -> Kernel:
-    """Return the kernel of the first stage alone. The stages' `active` (W,) marks the worlds that take part."""
-    sense_tick = source.sense
-
-    def sense(model: Any, state: Any, record: Any, active: wp.array(dtype=wp.int32)):
-        """Move and measure. One thread per world; the tick has its number from the start."""
-        world = wp.tid()
-        if active[world] != 0:
-            sense_tick(model, state, record, world, state.tick[world] + 1)
-
-    return _named(sense, source.name)
-
-
-@cache
-def deliver_kernel(source: Source) -> Kernel:
-    """Return the kernel that lets one vehicle receive."""
-    deliver_messages = source.deliver
-
-    def deliver(model: Any, state: Any, record: Any, active: wp.array(dtype=wp.int32), vehicle: int):
-        """Receive. One thread per world."""
-        world = wp.tid()
-        if active[world] != 0:
-            deliver_messages(model, state, record, world, vehicle, state.tick[world] + 1)
-
-    return _named(deliver, source.name)
-
-
-@cache
-def start_kernel(observer: Embedded) -> Kernel:
-    """Return the kernel that starts one vehicle's observer. It and the next two serve observers that are plug-ins."""
-    start_vehicle = observer.start
-
-    def start(model: Any, state: Any, memory: Any, vehicle: int):
-        """Start the observer. One thread per world."""
+    def start_one(model: Model, state: State, memory: Memory, vehicle: int):
+        """Start one vehicle's observer. One thread per world."""
         start_vehicle(model, state, memory, wp.tid(), vehicle)
 
-    return _named(start, observer.name, **observer.options)
-
-
-@cache
-def estimate_kernel(observer: Embedded) -> Kernel:
-    """Return the kernel that lets one vehicle estimate."""
-    estimate_pose = observer.estimate
-
-    def estimate(
-        model: Any,
-        state: Any,
-        memory: Any,
+    def estimate_one(
+        model: Model,
+        state: State,
+        memory: Memory,
         vehicle: int,
         tick: wp.array(dtype=wp.int32),
         period: wp.array(dtype=wp.float64),
         due: wp.array(dtype=wp.int32),
     ):
-        """Take a tick, see `Now`. One thread per world."""
+        """Let one vehicle take a tick, see `Now`. One thread per world."""
         world = wp.tid()
         now = Now()
         now.tick = tick[world]
@@ -180,33 +161,66 @@ def estimate_kernel(observer: Embedded) -> Kernel:
         now.due = due[world] != 0
         estimate_pose(model, state, memory, world, vehicle, now)
 
-    return _named(estimate, observer.name, **observer.options)
-
-
-@cache
-def send_kernel(observer: Embedded) -> Kernel:
-    """Return the kernel that lets one vehicle put a message on the air."""
-    send_message = observer.send
-
-    def send(model: Any, state: Any, memory: Any, vehicle: int, tick: wp.array(dtype=wp.int32)):
-        """Send. One thread per world."""
+    def send_one(model: Model, state: State, memory: Memory, vehicle: int, tick: wp.array(dtype=wp.int32)):
+        """Let one vehicle send. One thread per world."""
         world = wp.tid()
         send_message(model, state, memory, world, vehicle, tick[world])
 
-    return _named(send, observer.name, **observer.options)
+    of_one_vehicle = (start_one, estimate_one, send_one) if p.name == "float64" else ()
+    return module_kernels(observer.name, p, follow, start, revive, *of_one_vehicle, **observer.options)
 
 
-def broadcast_kernel(model: Any, state: Any, active: wp.array(dtype=wp.int32), vehicle: int):
-    """Take what has been written as the vehicle's estimate, and send it. One thread per world."""
-    world = wp.tid()
-    if active[world] != 0:
-        tick = state.tick[world] + 1
-        sample_gramian(model, state, world, vehicle, tick)
-        broadcast(model, state, world, vehicle, tick)
+@cache
+def fused_kernel(source: Source, observer: Embedded, p: Precision) -> wp.Kernel:
+    """Return the kernel that runs whole decisions of a source and an observer."""
+    Model, State, Memory, Record = model_struct(p), state_struct(p), observer.memory, source.record(p)
+    sense_tick, follow_tick = source.sense, _follow_tick(observer)
+
+    def advance(
+        model: Model,
+        state: State,
+        memory: Memory,
+        record: Record,
+        actions: wp.array3d(dtype=p.scalar),
+        hold: wp.array(dtype=wp.int32),
+        ticks: int,
+    ):
+        """Advance by up to `ticks` camera ticks, not beyond the horizon. One thread per world."""
+        world = wp.tid()
+        count = wp.where(hold[world] == 0, wp.min(ticks, model.horizon_ticks - state.tick[world]), 0)
+        if count > 0:
+            make_commands(model, state, actions, world)
+        for _ in range(count):
+            tick = state.tick[world] + 1
+            sense_tick(model, state, record, world, tick)
+            follow_tick(model, state, memory, world, tick)
+
+    return module_kernels(f"advance_{source.name}_{observer.name}", p, advance, **observer.options)["advance"]
 
 
-def finish_kernel(model: Any, state: Any, active: wp.array(dtype=wp.int32)):
-    """End the tick. One thread per world."""
-    world = wp.tid()
-    if active[world] != 0:
-        finish(model, state, world, state.tick[world] + 1)
+@cache
+def host_kernels(p: Precision) -> Kernels:
+    """Return the stages around observers on the host: `receive`, `broadcast` and `finish`."""
+    Model, State, Hold = model_struct(p), state_struct(p), wp.array(dtype=wp.int32)
+
+    def receive(model: Model, state: State, hold: Hold, vehicle: int):
+        """Let one vehicle receive. One thread per world."""
+        world = wp.tid()
+        if is_active(model, state, hold, world):
+            deliver(model, state, world, vehicle, state.tick[world] + 1)
+
+    def broadcast(model: Model, state: State, hold: Hold, vehicle: int):
+        """Take what has been written as the vehicle's estimate, and send it. One thread per world."""
+        world = wp.tid()
+        if is_active(model, state, hold, world):
+            tick = state.tick[world] + 1
+            sample_gramian(model, state, world, vehicle, tick)
+            broadcast_estimate(model, state, world, vehicle, tick)
+
+    def finish(model: Model, state: State, hold: Hold):
+        """End the tick. One thread per world."""
+        world = wp.tid()
+        if is_active(model, state, hold, world):
+            finish_tick(model, state, world, state.tick[world] + 1)
+
+    return module_kernels("host", p, receive, broadcast, finish)

@@ -41,34 +41,47 @@ def put_into_inbox(model: Any, state: Any, world: int, receiver: int, sender: in
 
 
 @device_function
-def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
-    """Receive what arrives at this tick from the neighbours that may be heard, and decide what the own message says.
+def transmit(model: Any, state: Any, world: int, tick: int):
+    """Decide which messages arrive at a tick, by the scenario's radio: write when they were sent, -1 where none does.
 
-    With delay 0 a follower hears its leaders' estimates of this very tick; a sender later in the order than
-    its receiver (possible only without the acyclic restriction) is heard one tick late.
+    With delay 0 a follower receives its leaders' estimates of this very tick; a sender later in the order than
+    its receiver (possible only without the acyclic restriction) is received one tick late.
     """
-    alter(model, state, world, receiver, tick)
-    here = state.position[world, model.landmarks + receiver]
-    for n in range(model.target_count[receiver]):
-        sender = model.targets[receiver, n] - model.landmarks
-        if sender >= 0:
-            lag = model.radio.delay
-            if lag == 0 and model.rank[sender] > model.rank[receiver]:
-                lag = int(1)
-            due = tick - lag
-            slot = wp.max(due, 0) % model.radio.slots
-            if due >= 0 and state.outbox_tick[world, sender, slot] == due:
-                heard = int(1)
+    for receiver in range(model.vehicles):
+        here = state.position[world, model.landmarks + receiver]
+        for sender in range(model.vehicles):
+            state.arriving[world, receiver, sender] = -1
+        for n in range(model.target_count[receiver]):
+            sender = model.targets[receiver, n] - model.landmarks
+            if sender >= 0:
+                lag = model.radio.delay
+                if lag == 0 and model.rank[sender] > model.rank[receiver]:
+                    lag = int(1)
+                due = tick - lag
                 there = state.position[world, model.landmarks + sender]
-                if wp.length(there - here) > model.radio.range:
-                    heard = int(0)
-                loss = model.radio.loss * state.parameter[world, V2X_LOSS]
-                if loss > type(loss)(0.0):
-                    words = random_words(state.seed[world], state.episode[world], tick, pair(receiver, sender), RADIO)
-                    if uniform(words[0], loss) < loss:
-                        heard = int(0)
-                if heard == 1:
-                    put_into_inbox(model, state, world, receiver, sender, due, tick)
+                if due >= 0 and due % model.radio.period == 0 and not wp.length(there - here) > model.radio.range:
+                    if not is_lost(model, state, world, receiver, sender, tick):
+                        state.arriving[world, receiver, sender] = due
+
+
+@device_function
+def is_lost(model: Any, state: Any, world: int, receiver: int, sender: int, tick: int) -> bool:
+    """Draw whether the radio loses the message that arrives at a receiver at a tick."""
+    loss = model.radio.loss * state.parameter[world, V2X_LOSS]
+    if loss > type(loss)(0.0):
+        words = random_words(state.seed[world], state.episode[world], tick, pair(receiver, sender), RADIO)
+        return uniform(words[0], loss) < loss
+    return False
+
+
+@device_function
+def deliver(model: Any, state: Any, world: int, receiver: int, tick: int):
+    """Receive what arrives at this tick, where it has been sent, and decide what the own message claims."""
+    alter(model, state, world, receiver, tick)
+    for sender in range(model.vehicles):
+        sent = state.arriving[world, receiver, sender]
+        if sent >= 0 and state.outbox_tick[world, sender, sent % model.radio.slots] == sent:
+            put_into_inbox(model, state, world, receiver, sender, sent, tick)
 
 
 @device_function

@@ -19,17 +19,7 @@ from coopenv.world.precision import check_device, device_memory, precision
 from coopenv.world.records import allocate, parts, size_of
 from coopenv.world.saved_state import Rule, checked_state
 from coopenv.world.state import VALID, allocate_state, overwrite, state_fields, state_sizes, state_struct
-from coopenv.world.step import (
-    Kernel,
-    advance_kernel,
-    broadcast_kernel,
-    decide_kernel,
-    deliver_kernel,
-    finish_kernel,
-    restart_kernel,
-    revive_kernel,
-    sense_kernel,
-)
+from coopenv.world.step import begin_kernel, fused_kernel, host_kernels, observer_kernels, source_kernels
 
 Keys = Sequence[int | None] | np.ndarray | None
 Options = Mapping[str, Any] | None
@@ -147,47 +137,61 @@ class World:
 
     def restart(self) -> None:
         """Start the next episode in the worlds of `self.mask`, on the device."""
-        kernel = restart_kernel(self.source, self.observer)
-        self._run("restart", kernel, PerWorld(self.memory), self._record, PerWorld(self.mask))
+        self._run("begin", begin_kernel(self.source, self.precision), self._record, PerWorld(self.mask))
+        if self.observer.starts:
+            start = observer_kernels(self.observer, self.precision)["start"]
+            self._run("start", start, PerWorld(self.memory), PerWorld(self.mask))
 
     def advance(self, ticks: int) -> None:
         """Run camera ticks under `self.actions`, stopping each world at its horizon; of one decision at most."""
+        memory, hold = PerWorld(self.memory), PerWorld(self.mask)
         if self.model.restarts == 1:
-            waiting = [PerWorld(self.memory), PerWorld(self.mask), ticks]
-            self._run(("revive", ticks), revive_kernel(self.observer), *waiting)
-        arguments = [PerWorld(self.memory), self._record, PerWorld(self.actions), PerWorld(self.mask), ticks]
-        self._run(("advance", ticks), advance_kernel(self.source, self.observer), *arguments)
+            revive = observer_kernels(self.observer, self.precision)["revive"]
+            self._run(("revive", ticks), revive, memory, hold, ticks)
+        if self.observer.fused and self.source.fused:
+            kernel = fused_kernel(self.source, self.observer, self.precision)
+            arguments = [memory, self._record, PerWorld(self.actions), hold, ticks]
+            self._run(("advance", ticks), kernel, *arguments)
+        else:
+            world, sensing = [self.model, PerWorld(self.state)], source_kernels(self.source, self.precision)
+            decide = sensing["decide"], [*world, PerWorld(self.actions), hold]
+            sense = sensing["sense"], [*world, self._record, hold]
+            follow = observer_kernels(self.observer, self.precision)["follow"], [*world, memory, hold]
+            self.launch.decision(("advance", ticks), ticks, decide, sense, follow)
 
     def load(self) -> None:
         """Load the kernels, compiling those that this machine has not compiled yet; nothing moves."""
         self.restart()
-        World.advance(self, 0)
+        self.mask.fill_(1)
+        World.advance(self, 1)
+        self.mask.zero_()
 
-    def _run(self, key: Hashable, kernel: Kernel, *arguments: Any) -> None:
+    def _run(self, key: Hashable, kernel: wp.Kernel, *arguments: Any) -> None:
         self.launch(key, kernel, [self.model, PerWorld(self.state), *arguments])
 
-    # A decision in stages, for estimators on the host: decide; then per tick sense, per vehicle deliver and broadcast,
-    # and finish.
+    # A decision in stages, for estimators on the host: decide; then per tick sense, per vehicle receive and broadcast,
+    # and finish; each in the worlds that `advance` would move.
 
     def decide(self) -> None:
-        """Make commands of `self.actions` in the worlds that `advance` would move."""
-        self._run("decide", decide_kernel, PerWorld(self.actions), PerWorld(self.mask))
+        """Make commands of `self.actions`."""
+        decide = source_kernels(self.source, self.precision)["decide"]
+        self._run("decide", decide, PerWorld(self.actions), PerWorld(self.mask))
 
-    def sense(self, active: Any) -> None:
-        """Move the truth of the active worlds (W,) to the next tick and measure it."""
-        self._run("sense", sense_kernel(self.source), self._record, PerWorld(active))
+    def sense(self) -> None:
+        """Move the truth to the next tick and measure it."""
+        self._run("sense", source_kernels(self.source, self.precision)["sense"], self._record, PerWorld(self.mask))
 
-    def deliver(self, active: Any, vehicle: int) -> None:
-        """Let a vehicle of the active worlds receive what arrives at this tick."""
-        self._run(("deliver", vehicle), deliver_kernel(self.source), self._record, PerWorld(active), vehicle)
+    def receive(self, vehicle: int) -> None:
+        """Let a vehicle receive what arrives at this tick."""
+        self._run(("receive", vehicle), host_kernels(self.precision)["receive"], PerWorld(self.mask), vehicle)
 
-    def broadcast(self, active: Any, vehicle: int) -> None:
-        """Let a vehicle of the active worlds, whose estimate has been written, send it."""
-        self._run(("broadcast", vehicle), broadcast_kernel, PerWorld(active), vehicle)
+    def broadcast(self, vehicle: int) -> None:
+        """Let a vehicle, whose estimate has been written, send it."""
+        self._run(("broadcast", vehicle), host_kernels(self.precision)["broadcast"], PerWorld(self.mask), vehicle)
 
-    def finish(self, active: Any) -> None:
-        """End the tick of the active worlds."""
-        self._run("finish", finish_kernel, PerWorld(active))
+    def finish(self) -> None:
+        """End the tick."""
+        self._run("finish", host_kernels(self.precision)["finish"], PerWorld(self.mask))
 
     def view(self, name: str) -> np.ndarray:
         """Return a field of the state on the host, without a copy on the CPU."""

@@ -20,14 +20,14 @@ from coopenv.world.camera import (
 )
 from coopenv.world.collision import depart, referee, touches_anything
 from coopenv.world.embedded import Source
-from coopenv.world.faults import alter, draw_faults
+from coopenv.world.faults import draw_faults
 from coopenv.world.parameters import COUNT as PARAMETER_COUNT
 from coopenv.world.parameters import draw_parameters
 from coopenv.world.precision import Precision
 from coopenv.world.presence import draw_presence
 from coopenv.world.records import array, fields
 from coopenv.world.reset import believe, place_agent, place_vehicle
-from coopenv.world.v2x import broadcast, deliver, put_into_inbox
+from coopenv.world.v2x import transmit
 
 BY_RADIO = wp.constant(-2)
 """In place of the ticks of sending of messages that a receiver heard: the scenario's radio decides."""
@@ -118,18 +118,17 @@ def recall(model: Any, state: Any, record: Any, world: int, tick: int):
 
 
 @wp.func
-def redeliver(model: Any, state: Any, record: Any, world: int, receiver: int, tick: int):
-    """Receive the messages that arrived at this tick, as the source says or else as the scenario's radio lets them."""
+def retransmit(model: Any, state: Any, record: Any, world: int, tick: int):
+    """Write which messages arrive at a tick, as the source says or else as the scenario's radio lets them."""
     row = row_of(record, tick)
-    if record.inbox_tick[row, receiver, receiver] == BY_RADIO:
-        deliver(model, state, world, receiver, tick)
+    if record.inbox_tick[row, 0, 0] == BY_RADIO:
+        transmit(model, state, world, tick)
         return
-    alter(model, state, world, receiver, tick)
-    for sender in range(model.vehicles):
-        sent = record.inbox_tick[row, receiver, sender]
-        slot = wp.max(sent, 0) % model.radio.slots
-        if sent > state.inbox_tick[world, receiver, sender] and state.outbox_tick[world, sender, slot] == sent:
-            put_into_inbox(model, state, world, receiver, sender, sent, tick)
+    for receiver in range(model.vehicles):
+        for sender in range(model.vehicles):
+            sent = record.inbox_tick[row, receiver, sender]
+            is_new = sent > state.inbox_tick[world, receiver, sender]
+            state.arriving[world, receiver, sender] = wp.where(is_new, sent, -1)
 
 
 @wp.func
@@ -139,6 +138,7 @@ def resense(model: Any, state: Any, record: Any, world: int, tick: int):
     recall(model, state, record, world, tick)
     for vehicle in range(model.vehicles):
         referee(model, state, world, vehicle)
+    retransmit(model, state, record, world, tick)
 
 
 @wp.func
@@ -170,10 +170,7 @@ def rewind(model: Any, state: Any, record: Any, world: int):
     recall(model, state, record, world, 0)
     for vehicle in range(model.vehicles):
         state.collided[world, vehicle] = touches_anything(model, state, world, vehicle)
-    for place in range(model.vehicles):
-        vehicle = model.order[place]
-        redeliver(model, state, record, world, vehicle, 0)
-        broadcast(model, state, world, vehicle, 0)
+    retransmit(model, state, record, world, 0)
 
 
 @cache
@@ -258,5 +255,5 @@ def true_twists(truth: Truth, dt: float) -> tuple[np.ndarray, np.ndarray]:
     return linear, angular
 
 
-RECORDED = Source("recorded", rewind, resense, redeliver, knows_truth=False)
+RECORDED = Source("recorded", rewind, resense, record_struct, knows_truth=False)
 """Ticks of a recording, or of any other source that is not on the device."""

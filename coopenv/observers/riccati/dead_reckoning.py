@@ -40,4 +40,4 @@ def estimate(model: Any, state: Any, memory: Any, world: int, vehicle: int, now:
         state.corrected_tick[world, vehicle] = now.tick
 
 
-DEAD_RECKONING = Embedded("dead_reckoning", estimate, start, send_nothing)
+DEAD_RECKONING = Embedded("dead_reckoning", estimate, start, send_nothing, fused=True)

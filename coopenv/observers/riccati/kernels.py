@@ -167,7 +167,9 @@ def fitted(model: Any) -> Embedded:
     return KALMAN if (model.observer.k.numpy() == 1.0).all() else RICCATI
 
 
-RICCATI = Embedded("riccati", make_estimate(gain_step), start_nothing, send_nothing, fit=fitted, messages=POSITION)
+RICCATI = Embedded(
+    "riccati", make_estimate(gain_step), start_nothing, send_nothing, fit=fitted, messages=POSITION, fused=True
+)
 KALMAN = replace(RICCATI, name="riccati_kalman", estimate=make_estimate(kalman_step))
 """Where every gain k is 1: the eigenvalues that other gains need are not even compiled."""
 
