@@ -16,7 +16,7 @@ from coopenv.observers.riccati.dead_reckoning import DEAD_RECKONING
 from coopenv.scenario import load_scenario
 from coopenv.world.collision import referee
 from coopenv.world.dynamics import move
-from coopenv.world.embedded import HOST, SIMULATED, Embedded, Source, sense_simulation
+from coopenv.world.embedded import HOST, SIMULATED, Embedded, sense_simulation
 from coopenv.world.odometry import measure_odometry
 from coopenv.world.v2x import transmit
 from coopenv.world.world import World
@@ -77,9 +77,7 @@ class Setting:
         observer = self.observer or find_embedded(scenario.observer.name) or HOST
         world = World(scenario, worlds, dtype, "cpu", 1, observer, start_covariances(scenario))
         if self.sense is not sense_simulation:
-            world.source = Source(
-                f"simulated_{self.sense.key}", SIMULATED.begin, self.sense, SIMULATED.record, fused=True
-            )
+            world.source = replace(SIMULATED, name=f"simulated_{self.sense.key}", sense=self.sense)
         if not self.visibility:
             world.model.sensed = 0
         if not self.sending:
