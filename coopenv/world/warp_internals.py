@@ -1,4 +1,8 @@
-"""What is used of Warp's private interface."""
+"""Replay of recorded launches through Warp's private interface.
+
+`context._build_cpu_args_structs` packs the arguments of a launch, `command.hooks.forward` is the compiled kernel. Both
+are private, so that `pyproject.toml` bounds the version of Warp; without them `command.launch` does the same, slower.
+"""
 
 import ctypes
 from collections.abc import Callable
