@@ -21,13 +21,12 @@ COLUMNS = {metric: table.COLUMNS[metric] for metric in COMPARED}
 """Metric, its heading, and the factor to the heading's unit."""
 INTRODUCTION = """# Agents
 
-One folder per driver, each with a card; [docs/agents.md](../docs/agents.md) tells of the scripted ones.
-The learned ones are those of `study.toml`, their settings and arms those of `train.toml`. `make agents` trains
-them and writes this page. Of each agent the best of its seeds, by the reward that it learnt from, in worlds that
-are not these.
+One folder per driver, each with a card; [docs/agents.md](../docs/agents.md) describes the scripted drivers.
+`study.toml` lists the learned agents, `train.toml` their settings and arms. `make agents` trains them and writes this
+page. It shows the best seed of each agent, chosen by the training reward in other worlds.
 """
-LEGEND = """With 95 % intervals over {worlds} held-out worlds, the same for all; e50 and e95 of the position error of
-vehicles under way, from 3 s on; e95 of seeds in their order."""
+LEGEND = """95 % intervals over {worlds} held-out worlds, the same for all agents. e50 and e95: percentiles of
+the position error of vehicles under way, from 3 s on. The last column lists the seeds in their order."""
 
 
 def write(groups: Sequence[Group], folder: Path, judge: Judge) -> None:
