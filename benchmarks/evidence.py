@@ -31,7 +31,7 @@ from coopenv.scenario.files import parse_scenario
 
 OBSERVERS = ("riccati", "schmidt_kalman", "robust")
 """In the parametric scenes."""
-SCENES = ("busy_intersection_tracking", "ring:5", "lane:8", "roots:10")
+SCENES = ("busy_intersection_tracking", "ring:5", "lane:8", "roots:10", "random:12,seed=1", "tree:15")
 HORIZON = 50.0
 """s, of the parametric scenes."""
 WINDOWS = (5.0, 10.0, 20.0, 35.0)

@@ -2,7 +2,7 @@
 
 Linearised at the prediction, gain and innovation depend on the same noise of odometry: ranges between vehicles that
 hardly move against each other drift outwards; linearised at the correction, they drift inwards; half way the drift
-vanishes, as a Stratonovich integral has none (docs/robust.md tells of the experiment).
+vanishes, as a Stratonovich integral has none (docs/observers.md#linearisation has the comparison).
 
 The other form is iterated to where the correction leads, which is Gauss-Newton: Bell and Cathey, The iterated Kalman
 filter update as a Gauss-Newton method, IEEE Transactions on Automatic Control 38(2), 1993; with a line search as in

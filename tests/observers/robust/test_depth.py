@@ -1,6 +1,6 @@
 """How sure `robust` is far down a graph of vehicles that measure each other: as sure as it may be, everywhere.
 
-`pytest -s -m slow tests/observers/robust/test_depth.py` prints the table of docs/robust.md.
+`pytest -s -m slow tests/observers/robust/test_depth.py` prints the table of docs/robust_evidence.md.
 """
 
 from __future__ import annotations

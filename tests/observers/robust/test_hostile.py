@@ -1,7 +1,7 @@
 """Messages that no honest vehicle sends, but that pass as messages, end no run of `robust` and `robust_joint`.
 
 Nor do those of one sender lead others astray that see two honest targets besides.
-`pytest -s -m slow tests/observers/robust/test_hostile.py` prints the table of docs/robust.md.
+`pytest -s -m slow tests/observers/robust/test_hostile.py` prints the table of docs/robust_evidence.md.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Who lies is found out before it costs much: five vehicles of which each sees at least two honest targets besides.
 
 The paper's intersection with more neighbours. Honest errors are compared with those in the same worlds without a lie.
-`pytest -s -m slow tests/observers/robust/test_liars.py` prints the table of docs/robust.md.
+`pytest -s -m slow tests/observers/robust/test_liars.py` prints the table of docs/robust_evidence.md.
 """
 
 from __future__ import annotations

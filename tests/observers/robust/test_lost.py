@@ -1,6 +1,6 @@
 """`robust` where nobody knows where it is: everybody finds its place, and nobody is sure of a wrong one.
 
-`pytest -s -m slow tests/observers/robust/test_lost.py` prints the table of docs/robust.md.
+`pytest -s -m slow tests/observers/robust/test_lost.py` prints the table of docs/robust_evidence.md.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A camera whose mounting is declared not to be known: robust finds out how it is turned, and is as sure as it may be.
 
-`pytest -s -m slow tests/observers/robust/test_mounting.py` prints the figures of docs/robust.md.
+`pytest -s -m slow tests/observers/robust/test_mounting.py` prints the figures of docs/robust_evidence.md.
 """
 
 from __future__ import annotations
