@@ -15,7 +15,7 @@ import pytest
 import coopenv
 from coopenv.backends.mcap import write_recording
 from coopenv.base.installation import environment_id, list_agents
-from coopenv.bench.observers.fault_knobs import KNOBS
+from coopenv.bench.observers.fault_variants import KNOBS
 from coopenv.bench.observers.faults import FAULTS
 from coopenv.cli import main
 from coopenv.cli.options import parse_value

@@ -10,7 +10,7 @@ from coopenv.api.engine import Engine
 from coopenv.evaluation import drive, held_out_seeds, score
 from coopenv.policies import load_agent
 from coopenv.scenario import load_scenario
-from coopenv.scenario.randomness import Difficulty
+from coopenv.scenario.learning import Difficulty
 
 LEARNING = ("open_square", "facade", "behind_truck", "urban_crossing", "large_crossing")
 

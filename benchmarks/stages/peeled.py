@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.observers.briefing import start_covariances
 from coopenv.observers.registry import find_embedded
 from coopenv.observers.riccati.dead_reckoning import DEAD_RECKONING
+from coopenv.observers.runner import start_covariances
 from coopenv.scenario import load_scenario
 from coopenv.world.collision import referee
 from coopenv.world.dynamics import move

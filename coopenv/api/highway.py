@@ -12,8 +12,7 @@ import gymnasium
 import numpy as np
 
 from coopenv.api.engine import Engine
-from coopenv.backends.highway.followed import Followed, FollowedWorld
-from coopenv.backends.highway.simulation import flipped, poses_of
+from coopenv.backends.highway import Followed, FollowedWorld, flipped, poses_of
 from coopenv.base.errors import CoopenvError, checked_seed
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.outcomes import Sight

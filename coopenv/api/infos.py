@@ -1,6 +1,8 @@
 """What one world tells beside observations: infos of its agents, and the state of everybody."""
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from gymnasium import spaces
@@ -9,7 +11,11 @@ from coopenv.api.engine import Engine
 from coopenv.backends.base import Conversing
 from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.scenario import Scenario
+from coopenv.viz.scene.stage import Frame
 from coopenv.world.state import FAULTS, LASTING_ERRORS
+
+if TYPE_CHECKING:
+    from coopenv.viz.topview import TopView
 
 
 def outcome_words(scenario: Scenario) -> tuple[str, ...]:
@@ -114,3 +120,34 @@ def state_vector(engine: Engine) -> np.ndarray:
     whole = np.concatenate([truth.ravel(), estimate.ravel(), share, errors.ravel()]).astype(np.float32)
     result: np.ndarray = np.nan_to_num(whole.clip(-LIMIT, LIMIT), nan=0.0)
     return result
+
+
+class Pictures:
+    """Draws worlds of an engine; matplotlib is loaded with the first picture."""
+
+    def __init__(self, engine: Engine, scenario: Scenario) -> None:
+        self._engine, self._scenario = engine, scenario
+        self._view: TopView | None = None
+
+    def of(self, world: int = 0) -> np.ndarray:
+        """Return an (H, W, 3) uint8 picture of a world."""
+        return self.view.paint(Frame.of(self._engine, world))
+
+    def show(self) -> None:
+        """Draw the first world in a window."""
+        self.view.show(self.of())
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._view is not None:
+            self._view.close()
+            self._view = None
+
+    @property
+    def view(self) -> TopView:
+        """What draws, made when it is first asked for."""
+        if self._view is None:
+            from coopenv.viz.topview import TopView
+
+            self._view = TopView(self._scenario)
+        return self._view

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from coopenv.api.array_io import ArrayKind
+from coopenv.api.arguments import ArrayKind
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.reward import RewardFunction
 from coopenv.api.vector_env import CooperativeVectorEnv

@@ -8,12 +8,9 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 
-from coopenv.api.actions import ActionReader
-from coopenv.api.choices import check_choice
+from coopenv.api.arguments import SETTINGS, ActionReader, check_choice, checked_options, world_number, world_parameters
 from coopenv.api.engine import Engine
-from coopenv.api.infos import InfoWriter, state_space, state_vector
-from coopenv.api.options import SETTINGS, checked_options, world_number, world_parameters
-from coopenv.api.pictures import Pictures
+from coopenv.api.infos import InfoWriter, Pictures, state_space, state_vector
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
 from coopenv.backends.base import EPISODE_OVER, IGNORED_OPTIONS, Backend, Health

@@ -16,9 +16,9 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError, shown, suggest
 from coopenv.estimation.arrays import Array
-from coopenv.observers.briefing import briefing_of
 from coopenv.observers.contract import Message
 from coopenv.observers.recording import Briefing, Sensed
+from coopenv.observers.runner import briefing_of
 from coopenv.scenario import Scenario
 from coopenv.world.command import ACCELERATION, PAN, SPEED, STEERING
 from coopenv.world.world import World

@@ -9,9 +9,9 @@ import numpy as np
 
 from coopenv.backends.base import Capabilities, Episode, SensingWorld, TickGenerator
 from coopenv.estimation.outcomes import Sight
-from coopenv.observers.briefing import start_covariances
 from coopenv.observers.recording import Sensed, Truth, is_due, sealed
 from coopenv.observers.registry import find_embedded
+from coopenv.observers.runner import start_covariances
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST
 

@@ -132,9 +132,10 @@ def simulation_of(scenario: Scenario) -> Simulated:
         from coopenv.backends.simulated import Simulated
 
         return Simulated(scenario)
-    from coopenv.backends.highway import Highway
 
-    return Highway(scenario)
+    from coopenv.backends.highway import HighwayBackend
+
+    return HighwayBackend(scenario)
 
 
 def open_backend(

@@ -7,10 +7,8 @@ import numpy as np
 
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.validity import are_numbers, are_rotations, are_unit_vectors, everywhere
-from coopenv.observers.checks import check_message
-from coopenv.observers.contract import Message
-from coopenv.observers.recording import Briefing, Sensed
-from coopenv.observers.recording_checks import LARGEST_PAN, SHAPES
+from coopenv.observers.contract import Message, check_message
+from coopenv.observers.recording import LARGEST_PAN, SHAPES, Briefing, Sensed
 
 MEASURED = ("rotation", "translation", "velocity", "angular_velocity", "bearings", "visible", "landmarks")
 TICK_SHAPES = {name: shape[1:] for name, shape in SHAPES.items() if shape[0] == "K" and name != "due"}

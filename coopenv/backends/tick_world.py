@@ -12,13 +12,12 @@ from coopenv.backends.replay.kernels import BY_RADIO, RECORDED, record_struct, t
 from coopenv.backends.tick_checks import MEASURED, check_tick, is_sound
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.rotations import exp_se3
-from coopenv.observers.briefing import start_covariances
-from coopenv.observers.checks import compiled_checks
-from coopenv.observers.contract import Message
+from coopenv.observers.contract import Message, compiled_checks
 from coopenv.observers.kernel_world import views_of
 from coopenv.observers.recording import Briefing, Sensed, Truth, is_due
 from coopenv.observers.registry import find_embedded
-from coopenv.scenario.randomness import PARAMETERS
+from coopenv.observers.runner import start_covariances
+from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.embedded import HOST
 from coopenv.world.records import allocate, fields
 from coopenv.world.state import state_fields

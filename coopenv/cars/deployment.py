@@ -380,7 +380,7 @@ def parse_deployment(raw: dict[str, Any], path: Path) -> Deployment:
     try:
         made = Deployment.model_validate(raw)
     except ValidationError as error:
-        from coopenv.scenario.validation import one_line  # the gate of a car has no need of scenarios
+        from coopenv.scenario.base import one_line  # the gate of a car has no need of scenarios
 
         raise DeploymentError(one_line(error, path.name, Deployment)) from None
     return made.model_copy(update={"file": path})

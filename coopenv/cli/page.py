@@ -39,7 +39,7 @@ def page(
     """Write the pages of environments: what they are, a picture, a film, what sensing is worth."""
     from coopenv.base.installation import list_envs
     from coopenv.bench import pages
-    from coopenv.bench.agents.dial import entrants, has_dial
+    from coopenv.bench.agents.cards import entrants, has_dial
     from coopenv.runs.console import Progress
 
     if bool(environments) == everything:

@@ -19,7 +19,7 @@ def list_command(
     from coopenv.runs import listing
 
     if kind is Kind.variants:
-        from coopenv.bench.observers.choice import variant_rows
+        from coopenv.bench.observers.sources import variant_rows
 
         rows = variant_rows()
     elif kind is Kind.scenes:
@@ -99,7 +99,7 @@ def scene(
 def schema(out: Annotated[Path | None, typer.Option(help="File to write (default: standard output).")] = None) -> None:
     """Write the JSON schema of scenario files, for editors."""
     from coopenv.base.files import replace_text
-    from coopenv.scenario.json_schema import schema_text
+    from coopenv.scenario.files import schema_text
 
     if out is None:
         sys.stdout.write(schema_text())

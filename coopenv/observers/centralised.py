@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import exp_so3, orthonormalise, skew
+from coopenv.observers.bearing_measurements import Lines, Sight, linearised
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.correction import Stacked, halfway
-from coopenv.observers.gate import Gate
-from coopenv.observers.lines import Lines, Sight, linearised
-from coopenv.observers.mekf import LeftError
+from coopenv.observers.correction import Gate, Stacked, halfway
+from coopenv.observers.error_state_filters import LeftError
 
 Masks = dict[int, NDArray[np.bool_]]
 """Of the targets of vehicles that saw any."""

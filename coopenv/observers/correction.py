@@ -7,15 +7,40 @@ vanishes, as a Stratonovich integral has none (docs/observers.md#linearisation h
 The other form is iterated to where the correction leads, which is Gauss-Newton: Bell and Cathey, The iterated Kalman
 filter update as a Gauss-Newton method, IEEE Transactions on Automatic Control 38(2), 1993; with a line search as in
 Skoglund, Hendeby and Axehill, Extended Kalman filter modifications based on an optimization view point, FUSION 2015.
+
+Source: Bar-Shalom, Li and Kirubarajan, Estimation with applications to tracking and navigation, 2001, section 5.4: the
+normalised innovation squared r^T S^-1 r of an honest bearing has a chi-square distribution of 2 degrees of freedom. S
+counts the prior, the sender's covariance where the filter uses one, and the bearing's noise. A target must also be
+where the bearing points, and not behind (cheirality).
+
+A filter that is sure of a wrong pose would refuse what contradicts it for ever. Trackers give up a track when what
+fits it stays away, and hold a new one for tentative until it is confirmed (Blackman and Popoli, Design and analysis of
+modern tracking systems, 1999, chapter 6). So does this gate: it opens, which means that it takes everything, where the
+prior is so wide that a linearised innovation has no meaning, and where most bearings are refused; it closes when few
+would be. Targets mistaken now and then, and one sender of two or more that lies, do not open it; a lie that is told
+while it is open is believed.
 """
 
 from collections.abc import Callable
 
 import numpy as np
+from numba import types
+from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array, solve
-from coopenv.estimation.compiled import MATRIX, VECTOR, compiled
-from coopenv.estimation.compiled_matrices import eliminated, place, transformed
+from coopenv.estimation.compiled import MATRICES, MATRIX, NUMBER, VECTOR, WHOLE, compiled
+from coopenv.estimation.compiled_matrices import eliminated, place, product, transformed
+from coopenv.observers.bearing_measurements import (
+    RIGHT,
+    Sight,
+    corrected,
+    dense,
+    linearise,
+    moved,
+    normalised,
+    recentring,
+)
+from coopenv.observers.contract import Tick
 
 CLOSE = 1e-3  # rad, by which the last step of an iteration may turn a line of sight
 MOST = 8  # steps, and halvings of a step
@@ -109,3 +134,101 @@ def iterated(P: Array, first: Stacked, look: Look, bend: Callable[[Array], float
         if bend(step) < CLOSE:
             break
     return at, joseph(P, K, H, N), nis
+
+
+LARGEST = 13.8155  # 0.999 of a chi-square of 2: -2 log 0.001
+WIDE = 0.5  # rad^2, trace of S: about 30 degrees per axis. Chosen
+AVERAGING = 1.0  # s, over which the share of refused bearings is averaged. Chosen
+LOST_SHARE, FOUND_SHARE = 0.6, 0.1
+"""Averaged shares of refused bearings above which the gate opens, and below which it closes. Chosen: one wrong target
+of two does not open it, and one of three does not let it close."""
+
+
+class Gate:
+    """The gate of one vehicle."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin anew."""
+        self.share = 0.0  # of refused bearings, averaged
+        self.is_open = False
+        self.time = 0.0  # s, of the last frame
+
+    def passed(self, time: float, residual: Array, S: Array, in_front: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return (m,) which bearings of a frame to take.
+
+        Args:
+            time: s.
+            residual: (m, 2) rad, in the tangent planes.
+            S: (m, 2, 2) rad^2, their covariances; where one is none, or not a number, its bearing is never taken.
+            in_front: (m,) whether the targets are where the bearings point.
+        """
+        definite, fits, refused, widest = judged(residual, S, in_front)
+        self.share += (refused - self.share) * min(1.0, max(0.0, time - self.time) / AVERAGING)
+        if widest > WIDE:
+            self.share = 1.0
+        self.time = time
+        self.is_open = self.share > (FOUND_SHARE if self.is_open else LOST_SHARE)
+        taken: NDArray[np.bool_] = definite if self.is_open else fits
+        return taken
+
+
+@compiled(MATRIX, MATRICES, types.Array(types.boolean, 1, "A", readonly=True))
+def judged(
+    residual: Array, S: Array, in_front: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], float, float]:
+    """Return (m,) which S are covariances, (m,) which bearings fit, the share of the others, and the largest trace."""
+    squared = normalised(residual, S)
+    definite = squared >= 0.0
+    fits = definite & (squared <= LARGEST) & in_front
+    widest = np.max(S[:, 0, 0] + S[:, 1, 1])
+    return definite, fits, 1.0 - np.count_nonzero(fits) / len(fits), widest
+
+
+FRAME = types.Tuple((VECTOR, MATRIX, MATRIX, MATRICES, NUMBER))
+"""Lever arm (3,), bearings (m, 3), points (m, 3), their covariances (m, 3, 3), and a bearing's variance."""
+Frame = tuple[Array, Array, Array, Array, float]
+
+
+def frame_of(tick: Tick, sight: Sight) -> Frame:
+    """Return what compiled functions need of a frame."""
+    return (
+        np.asarray(tick.lever_arm, float),
+        sight.bearings,
+        sight.positions,
+        sight.covariances,
+        tick.noise.bearing_std**2,
+    )
+
+
+@compiled(WHOLE, MATRIX, VECTOR, FRAME)
+def stacked(kind: int, R: Array, p: Array, frame: Frame) -> tuple[Array, Array, Array]:
+    """Return residual (2m,), H (2m, 6) and N (2m, 2m) at a pose."""
+    residual, H, N, _ = linearise(R, p, kind == RIGHT, *frame)
+    return residual.ravel(), H.reshape(-1, 6), dense(N)
+
+
+@compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)
+def halfway_gain(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, Array, float]:
+    """Return (K (6, 2m), H, N, dx (6,), r^T S^-1 r at the prediction) of the correction of a prediction.
+
+    H (2m, 6) and N (2m, 2m) are those half way; P (6, 6) is the prediction's covariance, over the error of that kind.
+    """
+    residual, H, N = stacked(kind, R, p, frame)
+    _, dx, nis = gain(P, H, N, residual)
+    at = 0.5 * dx
+    R, p = moved(kind, R, p, at)
+    residual, H, N = stacked(kind, R, p, frame)
+    H = product(H, recentring(kind, at))
+    K, dx, _ = gain(P, H, N, residual + transformed(H, at))
+    return K, H, N, dx, nis
+
+
+@compiled(WHOLE, MATRIX, VECTOR, MATRIX, FRAME)
+def updated(kind: int, R: Array, p: Array, P: Array, frame: Frame) -> tuple[Array, Array, Array, float]:
+    """Return R (3, 3), p (3,) in m, P (6, 6) and r^T S^-1 r of the correction of a prediction of covariance P."""
+    K, H, N, dx, nis = halfway_gain(kind, R, p, P, frame)
+    R, p, P = corrected(kind, R, p, dx, joseph(P, K, H, N))
+    return R, p, P, nis

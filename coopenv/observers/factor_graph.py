@@ -16,10 +16,10 @@ import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import adjoint
+from coopenv.observers.bearing_measurements import ahead, linearised, sight_of
 from coopenv.observers.contract import Estimate, Setup, Tick
-from coopenv.observers.gate import Gate
-from coopenv.observers.lines import ahead, linearised, sight_of
-from coopenv.observers.mekf import LeftError, PoseObserver
+from coopenv.observers.correction import Gate
+from coopenv.observers.error_state_filters import LeftError, PoseObserver
 
 LAG = 1.0  # s
 KEY_PERIOD = 0.1  # s between key frames

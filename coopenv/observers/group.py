@@ -14,8 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 from coopenv.base.errors import CoopenvError, told
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
-from coopenv.observers.checks import check_estimate, check_message
-from coopenv.observers.contract import Estimate, Factory, JointObserver, Message, Observer
+from coopenv.observers.contract import (
+    Estimate,
+    Factory,
+    JointObserver,
+    Message,
+    Observer,
+    check_estimate,
+    check_message,
+)
 from coopenv.observers.interference import Interference
 from coopenv.observers.mailbox import Mailbox
 from coopenv.observers.recording import Briefing, Sensed

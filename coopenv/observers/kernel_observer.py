@@ -16,8 +16,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.estimation.outcomes import Sight
-from coopenv.observers.checks import check_message
-from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick
+from coopenv.observers.contract import Estimate, Message, Received, Setup, Tick, check_message
 from coopenv.observers.kernel_world import model_of, views_of
 from coopenv.observers.riccati_coordinates import left_covariance
 from coopenv.world.embedded import Embedded, Messages

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.arrays import Array
-from coopenv.observers.checks import check_message, check_received
-from coopenv.observers.contract import Message, Received
+from coopenv.observers.contract import Message, Received, check_message, check_received
 from coopenv.observers.recording import Briefing, sealed
 
 MOST_CONTENTS = 100_000  # bytes of a message

@@ -5,14 +5,247 @@ vehicles that consider each other, the cross-covariances of Roumeliotis and Beke
 IEEE Transactions on Robotics and Automation 18(5), 2002. One's own pose and those of the neighbours in view are one
 state, in which the gain of the neighbours is zero. What neighbours have in common with each other is what they tell:
 each sends the cross-covariances that it keeps with its own. What changes those is carried on as neighbours.py tells.
+
+The error of a neighbour j is that of its marker's pose as it tells it, R_j = Rhat_j Exp(theta), z_j = zhat_j + Rhat_j
+rho. C_ij is the covariance of one's own error with it. One's own errors change by F (odometry) and by P+ P-^-1
+(bearings); the product of these since the last message, a vehicle's factor, is told, so that a neighbour carries its
+C_ij on by C_ij <- C_ij factor_j^T. Source of this rule: Luft, Schubert, Roumeliotis and Burgard, Recursive
+decentralized localization for multi-robot systems with asynchronous pairwise communication, International Journal of
+Robotics Research 37(10), 2018. It is exact for odometry and landmarks; for bearings to a third vehicle it holds if the
+two have nothing in common but what the first one knows. For messages that were lost the factor that came stands in.
+
+Source: Luft, Schubert, Roumeliotis and Burgard, Recursive decentralized localization for multi-robot systems with
+asynchronous pairwise communication, International Journal of Robotics Research 37(10), 2018. Sigma_ij is kept in
+factors; odometry and landmarks change one's own alone, and a bearing from i to j changes Sigma_ij exactly, while every
+other one is carried on by Sigma_ii+ Sigma_ii-^-1.
+
+The deviation: there a measurement corrects both vehicles, which exchange covariances and factors both ways. Here
+messages are broadcast, and who is seen does not learn of it: j is considered with its covariance and the
+cross-covariance, and only i is corrected. The product Sigma_ij is kept by i; j's factor carries it on (neighbours.py).
 """
 
-import numpy as np
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
-from coopenv.estimation.arrays import Array
-from coopenv.observers.contract import Message, Tick
-from coopenv.observers.lines import Lines, Sight
-from coopenv.observers.neighbours import Considering
+import numpy as np
+from numba import types
+
+from coopenv.estimation.arrays import Array, cholesky
+from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled
+from coopenv.estimation.compiled_matrices import eliminated, place, product, transformed
+from coopenv.estimation.rotations import skew
+from coopenv.observers.bearing_measurements import LEFT, Lines, Sight, corrected, dense, linearise, moved, recentring
+from coopenv.observers.contract import Message, Setup, Tick
+from coopenv.observers.correction import FRAME, Frame, frame_of, gain, joseph
+from coopenv.observers.error_state_filters import LeftError, Mekf
+
+IDENTITY = np.eye(6)
+PLACES = types.Array(types.int64, 1, "A", readonly=True)
+MOST_LOST = 60  # messages in a row for which a factor stands in
+SHRINKING = (0.98, 0.9, 0.7, 0.4, 0.0)
+"""Factors of cross-covariances where no joint distribution has them: a sender may lie, the rule approximates."""
+
+
+@dataclass(frozen=True)
+class Neighbour:
+    """What is known of a neighbour."""
+
+    number: int  # of its last message
+    R: Array  # (3, 3) as told
+    P: Array  # (6, 6) as told, about its marker
+    cross: Array  # (6, 6) C_ij
+
+
+class Considering(Mekf):
+    """The part of a filter that keeps cross-covariances; its own error is a left one."""
+
+    sends_covariance = True
+
+    def __init__(self, setup: Setup, gated: bool = True) -> None:
+        """Take a setup; without `gated` every bearing is believed."""
+        super().__init__(setup, gated)
+        self.to_marker = np.eye(6)  # own left error to that of the marker's pose
+        self.to_marker[3:, :3] = -skew(setup.marker)
+        self.from_marker = np.eye(6)
+        self.from_marker[3:, :3] = skew(setup.marker)
+
+    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
+        """Start at a pose that has nothing to do with others'."""
+        super().reset(initial_pose, initial_covariance)
+        self.neighbours: dict[int, Neighbour] = {}
+        self.factor, self.number = IDENTITY, 0
+
+    def message(self) -> Message:
+        """Return the marker's pose and covariance, and the factor since the last message with its number."""
+        T = self.to_marker
+        factor = T.dot(self.factor).dot(self.from_marker)
+        self.factor, self.number = IDENTITY, self.number + 1
+        extra = {"factor": factor, "number": np.array([self.number])}
+        position = self.state.p + self.state.R.dot(self.marker)
+        return Message(position, self.state.R, T.dot(self.state.P).dot(T.T), extra)
+
+    def predict(self, tick: Tick) -> None:
+        """Append the increment."""
+        self.carry(LeftError.transition(tick.rotation, tick.translation))
+        super().predict(tick)
+
+    def carry(self, A: Array, others: Sequence[int] | None = None) -> None:
+        """Let the own error be A times what it was, in the factor and in cross-covariances; `others`: in whose."""
+        for j in self.neighbours if others is None else others:
+            of = self.neighbours[j]
+            self.neighbours[j] = Neighbour(of.number, of.R, of.P, A.dot(of.cross))
+        self.factor = A.dot(self.factor)
+
+    def take(self, tick: Tick, sight: Sight) -> None:
+        """Hear who is seen, then correct."""
+        for target, message in zip(sight.targets.tolist(), sight.messages, strict=True):
+            if message is not None:
+                self.hear(target, message)
+        super().take(tick, sight)
+
+    def spread(self, tick: Tick, sight: Sight, lines: Lines) -> Array:
+        """Return (m, 2, 2) the covariances of the innovations, with what the two errors have in common."""
+        S = super().spread(tick, sight, lines)
+        for n, target in enumerate(sight.targets.tolist()):
+            if target in self.neighbours:
+                of = self.neighbours[target]
+                common = lines.H[n].dot(of.cross[:, 3:]).dot(lines.G[n].dot(of.R).T)
+                S[n] += common + common.T
+        return S
+
+    def hear(self, target: int, message: Message) -> None:
+        """Take what a neighbour tells of itself, if it is what this observer sends."""
+        factor, number = (np.asarray(message.extra.get(name, np.nan)) for name in ("factor", "number"))
+        if message.rotation is None or message.covariance is None or np.shape(message.covariance) != (6, 6):
+            return
+        if factor.shape != (6, 6) or number.shape != (1,) or factor.dtype.kind not in "biuf":
+            return
+        factor = factor.astype(float)
+        of, now = self.neighbours.get(target), int(number[0])
+        cross = np.zeros((6, 6)) if of is None else of.cross
+        if of is not None and now != of.number:
+            lost = max(1, min(now - of.number, MOST_LOST))
+            cross = cross.dot(factor.T if lost == 1 else np.linalg.matrix_power(factor, lost).T)
+        cross = bounded(cross, self.state.P, np.asarray(message.covariance, float))
+        self.neighbours[target] = Neighbour(now, message.rotation, message.covariance, cross)
+
+    def consider(self, tick: Tick, sight: Sight, told: Array | None = None) -> float:
+        """Correct by bearings to landmarks and to neighbours that are known; return the squared innovation.
+
+        `told` (n, n, 6, 6) holds the covariances of the neighbours with each other, in the order of the sight.
+        """
+        targets = sight.targets.tolist()
+        seen = [t for t in targets if t in self.neighbours]
+        of, before = [self.neighbours[t] for t in seen], self.state
+        joint = self.joint_covariance(of, told)
+        places = np.array([seen.index(t) if t in self.neighbours else -1 for t in targets])
+        turns = np.array([one.R for one in of], float).reshape(-1, 3, 3)
+        exact = frame_of(tick, sight._replace(covariances=np.zeros((len(targets), 3, 3))))
+        R, p, P, carried, crosses, nis = considered(before.R, before.p, joint, exact, turns, places)
+        self.state = LeftError(R, p, P)
+        self.carry(carried, [t for t in self.neighbours if t not in seen])
+        for target, was, cross in zip(seen, of, crosses, strict=True):
+            self.neighbours[target] = Neighbour(was.number, was.R, was.P, cross)
+        return float(nis)
+
+    def joint_covariance(self, of: Sequence[Neighbour], told: Array | None) -> Array:
+        """Return the joint covariance of the own error and those of neighbours, which is positive definite."""
+        size = 6 + 6 * len(of)
+        joint = np.zeros((size, size))
+        joint[:6, :6] = self.state.P
+        for n, one in enumerate(of):
+            k = slice(6 * n + 6, 6 * n + 12)
+            joint[k, k], joint[:6, k], joint[k, :6] = one.P, one.cross, one.cross.T
+            if told is not None:
+                joint[k, 6 : 6 * n + 6] = told[n, :n].transpose(1, 0, 2).reshape(6, -1)
+                joint[6 : 6 * n + 6, k] = joint[k, 6 : 6 * n + 6].T
+        if not of or _has_factor(joint):
+            return joint
+        alone = np.kron(np.eye(len(of) + 1), np.ones((6, 6)))
+        for factor in SHRINKING:
+            shrunk = joint * (alone + factor * (1.0 - alone))
+            if _has_factor(shrunk):
+                return shrunk
+        return shrunk
+
+
+@compiled(MATRICES, MATRICES, MATRIX, MATRICES, PLACES)
+def joint_jacobian(H: Array, G: Array, recentring: Array, turns: Array, places: Any) -> Array:
+    """Return (2m, 6 + 6k) the derivative of m bearings by one's own error and those of k neighbours.
+
+    Args:
+        H: (m, 2, 6) by the error about where it is linearised.
+        G: (m, 2, 3) by the points, map axes.
+        recentring: (6, 6) of one's own error.
+        turns: (k, 3, 3) the neighbours' orientations.
+        places: (m,) which of them is seen, -1: none.
+    """
+    whole = np.zeros((2 * len(H), 6 + 6 * len(turns)))
+    for n in range(len(H)):
+        place(whole, 2 * n, 0, product(H[n], recentring))
+        k = places[n]
+        if k >= 0:
+            place(whole, 2 * n, 6 * k + 9, product(G[n], turns[k]))
+    return whole
+
+
+@compiled(MATRIX, VECTOR, MATRIX, FRAME, MATRICES, PLACES)
+def considered(
+    R: Array, p: Array, joint: Array, frame: Frame, turns: Array, places: Any
+) -> tuple[Array, Array, Array, Array, Array, float]:
+    """Correct one's own pose by bearings, linearised half way (correction.py), and no neighbour's (Schmidt).
+
+    Args:
+        R: (3, 3) one's own orientation.
+        p: (3,) one's own position.
+        joint: (6 + 6k, 6 + 6k) covariance of one's own error and those of k neighbours.
+        frame: the bearings; points have no covariances.
+        turns: see `joint_jacobian`.
+        places: see `joint_jacobian`.
+
+    Returns:
+        Orientation, position, covariance (6, 6), what carries cross-covariances with others on (6, 6), those with the
+        neighbours (k, 6, 6), and r^T S^-1 r at the prediction.
+    """
+    residual, H, N, G = linearise(R, p, False, *frame)
+    whole = joint_jacobian(H, G, np.eye(6), turns, places)
+    _, dx, nis = gain(joint, whole, dense(N), residual.ravel())
+    at = 0.5 * dx
+    at[6:] = 0.0
+    R_there, p_there = moved(LEFT, R, p, at[:6])
+    residual, H, N, G = linearise(R_there, p_there, False, *frame)
+    whole = joint_jacobian(H, G, recentring(LEFT, at[:6]), turns, places)
+    K, dx, _ = gain(joint, whole, dense(N), residual.ravel() + transformed(whole, at))
+    K[6:] = 0.0
+    after = joseph(joint, K, whole, dense(N))
+    R, p, P = corrected(LEFT, R, p, dx[:6], after[:6, :6])
+    recentred = recentring(LEFT, dx[:6])
+    carried = eliminated(joint[:6, :6], product(after[:6, :6], recentred.T)).T
+    crosses = np.empty((len(turns), 6, 6))
+    for n in range(len(turns)):
+        place(crosses[n], 0, 0, product(recentred, after[:6, 6 * n + 6 : 6 * n + 12]))
+    return R, p, P, carried, crosses, nis
+
+
+@compiled(MATRIX, MATRIX, MATRIX)
+def bounded(cross: Array, P: Array, of: Array) -> Array:
+    """Return (6, 6) a cross-covariance within what any two errors can have in common: what is told may be anything."""
+    result = np.zeros((6, 6))
+    for i in range(6):
+        for j in range(6):
+            limit = np.sqrt(max(P[i, i] * of[j, j], 0.0))
+            if not np.isnan(cross[i, j]):
+                result[i, j] = min(max(cross[i, j], -limit), limit)
+    return result
+
+
+def _has_factor(P: Array) -> bool:
+    try:
+        cholesky(P)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 class SchmidtKalman(Considering):
@@ -50,3 +283,18 @@ def told_of(message: Message, target: int) -> Array:
         return np.zeros((6, 6))
     found = np.flatnonzero(targets == target)
     return np.asarray(cross[found[0]]) if len(found) else np.zeros((6, 6))
+
+
+class Pairwise(Considering):
+    """Keeps cross-covariances pair by pair.
+
+    It sends its pose with covariance and its factor. It tells the normalised innovation of the landmarks.
+    """
+
+    def correct(self, tick: Tick, sight: Sight, lines: Lines) -> None:
+        """Correct by the landmarks, then by neighbours one at a time."""
+        known = np.array([target not in self.neighbours for target in sight.targets.tolist()])
+        if known.any():
+            self.nis, self.nis_dof = self.consider(tick, sight.only(known)), 2 * int(known.sum())
+        for n in np.flatnonzero(~known).tolist():
+            self.consider(tick, sight.one(n))

@@ -4,6 +4,8 @@ Source: candidates by robust/p3p.py; among them that which agrees with most bear
 predicted by odometry (Fischler and Bolles, Random sample consensus, Communications of the ACM 24(6), 1981, with all
 triples in place of random ones); then Gauss-Newton over all bearings that agree. Where Gauss-Newton from the predicted
 pose ends at a pose that fits, that is the candidate nearest to it, and the closed form is not needed.
+
+Source: composition of the increments; covariance as in the prediction of the left-error filter (see mekf.py).
 """
 
 from itertools import combinations
@@ -12,9 +14,9 @@ from math import inf, sqrt
 import numpy as np
 
 from coopenv.estimation.arrays import Array, solve
-from coopenv.observers.contract import Estimate, Tick
-from coopenv.observers.lines import Sight, ahead, linearised, normalised, sight_of
-from coopenv.observers.mekf import LeftError, PoseObserver
+from coopenv.observers.bearing_measurements import Sight, ahead, linearised, normalised, sight_of
+from coopenv.observers.contract import Estimate, Message, Setup, Tick
+from coopenv.observers.error_state_filters import LeftError, PoseObserver
 from coopenv.observers.robust.p3p import solve_p3p
 
 MOST_TRIPLES = 20
@@ -125,3 +127,23 @@ def distance(pose: LeftError, predicted: LeftError) -> float:
     vector = np.array([tilde[2, 1] - tilde[1, 2], tilde[0, 2] - tilde[2, 0], tilde[1, 0] - tilde[0, 1]])
     e = np.concatenate([vector / sqrt(max(1.0 + tilde.trace(), 1e-9)), predicted.R.T.dot(pose.p - predicted.p)])
     return float(e.dot(solve(pose.P + predicted.P, e)))
+
+
+class DeadReckoning:
+    """Adds up odometry and sends nothing."""
+
+    def __init__(self, setup: Setup) -> None:
+        """Nothing to set up."""
+
+    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
+        """Start at a pose."""
+        self.state = LeftError.start(*initial_pose, initial_covariance)
+
+    def update(self, tick: Tick) -> Estimate:
+        """Append the increment."""
+        self.state = self.state.predicted(tick)
+        return self.state.estimate()
+
+    def message(self) -> Message:
+        """Return an empty message."""
+        return Message()

@@ -20,7 +20,7 @@ class Entry:
 
 ZOO = {
     "dead_reckoning": Entry(
-        "dead_reckoning:DeadReckoning", "Adds up odometry and sends nothing", "riccati.dead_reckoning:DEAD_RECKONING"
+        "single_frame:DeadReckoning", "Adds up odometry and sends nothing", "riccati.dead_reckoning:DEAD_RECKONING"
     ),
     # on a plane bearings to three points say more than a pose needs
     "p3p": Entry("single_frame:PerspectivePoints", "A pose per frame from three bearings, no memory", on_a_plane=False),
@@ -30,28 +30,30 @@ ZOO = {
         "riccati.kernels:RICCATI",
         covariance=False,
     ),
-    "hamel_samson": Entry("hamel_samson:HamelSamson", "The paper's observer with landmarks alone", covariance=False),
-    "mekf": Entry("mekf:Mekf", "Error-state filter; takes received positions as exact"),
+    "hamel_samson": Entry(
+        "error_state_filters:HamelSamson", "The paper's observer with landmarks alone", covariance=False
+    ),
+    "mekf": Entry("error_state_filters:Mekf", "Error-state filter; takes received positions as exact"),
     "mekf_covariance": Entry(
-        "mekf_covariance:MekfCovariance", "Error-state filter; weighs received positions by covariance"
+        "error_state_filters:MekfCovariance", "Error-state filter; weighs received positions by covariance"
     ),
     "mekf_covariance_ungated": Entry(
-        "mekf_covariance:MekfCovarianceUngated", "Error-state filter that accepts every bearing"
+        "error_state_filters:MekfCovarianceUngated", "Error-state filter that accepts every bearing"
     ),
     "covariance_intersection": Entry(
         "covariance_intersection:CovarianceIntersection", "Kalman filter; neighbours by covariance intersection"
     ),
     "split_covariance_intersection": Entry(
-        "split_covariance_intersection:SplitCovarianceIntersection", "Kalman filter; neighbours by split intersection"
+        "covariance_intersection:SplitCovarianceIntersection", "Kalman filter; neighbours by split intersection"
     ),
-    "pairwise": Entry("pairwise:Pairwise", "Keeps cross-covariances pair by pair"),
+    "pairwise": Entry("schmidt_kalman:Pairwise", "Keeps cross-covariances pair by pair"),
     "schmidt_kalman": Entry("schmidt_kalman:SchmidtKalman", "Considers neighbours with cross-covariances"),
     "iterated_ekf": Entry(
-        "iterated_ekf:IteratedEkf", "Error-state filter that iterates corrections; sends covariances"
+        "error_state_filters:IteratedEkf", "Error-state filter that iterates corrections; sends covariances"
     ),
-    "left_invariant": Entry("left_invariant:LeftInvariant", "Invariant filter, left error; sends covariances"),
-    "right_invariant": Entry("right_invariant:RightInvariant", "Invariant filter, right error; sends covariances"),
-    "ukf": Entry("ukf:Ukf", "Unscented (sigma-point) filter; sends covariances"),
+    "left_invariant": Entry("error_state_filters:LeftInvariant", "Invariant filter, left error; sends covariances"),
+    "right_invariant": Entry("error_state_filters:RightInvariant", "Invariant filter, right error; sends covariances"),
+    "ukf": Entry("error_state_filters:Ukf", "Unscented (sigma-point) filter; sends covariances"),
     "factor_graph": Entry(
         "factor_graph:FactorGraph", "Factor graph smoothed at key frames; sends covariances", needs="gtsam"
     ),

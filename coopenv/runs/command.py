@@ -54,7 +54,7 @@ def execute(
     """Run, write to the folder `out`, and return what `run --json` prints: the metrics, and the paths of the files.
 
     A run that does not reach its end writes nothing. `figures` is their format; None: no figures. `width` is a column
-    of `coopenv.viz.paper`; None: a page's. `describe` says what is shown beside the bar meanwhile.
+    of `coopenv.viz.figures`; None: a page's. `describe` says what is shown beside the bar meanwhile.
 
     Raises:
         NoTruthError: no true poses are known.

@@ -8,7 +8,7 @@ import numpy as np
 
 from coopenv.base.errors import listed
 from coopenv.base.format import number
-from coopenv.scenario.randomness import PARAMETERS
+from coopenv.scenario.learning import PARAMETERS
 from coopenv.scenario.schema import Scenario
 
 

@@ -14,15 +14,15 @@ from coopenv.scenario.bodies import (
     InitialEstimate,
     InitialPose,
     Landmark,
+    LandmarkGroup,
     SegmentMotion,
     TrafficMotion,
     Vehicle,
     WaypointMotion,
 )
-from coopenv.scenario.landmarks import LandmarkGroup
 from coopenv.scenario.routes import Route
 from coopenv.scenario.schema import Scenario
-from coopenv.scenario.topology import neighbour_sets
+from coopenv.scenario.starts import neighbour_sets
 
 MANY_LANDMARKS = 4  # from this number on, `all landmarks` stands for their names
 

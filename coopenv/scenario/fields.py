@@ -5,14 +5,11 @@ from typing import Literal
 from pydantic import Field
 
 from coopenv.scenario.base import Part, Positive, Text, Vector3, overlaid
-from coopenv.scenario.bodies import Landmark, Obstacle, Road, Vehicle
-from coopenv.scenario.faults import Faults
+from coopenv.scenario.bodies import Landmark, LandmarkGroup, Obstacle, Road, Vehicle
 from coopenv.scenario.highway import Highway
-from coopenv.scenario.landmarks import LandmarkGroup
-from coopenv.scenario.learning import Action, Dynamics, Observation, Reward, Termination
-from coopenv.scenario.randomness import Difficulty, Randomisation
+from coopenv.scenario.learning import Action, Difficulty, Dynamics, Observation, Randomisation, Reward, Termination
 from coopenv.scenario.routes import Route
-from coopenv.scenario.sensing import Camera, Noise, Observer, Rates, Topology, V2x
+from coopenv.scenario.sensing import Camera, Faults, Noise, Observer, Rates, Topology, V2x
 
 
 class Map(Part):

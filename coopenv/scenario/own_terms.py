@@ -9,6 +9,7 @@ from pydantic import ValidationError
 
 from coopenv.base import user_code
 from coopenv.base.errors import CoopenvError, shown
+from coopenv.scenario.base import one_line
 from coopenv.scenario.terms import (
     GROUPS,
     OBSERVATION_FIELDS,
@@ -22,7 +23,6 @@ from coopenv.scenario.terms import (
     Scale,
     Term,
 )
-from coopenv.scenario.validation import one_line
 
 SECTIONS = ("observation", "reward", "termination")
 """Parts of a scenario with a table `custom`."""

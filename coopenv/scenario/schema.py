@@ -13,8 +13,7 @@ from coopenv.base.errors import ScenarioWarning, listed, shown, suggest
 from coopenv.scenario.bodies import Landmark
 from coopenv.scenario.fields import ScenarioFields
 from coopenv.scenario.routes import followers
-from coopenv.scenario.starts import check_room
-from coopenv.scenario.topology import neighbour_sets, processing_order
+from coopenv.scenario.starts import check_room, neighbour_sets, processing_order
 
 MOST_TICKS = 1e8  # camera frames or odometry samples of one episode; counters are 32 bits wide
 

@@ -15,12 +15,11 @@ from coopenv.evaluation import Result, drive, held_out_seeds, score
 from coopenv.policies import load_agent
 from coopenv.policies.loader import AGENT_FILE, CARD_FILES, CHECKPOINT_FILE
 from coopenv.scenario import Scenario
-from coopenv.training import checkpoint, settings_file
-from coopenv.training.environment_file import environment_file
+from coopenv.training import checkpoint, files
 from coopenv.training.export import EXPORTED, check_onnx, export
+from coopenv.training.files import environment_file
 from coopenv.training.settings import Plan
-from coopenv.training.trainer import DivergedError, Trainer
-from coopenv.training.watch import Status
+from coopenv.training.trainer import DivergedError, Status, Trainer
 
 NAMES = (*EXPORTED, CHECKPOINT_FILE, *CARD_FILES)
 """Of files that an agent's folder can hold; a card tells of one agent only, and goes with it."""
@@ -108,7 +107,7 @@ def train(
         raise CoopenvError(f"{out} holds an unfinished training: go on with --resume, or remove {path}")
     if kept is None and (out / AGENT_FILE).exists() and not force:
         raise OutputError(f"{out / AGENT_FILE}: exists already; --force replaces the agent")
-    settings_file.check(out, plan, environment_file(plan.environment).name)
+    files.check(out, plan, environment_file(plan.environment).name)
     outputs = checkpoint.Outputs(onnx, logs)
     if kept is not None:
         outputs = outputs.or_else(kept.outputs)
@@ -129,7 +128,7 @@ def train(
             _learn(trainer, path, curve, outputs, threads, tell)
             results = _judge(trainer, held_out_seeds(0, worlds), threads, tell)
         with replacing_folder(out, (*NAMES, trainer.environment.name)) as folder:
-            settings_file.write(folder, out, plan, trainer.environment.name)
+            files.write(folder, out, plan, trainer.environment.name)
             export(folder, trainer, results, curve, outputs.onnx)
     finally:
         trainer.close()

@@ -22,7 +22,7 @@ from coopenv.evaluation import Result
 from coopenv.policies.loader import AGENT_FILE, NetworkCard
 from coopenv.policies.network import ENTRY, layout_hash, layout_tables
 from coopenv.scenario import Scenario
-from coopenv.training import settings_file
+from coopenv.training import files
 from coopenv.training.settings import SETTINGS_FILE
 from coopenv.training.trainer import Trainer
 
@@ -35,7 +35,7 @@ PACKAGES = ("numpy", "warp-lang", "torch", "stable-baselines3")
 def export(
     folder: Path, trainer: Trainer, results: Sequence[Result], curve: list[dict[str, float]], onnx: bool = False
 ) -> None:
-    """Write everything that an agent's folder holds, but for its settings (`settings_file.write`).
+    """Write everything that an agent's folder holds, but for its settings (`files.write`).
 
     Args:
         folder: to write to.
@@ -114,7 +114,7 @@ def _card(trainer: Trainer, results: Sequence[Result], digest: str) -> str:
         "environment": environment.name,
         "seed": plan.seed,
         "scenario": scenario_digest(trainer.scenario),
-        "settings": settings_file.settings_digest(plan),
+        "settings": files.settings_digest(plan),
         **({"arm": plan.arm} if plan.arm else {}),
         "steps": trainer.status.steps,
         "minutes": round(trainer.status.seconds / 60.0, 2),

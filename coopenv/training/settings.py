@@ -10,8 +10,7 @@ from typing import Annotated, Any
 from pydantic import Field, ValidationError, model_validator
 
 from coopenv.base.errors import CoopenvError, suggest
-from coopenv.scenario.base import NonNegative, Part, Positive, Probability
-from coopenv.scenario.validation import one_line
+from coopenv.scenario.base import NonNegative, Part, Positive, Probability, one_line
 
 SETTINGS_FILE = "train.toml"
 Count = Annotated[int, Field(gt=0, le=2**31)]

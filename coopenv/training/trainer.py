@@ -1,27 +1,233 @@
 """One training: the batch, Stable-Baselines3's PPO on it, and how far it is. Needs the extra `train`."""
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from time import monotonic, process_time
 from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger, configure
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from coopenv.api.trainers.sb3 import CooperativeSB3VecEnv
-from coopenv.api.trainers.sb3_buffer import ActingRowsBuffer
+from coopenv.api.terms.layout import action_fields
+from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv
 from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.base.errors import CoopenvError
 from coopenv.evaluation.episodes import driven_vehicles
+from coopenv.evaluation.metrics import SETTLED_FROM
+from coopenv.policies import decide, load_agent, restart
 from coopenv.scenario import Scenario
-from coopenv.training.cloning import clone
-from coopenv.training.environment_file import environment_file
-from coopenv.training.normalised import NormalisedEnv
-from coopenv.training.settings import Plan
-from coopenv.training.watch import Status, Watch
+from coopenv.training.files import environment_file
+from coopenv.training.settings import Clone, Plan
+
+EPISODES = 200
+"""Last episodes of vehicles over which is averaged."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """How far a training is, and how the exploring policy did lately."""
+
+    steps: int
+    """Decisions of vehicles so far."""
+    seconds: float
+    share: float
+    """Of the budget, 0 to 1."""
+    figures: dict[str, float]
+    """`return`, `arrival_rate` and `collision_rate` over the last episodes; `e50_m` and `e95_m` in the last rollout."""
+
+    @property
+    def line(self) -> str:
+        """The status in a few words."""
+        f = self.figures
+        parts = [f"{self.steps / 1e6:.2f} M steps", f"{self.steps / max(self.seconds, 1e-9):,.0f}/s"]
+        if "return" in f:
+            parts += [f"return {f['return']:.1f}", f"arrived {f['arrival_rate']:.0%}", f"hit {f['collision_rate']:.0%}"]
+        if "e95_m" in f:
+            parts.append(f"e95 {100 * f['e95_m']:.0f} cm")
+        return ", ".join(parts)
+
+
+class Watch(BaseCallback):
+    """Collects errors of the rollout and ends of episodes, and records both for TensorBoard."""
+
+    def __init__(self, env: CooperativeSB3VecEnv) -> None:
+        super().__init__()
+        self._env = env
+        self._errors: list[np.ndarray] = []
+        self._ended: deque[dict[str, Any]] = deque(maxlen=EPISODES)
+
+    def _on_step(self) -> bool:
+        told = self._env.batch_infos
+        counts = self._env.acted & (told["time"] > SETTLED_FROM)
+        self._errors.append(told["position_error"][counts])
+        self._ended.extend(self.locals["infos"][row] for row in np.flatnonzero(self.locals["dones"]))
+        return True
+
+    def _on_rollout_end(self) -> None:
+        for name, value in self.figures().items():
+            self.logger.record(f"vehicles/{name}", value)
+        for name in self._env.engine.reward_terms if self._ended else ():
+            mean = np.mean([info["reward_terms"][name] for info in self._ended])
+            self.logger.record(f"reward_terms/{name}", float(mean))
+
+    def figures(self) -> dict[str, float]:
+        """Return what `Status` holds."""
+        found: dict[str, float] = {}
+        errors = np.concatenate(self._errors) if self._errors else np.empty(0)
+        if errors.size:
+            found |= {"e50_m": float(np.median(errors)), "e95_m": float(np.percentile(errors, 95))}
+        if self._ended:
+            outcomes = [info["outcome"] for info in self._ended]
+            found["return"] = float(np.mean([info["episode"]["r"] for info in self._ended]))
+            found["arrival_rate"] = outcomes.count("arrived") / len(outcomes)
+            found["collision_rate"] = outcomes.count("collided") / len(outcomes)
+        return found
+
+    def _on_rollout_start(self) -> None:
+        self._errors.clear()
+
+
+LEAST_VARIANCE = 1e-4
+"""Added to variances: what hardly ever changes is not blown up to the size of the rest."""
+
+
+class NormalisedEnv(VecEnvWrapper):
+    """What a policy learns from: normalised observations of vehicles under way, rewards of order one.
+
+    Unlike SB3's `VecNormalize` it leaves parked vehicles out of the statistics and is saved without pickle. Returns in
+    `info["episode"]` stay in the units of the scenario.
+    """
+
+    venv: CooperativeSB3VecEnv
+
+    def __init__(self, venv: CooperativeSB3VecEnv, clip: float, reward_scale: float) -> None:
+        """Wrap a batch; `clip` in standard deviations."""
+        shape = venv.observation_space.shape
+        super().__init__(venv, observation_space=spaces.Box(-clip, clip, shape=shape, dtype=np.float32))
+        self.statistics = RunningMeanStd(shape=shape or ())
+        self._clip, self._reward_scale = clip, reward_scale
+        self._present: np.ndarray | None = None
+
+    def start(self) -> None:
+        """Start episodes already now; the next `reset` goes on from there."""
+        self._present = self.reset()
+
+    def go_on_from(self, observations: np.ndarray) -> None:
+        """Let the next `reset` go on from raw observations of episodes under way instead of starting new ones."""
+        self._present = self.normalise(observations)
+
+    def normalise(self, observations: np.ndarray) -> np.ndarray:
+        """Return observations as the policy sees them."""
+        scaled = (observations - self.statistics.mean) / self.std
+        return np.asarray(np.clip(scaled, -self._clip, self._clip), dtype=np.float32)
+
+    @property
+    def std(self) -> np.ndarray:
+        """Standard deviations by which observations are divided, (D,)."""
+        return np.asarray(np.sqrt(self.statistics.var + LEAST_VARIANCE))
+
+    def reset(self) -> np.ndarray:
+        """Start new episodes, or go on where told to."""
+        if self._present is not None:
+            present, self._present = self._present, None
+            return present
+        observations = self.venv.reset()
+        self.statistics.update(observations)
+        return self.normalise(observations)
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Step, and learn the statistics of what vehicles under way see."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        if self.venv.acted.any():
+            self.statistics.update(observations[self.venv.acted])
+        for row in np.flatnonzero(dones):
+            infos[row]["terminal_observation"] = self.normalise(infos[row]["terminal_observation"])
+        return self.normalise(observations), rewards * self._reward_scale, dones, infos
+
+
+BATCH = 512  # rows per gradient step
+
+
+def clone(
+    policy: ActorCriticPolicy,
+    env: NormalisedEnv,
+    settings: Clone,
+    gamma: float,
+    reward_scale: float,
+    seed: int,
+    tell: Callable[[str], None] = lambda line: None,
+) -> None:
+    """Fit the mean action to what a driver does, and the value to the discounted rewards that follow.
+
+    What it saw also becomes the first of the statistics by which observations are normalised. The noise that is added
+    to its actions shows how it mends deviations (Laskey et al. 2017).
+
+    Args:
+        policy: to be fitted.
+        env: whose statistics are to be filled.
+        settings: whom to watch, and for how long.
+        gamma: discount per decision.
+        reward_scale: of the rewards that the value is to predict.
+        seed: of the worlds, the noise and the order of rows.
+        tell: called with what is being done, and how far it is.
+    """
+    raw, actions, returns = watch(env.venv.envs, settings, gamma, seed, tell)
+    env.statistics.update(raw)
+    observations = torch.from_numpy(env.normalise(raw))
+    targets = torch.from_numpy(actions.astype(np.float32))
+    values = torch.from_numpy((reward_scale * returns).astype(np.float32))
+    optimiser = torch.optim.Adam(policy.parameters(), settings.learning_rate)
+    shuffle = torch.Generator().manual_seed(seed)
+    for epoch in range(settings.epochs):
+        tell(f"learning from {settings.agent}: pass {epoch + 1} of {settings.epochs}")
+        for rows in torch.randperm(len(observations), generator=shuffle).split(BATCH):
+            latent_policy, latent_value = policy.mlp_extractor(observations[rows])
+            action_error = policy.action_net(latent_policy) - targets[rows]
+            value_error = policy.value_net(latent_value).squeeze(-1) - values[rows]
+            loss = (action_error**2).mean() + (value_error**2).mean()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+
+
+def watch(
+    like: CooperativeVectorEnv, settings: Clone, gamma: float, seed: int, tell: Callable[[str], None]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return observations (rows, D), the driver's actions (rows, A), and the discounted returns from there (rows,)."""
+    scenario = like.scenario
+    env = CooperativeVectorEnv(
+        scenario, "clone", num_worlds=settings.episodes, autoreset="disabled", threads=like.engine.world.threads
+    )
+    driver, noise = load_agent(settings.agent, scenario), np.random.default_rng(seed)
+    observation, _ = env.reset(seed=seed)
+    restart(driver, np.ones(env.num_envs, dtype=bool))
+    under_way = np.ones(env.num_envs, dtype=bool)
+    steps: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
+    while under_way.any():
+        tell(f"watching {settings.agent}: {len(steps) / scenario.rates.decision:.0f} of {scenario.horizon:g} s")
+        action = decide(driver, observation, len(action_fields(scenario)))
+        tried = np.clip(action + settings.noise * noise.standard_normal(action.shape), -1.0, 1.0)
+        before, acted = observation, under_way
+        observation, reward, terminated, truncated, _ = env.step(tried.astype(np.float32))
+        steps.append((before, action, np.where(acted, reward, 0.0), acted))
+        under_way = acted & ~(terminated | truncated)
+    env.close()
+    observations, actions, rewards, acted = (np.stack(column) for column in zip(*steps, strict=True))
+    returns, following = np.zeros_like(rewards), np.zeros(env.num_envs)
+    for t in reversed(range(len(rewards))):
+        returns[t] = following = rewards[t] + gamma * following
+    return observations[acted], actions[acted], returns[acted]
+
 
 TORCH_REFUSES = "Expected parameter"
 """So begins what torch says of a distribution whose parameters are not finite."""

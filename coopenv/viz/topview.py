@@ -13,11 +13,9 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Body
 from coopenv.viz import topview_geometry as geometry
 from coopenv.viz import topview_ground as ground
-from coopenv.viz.scene.frame import Frame, Shown
-from coopenv.viz.scene.stage import Stage
+from coopenv.viz.scene.stage import Frame, Shown, Stage
 from coopenv.viz.style import DARK_BLUE, INK, NORMAL, vehicle_colour
-from coopenv.viz.topview_goals import Goals
-from coopenv.viz.topview_layers import Layers
+from coopenv.viz.topview_ground import Goals, Layers
 from coopenv.viz.window import Window
 
 _SHORTEST = 28  # px, drawn length of a vehicle

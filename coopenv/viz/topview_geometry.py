@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Obstacle, Vehicle
-from coopenv.scenario.motion import TwistTable, compile_motion, left_jacobian
-from coopenv.scenario.routes import even_points
+from coopenv.scenario.routes import TwistTable, compile_motion, even_points, left_jacobian
 from coopenv.scenario.sensing import ROTATION_OF_CAMERA, Camera
 from coopenv.scenario.starts import agent_starts
 

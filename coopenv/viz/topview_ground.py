@@ -1,11 +1,14 @@
 """What stands still under the top view: axes, roads, buildings, names of landmarks, and the panel's legend."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_rgba_array
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
@@ -16,8 +19,8 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Obstacle
-from coopenv.viz.labels import place_names
-from coopenv.viz.scene.stage import sees_a_part
+from coopenv.viz.drawing import place_names
+from coopenv.viz.scene.stage import Frame, sees_a_part
 from coopenv.viz.style import DARK_BLUE, DPI, GREY, INK, NORMAL, SMALL, legend, new_figure, vehicle_colour
 from coopenv.viz.topview_geometry import limits, road_corners, ways
 
@@ -177,3 +180,125 @@ def _mark(marker: str, edge: str, face: str, size: float, label: str) -> Line2D:
     mark = Line2D([], [], linestyle="none", marker=marker, markersize=size, markeredgewidth=0.9, label=label)
     mark.set(markeredgecolor=edge, markerfacecolor=face)
     return mark
+
+
+class Layers:
+    """The moving artists of a figure, from below to above in the order in which they are added."""
+
+    def __init__(self, figure: Figure, axes: Axes) -> None:
+        self._figure, self._axes = figure, axes
+        self._canvas = cast(FigureCanvasAgg, figure.canvas)
+        self._artists: list[Artist] = []
+        self._background: Any = None
+
+    def polygons(self, **look: Any) -> Any:
+        """Add a collection of polygons, in axes coordinates."""
+        return self.keep(self._axes.add_collection(PolyCollection([], **look), autolim=False))
+
+    def lines(self, **look: Any) -> Any:
+        """Add a collection of lines, in axes coordinates."""
+        return self.keep(self._axes.add_collection(LineCollection([], **look), autolim=False))
+
+    def points(self, marker: str, face: str, edge: str, size: float) -> Any:
+        """Add points, in axes coordinates; `size` in pt."""
+        line = Line2D([], [], linestyle="none", marker=marker, markersize=size, markeredgewidth=0.9)
+        line.set(markerfacecolor=face, markeredgecolor=edge)
+        return self.keep(self._axes.add_line(line))
+
+    def keep(self, artist: Any) -> Any:
+        """Add an artist that is already in the figure."""
+        artist.set_animated(True)
+        self._artists.append(artist)
+        return artist
+
+    def paint(self) -> np.ndarray:
+        """Return the picture, (H, W, 3) uint8; what is no layer must not have changed since the first one."""
+        if self._background is None:
+            self._canvas.draw()
+            self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+        self._canvas.restore_region(self._background)
+        renderer = self._canvas.get_renderer()
+        for artist in self._artists:
+            artist.draw(renderer)
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+
+_CORNERS = 48  # of the polygon that stands for a circle
+_ANGLE = np.linspace(0.0, 2 * np.pi, _CORNERS, endpoint=False)
+_CIRCLE = np.stack([np.cos(_ANGLE), np.sin(_ANGLE)], axis=-1)
+_GAP = 3  # px between goals and their name
+_MOST_NAMES = 3  # that stand for goals which touch one another; of the others there is the number
+
+
+class Goals:
+    """The goals of all vehicles, and the routes of those that have drawn one."""
+
+    def __init__(self, scenario: Scenario, layers: Layers) -> None:
+        """Add all but the names."""
+        there = [i for i, vehicle in enumerate(scenario.vehicles) if vehicle.goal_radius > 0]
+        self._there = there
+        self._radius = np.array([scenario.vehicles[i].goal_radius for i in there])
+        colours = to_rgba_array([vehicle_colour(i) for i in there])
+        self._routes = layers.lines(linewidth=0.9, alpha=0.55)
+        self._discs = layers.polygons(facecolor="white", edgecolor="none", alpha=0.6)
+        self._rims = layers.polygons(facecolor="none", edgecolor=colours, linestyle=DOTTED, linewidth=1.6)
+
+    def add_names(self, axes: Axes, layers: Layers, others: Sequence[Text]) -> None:
+        """Add the names, over all that has been added before and where `others`, which stand still, are not."""
+        low, self._end = axes.get_xlim()
+        self._pixel = (self._end - low) / axes.get_window_extent().width  # m
+        taken = [axes.transData.inverted().transform(other.get_window_extent()) for other in others]
+        self._taken = np.array(taken).reshape(-1, 2, 2)  # m, lower left and upper right corners
+        halo = [withStroke(linewidth=2.2, foreground="white")]
+        look: dict[str, Any] = {"fontsize": SMALL, "va": "center", "clip_on": True, "color": INK, "path_effects": halo}
+        self._names: list[Text] = [layers.keep(axes.text(0, 0, "", **look)) for _ in self._there]
+
+    def place(self, frame: Frame) -> None:
+        """Move them to where they are now."""
+        center = frame.goal[self._there, :2]
+        shapes = center[:, None] + self._radius[:, None, None] * _CIRCLE
+        self._discs.set_verts(list(shapes))
+        self._rims.set_verts(list(shapes))
+        groups = touching(center, self._radius)
+        for name, members in zip(self._names, groups + [[]] * (len(self._names) - len(groups)), strict=True):
+            name.set_text(self._text(members))
+            if members:
+                self._put(name, center[members], self._radius[members])
+        drawn = [i for i in self._there if frame.route_drawn[i] >= 0]
+        self._routes.set_segments([frame.route[i, : int(frame.route_count[i]), :2] for i in drawn])
+        self._routes.set_color([vehicle_colour(i) for i in drawn])
+
+    def _text(self, members: list[int]) -> str:
+        """Return the name of goals that touch one another."""
+        named = len(members) if len(members) <= _MOST_NAMES else _MOST_NAMES - 1
+        marks = ", ".join(vehicle_mark(self._there[k]) for k in members[:named])
+        return marks + (f" +{len(members) - named}" if len(members) > named else "")
+
+    def _put(self, name: Text, center: np.ndarray, radius: np.ndarray) -> None:
+        """Write a name into a goal if it fits, else to the right of it, or to the left, where no other name is."""
+        extent = name.get_window_extent()
+        wide, tall, gap = extent.width * self._pixel, extent.height * self._pixel, _GAP * self._pixel
+        left, right = float((center[:, 0] - radius).min()), float((center[:, 0] + radius).max())
+        y = float((center[:, 1].min() + center[:, 1].max()) / 2)
+        places = [right + gap, left - gap - wide]  # of the name's left end
+        if len(center) == 1 and wide + 2 * gap < right - left:
+            places.insert(0, (left + right - wide) / 2)
+        inside = [x for x in places if x + wide < self._end] or places[-1:]
+        name.set(x=next((x for x in inside if self._is_free(x, y, wide, tall)), inside[0]), y=y)
+
+    def _is_free(self, x: float, y: float, wide: float, tall: float) -> bool:
+        """Return whether a name of a size would cover no other one; `x`, `y`: the middle of its left side, m."""
+        low, high = np.array([x, y - tall / 2]), np.array([x + wide, y + tall / 2])
+        return not ((self._taken[:, 0] < high) & (self._taken[:, 1] > low)).all(axis=1).any()
+
+
+def touching(center: np.ndarray, radius: np.ndarray) -> list[list[int]]:
+    """Return the indices of circles, centres (N, 2) and radii (N,), in groups that touch one another."""
+    groups: list[list[int]] = []
+    for i in range(len(center)):
+        if not np.isfinite(center[i]).all():
+            continue
+        reach = np.linalg.norm(center - center[i], axis=-1) < radius + radius[i]
+        near = [group for group in groups if reach[group].any()]
+        groups = [group for group in groups if group not in near] + [sorted(sum(near, [i]))]
+    return groups

@@ -10,11 +10,9 @@ import warp as wp
 from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Vehicle
-from coopenv.scenario.learning import Dynamics
-from coopenv.scenario.motion import compile_motion
-from coopenv.scenario.randomness import FASTEST_PACE
-from coopenv.scenario.starts import agent_starts, rotation_of
-from coopenv.scenario.topology import neighbour_sets, processing_order
+from coopenv.scenario.learning import FASTEST_PACE, Dynamics
+from coopenv.scenario.routes import compile_motion
+from coopenv.scenario.starts import agent_starts, neighbour_sets, processing_order, rotation_of
 from coopenv.world.build_draws import drawn_of, routes_of
 from coopenv.world.build_faults import fault_entries, fault_switches
 from coopenv.world.build_sensors import camera_entries, noise_entries

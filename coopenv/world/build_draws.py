@@ -6,7 +6,7 @@ import numpy as np
 
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Vehicle
-from coopenv.scenario.randomness import PARAMETERS
+from coopenv.scenario.learning import PARAMETERS
 from coopenv.scenario.routes import even_points, followers, point_count
 from coopenv.world.model import CONTINUE, LEAVE, PARK
 

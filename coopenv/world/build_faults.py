@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.scenario import Scenario
-from coopenv.scenario.faults import Faults
+from coopenv.scenario.sensing import Faults
 from coopenv.world.fault_kinds import KINDS
 
 

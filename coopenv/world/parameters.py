@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.scenario.randomness import PARAMETERS
+from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.random import PARAMETER, random_words, uniform
 
 _NUMBER = {name: number for number, name in enumerate(PARAMETERS)}

@@ -14,7 +14,7 @@ import warp as wp
 
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario.base import LARGEST
-from coopenv.scenario.randomness import MOST, PARAMETERS
+from coopenv.scenario.learning import MOST, PARAMETERS
 from coopenv.world.precision import Precision
 from coopenv.world.records import allocate, array, fields
 from coopenv.world.saved_state import (

@@ -8,7 +8,7 @@ import warp as wp
 
 from coopenv.base.errors import CoopenvError, check_memory
 from coopenv.scenario import Scenario
-from coopenv.scenario.randomness import PARAMETERS
+from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
 from coopenv.world.fault_kinds import UNKNOWN

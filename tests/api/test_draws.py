@@ -15,7 +15,7 @@ from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.runs import Rollout
 from coopenv.runs.metrics import outcome_line
 from coopenv.scenario import Scenario
-from coopenv.scenario.randomness import PARAMETERS
+from coopenv.scenario.learning import PARAMETERS
 from tests.helpers.builders import constant, landmark, scenario, vehicle
 from tests.helpers.four_way import FOUR_WAY
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import coopenv
-from coopenv.bench.agents.dial import has_dial
-from coopenv.policies.peek import Peek
+from coopenv.bench.agents.cards import has_dial
+from coopenv.policies.look_ahead import Peek
 from coopenv.policies.route_follower import RouteFollower
 from coopenv.scenario import load_scenario
 from tests.helpers.marks import largest_slow

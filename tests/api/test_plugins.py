@@ -17,7 +17,7 @@ import coopenv.observers.registry as registry
 from coopenv import CoopenvError
 from coopenv.api.engine import Engine
 from coopenv.observers import Coordinates, Estimate, Setup, Tick, register, run
-from coopenv.observers.dead_reckoning import DeadReckoning
+from coopenv.observers.single_frame import DeadReckoning
 from coopenv.runs.recorder import record
 from tests.helpers.four_way import FOUR_WAY
 from tests.oracles.riccati import Riccati

@@ -8,8 +8,7 @@ import pytest
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import coopenv
-from coopenv.api.statistics import RecordVehicleEpisodes
-from coopenv.api.true_ends import TrueEnds
+from coopenv.api.vector_env import RecordVehicleEpisodes, TrueEnds
 from tests.helpers.four_way import FOUR_WAY
 
 DECISIONS = 60

@@ -17,9 +17,8 @@ from coopenv import CoopenvError
 from coopenv.api.engine import Engine
 from coopenv.backends.base import Told
 from coopenv.observers import Message, Received, register, run
-from coopenv.observers.dead_reckoning import DeadReckoning
-from coopenv.observers.recording import Sensed
-from coopenv.observers.recording_checks import check_recording
+from coopenv.observers.recording import Sensed, check_recording
+from coopenv.observers.single_frame import DeadReckoning
 from coopenv.policies import load_policy
 from coopenv.runs import record
 from coopenv.world.launch import kernel

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from coopenv.backends.mrclam import VARIANTS, load_dataset
-from coopenv.backends.mrclam.dataset import Truth
-from coopenv.backends.mrclam.odometry import MAX_HOLD_S, HeldCommands
+from coopenv.backends.mrclam.dataset import MAX_HOLD_S, HeldCommands, Truth
 from coopenv.backends.mrclam.recording import check_variant, counted
 from coopenv.base.errors import DataError, DataWarning
 from tests.helpers.mrclam_files import LANDMARKS, write

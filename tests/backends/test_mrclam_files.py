@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from coopenv.backends.mrclam import load_dataset
-from coopenv.backends.mrclam.tables import find_folder
+from coopenv.backends.mrclam.dataset import find_folder
 from coopenv.base.errors import DataError, DataWarning
 from tests.helpers.mrclam_files import LANDMARKS, ORIGIN, command, pose, write
 

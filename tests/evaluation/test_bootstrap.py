@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coopenv.evaluation.bootstrap import Quantile, Ratio, interval, resamples
+from coopenv.evaluation.metrics import Quantile, Ratio, interval, resamples
 
 WORLDS = 12
 

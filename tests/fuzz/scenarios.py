@@ -18,9 +18,9 @@ import coopenv
 from coopenv import CoopenvError
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.scenario import parse_scenario
+from coopenv.scenario.base import TOO_DEEP
 from coopenv.scenario.files import apply_vehicle_defaults
 from coopenv.scenario.own_terms import located
-from coopenv.scenario.validation import TOO_DEEP
 
 STEPS = 5
 FINITE = (

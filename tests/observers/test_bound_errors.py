@@ -10,8 +10,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers import Recording
-from coopenv.observers.bound import cramer_rao
-from coopenv.observers.bound_errors import error_states
+from coopenv.observers.bound import cramer_rao, error_states
 from tests.oracles.batch import small_record
 
 STD = {"scale": 0.05, "bias": 0.03, "mounting": 0.02, "place": 0.04, "clock": 0.03}

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv import CoopenvError
 from coopenv.observers import Estimate, Message
-from coopenv.observers.checks import check_estimate, check_message
+from coopenv.observers.contract import check_estimate, check_message
 
 POSE: dict[str, Any] = {"rotation": np.eye(3), "position": np.zeros(3)}
 LOPSIDED = np.eye(6) + np.eye(6, k=1) * 1e-3

@@ -11,9 +11,7 @@ from scipy.spatial.transform import Rotation
 from coopenv.estimation.rotations import right_jacobian
 from coopenv.observers import Coordinates
 from coopenv.observers.correction import halfway, iterated, kalman
-from coopenv.observers.left_invariant import InvariantError
-from coopenv.observers.mekf import LeftError
-from coopenv.observers.right_invariant import RightError
+from coopenv.observers.error_state_filters import InvariantError, LeftError, RightError
 from tests.observers.test_filters import derivative, pose, spd
 
 

@@ -11,13 +11,11 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers import Coordinates, Recording, SensorNoise, Tick, run
+from coopenv.observers.bearing_measurements import Sight, from_left, linearise
 from coopenv.observers.correction import kalman
 from coopenv.observers.covariance_intersection import CovarianceIntersection, best_weight
-from coopenv.observers.lines import Sight, linearise
-from coopenv.observers.mekf import LeftError
-from coopenv.observers.pose_errors import from_left
+from coopenv.observers.error_state_filters import LeftError, RightError
 from coopenv.observers.registry import find
-from coopenv.observers.right_invariant import RightError
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.oracles.batch import small_record, solve

@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import chi2
 
 from coopenv.observers import Recording, Setup, run
-from coopenv.observers.gate import LARGEST, Gate
-from coopenv.observers.mekf_covariance import MekfCovariance
+from coopenv.observers.correction import LARGEST, Gate
+from coopenv.observers.error_state_filters import MekfCovariance
 from coopenv.runs.recorder import record
 from tests.oracles.batch import small_errors
 

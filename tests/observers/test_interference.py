@@ -16,9 +16,8 @@ from coopenv.backends.replay.backend import Replay
 from coopenv.base.errors import CoopenvError
 from coopenv.base.seeds import world_keys
 from coopenv.observers import Message, Recording, run
-from coopenv.observers.checks import check_received
-from coopenv.observers.contract import Tick
-from coopenv.observers.mekf_covariance import MekfCovariance
+from coopenv.observers.contract import Tick, check_received
+from coopenv.observers.error_state_filters import MekfCovariance
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.builders import simulate

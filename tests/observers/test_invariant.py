@@ -10,9 +10,15 @@ from numpy.testing import assert_allclose
 from scipy.linalg import logm
 
 from coopenv.observers import Coordinates, Estimate, SensorNoise, run
-from coopenv.observers.left_invariant import InvariantError, LeftInvariant
-from coopenv.observers.mekf import LeftError, Mekf
-from coopenv.observers.ukf import SPREAD, Ukf, sigma_points
+from coopenv.observers.error_state_filters import (
+    SPREAD,
+    InvariantError,
+    LeftError,
+    LeftInvariant,
+    Mekf,
+    Ukf,
+    sigma_points,
+)
 from tests.observers.test_filters import QUIET, pose, spd, tick
 from tests.oracles.batch import small_record, solve
 

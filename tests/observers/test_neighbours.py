@@ -12,10 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.rotations import right_jacobian
 from coopenv.observers import Message, Received, Recording, run
-from coopenv.observers.lines import linearise
-from coopenv.observers.neighbours import considered as update
-from coopenv.observers.pairwise import Pairwise
-from coopenv.observers.schmidt_kalman import SchmidtKalman
+from coopenv.observers.bearing_measurements import linearise
+from coopenv.observers.schmidt_kalman import Pairwise, SchmidtKalman
+from coopenv.observers.schmidt_kalman import considered as update
 from coopenv.runs.recorder import record
 from coopenv.scenario import load_scenario
 from tests.observers.test_filters import derivative, pose, spd

@@ -10,11 +10,11 @@ import pytest
 import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.observers import registry
-from coopenv.observers.dead_reckoning import DeadReckoning
 from coopenv.observers.registry import find, named, portable
+from coopenv.observers.single_frame import DeadReckoning
 
 SOURCE = """
-from coopenv.observers.dead_reckoning import DeadReckoning
+from coopenv.observers.single_frame import DeadReckoning
 
 class Mine(DeadReckoning):
     pass
@@ -43,7 +43,10 @@ def test_a_place_gets_the_name_of_its_class(folder: Path) -> None:
     assert named("mine.py:Mine") == "Mine" == named(f"{folder}/mine.py:Mine")
     assert find("Mine") is find("mine.py:Mine")
     assert portable("Mine") == f"{folder.resolve()}/mine.py:Mine"
-    assert named("coopenv.observers.ukf:Ukf") == "Ukf" and portable("Ukf") == "coopenv.observers.ukf:Ukf"
+    assert (
+        named("coopenv.observers.error_state_filters:Ukf") == "Ukf"
+        and portable("Ukf") == "coopenv.observers.error_state_filters:Ukf"
+    )
 
 
 def test_classes_get_their_name() -> None:

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers import Message, Received, Tick, run
-from coopenv.observers.mekf import LeftError
+from coopenv.observers.error_state_filters import LeftError
 from coopenv.observers.single_frame import PerspectivePoints
 from tests.observers.test_filters import QUIET, tick
 from tests.oracles.batch import small_record

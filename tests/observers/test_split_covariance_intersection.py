@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from coopenv.observers import run
 from coopenv.observers.correction import kalman
-from coopenv.observers.split_covariance_intersection import best_weight
+from coopenv.observers.covariance_intersection import best_split_weight
 from tests.observers.test_filters import spd
 from tests.oracles.batch import small_record
 
@@ -25,7 +25,7 @@ def test_it_is_consistent_for_any_correlation_of_the_dependent_parts(seed: int) 
     own = variance * np.eye(2)
     H, G = rng.normal(size=(2, 6)), rng.normal(size=(2, 3))
     R_d = G @ C @ G.T
-    w = best_weight(P_d, P_i, H, R_d + own, variance)
+    w = best_split_weight(P_d, P_i, H, R_d + own, variance)
     if w == 1.0:
         return
     P_1, P_2 = P_d / w + P_i, R_d / (1 - w) + own
@@ -41,7 +41,7 @@ def test_without_dependent_parts_it_is_the_kalman_filter() -> None:
     """The first time that a follower hears its leader, nothing of its own is shared: w goes to its least."""
     rng = np.random.default_rng(0)
     P, H, R_d = spd(rng, 6), rng.normal(size=(2, 6)), spd(rng, 2)
-    w = best_weight(np.zeros((6, 6)), P, H, R_d + np.eye(2), 1.0)
+    w = best_split_weight(np.zeros((6, 6)), P, H, R_d + np.eye(2), 1.0)
     assert_allclose(R_d / (1 - w), R_d, rtol=0.03)
     made = small_record(1)
     split, plain = run("split_covariance_intersection", made), run("mekf_covariance", made)

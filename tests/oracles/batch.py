@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from coopenv.observers import Recording
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.scenario.motion import ConstantMotion
+from coopenv.scenario.routes import ConstantMotion
 
 
 def small_errors(overrides: dict[str, object], size: float = 1e-4, turning: bool = True) -> Scenario:

@@ -9,13 +9,9 @@ from coopenv.api.engine import Engine
 from coopenv.base.installation import list_agents
 from coopenv.evaluation import drive, held_out_seeds, score
 from coopenv.policies import load_agent, restart
-from coopenv.policies.belief import Belief
-from coopenv.policies.idm import IntelligentDriver
-from coopenv.policies.look_ahead import LookAhead
-from coopenv.policies.peek import Peek
-from coopenv.policies.route_follower import RouteFollower, nearest
-from coopenv.policies.stop_when_lost import StopWhenLost
-from coopenv.policies.view import FieldOfView
+from coopenv.policies.belief import Belief, FieldOfView
+from coopenv.policies.look_ahead import LookAhead, Peek
+from coopenv.policies.route_follower import IntelligentDriver, RouteFollower, StopWhenLost, nearest
 from coopenv.scenario import load_scenario
 from tests.helpers.square import GROUPS, square
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from coopenv.api.terms.layout import observation_layout
 from coopenv.policies import load_agent
+from coopenv.policies.belief import Box, Occluders, unhidden
 from coopenv.policies.look_ahead import LookAhead
-from coopenv.policies.occluders import Box, Occluders, unhidden
 from coopenv.scenario import Scenario, load_scenario
 from tests.helpers.square import GROUPS, square
 from tests.oracles.geometry import is_occluded

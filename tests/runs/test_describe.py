@@ -21,8 +21,7 @@ from coopenv.runs import scenario_text as words
 from coopenv.runs.describe import describe_scenario
 from coopenv.runs.scenario_rows import settings
 from coopenv.scenario.bodies import ConstantMotion, InitialEstimate, SegmentMotion, TwistSegment, WaypointMotion
-from coopenv.scenario.files import apply_vehicle_defaults, parse_scenario
-from coopenv.scenario.json_schema import schema_text
+from coopenv.scenario.files import apply_vehicle_defaults, parse_scenario, schema_text
 from tests.helpers.four_way import FOUR_WAY
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "scenario.schema.json"

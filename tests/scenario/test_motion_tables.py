@@ -9,7 +9,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from coopenv.scenario.bodies import ConstantMotion, SegmentMotion, StaticMotion, TwistSegment, Waypoint, WaypointMotion
-from coopenv.scenario.motion import TwistTable, compile_motion, left_jacobian, path_heading
+from coopenv.scenario.routes import TwistTable, compile_motion, left_jacobian, path_heading
 from tests.oracles import continuous
 
 POINTS = [(0.0, (1.0, 2.0, 0.0)), (1.3, (2.5, 2.0, 0.3)), (2.0, (3.0, 3.5, 0.5)), (4.1, (1.0, 5.0, 0.0))]

@@ -16,11 +16,10 @@ from coopenv.base.installation import is_scene, list_envs
 from coopenv.observers.bound import ancestors, cramer_rao_ancestors
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
-from coopenv.scenario.motion import compile_motion
-from coopenv.scenario.scenes import SCENES, scene_rows, scene_text
-from coopenv.scenario.scenes.request import MOST_VEHICLES
-from coopenv.scenario.topology import neighbour_sets
-from coopenv.training.environment_file import environment_file
+from coopenv.scenario.routes import compile_motion
+from coopenv.scenario.scenes import MOST_VEHICLES, SCENES, scene_rows, scene_text
+from coopenv.scenario.starts import neighbour_sets
+from coopenv.training.files import environment_file
 
 
 def made(name: str, **changes: object) -> Scenario:

@@ -10,7 +10,7 @@ pytest.importorskip("tomlkit", reason="needs the extra 'train'")
 
 import coopenv
 from coopenv.policies import find_agent
-from coopenv.training.environment_file import environment_file
+from coopenv.training.files import environment_file
 
 FILE = coopenv.base.installation.data_directory("envs") / "open_square.toml"
 

@@ -21,9 +21,8 @@ from coopenv.scenario import Scenario
 from coopenv.scenario.terms import REWARD_TERMS
 from coopenv.training.command import train
 from coopenv.training.export import export, network_of, onnx_model
-from coopenv.training.normalised import LEAST_VARIANCE, NormalisedEnv
 from coopenv.training.settings import Clone, Evaluation, Plan, Ppo, Settings
-from coopenv.training.trainer import Trainer
+from coopenv.training.trainer import LEAST_VARIANCE, NormalisedEnv, Trainer
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.train

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("tomlkit", reason="needs the extra 'train'")
 
 from coopenv.base.errors import OutputError
-from coopenv.training import settings_file
+from coopenv.training import files
 from coopenv.training.settings import Plan, read_settings
 
 MINE = """# my own words
@@ -43,12 +43,12 @@ def plan_of(folder: Path, arm: str | None = None, **changes: int) -> Plan:
 
 def finish(folder: Path, plan: Plan) -> None:
     """Leave in a folder what a training writes of its settings there."""
-    settings_file.write(folder, folder / "nothing", plan, "urban_crossing")
-    (folder / "agent.toml").write_text(f'[training]\nsettings = "{settings_file.settings_digest(plan)}"\n')
+    files.write(folder, folder / "nothing", plan, "urban_crossing")
+    (folder / "agent.toml").write_text(f'[training]\nsettings = "{files.settings_digest(plan)}"\n')
 
 
 def test_what_the_user_wrote_stays_byte_for_byte(old: Path, new: Path) -> None:
-    settings_file.write(new, old, plan_of(old), "urban_crossing")
+    files.write(new, old, plan_of(old), "urban_crossing")
     assert (new / "train.toml").read_bytes() == (old / "train.toml").read_bytes()
 
 
@@ -56,16 +56,16 @@ def test_what_the_user_wrote_stays_byte_for_byte(old: Path, new: Path) -> None:
 def test_with_other_options_it_is_refused(arm: str | None, changes: dict[str, int], old: Path, new: Path) -> None:
     plan = plan_of(old, arm, **changes)
     with pytest.raises(OutputError, match=REFUSED):
-        settings_file.check(old, plan, "urban_crossing")
+        files.check(old, plan, "urban_crossing")
     with pytest.raises(OutputError, match=REFUSED):
-        settings_file.write(new, old, plan, "urban_crossing")
+        files.write(new, old, plan, "urban_crossing")
 
 
 def test_overrides_are_among_the_settings(old: Path) -> None:
     settings = read_settings(old / "train.toml")
-    settings_file.check(old, Plan("urban_crossing", settings, 5, None, {"horizon": 6.0}), "urban_crossing")
+    files.check(old, Plan("urban_crossing", settings, 5, None, {"horizon": 6.0}), "urban_crossing")
     with pytest.raises(OutputError, match=REFUSED):
-        settings_file.check(old, Plan("urban_crossing", settings, 5, None, {"horizon": 7.0}), "urban_crossing")
+        files.check(old, Plan("urban_crossing", settings, 5, None, {"horizon": 7.0}), "urban_crossing")
 
 
 def test_those_of_an_agent_that_is_replaced_are_replaced(old: Path, new: Path) -> None:
@@ -75,13 +75,13 @@ def test_those_of_an_agent_that_is_replaced_are_replaced(old: Path, new: Path) -
     other = plan_of(old, steps=10)
     newer = new / "newer"
     newer.mkdir()
-    settings_file.write(newer, new, other, "urban_crossing")
+    files.write(newer, new, other, "urban_crossing")
     assert read_settings(newer / "train.toml") == other.settings
 
 
 def test_those_of_an_agent_of_before_the_digest_are_replaced(old: Path) -> None:
     (old / "agent.toml").write_text("[training]\nseed = 5\n")
-    settings_file.check(old, plan_of(old, steps=10), "urban_crossing")
+    files.check(old, plan_of(old, steps=10), "urban_crossing")
 
 
 def test_those_of_an_agent_that_the_user_has_changed_are_the_users(old: Path, new: Path) -> None:
@@ -89,20 +89,20 @@ def test_those_of_an_agent_that_the_user_has_changed_are_the_users(old: Path, ne
     finish(new, plan)
     with (new / "train.toml").open("a") as file:
         file.write("# gamma = 0.9 was worse\n")
-    settings_file.check(new, plan, "urban_crossing")
+    files.check(new, plan, "urban_crossing")
     with pytest.raises(OutputError, match=REFUSED):
-        settings_file.check(new, plan_of(old, steps=10), "urban_crossing")
+        files.check(new, plan_of(old, steps=10), "urban_crossing")
 
 
 def test_what_cannot_be_read_is_the_users(old: Path) -> None:
     plan = plan_of(old)
     (old / "train.toml").write_text("steps = ")
     with pytest.raises(OutputError, match=REFUSED):
-        settings_file.check(old, plan, "urban_crossing")
+        files.check(old, plan, "urban_crossing")
 
 
 def test_a_link_stays_a_link(old: Path, new: Path) -> None:
     (old / "train.toml").rename(old.parent / "mine.toml")
     (old / "train.toml").symlink_to("../mine.toml")
-    settings_file.write(new, old, plan_of(old), "urban_crossing")
+    files.write(new, old, plan_of(old), "urban_crossing")
     assert (new / "train.toml").readlink() == Path("../mine.toml")

@@ -19,10 +19,9 @@ from coopenv.estimation.metrics import summarise
 from coopenv.estimation.observability import analyse_observability
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.trajectory import Trajectory
-from coopenv.viz import FIGURE_NAMES, consistency, style
-from coopenv.viz.error_figure import error_figure, unwrapped
+from coopenv.viz import FIGURE_NAMES, error_figures, style
+from coopenv.viz.error_figures import error_figure, observability_figure, unwrapped
 from coopenv.viz.figures import save_figures
-from coopenv.viz.observability import observability_figure
 from coopenv.viz.topology import topology_figure
 from coopenv.viz.trajectories import trajectory_figure_2d
 from tests.helpers.drawn import spans, texts, xdata, ydata
@@ -64,7 +63,7 @@ def test_lost_observer_without_covariance_is_drawn(tmp_path: Path) -> None:
         nees=np.full_like(run.nees, np.nan),
     )
     assert len(save_figures(run, tmp_path)) == len(NAMES)
-    assert "no covariance declared" in texts(consistency.consistency_figure(run))
+    assert "no covariance declared" in texts(error_figures.consistency_figure(run))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
@@ -162,7 +161,7 @@ def test_a_run_that_does_not_settle_says_so(run: Trajectory) -> None:
 
 def test_nees_bounds_are_the_central_95_percent_of_six_dof() -> None:
     draws = chi2(6).rvs(200_000, random_state=np.random.default_rng(0))
-    low, high = consistency.NEES_BOUNDS
+    low, high = error_figures.NEES_BOUNDS
     assert np.mean(draws < low) == pytest.approx(0.025, abs=0.002)
     assert np.mean(draws > high) == pytest.approx(0.025, abs=0.002)
 
@@ -170,7 +169,7 @@ def test_nees_bounds_are_the_central_95_percent_of_six_dof() -> None:
 def test_consistency_shows_the_share_of_ticks_inside_and_the_claimed_deviation(run: Trajectory) -> None:
     nees = np.full_like(run.nees, 6.0)
     nees[: len(nees) // 4] = 100.0
-    figure = consistency.consistency_figure(dataclasses.replace(run, nees=nees), steady_from=0.0)
+    figure = error_figures.consistency_figure(dataclasses.replace(run, nees=nees), steady_from=0.0)
     assert sum("75 % of ticks inside" in text for text in texts(figure)) == 1  # equal notes, one set member
     claimed, error = figure.axes[1].lines
     assert ydata(error)[0] == pytest.approx(run.position_error[0, 0])
@@ -180,11 +179,11 @@ def test_consistency_shows_the_share_of_ticks_inside_and_the_claimed_deviation(r
 
 
 def test_mean_nees_is_the_one_of_the_table(run: Trajectory) -> None:
-    shown = texts(consistency.consistency_figure(run, steady_from=30.0))
+    shown = texts(error_figures.consistency_figure(run, steady_from=30.0))
     for row in summarise(run, 30.0):
         assert any(text.startswith(f"after 30 s: mean {row['mean_nees']:.3g}, ") for text in shown)
-    assert any(text.startswith("after 35 s: mean ") for text in texts(consistency.consistency_figure(run)))
-    late = consistency.consistency_figure(run, ends=[50.0, 20.0, 50.0, 50.0, 50.0], steady_from=30.0)
+    assert any(text.startswith("after 35 s: mean ") for text in texts(error_figures.consistency_figure(run)))
+    late = error_figures.consistency_figure(run, ends=[50.0, 20.0, 50.0, 50.0, 50.0], steady_from=30.0)
     assert "ended before the steady state (30 s)" in texts(late)
 
 
@@ -203,7 +202,7 @@ def test_lines_stop_where_a_vehicle_ends(run: Trajectory) -> None:
     assert spans(topology.axes[1], style.ENDED) == [pytest.approx((20.0, 50.0))]
     seen = run.visible[run.t <= 20.0, 1].sum() / 1201
     assert any(f"{seen:.2f} targets in view on average" in text for text in texts(topology))
-    nees = consistency.consistency_figure(run, ENDS).axes[3]
+    nees = error_figures.consistency_figure(run, ENDS).axes[3]
     assert max(xdata(x)[-1] for x in nees.lines if len(xdata(x)) > 2) == pytest.approx(20.0)
     local, verdict = observability_figure(analyse_observability(run), ENDS).axes
     assert xdata(local.lines[1])[-1] == pytest.approx(19.0)
@@ -211,9 +210,9 @@ def test_lines_stop_where_a_vehicle_ends(run: Trajectory) -> None:
     plan = trajectory_figure_2d(run, ENDS).axes[0]
     dotted = [x for x in plan.lines if x.get_color() == style.INK and len(xdata(x)) > 1]
     assert ydata(dotted[1])[-1] == pytest.approx(run.position[1200, 1, 1])
-    for figure in (errors, topology, consistency.consistency_figure(run, ENDS)):
+    for figure in (errors, topology, error_figures.consistency_figure(run, ENDS)):
         assert "ended, parked" in texts(figure)
-    for draw in (error_figure, topology_figure, consistency.consistency_figure):
+    for draw in (error_figure, topology_figure, error_figures.consistency_figure):
         assert "ended, parked" not in texts(draw(run))
 
 

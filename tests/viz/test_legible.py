@@ -17,8 +17,8 @@ from matplotlib.text import Text
 import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.cli.options import FigureColumn
-from coopenv.viz import FIGURE_NAMES, WIDTHS, paper, style
-from coopenv.viz.contrast import LEAST, contrast, luminance
+from coopenv.viz import FIGURE_NAMES, WIDTHS, figures, style
+from coopenv.viz.drawing import LEAST, contrast, luminance
 from coopenv.viz.figures import draw_figure, save_figures
 from coopenv.viz.topview import TopView
 from coopenv.viz.topview_ground import ASPHALT, GROUND, ROOF
@@ -50,7 +50,7 @@ def test_no_text_is_cut_and_all_of_it_stands_out(name: str, width: str | None) -
     for text in texts:
         assert contrast(text.get_color()) >= LEAST and text.get_alpha() in (None, 1.0), text.get_text()
     if width is not None:
-        assert figure.get_figwidth() == pytest.approx(paper.COLUMNS[width].inches)
+        assert figure.get_figwidth() == pytest.approx(figures.COLUMNS[width].inches)
         assert min(text.get_fontsize() for text in texts) >= 5.5
 
 
@@ -70,11 +70,11 @@ def test_contrast_is_that_of_wcag() -> None:
 
 
 def test_a_style_of_ones_own_gives_figures_of_the_columns_width(tmp_path: Path) -> None:
-    assert set(WIDTHS) == set(paper.COLUMNS) == {column.value for column in FigureColumn}
+    assert set(WIDTHS) == set(figures.COLUMNS) == {column.value for column in FigureColumn}
     inches = {"ieee1": 3.5, "ieee2": 7.16, "springer1": 84 / 25.4, "springer2": 174 / 25.4}
     before = dict(mpl.rcParams)
     for name, width in inches.items():
-        with mpl.rc_context(paper.style(name)):
+        with mpl.rc_context(figures.style(name)):
             figure = Figure()
             ax = figure.add_subplot()
             ax.plot([0, 1], [0, 1], label="a")
@@ -82,7 +82,7 @@ def test_a_style_of_ones_own_gives_figures_of_the_columns_width(tmp_path: Path) 
             ax.legend()
             figure.savefig(tmp_path / f"{name}.pdf")
             assert figure.get_figwidth() == pytest.approx(width)
-            assert ax.xaxis.label.get_fontsize() == paper.COLUMNS[name].size
+            assert ax.xaxis.label.get_fontsize() == figures.COLUMNS[name].size
             assert to_rgba(ax.lines[0].get_color()) == to_rgba(style.VEHICLE_COLOURS[0])
         assert (tmp_path / f"{name}.pdf").read_bytes().startswith(b"%PDF")
     assert dict(mpl.rcParams) == before
@@ -90,7 +90,7 @@ def test_a_style_of_ones_own_gives_figures_of_the_columns_width(tmp_path: Path) 
 
 def test_an_unknown_column_is_told_with_those_that_there_are() -> None:
     with pytest.raises(CoopenvError, match=r"unknown width 'ieee' \(did you mean 'ieee.'\?\); known: ieee1, ieee2"):
-        paper.style("ieee")
+        figures.style("ieee")
     with pytest.raises(CoopenvError, match="unknown figure 'error'"):
         draw_figure("error", make_trajectory(ticks=20))
 

@@ -35,8 +35,7 @@ from coopenv.viz.topview_geometry import (
     position_covariance,
     ways,
 )
-from coopenv.viz.topview_goals import touching
-from coopenv.viz.topview_ground import HEIGHT, MAP_WIDTH, PANEL, ROW, TABLE_TOP, WIDTH
+from coopenv.viz.topview_ground import HEIGHT, MAP_WIDTH, PANEL, ROW, TABLE_TOP, WIDTH, touching
 from tests.helpers.builders import scenario
 from tests.helpers.four_way import FOUR_WAY
 

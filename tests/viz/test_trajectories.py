@@ -14,8 +14,7 @@ from mpl_toolkits.mplot3d import proj3d
 import coopenv
 from coopenv.estimation.trajectory import Trajectory
 from coopenv.viz import style
-from coopenv.viz.clipping import clipped
-from coopenv.viz.labels import place_names
+from coopenv.viz.drawing import clipped, place_names
 from coopenv.viz.trajectories import trajectory_figure_2d, trajectory_figure_3d
 from tests.helpers.drawn import texts, xdata, ydata
 from tests.helpers.four_way import FOUR_WAY

@@ -18,12 +18,10 @@ from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.runs.scenes import scene_of
 from coopenv.viz.scene import SceneRecord, Source, Stage
-from coopenv.viz.web.copies import placed, quaternions
+from coopenv.viz.web.actors import placed, quaternions
 from coopenv.viz.web.extra import has_viser, viser_module
-from coopenv.viz.web.ground import spacing_of
-from coopenv.viz.web.labels import levels
-from coopenv.viz.web.legend import GAIN
-from coopenv.viz.web.look import linear
+from coopenv.viz.web.ground import GAIN, linear, spacing_of
+from coopenv.viz.web.lines import levels
 from coopenv.viz.web.picture import FIELD_OF_VIEW, first_camera, useful_magnification
 from coopenv.viz.web.replay import write_replay
 

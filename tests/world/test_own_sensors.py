@@ -13,7 +13,7 @@ from coopenv.api.terms.layout import observation_layout
 from coopenv.backends.replay import Replay
 from coopenv.base.errors import ScenarioError
 from coopenv.estimation.outcomes import Sight
-from coopenv.observers.briefing import briefing_of
+from coopenv.observers.runner import briefing_of
 from coopenv.runs import record
 from coopenv.scenario import Scenario, load_scenario, parse_scenario
 from tests.helpers.builders import command, constant, run, same_bits, scenario, simulate, start, vehicle

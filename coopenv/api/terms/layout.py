@@ -11,8 +11,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import Dynamics
-from coopenv.scenario.term_rows import SETTINGS, SETTINGS_OF_ACTIONS
-from coopenv.scenario.terms import GROUPS, OBSERVATION_FIELDS, ObservationField
+from coopenv.scenario.terms import GROUPS, OBSERVATION_FIELDS, SETTINGS, SETTINGS_OF_ACTIONS, ObservationField
 
 if TYPE_CHECKING:
     from gymnasium import spaces

@@ -7,8 +7,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorWrapper
 
 from coopenv.api.make import make_vec
-from coopenv.api.true_ends import TrueEnds
-from coopenv.api.vector_env import CooperativeVectorEnv
+from coopenv.api.vector_env import CooperativeVectorEnv, TrueEnds
 
 try:
     from torchrl.envs import GymWrapper
@@ -49,7 +48,7 @@ class WholeWorlds(VectorWrapper):
 def batched_env(name_or_path: str | Path, *, num_worlds: int, **options: Any) -> GymWrapper:
     """Return num_worlds x vehicles rows as one TorchRL environment of that batch size, for a policy that they share.
 
-    A row is done when its vehicle's episode ends, see `coopenv.api.true_ends.TrueEnds`.
+    A row is done when its vehicle's episode ends, see `coopenv.api.vector_env.TrueEnds`.
 
     Args:
         name_or_path: environment or TOML file.

@@ -11,10 +11,9 @@ from coopenv.base.errors import DataError
 from coopenv.base.format import jsonable
 from coopenv.observers.contract import Gains, SensorNoise, Setup
 from coopenv.observers.recording import Drawn, Recording
-from coopenv.scenario.base import Number, Part, Vector3
+from coopenv.scenario.base import Number, Part, Vector3, one_line
 from coopenv.scenario.files import parse_scenario
 from coopenv.scenario.own_terms import without_own_terms
-from coopenv.scenario.validation import one_line
 
 Index = Annotated[int, Field(ge=0, lt=2**31)]
 

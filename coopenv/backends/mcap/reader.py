@@ -10,8 +10,7 @@ from coopenv.backends.mcap.header import Header
 from coopenv.backends.mcap.messages import ATTACHMENT, EXACT, FORMAT, LANDMARKS, LANDMARKS_TYPE, PAN, codec, topic
 from coopenv.backends.mcap.ticks import TickArrays
 from coopenv.base.errors import CoopenvError, DataError, shown
-from coopenv.observers.recording import Recording
-from coopenv.observers.recording_checks import check_recording
+from coopenv.observers.recording import Recording, check_recording
 
 if TYPE_CHECKING:
     from coopenv.backends.mcap.container import Container

@@ -8,8 +8,7 @@ import numpy as np
 
 from coopenv.backends.mcap.messages import CONTENTS, EXACT, LANDMARKS, PAN, topic
 from coopenv.base.errors import check_memory
-from coopenv.observers.recording import Truth
-from coopenv.observers.recording_checks import KINDS, SHAPES
+from coopenv.observers.recording import KINDS, SHAPES, Truth
 
 
 class TickArrays:

@@ -27,8 +27,7 @@ from coopenv.backends.mcap.view import Clock, View, ros_definition
 from coopenv.base.errors import OutputError
 from coopenv.base.files import check_file, replacing_file
 from coopenv.base.installation import version
-from coopenv.observers.recording import Recording
-from coopenv.observers.recording_checks import check_recording
+from coopenv.observers.recording import Recording, check_recording
 
 
 def write_recording(recording: Recording, path: str | Path, *, views: Sequence[View] = (), start: float = 0.0) -> None:

@@ -12,13 +12,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from coopenv.backends.mrclam.dataset import MAX_TRUTH_GAP_S, ROBOTS, Dataset, Robot
-from coopenv.backends.mrclam.odometry import HeldCommands
+from coopenv.backends.mrclam.dataset import MAX_TRUTH_GAP_S, ROBOTS, Dataset, HeldCommands, Robot
 from coopenv.base.errors import DataError, suggest
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Gains, SensorNoise, Setup
-from coopenv.observers.recording import Recording, Truth
-from coopenv.observers.recording_checks import check_recording
+from coopenv.observers.recording import Recording, Truth, check_recording
 
 Variant = Literal["landmarks", "landmarks+robots", "blind"]
 VARIANTS: tuple[Variant, ...] = get_args(Variant)

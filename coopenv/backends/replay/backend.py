@@ -11,8 +11,7 @@ import warp as wp
 from coopenv.backends.base import Capabilities, Episode, SensingWorld, TickGenerator
 from coopenv.backends.replay.kernels import RECORDED, samples_taken, upload
 from coopenv.backends.replay.scenario import scenario_of
-from coopenv.observers.recording import Briefing, Recording, Sensed
-from coopenv.observers.recording_checks import check_recording
+from coopenv.observers.recording import Briefing, Recording, Sensed, check_recording
 from coopenv.observers.registry import find_embedded
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST

@@ -8,7 +8,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from coopenv.observers.recording import Recording, Truth
-from coopenv.scenario.randomness import PARAMETERS
+from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.camera import (
     MISSED,
     NOT_A_NEIGHBOUR,

@@ -1,5 +1,9 @@
 """Figures of an evaluation: error along the way, time against error, where drivers looked."""
 
+import re
+from collections.abc import Iterator
+from contextlib import closing
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -7,12 +11,24 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from PIL import Image
+from rich.console import Console
 
-from coopenv.bench.agents.contest import Evaluation
-from coopenv.evaluation.bootstrap import Quantile, interval, resamples
+from coopenv.api.engine import Engine
+from coopenv.bench.agents.contest import Entrant, Evaluation
+from coopenv.evaluation import held_out_seeds
 from coopenv.evaluation.episodes import Episodes
-from coopenv.viz import paper, style
+from coopenv.evaluation.metrics import Quantile, interval, resamples
+from coopenv.runs.command import REPLAY_FILE
+from coopenv.runs.console import Progress
+from coopenv.runs.episode import play
+from coopenv.runs.scenes import scene_of, write_page
+from coopenv.runs.video import frame_stride, open_film
+from coopenv.viz import style
+from coopenv.viz.figures import inches_of, restyle
+from coopenv.viz.scene import Source
 from coopenv.viz.style import INK, NORMAL, SMALL
+from coopenv.viz.topview import TopView
 
 BINS = 24
 _RESAMPLES, _FINE = 300, 300
@@ -23,8 +39,8 @@ _RAREST = 1e-3
 
 
 def save_figures(evaluation: Evaluation, folder: Path, file_format: str, width: str | None = None) -> list[Path]:
-    """Write all figures of an evaluation to a folder, for a page or a column of `coopenv.viz.paper`."""
-    inches = paper.inches_of(width)
+    """Write all figures of an evaluation to a folder, for a page or a column of `coopenv.viz.figures`."""
+    inches = inches_of(width)
     figures = {
         "error_along_the_way": error_figure(evaluation, inches),
         "time_against_error": pareto_figure(evaluation, inches),
@@ -34,7 +50,7 @@ def save_figures(evaluation: Evaluation, folder: Path, file_format: str, width: 
     about["agents"] = ", ".join(evaluation.episodes)
     if width is not None:
         for figure in figures.values():
-            paper.restyle(figure, width)
+            restyle(figure, width)
     return [style.save(figure, folder / f"{name}.{file_format}", about=about) for name, figure in figures.items()]
 
 
@@ -133,3 +149,91 @@ def _looks(evaluation: Evaluation, marks: bool = True) -> list[dict[str, Any]]:
 
 def _note(evaluation: Evaluation, words: str) -> str:
     return f"{evaluation.environment}, {evaluation.worlds} held-out worlds (block {evaluation.block}); {words}"
+
+
+COLUMNS = 3
+WIDEST = 1920  # px
+
+
+def write_film(evaluation: Evaluation, folder: Path, log: Console) -> Path:
+    """Film the first world of an evaluation, one picture per driver, until the last has ended."""
+    scenario = evaluation.entrants[0].scenario
+    seed = held_out_seeds(evaluation.block, evaluation.worlds)[0]
+    film = open_film(folder, scenario.rates.camera / frame_stride(scenario))
+    with film, Progress(log, f"filming {film.path.name}", scenario.horizon_ticks) as progress:
+        for done, pictures in enumerate(_together([pictures_of(entrant, seed) for entrant in evaluation.entrants])):
+            film.add(tiled(pictures))
+            progress.update(done * frame_stride(scenario))
+        film.close()
+    return film.path
+
+
+def pictures_of(entrant: Entrant, seed: int) -> Iterator[np.ndarray]:
+    """Yield the pictures, (H, W, 3) uint8, of a driver's episode: its name, the error and the time above the map."""
+    scenario = entrant.scenario
+    engine = Engine(scenario)
+    view = TopView(engine.backend.scenario.model_copy(update={"title": entrant.name}), panel=False)
+    try:
+        for tick in play(engine, [seed], scenario.horizon_ticks, entrant.policy, to_the_end=False):
+            if tick % frame_stride(scenario) == 0:
+                yield view.draw(engine)
+    finally:
+        engine.close()
+        view.close()
+
+
+def _together(films: list[Iterator[np.ndarray]]) -> Iterator[list[np.ndarray]]:
+    """Yield the pictures of all films at each moment; one that is over stays at its last."""
+    last: list[np.ndarray] = []
+    for pictures in zip_longest(*films):
+        last = [old if new is None else new for new, old in zip(pictures, last or pictures, strict=True)]
+        yield last
+
+
+def tiled(pictures: list[np.ndarray]) -> np.ndarray:
+    """Return pictures of one size beside and below each other, at most `COLUMNS` in a row and `WIDEST` wide."""
+    height, width, _ = pictures[0].shape
+    columns = min(COLUMNS, len(pictures))
+    rows = -(-len(pictures) // columns)
+    whole = np.full((rows * height, columns * width, 3), 255, np.uint8)
+    for i, picture in enumerate(pictures):
+        y, x = divmod(i, columns)
+        whole[y * height : (y + 1) * height, x * width : (x + 1) * width] = picture
+    if whole.shape[1] <= WIDEST:
+        return whole
+    size = WIDEST, round(whole.shape[0] * WIDEST / whole.shape[1])
+    return np.asarray(Image.fromarray(whole).resize(size, Image.Resampling.LANCZOS))
+
+
+OTHERS = "replay_*.html"
+"""Names of the pages but that of `shown_of`, which is `replay.html`."""
+
+
+def write_replays(evaluation: Evaluation, folder: Path, log: Console) -> list[Path]:
+    """Write the pages; none, and a line, where the extra `view` is missing."""
+    files, seed = replay_files(evaluation), held_out_seeds(evaluation.block, evaluation.worlds)[0]
+    written = []
+    for entrant in sorted(evaluation.entrants, key=lambda e: e is not shown_of(evaluation)):
+        source = Source.of(evaluation.environment, entrant.scenario, policy=entrant.name, seed=seed)
+        with closing(Engine(entrant.scenario)) as engine, Progress(log, f"replay of {entrant.name}", 1.0) as progress:
+            record = scene_of(engine, source, entrant.policy, progress.update)
+        page = write_page(record, folder / files[entrant.name], log, files)
+        if page is None:
+            return []
+        written.append(page)
+    return written
+
+
+def shown_of(evaluation: Evaluation) -> Entrant:
+    """Return the driver whose page is `replay.html`: the first that has learnt, else the first of all."""
+    return next((e for e in evaluation.entrants if e.kind == "learned"), evaluation.entrants[0])
+
+
+def replay_files(evaluation: Evaluation) -> dict[str, str]:
+    """Return the name of each driver's page, in the order of the drivers."""
+    shown, files = shown_of(evaluation).name, dict[str, str]()
+    for number, entrant in enumerate(evaluation.entrants):
+        plain = re.sub(r"[^\w.-]+", "_", entrant.name)
+        file = REPLAY_FILE if entrant.name == shown else OTHERS.replace("*", plain)
+        files[entrant.name] = file if file not in files.values() else OTHERS.replace("*", f"{plain}_{number}")
+    return files

@@ -9,8 +9,7 @@ from typing import Annotated, NamedTuple
 from pydantic import Field, ValidationError
 
 from coopenv.base.errors import CoopenvError, suggest
-from coopenv.scenario.base import Part
-from coopenv.scenario.validation import one_line
+from coopenv.scenario.base import Part, one_line
 from coopenv.training.settings import Plan, Settings, read_settings
 
 Seed = Annotated[int, Field(ge=0, le=2**31 - 1)]

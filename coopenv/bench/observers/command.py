@@ -1,24 +1,44 @@
 """`coopenv bench observers`: from what the user asked for to tables and files."""
 
+import io
+import math
 import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replace_text, replacing_folder
-from coopenv.base.format import json_text, jsonable
+from coopenv.base.format import json_text, jsonable, with_error
 from coopenv.base.installation import versions
 from coopenv.bench.executors import Executor
-from coopenv.bench.observers.basin import Basin, Draw, basin_failures, basin_table, basins_of, check_source, study_basin
-from coopenv.bench.observers.choice import ALL, find_source
+from coopenv.bench.observers.basin import (
+    RADIUS,
+    Basin,
+    Draw,
+    basin_failures,
+    basin_table,
+    basins_of,
+    check_source,
+    study_basin,
+)
 from coopenv.bench.observers.comparison import Comparison, Plan
-from coopenv.bench.observers.tables import csv_text
+from coopenv.bench.observers.faults import NOMINAL
+from coopenv.bench.observers.figures import basin_figure, chart_data, page_file, plotly
+from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard, headline, quality
+from coopenv.bench.observers.rows import Row, spread
+from coopenv.bench.observers.sources import ALL, find_source
+from coopenv.bench.observers.tables import csv_text, failures, honest_line
+from coopenv.estimation.metrics import CONVERGED
 from coopenv.observers.registry import observer_names, obstacle
 from coopenv.runs.console import Progress
 from coopenv.viz import FORMATS
@@ -110,7 +130,7 @@ def perform(
     """Compare, print the tables (or what `leaderboard.json` holds) and write the files to the folder `out`, if any.
 
     `figures` is the format of figures as files of their own; None: the report alone has them. `width` is a column of
-    `coopenv.viz.paper` that they are drawn for; None: a page's.
+    `coopenv.viz.figures` that they are drawn for; None: a page's.
 
     Raises:
         CoopenvError: something that was asked for does not exist, or cannot be written.
@@ -178,7 +198,6 @@ def write_files(
 ) -> None:
     """Write the leaderboard as JSON and CSV, the draws as CSV, the report, and figures by name, kind and variant."""
     from coopenv.bench.observers.figures import KINDS
-    from coopenv.bench.observers.report import report_text
 
     comparison, draws, basins = found
     content = found.document(command)
@@ -192,3 +211,115 @@ def write_files(
     for name, (kind, variant) in figures.items():
         if KINDS[kind](comparison, variant, None) is not None:
             comparison.figure(kind, variant=variant, width=width, path=out / name)
+
+
+MOST_BYTES = 1_950_000
+"""Of a report: more than that mails badly and opens slowly on a phone."""
+_COORDINATE = re.compile(r"(?<=[ML ])(-?\d+\.\d\d)\d+(?=[ \n])")
+"""A coordinate of a line in SVG, of which hundredths of a point are enough."""
+
+
+def report_text(
+    board: Leaderboard, content: Mapping[str, Any], draws: Sequence[Draw] = (), basins: Sequence[Basin] = ()
+) -> str:
+    """Return the report as one HTML text; `content` of `leaderboard.json` tells the command and versions."""
+    text = _rendered(board, content, draws, basins, with_rows=True)
+    return text if len(text.encode()) < MOST_BYTES else _rendered(board, content, draws, basins, with_rows=False)
+
+
+def _rendered(
+    board: Leaderboard, content: Mapping[str, Any], draws: Sequence[Draw], basins: Sequence[Basin], with_rows: bool
+) -> str:
+    variants = [_variant(board, name) for name in board.variants]
+    nominal = variants[0]["name"] == NOMINAL
+    return (
+        _environment(board)
+        .get_template("report.html.j2")
+        .render(
+            board=board,
+            with_rows=with_rows,
+            headline=headline(board),
+            data=chart_data(board),
+            plotly=plotly(),
+            charts=Markup(page_file("charts.js").decode()),
+            content=content,
+            vehicles=board.samples[0].scene.vehicles,
+            boards=variants[:1] if nominal else variants,  # faults have one table
+            variants=variants,
+            nominal=nominal,
+            honest=honest_line(board.rows),
+            failures=failures(board.rows),
+            basins=basins,
+            basin_failures=basin_failures(basins),
+            basin_map=_svg(basin_figure(board.environment, draws)) if draws else "",
+            radius=RADIUS,
+            tolerance=CONVERGED.text,
+            columns=[f.name for f in fields(Row) if f.name not in ("environment", "failure")],
+            definitions={f.name: f.metadata["meaning"] for f in fields(Row)},
+        )
+    )
+
+
+def _environment(board: Leaderboard) -> Environment:
+    environment = Environment(
+        loader=PackageLoader("coopenv.bench.observers", "page"), autoescape=True, undefined=StrictUndefined
+    )
+    environment.globals |= {"with_error": with_error, "breakable": _breakable, "tint": _tints(board), "nan": math.nan}
+    environment.filters["append"] = lambda text, more: text + more
+    return environment
+
+
+def _variant(board: Leaderboard, name: str) -> dict[str, Any]:
+    """Return what the template shows of one variant."""
+    return {
+        "name": name,
+        "summary": board.variants[name],
+        "bounds": {BOUNDS[column]: values for column, values in board.bounds_in(name).items()},
+        "paper_noise": board.samples[0].scene.paper_noise,
+        "observers": {
+            observer: {
+                "rows": board.rows_in(name, observer),
+                "total": board.totals[name, observer],
+                **quality(board, name, observer),
+            }
+            for observer in board.ranked
+        },
+        "windows": {observer: _windows(board, name, observer) for observer in board.ranked},
+    }
+
+
+def _windows(board: Leaderboard, variant: str, observer: str) -> list[dict[str, Any]]:
+    """Return what the template shows of one observer by window; the steady state alone is no table."""
+    found = [(window, board.windows_in(variant, observer, window)) for window in board.windows]
+    columns = ("ratio_to_bound_ancestors", "anees")
+    return [
+        {"name": window.name, "rows": rows, **{column: spread(rows, column) for column in columns}}
+        for window, rows in (found if len(found) > 1 else ())
+    ]
+
+
+def _breakable(name: str) -> Markup:
+    """Return a name that may be broken after underscores."""
+    return Markup("<wbr>").join(re.split(r"(?<=_)", name))
+
+
+def _tints(board: Leaderboard) -> Callable[[float], Markup]:
+    """Return what gives a cell of the table of variants the darker a background, the larger its error."""
+    sizes = [math.log(total.rmse.value) for total in board.totals.values() if total.rmse.value > 0]
+    low, high = min(sizes, default=0.0), max(sizes, default=1.0)
+
+    def tint(value: float) -> Markup:
+        if not value > 0:
+            return Markup("")
+        share = (math.log(value) - low) / max(high - low, 1e-9)
+        return Markup(f' style="background: rgb(213 94 0 / {0.45 * share:.2f})"')  # text stays legible on it
+
+    return tint
+
+
+def _svg(figure: Figure) -> Markup:
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    text = buffer.getvalue()
+    text = _COORDINATE.sub(r"\1", text[text.index("<svg") :])
+    return Markup(text)  # drawn here, so that it needs no escaping

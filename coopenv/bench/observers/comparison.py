@@ -16,12 +16,10 @@ from coopenv.base.errors import CoopenvError, checked_seed, suggest
 from coopenv.base.files import replace_text
 from coopenv.bench.executors import Executor, Local
 from coopenv.bench.observers import tables
-from coopenv.bench.observers.choice import find_source, variants_of
 from coopenv.bench.observers.judge import Task, judge
 from coopenv.bench.observers.leaderboard import Leaderboard
-from coopenv.bench.observers.rows import Row
-from coopenv.bench.observers.sources import Source
-from coopenv.bench.observers.windows import EDGES, WindowRow, checked_edges
+from coopenv.bench.observers.rows import EDGES, Row, WindowRow, checked_edges
+from coopenv.bench.observers.sources import Source, find_source, variants_of
 from coopenv.observers.contract import Factory
 from coopenv.observers.registry import available_names, find, named, portable
 from coopenv.runs.console import Progress
@@ -100,7 +98,7 @@ class Comparison(Leaderboard):
         Args:
             kind: "errors" or "consistency" over time, "variants" (a map of errors) or "cost" (error against time).
             variant: of errors, consistency and cost; None: the first one.
-            width: a column of `coopenv.viz.paper.COLUMNS`, whose fonts the figure then has, such as "ieee1", or
+            width: a column of `coopenv.viz.figures.COLUMNS`, whose fonts the figure then has, such as "ieee1", or
                 inches; None: a page's.
             path: file to write.
             format: "png", "pdf" or "svg"; None: as the path ends.
@@ -109,16 +107,16 @@ class Comparison(Leaderboard):
             CoopenvError: no such kind or variant, nothing to draw, or the file cannot be written.
         """
         from coopenv.bench.observers.figures import KINDS
-        from coopenv.viz import paper
+        from coopenv.viz import figures
         from coopenv.viz.style import save
 
         if kind not in KINDS:
             raise CoopenvError(f"unknown figure '{kind}'{suggest(kind, KINDS)}; known: {', '.join(KINDS)}")
-        drawn = KINDS[kind](self, self._checked(variant), paper.inches_of(width))
+        drawn = KINDS[kind](self, self._checked(variant), figures.inches_of(width))
         if drawn is None:
             raise CoopenvError(f"figure '{kind}': there is nothing to draw")
         if isinstance(width, str):
-            paper.restyle(drawn, width)
+            figures.restyle(drawn, width)
         if path is not None:
             save(drawn, Path(path), format or "", about=self._about(variant))
         return drawn

@@ -1,9 +1,18 @@
-"""The figures of a comparison: errors and consistency over time, variants as a heat map, cost against accuracy."""
+"""The figures of a comparison: errors and consistency over time, variants as a heat map, cost against accuracy.
 
-from collections.abc import Callable
+plotly.js (MIT) stands beside the page's template as its authors publish it, from `npm pack plotly.js-basic-dist-min`:
+the bundle that the Python package brings is four times as large.
+"""
+
+import json
+from base64 import b64encode
+from collections.abc import Callable, Sequence
+from gzip import compress
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
@@ -11,16 +20,28 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from coopenv.base.format import number
+from coopenv.base.format import jsonable, number
+from coopenv.bench.observers.basin import ANGLE_BINS, RADIUS, Draw, basins_of, by_angle
 from coopenv.bench.observers.faults import NOMINAL
+from coopenv.bench.observers.judge import Sample
 from coopenv.bench.observers.leaderboard import BOUNDS, Leaderboard
-from coopenv.bench.observers.rows import mean_of
-from coopenv.bench.observers.wording import FAILED, short_name
-from coopenv.estimation.consistency import mean_bounds
+from coopenv.bench.observers.rows import FAILED, mean_of, short_name
+from coopenv.estimation.arrays import Array
+from coopenv.estimation.consistency import mean_bounds, wilson_interval
 from coopenv.viz import style
-from coopenv.viz.contrast import contrast
-from coopenv.viz.labels import place_names
-from coopenv.viz.style import BLUE, GREY, INK, NORMAL, SHADE, SMALL, VERMILION, vehicle_colour, vehicle_label
+from coopenv.viz.drawing import contrast, place_names
+from coopenv.viz.style import (
+    BLUE,
+    GREY,
+    INK,
+    NORMAL,
+    SHADE,
+    SMALL,
+    VEHICLE_COLOURS,
+    VERMILION,
+    vehicle_colour,
+    vehicle_label,
+)
 
 MOST_VEHICLES = 6
 NEES_RANGE = (1e-4, 1e4)
@@ -213,3 +234,148 @@ KINDS: dict[str, Callable[[Leaderboard, str, float | None], Figure | None]] = {
     "cost": cost_figure,
 }
 """Each of a board, one of its variants and a width in inches (None: a page's); None where nothing is to draw."""
+
+
+PLOTLY = "plotly-basic-4.1.1.min.js.gz"
+MOST_POINTS, FEWEST_POINTS = 400, 40  # of a curve
+MOST_NUMBERS = 300_000  # of all curves together: about half a megabyte once packed
+SHOWN = 4  # of the best observers, at first; the legend shows others
+_DIGITS = 3
+_LEAST_MARK, _GROWTH = 9.0, 0.08  # px, and px per root of bytes/s
+
+
+def page_file(name: str) -> bytes:
+    """Return a file of the page."""
+    return (files("coopenv.bench.observers") / "page" / name).read_bytes()
+
+
+def packed(data: bytes) -> str:
+    """Return data as text that `charts.js` unpacks."""
+    return b64encode(data).decode()
+
+
+def plotly() -> str:
+    """Return plotly.js, packed."""
+    return packed(page_file(PLOTLY))
+
+
+def chart_data(board: Leaderboard) -> str:
+    """Return the data of all charts, packed."""
+    text = json.dumps(jsonable(_document(board)), separators=(",", ":"))
+    return packed(compress(text.encode(), 9, mtime=0))
+
+
+def _document(board: Leaderboard) -> dict[str, Any]:
+    first = next(iter(board.variants))
+    scene, sample = board.samples[0].scene, board.samples[0]
+    curves = len(board.variants) * len(board.observers) * len(scene.vehicles) * 3
+    points = int(np.clip(MOST_NUMBERS / curves, FEWEST_POINTS, MOST_POINTS))
+    return {
+        "vehicles": list(scene.vehicles),
+        "observers": board.ranked,
+        "colours": VEHICLE_COLOURS,
+        "shown": SHOWN,
+        "dof": sample.nees_dof,
+        "band": [float(end) for end in mean_bounds(sample.nees_dof, len(board.seeds))],
+        "variants": [_variant(board, name, points) for name in board.variants],
+        "cost": _cost(board, first),
+    }
+
+
+def _variant(board: Leaderboard, name: str, points: int) -> dict[str, Any]:
+    groups = board.samples_in(name)
+    samples = [sample for sample in board.samples if sample.variant == name]
+    t = samples[0].scene.t
+    keep = np.unique(np.linspace(0, len(t) - 1, min(len(t), points)).round().astype(int))
+    own = groups[next(iter(groups))] if groups else samples[:1]
+    bound = np.sqrt(np.mean([sample.scene.bound**2 for sample in own], axis=0))
+    return {
+        "name": name,
+        "t": _short(t[keep]),
+        "bound": [_short(column) for column in bound[keep].T],
+        "curves": {observer: _curves(chosen, keep) for observer, chosen in groups.items()},
+    }
+
+
+def _curves(samples: list[Sample], keep: Array) -> dict[str, list[list[float]]]:
+    """Return medians over the seeds of errors and claims, m, and mean NEES over its dimension, a list per vehicle."""
+    error = np.median([sample.series.position_error[keep] for sample in samples], axis=0)
+    std = 3.0 * np.median([sample.series.position_std[keep] for sample in samples], axis=0)
+    nees = np.mean([sample.series.nees[keep] for sample in samples], axis=0) / samples[0].nees_dof
+    columns = {"error": error, "std": std, "nees": nees}
+    return {name: [_short(column) for column in values.T] for name, values in columns.items()}
+
+
+def _cost(board: Leaderboard, variant: str) -> list[dict[str, Any]]:
+    found = []
+    for name in board.samples_in(variant):
+        rows, total = board.rows_in(variant, name), board.totals[variant, name].rmse
+        sent = mean_of(rows, "bytes_per_s")
+        point = {"observer": name, "rmse": total.value, "se": total.error, "us": mean_of(rows, "us_per_update")}
+        found.append({**point, "bytes": round(sent), "size": _LEAST_MARK + _GROWTH * float(np.sqrt(sent))})
+    return found
+
+
+def _short(values: Array) -> list[float]:
+    """Return numbers with few digits; what a logarithmic axis cannot show is NaN."""
+    return [
+        float(f"{value:.{_DIGITS}g}") if value == 0 or 1e-9 < abs(value) < 1e9 else float("nan") for value in values
+    ]
+
+
+_PANEL, _BASIN_MARGIN = 2.6, 0.6  # inches
+
+
+def basin_figure(environment: str, draws: Sequence[Draw], width: float | None = None) -> Figure:
+    """Draw, per observer, every vehicle of every draw at its initial errors, and the share by angle below."""
+    basins = basins_of(environment, draws)
+    columns = style.fitting(width or style.PAGE, 3.0, min(3, len(basins)))
+    rows = -(-len(basins) // columns)
+    figure, _ = style.canvas(
+        width, _BASIN_MARGIN + _PANEL * rows, f"{environment}, {basins[0].draws} initial estimates"
+    )
+    for n, ((cloud, bars), basin) in enumerate(zip(_pairs(figure, rows, columns, len(basins)), basins, strict=True)):
+        own = [draw for draw in draws if draw.observer == basin.observer]
+        _draw_cloud(cloud, own, first=n % columns == 0)
+        _draw_shares(bars, own, first=n % columns == 0)
+        low, high = (100 * end for end in basin.interval)
+        share = f"all vehicles: {100 * basin.converged_fraction:.1f} %  [{low:.1f}, {high:.1f}]"
+        cloud.set_title(f"{basin.observer}\n{share}", fontsize=SMALL + 0.5, color=INK, pad=3)
+    handles = [
+        Line2D([], [], ls="", marker="o", ms=4, color=BLUE, label="a vehicle that ends below 0.1 m and 1 deg"),
+        Line2D([], [], ls="", marker="x", ms=4, color=VERMILION, label="one that does not"),
+    ]
+    style.legend_above(figure, handles)
+    return figure
+
+
+def _pairs(figure: Figure, rows: int, columns: int, count: int) -> list[tuple[Axes, Axes]]:
+    """Return the two axes of every panel, one above the other."""
+    grid = figure.add_gridspec(2 * rows, columns, height_ratios=[2, 1] * rows)
+    places = [divmod(n, columns) for n in range(count)]
+    clouds = [figure.add_subplot(grid[2 * y, x]) for y, x in places]
+    bars = [figure.add_subplot(grid[2 * y + 1, x], sharex=clouds[n]) for n, (y, x) in enumerate(places)]
+    return list(zip(clouds, bars, strict=True))
+
+
+def _draw_cloud(ax: Axes, draws: Sequence[Draw], first: bool) -> None:
+    style.tidy(ax, y_label="distance [m]" if first else "")
+    angle = np.array([draw.initial_orientation_error_deg for draw in draws])
+    distance = np.array([draw.initial_position_error_m for draw in draws])
+    converged = np.array([draw.converged for draw in draws])
+    ax.scatter(angle[converged], distance[converged], s=5, color=BLUE, linewidth=0, alpha=0.6)
+    ax.scatter(angle[~converged], distance[~converged], s=8, color=VERMILION, marker="x", linewidth=0.6, alpha=0.7)
+    ax.set(xlim=(0, 180), ylim=(0, RADIUS), xticks=ANGLE_BINS)
+    ax.tick_params(labelbottom=False)
+
+
+def _draw_shares(ax: Axes, draws: Sequence[Draw], first: bool) -> None:
+    style.tidy(ax, x_label="initial orientation error [deg]", y_label="converged" if first else "")
+    ax.xaxis.label.set_fontsize(NORMAL - 1)
+    for (converged, count), start, end in zip(by_angle(draws), ANGLE_BINS, ANGLE_BINS[1:], strict=False):
+        if count:
+            share, (low, high) = converged / count, wilson_interval(converged, count)
+            middle = (start + end) / 2
+            ax.bar(middle, share, width=0.85 * (end - start), color=BLUE, alpha=0.35)
+            ax.plot([middle, middle], [low, high], color=INK, linewidth=0.9)
+    ax.set(ylim=(0, 1.02), yticks=(0, 0.5, 1))

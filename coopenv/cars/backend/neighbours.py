@@ -18,8 +18,7 @@ from coopenv.estimation.rotations import skew
 from coopenv.observers.contract import Message, Received
 from coopenv.observers.riccati_coordinates import left_covariance
 from coopenv.observers.robust.messages import from_six
-from coopenv.scenario.starts import rotation_of
-from coopenv.scenario.topology import neighbour_sets
+from coopenv.scenario.starts import neighbour_sets, rotation_of
 
 
 def message_of(value: Pose | Report, marker: Array) -> Message:

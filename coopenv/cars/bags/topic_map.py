@@ -12,7 +12,7 @@ from coopenv.base.errors import CoopenvError, DataError, listed, suggest
 from coopenv.cars.deployment import Car, Marker, Name, Number, Part, Positive, refuse_repeated
 from coopenv.cars.readings import READERS
 from coopenv.cars.topics import TOPICS, Role, topic_of
-from coopenv.scenario.validation import one_line
+from coopenv.scenario.base import one_line
 
 READ = (
     *(Role.DETECTIONS, Role.BEARINGS, Role.CAMERA_INFO, Role.WHEEL, Role.IMU, Role.ODOMETRY),

@@ -18,11 +18,8 @@ from dataclasses import replace
 import numpy as np
 
 from coopenv.estimation.arrays import Array
-from coopenv.observers.planar.bearing import wrapped
-from coopenv.observers.planar.commands import Step
 from coopenv.observers.planar.filter import PlanarFilter
-from coopenv.observers.planar.state import HEADING, STATES, PlanarPose, picked
-from coopenv.observers.planar.tuning import Tuning
+from coopenv.observers.planar.model import HEADING, STATES, PlanarPose, Step, Tuning, picked, wrapped
 
 WIDEST = 0.5  # rad, of the heading of one filter
 MOST = 15

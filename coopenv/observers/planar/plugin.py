@@ -12,12 +12,10 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.planar.commands import Step
 from coopenv.observers.planar.filter import PlanarFilter
-from coopenv.observers.planar.heard import LOWER, Sightings, place_of, sightings_of
+from coopenv.observers.planar.fusion import LOWER, Sightings, place_of, sightings_of
 from coopenv.observers.planar.mixture import Mixture
-from coopenv.observers.planar.state import PlanarPose, X, Y
-from coopenv.observers.planar.tuning import TEXTBOOK, Tuning
+from coopenv.observers.planar.model import TEXTBOOK, PlanarPose, Step, Tuning, X, Y
 
 PLANE = np.ix_((2, 3, 4), (2, 3, 4))  # indices of the LEFT coordinates in the plane: yaw, forward, left
 OUT_OF_PLANE_STD = 1e-3  # rad and m

@@ -8,16 +8,11 @@ import numpy as np
 
 from coopenv.estimation.arrays import Array
 from coopenv.observers.contract import Estimate, Message, Setup, Tick
-from coopenv.observers.planar.circle import Circle
-from coopenv.observers.planar.commands import Step
-from coopenv.observers.planar.heard import Sightings
-from coopenv.observers.planar.loss import LossTest
-from coopenv.observers.planar.memory import Memory
+from coopenv.observers.planar.fusion import Circle, Sightings
 from coopenv.observers.planar.mixture import Mixture
+from coopenv.observers.planar.model import BIAS, CALIBRATING, HEADING, TURN_SCALE, PlanarPose, Step, Tuning, X, Y
 from coopenv.observers.planar.plugin import PlanarEkf
-from coopenv.observers.planar.search import Known, find_pose
-from coopenv.observers.planar.state import BIAS, HEADING, TURN_SCALE, PlanarPose, X, Y
-from coopenv.observers.planar.tuning import CALIBRATING, Tuning
+from coopenv.observers.planar.search import Known, LossTest, Memory, find_pose
 
 CLEAR_STD = (8.0, 1.6)  # m, rad; whoever is less certain cannot correct with single bearings, and collects them
 LOST_HEADING_STD = math.pi / math.sqrt(3)  # rad, of a heading that may be any

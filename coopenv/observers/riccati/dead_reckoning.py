@@ -1,6 +1,6 @@
 """Odometry alone in the world's kernels: the lower reference, with the covariance that odometry's noise makes.
 
-It is `coopenv.observers.dead_reckoning` on the state of the Riccati observer, whose P is over e = (2 lambda, p - phat),
+It is `coopenv.observers.single_frame` on the state of the Riccati observer, whose P is over e = (2 lambda, p - phat),
 positions in the body frame. An error (theta, rho) in LEFT coordinates is there (theta, rho + S(phat) theta).
 """
 

@@ -7,8 +7,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import exp_so3, log_so3
-from coopenv.observers.checks import check_estimate, is_definite
-from coopenv.observers.contract import Estimate, Message
+from coopenv.observers.contract import Estimate, Message, check_estimate, is_definite
 from coopenv.observers.robust.constants import MIN_VARIANCE
 from coopenv.scenario.base import LARGEST
 

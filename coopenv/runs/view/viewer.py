@@ -11,7 +11,7 @@ from coopenv.runs.video import MAX_FPS
 from coopenv.runs.view.reels import FAULTS, Reel
 from coopenv.viz.scene import Frame, Stage
 from coopenv.viz.scene.stage import entry
-from coopenv.viz.web.look import Look
+from coopenv.viz.web.ground import Look
 from coopenv.viz.web.panel import NO_FAULT, Panel
 from coopenv.viz.web.picture import Picture, useful_magnification
 from coopenv.viz.web.plots import History

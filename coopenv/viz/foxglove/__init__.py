@@ -3,7 +3,6 @@
 Messages are of Foxglove's published types, which its SDK encodes; the extra `log` brings it.
 """
 
-from coopenv.viz.foxglove.layout import layout_text
-from coopenv.viz.foxglove.views import check_installed, views
+from coopenv.viz.foxglove.views import check_installed, layout_text, views
 
 __all__ = ["check_installed", "layout_text", "views"]

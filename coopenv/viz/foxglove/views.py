@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from coopenv.base.errors import CoopenvError
+from coopenv.viz.style import vehicle_colour
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -38,8 +41,8 @@ def views(recording: Recording, run: Run, *, start: float = 0.0, gain: bool = Fa
     from foxglove import messages as fox
 
     from coopenv.backends.mcap.view import Clock, View, ros_definition
-    from coopenv.viz.foxglove import camera, estimates, motion, scene
-    from coopenv.viz.foxglove.shown import Shown
+    from coopenv.viz.foxglove import camera, scene
+    from coopenv.viz.foxglove.scene import Shown
 
     shown = Shown(recording, run, Clock(recording.dt, start), gain)
 
@@ -50,31 +53,102 @@ def views(recording: Recording, run: Run, *, start: float = 0.0, gain: bool = Fa
     found = [
         published("/scene/world", fox.SceneUpdate, scene.world(shown)),
         published("/scene/vehicles", fox.SceneUpdate, scene.vehicles(shown)),
-        published("/tf", fox.FrameTransforms, motion.transforms(shown)),
-        published("/scene/sight", fox.SceneUpdate, motion.sight(shown)),
+        published("/tf", fox.FrameTransforms, scene.transforms(shown)),
+        published("/scene/sight", fox.SceneUpdate, scene.sight(shown)),
     ]
     if len(scene.moving_landmarks(shown)):
-        found.append(published("/scene/landmarks", fox.SceneUpdate, motion.landmarks(shown)))
+        found.append(published("/scene/landmarks", fox.SceneUpdate, scene.landmarks(shown)))
     if not gain:
-        found.append(published("/scene/uncertainty", fox.SceneUpdate, motion.uncertainty(shown, scene.extent(shown))))
+        found.append(published("/scene/uncertainty", fox.SceneUpdate, scene.uncertainty(shown, scene.extent(shown))))
     for i, name in enumerate(shown.names):
         pose = View(
             f"/{name}/estimate",
-            estimates.POSE,
+            camera.POSE,
             "ros2msg",
-            ros_definition(estimates.POSE),
+            ros_definition(camera.POSE),
             "cdr",
-            estimates.poses(shown, i),
+            camera.poses(shown, i),
         )
-        error = View(
-            f"/{name}/error", estimates.ERROR, "jsonschema", estimates.ERROR_SCHEMA, "json", estimates.errors(shown, i)
-        )
+        error = View(f"/{name}/error", camera.ERROR, "jsonschema", camera.ERROR_SCHEMA, "json", camera.errors(shown, i))
         found += [pose, error]
         one = shown.camera(i)
         if one is not None:
             found += [
                 published(f"/{name}/camera/calibration", fox.CameraCalibration, camera.calibration(shown, i, one)),
                 published(f"/{name}/camera/image", fox.CompressedImage, camera.image(shown, i, one)),
-                published(f"/{name}/camera/annotations", fox.ImageAnnotations, camera.annotations(shown, i, one)),
+                published(
+                    f"/{name}/camera/annotations", fox.ImageAnnotations, camera.camera_annotations(shown, i, one)
+                ),
             ]
     return found
+
+
+_PLOTS = {
+    "Plot!position": ("position_error_m", "position error [m]"),
+    "Plot!orientation": ("orientation_error_deg", "orientation error [deg]"),
+}
+
+
+def layout_text(topics: Sequence[str]) -> str:
+    """Return the layout for a log with these topics as JSON, to import as `foxglove_layout.json`."""
+    vehicles = [topic.split("/")[1] for topic in topics if topic.endswith("/error")]
+    cameras = [topic.removesuffix("/camera/image") for topic in topics if topic.endswith("/camera/image")]
+    panels: dict[str, Any] = {"3D!scene": _scene(topics)}
+    panels |= {name: _plot(vehicles, *column) for name, column in _PLOTS.items()}
+    side: Any = _split(*_PLOTS, direction="column")
+    if cameras:
+        panels["Image!camera"] = _image(cameras[0])
+        side = _split("Image!camera", side, direction="column", share=40)
+    document = {
+        "configById": panels,
+        "globalVariables": {},
+        "userNodes": {},
+        "playbackConfig": {"speed": 1},
+        "layout": _split("3D!scene", side, direction="row", share=62),
+    }
+    return json.dumps(document, indent=2) + "\n"
+
+
+def _scene(topics: Sequence[str]) -> dict[str, Any]:
+    visible = {topic: {"visible": True} for topic in topics if topic.startswith("/scene/")}
+    hidden = {topic: {"visible": False} for topic in topics if topic.endswith(("/odometry", "/truth", "/estimate"))}
+    camera = {"distance": 60, "perspective": True, "phi": 50, "thetaOffset": 30, "targetOffset": [0, 0, 0]}
+    grid = {"visible": True, "frameLocked": True, "label": "Grid", "instanceId": "grid", "layerId": "foxglove.Grid"}
+    return {
+        "cameraState": {**camera, "target": [0, 0, 0], "targetOrientation": [0, 0, 0, 1], "fovy": 45, "near": 0.1},
+        "followTf": "map",
+        "followMode": "follow-none",
+        "scene": {"transforms": {"showLabel": False, "axisScale": 0}},
+        "topics": {**visible, **hidden},
+        "layers": {"grid": {**grid, "size": 100, "divisions": 20, "lineWidth": 1, "color": "#248eff20"}},
+    }
+
+
+def _image(vehicle: str) -> dict[str, Any]:
+    mode = {
+        "imageTopic": f"{vehicle}/camera/image",
+        "calibrationTopic": f"{vehicle}/camera/calibration",
+        "annotations": {f"{vehicle}/camera/annotations": {"visible": True}},
+        "synchronize": False,
+    }
+    return {"imageMode": mode, "foxglovePanelTitle": f"camera of {vehicle.strip('/')}"}
+
+
+def _plot(vehicles: Sequence[str], column: str, title: str) -> dict[str, Any]:
+    paths = [
+        {
+            "value": f"/{vehicle}/error.{column}",
+            "label": vehicle,
+            "color": vehicle_colour(i),
+            "enabled": True,
+            "timestampMethod": "receiveTime",
+        }
+        for i, vehicle in enumerate(vehicles)
+    ]
+    axes = {"showXAxisLabels": True, "showYAxisLabels": True, "xAxisVal": "timestamp", "isSynced": True}
+    legend = {"showLegend": True, "legendDisplay": "floating", "showPlotValuesInLegend": True}
+    return {"paths": paths, "foxglovePanelTitle": title, **axes, **legend, "sidebarDimension": 240}
+
+
+def _split(first: Any, second: Any, *, direction: str, share: int = 50) -> dict[str, Any]:
+    return {"first": first, "second": second, "direction": direction, "splitPercentage": share}

@@ -4,8 +4,7 @@ The top view, the page in the browser and films are made from these alone, wheth
 the one of real cars.
 """
 
-from coopenv.viz.scene.frame import Frame, Shown
 from coopenv.viz.scene.record import SceneRecord, SceneWriter, Source
-from coopenv.viz.scene.stage import Stage
+from coopenv.viz.scene.stage import Frame, Shown, Stage
 
 __all__ = ["Frame", "SceneRecord", "SceneWriter", "Shown", "Source", "Stage"]

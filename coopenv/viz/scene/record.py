@@ -14,11 +14,10 @@ from coopenv.base.format import jsonable
 from coopenv.base.npz import read_npz
 from coopenv.observers.registry import states_covariance
 from coopenv.scenario import Scenario
-from coopenv.scenario.base import Part
+from coopenv.scenario.base import Part, one_line
 from coopenv.scenario.files import parse_scenario
 from coopenv.scenario.own_terms import without_own_terms
-from coopenv.scenario.validation import one_line
-from coopenv.viz.scene.frame import FIELDS, WHOLE_FIELDS, Frame, Shown
+from coopenv.viz.scene.stage import FIELDS, WHOLE_FIELDS, Frame, Shown
 
 SCENE_FILE = "scene.npz"
 _HEADER = "header"

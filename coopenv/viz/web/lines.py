@@ -5,12 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.estimation.outcomes import Sight
+from coopenv.base.format import fixed
+from coopenv.estimation.outcomes import Outcome, Sight
 from coopenv.viz.scene import Frame, Stage
 from coopenv.viz.scene.stage import Box
 from coopenv.viz.style import GREY, INK
-from coopenv.viz.web import shapes
-from coopenv.viz.web.look import Look, linear, rgb
+from coopenv.viz.web import ground
+from coopenv.viz.web.actors import Batch, fine, placed
+from coopenv.viz.web.ground import ROOT, Look, in_turn, linear, rgb
 from coopenv.viz.web.sent import Sent
 
 Coloured = tuple[np.ndarray, np.ndarray]
@@ -115,7 +117,7 @@ def way_lines(stage: Stage, frame: Frame, colours: np.ndarray, z: float) -> Colo
         if frame.route_drawn[i] >= 0 and len(points) > 1:
             parts.append((np.stack([points[:-1], points[1:]], axis=1), np.repeat(pale, len(points) - 1, axis=0)))
         if vehicle.goal_radius > 0:
-            ring = shapes.circle(vehicle.goal_radius) + np.array([*frame.goal[i, :2], z])
+            ring = ground.circle(vehicle.goal_radius) + np.array([*frame.goal[i, :2], z])
             parts.append((ring, np.repeat(colours[i][None], len(ring), axis=0)))
     return joined(*parts)
 
@@ -161,3 +163,124 @@ def _dashed(start: np.ndarray, end: np.ndarray, colours: np.ndarray, count: int,
 
 def _one(colour: str, count: int) -> np.ndarray:
     return np.tile(np.array(rgb(colour), np.uint8), (count, 1))
+
+
+FLIGHT, PAUSE = 0.5, 1.0
+"""s of the scene's time: how long a bead flies, and the least time between two of a link."""
+_SIZE = 0.006  # of the scene's side
+
+
+class Pulses:
+    """Beads on the links between vehicles."""
+
+    def __init__(self, scene: Any, stage: Stage, colours: np.ndarray) -> None:
+        """Begin with none."""
+        n = stage.vehicles
+        self._stage = stage
+        self._receiver, self._sender = (part.ravel() for part in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
+        self._batch = Batch(scene, f"{ROOT}/messages", ground.sphere(5), colours[self._sender])
+        self._began = np.full(n * n, -np.inf)
+        self._last = np.full(n * n, -1)
+        self._time = -np.inf
+        self._step = 2.0 ** np.floor(np.log2(stage.side * 1e-4))
+
+    def place(self, frame: Frame, time: float, shown: bool) -> None:
+        """Let those fly whose message arrived since the last frame, and the others on."""
+        arrived = frame.inbox_tick.ravel()
+        if time < self._time:
+            self._began[:], self._last[:] = -np.inf, arrived
+        new = (arrived > self._last) & (time >= self._began + PAUSE)
+        self._began[new] = time
+        self._last, self._time = arrived.copy(), time
+        share = (time - self._began) / FLIGHT
+        eye = self._stage.eyes(frame)
+        start, end = eye[self._sender], eye[self._receiver]
+        flying = (share >= 0.0) & (share <= 1.0) & (self._sender != self._receiver)
+        at = start + np.where(flying, share, 0.0)[:, None] * (end - start)
+        size = np.where(flying, _SIZE * self._stage.side, np.nan)[:, None].repeat(3, axis=1)
+        self._batch.put(placed(None, fine(at, self._step), size), shown)
+
+
+_OFTEN = 0.5  # s between two texts of a label
+_CLOSE, _RAISED = 0.09, 0.035  # of the scene's side: vehicles so close have their names so far above each other
+_APART = 0.06  # of the scene's side, distance from which on an estimate has a name of its own
+_MOST_NAMES = 24  # landmarks; more would hide one another
+
+
+class Labels:
+    """Texts that stand over what they name."""
+
+    def __init__(self, scene: Any, stage: Stage) -> None:
+        """Add them."""
+        self._stage, self._said = stage, -np.inf
+        look: dict[str, Any] = {"anchor": "bottom-center", "depth_test": False}
+        marks = [stage.short_name(stage.landmarks + i) for i in range(stage.vehicles)]
+        self._cars = [Sent(scene.add_label(f"{ROOT}/names/{mark}", mark, **look)) for mark in marks]
+        self._marks = marks
+        self._marked, self._marks_at = False, np.zeros((0, 3))
+        above = stage.bodies[0][:, 2] + 0.012 * stage.side
+        self._above = np.column_stack([np.zeros((len(above), 2)), above])
+        small = {**look, "font_screen_scale": 0.85}
+        believed = f"{ROOT}/names/estimates"
+        self._believed = [Sent(scene.add_label(f"{believed}/{mark}", f"{mark} estimated", **small)) for mark in marks]
+        self._landmarks = {
+            i: Sent(scene.add_label(f"{ROOT}/names/landmarks/{i}", stage.short_name(i), **small))
+            for i, landmark in enumerate(stage.scenario.landmarks)
+            if landmark.group is None and stage.landmarks <= _MOST_NAMES
+        }
+
+    def place(self, frame: Frame, time: float, shown: bool, turn: int | None = None) -> None:
+        """Put them over what they name; with a `turn` those of some vehicles, as in `Picture.show`."""
+        again = not 0.0 <= time - self._said < _OFTEN - 1e-9
+        self._said = time if again else self._said
+        if again and shown:
+            for i, label in enumerate(self._cars):
+                label.tell(text=self._text(frame, i))
+        mine = in_turn(turn, self._stage.vehicles)
+        places = frame.vehicle_position + self._above
+        places[:, 2] += _RAISED * self._stage.side * levels(places[:, :2], _CLOSE * self._stage.side)
+        for label, place in zip(self._cars[mine], places[mine], strict=True):
+            _put(label, place, shown)
+        self._place_believed(frame, shown, mine)
+        places = self._stage.targets(frame)[: self._stage.landmarks]
+        if shown != self._marked or not np.array_equal(places, self._marks_at, equal_nan=True):
+            self._marked, self._marks_at = shown, places
+            for i, label in self._landmarks.items():
+                _put(label, places[i] + [0.0, 0.0, 0.015 * self._stage.side], shown)
+
+    def _place_believed(self, frame: Frame, shown: bool, mine: slice) -> None:
+        """Name the estimates that are not where their vehicles are."""
+        places = (frame.estimate_position + self._above)[mine]
+        inside = np.all((places[:, :2] > self._stage.low) & (places[:, :2] < self._stage.high), axis=-1)
+        named = inside & (frame.position_error[mine] > _APART * self._stage.side)
+        for label, place, there in zip(self._believed[mine], places, named.tolist(), strict=True):
+            _put(label, place, shown and there)
+
+    def _text(self, frame: Frame, vehicle: int) -> str:
+        mark, ended = self._marks[vehicle], int(frame.ended[vehicle])
+        if ended == Outcome.UNDER_WAY:
+            return f"{mark}  {fixed(frame.position_error[vehicle], 2)} m"
+        known = {outcome.value for outcome in Outcome}
+        return f"{mark}  {Outcome(ended).words}" if ended in known else f"{mark}  ended"
+
+
+def levels(points: np.ndarray, close: float) -> np.ndarray:
+    """Return (N,) on which level the name of each point (N, 2) stands: no two of one level are close to each other.
+
+    Of two that are close the one farther to the north has the higher level: the first camera looks from the south.
+    """
+    near = np.linalg.norm(points[:, None] - points, axis=-1) < close
+    level, done = np.zeros(len(points), int), np.zeros(len(points), bool)
+    for i in np.argsort(points[:, 1], kind="stable"):
+        taken = set(level[near[i] & done].tolist())
+        level[i] = next(k for k in range(len(points)) if k not in taken)
+        done[i] = True
+    return level
+
+
+def _put(label: Sent, place: np.ndarray, shown: bool) -> None:
+    """Put a label to a place (3,), NaN: nowhere."""
+    shown = shown and not np.isnan(place[0])
+    label.tell(visible=shown)
+    if shown:
+        label.tell(position=tuple(place.round(3).tolist()))

@@ -14,8 +14,7 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.viz.camera_image import camera_image
 from coopenv.viz.scene import Frame, Source, Stage
 from coopenv.viz.style import vehicle_colour
-from coopenv.viz.web.legend import legend_html, swatch
-from coopenv.viz.web.look import Look
+from coopenv.viz.web.ground import Look, legend_html, swatch
 from coopenv.viz.web.plots import History, Plots
 
 SPEEDS = ("0.1", "0.25", "0.5", "1", "2", "4", "8")

@@ -6,12 +6,9 @@ import numpy as np
 
 from coopenv.viz.scene import Frame, Source, Stage
 from coopenv.viz.web import lines
-from coopenv.viz.web.actors import Actors
-from coopenv.viz.web.copies import fine
-from coopenv.viz.web.ground import ROOT, Ground
-from coopenv.viz.web.labels import Labels
-from coopenv.viz.web.look import Look, in_turn, vehicle_colours
-from coopenv.viz.web.pulses import Pulses
+from coopenv.viz.web.actors import Actors, fine
+from coopenv.viz.web.ground import ROOT, Ground, Look, in_turn, vehicle_colours
+from coopenv.viz.web.lines import Labels, Pulses
 from coopenv.viz.web.sent import Sent
 
 FIELD_OF_VIEW = 0.72

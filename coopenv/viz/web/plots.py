@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.viz.consistency import NEES_BOUNDS
+from coopenv.viz.error_figures import NEES_BOUNDS
 from coopenv.viz.scene import Frame, Source
-from coopenv.viz.scene.frame import three_sigma
+from coopenv.viz.scene.stage import three_sigma
 from coopenv.viz.style import BLUE, GREY, VEHICLE_COLOURS
-from coopenv.viz.web.legend import swatch
+from coopenv.viz.web.ground import swatch
 
 _LONGEST = 600  # frames that are kept
 _LEAST = 1e-4  # on a logarithmic axis

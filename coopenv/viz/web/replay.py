@@ -11,8 +11,7 @@ import numpy as np
 from coopenv.base.files import replace_text
 from coopenv.viz.scene import SceneRecord, Stage
 from coopenv.viz.web.extra import guarded_server
-from coopenv.viz.web.legend import legend_html
-from coopenv.viz.web.look import Look
+from coopenv.viz.web.ground import Look, legend_html
 from coopenv.viz.web.picture import FIELD_OF_VIEW, Picture, first_camera, useful_magnification
 
 REPLAY_FILE = "replay.html"

@@ -17,8 +17,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
 import coopenv
-from coopenv.api.trainers.sb3 import CooperativeSB3VecEnv, make_sb3_vec_env
-from coopenv.api.trainers.sb3_buffer import ActingRowsBuffer
+from coopenv.api.trainers.sb3 import ActingRowsBuffer, CooperativeSB3VecEnv, make_sb3_vec_env
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.train

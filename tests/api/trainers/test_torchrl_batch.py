@@ -11,8 +11,8 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 import coopenv
-from coopenv.api.statistics import RecordVehicleEpisodes
 from coopenv.api.trainers.torchrl import batched_env
+from coopenv.api.vector_env import RecordVehicleEpisodes
 from tests.helpers.four_way import FOUR_WAY
 
 pytestmark = pytest.mark.torchrl

@@ -22,7 +22,7 @@ from coopenv.bench.observers.basin import (
     study_basin,
 )
 from coopenv.observers import Estimate, Tick, find
-from coopenv.observers.dead_reckoning import DeadReckoning
+from coopenv.observers.single_frame import DeadReckoning
 
 
 def draws_of(number: int, angles: list[float], ends: list[float], time: float) -> list[Draw]:

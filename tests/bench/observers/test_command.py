@@ -17,12 +17,11 @@ import pytest
 
 import coopenv
 from coopenv.bench.observers import compare
-from coopenv.bench.observers.charts import PLOTLY, chart_data, page_file
-from coopenv.bench.observers.command import figure_files
-from coopenv.bench.observers.quality import headline, quality
-from coopenv.bench.observers.report import report_text
+from coopenv.bench.observers.command import figure_files, report_text
+from coopenv.bench.observers.figures import PLOTLY, chart_data, page_file
+from coopenv.bench.observers.judge import Series
+from coopenv.bench.observers.leaderboard import headline, quality
 from coopenv.bench.observers.rows import Row
-from coopenv.bench.observers.samples import Series
 from coopenv.cli import main
 from coopenv.observers import registry
 from tests.bench.observers.test_compare import Raises
@@ -279,7 +278,7 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_work(
 
 
 SOURCE = """
-from coopenv.observers.dead_reckoning import DeadReckoning
+from coopenv.observers.single_frame import DeadReckoning
 
 class Mine(DeadReckoning):
     pass

@@ -13,7 +13,7 @@ from coopenv.bench.observers.tables import failures
 from coopenv.observers import registry, run
 from coopenv.observers.bound import cramer_rao, cramer_rao_ancestors
 from coopenv.observers.contract import Estimate, Tick
-from coopenv.observers.dead_reckoning import DeadReckoning
+from coopenv.observers.single_frame import DeadReckoning
 from coopenv.runs.recorder import record
 
 SHORT = {"horizon": 1.5}

@@ -20,12 +20,12 @@ from rich.console import Console
 import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.base.format import in_parentheses, with_error
-from coopenv.bench.observers.report import report_text
+from coopenv.bench.observers.command import report_text
 from coopenv.bench.observers.rows import Row
 from coopenv.observers import Estimate, Setup, Tick, registry
-from coopenv.observers.dead_reckoning import DeadReckoning
-from coopenv.viz.contrast import LEAST, contrast
-from coopenv.viz.paper import COLUMNS
+from coopenv.observers.single_frame import DeadReckoning
+from coopenv.viz.drawing import LEAST, contrast
+from coopenv.viz.figures import COLUMNS
 
 
 class Mine(DeadReckoning):

@@ -14,12 +14,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from coopenv.backends.mcap.writer import write_recording
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers import compare
-from coopenv.bench.observers.choice import find_source
 from coopenv.bench.observers.command import figure_files, request_of
-from coopenv.bench.observers.fault_grammar import parts_of
-from coopenv.bench.observers.fault_knobs import KNOBS
+from coopenv.bench.observers.fault_variants import KNOBS, parts_of
 from coopenv.bench.observers.faults import with_loss
-from coopenv.bench.observers.sources import Simulated
+from coopenv.bench.observers.sources import Simulated, find_source
 from coopenv.cli import main
 from coopenv.observers.interference import Interference
 from coopenv.runs.recorder import record

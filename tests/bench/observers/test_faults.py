@@ -23,7 +23,7 @@ from coopenv.bench.observers.faults import (
 )
 from coopenv.observers import Message, Recording, run
 from coopenv.observers.contract import Setup
-from coopenv.observers.mekf_covariance import MekfCovariance
+from coopenv.observers.error_state_filters import MekfCovariance
 from coopenv.runs.recorder import record
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from coopenv.bench.observers import compare
-from coopenv.bench.observers.report import report_text
+from coopenv.bench.observers.command import report_text
 
 pytestmark = pytest.mark.browser
 SIZES = {"desk": (1280, 800), "phone": (390, 844)}

@@ -11,9 +11,9 @@ import pytest
 import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.bench.observers import compare, find_source
-from coopenv.bench.observers.choice import variants_of
 from coopenv.bench.observers.command import request_of
 from coopenv.bench.observers.faults import FAULTS
+from coopenv.bench.observers.sources import variants_of
 from coopenv.observers import run
 from coopenv.runs.recorder import record
 from tests.helpers import mrclam_files

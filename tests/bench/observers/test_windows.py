@@ -13,9 +13,9 @@ from numpy.testing import assert_allclose
 
 import coopenv
 from coopenv.base.errors import CoopenvError
-from coopenv.bench.observers import compare, scene
-from coopenv.bench.observers.samples import Window, windows_of
-from coopenv.bench.observers.windows import EDGES, WindowRow, checked_edges, spread
+from coopenv.bench.observers import compare, judge
+from coopenv.bench.observers.judge import Window, windows_of
+from coopenv.bench.observers.rows import EDGES, WindowRow, checked_edges, spread
 from coopenv.cli import main
 from coopenv.observers import run
 from coopenv.observers.bound import cramer_rao_ancestors
@@ -93,8 +93,8 @@ def test_seeds_share_one_bound(monkeypatch: pytest.MonkeyPatch) -> None:
         calls.append(recording)
         return cramer_rao_ancestors(recording)
 
-    monkeypatch.setattr(scene, "cramer_rao_ancestors", counted)
-    monkeypatch.setattr(scene, "_kept", type(scene._kept)())
+    monkeypatch.setattr(judge, "cramer_rao_ancestors", counted)
+    monkeypatch.setattr(judge, "_kept", type(judge._kept)())
     compare(["dead_reckoning"], "lane:2", 3, overrides={"horizon": 0.5})
     assert len(calls) == 1
     compare(["dead_reckoning"], "lane:2", 2, overrides={"horizon": 0.5, "noise.bearing.scale": 0.01})

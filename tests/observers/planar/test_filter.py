@@ -9,22 +9,33 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from coopenv.observers.planar.bearing import left_out, unsure
-from coopenv.observers.planar.commands import (
+from coopenv.observers.planar.filter import PlanarFilter
+from coopenv.observers.planar.model import (
     ARC,
+    BIAS,
+    CALIBRATING,
+    HEADING,
+    IROBOT_CREATE,
+    LEAD,
     PATH,
+    SHARE,
     SLOWING,
+    STATES,
     SWITCHING,
+    TEXTBOOK,
     TOLD,
     TURN,
+    TURN_SCALE,
     TURNING,
     CommandHistory,
+    PlanarPose,
     Wheels,
+    X,
+    Y,
+    growth,
+    left_out,
+    unsure,
 )
-from coopenv.observers.planar.filter import PlanarFilter
-from coopenv.observers.planar.intersection import growth
-from coopenv.observers.planar.state import BIAS, HEADING, LEAD, SHARE, STATES, TURN_SCALE, PlanarPose, X, Y
-from coopenv.observers.planar.tuning import CALIBRATING, IROBOT_CREATE, TEXTBOOK
 
 DT = 0.05
 COMMANDS = [(0.07, 0.0), (0.08, 0.4), (0.05, 0.4), (0.0, -0.3), (0.067, 0.01), (0.086, -0.398), (0.086, 0.0)] * 3

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coopenv.observers.planar.heard import LEAST_STD, MOST_SEEN, sightings_of
+from coopenv.observers.planar.fusion import LEAST_STD, MOST_SEEN, sightings_of
 
 TOLD = {
     "seen": np.array([15, 17], np.uint8),

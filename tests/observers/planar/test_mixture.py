@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from coopenv.observers.planar.mixture import Mixture
-from coopenv.observers.planar.state import DRIFT, HEADING, TURN_SCALE, X, Y
-from coopenv.observers.planar.tuning import CALIBRATING
+from coopenv.observers.planar.model import CALIBRATING, DRIFT, HEADING, TURN_SCALE, X, Y
 
 ONE_KIND = replace(CALIBRATING, drifting=(0.0, 0.0))
 DT = 0.05

@@ -8,10 +8,9 @@ import pytest
 from benchmarks.planar.changes import blindfolded
 from benchmarks.planar.lies import Drifting
 from coopenv.backends.mrclam import recording_of
-from coopenv.observers.planar.bearing import misfit
+from coopenv.observers.planar.fusion import ENOUGH, Trust
+from coopenv.observers.planar.model import PlanarPose, misfit
 from coopenv.observers.planar.robust import PlanarRobust
-from coopenv.observers.planar.state import PlanarPose
-from coopenv.observers.planar.trust import ENOUGH, Trust
 from coopenv.observers.runner import run
 from tests.helpers.barrier_robots import barrier_robots
 

@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 
 from coopenv.api.engine import Engine
 from coopenv.observers import registry
-from coopenv.observers.dead_reckoning import DeadReckoning
+from coopenv.observers.single_frame import DeadReckoning
 from coopenv.scenario import load_scenario
 from coopenv.viz.topview_geometry import position_covariance
 from coopenv.world.world import World

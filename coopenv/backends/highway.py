@@ -1,0 +1,330 @@
+"""highway-env as a co-simulator: its roads, traffic and dynamics under this project's cameras, radio and observers."""
+
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from coopenv.backends.moved import MovedWorld, Poses
+from coopenv.backends.simulated import Simulated
+from coopenv.base.errors import CoopenvError, ScenarioError, listed, shown, suggest, told
+from coopenv.estimation.arrays import Array
+from coopenv.scenario import Scenario
+from coopenv.scenario.bodies import Road
+from coopenv.scenario.highway import Highway
+from coopenv.world.collision import UNDER_WAY
+from coopenv.world.command import ACCELERATION, SPEED, STEERING
+
+
+class FollowedWorld(MovedWorld):
+    """One world whose vehicles stand where `present` says."""
+
+    present: Poses
+
+    def restart(self) -> None:
+        """Begin an episode where the vehicles stand, see `World.restart`."""
+        if self.mask.numpy().any():
+            self.place(0, self.present)
+        super().restart()
+
+    def fetch(self) -> bool:
+        """Move the vehicles to where they stand."""
+        self.move(0, self.present)
+        return True
+
+
+class Followed(Simulated):
+    """One world that follows an environment of highway-env."""
+
+    kind = FollowedWorld
+
+
+BEND = 2.0  # m, length of a strip of a lane that bends
+MARGIN = 25.0  # m, of road that is drawn beyond the outermost landmark
+
+
+def drawn_roads(network: Any, scenario: Scenario) -> tuple[Road, ...]:
+    """Return strips of all lanes as far as the landmarks stand, y up, in the coordinates of the scenario's file."""
+    places = [landmark.position[:2] for landmark in scenario.landmarks] or [(0.0, 0.0)]
+    reach = float(np.abs(places).max()) + MARGIN
+    return tuple(road for lane in network.lanes_list() for road in _strips(lane, reach))
+
+
+def _strips(lane: Any, reach: float) -> list[Road]:
+    s = np.linspace(0.0, lane.length, max(2, int(np.ceil(lane.length / BEND)) + 1))
+    middle = np.array([lane.position(x, 0.0) for x in s]) * (1.0, -1.0)
+    middle = middle[np.abs(middle).max(axis=1) <= reach]
+    if np.ptp([lane.heading_at(x) for x in s]) < 1e-9:
+        middle = middle[[0, -1]] if len(middle) else middle  # straight: one strip
+    width = float(lane.width_at(0.0))
+    return [
+        Road(start=(ax, ay), end=(bx, by), width=width, marked=False)
+        for (ax, ay), (bx, by) in pairwise(middle.tolist())
+        if (ax, ay) != (bx, by)
+    ]
+
+
+OWNED = {
+    "action": "[dynamics] and [action]",
+    "controlled_vehicles": "the vehicles whose motion is driven",
+    "duration": "horizon",
+    "observation": "[observation]",
+    "policy_frequency": "rates.decision",
+    "simulation_frequency": "rates.camera",
+}
+"""Keys of highway-env's configuration that follow from other parts of a scenario, named here."""
+
+NO_ENVIRONMENT = "backend 'highway' needs highway-env, which is not installed: pip install '.[highway]'"
+
+
+def make_environment(scenario: Scenario) -> Any:
+    """Return the environment of highway-env, whose every step is one camera tick.
+
+    Raises:
+        CoopenvError: highway-env is not installed.
+        ScenarioError: it has no such environment or key, or it does not take a value.
+    """
+    assert scenario.highway is not None  # the schema asks for it
+    creator = _creator(scenario.highway.id)
+    config = _config(scenario, scenario.highway, creator.default_config())
+    try:
+        return creator(config=config)
+    except Exception as error:  # whatever highway-env makes of it
+        raise ScenarioError(f"highway: {scenario.highway.id} cannot be made: {told(error)}") from None
+
+
+def _creator(name: str) -> Any:
+    """Return the class of an environment."""
+    try:
+        import gymnasium
+        import highway_env  # noqa: F401  (registers its environments)
+    except ImportError:
+        raise CoopenvError(NO_ENVIRONMENT) from None
+    from gymnasium.envs.registration import load_env_creator
+
+    known = {i: s.entry_point for i, s in gymnasium.registry.items() if str(s.entry_point).startswith("highway_env.")}
+    if name not in known:
+        near = suggest(name, known) or f"; known: {listed(sorted(known), 40)}"
+        raise ScenarioError(f"highway.id: highway-env has no environment {shown(name)}{near}")
+    creator: Any = load_env_creator(str(known[name]))
+    if not hasattr(creator, "default_config"):
+        raise ScenarioError(f"highway.id: {name} is not one environment but a wrapper of another")
+    return creator
+
+
+def _config(scenario: Scenario, section: Highway, defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what highway-env is told: the section's own keys, checked, and what the rest of the scenario says."""
+    rate = int(scenario.rates.camera)
+    for key, value in section.config.items():
+        if key in OWNED:
+            raise ScenarioError(f"highway.config.{key}: follows from {OWNED[key]}; leave this out")
+        if key not in defaults:
+            near = suggest(key, defaults) or f"; allowed: {listed(sorted(set(defaults) - set(OWNED)), 40)}"
+            raise ScenarioError(f"highway.config.{key}: unknown key{near}")
+        if not _like(value, defaults[key]):
+            raise ScenarioError(
+                f"highway.config.{key}: expected a value like {shown(defaults[key])}, got {shown(value)}"
+            )
+    kind = "IntersectionTraffic" if section.id.startswith("intersection") else "Traffic"
+    acceleration, steering = most_of_actions(scenario)
+    speeds = [limits.max_speed for limits in scenario.limits]
+    drive = {
+        "type": "ContinuousAction",
+        "acceleration_range": [-acceleration, acceleration],
+        "steering_range": [-steering, steering],
+        "speed_range": [-max(speeds) if any(limits.reverse for limits in scenario.limits) else 0.0, max(speeds)],
+        "dynamical": section.dynamical,
+    }
+    return {
+        "other_vehicles_type": f"coopenv.backends.highway_traffic.{kind}",
+        **{key: list(value) if isinstance(value, tuple) else value for key, value in section.config.items()},
+        "action": {"type": "MultiAgentAction", "action_config": drive},
+        "observation": {"type": "AttributesObservation", "attributes": []},
+        "simulation_frequency": rate,
+        "policy_frequency": rate,
+        "controlled_vehicles": sum(vehicle.motion.kind == "driven" for vehicle in scenario.vehicles),
+        "duration": scenario.horizon,
+    }
+
+
+def most_of_actions(scenario: Scenario) -> tuple[float, float]:
+    """Return the acceleration (m/s^2) and the steering angle (rad) that an action of highway-env of 1 stands for."""
+    limits = scenario.limits
+    return max(of.max_acceleration for of in limits), max(of.max_steering for of in limits)
+
+
+def _like(value: Any, default: Any) -> bool:
+    """Return whether a value is of the kind of highway-env's default; where that is None anything may be meant."""
+    if default is None:
+        return True
+    if isinstance(default, bool) or isinstance(value, bool):
+        return isinstance(default, bool) and isinstance(value, bool)
+    kinds = (int | float, str, list | tuple)
+    return any(isinstance(value, kind) and isinstance(default, kind) for kind in kinds)
+
+
+HEIGHT = 1.5  # m, of the traffic's boxes: highway-env is flat
+MOST_DRAWS = 50  # resets until there is enough traffic to connect
+
+
+class Simulation:
+    """An environment of highway-env whose cars are the scenario's vehicles, in its order."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Make the environment; errors as for `make_environment`."""
+        self._scenario = scenario
+        self._driven = [vehicle.motion.kind == "driven" for vehicle in scenario.vehicles]
+        self._origin = np.array(scenario.map.origin)
+        self.environment = make_environment(scenario)
+        self._cars: list[Any] = []
+
+    @property
+    def begun(self) -> bool:
+        """Whether it has been reset."""
+        return bool(self._cars)
+
+    def reset(self, seed: int) -> Poses:
+        """Draw traffic and starts; of the traffic, the cars nearest to the first driven one are connected.
+
+        Raises:
+            ScenarioError: its road does not have the vehicles that the scenario names.
+        """
+        driven, connected = sum(self._driven), len(self._driven) - sum(self._driven)
+        for draw in range(MOST_DRAWS):
+            self._call("reset", seed=seed if draw == 0 else None)
+            drivers = list(self.environment.controlled_vehicles)
+            if len(drivers) != driven:
+                raise ScenarioError(f"vehicles: {driven} are driven, but highway-env drives {len(drivers)} there")
+            known = {id(car) for car in drivers}
+            traffic = [car for car in self.environment.road.vehicles if id(car) not in known]
+            if len(traffic) >= connected:
+                break
+        else:
+            raise ScenarioError(f"vehicles: {connected} are in traffic, but highway-env has fewer there")
+        traffic.sort(key=lambda car: float(np.linalg.norm(car.position - drivers[0].position)))
+        own, others = iter(drivers), iter(traffic)
+        self._cars = [next(own if is_driven else others) for is_driven in self._driven]
+        return self.poses()
+
+    def drive(self, commands: Array, present: Array) -> Poses:
+        """Drive for one camera tick under commands (N, 3), see `coopenv.world.command`; traffic drives itself.
+
+        Those that are not present (N,) are taken off the road.
+        """
+        gone = {id(car) for car, there in zip(self._cars, present, strict=True) if not there}
+        road = self.environment.road
+        road.vehicles = [car for car in road.vehicles if id(car) not in gone]
+        (acceleration, steering), rate = most_of_actions(self._scenario), self._scenario.rates.camera
+        actions = []
+        for car, command in zip(self._cars, commands, strict=True):
+            wanted = (command[SPEED] - car.speed) * rate
+            most = command[ACCELERATION]
+            gas = np.clip(wanted, -most, most) / acceleration
+            actions.append(np.array([gas, -command[STEERING] / steering]))
+        self._call("step", tuple(action for action, driven in zip(actions, self._driven, strict=True) if driven))
+        return self.poses()
+
+    def poses(self) -> Poses:
+        """Return where everybody is; errors as for `poses_of`."""
+        assert self._scenario.highway is not None
+        return poses_of(self._cars, self.environment.road, self._origin, self._scenario.highway.most_vehicles)
+
+    def _call(self, method: str, *arguments: Any, **options: Any) -> None:
+        try:
+            getattr(self.environment, method)(*arguments, **options)
+        except Exception as error:  # whatever goes wrong in there
+            raise CoopenvError(f"highway-env: {method}: {told(error)}") from error
+
+
+def poses_of(cars: Sequence[Any], road: Any, origin: Array, most: int) -> Poses:
+    """Return where some cars of a road are, and everything else on it, in a map whose origin is at `origin` (3,).
+
+    Raises:
+        CoopenvError: there are more than `most` other things.
+    """
+    here, own = {id(car) for car in road.vehicles}, {id(car) for car in cars}
+    others = [car for car in road.vehicles if id(car) not in own] + [thing for thing in road.objects if thing.solid]
+    if len(others) > most:
+        raise CoopenvError(f"highway.most_vehicles: {most} are too few, there are {len(others)} on the road")
+    position, heading, half = np.zeros((most, 3)), np.zeros(most), np.zeros((most, 3))
+    for k, car in enumerate(others):
+        position[k] = (*flipped(car.position), HEIGHT / 2)
+        heading[k], half[k] = -car.heading, (car.LENGTH / 2, car.WIDTH / 2, HEIGHT / 2)
+    moving = np.array([id(car) in here for car in cars])
+    return Poses(
+        xy=np.array([flipped(car.position) for car in cars]) - origin[:2],
+        heading=np.array([-car.heading for car in cars]),
+        speed=np.array([car.speed for car in cars]) * moving,
+        steering=np.array([-car.action["steering"] for car in cars]),
+        crashed=np.array([car.crashed for car in cars]),
+        left=~moving,
+        traffic_position=position - origin,
+        traffic_heading=heading,
+        traffic_half=half,
+    )
+
+
+def flipped(xy: Array) -> Array:
+    """Return (x, y) of highway-env in a frame whose y axis points up, or the other way round."""
+    return np.array([xy[0], -xy[1]])
+
+
+class HighwayWorld(MovedWorld):
+    """Worlds of which each has an environment of highway-env, stepped one after the other."""
+
+    def __init__(self, scenario: Scenario, *arguments: Any, **options: Any) -> None:
+        """Build the arrays and the environments; arguments and errors as for `World` and `make_environment`."""
+        super().__init__(scenario, *arguments, **options)
+        self._simulations = [Simulation(scenario) for _ in range(self.worlds)]
+
+    def restart(self) -> None:
+        """Start the next episode in the worlds of `self.mask`, see `World.restart`."""
+        seeds, episodes = self.view("seed"), self.view("episode")
+        for w in np.flatnonzero(self.mask.numpy()).tolist():
+            key = [int(seeds[w]), (int(episodes[w]) + 1) % 2**32]
+            self.place(w, self._simulations[w].reset(int(np.random.SeedSequence(key).generate_state(1)[0])))
+        super().restart()
+
+    def fetch(self) -> bool:
+        """Drive to the next tick in the worlds that are not over.
+
+        Who has ended brakes with its wheels straight: here it still rolls, and its action must not steer it.
+        """
+        commands, k = np.array(self.view("command"), dtype=float), self.view("tick")
+        ended = self.view("ended") != UNDER_WAY
+        commands[ended, SPEED] = commands[ended, STEERING] = 0.0
+        present = self.view("present")[:, self.model.landmarks :]
+        for w in np.flatnonzero((self.mask.numpy() == 0) & (k < self.model.horizon_ticks)).tolist():
+            self.move(w, self._simulations[w].drive(commands[w], present[w]))
+        return True
+
+    def source_state(self) -> dict[str, Any]:
+        """Return copies of the environments, which are objects."""
+        return {"highway": deepcopy(self._simulations)}
+
+    def set_source_state(self, values: Mapping[str, Any]) -> None:
+        """Go on with copies of environments. Raises CoopenvError: they are not of these worlds."""
+        given: Any = values.get("highway")
+        if not isinstance(given, list) or [type(simulation) for simulation in given] != [Simulation] * self.worlds:
+            raise CoopenvError("state: no environments of highway-env in it")
+        self._simulations = deepcopy(given)
+        for w, simulation in enumerate(self._simulations):
+            if simulation.begun:
+                self.remember(w, simulation.poses())
+
+
+class HighwayBackend(Simulated):
+    """Worlds of highway-env: many at once on the CPU, or one of them tick by tick."""
+
+    kind = HighwayWorld
+
+    def __init__(self, scenario: Scenario) -> None:
+        """Make one environment, whose roads are drawn; errors as for `make_environment`."""
+        road = Simulation(scenario).environment.road
+        roads = scenario.roads or drawn_roads(road.network, scenario)
+        super().__init__(scenario.model_copy(update={"roads": roads}))
+
+
+__all__ = ["HighwayBackend"]

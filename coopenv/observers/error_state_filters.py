@@ -1,0 +1,334 @@
+"""Error-state Kalman filters on SE(3): multiplicative, invariant, iterated and unscented."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from coopenv.estimation.arrays import Array, cholesky, solve
+from coopenv.estimation.compiled import MATRICES, MATRIX, VECTOR, compiled
+from coopenv.estimation.compiled_matrices import congruent, transformed
+from coopenv.estimation.compiled_rotations import exp_so3, exp_translation
+from coopenv.estimation.coordinates import Coordinates
+from coopenv.estimation.rotations import IDENTITY, lengths, skew
+from coopenv.observers import bearing_measurements
+from coopenv.observers.bearing_measurements import (
+    INVARIANT,
+    RIGHT,
+    Lines,
+    Sight,
+    across,
+    ahead,
+    dense,
+    from_left,
+    linearised,
+    sight_of,
+)
+from coopenv.observers.contract import Estimate, Message, Setup, Tick
+from coopenv.observers.correction import FRAME, Frame, Gate, Stacked, frame_of, iterated, turn_of_sight, updated
+from coopenv.observers.kernel_observer import KernelObserver
+from coopenv.observers.riccati.kernels import RICCATI
+
+
+@dataclass(frozen=True)
+class LeftError:
+    """A pose with a covariance over its left error."""
+
+    R: Array
+    p: Array  # map frame
+    P: Array
+    kind: ClassVar[int] = bearing_measurements.LEFT
+
+    @classmethod
+    def start(cls, R: Array, p: Array, P: Array) -> Self:
+        """Return the state of a pose with a covariance in LEFT coordinates."""
+        return cls(np.array(R, float), np.array(p, float), np.array(P, float))
+
+    @staticmethod
+    def transition(rotation: Array, translation: Array) -> Array:
+        """Return F (6, 6) of the error over an odometry increment (dR, dp)."""
+        F: Array = bearing_measurements.transition(np.asarray(rotation, float), np.asarray(translation, float))
+        return F
+
+    def predicted(self, tick: Tick) -> Self:
+        """Return the state after the tick's odometry."""
+        rotation, translation = np.asarray(tick.rotation, float), np.asarray(tick.translation, float)
+        step = (rotation, translation, tick.noise.odometry(tick.dt))
+        return type(self)(*bearing_measurements.predicted(self.kind, self.R, self.p, self.P, *step))
+
+    def moved(self, dx: Array, P: Array) -> Self:
+        """Return the state moved by an error dx."""
+        return type(self)(*bearing_measurements.moved(self.kind, self.R, self.p, dx), P)
+
+    @classmethod
+    def recentring(cls, dx: Array) -> Array:
+        """Return G (6, 6): about the state moved by dx, an error of dx + d about this one is G d to first order."""
+        G: Array = bearing_measurements.recentring(cls.kind, dx)
+        return G
+
+    def corrected(self, dx: Array, P: Array) -> Self:
+        """Return the state moved by an error dx, of which P is the covariance about this state."""
+        return type(self)(*bearing_measurements.corrected(self.kind, self.R, self.p, dx, P))
+
+    def point_covariance(self, marker: Array) -> Array:
+        """Return the covariance (3, 3) in map axes of a point of the body."""
+        J = np.empty((3, 6))
+        J[:, :3] = self.R.dot(skew(-marker))
+        J[:, 3:] = self.R
+        return np.asarray(J.dot(self.P).dot(J.T))
+
+    def estimate(self, nis: float | None = None, nis_dof: int = 0) -> Estimate:
+        """Return the pose with its covariance, and the normalised innovation squared of its correction."""
+        return Estimate(self.R, self.p, self.P, Coordinates.LEFT, nis, nis_dof)
+
+
+class PoseObserver:
+    """What observers share that believe in one pose and a covariance, and tell where their marker is."""
+
+    belief: ClassVar[type[LeftError]] = LeftError
+    sends_covariance = True
+
+    def __init__(self, setup: Setup) -> None:
+        self.marker = setup.marker  # what others measure
+
+    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
+        """Start at a pose."""
+        self.state = self.belief.start(*initial_pose, initial_covariance)
+
+    def message(self) -> Message:
+        """Return the marker's position, and its covariance if this observer sends it."""
+        covariance = self.state.point_covariance(self.marker) if self.sends_covariance else None
+        return Message(position=self.state.p + self.state.R.dot(self.marker), covariance=covariance)
+
+
+class Mekf(PoseObserver):
+    """Error-state filter; trusts the positions that it hears.
+
+    It sends its position alone.
+    """
+
+    sends_covariance = False
+
+    def __init__(self, setup: Setup, gated: bool = True) -> None:
+        """Take a setup; without `gated` every bearing is believed."""
+        super().__init__(setup)
+        self.gated, self.gate = gated, Gate()
+
+    def reset(self, initial_pose: tuple[Array, Array], initial_covariance: Array) -> None:
+        """Start at a pose."""
+        super().reset(initial_pose, initial_covariance)
+        self.gate.reset()
+
+    def update(self, tick: Tick) -> Estimate:
+        """Predict, then correct by every usable bearing."""
+        self.predict(tick)
+        self.nis: float | None = None
+        self.nis_dof = 0
+        sight = sight_of(tick, self.sends_covariance) if tick.due else None
+        if sight is not None:
+            self.take(tick, sight)
+        return self.state.estimate(self.nis, self.nis_dof)
+
+    def predict(self, tick: Tick) -> None:
+        """Append the increment."""
+        self.state = self.state.predicted(tick)
+
+    def take(self, tick: Tick, sight: Sight) -> None:
+        """Correct by what passes the gate."""
+        lines = linearised(self.state, tick, sight)
+        if self.gated:
+            S = self.spread(tick, sight, lines)
+            kept = self.gate.passed(tick.time, lines.residual, S, ahead(self.state, tick, sight))
+            if not kept.all():
+                sight, lines = sight.only(kept), lines.only(kept)
+        if len(lines.residual):
+            self.correct(tick, sight, lines)
+
+    def spread(self, tick: Tick, sight: Sight, lines: Lines) -> Array:
+        """Return (m, 2, 2) the covariances of the innovations."""
+        return lines.spread(self.state.P)
+
+    def correct(self, tick: Tick, sight: Sight, lines: Lines) -> None:
+        """Correct by bearings, which are linearised at the prediction."""
+        self.nis = self.fuse(tick, sight)
+        self.nis_dof = 2 * len(lines.residual)
+
+    def fuse(self, tick: Tick, sight: Sight) -> float:
+        """Correct by bearings; return their normalised innovation squared."""
+        before = self.state
+        R, p, P, nis = updated(before.kind, before.R, before.p, before.P, frame_of(tick, sight))
+        self.state = self.belief(R, p, P)
+        return float(nis)
+
+
+class MekfCovariance(Mekf):
+    """Error-state filter; weighs what it hears by covariance.
+
+    It sends position and covariance, and adds a sender's covariance to the bearing's noise.
+    """
+
+    sends_covariance = True
+
+
+class MekfCovarianceUngated(MekfCovariance):
+    """Error-state filter that believes every bearing.
+
+    It is `mekf_covariance` without a gate and without cheirality.
+    """
+
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(setup, gated=False)
+
+
+@dataclass(frozen=True)
+class InvariantError(LeftError):
+    """A pose with a covariance over xi, which is also that over the left error to first order."""
+
+    kind: ClassVar[int] = INVARIANT
+
+
+class LeftInvariant(Mekf):
+    """Invariant filter, left error; sends covariances."""
+
+    belief: ClassVar[type[LeftError]] = InvariantError
+    sends_covariance = True
+
+
+@dataclass(frozen=True)
+class RightError(LeftError):
+    """A pose with a covariance over its right error."""
+
+    kind: ClassVar[int] = RIGHT
+
+    @classmethod
+    def start(cls, R: Array, p: Array, P: Array) -> Self:
+        """Return the state of a pose with a covariance in LEFT coordinates."""
+        left = LeftError.start(R, p, P)
+        return cls(left.R, left.p, congruent(from_left(left.R, left.p), left.P))
+
+    def point_covariance(self, marker: Array) -> Array:
+        """Return the covariance (3, 3) in map axes of a point of the body."""
+        J = np.concatenate([skew(-self.p - self.R.dot(marker)), IDENTITY], axis=1)
+        return np.asarray(J.dot(self.P).dot(J.T))
+
+    def estimate(self, nis: float | None = None, nis_dof: int = 0) -> Estimate:
+        """Return the pose with its covariance, and the normalised innovation squared of its correction."""
+        return Estimate(self.R, self.p, self.P, Coordinates.RIGHT, nis, nis_dof)
+
+
+class RightInvariant(Mekf):
+    """Invariant filter, right error; sends covariances."""
+
+    belief: ClassVar[type[LeftError]] = RightError
+    sends_covariance = True
+
+
+class IteratedEkf(MekfCovariance):
+    """Error-state filter that iterates corrections; sends covariances."""
+
+    def fuse(self, tick: Tick, sight: Sight) -> float:
+        """Correct by bearings, linearised anew until the pose stays where it is; return what `Mekf.fuse` does."""
+        before, distance = self.state, float(lengths(sight.positions - self.state.p).min())
+
+        def look(at: Array) -> Stacked:
+            residual, H, N = linearised(before.moved(at, before.P), tick, sight).stacked()
+            return residual, H.dot(before.recentring(at)), N
+
+        dx, P, nis = iterated(before.P, look(np.zeros(6)), look, lambda dx: turn_of_sight(dx, distance))
+        self.state = before.corrected(dx, P)
+        return nis
+
+
+class HamelSamson(KernelObserver):
+    """The paper's observer with landmarks alone."""
+
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(RICCATI, replace(setup, targets=setup.targets[setup.targets < setup.landmarks]))
+
+    def message(self) -> Message:
+        """Return an empty message."""
+        return Message()
+
+    def __reduce__(self) -> Any:
+        return HamelSamson, (self.setup,), super().__reduce__()[2]
+
+
+SPREAD = 6.0  # squared distance of the sigma points from the mean in standard deviations: alpha = 1 in six dimensions
+WEIGHT = 1.0 / (2.0 * SPREAD)  # weight of every sigma point but the mean
+MEAN_WEIGHT = 2.0  # weight of the mean in covariances: 3 - alpha^2. In means it is 0
+
+
+class Ukf(Mekf):
+    """Unscented (sigma-point) filter; sends covariances."""
+
+    belief: ClassVar[type[LeftError]] = InvariantError
+    sends_covariance = True
+
+    def take(self, tick: Tick, sight: Sight) -> None:
+        """Correct by what passes the gate."""
+        P, frame = self.state.P, frame_of(tick, sight)
+        xi = sigma_points(P)
+        lines = linearised(self.state, tick, sight)
+        mean, S, y = unscented(self.state.R, self.state.p, xi, lines.N, frame)
+        r = lines.residual.ravel() - mean
+        if self.gated:
+            each = np.arange(len(sight.targets))
+            blocks = S.reshape(len(each), 2, len(each), 2)[each, :, each, :]
+            kept = self.gate.passed(tick.time, r.reshape(-1, 2), blocks, ahead(self.state, tick, sight)).repeat(2)
+            if not kept.any():
+                return
+            if not kept.all():
+                S, y, r = S[np.ix_(kept, kept)], y[:, kept], r[kept]
+        solved = solve(S, np.concatenate([WEIGHT * y.T.dot(xi), r[:, None]], axis=1))
+        gain = solved[:, :-1].T
+        P = P - gain.dot(S).dot(gain.T)
+        self.state = self.state.moved(gain.dot(r), (P + P.T) / 2)
+        self.nis, self.nis_dof = float(r.dot(solved[:, -1])), len(r)
+
+
+def sigma_points(P: Array) -> Array:
+    """Return (12, 6) the sigma points but the mean: plus and minus the columns of a square root of SPREAD P."""
+    try:
+        root = cholesky(SPREAD * P).T
+    except np.linalg.LinAlgError:  # singular to rounding
+        values, vectors = np.linalg.eigh(SPREAD * P)
+        root = (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    return np.concatenate([root, -root])
+
+
+@compiled(VECTOR)
+def unit(v: Array) -> Array:
+    """Return v (3,) at length 1."""
+    return v / max(math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]), 1e-9)
+
+
+@compiled(MATRIX, VECTOR, MATRIX, MATRICES, FRAME)
+def unscented(R: Array, p: Array, xi: Array, N: Array, frame: Frame) -> tuple[Array, Array, Array]:
+    """Return the mean (2m,) and covariance (2m, 2m) of bearings in the tangent planes at the mean's, noise N included.
+
+    The third is what each of the sigma points xi (k, 6) adds, (k, 2m).
+    """
+    lever_arm, _, positions, _, _ = frame
+    m, k = len(positions), len(xi)
+    y, mean = np.empty((k, 2 * m)), np.zeros(2 * m)
+    for n in range(m):
+        a = transformed(R.T, positions[n] - p)
+        d = unit(a - lever_arm)
+        B = across(d[0], d[1], d[2])
+        for s in range(k):
+            theta, rho = xi[s, :3], xi[s, 3:]
+            d = unit(transformed(exp_so3(theta).T, a - exp_translation(theta, rho)) - lever_arm)
+            for r in range(2):
+                y[s, 2 * n + r] = B[r, 0] * d[0] + B[r, 1] * d[1] + B[r, 2] * d[2]
+                mean[2 * n + r] += WEIGHT * y[s, 2 * n + r]
+    S = dense(N)
+    for i in range(2 * m):
+        for s in range(k):
+            y[s, i] -= mean[i]
+    for i in range(2 * m):
+        for j in range(2 * m):
+            S[i, j] += MEAN_WEIGHT * mean[i] * mean[j]
+            for s in range(k):
+                S[i, j] += WEIGHT * y[s, i] * y[s, j]
+    return mean, S, y

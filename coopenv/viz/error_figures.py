@@ -1,0 +1,373 @@
+"""Errors, consistency and observability over time."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, NullLocator
+from scipy.stats import chi2
+
+from coopenv.estimation.metrics import (
+    CONVERGED,
+    STEADY_SHARE,
+    error_rotation,
+    live_ticks,
+    observability_of,
+    roll_pitch_yaw_deg,
+    settling_times,
+    steady_mean,
+)
+from coopenv.estimation.observability import Observability
+from coopenv.estimation.trajectory import Trajectory
+from coopenv.viz import style
+
+_ROW, _NARROW_ROW, _FRAME = 1.35, 0.95, 0.95  # inches
+_DASHED, _DOTTED = (0, (4, 2)), (0, (1, 1.5))
+_LATE = 0.7  # share of the record after which errors are small, and drawn linearly
+_LEAST_LINEAR = 1e-3  # m or deg
+_MOST_DECADES = 2  # that are labelled on each side of zero
+_ALWAYS = 0.95  # share of the record: what holds for longer is no event to shade
+_USUAL = 0.9  # share of the last errors that are drawn linearly
+_DOT = 4.0  # pt
+
+
+class _Quantity(NamedTuple):
+    """What one column shows."""
+
+    components: list[np.ndarray]  # per vehicle (k, 3), m or deg
+    title: str
+    tolerance: float  # m or deg, of settling
+    names: tuple[str, str, str]
+
+
+def error_figure(trajectory: Trajectory, ends: Sequence[float] | None = None, width: float | None = None) -> Figure:
+    """Draw position (map frame, m) and orientation errors (roll, pitch, yaw of Rtilde, deg) against time.
+
+    Ordinates are linear about zero and logarithmic beyond, the same for all vehicles, so that the first errors and the
+    last can be read alike. Lines are medians over short stretches, bands their range. Dots: the errors at t = 0, before
+    the first correction. Blue shading: the vehicle detects a moving target. Dashed line: from there on the errors stay
+    below the tolerance. Grey: the vehicle has ended (at `ends`, s) and is parked. `width`: inches (None: a page's).
+    """
+    count = len(trajectory.vehicles)
+    narrow = width is not None and width < style.NARROW
+    figure, inches = style.canvas(width, _FRAME + (_NARROW_ROW if narrow else _ROW) * count, "")
+    axes = figure.subplots(count, 2, squeeze=False)
+    converged, live = settling_times(trajectory, ends), live_ticks(trajectory.t, count, ends)
+    seen = [style.moving_target_seen(trajectory, vehicle, ticks) for vehicle, ticks in enumerate(live)]
+    events = [
+        mask if mask[:ticks].mean() < _ALWAYS else np.zeros_like(mask) for mask, ticks in zip(seen, live, strict=True)
+    ]
+    for quantity, column in zip(_quantities(trajectory, live), axes.T, strict=True):
+        for vehicle, (ax, ticks) in enumerate(zip(column, live, strict=True)):
+            style.tidy(ax)
+            style.shade(ax, style.runs(trajectory.t, events[vehicle], style.MERGED_GAP))
+            style.shade_ended(ax, trajectory.t, ticks)
+            _draw(ax, trajectory.t[:ticks], quantity, vehicle, style.bins_of(inches / 2))
+            if np.isfinite(converged[vehicle]):
+                ax.axvline(converged[vehicle], color=style.INK, linewidth=0.8, linestyle=_DASHED)
+            style.time_axis(ax, trajectory.t, labelled=vehicle == count - 1)
+        _share_scale(column, quantity)
+        column[0].set_title(
+            quantity.title.replace(" error", "" if narrow else " error"), fontsize=style.NORMAL, color=style.INK
+        )
+    for vehicle, ax in enumerate(axes[:, 0]):
+        name, last = style.vehicle_label(trajectory.vehicles[vehicle]), converged[vehicle]
+        ax.set_ylabel(name, rotation=0, ha="right", va="center", fontsize=style.NORMAL + 2, color=style.INK)
+        when = f"last above {CONVERGED.position_m:g} m or {CONVERGED.orientation_deg:g} deg: {last:.1f} s"
+        when = "above to the end" if np.isnan(last) else f"last above: {last:.1f} s" if narrow else when
+        style.note(ax, 0.985, 0.95, when, ha="right", va="top", path_effects=style.HALO)
+    style.legend_above(figure, _marks(converged, any(map(np.any, events)), live.min() < len(trajectory.t)))
+    return figure
+
+
+def _quantities(trajectory: Trajectory, live: np.ndarray) -> tuple[_Quantity, _Quantity]:
+    positions, angles = [], []
+    for vehicle, ticks in enumerate(live):
+        part = slice(ticks), vehicle
+        with np.errstate(invalid="ignore", over="ignore"):  # of an observer that has diverged
+            tilde = error_rotation(trajectory.rotation[part], trajectory.rotation_estimate[part])
+            error = np.asarray(trajectory.position[part], float) - trajectory.position_estimate[part]
+        positions.append(style.drawable(error))
+        angles.append(unwrapped(style.drawable(roll_pitch_yaw_deg(tilde))))
+    return (
+        _Quantity(positions, "position error [m]", CONVERGED.position_m, ("x", "y", "z")),
+        _Quantity(angles, "orientation error [deg]", CONVERGED.orientation_deg, ("roll", "pitch", "yaw")),
+    )
+
+
+def unwrapped(angles: np.ndarray) -> np.ndarray:
+    """Return angles (K, 3), deg, without jumps by whole turns; in the end they lie within half a turn of zero.
+
+    What is NaN stays so, and is passed over.
+    """
+    result = np.array(angles, float)
+    for angle in result.T:
+        known = np.isfinite(angle)
+        if known.any():
+            smooth = np.unwrap(angle[known], period=360.0)
+            late = np.median(smooth[int(_LATE * len(smooth)) :])
+            angle[known] = smooth - 360.0 * np.round(late / 360.0)
+    return result
+
+
+def _draw(ax: Axes, t: np.ndarray, quantity: _Quantity, vehicle: int, bins: int) -> None:
+    ax.axhline(0.0, color=style.GREY, linewidth=0.6, zorder=1)
+    for level in (-quantity.tolerance, quantity.tolerance):
+        ax.axhline(level, color=style.GREY, linewidth=0.9, linestyle=_DOTTED)
+    for component, colour in zip(quantity.components[vehicle].T, style.AXES_COLOURS, strict=True):
+        first = 1 if len(t) > 1 else 0  # what was before the first correction is a dot
+        style.draw_band(ax, t[first:], component[first:], bins, color=colour, linewidth=style.LINE)
+        ax.plot(t[:1], component[:1], "o", color=colour, markersize=_DOT, clip_on=False, zorder=4)
+
+
+def _share_scale(column: Sequence[Axes], quantity: _Quantity) -> None:
+    """Give panels the same ordinate: linear up to the size of the last errors, logarithmic beyond."""
+    late = np.concatenate([part[int(_LATE * len(part)) :].ravel() for part in quantity.components])
+    whole = np.concatenate([part.ravel() for part in quantity.components])
+    late, whole = np.abs(late[np.isfinite(late)]), np.abs(whole[np.isfinite(whole)])
+    usual = float(np.quantile(late, _USUAL)) if len(late) else 0.0
+    largest = float(whole.max(initial=quantity.tolerance))
+    linear = float(np.clip(10 ** np.ceil(np.log10(max(usual, 1e-12))), _LEAST_LINEAR, quantity.tolerance))
+    decades = linear * 10.0 ** np.arange(0, np.floor(np.log10(largest / linear) + 1e-9) + 1)
+    decades = decades[:: -(-len(decades) // _MOST_DECADES)]
+    for ax in column:
+        ax.set_yscale("symlog", linthresh=linear, linscale=1.0)
+        ax.set_ylim(-1.6 * largest, 1.6 * largest)
+        ax.set_yticks([*-decades[::-1], 0.0, *decades])
+        ax.yaxis.set_minor_locator(NullLocator())
+        ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "\N{MINUS SIGN}")))
+
+
+def _marks(converged: np.ndarray, shaded: bool, ended: bool) -> list[Line2D | Patch]:
+    """Return what the legend explains of all that is in the figure."""
+    ink = style.INK
+    lines = [
+        Line2D([], [], color=colour, linewidth=style.LINE, label=f"{first}, {second}")
+        for first, second, colour in zip("xyz", ("roll", "pitch", "yaw"), style.AXES_COLOURS, strict=True)
+    ]
+    marks: list[tuple[bool, Line2D | Patch]] = [
+        (True, Line2D([], [], color=ink, linestyle="none", marker="o", markersize=_DOT, label="at t = 0")),
+        (True, Line2D([], [], color=style.GREY, linestyle=_DOTTED, linewidth=0.9, label=f"± {CONVERGED.text}")),
+        (
+            bool(np.isfinite(converged).any()),
+            Line2D([], [], color=ink, linestyle=_DASHED, linewidth=0.8, label="last above either"),
+        ),
+        (shaded, Patch(facecolor=style.SHADE, label="moving target detected")),
+        (ended, Patch(facecolor=style.ENDED, label="ended, parked")),
+    ]
+    return [*lines, *(mark for occurs, mark in marks if occurs)]
+
+
+DEGREES_OF_FREEDOM = 6
+NEES_BOUNDS = (float(chi2.ppf(0.025, DEGREES_OF_FREEDOM)), float(chi2.ppf(0.975, DEGREES_OF_FREEDOM)))
+"""95 % of the NEES of a consistent observer lie between these, at one instant over many runs."""
+
+_NEES_ROW, _NEES_NARROW_ROW, _NEES_FRAME = 1.3, 0.95, 1.2  # inches
+_EXPECTED: dict[str, Any] = {"color": style.GREY, "linewidth": 0.8, "linestyle": (0, (4, 2))}
+_STEADY: dict[str, Any] = {"color": style.INK, "linewidth": 0.7, "linestyle": (0, (1, 1.5))}
+_SPREAD_LOOKS: tuple[dict[str, Any], dict[str, Any]] = (
+    {"color": style.VERMILION, "linestyle": (0, (4, 1.5)), "linewidth": 1.4},
+    {"color": style.INK, "linestyle": "-", "linewidth": 0.8},
+)
+"""Of what is claimed, and of what is."""
+_SHORT = 9.0  # inches: in narrower figures panels have no room for sentences
+_TITLES, _NARROW_TITLES = ("NEES (6 dof)", "position [m]", "orientation [deg]"), ("NEES", "[m]", "[deg]")
+_ROOM = 0.3  # of the height, for words above the curves
+HONEST = (
+    "An honest observer's NEES lies in the band 95 % of the time; "
+    "above it, the observer believes itself better than it is."
+)
+GAIN = "The P of this observer is the gain matrix of its Riccati equation, not a covariance: its NEES says nothing."
+
+
+def consistency_figure(
+    trajectory: Trajectory,
+    ends: Sequence[float] | None = None,
+    steady_from: float | None = None,
+    width: float | None = None,
+    *,
+    gain: bool = False,
+) -> Figure:
+    """Draw, per vehicle, NEES, and both errors beside the standard deviations that the observer claims.
+
+    The bounds hold at each instant over many runs; the ticks of one run are correlated, so the share of ticks
+    inside is a hint, not a test. Ordinates are the same for all vehicles.
+
+    Args:
+        trajectory: the record of a run.
+        ends: s, when each vehicle was parked, after which nothing counts.
+        steady_from: s; the mean NEES and the share inside are over the ticks after it (None: `STEADY_SHARE` of
+            the record).
+        width: inches (None: a page's).
+        gain: whether P is the gain matrix of an observer that states no covariance, which the figure then says.
+    """
+    if steady_from is None:
+        steady_from = STEADY_SHARE * float(trajectory.t[-1])
+    count = len(trajectory.vehicles)
+    narrow, short = (width is not None and width < limit for limit in (style.NARROW, _SHORT))
+    figure, _ = style.canvas(width, _NEES_FRAME + (_NEES_NARROW_ROW if narrow else _NEES_ROW) * count, "")
+    axes = figure.subplots(count, 3, squeeze=False)
+    variance = np.diagonal(np.asarray(trajectory.covariance, float), axis1=-2, axis2=-1)
+    with np.errstate(invalid="ignore"):  # of an observer that has diverged
+        spread = np.sqrt(variance.reshape(-1, count, 2, 3).sum(axis=-1))
+    live = live_ticks(trajectory.t, count, ends)
+    for vehicle, (left, middle, right) in enumerate(axes):
+        ticks = live[vehicle]
+        t, part = trajectory.t[:ticks], (slice(ticks), vehicle)
+        _draw_nees(left, t, trajectory.nees[part], steady_from, short)
+        _draw_spread(middle, t, trajectory.position_error[part], spread[part][:, 1])
+        _draw_spread(right, t, trajectory.orientation_error[part], np.degrees(spread[part][:, 0]))
+        name = style.vehicle_label(trajectory.vehicles[vehicle])
+        left.set_ylabel(name, fontsize=style.NORMAL + 2, rotation=0, ha="right", va="center")
+        for ax in (left, middle, right):
+            style.shade_ended(ax, trajectory.t, ticks)
+            style.time_axis(ax, trajectory.t, labelled=vehicle == count - 1)
+    for column, room in zip(axes.T, (_ROOM, 0.0, 0.0), strict=True):
+        _share_decades(column, room)
+    for ax, title in zip(axes[0], _NARROW_TITLES if narrow else _TITLES, strict=True):
+        ax.set_title(title, fontsize=style.NORMAL, color=style.INK)
+    style.explain(figure, GAIN if gain else HONEST)
+    ended = [Patch(facecolor=style.ENDED, label="ended, parked")] if live.min() < len(trajectory.t) else []
+    style.legend_above(figure, [*_nees_marks(trajectory.t, steady_from), *ended])
+    return figure
+
+
+def _nees_marks(t: np.ndarray, steady_from: float) -> list[Patch | Line2D]:
+    claimed, error = _SPREAD_LOOKS
+    steady = [Line2D([], [], label="steady state", **_STEADY)] if t[0] < steady_from < t[-1] else []
+    return [
+        Patch(facecolor=style.SHADE, label="95 % of $\\chi^2_6$"),
+        Line2D([], [], label="expected", **_EXPECTED),
+        *steady,
+        Line2D([], [], label="error", **error),
+        Line2D([], [], label="claimed std. deviation", **claimed),
+    ]
+
+
+def _share_decades(column: Sequence[Axes], room: float) -> None:
+    """Give panels the same logarithmic ordinate, which holds what all of them show, and room above it."""
+    for ax in column:
+        style.show_decades(ax)
+    limits = [ax.get_ylim() for ax in column]
+    bottom, top = min(low for low, _ in limits), max(high for _, high in limits)
+    for ax in column:
+        ax.set_ylim(bottom, top * (top / bottom) ** room)
+
+
+def _draw_nees(ax: Axes, t: np.ndarray, nees: np.ndarray, steady_from: float, short: bool) -> None:
+    style.tidy(ax)
+    ax.axhspan(*NEES_BOUNDS, color=style.SHADE, zorder=0)
+    ax.axhline(DEGREES_OF_FREEDOM, **_EXPECTED)
+    ax.set_yscale("log")
+    shown = style.drawable(nees, positive=True)
+    if np.isnan(shown).all():
+        reason = "no covariance declared" if np.isnan(nees).all() else "none to draw"
+        style.note(ax, 0.5, 0.5, reason, ha="center", color=style.NOTE)
+        return
+    keep = style.thinned(len(t))
+    ax.plot(t[keep], shown[keep], color=style.INK, linewidth=0.7)
+    words = _verdict(t, nees, steady_from, short)
+    style.note(ax, 0.985, 0.95, words, ha="right", va="top", path_effects=style.HALO)
+    if t[0] < steady_from < t[-1]:
+        ax.axvline(steady_from, **_STEADY)
+
+
+def _verdict(t: np.ndarray, nees: np.ndarray, steady_from: float, short: bool) -> str:
+    """Return the mean NEES that the table of the run has, too."""
+    steady = nees[t > steady_from]
+    if not len(steady):
+        return "ended before" if short else f"ended before the steady state ({steady_from:.4g} s)"
+    inside = np.mean((steady >= NEES_BOUNDS[0]) & (steady <= NEES_BOUNDS[1]))
+    mean = float(steady_mean(t, nees, steady_from))
+    if short:
+        return f"mean {mean:.3g}"
+    return f"after {steady_from:.4g} s: mean {mean:.3g}, {100 * inside:.0f} % of ticks inside"
+
+
+def _draw_spread(ax: Axes, t: np.ndarray, error: np.ndarray, spread: np.ndarray) -> None:
+    style.tidy(ax)
+    ax.set_yscale("log")
+    keep = style.thinned(len(t))
+    for values, look in zip((spread, error), _SPREAD_LOOKS, strict=True):
+        shown = style.drawable(values, positive=True)
+        if not np.isnan(shown).all():
+            ax.plot(t[keep], shown[keep], **look)
+
+
+_VERDICTS: dict[bool, dict[str, Any]] = {
+    True: {"facecolor": style.GREEN, "edgecolor": "none", "label": "observable"},
+    False: {"facecolor": "white", "edgecolor": style.VERMILION, "hatch": "//////", "label": "not observable"},
+}
+_FLOOR = 1e-8  # smaller eigenvalues are drawn here: they are zero but for rounding
+_DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (6, 1.5, 1, 1.5)), (0, (1, 0.8)))
+_GRAMIAN_FRAME, _NARROW_FRAME, _LANE = 3.6, 2.6, 0.24  # inches
+MEANING = (
+    "Observable: the bearings of a window, together with odometry, determine the pose near the truth. "
+    "It does not promise that an observer gets there from any start."
+)
+
+
+def observability_figure(
+    observability: Observability, ends: Sequence[float] | None = None, width: float | None = None
+) -> Figure:
+    """Draw the eigenvalue that the verdict rests on, and the verdict of every vehicle.
+
+    Windows that reach beyond a vehicle's end (s) are left out. `width` is in inches (None: a page's).
+    """
+    count = len(observability.vehicles)
+    cut = [observability_of(observability, i, np.nan if ends is None else ends[i]) for i in range(count)]
+    frame = _NARROW_FRAME if width is not None and width < style.NARROW else _GRAMIAN_FRAME
+    figure, _ = style.canvas(width, frame + _LANE * count, "")
+    local, verdict = figure.subplots(2, 1, height_ratios=(2.0, max(0.3, _LANE * count)))
+    handles = _draw_eigenvalues(local, cut)
+    low = any((part.local_eigenvalue < _FLOOR).any() for part in cut)
+    style.explain(figure, MEANING + (f" Smaller eigenvalues are drawn at {_FLOOR:g}." if low else ""))
+    local.axhline(observability.threshold, color=style.INK, linewidth=0.9, linestyle=_DASHES[1])
+    handles.append(Line2D([], [], color=style.INK, linewidth=0.9, linestyle=_DASHES[1], label="threshold"))
+    window = f"smallest eigenvalue of the\nGramian over {observability.window:.3g} s, scaled [-]"
+    local.set_ylabel(window, fontsize=style.NORMAL, color=style.INK)
+    style.show_decades(local)
+    occurring = _draw_verdict(verdict, cut)
+    for ax in (local, verdict):
+        if len(observability.t):
+            span = np.array([observability.t[0], observability.t[-1] + observability.window])
+            style.time_axis(ax, span, labelled=ax is verdict)
+    style.legend_above(figure, [*handles, *occurring])
+    return figure
+
+
+def _draw_eigenvalues(ax: Axes, cut: list[Observability]) -> list[Line2D | Patch]:
+    """Draw one line per vehicle, of different dashes where they lie upon one another; return what explains them."""
+    style.tidy(ax)
+    ax.set_yscale("log")
+    drawn: list[Line2D | Patch] = []
+    for vehicle, part in enumerate(cut):
+        name = style.vehicle_label(part.vehicles[0])
+        look: dict[str, Any] = {"linewidth": style.LINE, "color": style.vehicle_colour(vehicle), "label": name}
+        look["linestyle"] = _DASHES[vehicle % len(_DASHES)]
+        drawn.append(Line2D([], [], **look))
+        if len(part.t):
+            keep = style.thinned(len(part.t))
+            values = part.local_eigenvalue[keep, 0]
+            ax.plot(part.t[keep], np.maximum(values, _FLOOR), **look)
+    return drawn
+
+
+def _draw_verdict(ax: Axes, cut: list[Observability]) -> list[Patch]:
+    """Draw the verdict of every vehicle, and return what explains it."""
+    style.tidy(ax)
+    ax.grid(False, axis="y")
+    occurring = set()
+    for vehicle, part in enumerate(cut):
+        for observable, look in _VERDICTS.items():
+            stretches = [(s, e - s) for s, e, verdict in part.intervals(0) if verdict == observable]
+            if stretches:
+                occurring.add(observable)
+                ax.broken_barh(stretches, (vehicle - 0.32, 0.64), linewidth=0.4, **look)
+    ax.set_yticks(range(len(cut)), [style.vehicle_label(part.vehicles[0]) for part in cut])
+    ax.set_ylim(len(cut) - 0.5, -0.5)
+    return [Patch(**look) for observable, look in _VERDICTS.items() if observable in occurring]
