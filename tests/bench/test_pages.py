@@ -161,7 +161,7 @@ def test_figures_that_are_older_than_the_environment_are_marked() -> None:
         (["page"], "name environments, or give --all"),
         (["page", "facade", "--all"], "name environments, or give --all"),
         (["page", "facad"], "did you mean 'facade'"),
-        (["page", "facade", "elsewhere/facade.toml"], "two environments have the same name"),
+        (["page", "facade", "envs/facade.toml"], "two environments have the same name"),
         (["page", "busy_intersection", "--measure"], "all motion here is prescribed"),
     ],
 )
