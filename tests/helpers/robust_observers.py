@@ -9,8 +9,8 @@ import numpy as np
 from coopenv.observers import Setup
 from coopenv.observers.kernel_observer import KernelObserver
 from coopenv.observers.robust.constants import MAX_MEMBERS, MAX_MEMBERS_JOINT
-from coopenv.observers.robust.joint.kernels import ROBUST_JOINT
-from coopenv.observers.robust.kernels import ROBUST
+from coopenv.observers.robust.joint_fusion import ROBUST_JOINT
+from coopenv.observers.robust.observer import ROBUST
 
 
 class Open(KernelObserver):

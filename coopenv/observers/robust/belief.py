@@ -21,7 +21,7 @@ from coopenv.observers.robust.algebra import (
     with_noise,
 )
 from coopenv.observers.robust.constants import FORGET_TIME, SAME_TIME
-from coopenv.observers.robust.memory import ERRORS, MOUNTING, Estimate, Member, Pose, mat66d
+from coopenv.observers.robust.memory import ERRORS, MOUNTING, Anchor, Estimate, Member, Pose, mat66d
 from coopenv.world.camera import VISIBLE
 from coopenv.world.device_function import device_function
 
@@ -207,3 +207,10 @@ def make_room(model: Any, memory: Any, world: int, i: int, tick: int) -> bool:
     if n > 0:
         remove_member(memory, world, i, n)
     return n > 0
+
+
+@device_function
+def set_anchor(memory: Any, world: int, i: int, P: Any, tick: int):
+    """Remember where the vehicle is, for a search after a loss."""
+    here = Estimate(memory.member[world, i, 0].pose, P)
+    memory.anchor[world, i] = Anchor(here, memory.belief[world, i].odometry, tick)

@@ -1,5 +1,7 @@
 """Every number that is a choice, and why it is what it is."""
 
+THIRD = 1.0 / 3.0
+
 # Belief
 
 MAX_MEMBERS, MAX_MEMBERS_JOINT = 5, 8
@@ -54,7 +56,7 @@ DRIFT_TIME, SLOW_DRIFT_TIME = 3.0, 30.0  # s over which a sender's place is held
 SLACK = 0.1  # share of the noise of its odometry by which a sender may be off in what it says of its errors. Tuned
 JUMP_STD = 4.0  # standard deviations beyond what brakes can do by which its odometry jumps
 WORD_GATE = 60.0
-"""Gate of the squared size of how far bearings say that a sender is off, see evidence.py. Tuned: the honest pass."""
+"""Gate of the squared size of a sender's error that innovations reveal. Tuned: honest senders pass."""
 EVIDENCE_SHARE = 0.5  # of a frame's information on that, because innovations are not quite white. Tuned
 LEAST_CERTAINTY = 0.01  # 1/m^2, at first
 ERROR_FACTOR = 2.0  # by which who has lied may be farther off than it seems. Chosen

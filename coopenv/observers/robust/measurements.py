@@ -20,19 +20,19 @@ from coopenv.observers.robust.constants import (
     MAX_ACCELERATION,
     MAX_SPEED,
     MEMBER_BEND_TIME,
+    THIRD,
 )
 from coopenv.observers.robust.memory import Frame, mat26d, vec3d
-from coopenv.observers.robust.mounting import mounting_of, mounting_variances
-from coopenv.observers.robust.odometry import increment_noise
+from coopenv.observers.robust.propagation import increment_noise, mounting_of, mounting_variances
+from coopenv.observers.robust.sender_monitor import is_barred
 from coopenv.observers.robust.tracklets import only_returns
-from coopenv.observers.robust.trust import is_barred
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
 from coopenv.world.device_function import device_function
 from coopenv.world.v2x import fresh
 
 HALF_ACCELERATION = 0.5 * MAX_ACCELERATION
-THIRD = 1.0 / 3.0
-"""Also the variance of a uniform distribution over [-1, 1], which the paper's noise has on the image plane."""
+UNIFORM_VARIANCE = THIRD
+"""Variance of a uniform distribution over [-1, 1], the paper's noise on the image plane."""
 SEARCH, RESECTION, TRACKING = 0, 1, 2  # what bearings are for
 
 
@@ -42,7 +42,7 @@ def bearing_variance(model: Any, i: int):
     std = wp.float64(model.noise[i].bearing)
     variance = std * std
     if model.noise[i].bearing_paper == 1:
-        variance = variance * wp.float64(THIRD)
+        variance = variance * wp.float64(UNIFORM_VARIANCE)
     return wp.max(variance, wp.float64(MIN_BEARING_STD) * wp.float64(MIN_BEARING_STD))
 
 

@@ -6,11 +6,15 @@ any precision, because what a neighbour has learnt is a small difference of larg
 
 from typing import Any
 
+import numpy as np
 import warp as wp
 
-from coopenv.observers.robust.constants import MAX_HYPOTHESES, MAX_MEMBERS
+from coopenv.estimation.validity import are_covariances
+from coopenv.observers.robust.constants import MAX_CORRELATIONS, MAX_HYPOTHESES, MAX_MEMBERS, MAX_OFFENCES, STEPS
+from coopenv.scenario.base import LARGEST
 from coopenv.world.device_function import device_function
-from coopenv.world.records import array
+from coopenv.world.records import array, extended
+from coopenv.world.saved_state import COVARIANCE, FLAG, LEAST_EIGENVALUE, ROTATION, TICK, Rule, numbers, whole
 
 vec2d: Any = wp.vec2d
 vec3d: Any = wp.vec3d
@@ -60,7 +64,7 @@ class Member:
     has_twist: wp.int32
     v: vec3d  # m/s, body; of the odometry's errors: (scale, 0, 0)
     w: vec3d  # rad/s, body; of the odometry's errors: the gyro's bias
-    dated_v: vec3d  # m/s, body: by which clocks that are off count, see told/clocks.py
+    dated_v: vec3d  # m/s, body: by which clocks that are off count, see correlated_fusion.py
     velocity_variance: wp.float64  # (m/s)^2 per axis, of v
     seen_tick: wp.int32  # when it was last in view
     report: Report  # its last one, at which it stands
@@ -72,7 +76,7 @@ class Member:
 
 @wp.struct
 class Drift:
-    """A sum of steps, which forgets, see drift.py."""
+    """A sum of steps, which forgets, see sender_monitor.py."""
 
     sum: vec3d  # m
     covariance: mat33d  # m^2
@@ -80,7 +84,7 @@ class Drift:
 
 @wp.struct
 class Word:
-    """What a vehicle makes of what another one says of its place, see trust.py; along the axes of the map."""
+    """What a vehicle makes of what another one says of its place, see sender_monitor.py; along the axes of the map."""
 
     offset: vec3d  # 1/m: information on how far it is from where it says
     certainty: mat33d  # 1/m^2: the matrix of that information
@@ -101,7 +105,7 @@ class Belief:
     has_sample: wp.int32  # whether there has been a tick
     sample_v: vec3d  # m/s, body: the odometry sample held at the last tick's end
     sample_w: vec3d  # rad/s, body
-    mean_v: vec3d  # m/s, body: of the samples of late, see odometry.py
+    mean_v: vec3d  # m/s, body: of the samples of late, see propagation.py
     members: wp.int32  # how many
     others: wp.int32  # the first of them that is another vehicle; before it the odometry's errors and the mounting
     depends_on: wp.uint64  # bits of vehicles
@@ -162,7 +166,7 @@ class Line:
     """A bearing of the frame as a measurement; scratch, see measurements.py."""
 
     member: wp.int32  # that it is to; 0: to a point in the map
-    teller: wp.int32  # the member who has told that point, see told/revision.py
+    teller: wp.int32  # the member who has told that point, see solution_separation.py
     mounting: wp.int32  # see `Frame`
     bearing: vec3d  # body frame
     point: vec3d  # m, in the member's body or in the map
@@ -212,8 +216,8 @@ class CommonMemory:
     gain: array("WAK", mat26d)  # scratch: of a line in a member, transposed and not yet weighted, see correction.py
 
 
-ERRORS = 1  # the member that stands for the odometry's errors, where there is one, see odometry.py
-MOUNTING = 2  # the member that stands for the error of the camera's mounting, where there is one, see mounting.py
+ERRORS = 1  # the member that stands for the odometry's errors, where there is one, see propagation.py
+MOUNTING = 2  # the member that stands for the error of the camera's mounting, where there is one, see propagation.py
 SIZES = {"K": MAX_MEMBERS + MOUNTING, "H": MAX_HYPOTHESES + 1}  # besides the hypotheses of one frame there is the prior
 
 
@@ -236,3 +240,126 @@ def clear(model: Any, memory: Any, world: int, i: int):
         memory.line[world, n] = Line()
         for k in range(members):
             memory.gain[world, n, k] = mat26d()
+
+
+LARGE = numbers(LARGEST**3)
+
+
+def are_joint(blocks: Any, count: Any) -> Any:
+    """Return (...) which blocks (..., K, K, 6, 6) are covariances, as far as they count (...)."""
+    K = blocks.shape[-3]
+    used = np.repeat(np.arange(K) < count[..., None], 6, axis=-1)
+    P = np.swapaxes(blocks, -3, -2).reshape(*count.shape, 6 * K, 6 * K)
+    joint = np.where(used[..., :, None] & used[..., None, :], P, np.eye(6 * K))
+    return are_covariances(joint, LEAST_EIGENVALUE[blocks.dtype])
+
+
+def where(used: str, rules: dict[str, Rule]) -> dict[str, Rule]:
+    """Return rules that count where a field of the memory says so."""
+    return {name: rule._replace(used=f"observer_{used}") for name, rule in rules.items()}
+
+
+def _others(rule: Rule) -> Rule:
+    """Return the rule of what is kept of the other vehicles, not of the vehicle itself and its odometry's errors."""
+
+    def holds(values: Any, fields: Any, model: Any) -> Any:
+        others = fields["observer_belief.others"][..., None]
+        mask = np.asarray(rule.holds(values, fields, model))
+        of_own = np.arange(values.shape[2]) < others
+        return mask | of_own.reshape(*of_own.shape, *(1,) * (mask.ndim - of_own.ndim))
+
+    return rule._replace(holds=holds)
+
+
+def rules_for(members: int) -> dict[str, Rule]:
+    """Return what a saved memory with so many members may hold, by field, see `coopenv.world.saved_state`."""
+    flags = (
+        "search.active outbox.valid inbox.valid belief.has_sample member.has_twist member.distrusted "
+        "member.considered member.untold outbox.news inbox.news member.report.news member.report.valid line.fits "
+        "belief.accused_followed word.perjured"
+    )
+    ticks = "member.seen_tick member.report.tick anchor.tick outbox.tick inbox.tick"
+    large = (
+        "hypothesis.cost hypothesis.misfit hypothesis.prior_distance line.variance line.noise line.common_noise "
+        "line.weight scratch.column gain word.certainty"
+    )
+    rules = {
+        **dict.fromkeys(flags.split(), FLAG),
+        **dict.fromkeys(ticks.split(), TICK),
+        **dict.fromkeys(large.split(), LARGE),
+        **dict.fromkeys(("belief.odometry.R", "anchor.estimate.pose.R", "anchor.odometry.R"), ROTATION),
+        **dict.fromkeys(("search.attempts", "belief.told_interval"), whole(0, 10**9)),
+        "word.offences": whole(0, MAX_OFFENCES),
+        "word.barred_until": whole(0, 2**31 - 1),
+        "belief.members": whole(1, members),
+        "belief.accused": whole(0, 0),
+        "belief.others": whole(1, MOUNTING + 1),
+        "P": Rule("a covariance", lambda P, fields, model: are_joint(P, fields["observer_belief.members"]), axes=4),
+        "anchor.estimate.P": COVARIANCE,
+        "search.hypotheses": whole(0, MAX_HYPOTHESES),
+        **dict.fromkeys(("line.member", "line.teller"), whole(0, members - 1)),
+        "line.mounting": whole(0, MOUNTING),
+        **where("belief.members", {"member.pose.R": ROTATION, "member.vehicle": whole(0, "vehicles")}),
+        **where("search.active", {"search.prior.pose.R": ROTATION, "search.prior.P": COVARIANCE}),
+        **where("search.hypotheses", {"hypothesis.estimate.pose.R": ROTATION, "hypothesis.estimate.P": COVARIANCE}),
+    }
+    reports = {"pose.R": ROTATION, "P": COVARIANCE, "odometry.R": ROTATION}
+    for box in ("outbox", "inbox"):
+        rules |= where(f"{box}.valid", {f"{box}.{name}": rule for name, rule in reports.items()})
+    return rules | where("belief.members", {f"member.report.{name}": _others(rule) for name, rule in reports.items()})
+
+
+@wp.struct
+class Correlation:
+    """What a sender tells of its error and that of a vehicle that it hears, see correlations.py."""
+
+    vehicle: wp.int32  # -1: none
+    tick: wp.int32  # when the report was sent that the sender has from that vehicle
+    matrix: mat66f  # whole numbers, in steps
+
+
+@wp.struct
+class Known:
+    """The covariance of a sender's new error with that of a member; scratch, see correlations.py."""
+
+    member: wp.int32
+    covariance: mat66d
+    coefficient: mat66d
+
+
+@wp.struct
+class Alone:
+    """Where landmarks and odometry alone put a vehicle, see solution_separation.py."""
+
+    begun: wp.int32  # 0 while the pose is searched for, and where it has been found wrong: it begins anew
+    exposed: wp.int32  # whether a sender may have misled the belief since the belief was last this
+    tick: wp.int32  # when it was last carried on
+    odometry: Pose  # of the belief, then
+    estimate: Estimate
+
+
+ToldMemory = extended(
+    CommonMemory,
+    "ToldMemory",
+    """C correlations in a message.""",
+    alone=array("WN", Alone),
+    outbox_correlation=array("WNSC", Correlation),
+    correlation=array("WNNC", Correlation),  # per receiver and sender
+    known=array("WK", Known),  # scratch
+    factor=array("WKK", mat66d),  # scratch: blocks of a Cholesky factor, on its diagonal their inverses
+)
+TOLD_SIZES = {**SIZES, "C": MAX_CORRELATIONS}
+
+VEHICLE = Rule("a vehicle or -1", lambda values, fields, model: (values >= -1) & (values < model.vehicles))
+WITHIN = Rule("within its steps", lambda values, fields, model: abs(values) <= STEPS)
+
+
+def told_rules() -> dict[str, Rule]:
+    """Return what a saved memory may hold, see `rules_for`."""
+    rules: dict[str, Any] = rules_for(TOLD_SIZES["K"])
+    for box in ("outbox_correlation", "correlation"):
+        rules |= {f"{box}.vehicle": VEHICLE, f"{box}.tick": TICK, f"{box}.matrix": WITHIN}
+    rules |= {"alone.begun": FLAG, "alone.exposed": FLAG, "alone.tick": TICK}
+    rules |= where("alone.begun", {"alone.estimate.pose.R": ROTATION, "alone.estimate.P": COVARIANCE})
+    rules |= where("alone.begun", {"alone.odometry.R": ROTATION})
+    return rules | {"known.member": whole(0, TOLD_SIZES["K"] - 1)}

@@ -9,8 +9,8 @@ from numpy.testing import assert_allclose
 from scipy.linalg import eigh
 
 from coopenv.observers.robust.constants import LEAST_LEFT
+from coopenv.observers.robust.correlations import excess
 from coopenv.observers.robust.memory import mat66d
-from coopenv.observers.robust.told.regression import excess
 from coopenv.world.launch import start_warp
 
 start_warp()

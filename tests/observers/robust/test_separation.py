@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.observers import run
 from coopenv.observers.robust.constants import SEPARATION_GATE
-from coopenv.observers.robust.told.separation import consistent_cost
+from coopenv.observers.robust.solution_separation import consistent_cost
 from coopenv.runs.recorder import record
 from coopenv.scenario import Scenario, load_scenario
 from coopenv.world.launch import start_warp

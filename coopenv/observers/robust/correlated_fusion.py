@@ -5,26 +5,55 @@ are not corrected by its bearings, as in the filter of Schmidt, Application of s
 problems, Advances in Control Systems 3, 1966. When a sender moves by d from where it was carried to, its error changes
 from e- to e+ = e- - d. As e+ is not correlated with d, d has the covariance N = P- - P+ and with any other error y
 cov(y, d) = cov(y, e-) - cov(y, e+): so the vehicle's own pose follows with the gain of that over N.
+
+Where clocks are declared to be off by a standard deviation, that error is considered like the sender's own: it adds
+2 s^2 v v^T to the covariance that it states, for its clock and the receiver's, and correlates with all that follows.
 """
 
 from typing import Any
 
 import warp as wp
 
+from coopenv.estimation.linalg import symmetric_part
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import append_member, apply_corrections, index_of, make_room, mark_seen
-from coopenv.observers.robust.drift import drift_of, has_jumped, note_step
-from coopenv.observers.robust.evidence import carry_evidence
+from coopenv.observers.robust.constants import LEAST_CHANGE, SHARE_OF_CHANGE
+from coopenv.observers.robust.correlations import is_positive, place_of, rank, regress
 from coopenv.observers.robust.measurements import is_heard
 from coopenv.observers.robust.memory import mat66d, vec6d
-from coopenv.observers.robust.odometry import lasting_noise
-from coopenv.observers.robust.told.clocks import by_clocks, changes_speed
-from coopenv.observers.robust.told.correlations import place_of, rank
-from coopenv.observers.robust.told.regression import is_positive, regress
+from coopenv.observers.robust.propagation import lasting_noise
+from coopenv.observers.robust.sender_monitor import carry_evidence, drift_of, has_jumped, is_barred, judge, note_step
 from coopenv.observers.robust.tracklets import bit_of, depends_on_own, propagate_member
-from coopenv.observers.robust.trust import is_barred, judge
 from coopenv.world.camera import VISIBLE
 from coopenv.world.device_function import device_function
+
+
+@device_function
+def by_clocks(model: Any, memory: Any, world: int, i: int, n: int):
+    """Return the covariance, 6x6, of how far member n is off by clocks; zero before its velocity is known."""
+    std = wp.float64(model.fault[i].clock)
+    v = memory.member[world, i, n].dated_v
+    P = mat66d()
+    P[3:, 3:] = (wp.float64(2.0) * std * std) * wp.outer(v, v)
+    return P
+
+
+@device_function
+def changes_speed(model: Any, memory: Any, world: int, i: int, n: int) -> bool:
+    """Let clocks count by the velocity of member n where that has changed much; return whether it has.
+
+    A covariance that followed every change would not be one.
+    """
+    if model.fault[i].clock == type(model.fault[i].clock)(0.0):
+        return False
+    v = memory.member[world, i, n].v
+    dated = memory.member[world, i, n].dated_v
+    if wp.length(v - dated) <= wp.float64(SHARE_OF_CHANGE) * wp.length(dated) + wp.float64(LEAST_CHANGE):
+        return False
+    memory.member[world, i, n].dated_v = v
+    P = memory.P[world, i, n, n] + by_clocks(model, memory, world, i, n)
+    memory.P[world, i, n, n] = symmetric_part(P)
+    return True
 
 
 @device_function

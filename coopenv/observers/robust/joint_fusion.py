@@ -1,0 +1,361 @@
+"""Every message of a tick: whether its vehicles are new, its information is new, or another message has said it."""
+
+from typing import Any
+
+import warp as wp
+
+from coopenv.estimation.coordinates import Coordinates
+from coopenv.observers.contract import Observer, Setup
+from coopenv.observers.robust import joint_messages
+from coopenv.observers.robust.algebra import (
+    AFTER,
+    BEFORE,
+    INVERSE,
+    between,
+    entry,
+    invert,
+    left_error,
+    moved,
+    multiply,
+    recentre,
+    recentring,
+    symmetrise,
+    transition,
+)
+from coopenv.observers.robust.belief import (
+    append_member,
+    apply_corrections,
+    index_of,
+    is_unseen,
+    longest_unseen,
+    mark_seen,
+    most_others,
+    remove_member,
+    subtract_block,
+)
+from coopenv.observers.robust.constants import MAX_TOLD, MAX_VARIANCE_GROWTH
+from coopenv.observers.robust.joint_messages import (
+    JOINT_SIZES,
+    Contact,
+    JointMemory,
+    clear_joint_messages,
+    joint_rules,
+    receive_joint,
+    send_joint,
+)
+from coopenv.observers.robust.measurements import is_heard
+from coopenv.observers.robust.memory import Estimate, mat66d, vec6d
+from coopenv.observers.robust.messages import JOINT_MESSAGES
+from coopenv.observers.robust.observer import OPTIONS, in_space, make_estimate, make_start
+from coopenv.observers.robust.propagation import increment_noise
+from coopenv.observers.robust.tracklets import bit_of, information_share, is_due, propagate_member, test_sender
+from coopenv.world.camera import VISIBLE
+from coopenv.world.device_function import device_function
+from coopenv.world.embedded import Embedded
+
+
+@device_function
+def predict_told(model: Any, memory: Any, world: int, i: int, c: int, count: int):
+    """Carry the contact's last message on to the new one by odometry: poses to `step`, covariance to BEFORE."""
+    for a in range(count):
+        last = memory.contact_told[world, i, c, a]
+        step = between(last.odometry, memory.told[world, a].odometry)
+        memory.step[world, a] = moved(last.pose, step)
+        F = transition(step)
+        for b in range(count):
+            memory.matrix[world, BEFORE, a, b] = F * memory.contact_P[world, i, c, MAX_TOLD * a + b]
+        memory.scratch[world, a].column = F
+    for a in range(count):
+        for b in range(count):
+            Ft = wp.transpose(memory.scratch[world, b].column)
+            memory.matrix[world, BEFORE, a, b] = memory.matrix[world, BEFORE, a, b] * Ft
+        ticks = wp.max(memory.told[world, a].tick - memory.contact_told[world, i, c, a].tick, 0)
+        dt = wp.float64(ticks) * model.camera_period
+        step = between(memory.contact_told[world, i, c, a].odometry, memory.told[world, a].odometry)
+        noise = increment_noise(model, memory, world, i, step, dt)
+        block = memory.matrix[world, BEFORE, a, a]
+        for k in range(6):
+            block[k, k] += noise[k // 3]
+        memory.matrix[world, BEFORE, a, a] = block
+
+
+@device_function
+def propagate_told(model: Any, memory: Any, world: int, i: int, count: int):
+    """Carry the members that a message tells of on to where it says that they were, unless they stand there already."""
+    for a in range(count):
+        told = memory.told[world, a]
+        n = index_of(memory, world, i, told.vehicle)
+        if n > 0:
+            last = memory.member[world, i, n].report
+            if told.tick > last.tick:
+                dt = wp.float64(told.tick - last.tick) * model.camera_period
+                step = between(last.odometry, told.odometry)
+                noise = increment_noise(model, memory, world, i, step, dt)
+                propagate_member(model, memory, world, i, n, step, dt, noise)
+                memory.member[world, i, n].report.tick = told.tick
+                memory.member[world, i, n].report.odometry = told.odometry
+
+
+@device_function
+def news_of(memory: Any, world: int, i: int, count: int, share: Any) -> bool:
+    """Turn the covariances BEFORE and AFTER into new information, of which a share counts; return whether there is any.
+
+    Its matrix takes the place of BEFORE, its vector that of the corrections in `scratch`.
+    """
+    for k in range(6 * count):
+        if entry(memory, world, AFTER, k, k) > wp.float64(MAX_VARIANCE_GROWTH) * entry(memory, world, BEFORE, k, k):
+            return False
+    invert(memory, world, AFTER, INVERSE, count)
+    for a in range(count):  # of the errors about `step`, as the rest
+        memory.scratch[world, a].recentring = recentring(left_error(memory.step[world, a], memory.told[world, a].pose))
+    recentre(memory, world, INVERSE, count)
+    for a in range(count):
+        vector = vec6d()
+        for b in range(count):
+            news = left_error(memory.step[world, b], memory.told[world, b].pose)
+            vector += memory.matrix[world, INVERSE, a, b] * news
+        memory.scratch[world, a].correction = vector
+    invert(memory, world, BEFORE, AFTER, count)
+    for a in range(count):
+        for b in range(count):
+            new = memory.matrix[world, INVERSE, a, b] - memory.matrix[world, AFTER, a, b]
+            memory.matrix[world, BEFORE, a, b] = share * new
+    symmetrise(memory, world, BEFORE, count)
+    size = wp.float64(0.0)
+    for a in range(count):
+        vector = share * memory.scratch[world, a].correction
+        for b in range(count):
+            n = index_of(memory, world, i, memory.told[world, b].vehicle)
+            offset = left_error(memory.step[world, b], memory.member[world, i, n].pose)
+            vector = vector - memory.matrix[world, BEFORE, a, b] * offset
+        memory.scratch[world, a].correction = vector
+        size += wp.dot(vector, vector)
+    for a in range(count):  # of the errors about the members, backwards, to second order
+        n = index_of(memory, world, i, memory.told[world, a].vehicle)
+        G = recentring(-left_error(memory.step[world, a], memory.member[world, i, n].pose))
+        memory.scratch[world, a].recentring = G
+        memory.scratch[world, a].correction = wp.transpose(G) * memory.scratch[world, a].correction
+    recentre(memory, world, BEFORE, count)
+    return wp.isfinite(size)
+
+
+@device_function
+def fuse_joint_information(memory: Any, world: int, i: int, count: int):
+    """Fuse information about the errors of all that a message tells of, see `fuse_information`.
+
+    The matrix BEFORE and the corrections in `scratch` hold it.
+    """
+    members = memory.belief[world, i].members
+    for a in range(count):
+        m = index_of(memory, world, i, memory.told[world, a].vehicle)
+        for k in range(members):
+            memory.blocks[world, k, a] = memory.P[world, i, k, m]
+    for a in range(count):
+        n = index_of(memory, world, i, memory.told[world, a].vehicle)
+        for b in range(count):
+            block = mat66d()
+            for c in range(count):
+                block += memory.blocks[world, n, c] * memory.matrix[world, BEFORE, c, b]
+            if a == b:
+                block += wp.identity(6, wp.float64)
+            memory.matrix[world, AFTER, a, b] = block
+    invert(memory, world, AFTER, INVERSE, count)
+    for a in range(count):
+        along = vec6d()
+        for b in range(count):
+            along += wp.transpose(memory.matrix[world, INVERSE, b, a]) * memory.scratch[world, b].correction
+        memory.scratch[world, a].last_correction = along
+    multiply(memory, world, BEFORE, INVERSE, AFTER, count)
+    symmetrise(memory, world, AFTER, count)
+    for k in range(members):
+        error = vec6d()
+        for b in range(count):
+            error += memory.blocks[world, k, b] * memory.scratch[world, b].last_correction
+            gain = mat66d()
+            for a in range(count):
+                gain += memory.blocks[world, k, a] * memory.matrix[world, AFTER, a, b]
+            for j in range(k + 1):
+                subtract_block(memory, world, i, k, j, gain * wp.transpose(memory.blocks[world, j, b]))
+        memory.scratch[world, k].correction = error
+    apply_corrections(memory, world, i)
+
+
+@device_function
+def is_told(memory: Any, world: int, count: int, vehicle: int) -> bool:
+    """Return whether the message that has been read tells of a vehicle."""
+    for n in range(count):
+        if memory.told[world, n].vehicle == vehicle:
+            return True
+    return False
+
+
+@device_function
+def make_joint_room(model: Any, memory: Any, world: int, i: int, tick: int, count: int) -> bool:
+    """Remove the members that the message tells of and, for want of room, those unseen for longest.
+
+    Return False, with nothing changed, if that does not make room for all that the message tells of.
+    """
+    own = wp.where(is_told(memory, world, count, i), 1, 0)
+    staying = int(0)
+    unseen = int(0)
+    for n in range(memory.belief[world, i].others, memory.belief[world, i].members):
+        if not is_told(memory, world, count, memory.member[world, i, n].vehicle):
+            staying += 1
+            if is_unseen(model, memory, world, i, n, tick):
+                unseen += 1
+    excess = wp.max(0, staying + count - own - most_others(memory))
+    if excess > unseen:
+        return False
+    for a in range(count):
+        n = index_of(memory, world, i, memory.told[world, a].vehicle)
+        if n > 0:
+            remove_member(memory, world, i, n)
+    for _ in range(excess):
+        remove_member(memory, world, i, longest_unseen(model, memory, world, i, tick))
+    return True
+
+
+@device_function
+def add_joint_members(model: Any, memory: Any, world: int, i: int, sender: int, count: int, tick: int):
+    """Add all that the message that has been read tells of, if there is room; their errors are as it says."""
+    if not make_joint_room(model, memory, world, i, tick, count):
+        return
+    depends_on = joint_messages.dependence(memory, world, i, sender)
+    for a in range(count):
+        told = memory.told[world, a]
+        if told.vehicle != i:
+            n = memory.belief[world, i].members
+            append_member(memory, world, i, told.vehicle, told.pose, memory.matrix[world, AFTER, a, a])
+            memory.member[world, i, n].report.tick = told.tick
+            memory.member[world, i, n].report.odometry = told.odometry
+            memory.member[world, i, n].seen_tick = tick
+            depends_on = depends_on | bit_of(told.vehicle)
+            for b in range(a):
+                m = index_of(memory, world, i, memory.told[world, b].vehicle)
+                if m > 0:
+                    block = memory.matrix[world, AFTER, a, b]
+                    memory.P[world, i, n, m] = block
+                    memory.P[world, i, m, n] = wp.transpose(block)
+    memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
+    c = joint_messages.contact_of(memory, world, i, sender)
+    if c < 0:
+        c = joint_messages.contact_of(memory, world, i, -1)
+    memory.contact[world, i, c] = Contact()
+    joint_messages.store_contact(memory, world, i, c, sender, count)
+    joint_messages.forget_contacts(memory, world, i)
+
+
+@device_function
+def fuse_joint_message(model: Any, memory: Any, world: int, i: int, c: int, sender: int, count: int):
+    """Carry all that a message tells of to it, and fuse what has been learnt since the contact's last message."""
+    ticks = memory.told[world, 0].tick - memory.contact_told[world, i, c, 0].tick
+    if not is_due(model, memory.contact_told[world, i, c, 0].tick, memory.told[world, 0].tick):
+        return
+    predict_told(model, memory, world, i, c, count)
+    joint_messages.store_contact(memory, world, i, c, sender, count)
+    propagate_told(model, memory, world, i, count)
+    n = index_of(memory, world, i, sender)
+    told = memory.told[world, 0]
+    was_distrusted = memory.contact[world, i, c].distrusted
+    joint_messages.note_contacts(memory, world, i)
+    now = Estimate(told.pose, memory.matrix[world, AFTER, 0, 0])
+    test_sender(memory, world, i, n, now, wp.float64(ticks) * model.camera_period)
+    memory.contact[world, i, c].distrusted = memory.member[world, i, n].distrusted
+    memory.contact[world, i, c].agreement_time = memory.member[world, i, n].agreement_time
+    if was_distrusted == 1 or memory.contact[world, i, c].distrusted == 1:
+        return
+    depends_on = memory.contact[world, i, c].depends_on
+    if news_of(memory, world, i, count, information_share(memory, world, i, depends_on)):
+        fuse_joint_information(memory, world, i, count)
+        memory.belief[world, i].depends_on = memory.belief[world, i].depends_on | depends_on
+
+
+@device_function
+def told_vehicle(memory: Any, world: int, i: int, sender: int, n: int) -> int:
+    """Return the n-th vehicle of which a received message tells, the sender first."""
+    if n == 0:
+        return sender
+    return memory.inbox_told[world, i, sender, n - 1].vehicle
+
+
+@device_function
+def tells_of_visible(model: Any, state: Any, memory: Any, world: int, i: int, sender: int) -> bool:
+    """Return whether a received message tells of a vehicle in view."""
+    for n in range(joint_messages.others_told(memory, world, i, sender) + 1):
+        if state.sight[world, i, model.landmarks + told_vehicle(memory, world, i, sender, n)] == VISIBLE:
+            return True
+    return False
+
+
+@device_function
+def fuse_one(model: Any, state: Any, memory: Any, world: int, i: int, sender: int, tick: int):
+    """Fuse one message, or add those that it tells of, or neither where another message has said it all."""
+    count = joint_messages.read_message(memory, world, i, sender)
+    c = joint_messages.contact_of(memory, world, i, sender)
+    if joint_messages.is_superseded(model, memory, world, i, sender, count):
+        if c >= 0:
+            joint_messages.store_contact(memory, world, i, c, sender, count)
+        return
+    if joint_messages.tells_of_the_same(memory, world, i, c, count):
+        fuse_joint_message(model, memory, world, i, c, sender, count)
+    elif c >= 0 or tells_of_visible(model, state, memory, world, i, sender):
+        add_joint_members(model, memory, world, i, sender, count, tick)
+    c = joint_messages.contact_of(memory, world, i, sender)
+    if c >= 0:
+        memory.contact[world, i, c].fused = 1
+
+
+@device_function
+def fuse_joint_messages(model: Any, state: Any, memory: Any, world: int, i: int, tick: int):
+    """Fuse the messages that tell of members, and add those that vehicles in view tell of; who tells of most first."""
+    joint_messages.forget_contacts(memory, world, i)  # the belief may have begun anew
+    mark_seen(model, state, memory, world, i, tick)
+    for c in range(memory.contact.shape[2]):
+        memory.contact[world, i, c].fused = 1
+    for n in range(model.target_count[i]):
+        sender = model.targets[i, n] - model.landmarks
+        if sender >= 0 and is_heard(model, state, memory, world, i, wp.max(sender, 0), tick):
+            c = joint_messages.contact_of(memory, world, i, sender)
+            if c >= 0:
+                memory.contact[world, i, c].fused = 0
+                if tells_of_visible(model, state, memory, world, i, sender):  # then all that it tells of count as seen
+                    for k in range(joint_messages.others_told(memory, world, i, sender) + 1):
+                        m = index_of(memory, world, i, told_vehicle(memory, world, i, sender, k))
+                        if m > 0:
+                            memory.member[world, i, m].seen_tick = tick
+    for fewer in range(MAX_TOLD):
+        for n in range(model.target_count[i]):
+            sender = model.targets[i, n] - model.landmarks
+            if sender >= 0 and is_heard(model, state, memory, world, i, wp.max(sender, 0), tick):
+                if joint_messages.others_told(memory, world, i, sender) == MAX_TOLD - 1 - fewer:
+                    fuse_one(model, state, memory, world, i, sender, tick)
+    joint_messages.forget_contacts(memory, world, i)
+    joint_messages.note_contacts(memory, world, i)
+
+
+@device_function
+def accept(model: Any, state: Any, memory: Any, world: int, i: int, now: Any):
+    """Accept the belief: its members are estimated along with the vehicle itself, and none is held to what it says."""
+
+
+ROBUST_JOINT = Embedded(
+    "robust_joint",
+    make_estimate(receive_joint, fuse_joint_messages, accept),
+    make_start(clear_joint_messages, receive_joint),
+    send_joint,
+    JointMemory,
+    JOINT_SIZES,
+    valid=joint_rules(),
+    messages=JOINT_MESSAGES,
+    coordinates=Coordinates.LEFT,
+    options=OPTIONS,
+)
+
+
+def robust_joint(setup: Setup) -> Observer:
+    """The robust observer with larger, joint messages, for vehicles in space.
+
+    Raises:
+        CoopenvError: the vehicle moves on a plane and its odometry is its commands.
+    """
+    return in_space("robust_joint", ROBUST_JOINT, setup)
