@@ -13,8 +13,23 @@ from numpy.testing import assert_allclose
 from scipy.stats import ortho_group
 
 from coopenv.estimation import linalg
-from tests.helpers.warp_calls import DTYPES, EPSILON, WIDE, call
+from tests.helpers.warp_calls import DTYPES, EPSILON, WIDE, Calls
 
+
+@wp.func
+def cholesky_factor(M: Any):
+    """Return L and, in blocks, the inverses of its diagonal blocks."""
+    A = linalg.block3(M, 0, 0)
+    B = linalg.block3(M, 0, 3)
+    L11, L21, L22, I11, I22 = linalg.cholesky6(A, B, linalg.block3(M, 3, 3))
+    return linalg.join6(L11, type(L11)(), L21, L22), linalg.join6(I11, type(I11)(), type(I11)(), I22)
+
+
+call = Calls(
+    __name__,
+    {linalg.eigen_symmetric6: "66 > 66 66", cholesky_factor: "66 > 66 66"},
+    {linalg.smallest_eigenvalue6: "66 > 1"},
+)
 SPECTRA = {
     "random": np.random.default_rng(0).uniform(0.1, 10.0, (60, 6)),
     "badly_scaled": np.tile(np.logspace(-10, 0, 6), (40, 1)),
@@ -121,15 +136,6 @@ def test_smallest_eigenvalue_of_sums_of_squares(seed: int, decades: float) -> No
     expected = np.linalg.eigvalsh(M)[:, 0]
     bound = 30 * EPSILON["float64"] * np.trace(M, axis1=1, axis2=2) + 2e-9 * np.abs(expected)
     assert (np.abs(call(linalg.smallest_eigenvalue6, "float64", M) - expected) <= bound).all()
-
-
-@wp.func
-def cholesky_factor(M: Any):
-    """Return L and, in blocks, the inverses of its diagonal blocks."""
-    A = linalg.block3(M, 0, 0)
-    B = linalg.block3(M, 0, 3)
-    L11, L21, L22, I11, I22 = linalg.cholesky6(A, B, linalg.block3(M, 3, 3))
-    return linalg.join6(L11, type(L11)(), L21, L22), linalg.join6(I11, type(I11)(), type(I11)(), I22)
 
 
 DEFINITE = [name for name in SPECTRA if SPECTRA[name].min() > 0.0]

@@ -11,7 +11,7 @@ from scipy.integrate import quad_vec
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import so3
-from tests.helpers.warp_calls import DTYPES, EPSILON, WIDE, call
+from tests.helpers.warp_calls import DTYPES, EPSILON, WIDE, Calls
 
 ANGLES = np.concatenate(
     [
@@ -21,6 +21,11 @@ ANGLES = np.concatenate(
         np.pi - np.logspace(-15, 0, 46),
         [np.pi],
     ]
+)
+call = Calls(
+    __name__,
+    {so3.exp_so3: "3 > 33", so3.rigid_motion: "3 3 > 33 3", so3.rotation_angle: "33 > 1"},
+    {so3.quaternion_vector: "33 > 3", so3.orthonormalise: "33 > 33"},
 )
 LARGE = np.array([3.5, 2 * np.pi - 1e-3, 2 * np.pi, 9.0, 40.0])
 component = st.floats(-1.0, 1.0, allow_subnormal=False)

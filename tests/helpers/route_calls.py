@@ -13,10 +13,12 @@ from coopenv.world.precision import precision
 from coopenv.world.records import allocate
 from coopenv.world.route import place_on_route, point_on_route
 from coopenv.world.state import state_struct
+from tests.helpers.warp_calls import DTYPES
 
 start_warp()
 
 
+@wp.kernel(enable_backward=False)
 def places_kernel(state: Any, query: wp.array(dtype=Any), found: wp.array(dtype=Any)):
     """Find the place of every query (x, y, -)."""
     i = wp.tid()
@@ -25,12 +27,19 @@ def places_kernel(state: Any, query: wp.array(dtype=Any), found: wp.array(dtype=
     found[i] = type(q)(s, lateral, heading)
 
 
+@wp.kernel(enable_backward=False)
 def points_kernel(state: Any, query: wp.array(dtype=Any), found: wp.array(dtype=Any)):
     """Find the point at every query (s, -, -)."""
     i = wp.tid()
     q = query[i]
     x, y, heading = point_on_route(state, 0, 0, q[0])
     found[i] = type(q)(x, y, heading)
+
+
+for dtype in DTYPES:  # one module for both precisions
+    state_type, vectors = state_struct(precision(dtype)), wp.array(dtype=precision(dtype).vec3)
+    for kernel in (places_kernel, points_kernel):
+        wp.overload(kernel, [state_type, vectors, vectors])
 
 
 def _found(function: Any, dtype: str, line: np.ndarray, query: np.ndarray) -> np.ndarray:
@@ -43,9 +52,7 @@ def _found(function: Any, dtype: str, line: np.ndarray, query: np.ndarray) -> np
         state.route_count.numpy()[0, 0] = len(line)
     given = wp.array(np.ascontiguousarray(query, dtype=p.numpy), dtype=p.vec3, device="cpu")
     found = wp.zeros_like(given)
-    module = wp.get_module(f"{__name__}.{function.__name__}.{dtype}")
-    module.options["enable_backward"] = False
-    wp.launch(wp.Kernel(function, module=module), dim=len(query), inputs=[state, given, found], device="cpu")
+    wp.launch(function, dim=len(query), inputs=[state, given, found], device="cpu")
     return np.asarray(found.numpy(), dtype=float)
 
 

@@ -18,9 +18,10 @@ from coopenv.world import camera
 from coopenv.world.model import entry_struct
 from coopenv.world.precision import precision
 from tests.helpers.builders import landmark, quaternion_wxyz, run, scenario, start, vehicle
-from tests.helpers.warp_calls import DTYPES, WIDE, call
+from tests.helpers.warp_calls import DTYPES, WIDE, Calls
 from tests.oracles import geometry, philox
 
+call = Calls(__name__, {camera.segment_hits_box: "3 3 1 33 3 3 > b"})
 PIXY = {"fx": 213.161906, "fy": 213.521038, "cx": 154.841998, "cy": 114.98398}
 SIZE = {"width": 316, "height": 208}
 PLUMB_BOB = (-0.352043, 0.137879, 0.001953, 0.000628, 0.0)
@@ -280,12 +281,16 @@ def there_and_back(lens: Any, xy: wp.array(dtype=Any), out: wp.array(dtype=Any),
     back[i] = type(xy[i])(x, y)
 
 
+LENSES = {dtype: entry_struct(precision(dtype), "camera") for dtype in DTYPES}
+for dtype, lens_type in LENSES.items():
+    wp.overload(there_and_back, [lens_type, *[wp.array(dtype=precision(dtype).vec2)] * 3])  # one module for both
+
+
 def through_lens(dtype: str, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return image coordinates (K, 2) distorted by the kernels, and these undistorted again."""
-    types = precision(dtype)
-    lens = entry_struct(types, "camera")()
+    lens = LENSES[dtype]()
     lens.k1, lens.k2, lens.p1, lens.p2, lens.k3 = PLUMB_BOB
-    given = wp.array(xy, dtype=types.vec2, device="cpu")
+    given = wp.array(xy, dtype=precision(dtype).vec2, device="cpu")
     results = [wp.zeros_like(given), wp.zeros_like(given)]
     wp.launch(there_and_back, dim=len(xy), inputs=[lens, given, *results], device="cpu")
     distorted, back = (result.numpy().astype(float) for result in results)

@@ -12,7 +12,9 @@ from scipy.spatial.transform import Rotation
 from coopenv.estimation.outcomes import Outcome
 from coopenv.world import collision
 from tests.helpers.builders import command, constant, landmark, reset, run, scenario, start, vehicle
-from tests.helpers.warp_calls import DTYPES, call
+from tests.helpers.warp_calls import DTYPES, Calls
+
+call = Calls(__name__, {collision.boxes_touch: "3 33 3 3 33 3 > b"})
 
 
 def overlap(ca: np.ndarray, Ra: np.ndarray, ha: np.ndarray, cb: np.ndarray, Rb: np.ndarray, hb: np.ndarray) -> float:

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from coopenv.estimation import metrics
 from coopenv.observers.riccati_coordinates import left_covariance
 from coopenv.world import quality
-from tests.helpers.warp_calls import DTYPES, call
+from tests.helpers.warp_calls import DTYPES, Calls
 
 COUNT = 300
 
@@ -30,6 +30,12 @@ def judged(P: Any, R: Any, position: Any, R_hat: Any, p_hat: Any):
     I11, L21, I22 = quality.cholesky_of(P)
     e1, e2 = quality.observer_error(R, position, R_hat, p_hat)
     return e1, e2, quality.normalised_error_squared(I11, L21, I22, e1, e2)
+
+
+call = Calls(
+    __name__,
+    {log_determinant: "66 > 1", judged: "66 33 3 33 3 > 3 3 1", quality.position_variance: "66 3 > 1"},
+)
 
 
 def covariances(rng: np.random.Generator) -> np.ndarray:

@@ -8,12 +8,20 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from coopenv.world import random
-from tests.helpers.warp_calls import DTYPES, WIDE, call
+from tests.helpers.warp_calls import DTYPES, WIDE, Calls
 from tests.oracles import philox
 
 LARGEST = 2**32 - 1
-
-
+call = Calls(
+    __name__,
+    {random.uniform: "u 1 > 1"},
+    {
+        random.philox: "u4 u u > u4",
+        random.random_words: "U u i i u > u4",
+        random.gaussian_pair: "u u 1 > 1 1",
+        random.unit_vector: "u u 3 > 3",
+    },
+)
 ONE = [1.0]
 ROUNDS = 7
 SEVEN_ROUNDS = (

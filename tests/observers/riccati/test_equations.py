@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.estimation import linalg
 from coopenv.observers.riccati import equations
-from tests.helpers.warp_calls import call
+from tests.helpers.warp_calls import Calls
 from tests.oracles import splitting
 from tests.oracles.continuous import skew
 
@@ -67,6 +67,11 @@ def modal(k: Any, h: Any, P: Any, M: Any, r1: Any, r2: Any):
     return dx1, dx2, equations.covariance_modes(h, T, spectrum)
 
 
+call = Calls(
+    __name__,
+    {equations.gain_factor: "1 1 1 > 1", kalman: "1 66 66 3 3 > 3 3 66", modal: "1 1 66 66 3 3 > 3 3 66"},
+    {predicted: "33 66 1 1 > 66", information: "3 3 3 1 > 66 3 3"},
+)
 GAINS = (0.51, 0.6, 1.0, 2.5, 5.0, 80.0, 1000.0)
 
 
