@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 from pydantic_core import to_json, to_jsonable_python
 
+LARGEST = 1e9
+"""Largest magnitude of any quantity, in its own unit: products of four such numbers still fit into single precision."""
+
 NONE = "-"
 MOST_DECIMALS = 5
 FINEST_ERROR = 1e-3  # share of its number below which a standard error is no longer told by its first digit

@@ -54,7 +54,8 @@ def view(
     Nothing is asked of any other computer. Cars are observed only: they are never armed from here.
     """
     from coopenv.runs.console import compile_notice
-    from coopenv.runs.view.serving import serving, vehicle_index
+    from coopenv.runs.view.reels import vehicle_index
+    from coopenv.runs.view.serving import serving
     from coopenv.runs.view.viewer import Viewer
     from coopenv.viz.web.extra import viser_module
 

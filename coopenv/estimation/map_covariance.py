@@ -28,3 +28,16 @@ def covariance_in_map(coordinates: Coordinates, rotation: Array, position: Array
             body = (np.swapaxes(R, -1, -2) @ p[..., None])[..., 0]
             J[..., :3, :3] = -R @ skew(body)
     return np.asarray(J @ np.asarray(covariance, float) @ np.swapaxes(J, -1, -2))
+
+
+def position_covariance(rotation: Array, position: Array, covariance: Array) -> Array:
+    """Return covariances (..., 3, 3) of estimated positions in the map frame, m^2, to first order.
+
+    Args:
+        rotation: Rhat (..., 3, 3), body to map.
+        position: phat (..., 3), body frame, m.
+        covariance: P (..., 6, 6) in the paper's coordinates, over (2 lambda, p - phat).
+    """
+    R, p = np.asarray(rotation, float), np.asarray(position, float)
+    in_map = (R @ p[..., None])[..., 0]
+    return covariance_in_map(Coordinates.RICCATI, R, in_map, covariance)[..., :3, :3]

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from coopenv.base.format import LARGEST
 from coopenv.estimation.arrays import Array
-from coopenv.scenario.base import LARGEST
 
 Mask = NDArray[np.bool_]
 

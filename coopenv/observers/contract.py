@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf
 
 from coopenv.base.errors import CoopenvError, shown
+from coopenv.base.format import LARGEST
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.estimation.validity import MAX_BEND, MOST_LOPSIDED
-from coopenv.scenario.base import LARGEST
 
 BYTES_PER_NUMBER = 8
 MIN_BEARING_STD = 1e-4  # rad; noise-free scenarios would leave a Kalman filter with a singular innovation

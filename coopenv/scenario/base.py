@@ -4,9 +4,11 @@ import math
 from difflib import get_close_matches
 from typing import Annotated, Any, Literal, TypeVar
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from coopenv.base.errors import shortened, shown, suggest
+from coopenv.base.format import LARGEST
 
 
 class Part(BaseModel):
@@ -36,15 +38,30 @@ def _unit_quaternion(q: tuple[float, float, float, float]) -> tuple[float, float
     return (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
 
 
+def rotation_of(yaw: float | None, quaternion_wxyz: Any) -> np.ndarray:
+    """Return the rotation (3, 3) that a file gives as a quaternion or a yaw."""
+    if quaternion_wxyz is None:
+        w, x, y, z = math.cos((yaw or 0.0) / 2), 0.0, 0.0, math.sin((yaw or 0.0) / 2)
+    else:
+        w, x, y, z = quaternion_wxyz
+        length = math.sqrt(x * x + y * y + z * z + w * w)
+        w, x, y, z = w / length, x / length, y / length, z / length
+    ww, xx, yy, zz = w * w, x * x, y * y, z * z
+    return np.array(
+        [
+            [xx - yy - zz + ww, 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), -xx + yy - zz + ww, 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), -xx - yy + zz + ww],
+        ]
+    )
+
+
 def _readable(text: str) -> str:
     for line in text.splitlines():
         if not line.replace("\t", " ").isprintable():
             raise ValueError(f"control characters are not allowed, got {shown(line)}")
     return text
 
-
-LARGEST = 1e9
-"""Largest magnitude of any quantity, in its own unit: products of four such numbers still fit into single precision."""
 
 Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Vector2 = tuple[Number, Number]

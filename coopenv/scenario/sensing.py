@@ -23,6 +23,7 @@ from coopenv.scenario.base import (
     Sample,
     Vector2,
     Vector3,
+    rotation_of,
 )
 
 PerAxis = NonNegative | NonNegativeVector3
@@ -78,6 +79,12 @@ class Camera(Part):
     focal_length_error: NonNegative = 0.0
     """Standard deviation of e: the true focal length is (1 + e) times what observers know, so that the coordinates of a
     bearing on the image plane (at distance 1) are (1 + e) times what they should be; drawn per vehicle and episode."""
+
+    def to_body(self, pan: float = 0.0) -> np.ndarray:
+        """Return the rotation (3, 3) from the nominal optical frame to the body, for a pan angle to the left, rad."""
+        given = self.orientation
+        mounted = ROTATION_OF_CAMERA[given] if isinstance(given, str) else rotation_of(None, given)
+        return mounted if pan == 0.0 else rotation_of(pan, None) @ mounted
 
     @property
     def is_misplaced(self) -> bool:

@@ -1,16 +1,16 @@
 """Initial poses and estimates, and who may measure and receive whom."""
 
-import math
 import warnings
 from collections.abc import Sequence
 from graphlib import CycleError, TopologicalSorter
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.base.errors import ScenarioWarning, listed, shown, suggest
+from coopenv.scenario.base import rotation_of
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.fields import ScenarioFields
 from coopenv.scenario.routes import Route, route_points
@@ -18,24 +18,6 @@ from coopenv.scenario.routes import Route, route_points
 SAME_PLACE = 1e-6  # m
 
 BLOCK = 200_000  # pairs that are compared at a time; each takes some 400 bytes
-
-
-def rotation_of(yaw: float | None, quaternion_wxyz: Any) -> np.ndarray:
-    """Return the rotation (3, 3) that a file gives as a quaternion or a yaw."""
-    if quaternion_wxyz is None:
-        w, x, y, z = math.cos((yaw or 0.0) / 2), 0.0, 0.0, math.sin((yaw or 0.0) / 2)
-    else:
-        w, x, y, z = quaternion_wxyz
-        length = math.sqrt(x * x + y * y + z * z + w * w)
-        w, x, y, z = w / length, x / length, y / length, z / length
-    ww, xx, yy, zz = w * w, x * x, y * y, z * z
-    return np.array(
-        [
-            [xx - yy - zz + ww, 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), -xx + yy - zz + ww, 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), -xx - yy + zz + ww],
-        ]
-    )
 
 
 def start_of(agent: Landmark | Vehicle, routes: Sequence[Route]) -> tuple[np.ndarray, np.ndarray]:

@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
-from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.outcomes import Sight
-from coopenv.scenario.sensing import ROTATION_OF_CAMERA, Camera
+from coopenv.scenario.base import rotation_of
+from coopenv.scenario.sensing import Camera
 from coopenv.viz.scene import Frame, Stage
 from coopenv.viz.scene.stage import Box
 from coopenv.viz.style import DARK_BLUE, GREY, INK, vehicle_colour
@@ -49,15 +49,9 @@ class Lens:
         self.around = self._camera.model != "pinhole"
         self.size = _ALL_AROUND if self.around else self._camera.image_size
         self.eye = stage.eyes(frame)[vehicle]
-        orientation = self._camera.orientation
-        if self.around:
-            mounted = np.eye(3)
-        elif isinstance(orientation, str):
-            mounted = ROTATION_OF_CAMERA[orientation]
-        else:
-            mounted = Rotation.from_quat(orientation, scalar_first=True).as_matrix()
-        turned = Rotation.from_euler("z", float(frame.pan[vehicle])).as_matrix()
-        self._to_map = frame.vehicle_rotation[vehicle] @ turned @ mounted
+        pan = float(frame.pan[vehicle])
+        to_body = rotation_of(pan, None) if self.around else self._camera.to_body(pan)
+        self._to_map = frame.vehicle_rotation[vehicle] @ to_body
 
     def distance(self, point: np.ndarray) -> float:
         """Return how far a point of the map is, m."""

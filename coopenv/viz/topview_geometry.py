@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from coopenv.estimation.lens import largest_radius, undistort
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Landmark, Obstacle, Vehicle
 from coopenv.scenario.routes import TwistTable, compile_motion, even_points, left_jacobian
-from coopenv.scenario.sensing import ROTATION_OF_CAMERA, Camera
+from coopenv.scenario.sensing import Camera
 from coopenv.scenario.starts import agent_starts
 
 SIGMAS = 3.0
@@ -17,26 +17,6 @@ _CIRCLE = np.linspace(0.0, 2 * np.pi, 97)
 _FAN_RAYS = 65
 _PATH_SAMPLES = 121
 _MARGIN = 0.05  # share of the scene around it
-
-
-def position_covariance(rotation: np.ndarray, position: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the covariance (..., 3, 3) of the estimated position in the map frame, m^2, to first order.
-
-    The observer's P is over e = (2 lambda, p - phat), with R = Rhat (I + S(2 lambda)) and p = R^T pbar the position
-    in the body frame. Hence pbar = R p = Rhat (phat + (p - phat) - S(phat) 2 lambda), and the error of pbar is
-    J e with J = Rhat [-S(phat), I].
-
-    Args:
-        rotation: Rhat (..., 3, 3), body to map.
-        position: phat (..., 3), body frame, m.
-        covariance: P (..., 6, 6).
-    """
-    p = np.asarray(position, float)
-    J = np.empty((*p.shape[:-1], 3, 6))
-    J[..., :3] = np.cross(p[..., None, :], np.eye(3))  # row i: phat x e_i, which is row i of -S(phat)
-    J[..., 3:] = np.eye(3)
-    J = np.asarray(rotation, float) @ J
-    return np.asarray(J @ np.asarray(covariance, float) @ np.swapaxes(J, -1, -2))
 
 
 def ellipses(center: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -102,12 +82,12 @@ def turned(shapes: np.ndarray, angle: np.ndarray) -> np.ndarray:
 def camera_fan(camera: Camera) -> np.ndarray:
     """Return unit rays (K, 3) in the body frame over the width of the image, at the height of its centre."""
     edges = (np.array([0.0, camera.image_size[0]]) - camera.principal_point[0]) / camera.focal_length[0]
-    left, right = (float(np.arctan(_undistorted(float(edge), camera))) for edge in edges)
+    imaged, has_ray = undistort(np.column_stack([edges, np.zeros(2)]), camera.distortion)
+    widest = np.copysign(largest_radius(camera.distortion), edges)  # where the lens images nothing at the edge
+    left, right = np.arctan(np.where(has_ray, imaged[:, 0], widest)).tolist()
     x = np.linspace(left, right, _FAN_RAYS)
     rays = np.stack([np.sin(x), np.zeros_like(x), np.cos(x)], axis=-1)
-    if isinstance(camera.orientation, str):
-        return np.asarray(rays @ ROTATION_OF_CAMERA[camera.orientation].T)
-    return np.asarray(Rotation.from_quat(camera.orientation, scalar_first=True).apply(rays))
+    return np.asarray(rays @ camera.to_body().T)
 
 
 def free_lengths(
@@ -144,16 +124,6 @@ def about_z(angle: float) -> np.ndarray:
     """Return the rotation (3, 3) about z by an angle, rad."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([(c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)])
-
-
-def _undistorted(edge: float, camera: Camera) -> float:
-    """Return the undistorted image coordinate of a side edge (both at distance 1)."""
-    k1, k2, _, p2, k3 = camera.distortion
-    x = edge
-    for _ in range(20):
-        r2 = x * x
-        x = (edge - 3 * p2 * r2) / (1 + r2 * (k1 + r2 * (k2 + r2 * k3)))
-    return x
 
 
 def limits(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:

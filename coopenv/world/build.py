@@ -9,10 +9,11 @@ import warp as wp
 
 from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario import Scenario
+from coopenv.scenario.base import rotation_of
 from coopenv.scenario.bodies import Landmark, Vehicle
 from coopenv.scenario.learning import FASTEST_PACE, Dynamics
 from coopenv.scenario.routes import compile_motion
-from coopenv.scenario.starts import agent_starts, neighbour_sets, processing_order, rotation_of
+from coopenv.scenario.starts import agent_starts, neighbour_sets, processing_order
 from coopenv.world.build_draws import drawn_of, routes_of
 from coopenv.world.build_faults import fault_entries, fault_switches
 from coopenv.world.build_sensors import camera_entries, noise_entries

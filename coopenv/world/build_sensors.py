@@ -5,14 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.scenario.sensing import ROTATION_OF_CAMERA, Camera, Noise, Rates
-from coopenv.scenario.starts import rotation_of
-
-
-def camera_to_body(c: Camera) -> np.ndarray:
-    """Return the rotation (3, 3) of a camera in its body."""
-    named = ROTATION_OF_CAMERA.get(c.orientation) if isinstance(c.orientation, str) else None
-    return rotation_of(None, c.orientation) if named is None else named
+from coopenv.estimation.lens import largest_radius
+from coopenv.scenario.sensing import Camera, Noise, Rates
 
 
 def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
@@ -21,10 +15,10 @@ def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
     same = ("position", "image_size", "focal_length", "principal_point")
     return {
         **{name: getattr(c, name) for name in same},
-        "rotation": camera_to_body(c),
+        "rotation": c.to_body(),
         "pinhole": int(c.model == "pinhole"),
         **dict(zip(("k1", "k2", "p1", "p2", "k3"), c.distortion, strict=True)),
-        "max_radius": _monotone_radius(c.distortion),
+        "max_radius": largest_radius(c.distortion),
         "undistort": int(c.undistort),
         "quantise": int(c.quantise),
         "range": math.inf if c.range is None else c.range,
@@ -33,14 +27,6 @@ def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
         "position_std": on * c.extrinsics_position_error,
         "focal_std": on * c.focal_length_error,
     }
-
-
-def _monotone_radius(k: tuple[float, ...]) -> float:
-    """Return the radius up to which r (1 + k1 r^2 + k2 r^4 + k3 r^6) grows: farther rays would fold back."""
-    k1, k2, _, _, k3 = k
-    roots = np.roots([7 * k3, 0, 5 * k2, 0, 3 * k1, 0, 1.0]) if any((k1, k2, k3)) else np.array([])
-    real = roots[np.abs(roots.imag) < 1e-9].real
-    return float(real[real > 0].min(initial=math.inf))
 
 
 def noise_entries(n: Noise, rates: Rates) -> dict[str, Any]:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError, shown
+from coopenv.base.format import LARGEST
 from coopenv.estimation.validity import are_covariances, are_rotations, are_unit_vectors, everywhere
-from coopenv.scenario.base import LARGEST
 
 Array = NDArray[Any]
 Mask = NDArray[np.bool_]

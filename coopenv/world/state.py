@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from coopenv.base.format import LARGEST
 from coopenv.estimation.outcomes import Sight
-from coopenv.scenario.base import LARGEST
 from coopenv.scenario.learning import MOST, PARAMETERS
 from coopenv.world.precision import Precision
 from coopenv.world.records import allocate, array, fields

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.cars import codec
-from coopenv.cars.lens import distort
+from coopenv.estimation.lens import distort
 from coopenv.estimation.rotations import log_so3
 from coopenv.observers import Recording
 from coopenv.runs.recorder import record

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 import coopenv
 from coopenv.api.engine import Engine
 from coopenv.base.format import fixed
+from coopenv.estimation.map_covariance import position_covariance
 from coopenv.estimation.metrics import error_coordinates
 from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import load_scenario
@@ -32,7 +33,6 @@ from coopenv.viz.topview_geometry import (
     free_lengths,
     limits,
     pointers,
-    position_covariance,
     ways,
 )
 from coopenv.viz.topview_ground import HEIGHT, MAP_WIDTH, PANEL, ROW, TABLE_TOP, WIDTH, touching

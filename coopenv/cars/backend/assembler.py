@@ -27,7 +27,6 @@ from coopenv.cars.transport.base import Arrival
 from coopenv.estimation.arrays import Array
 from coopenv.observers.recording import Sensed, Truth, is_due, sealed
 from coopenv.scenario.sensing import Camera
-from coopenv.world.build_sensors import camera_to_body
 
 LATE = round((TOPICS[Role.DETECTIONS].max_age or 0.0) * 1e9)
 SILENT = round((TOPICS[Role.ODOMETRY].max_age or 0.0) * 1e9)
@@ -61,7 +60,7 @@ class Assembler:
         scenario = binding.scenario
         self._period = round(1e9 / scenario.rates.camera)
         self._ratio = (scenario.rates.observer or scenario.rates.camera) / scenario.rates.camera
-        self._to_body = [camera_to_body(camera) for camera in scenario.cameras]
+        self._to_body = [camera.to_body() for camera in scenario.cameras]
         self._cars = [_Car() for _ in scenario.vehicles]
         self._begin = 0
         self.refused: Counter[str] = Counter()

@@ -18,7 +18,8 @@ from coopenv.estimation.rotations import skew
 from coopenv.observers.contract import Message, Received
 from coopenv.observers.riccati_coordinates import left_covariance
 from coopenv.observers.robust.messages import from_six
-from coopenv.scenario.starts import neighbour_sets, rotation_of
+from coopenv.scenario.base import rotation_of
+from coopenv.scenario.starts import neighbour_sets
 
 
 def message_of(value: Pose | Report, marker: Array) -> Message:

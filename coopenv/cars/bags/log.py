@@ -27,7 +27,7 @@ from coopenv.cars.codec import stamp_of
 from coopenv.cars.readings import read
 from coopenv.cars.samples import Calibration, Pose, Sample, Twist, Value
 from coopenv.cars.topics import Role
-from coopenv.scenario.starts import rotation_of
+from coopenv.scenario.base import rotation_of
 
 Delays = Mapping[str, int]
 """ns by which each source of a file is behind its recorder: the smallest (received - stamp)."""

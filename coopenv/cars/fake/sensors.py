@@ -8,9 +8,9 @@ import numpy as np
 from coopenv.cars.deployment import MARKERS
 from coopenv.cars.fake.faults import Faults
 from coopenv.cars.fake.world import Room
-from coopenv.cars.lens import distort
 from coopenv.cars.samples import Calibration
 from coopenv.estimation.arrays import Array
+from coopenv.estimation.lens import distort
 from coopenv.scenario.sensing import Camera, Noise
 from coopenv.world.parameters import ODOMETRY_NOISE
 

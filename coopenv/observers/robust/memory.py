@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from coopenv.base.format import LARGEST
 from coopenv.estimation.validity import are_covariances
 from coopenv.observers.robust.constants import MAX_CORRELATIONS, MAX_HYPOTHESES, MAX_MEMBERS, MAX_OFFENCES, STEPS
-from coopenv.scenario.base import LARGEST
 from coopenv.world.device_function import device_function
 from coopenv.world.records import array, extended
 from coopenv.world.saved_state import COVARIANCE, FLAG, LEAST_EIGENVALUE, ROTATION, TICK, Rule, numbers, whole

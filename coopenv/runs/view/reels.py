@@ -6,7 +6,7 @@ from typing import Any
 
 from coopenv.api.engine import Engine
 from coopenv.backends.base import Backend
-from coopenv.base.errors import CoopenvError
+from coopenv.base.errors import CoopenvError, listed, suggest
 from coopenv.policies import Policy
 from coopenv.runs.episode import play
 from coopenv.runs.video import MAX_FPS
@@ -181,3 +181,20 @@ FAULTS: dict[str, Callable[[float, int], dict[str, Any]]] = {
     "half of the detections missed, whole episode": _blurred,
 }
 """By name: what is changed of the scenario, for a time in s and a vehicle."""
+
+
+def vehicle_index(scenario: Scenario, name: str | None) -> int | None:
+    """Return the index of a vehicle by its name or by f1, f2, ...; None without a name.
+
+    Raises:
+        CoopenvError: there is no such vehicle.
+    """
+    if name is None:
+        return None
+    names = list(scenario.vehicle_names)
+    short = {f"f{i + 1}": i for i in range(len(names))}
+    if name in short:
+        return short[name]
+    if name not in names:
+        raise CoopenvError(f"--vehicle {name}: no such vehicle{suggest(name, names)}; known: {listed(names)}")
+    return names.index(name)

@@ -1,12 +1,11 @@
-"""The server of the live view: where it listens, and which vehicle is meant."""
+"""The server of the live view: its address, port and token."""
 
 import errno
 import socket
 from contextlib import AbstractContextManager
 from typing import Any
 
-from coopenv.base.errors import CoopenvError, listed, suggest
-from coopenv.scenario import Scenario
+from coopenv.base.errors import CoopenvError
 from coopenv.viz.web.extra import guarded_server
 
 PORT, PORTS = 8080, 20
@@ -53,20 +52,3 @@ def _obstacle(host: str, port: int) -> str:
             raise CoopenvError(f"--host {host}: is no address of this computer") from None
         return "another program listens there; name another one"
     return ""
-
-
-def vehicle_index(scenario: Scenario, name: str | None) -> int | None:
-    """Return the index of a vehicle by its name or by f1, f2, ...; None without a name.
-
-    Raises:
-        CoopenvError: there is no such vehicle.
-    """
-    if name is None:
-        return None
-    names = list(scenario.vehicle_names)
-    short = {f"f{i + 1}": i for i in range(len(names))}
-    if name in short:
-        return short[name]
-    if name not in names:
-        raise CoopenvError(f"--vehicle {name}: no such vehicle{suggest(name, names)}; known: {listed(names)}")
-    return names.index(name)

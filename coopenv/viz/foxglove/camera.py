@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from coopenv.backends.mcap.messages import codec
 from coopenv.base.format import jsonable
-from coopenv.cars.lens import distort
 from coopenv.estimation.arrays import Array
+from coopenv.estimation.lens import distort
 from coopenv.estimation.map_covariance import covariance_in_map
 from coopenv.scenario.sensing import Camera
 from coopenv.viz.foxglove.scene import MAP, Shown, colour, colour_of, short

@@ -19,7 +19,7 @@ from coopenv.estimation.map_covariance import covariance_in_map
 from coopenv.observers import Run
 from coopenv.observers.recording import Recording
 from coopenv.scenario.bodies import Body
-from coopenv.scenario.sensing import ROTATION_OF_CAMERA, Camera
+from coopenv.scenario.sensing import Camera
 from coopenv.viz.style import DARK_BLUE, INK, vehicle_colour
 from coopenv.viz.topview_geometry import SIGMAS, road_corners, ways
 from coopenv.viz.topview_ground import ASPHALT, ROOF
@@ -97,12 +97,7 @@ class Shown:
         """Return the rotation (3, 3) of a vehicle's optical frame to its body at a tick."""
         camera = self.camera(vehicle)
         assert camera is not None
-        if isinstance(camera.orientation, str):
-            mounted = ROTATION_OF_CAMERA[camera.orientation]
-        else:
-            mounted = Rotation.from_quat(camera.orientation, scalar_first=True).as_matrix()
-        pan = 0.0 if self.recording.pan is None else float(self.recording.pan[k, vehicle])
-        return np.asarray(Rotation.from_euler("z", pan).as_matrix() @ mounted)
+        return camera.to_body(0.0 if self.recording.pan is None else float(self.recording.pan[k, vehicle]))
 
 
 def short(values: Any) -> list[float]:

@@ -5,16 +5,15 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pytest
 import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy.optimize import root
 
-from coopenv.cars.lens import distort, largest_radius, rays, undistort
+from coopenv.cars.lens import rays
 from coopenv.cars.samples import Calibration
-from coopenv.world.build_sensors import _monotone_radius
+from coopenv.estimation.lens import distort, largest_radius, undistort
 from coopenv.world.camera import undistort as simulated
 
 PIXY = (-0.352043, 0.137879, 0.001953, 0.000628, 0.0)
@@ -75,11 +74,6 @@ def test_the_simulator_undistorts_alike() -> None:
     wp.launch(undistort_all, dim=50, inputs=[lens, wp.array(points, dtype=wp.vec2d, device="cpu"), out], device="cpu")
     assert there.all()
     assert_allclose(found, out.numpy(), atol=2e-5)  # whose fixed-point iteration stops after 20 rounds
-
-
-@pytest.mark.parametrize("distortion", [PIXY, FISH, CUSHION, (0.0, 0.0, 0.0, 0.0, 0.0)])
-def test_the_radius_is_the_simulators(distortion: Any) -> None:
-    assert largest_radius(distortion) == _monotone_radius(distortion)
 
 
 def test_points_that_no_ray_gives_are_told() -> None:

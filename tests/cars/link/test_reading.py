@@ -11,10 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from coopenv import CoopenvError
 from coopenv.cars import codec
-from coopenv.cars.lens import distort
 from coopenv.cars.readings import read
 from coopenv.cars.samples import Calibration, Detections, Pose, Report, Status, Twist
 from coopenv.cars.topics import TOPICS, Role
+from coopenv.estimation.lens import distort
 
 pytest.importorskip("rosbags", reason="needs the extra 'svea'")
 

@@ -10,10 +10,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from coopenv.api.engine import Engine
+from coopenv.estimation.map_covariance import position_covariance
 from coopenv.observers import registry
 from coopenv.observers.single_frame import DeadReckoning
 from coopenv.scenario import load_scenario
-from coopenv.viz.topview_geometry import position_covariance
 from coopenv.world.world import World
 from tests.helpers.builders import (
     constant,
