@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,6 +17,11 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 # Small matrices: more BLAS threads only get in each other's way. Read when NumPy is loaded, so not in a fixture.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+MODULES_AT_MOST = 120
+"""Warp modules that a run of the tests may compile: each costs a second or more with an empty cache."""
+STARTED = time.time()
+COMPILED = pytest.StashKey[int]()
 
 
 # The same examples at every run: a failure is then a change of the code, not of the luck.
@@ -36,3 +42,25 @@ def browser() -> Iterator[Any]:
     """A browser without a screen; of one module, as no two can be there at once, nor an event loop beside it."""
     with chromium() as started:
         yield started
+
+
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    """Fail a run that compiled too many Warp modules; counted once, by the process that controls the workers."""
+    if hasattr(session.config, "workerinput"):
+        return
+    from coopenv.world import kernel_cache, launch  # slow to load, and late enough for the variables above
+
+    launch.start_warp()
+    folders = [kernel_cache.cache_folder() / name for name in kernel_cache.modules()]
+    compiled = sum(folder.stat().st_mtime > STARTED for folder in folders)
+    session.config.stash[COMPILED] = compiled
+    if exitstatus == pytest.ExitCode.OK and compiled > MODULES_AT_MOST:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print the number of Warp modules that the run compiled."""
+    compiled = terminalreporter.config.stash.get(COMPILED, None)
+    if compiled is not None:
+        verdict = f", more than {MODULES_AT_MOST}" if compiled > MODULES_AT_MOST else ""
+        terminalreporter.write_line(f"Warp modules compiled in this run: {compiled}{verdict}")
