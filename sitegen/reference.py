@@ -9,7 +9,7 @@ from pydantic.fields import FieldInfo
 from coopenv.base.installation import list_envs
 from coopenv.cars.bags.topic_map import TopicMap
 from coopenv.cars.deployment import Deployment
-from coopenv.cars.topics import TOPICS, Role
+from coopenv.cars.profile import SVEA, CarProfile, Role
 from coopenv.runs.markdown import table
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
 from coopenv.training.settings import Settings
@@ -60,13 +60,21 @@ TOPIC = """# Topics of cars
 
 <!-- Written by `python -m sitegen.reference`. -->
 
-Topics are below `fleet/CAR/`, in CDR as zenoh-bridge-ros2dds sends it: the Zenoh key is the ROS name without its
-leading slash. Motion capture is `fleet/qualisys/CAR/odom`. Presence is a Zenoh liveliness token, `fleet/alive/NAME`.
-Rates are those of [fake cars](../fake_cars.md). Messages above the maximal age are not used. Bearings in messages point
-from the target to the camera, in the optical frame.
+These are the topics of SVEA, `coopenv/cars/profiles/svea.toml`. They are below `fleet/CAR/`, in CDR as
+zenoh-bridge-ros2dds sends it: the Zenoh key is the ROS name without its leading slash. Motion capture is
+`fleet/qualisys/CAR/odom`. Presence is a Zenoh liveliness token, `fleet/alive/NAME`. Rates are those of
+[fake cars](../fake_cars.md). Messages above the maximal age are not used. Bearings in messages point from the target to
+the camera, in the optical frame.
 
 `network.kind = "nats"` or `"ros1"` is for the authors' cars with their names: `agentN.riccatiPoint`,
 `/agentN/pixy_node/objectsInfo`, `/agentN/actuation_twist`, `/qualisys/CAR/odom`, `/agentN/lli/ctrl_request`.
+
+"""
+
+PROFILE = """## Profile of a make
+
+A profile is one TOML file with the keys below; `topics.KEY` is `topics.ROLE.KEY`. Roles and an example are in
+`svea.toml`. A deployment file names its profile (`profile = "my_make.toml"`), the map of a bag too (`names`).
 
 """
 
@@ -115,10 +123,20 @@ def topics() -> str:
     """Return the page of the topics of a car."""
     rows = []
     for role, (sender, rate, content) in TOPIC_ROWS.items():
-        topic = TOPICS[role]
+        topic = SVEA.topics[role]
         age = "" if topic.max_age is None else f"{topic.max_age:g}"
-        rows.append((f"`{topic.suffix}`", f"`{topic.type.replace('/msg/', '/')}`", sender, rate, age, content))
-    return f"{TOPIC}{table(('topic', 'type', 'from', 'Hz', 'max. age, s', 'content'), rows)}\n"
+        rows.append(
+            (
+                f"`{topic.name.removeprefix('fleet/').removeprefix('{car}/')}`",
+                f"`{topic.type.replace('/msg/', '/')}`",
+                sender,
+                rate,
+                age,
+                content,
+            )
+        )
+    found = table(("topic", "type", "from", "Hz", "max. age, s", "content"), rows)
+    return f"{TOPIC}{found}\n\n{PROFILE}{_reference(CarProfile)}"
 
 
 def _reference(part: type[BaseModel]) -> str:
@@ -136,7 +154,7 @@ def _keys(part: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldI
         if field.description and f"{prefix}{name}" not in ("file", "path"):
             yield f"{prefix}{name}", field
         for kind in (field.annotation, *get_args(field.annotation)):
-            if isinstance(kind, type) and issubclass(kind, BaseModel):
+            if isinstance(kind, type) and issubclass(kind, BaseModel) and kind is not CarProfile:
                 yield from _keys(kind, f"{prefix}{name}.")
 
 

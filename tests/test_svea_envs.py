@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import coopenv
-from coopenv.cars.limits import HARDEST
+from coopenv.cars.profile import SVEA
 from coopenv.cli import main
 from coopenv.policies import load_agent
 from tests.helpers.processes import ROOT
@@ -43,7 +43,7 @@ def test_limits_are_those_of_the_cars(name: str) -> None:
     scenario = coopenv.load_scenario(name)
     for limits in scenario.limits:
         assert 0.0 < limits.dead_band < 0.26 <= limits.max_speed <= 0.5
-        assert limits.max_steering <= HARDEST.steering + 1e-9 and not limits.reverse
+        assert limits.max_steering <= SVEA.hardest.steering + 1e-9 and not limits.reverse
     assert scenario.horizon <= 45.0
     assert scenario.topology.acyclic and scenario.topology.mode == "sensed"
     assert [landmark.name for landmark in scenario.landmarks][:4] == ["SL1", "SL2", "SL4", "SL5"]

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.topics import TOPICS
+from coopenv.cars.profile import SVEA, CarProfile
 
 CAMERA = {
     "pixy_camera/msg/ObjectInfo": """
@@ -231,12 +231,22 @@ def _decoded(read: Any, payload: bytes, kind: str) -> Any:
 
 
 @cache
-def warm_up() -> None:
-    """Encode and decode one message of every type."""
+def _warm_up(types: frozenset[str]) -> None:
     store = ros2()
-    for topic in TOPICS.values():
-        message = empty(topic.type)
-        store.deserialize_cdr(store.serialize_cdr(message, topic.type), topic.type)
+    for kind in types:
+        store.deserialize_cdr(store.serialize_cdr(empty(kind), kind), kind)
+
+
+def warm_up(profile: CarProfile = SVEA) -> None:
+    """Encode and decode one message of every type, which compiles the codec.
+
+    Raises:
+        CoopenvError: a type of the profile is not known.
+    """
+    for role, topic in profile.topics.items():
+        if topic.type not in ros2().types:
+            raise CoopenvError(f"profile: topics.{role}.type: {topic.type} is not known")
+    _warm_up(frozenset(topic.type for topic in profile.topics.values()))
 
 
 def empty(kind: str) -> Any:

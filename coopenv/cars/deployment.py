@@ -2,24 +2,19 @@
 
 import tomllib
 from collections import Counter
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
 
 from coopenv.base.errors import CoopenvError, listed, shown, suggest
-from coopenv.cars.limits import HARDEST, USUAL, Limits, Point, is_simple
+from coopenv.cars.limits import USUAL, Limits, Point, is_simple
+from coopenv.cars.profile import SVEA, CarProfile, Number, Positive, Pulses, Section, load_profile
 from coopenv.cars.transport.endpoints import SECURE, address_of
 
 
-class Part(BaseModel):
-    """A section of the file; unknown keys are refused."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
-
-
-class Tls(Part):
+class Tls(Section):
     """Certificates of the transport; paths are relative to the file."""
 
     root_ca: Path
@@ -59,7 +54,7 @@ def refuse_foreign(kind: str, endpoints: tuple[str, ...]) -> None:
             raise ValueError(f"connect: {shown(endpoint)}: {kind} has {listed(WIRES[kind][1])}")
 
 
-class Network(Part):
+class Network(Section):
     """How the cars are reached."""
 
     kind: Literal["zenoh", "nats", "ros1"] = "zenoh"
@@ -86,7 +81,7 @@ class Network(Part):
         return self
 
 
-class GateLink(Part):
+class GateLink(Section):
     """Where the gate of a car connects to, whatever `network` says: no radio may stand between it and the wheels."""
 
     connect: tuple[Endpoint, ...] | None = Field(default=None, min_length=1)
@@ -95,15 +90,11 @@ class GateLink(Part):
 
 
 MOST_CHANNELS = 18
-NEUTRAL, MOVED = 1500, 100
-"""Pulse of a stick at rest, and by how much one has to change to count as moved, us."""
-SHORTEST, LONGEST = 800, 2200
-"""Pulses that are a signal, us."""
 
 Channel = Annotated[int, Field(ge=1, le=MOST_CHANNELS)]
 
 
-class Remote(Part):
+class Remote(Section):
     """Channels of the remote control, as `mavros/rc/in` numbers them from 1 on; PX4's usual order."""
 
     steering: Channel = 1
@@ -119,36 +110,33 @@ class Remote(Part):
             raise ValueError("steering, throttle and mode_switch: two of them are on the same channel")
         return self
 
-    def fault(self, pulses: tuple[int, ...]) -> str:
+    def fault(self, pulses: tuple[int, ...], usual: Pulses = SVEA.pulses) -> str:
         """Return why pulses, us, one per channel, tell nothing; empty where they do."""
         for name in ("steering", "throttle", "mode_switch"):
             channel = getattr(self, name)
             if pulses and channel > len(pulses):
                 return f"its remote control has {len(pulses)} channels, remote.{name} is {channel}"
-            if not pulses or (channel and not SHORTEST <= pulses[channel - 1] <= LONGEST):
+            if not pulses or (channel and not usual.shortest <= pulses[channel - 1] <= usual.longest):
                 return "its remote control has no signal"
         return ""
 
-    def drives(self, pulses: tuple[int, ...]) -> bool:
+    def drives(self, pulses: tuple[int, ...], usual: Pulses = SVEA.pulses) -> bool:
         """Return whether a stick is moved; one without a signal is not."""
         used = [pulses[channel - 1] for channel in (self.steering, self.throttle) if channel <= len(pulses)]
-        return any(SHORTEST <= pulse <= LONGEST and abs(pulse - NEUTRAL) > MOVED for pulse in used)
+        return any(
+            usual.shortest <= pulse <= usual.longest and abs(pulse - usual.neutral) > usual.moved for pulse in used
+        )
 
-    def switched(self, pulses: tuple[int, ...], before: tuple[int, ...]) -> bool:
+    def switched(self, pulses: tuple[int, ...], before: tuple[int, ...], usual: Pulses = SVEA.pulses) -> bool:
         """Return whether the switch is no longer where it was."""
         if not 0 < self.mode_switch <= min(len(pulses), len(before)):
             return False
-        return abs(pulses[self.mode_switch - 1] - before[self.mode_switch - 1]) > MOVED
+        return abs(pulses[self.mode_switch - 1] - before[self.mode_switch - 1]) > usual.moved
 
-
-MARKERS = range(1, 8)
-"""Numbers of markers: the Pixy2 tells apart seven colour signatures."""
 
 Name = Annotated[str, Field(max_length=64, pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 Marker = Annotated[int, Field(ge=0)]
 Agent = Annotated[int, Field(ge=0, le=9999)]
-Positive = Annotated[float, Field(gt=0.0, le=1e6)]
-Number = Annotated[float, Field(ge=-1e6, le=1e6)]
 Age = Annotated[float, Field(gt=0.0, le=2.0)]
 Corner = tuple[Number, Number]
 
@@ -157,7 +145,7 @@ class DeploymentError(CoopenvError):
     """A deployment file does not describe a fleet that can drive."""
 
 
-class Car(Part):
+class Car(Section):
     """One car."""
 
     name: Name
@@ -178,13 +166,13 @@ class Car(Part):
         return self.marker if self.agent is None else self.agent
 
 
-def refuse_repeated(cars: Sequence[Car], markers: Mapping[str, int], numbers: Container[int] | None = None) -> None:
+def refuse_repeated(cars: Sequence[Car], markers: Mapping[str, int], numbers: tuple[int, int] | None = None) -> None:
     """Refuse a name, vehicle, landmark or marker of two, with a ValueError that says which.
 
     Args:
         cars: a fleet.
         markers: numbers of the markers of landmarks, by name.
-        numbers: those that the camera knows (None: any).
+        numbers: smallest and largest one that the camera identifies (None: any).
     """
     given: dict[str, list[Any]] = {
         "cars: the name": [car.name for car in cars],
@@ -198,14 +186,14 @@ def refuse_repeated(cars: Sequence[Car], markers: Mapping[str, int], numbers: Co
             if times > 1:
                 raise ValueError(f"{what} {value!r} is used twice")
     for what, number in [*markers.items(), *((c.name, c.marker) for c in cars if c.marker is not None)]:
-        if numbers is not None and number not in numbers:
-            raise ValueError(f"marker {number} of {what}: the camera knows {MARKERS[0]} to {MARKERS[-1]} only")
+        if numbers is not None and not numbers[0] <= number <= numbers[1]:
+            raise ValueError(f"marker {number} of {what}: the camera knows {numbers[0]} to {numbers[1]} only")
     for i, car in enumerate(cars):
         if car.vehicle is not None and car.landmark is not None:
             raise ValueError(f"cars.{i}: is a vehicle or a landmark, not both")
 
 
-class Sensors(Part):
+class Sensors(Section):
     """Which topics are read."""
 
     odometry: Literal["wheel+imu", "wheel", "odometry"] = "wheel+imu"
@@ -220,16 +208,19 @@ class Sensors(Part):
     """Whether motion capture is read. It serves infos, metrics and safety, never observations."""
 
 
-class Safety(Part):
-    """What stops the cars. Limits above the hard ones of `coopenv.cars.limits` are refused."""
+LIMITED = ("speed", "steering", "acceleration", "steering_rate")
 
-    max_speed: float = Field(default=USUAL.speed, gt=0.0, le=HARDEST.speed)
+
+class Safety(Section):
+    """What stops the cars. Limits above those of the profile are refused."""
+
+    max_speed: float = Field(default=USUAL.speed, gt=0.0)
     """Largest speed, m/s."""
-    max_steering: float = Field(default=USUAL.steering, gt=0.0, le=HARDEST.steering)
+    max_steering: float = Field(default=USUAL.steering, gt=0.0)
     """Largest steering angle, rad."""
-    max_acceleration: float = Field(default=USUAL.acceleration, gt=0.0, le=HARDEST.acceleration)
+    max_acceleration: float = Field(default=USUAL.acceleration, gt=0.0)
     """Largest acceleration, m/s^2."""
-    max_steering_rate: float = Field(default=USUAL.steering_rate, gt=0.0, le=HARDEST.steering_rate)
+    max_steering_rate: float = Field(default=USUAL.steering_rate, gt=0.0)
     """Largest rate of the steering angle, rad/s."""
     reverse: bool = False
     """Whether cars may drive backwards."""
@@ -260,14 +251,8 @@ class Safety(Part):
             raise ValueError("expected at least 3 corners of a polygon whose edges do not cross")
         return corners
 
-    @property
-    def limits(self) -> Limits:
-        """The limits of commands."""
-        speeds = (self.max_speed, self.max_steering, self.max_acceleration, self.max_steering_rate)
-        return Limits(*speeds, reverse=self.reverse)
 
-
-class Security(Part):
+class Security(Section):
     """Signatures of commands and of messages between cars."""
 
     keys: Path | None = None
@@ -276,13 +261,15 @@ class Security(Part):
     """Name of the key with which this end signs, if it is not a car."""
 
 
-class Deployment(Part):
+class Deployment(Section):
     """A fleet and its use."""
 
     environment: str
     """Name of an environment, or TOML file (relative to this file): vehicles, sensors, radio and observer."""
     overrides: dict[str, Any] = Field(default={})
     """Dotted keys of the environment with other values."""
+    profile: CarProfile = SVEA
+    """Make of the cars: a shipped profile, `svea`, or a TOML file (relative to this file)."""
     cars: tuple[Car, ...] = Field(min_length=1, max_length=64)
     """One table `[[cars]]` per car."""
     markers: dict[str, Marker] = Field(default={})
@@ -300,7 +287,15 @@ class Deployment(Part):
 
     @model_validator(mode="after")
     def _nothing_is_used_twice(self) -> Self:
-        refuse_repeated(self.cars, self.markers, MARKERS)
+        refuse_repeated(self.cars, self.markers, self.profile.markers)
+        return self
+
+    @model_validator(mode="after")
+    def _limits_are_those_of_the_make(self) -> Self:
+        for key in self.safety.model_fields_set & {f"max_{name}" for name in LIMITED}:
+            value, most = getattr(self.safety, key), getattr(self.profile.hardest, key.removeprefix("max_"))
+            if value > most:
+                raise ValueError(f"safety.{key}: {value:g} is over {most:.4g}, the largest of this make")
         return self
 
     @model_validator(mode="after")
@@ -310,6 +305,13 @@ class Deployment(Part):
         except ValueError as error:
             raise ValueError(f"gate.{error}") from None
         return self
+
+    @property
+    def limits(self) -> Limits:
+        """The limits of commands; a default is at most the largest of the make."""
+        hardest = self.profile.hardest
+        values = {name: min(getattr(self.safety, f"max_{name}"), getattr(hardest, name)) for name in LIMITED}
+        return Limits(**values, reverse=self.safety.reverse)
 
     @property
     def gate_connect(self) -> tuple[str, ...]:
@@ -377,6 +379,11 @@ def load_deployment(path: str | Path, connect: str | None = None) -> Deployment:
 
 def parse_deployment(raw: dict[str, Any], path: Path) -> Deployment:
     """Validate plain data that stands, or could stand, in a file; errors as for `load_deployment`."""
+    if isinstance(given := raw.get("profile"), str):
+        try:
+            raw = {**raw, "profile": load_profile(given, path.parent)}
+        except CoopenvError as error:
+            raise DeploymentError(f"{path.name}: profile: {error}") from None
     try:
         made = Deployment.model_validate(raw)
     except ValidationError as error:

@@ -1,4 +1,4 @@
-"""What a car may be told to do."""
+"""Limits of commands, and the polygon of a geofence."""
 
 import math
 from collections.abc import Sequence
@@ -31,10 +31,10 @@ class Limits:
         speed = _toward(before[0], wanted[0], self.acceleration * dt)
         return speed, _toward(before[1], wanted[1], self.steering_rate * dt)
 
-    def check(self) -> "Limits":
+    def check(self, hardest: "Limits") -> "Limits":
         """Return these limits. Raises CoopenvError: one of them is not above zero, or beyond the hardest."""
         for field in fields(self):
-            value, most = getattr(self, field.name), getattr(HARDEST, field.name)
+            value, most = getattr(self, field.name), getattr(hardest, field.name)
             if field.name != "reverse" and not 0.0 < value <= most:
                 raise CoopenvError(f"limit of {field.name.replace('_', ' ')}: must be above 0, at most {most:.4g}")
         return self
@@ -48,11 +48,8 @@ def _toward(before: float, wanted: float, most: float) -> float:
 SLACK = 1e-6
 """m/s or rad, of numbers that have gone through single precision."""
 
-HARDEST = Limits(speed=1.53, steering=math.pi / 6, acceleration=2.0, steering_rate=4.0, reverse=True)
-"""Beyond which no file can go: 90 % of the low gear, and what a SVEA's servo does."""
-
 USUAL = Limits(speed=0.5, steering=math.pi / 6, acceleration=1.0, steering_rate=2.0)
-"""Where nothing else is said."""
+"""Default limits."""
 
 
 Point = tuple[float, float]

@@ -8,6 +8,7 @@ import numpy as np
 from coopenv.base.errors import CoopenvError, listed, shown
 from coopenv.cars.deployment import MOST_CHANNELS
 from coopenv.cars.lens import bearings, detections
+from coopenv.cars.profile import CarProfile, Role
 from coopenv.cars.samples import (
     Array,
     Calibration,
@@ -22,7 +23,6 @@ from coopenv.cars.samples import (
     rotation_vector_of,
     vector,
 )
-from coopenv.cars.topics import Role
 
 LONGEST_MODE = 64  # characters
 
@@ -200,3 +200,10 @@ READERS: dict[Role, dict[str, Callable[..., Value]]] = {
     Role.BATTERY: {"sensor_msgs/msg/BatteryState": battery_of},
 }
 """Types of a role, and what reads them; roles of commands are not here."""
+
+
+def check_types(profile: CarProfile, where: str) -> None:
+    """Refuse a profile with a type that cannot be read in its role, with a CoopenvError that begins with `where`."""
+    for role, readers in READERS.items():
+        if (kind := profile.topics[role].type) not in readers:
+            raise CoopenvError(f"{where}: profile: topics.{role}.type: {kind} is none of {listed(list(readers))}")

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.base.errors import CoopenvError, shown
-from coopenv.cars.topics import Role
+from coopenv.cars.profile import Role
 
 Array = NDArray[np.float64]
 

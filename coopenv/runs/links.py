@@ -8,7 +8,7 @@ from rich.table import Table
 
 from coopenv.base.errors import listed
 from coopenv.cars.backend.backend import Svea
-from coopenv.cars.topics import Role, topic_of
+from coopenv.cars.profile import Role
 
 STEADY_FROM = 2.0
 """s: cars know their places by then."""
@@ -63,7 +63,7 @@ def truth_report(backend: Svea) -> str:
     if not backend.health.received:
         where = ", ".join(backend.deployment.network.connect)
         return f"nothing has come from {listed(names)} by {where}: are they on, and are their names fleet/NAME/...?"
-    topics = [topic_of(name, Role.TRUTH) for name in names]
+    topics = [backend.binding.profile.topic_of(name, Role.TRUTH) for name in names]
     came = [topic for topic in topics if isfinite(backend.station.silence(topic))]
     silent = [topic for topic in topics if topic not in came]
     parts = [f"nothing came on {listed(silent)}"] if silent else []

@@ -20,7 +20,7 @@ import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.opening import open_svea
 from coopenv.cars.codec import decode
-from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Arrival
 from coopenv.cars.transport.zenoh import open_zenoh
 from tests.helpers.cars import OVERTAKING, PATIENT, cars, fakes, write_fleet
@@ -221,7 +221,7 @@ def test_actions_mean_the_same_speeds_and_angles(lab: tuple[Path, Any], processe
     for network, env in ((hub.connect(), in_process(path, hub)), (watch, over_zenoh(processes))):
         arrivals: list[Arrival] = []
         for car in wanted:
-            network.subscribe(topic_of(car, Role.COMMAND), arrivals.append)
+            network.subscribe(SVEA.topic_of(car, Role.COMMAND), arrivals.append)
         heard: dict[str, dict[int, np.ndarray]] = {car: {} for car in wanted}
         try:
             env.reset(seed=1, options={"arm": True})
@@ -229,7 +229,7 @@ def test_actions_mean_the_same_speeds_and_angles(lab: tuple[Path, Any], processe
                 env.step(dict.fromkeys(env.possible_agents, action))
                 for car, commands in heard.items():
                     for arrival in [a for a in arrivals if car in a.topic]:
-                        command = decode(arrival.payload, TOPICS[Role.COMMAND].type)
+                        command = decode(arrival.payload, SVEA.topics[Role.COMMAND].type)
                         number = int(command.header.frame_id.rpartition(":")[2])
                         commands[number] = np.array([command.drive.speed, command.drive.steering_angle])
                 if min(map(len, heard.values())) >= 6:

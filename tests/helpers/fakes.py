@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections import defaultdict
 from typing import Any
 
-from coopenv.cars.actuation import Drive, to_manual
 from coopenv.cars.backend.binding import bind
 from coopenv.cars.codec import decode, encode, make
 from coopenv.cars.deployment import Car, Deployment, Sensors
 from coopenv.cars.fake.car import Fake
-from coopenv.cars.gate.codec import write_manual
+from coopenv.cars.gate.codec import write_drive
 from coopenv.cars.gate.core import Clock
-from coopenv.cars.topics import RESET_TOPIC, TOPICS, Role, topic_of
+from coopenv.cars.profile import RESET_TOPIC, SVEA, CarProfile, Drive, Role
 from coopenv.cars.transport.base import Arrival, Hub
 from coopenv.scenario import Scenario, load_scenario
 
@@ -33,17 +32,20 @@ class Stage:
         cars: tuple[Car, ...],
         overrides: dict[str, Any] | None = None,
         sensors: Sensors | None = None,
+        profile: CarProfile = SVEA,
         **options: Any,
     ) -> None:
         self.now, self.wall, self.died = 10**12, 1_700_000_000 * 10**9, list[str]()
         self.complaints: list[str] = []
         self.scenario: Scenario = load_scenario(environment, overrides or {})
         sensors = sensors or Sensors()
-        self.fleet = Deployment(environment=environment, cars=cars, markers=MARKERS, fakes=True, sensors=sensors)
+        self.fleet = Deployment(
+            environment=environment, cars=cars, markers=MARKERS, fakes=True, sensors=sensors, profile=profile
+        )
         self.hub, self._said = Hub(), defaultdict[str, list[Arrival]](list)
         self.network = self.hub.connect()
         self.network.subscribe("**", lambda arrival: self._said[arrival.topic].append(arrival))
-        binding = bind(self.scenario, cars, MARKERS, "test", None)
+        binding = bind(self.scenario, cars, MARKERS, "test", None, profile)
         clock = Clock(lambda: self.wall + self.now, lambda: self.now)
         self.cars = {
             car.name: Fake(
@@ -68,8 +70,8 @@ class Stage:
 
     def command(self, car: str, speed: float, steering: float = 0.0) -> None:
         """Send what a gate would."""
-        payload = write_manual(self.wall + self.now, to_manual(Drive(steering, speed)))
-        self.network.publish(topic_of(car, Role.MANUAL), payload)
+        payload = write_drive(self.wall + self.now, self.fleet.profile.command, Drive(steering, speed))
+        self.network.publish(self.fleet.profile.topic_of(car, Role.MANUAL), payload)
 
     def drive(self, car: str, speed: float, steering: float, seconds: float) -> None:
         """Send a command 20 times a second."""
@@ -83,7 +85,15 @@ class Stage:
 
     def arrivals(self, car: str, role: Role) -> list[Any]:
         """Return the messages under a topic since `forget`, decoded."""
-        return [decode(arrival.payload, TOPICS[role].type) for arrival in self._said[topic_of(car, role)]]
+        return [
+            decode(arrival.payload, self.fleet.profile.topics[role].type)
+            for arrival in self._said[self.fleet.profile.topic_of(car, role)]
+        ]
+
+    @property
+    def hub_arrivals(self) -> list[Arrival]:
+        """All messages since `forget`."""
+        return [arrival for arrivals in self._said.values() for arrival in arrivals]
 
     def forget(self) -> None:
         """Forget what has been said."""

@@ -18,7 +18,7 @@ from coopenv.cars.backend.gates import Gates
 from coopenv.cars.backend.opening import open_svea
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.limits import USUAL
-from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Hub
 from coopenv.runs.command import execute, report
 from coopenv.runs.links import links_line, links_report
@@ -102,13 +102,13 @@ def test_what_gates_refused_before_does_not_count() -> None:
             "state": state,
             **counts,
         }
-        message = make(TOPICS[Role.GATE].type, **about, accepted=0, last_sequence=0)
-        gate.publish(topic_of("svea7", Role.GATE), encode(message))
+        message = make(SVEA.topics[Role.GATE].type, **about, accepted=0, last_sequence=0)
+        gate.publish(SVEA.topic_of("svea7", Role.GATE), encode(message))
 
     assert gates.refused("svea7") == {}
     say("disarmed", "", 40)
     assert sum(gates.refused("svea7").values()) == 0
-    gate.subscribe(topic_of("svea7", Role.ARM), lambda _: say("armed", gates.session, 42))
+    gate.subscribe(SVEA.topic_of("svea7", Role.ARM), lambda _: say("armed", gates.session, 42))
     say("disarmed", "", 41)
     assert gates.refused("svea7") == {"stale": 1, "session": 0}
     gates.begin()

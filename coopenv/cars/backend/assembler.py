@@ -20,17 +20,14 @@ from coopenv.cars.backend.neighbours import Hearsay
 from coopenv.cars.backend.tracks import Frames, Odometer, PoseTrack
 from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Sensors
+from coopenv.cars.profile import Role
 from coopenv.cars.readings import read
 from coopenv.cars.samples import Calibration, Detections, Pose, Report, Sample, Twist
-from coopenv.cars.topics import TOPICS, Role, topic_of
 from coopenv.cars.transport.base import Arrival
 from coopenv.estimation.arrays import Array
 from coopenv.observers.recording import Sensed, Truth, is_due, sealed
 from coopenv.scenario.sensing import Camera
 
-LATE = round((TOPICS[Role.DETECTIONS].max_age or 0.0) * 1e9)
-SILENT = round((TOPICS[Role.ODOMETRY].max_age or 0.0) * 1e9)
-"""ns without odometry after which nothing is said to have come from a car."""
 FUTURE = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
 NS = 1e-9
 
@@ -57,7 +54,8 @@ class Assembler:
         """
         self.binding = binding
         self._offsets = dict(offsets or {})
-        scenario = binding.scenario
+        scenario, topics = binding.scenario, binding.profile.topics
+        self._late, self._silent = topics[Role.DETECTIONS].max_age_ns, topics[Role.ODOMETRY].max_age_ns
         self._period = round(1e9 / scenario.rates.camera)
         self._ratio = (scenario.rates.observer or scenario.rates.camera) / scenario.rates.camera
         self._to_body = [camera.to_body() for camera in scenario.cameras]
@@ -151,12 +149,12 @@ class Assembler:
                 continue
             stamp = car.odometer.stamp
             age = now - stamp if stamp is not None else None
-            missing[i] = age is None or age > SILENT
+            missing[i] = age is None or age > self._silent
             odometry_age[i] = np.inf if age is None else max(age, 0) * NS
             velocity[i], angular_velocity[i] = car.odometer.twist
             bearing_age[i] = (now - car.exposed) * NS if car.exposed is not None else (now - self._begin) * NS
             if frame is not None:
-                late[i] = car.lag > LATE
+                late[i] = car.lag > self._late
                 self._see(i, frame, now, bearings[i], visible[i])
         self._count()
         return Sensed(
@@ -256,7 +254,7 @@ class Intake:
     def __init__(self, binding: Binding, sensors: Sensors) -> None:
         """Say which topics are read."""
         self._topics: dict[str, tuple[str, Role, Calibration | None]] = {}
-        self._sensors = sensors
+        self._sensors, self._profile = sensors, binding.profile
         self.offsets = {name: ClockOffset.unknown() for name in binding.cars}
         self.rejected: dict[str, Counter[str]] = {name: Counter() for name in (*binding.cars, *binding.leaders)}
         """Messages that could not be used, by car and role."""
@@ -264,10 +262,10 @@ class Intake:
         """Of the environment, by car."""
         for name, vehicle in binding.cars.items():
             for role in roles_of(sensors, vehicle in binding.local):
-                self._topics[topic_of(name, role)] = name, role, self.calibrations[name]
+                self._topics[binding.profile.topic_of(name, role)] = name, role, self.calibrations[name]
         for name in binding.leaders:
             for role in (Role.ESTIMATE, Role.POINT, *((Role.TRUTH,) if sensors.truth else ())):
-                self._topics[topic_of(name, role)] = name, role, None
+                self._topics[binding.profile.topic_of(name, role)] = name, role, None
 
     @property
     def topics(self) -> tuple[str, ...]:
@@ -281,7 +279,7 @@ class Intake:
             return
         car, role, calibration = found
         try:
-            message = decode(arrival.payload, TOPICS[role].type)
+            message = decode(arrival.payload, self._profile.topics[role].type)
             stamp = stamp_of(message)
             value = read(role, message, calibration, distorted=self._sensors.distorted)
         except CoopenvError:

@@ -21,7 +21,7 @@ from coopenv.cars.backend.watchdog import Trip, Vitals, Watchdog
 from coopenv.cars.codec import encode, warm_up
 from coopenv.cars.deployment import Deployment
 from coopenv.cars.keys import Signer, Verifier
-from coopenv.cars.topics import Role, presence_of, topic_of
+from coopenv.cars.profile import Role, presence_of
 from coopenv.cars.transport.base import Arrival, Transport
 from coopenv.observers.recording import Sensed
 
@@ -81,10 +81,12 @@ class Svea:
         self.intake = Intake(binding, deployment.sensors)
         own = deployment.security.identity
         heard = (*binding.cars, *binding.leaders)
-        said = {topic_of(name, role): (name, own) for name in heard for role in SPOKEN}
+        said = {binding.profile.topic_of(name, role): (name, own) for name in heard for role in SPOKEN}
         self.station = Station(transport, self.intake.topics, verifier, said)
-        self.gates = Gates(transport, tuple(self._local), deployment.safety.limits, signer, verifier)
-        self.board = StatusBoard(transport, tuple(self._local), deployment.remote, deployment.conditions)
+        self.gates = Gates(transport, tuple(self._local), deployment.limits, signer, verifier, binding.profile)
+        self.board = StatusBoard(
+            transport, tuple(self._local), deployment.remote, deployment.conditions, binding.profile
+        )
         rates = self.scenario.rates
         self._pacer = Pacer(1.0 / rates.camera, self.scenario.ticks_per_decision)
         self._assembler = Assembler(binding)
@@ -101,6 +103,7 @@ class Svea:
             self._others,
             self._odometry,
             1.0 / rates.decision,
+            binding.profile,
         )
         calibrations = {name: self.intake.calibrations[name] for name in self._local}
         fleet = Fleet(deployment, calibrations, self.station, self.intake, self.board, self.vitals, self._others)
@@ -113,7 +116,7 @@ class Svea:
         self._presented = presence_of(deployment.security.identity)
         transport.announce(self._presented)
         self._closed = threading.Lock()
-        warm_up()
+        warm_up(binding.profile)
 
     def _presence(self, key: str, there: bool) -> None:
         name = key.rsplit("/", 1)[-1]
@@ -209,7 +212,7 @@ class Svea:
                 self._publish(name, Role.REPORT, report)
 
     def _publish(self, name: str, role: Role, message: Any) -> None:
-        topic, payload = topic_of(name, role), encode(message)
+        topic, payload = self.binding.profile.topic_of(name, role), encode(message)
         signature = b"" if self._signer is None else self._signer.sign(topic, payload)
         self._transport.publish(topic, payload, signature)
 

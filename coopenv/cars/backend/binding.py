@@ -7,6 +7,8 @@ from typing import Any
 from coopenv.backends.base import IGNORED_OPTIONS
 from coopenv.base.errors import CoopenvError, listed, shown, suggest
 from coopenv.cars.deployment import Car
+from coopenv.cars.profile import SVEA, CarProfile
+from coopenv.cars.readings import check_types
 from coopenv.scenario import Scenario
 
 
@@ -19,6 +21,7 @@ class Binding:
     leaders: Mapping[str, int]  # or of the moving landmark
     targets: Mapping[int, int]  # number of a marker to the index of the target that carries it
     local: tuple[int, ...]  # vehicles that are estimated here
+    profile: CarProfile = SVEA  # make of the cars
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -39,7 +42,14 @@ class Binding:
         return len(self.local) < len(self.cars)
 
 
-def bind(scenario: Scenario, cars: Sequence[Car], markers: Mapping[str, int], where: str, only: str | None) -> Binding:
+def bind(
+    scenario: Scenario,
+    cars: Sequence[Car],
+    markers: Mapping[str, int],
+    where: str,
+    only: str | None,
+    profile: CarProfile = SVEA,
+) -> Binding:
     """Return who is who.
 
     Args:
@@ -48,10 +58,13 @@ def bind(scenario: Scenario, cars: Sequence[Car], markers: Mapping[str, int], wh
         markers: numbers of the markers of landmarks, by name.
         where: the file that says so.
         only: the car whose vehicle alone is estimated here; None: all are.
+        profile: make of the cars.
 
     Raises:
-        CoopenvError: a name is not of the scenario, a vehicle has no car, or the camera has no calibration.
+        CoopenvError: a name is not of the scenario, a vehicle has no car, or the camera has no calibration; the
+            profile has a type that cannot be read.
     """
+    check_types(profile, where)
     vehicles, landmarks = scenario.vehicle_names, [landmark.name for landmark in scenario.landmarks]
     driven, leaders = [car for car in cars if car.landmark is None], [car for car in cars if car.landmark is not None]
     if len(driven) != len(vehicles):
@@ -80,7 +93,7 @@ def bind(scenario: Scenario, cars: Sequence[Car], markers: Mapping[str, int], wh
     if only is not None and only not in chosen:
         raise CoopenvError(f"{where}: unknown car '{only}'{suggest(only, chosen)}; known: {listed([*chosen])}")
     local = tuple(range(len(vehicles))) if only is None else (chosen[only],)
-    return Binding(scenario, chosen, led, targets, local)
+    return Binding(scenario, chosen, led, targets, local, profile)
 
 
 def _index(known: Sequence[str], name: str, where: str) -> int:

@@ -27,7 +27,7 @@ from coopenv.cars.backend.assembler import Assembler, Intake
 from coopenv.cars.backend.binding import OPTIONS, Binding, bind, wishes_of
 from coopenv.cars.codec import STOPPED, TICK, decode, encode, header, make, ros2, stamp_of
 from coopenv.cars.deployment import Deployment, parse_deployment
-from coopenv.cars.topics import STOPPED_TOPIC, TICK_TOPIC
+from coopenv.cars.profile import STOPPED_TOPIC, TICK_TOPIC
 from coopenv.cars.transport.base import Arrival, Callback, Transport
 from coopenv.scenario.files import override, parse_scenario
 from coopenv.scenario.own_terms import without_own_terms
@@ -262,7 +262,7 @@ class Drive(TickGenerator):
             override(raw, key, value)
         scenario = parse_scenario(raw, f"{self._where}: {ATTACHMENT}")
         deployment = parse_deployment(given, Path(self._where))
-        return deployment, bind(scenario, deployment.cars, deployment.markers, self._where, only)
+        return deployment, bind(scenario, deployment.cars, deployment.markers, self._where, only, deployment.profile)
 
     def _warn(self) -> None:
         """Say from where on the file is missing."""

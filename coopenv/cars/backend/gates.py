@@ -11,7 +11,7 @@ from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import MOST_BYTES, decode, encode, header, make, stamp_of
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.limits import Limits
-from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.profile import GATE_TYPES, SVEA, CarProfile, Role
 from coopenv.cars.transport.base import Arrival, Transport
 
 PATIENCE = 1.0  # s in which a gate has to answer
@@ -48,13 +48,14 @@ class Gates:
         limits: Limits,
         signer: Signer | None,
         verifier: Verifier | None = None,
+        profile: CarProfile = SVEA,
     ) -> None:
         """Listen to the gates; with a verifier only to what they have signed."""
         self._transport, self._limits, self._signer, self._verifier = transport, limits, signer, verifier
-        self._lock = threading.Lock()
+        self._profile, self._lock = profile, threading.Lock()
         self._states = {car: GateState() for car in cars}
         self._before: dict[str, dict[str, int]] = {}
-        self._cars = {topic_of(car, Role.GATE): car for car in cars}
+        self._cars = {self._profile.topic_of(car, Role.GATE): car for car in cars}
         self._stamps = dict.fromkeys(cars, 0)
         self._stopping = False
         self.stopped_by_others: set[str] = set()
@@ -91,7 +92,7 @@ class Gates:
             self.dropped[car]["signature"] += 1
             return
         try:
-            m = decode(arrival.payload, TOPICS[Role.GATE].type)
+            m = decode(arrival.payload, GATE_TYPES[Role.GATE])
         except CoopenvError:
             self.dropped[car]["malformed"] += 1
             return
@@ -155,7 +156,7 @@ class Gates:
             if dropped := self.dropped[car] - known[car]:
                 why = ", ".join(f"{reason} {count}" for reason, count in dropped.items())
                 raise CoopenvError(f"{car}: what its gate says is not believed ({why}): are keys and clocks the same?")
-            topic = topic_of(car, Role.GATE)
+            topic = self._profile.topic_of(car, Role.GATE)
             raise CoopenvError(f"{car}: no gate has spoken on {topic}: is `coopenv svea gate` running there?")
         return self.states
 
@@ -167,7 +168,7 @@ class Gates:
 
     def _arm(self, car: str, armed: bool, nonce: str) -> None:
         message = make(
-            TOPICS[Role.ARM].type, header=header(time.time_ns()), session=self.session, nonce=nonce, armed=armed
+            GATE_TYPES[Role.ARM], header=header(time.time_ns()), session=self.session, nonce=nonce, armed=armed
         )
         self._send(car, Role.ARM, message)
 
@@ -176,7 +177,7 @@ class Gates:
         with self._lock:
             self._stopping = True
         for car in self._states:
-            self._send(car, Role.STOP, make(TOPICS[Role.STOP].type, data=True))
+            self._send(car, Role.STOP, make(GATE_TYPES[Role.STOP], data=True))
 
     def command(self, car: str, speed: float, steering: float, acceleration: float) -> None:
         """Send a command: m/s, rad, m/s^2, clipped to the limits."""
@@ -192,16 +193,16 @@ class Gates:
             jerk=0.0,
         )
         about = header(time.time_ns(), f"{self.session}:{self._sequence}")
-        self._send(car, Role.COMMAND, make(TOPICS[Role.COMMAND].type, header=about, drive=drive))
+        self._send(car, Role.COMMAND, make(GATE_TYPES[Role.COMMAND], header=about, drive=drive))
 
     def next(self) -> None:
         """Begin the commands of the next decision."""
         self._sequence += 1
 
     def _send(self, car: str, role: Role, message: Any) -> None:
-        topic, payload = topic_of(car, role), encode(message)
+        topic, payload = self._profile.topic_of(car, role), encode(message)
         signature = b"" if self._signer is None else self._signer.sign(topic, payload)
-        kind = TOPICS[role]
+        kind = self._profile.topics[role]
         self._transport.publish(topic, payload, signature, urgent=kind.urgent, reliable=kind.reliable)
 
 

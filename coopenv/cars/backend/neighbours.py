@@ -11,8 +11,8 @@ from coopenv.backends.base import Told
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.backend.tracks import PlaceTrack
 from coopenv.cars.codec import header, make
+from coopenv.cars.profile import Role
 from coopenv.cars.samples import Pose, Report
-from coopenv.cars.topics import TOPICS, Role
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.rotations import skew
 from coopenv.observers.contract import Message, Received
@@ -94,8 +94,6 @@ def checked(told: Told) -> bool:
     return bool(np.isfinite(numbers).all())
 
 
-STALE = round((TOPICS[Role.ESTIMATE].max_age or 0.0) * 1e9)
-"""ns after which what another car has said no longer counts."""
 NS = 1e-9
 
 Placed = TypeVar("Placed", bound=Pose | Report)
@@ -112,6 +110,7 @@ class Hearsay:
             refused: where messages are counted that are not used, by reason.
         """
         self._binding, self._refused, scenario = binding, refused, binding.scenario
+        self._max_age = binding.profile.topics[Role.ESTIMATE].max_age_ns
         self._origin = np.array(scenario.map.origin)
         places = [np.array(m.position) + rotation_of(m.yaw, None) @ np.array(m.marker) for m in scenario.landmarks]
         self._landmarks = np.array(places).reshape(-1, 3) - self._origin
@@ -129,7 +128,7 @@ class Hearsay:
     def put_landmark(self, landmark: int, role: Role, stamp: int, age: int, pose: Pose) -> None:
         """Take what a moving landmark has said of itself; `age` is that with which it came."""
         position = message_of(self.on_map(pose), self._markers[landmark]).position
-        if age > STALE:
+        if age > self._max_age:
             self._refused["stale message"] += 1
         elif position is not None and self._is_new(landmark, role, stamp):
             self._led[landmark].put(stamp, position)  # unless it has said so in another role
@@ -153,7 +152,7 @@ class Hearsay:
 
     def is_lost(self, target: int, now: int) -> bool:
         """Return whether a target is a moving landmark of which nobody knows where it is now."""
-        return target in self._led and now - self._led[target].stamp > STALE
+        return target in self._led and now - self._led[target].stamp > self._max_age
 
     def places(self, now: int, when: int) -> Array:
         """Return (L, 3) where the landmarks were at a time `when`; who is lost by now is where it has been last."""
@@ -175,7 +174,7 @@ class Hearsay:
             if newest is None or not receivers:
                 continue
             stamp, told = newest
-            if now - stamp > STALE:
+            if now - stamp > self._max_age:
                 self._refused["stale message"] += 1
                 continue
             message = message_of(told, self._markers[L + sender])

@@ -13,7 +13,7 @@ from coopenv.cars.backend.drive import PRESENCE, Tape, Taped, head_of
 from coopenv.cars.backend.status import ROLES
 from coopenv.cars.deployment import Deployment, load_deployment
 from coopenv.cars.keys import Signer, Verifier, check_known, load_signer, load_verifier
-from coopenv.cars.topics import RESET_TOPIC, TOPICS, Role, presence_of, topic_of
+from coopenv.cars.profile import RESET_TOPIC, Role, presence_of
 from coopenv.cars.transport.base import Transport
 from coopenv.cars.transport.open import open_transport
 from coopenv.scenario import Scenario, load_scenario
@@ -47,7 +47,7 @@ def open_svea(
     """
     deployment = load_deployment(path, connect)
     scenario = scenario_of(deployment, environment, overrides or {})
-    binding = bind(scenario, deployment.cars, deployment.markers, Path(path).name, car)
+    binding = bind(scenario, deployment.cars, deployment.markers, Path(path).name, car, deployment.profile)
     if binding.unmarked:
         remark = f"{Path(path).name}: no markers, so that no camera can tell them: {listed(binding.unmarked)}"
         warnings.warn(DataWarning(remark), stacklevel=2)
@@ -61,8 +61,8 @@ def open_svea(
         raise
     if tape is not None:
         names = [binding.names[i] for i in binding.local]
-        aside = {topic_of(name, role) for name in names for role in (Role.GATE, *ROLES)}
-        link = Taped(link, tape, aside, {topic_of(name, Role.STOP) for name in names})
+        aside = {binding.profile.topic_of(name, role) for name in names for role in (Role.GATE, *ROLES)}
+        link = Taped(link, tape, aside, {binding.profile.topic_of(name, Role.STOP) for name in names})
     return Svea(deployment, binding, link, signer, verifier, tape)
 
 
@@ -113,6 +113,7 @@ def _keys(deployment: Deployment, binding: Binding, car: str | None) -> tuple[Si
 def _types(binding: Binding, identity: str) -> dict[str, str]:
     """Return the type of every topic of the cars, presence included."""
     names = (*binding.cars, *binding.leaders)
-    types = {topic_of(name, role): topic.type for name in names for role, topic in TOPICS.items()}
+    profile = binding.profile
+    types = {profile.topic_of(name, role): topic.type for name in names for role, topic in profile.topics.items()}
     present = {presence_of(name): PRESENCE for name in (*names, identity)}
     return {**types, **present, RESET_TOPIC: "std_msgs/msg/Int64"}

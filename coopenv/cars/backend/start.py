@@ -15,8 +15,8 @@ from coopenv.cars.backend.status import StatusBoard
 from coopenv.cars.backend.watchdog import Vitals, Watchdog, misplaced
 from coopenv.cars.codec import encode, make
 from coopenv.cars.deployment import Deployment
+from coopenv.cars.profile import RESET_TOPIC, Role
 from coopenv.cars.samples import Calibration
-from coopenv.cars.topics import RESET_TOPIC, Role, topic_of
 from coopenv.cars.transport.base import Transport
 
 PIXELS = 2.0
@@ -43,12 +43,12 @@ def problems_of(fleet: Fleet) -> Iterator[str]:
     for car in fleet.calibrations:
         yield from _its_clock(fleet, car)  # by which all else is judged
         for role in VELOCITY[sensors.odometry]:
-            topic = topic_of(car, role)
+            topic = fleet.deployment.profile.topic_of(car, role)
             if (age := fleet.station.silence(topic)) > safety.odometry_age:
                 yield f"{car}: no odometry on {topic} {_since(age)}"
             if (age := fleet.vitals.age(car, role)) > safety.odometry_age:
                 yield f"{car}: nothing new that could be used on {topic} {_since(age)}"
-        camera = topic_of(car, Role(sensors.detections))
+        camera = fleet.deployment.profile.topic_of(car, Role(sensors.detections))
         if (age := fleet.station.silence(camera)) > safety.odometry_age:
             yield f"{car}: no camera frames on {camera} {_since(age)}"
         yield from _about_itself(fleet, car)
@@ -71,7 +71,8 @@ def _about_itself(fleet: Fleet, car: str) -> Iterator[str]:
     if obstacle := fleet.board.obstacle(car):
         yield f"{car}: {obstacle}"
     battery = fleet.board.battery(car)
-    if battery is None and fleet.deployment.conditions and safety.min_battery > 0.0:
+    needed = fleet.deployment.conditions and "battery" in fleet.deployment.profile.conditions
+    if battery is None and needed and safety.min_battery > 0.0:
         yield f"{car}: its battery does not tell how much is left (safety.min_battery = 0 does without)"
     if battery is not None and battery < safety.min_battery:
         yield f"{car}: its battery is at {100 * battery:.0f} %, {100 * safety.min_battery:.0f} % are needed"
@@ -124,6 +125,7 @@ class Start:
             drain: takes what has come.
         """
         self._fleet, self._transport, self._gates, self._watchdog = fleet, transport, gates, watchdog
+        topic_of = fleet.deployment.profile.topic_of
         self._topics = [topic_of(name, role) for name in fleet.calibrations for role in odometry]
         self._drain, self._heard_once = drain, False
 

@@ -7,13 +7,12 @@ from dataclasses import dataclass, field, replace
 from coopenv.base.errors import CoopenvError, shown
 from coopenv.cars.codec import decode, stamp_of
 from coopenv.cars.deployment import Remote
+from coopenv.cars.profile import SVEA, CarProfile, Role
 from coopenv.cars.readings import read
 from coopenv.cars.samples import Calibration, Status
-from coopenv.cars.topics import TOPICS, Role, topic_of
 from coopenv.cars.transport.base import Arrival, Transport
 
-CONDITIONS = (Role.STATE, Role.REMOTE, Role.BATTERY)
-ROLES = (*CONDITIONS, Role.CAMERA_INFO)
+ROLES = (Role.STATE, Role.REMOTE, Role.BATTERY, Role.CAMERA_INFO)
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,9 @@ class Condition:
 class StatusBoard:
     """The last word of each car, and what has happened to it since arming."""
 
-    def __init__(self, transport: Transport, cars: tuple[str, ...], remote: Remote, needed: bool) -> None:
+    def __init__(
+        self, transport: Transport, cars: tuple[str, ...], remote: Remote, needed: bool, profile: CarProfile = SVEA
+    ) -> None:
         """Listen to the cars.
 
         Args:
@@ -40,10 +41,12 @@ class StatusBoard:
             cars: their names.
             remote: channels of their remote controls.
             needed: whether silence of a car about itself counts against it.
+            profile: make of the cars.
         """
         self._lock = threading.Lock()
-        self._remote, self._needed = remote, needed
-        self._topics = {topic_of(car, role): (car, role) for car in cars for role in ROLES}
+        self._remote, self._needed, self._profile = remote, needed, profile
+        self._conditions_needed = tuple(map(Role, profile.conditions)) if needed else ()
+        self._topics = {profile.topic_of(car, role): (car, role) for car in cars for role in ROLES}
         self._conditions = {car: Condition() for car in cars}
         self._begun: dict[str, Condition] = {}  # as it was at arming
         self._happened: dict[str, str] = {}
@@ -70,25 +73,26 @@ class StatusBoard:
         """Return why a car is not to be armed, by what it says of itself; empty: nothing stands against it."""
         with self._lock:
             now = self._conditions[car]
-        for role in CONDITIONS if self._needed else ():
-            if why := _silent(now, car, role):
+        for role in self._conditions_needed:
+            if why := self._silent(now, car, role):
                 return why
-        if self._remote.drives(now.said.pulses or ()):
+        if self._remote.drives(now.said.pulses or (), self._profile.pulses):
             return "is driven by remote control"
-        if not self._needed:
-            return ""
-        return self._remote.fault(now.said.pulses or ()) or ("" if now.said.armed else "its autopilot is not armed")
+        fault = self._remote.fault(now.said.pulses or (), self._profile.pulses)
+        if fault and Role.REMOTE in self._conditions_needed:
+            return fault
+        return "its autopilot is not armed" if Role.STATE in self._conditions_needed and not now.said.armed else ""
 
     def happened(self, car: str) -> str:
         """Return why a car that was armed is to be stopped, by what it has said of itself since; empty: no reason."""
         with self._lock:
             now, happened = self._conditions[car], self._happened.get(car, "")
-        return happened or (_silent(now, car, Role.REMOTE) if self._needed else "")
+        return happened or (self._silent(now, car, Role.REMOTE) if Role.REMOTE in self._conditions_needed else "")
 
     def _take(self, arrival: Arrival) -> None:
         car, role = self._topics[arrival.topic]
         try:
-            message = decode(arrival.payload, TOPICS[role].type)
+            message = decode(arrival.payload, self._profile.topics[role].type)
             value, stamp = read(role, message), stamp_of(message)
         except CoopenvError:
             return
@@ -96,7 +100,7 @@ class StatusBoard:
         with self._lock:
             if isinstance(value, Calibration):
                 self._calibration[car] = value
-            elif isinstance(value, Status) and abs(delay) <= (TOPICS[role].max_age or 0.0):
+            elif isinstance(value, Status) and abs(delay) <= (self._profile.topics[role].max_age or 0.0):
                 before = self._conditions[car]
                 if stamp > before.stamps.get(role, -1):
                     since = {**before.since, role: time.monotonic() - max(delay, 0.0)}
@@ -106,18 +110,24 @@ class StatusBoard:
                         self._happened.setdefault(car, why)
 
     def _changed(self, then: Status, now: Status) -> str:
-        pulses = now.pulses or ()
-        if self._remote.drives(pulses):
+        pulses, usual = now.pulses or (), self._profile.pulses
+        if self._remote.drives(pulses, usual):
             return "is driven by remote control"
-        if self._needed and (fault := self._remote.fault(pulses)):
+        if Role.REMOTE in self._conditions_needed and (fault := self._remote.fault(pulses, usual)):
             return fault
-        if self._remote.switched(pulses, then.pulses or ()):
+        if self._remote.switched(pulses, then.pulses or (), usual):
             return "the mode switch of its remote control was moved"
         if now.armed is False and (self._needed or then.armed):
             return "its autopilot is no longer armed"
         if then.mode is not None and now.mode != then.mode:
             return f"its autopilot went from mode {shown(then.mode)} to {shown(now.mode)}"
         return ""
+
+    def _silent(self, condition: Condition, car: str, role: Role) -> str:
+        age, topic = condition.age(role), self._profile.topic_of(car, role)
+        if age <= (self._profile.topics[role].max_age or 0.0):
+            return ""
+        return f"nothing of use has {'ever come' if age == float('inf') else f'come for {age:.2f} s'} on {topic}"
 
 
 def _joined(before: Status, value: Status, role: Role) -> Status:
@@ -127,10 +137,3 @@ def _joined(before: Status, value: Status, role: Role) -> Status:
     if role is Role.REMOTE:
         return replace(before, pulses=value.pulses)
     return replace(before, battery=value.battery)
-
-
-def _silent(condition: Condition, car: str, role: Role) -> str:
-    age, topic = condition.age(role), topic_of(car, role)
-    if age <= (TOPICS[role].max_age or 0.0):
-        return ""
-    return f"nothing of use has {'ever come' if age == float('inf') else f'come for {age:.2f} s'} on {topic}"

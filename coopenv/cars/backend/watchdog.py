@@ -13,8 +13,8 @@ from coopenv.cars.backend.gates import OLD, Gates
 from coopenv.cars.backend.station import Station
 from coopenv.cars.deployment import Safety
 from coopenv.cars.limits import inside
+from coopenv.cars.profile import SVEA, CarProfile, Role
 from coopenv.cars.samples import Pose, Report, Sample
-from coopenv.cars.topics import Role, topic_of
 from coopenv.estimation.arrays import Array
 
 AHEAD = 50_000_000  # ns by which a stamp may be ahead of the receiver's clock
@@ -146,6 +146,7 @@ class Watchdog:
         others: Collection[str],
         odometry: Collection[Role],
         decision: float,
+        profile: CarProfile = SVEA,
     ) -> None:
         """Begin to look.
 
@@ -157,10 +158,12 @@ class Watchdog:
             cars: those that are driven here.
             others: the other ones of the fleet.
             odometry: what each car has to measure.
+            profile: make of the cars.
             decision: s between decisions.
         """
         self._safety, self._station, self._gates, self._vitals = safety, station, gates, vitals
         self._cars, self._others, self._odometry, self._decision = cars, others, odometry, decision
+        self._profile = profile
         self._lock = threading.Lock()
         self._armed, self._closed = False, threading.Event()
         self.trip: Trip | None = None
@@ -261,7 +264,7 @@ class Watchdog:
     def _of_car(self, car: str) -> Iterator[Trip]:
         longest = self._safety.odometry_age
         for role in self._odometry:
-            topic = topic_of(car, role)
+            topic = self._profile.topic_of(car, role)
             if (age := self._station.silence(topic)) > longest:
                 yield Trip(f"{car}: no odometry on {topic} for {age:.2f} s", car)
             # Only the step loop reads messages, so that this means nothing before the first step.

@@ -12,8 +12,8 @@ from coopenv.cars.backend.binding import OPTIONS, Binding, bind, wishes_of
 from coopenv.cars.bags.files import check_extra
 from coopenv.cars.bags.log import NS, Log, read_log
 from coopenv.cars.bags.topic_map import TopicMap, load_map
+from coopenv.cars.profile import Role
 from coopenv.cars.samples import Sample
-from coopenv.cars.topics import Role
 from coopenv.scenario import Scenario, load_scenario
 
 AHEAD = 100_000_000

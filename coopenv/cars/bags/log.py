@@ -24,9 +24,9 @@ from coopenv.cars.backend.binding import Binding
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.bags.topic_map import Chosen, Frame, TopicMap, select
 from coopenv.cars.codec import stamp_of
+from coopenv.cars.profile import Role
 from coopenv.cars.readings import read
 from coopenv.cars.samples import Calibration, Pose, Sample, Twist, Value
-from coopenv.cars.topics import Role
 from coopenv.scenario.base import rotation_of
 
 Delays = Mapping[str, int]

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from coopenv.base.errors import CoopenvError, DataError, listed, suggest
-from coopenv.cars.deployment import Car, Marker, Name, Number, Part, Positive, refuse_repeated
+from coopenv.cars.deployment import Car, Marker, Name, refuse_repeated
+from coopenv.cars.profile import PREFIX, Number, Positive, Role, Section, load_profile
 from coopenv.cars.readings import READERS
-from coopenv.cars.topics import TOPICS, Role, topic_of
 from coopenv.scenario.base import one_line
 
 READ = (
@@ -21,10 +21,6 @@ READ = (
 """Roles that are of use in a bag."""
 
 PATTERNS: dict[str, dict[Role, tuple[str, ...]]] = {
-    "svea": {
-        **{role: (f"/{topic_of('{car}', role)}", f"/{{car}}/{TOPICS[role].suffix}") for role in READ if role in TOPICS},
-        Role.TRUTH: tuple(f"/{fleet}qualisys/{{body}}/{kind}" for fleet in ("fleet/", "") for kind in ("odom", "pose")),
-    },
     "authors": {
         Role.DETECTIONS: ("/{agent}/pixy_node/objectsInfo",),
         Role.BEARINGS: ("/{agent}/pixy_landmark_detection/objectsBearing",),
@@ -38,6 +34,18 @@ PATTERNS: dict[str, dict[Role, tuple[str, ...]]] = {
 """By name and role: the first of them that a bag has counts."""
 
 
+def patterns_of(names: str, folder: Path) -> dict[Role, tuple[str, ...]]:
+    """Return the names of topics by role. Raises CoopenvError: there is no such scheme or profile."""
+    if names in PATTERNS:
+        return PATTERNS[names]
+    found, topics = {}, load_profile(names, folder).topics
+    for role in READ:
+        topic = topics[role]
+        given = (topic.name, *(topic.bag_names or (topic.name.removeprefix(f"{PREFIX}/"),)))
+        found[role] = tuple(dict.fromkeys(f"/{name}" for name in given))
+    return found
+
+
 TopicName = Annotated[str, Field(max_length=256, pattern=r"^/[A-Za-z0-9_/~]+$")]
 
 
@@ -45,7 +53,7 @@ class TopicMapError(CoopenvError):
     """A file does not say what is in a bag."""
 
 
-class Topics(Part):
+class Topics(Section):
     """Topics of one car, in place of those of the naming scheme."""
 
     detections: TopicName | None = None
@@ -89,7 +97,7 @@ class BagCar(Car):
         return {"car": self.name, "agent": agent, "body": self.body or self.name}
 
 
-class Clocks(Part):
+class Clocks(Section):
     """How times are read."""
 
     mode: Literal["auto", "stamps", "received"] = "auto"
@@ -101,7 +109,7 @@ class Clocks(Part):
     """Time added to the stamps of a car, or of `truth`, instead of the estimated offset, s."""
 
 
-class Frame(Part):
+class Frame(Section):
     """Where the frame of positions in a bag is in the environment's coordinates."""
 
     position: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
@@ -110,7 +118,7 @@ class Frame(Part):
     """Rotation of the frame to the left, rad."""
 
 
-class Frames(Part):
+class Frames(Section):
     """Frames of the bag's positions."""
 
     map: Frame = Frame()
@@ -119,15 +127,16 @@ class Frames(Part):
     """Of motion capture (default: the same)."""
 
 
-class TopicMap(Part):
+class TopicMap(Section):
     """What a bag holds."""
 
     environment: str
     """Name of an environment, or TOML file (relative to this file): landmarks, cameras, noise and observer."""
     overrides: dict[str, Any] = Field(default={})
     """Dotted keys of the environment with other values."""
-    names: Literal["svea", "authors", "none"] = "svea"
-    """Scheme of topic names, unless `cars.topics` gives others."""
+    names: str = "svea"
+    """Scheme of topic names, unless `cars.topics` gives others: `authors`, `none`, or a profile as in a deployment
+    file, `svea` or a TOML file (relative to this file)."""
     cars: tuple[BagCar, ...] = Field(min_length=1, max_length=64)
     """One table `[[cars]]` per car."""
     markers: dict[str, Marker] = Field(default={})
@@ -180,6 +189,10 @@ def load_map(path: str | Path) -> TopicMap:
         made = TopicMap.model_validate(raw)
     except ValidationError as error:
         raise TopicMapError(one_line(error, path.name, TopicMap)) from None
+    try:
+        patterns_of(made.names, path.parent)
+    except CoopenvError as error:
+        raise TopicMapError(f"{path.name}: names: {error}, authors, none") from None
     return made.model_copy(update={"path": path})
 
 
@@ -260,7 +273,7 @@ def candidates(given: TopicMap, car: BagCar) -> dict[Role, tuple[str, ...]]:
     """Return the names that topics of a car may have, by role."""
     scheme = {
         role: tuple(pattern.format(**car.names) for pattern in patterns)
-        for role, patterns in PATTERNS[given.names].items()
+        for role, patterns in patterns_of(given.names, given.path.parent).items()
     }
     return scheme | {role: (name,) for role, name in car.topics.given.items()}
 

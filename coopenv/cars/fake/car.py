@@ -9,7 +9,6 @@ from functools import partial
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.actuation import from_manual
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode, warm_up
 from coopenv.cars.deployment import Deployment
@@ -17,10 +16,11 @@ from coopenv.cars.fake.faults import Fault, Faults, Wire, end_process, fault_top
 from coopenv.cars.fake.messages import Act, DriverVoice, Voice
 from coopenv.cars.fake.sensors import Pixy, Sensors, calibration_of
 from coopenv.cars.fake.world import Actuators, Neighbours, Room
+from coopenv.cars.gate.codec import Malformed, read_drive
 from coopenv.cars.gate.core import PERIOD, Clock, Gate
 from coopenv.cars.gate.process import Link
 from coopenv.cars.keys import Signer, Verifier
-from coopenv.cars.topics import RESET_TOPIC, TOPICS, Role, presence_of, topic_of
+from coopenv.cars.profile import RESET_TOPIC, Role, presence_of
 from coopenv.cars.transport.base import Arrival, Transport
 
 JITTER = 0.05  # of a period, largest deviation to either side of a regular time
@@ -114,6 +114,7 @@ class Fake:
         scenario, self._drives = binding.scenario, name in binding.cars
         leader = binding.leaders.get(name, 0)
         agent = len(scenario.landmarks) + binding.cars[name] if self._drives else leader
+        self._profile = binding.profile
         self.room = Room(scenario, agent)
         self._wire = Wire(transport, self._faults, clock.steady, seed)
         self._inbox: deque[Callable[[], None]] = deque()
@@ -129,12 +130,13 @@ class Fake:
         self._acts = {name: act for name, (_, act) in self._voice.acts.items()}
         if self._drives and gate:
             car_clock = Clock(lambda: clock.wall() + self._faults.clock_error(clock.steady()), clock.steady)
-            decides = Gate(name, deployment.safety.limits, car_clock, verifier, deployment.security.identity)
-            self._link = Link(decides, name, self._wire, signer)  # which lets others see the car
+            identity = deployment.security.identity
+            decides = Gate(name, deployment.limits, car_clock, verifier, identity, self._profile)
+            self._link = Link(decides, name, self._wire, signer, self._profile)  # which lets others see the car
             rates["gate"], self._acts["gate"] = 1e9 / PERIOD, self._tick_gate
         else:
             if self._drives:
-                self._wire.subscribe(topic_of(name, Role.MANUAL), self._hear_manual)
+                self._wire.subscribe(self._profile.topic_of(name, Role.MANUAL), self._hear_manual)
             transport.announce(presence_of(name))
         self._schedule = Schedule(rates, clock.steady(), self._rng)
         for fault in faults:
@@ -142,14 +144,16 @@ class Fake:
 
     def _build(self, binding: Binding, transport: Transport, odometry: str) -> None:
         """Put sensors and wheels on the car; the wheels tell a turn rate only where there is no other one."""
-        whose = (self.name, self.room, self._wire, self._stamp, transport)
+        whose = (self.name, self.room, self._wire, self._stamp, transport, self._profile)
         self._voice = Voice(*whose)
         if self._drives:
             vehicle, scenario = self.room.vehicle, self.room.scenario
             carriers = {target: marker for marker, target in binding.targets.items()}
-            self._pixy = Pixy(self.room, calibration_of(scenario.cameras[vehicle]), carriers, self._faults)
+            self._pixy = Pixy(
+                self.room, calibration_of(scenario.cameras[vehicle]), carriers, self._faults, binding.profile.markers
+            )
             self._sensors = Sensors(self.room, differential=odometry == "wheel")
-            self._wheels = Actuators(scenario.limits[vehicle].latency)
+            self._wheels = Actuators(scenario.limits[vehicle].latency, binding.profile.command.timeout)
             voice = DriverVoice(*whose, pixy=self._pixy, sensors=self._sensors, rng=lambda: self._rng)
             voice.before_frame = self._others.place
             self._voice = voice
@@ -167,7 +171,7 @@ class Fake:
 
     def _warm_up(self) -> None:
         """Do once what takes long at the first time: kernels and codecs are compiled, or loaded."""
-        warm_up()
+        warm_up(self._profile)
         if not self._drives:
             self.room.follow(0.0)
             return
@@ -226,8 +230,10 @@ class Fake:
             self._obey(self._link.tick(), max(self._link.commanded, due - PERIOD))
 
     def _obey(self, payload: bytes, at: int) -> None:
-        manual = decode(payload, TOPICS[Role.MANUAL].type)
-        self._wheels.receive(from_manual(manual.y, manual.z, manual.aux3), at)
+        try:
+            self._wheels.receive(read_drive(payload, self._profile.command), at)
+        except Malformed as error:
+            raise CoopenvError(f"{self._profile.topics[Role.MANUAL].type}: cannot be read ({error})") from None
 
     # Called in threads of the transport: they only keep what has come.
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from coopenv.base.errors import CoopenvError, listed, shown, suggest
-from coopenv.cars.topics import PREFIX
+from coopenv.cars.profile import PREFIX
 from coopenv.cars.transport.base import Arrival, Callback, Transport
 
 

@@ -193,7 +193,7 @@ def prepare_fake(path: str | Path, car: str, gate: bool = True, station: str | N
     scenario = scenario_of(fleet, None, {})
     if scenario.backend != "simulated":
         raise CoopenvError(f"{path}: environment: backend '{scenario.backend}' has no fakes; known: simulated")
-    binding = bind(scenario, fleet.cars, fleet.markers, Path(path).name, None)
+    binding = bind(scenario, fleet.cars, fleet.markers, Path(path).name, None, fleet.profile)
     given = Settings.of(car, Path(path)).changed({}, station=station)
     signer, verifier = given.identities() if gate else (None, None)
     trusting = fleet.security.model_copy(update={"identity": given.station})

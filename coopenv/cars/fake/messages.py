@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.fake.sensors import FILTER_RATE, IMU_RATE, WHEEL_RATE, Block, Pixy, Sensors, bearings_of
 from coopenv.cars.fake.world import Room
+from coopenv.cars.profile import CarProfile, Role
 from coopenv.cars.samples import Calibration
-from coopenv.cars.topics import TOPICS, Role, topic_of
 from coopenv.cars.transport.base import Transport
 from coopenv.estimation.arrays import Array
 
@@ -177,7 +178,15 @@ Act = Callable[[int, int], None]
 class Voice:
     """The messages of any car: motion capture, and those of a moving landmark."""
 
-    def __init__(self, name: str, room: Room, wire: Transport, room_clock: Callable[[int], int], outside: Transport):
+    def __init__(
+        self,
+        name: str,
+        room: Room,
+        wire: Transport,
+        room_clock: Callable[[int], int],
+        outside: Transport,
+        profile: CarProfile,
+    ):
         """Say whose they are.
 
         Args:
@@ -186,9 +195,10 @@ class Voice:
             wire: its own link.
             room_clock: returns the stamp of motion capture for a time of the steady clock.
             outside: the network of motion capture, which has nothing to do with the car's.
+            profile: make of the car.
         """
         self.name, self.room, self.wire = name, room, wire
-        self._room_clock, self._outside = room_clock, outside
+        self._room_clock, self._outside, self._profile = room_clock, outside, profile
         self._origin = np.array(room.scenario.map.origin)
 
     @property
@@ -198,15 +208,19 @@ class Voice:
 
     def say(self, role: Role, message: Any) -> None:
         """Publish on the car's link."""
-        topic = TOPICS[role]
-        name = topic_of(self.name, role)
-        self.wire.publish(name, encode(message), urgent=topic.urgent, reliable=topic.reliable)
+        topic, name = self._profile.topics[role], self._profile.topic_of(self.name, role)
+        self.wire.publish(name, self._encoded(role, message), urgent=topic.urgent, reliable=topic.reliable)
+
+    def _encoded(self, role: Role, message: Any) -> bytes:
+        if message.__msgtype__ != (kind := self._profile.topics[role].type):
+            raise CoopenvError(f"profile: topics.{role}.type: {kind}: fake cars have {message.__msgtype__} alone")
+        return encode(message)
 
     def _truth(self, due: int, _stamp: int) -> None:
         R, p = self.room.pose(self.room.agent)
         frames = ("mocap", self.name)
         message = odometry(self._room_clock(due), frames, (R, p + self._origin), self.room.twist)
-        self._outside.publish(topic_of(self.name, Role.TRUTH), encode(message))
+        self._outside.publish(self._profile.topic_of(self.name, Role.TRUTH), self._encoded(Role.TRUTH, message))
 
     def _leader(self, _due: int, stamp: int) -> None:
         R, p = self.room.pose(self.room.agent)

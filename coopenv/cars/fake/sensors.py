@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from coopenv.cars.deployment import MARKERS
 from coopenv.cars.fake.faults import Faults
 from coopenv.cars.fake.world import Room
 from coopenv.cars.samples import Calibration
@@ -99,7 +98,9 @@ class Block:
 class Pixy:
     """The camera of one car."""
 
-    def __init__(self, room: Room, calibration: Calibration, markers: dict[int, int], faults: Faults) -> None:
+    def __init__(
+        self, room: Room, calibration: Calibration, markers: dict[int, int], faults: Faults, numbers: tuple[int, int]
+    ) -> None:
         """Put it on the car.
 
         Args:
@@ -107,8 +108,10 @@ class Pixy:
             calibration: of its lens.
             markers: numbers of markers by the agent that carries them.
             faults: that it may have.
+            numbers: smallest and largest marker that it identifies.
         """
         self._room, self._markers, self._faults = room, markers, faults
+        self._numbers = range(numbers[0], numbers[1] + 1)
         self.calibration = calibration
         """Of its lens."""
         self._ages: dict[int, int] = {}
@@ -152,7 +155,7 @@ class Pixy:
         if rate := faults.value("false_blocks", now):
             for _ in range(rng.poisson(rate / self._room.scenario.rates.camera)):
                 x, y = int(rng.integers(width)), int(rng.integers(height))
-                blocks = [*blocks, Block(int(rng.choice(MARKERS)), x, y, 2, 2)]
+                blocks = [*blocks, Block(int(rng.choice(self._numbers)), x, y, 2, 2)]
         return blocks
 
 

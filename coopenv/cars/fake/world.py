@@ -9,11 +9,10 @@ import numpy as np
 import warp as wp
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.actuation import NEUTRAL, Drive
 from coopenv.cars.backend.binding import Binding
 from coopenv.cars.codec import decode
+from coopenv.cars.profile import NEUTRAL, Drive, Role
 from coopenv.cars.samples import rotation_of
-from coopenv.cars.topics import TOPICS, Role, topic_of
 from coopenv.cars.transport.base import Arrival, Transport
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.outcomes import Sight
@@ -138,6 +137,7 @@ class Neighbours:
         L = room.model.landmarks
         agents = {**binding.leaders, **{car: L + vehicle for car, vehicle in binding.cars.items()}}
         self._room, self._origin = room, np.array(room.scenario.map.origin)
+        self._truth_type, topic_of = binding.profile.topics[Role.TRUTH].type, binding.profile.topic_of
         self._agents = {topic_of(car, Role.TRUTH): agent for car, agent in agents.items() if car != name}
         self._heard: dict[str, bytes] = {}
         self._moving = np.flatnonzero(room.model.motion.kind.numpy()[:L] == int(PRESCRIBED))
@@ -159,7 +159,7 @@ class Neighbours:
         while self._heard:
             try:
                 topic, payload = self._heard.popitem()
-                message = decode(payload, TOPICS[Role.TRUTH].type)
+                message = decode(payload, self._truth_type)
                 place = message.pose.pose.position
                 R = rotation_of(message.pose.pose.orientation, "orientation")
             except CoopenvError:
@@ -167,15 +167,12 @@ class Neighbours:
             self._room.put(self._agents[topic], R, np.array([place.x, place.y, place.z]) - self._origin)
 
 
-TIMEOUT = 500_000_000  # ns without a command after which the flight controller (PX4) goes to neutral
-
-
 class Actuators:
     """Commands in the order of time; times in ns on one clock. Lag, limits and dead band are the room's."""
 
-    def __init__(self, latency: float) -> None:
-        """Build them for a dead time in s."""
-        self._latency = round(latency * 1e9)
+    def __init__(self, latency: float, timeout: float) -> None:
+        """Build them for a dead time, and a time without a command after which they go to neutral; both in s."""
+        self._latency, self._timeout = round(latency * 1e9), round(timeout * 1e9)
         self._waiting: deque[tuple[int, Drive]] = deque()  # from when on
         self._now = NEUTRAL
         self._until = 0  # when the command that is followed becomes too old
@@ -195,7 +192,7 @@ class Actuators:
         while now < end:
             if self._waiting and self._waiting[0][0] <= now:
                 since, self._now = self._waiting.popleft()
-                self._until = since + TIMEOUT
+                self._until = since + self._timeout
                 continue
             if self._now != NEUTRAL and now >= self._until:
                 self._now = NEUTRAL

@@ -1,17 +1,22 @@
 """The gate's few messages as CDR, without a library; `coopenv.cars.codec` has all messages of cars."""
 
+from __future__ import annotations
+
 import struct
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass
-from typing import Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
-from coopenv.cars.actuation import Manual
+from coopenv.base.errors import CoopenvError
+
+if TYPE_CHECKING:
+    from coopenv.cars.profile import CommandMessage, Drive
 
 ENCAPSULATION = b"\0\1\0\0"
 LONGEST_PADDING = 3  # bytes after the last field, which some writers add
 
 
-class Malformed(ValueError):  # noqa: N818
+class Malformed(CoopenvError):  # noqa: N818
     """Bytes are not the message that they should be."""
 
 
@@ -89,7 +94,11 @@ class Writer:
         return ENCAPSULATION + bytes(self._body)
 
 
-MANUAL_KINDS = "ffffHHBffffffff"  # of the fields of ManualControl
+KINDS = {
+    **{"bool": "?", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H"},
+    **{"int32": "i", "uint32": "I", "float32": "f", "float64": "d"},
+}
+"""Kinds of the module struct by type of ROS."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,13 +171,22 @@ def write_bool(value: bool) -> bytes:
     return writer.payload()
 
 
-def write_manual(stamp: int, fields: Manual) -> bytes:
-    """Return a mavros_msgs/ManualControl with a stamp in ns."""
+def write_drive(stamp: int, message: CommandMessage, drive: Drive) -> bytes:
+    """Return the message from the gate to the car for a finite command, with a stamp in ns."""
     writer = Writer()
     writer.header(stamp)
-    for kind, value in zip(MANUAL_KINDS, astuple(fields), strict=True):
-        writer.put(kind, value)
+    for (kind, _), value in zip(message.neutral.values(), message.values(drive).values(), strict=True):
+        writer.put(KINDS[kind], value if kind.startswith("float") else int(value))
     return writer.payload()
+
+
+def read_drive(payload: bytes, message: CommandMessage) -> Drive:
+    """Return the command in a message from a gate to its car. Raises Malformed: the bytes are none."""
+    reader = Reader(payload)
+    reader.stamp(), reader.text()
+    values = {name: reader.take(KINDS[kind]) for name, (kind, _) in message.neutral.items()}
+    reader.end()
+    return message.drive(values)
 
 
 def write_status(status: Status) -> bytes:

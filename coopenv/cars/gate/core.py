@@ -19,7 +19,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
-from coopenv.cars.actuation import NEUTRAL, Drive, to_manual
 from coopenv.cars.gate.codec import (
     Command,
     Malformed,
@@ -27,12 +26,12 @@ from coopenv.cars.gate.codec import (
     read_arm,
     read_bool,
     read_command,
-    write_manual,
+    write_drive,
     write_status,
 )
 from coopenv.cars.keys import Verifier, is_identity
 from coopenv.cars.limits import Limits
-from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.profile import NEUTRAL, SVEA, CarProfile, Drive, Role
 
 
 class State(StrEnum):
@@ -78,7 +77,6 @@ class Clock:
 
 PERIOD = 50_000_000  # ns between outputs
 TIMEOUT = 200_000_000  # ns without a valid command after which the car gets neutral
-MOST_AGE = round(1e9 * (TOPICS[Role.COMMAND].max_age or 0.0))  # ns
 MOST_AHEAD = 50_000_000  # ns that a stamp may lie in the future
 MOST_BYTES = 512  # of a message to the gate; its own have less than 300
 MOST_DIGITS = 18  # of a sequence number
@@ -88,7 +86,13 @@ class Gate:
     """The gate of one car; calls from several threads are to be kept apart."""
 
     def __init__(
-        self, car: str, limits: Limits, clock: Clock, verifier: Verifier | None = None, station: str = "station"
+        self,
+        car: str,
+        limits: Limits,
+        clock: Clock,
+        verifier: Verifier | None = None,
+        station: str = "station",
+        profile: CarProfile = SVEA,
     ) -> None:
         """Start disarmed.
 
@@ -98,9 +102,10 @@ class Gate:
             clock: clocks.
             verifier: knows the station's public key; None: nothing is signed, and anybody can drive the car.
             station: who may arm and command.
+            profile: make of the car.
         """
         self._car, self._limits, self._clock = car, limits, clock
-        self._verifier, self._station = verifier, station
+        self._verifier, self._station, self._profile = verifier, station, profile
         self._readers = {Role.COMMAND: self._command, Role.ARM: self._arm, Role.STOP: self._stop}
         self._counts = dict.fromkeys(Reason, 0)
         self._state, self._nonce = State.DISARMED, secrets.token_hex(8)
@@ -139,7 +144,7 @@ class Gate:
         return None
 
     def tick(self) -> bytes:
-        """Return the ManualControl for the car now; to be called every 50 ms."""
+        """Return the message for the car now; to be called every 50 ms."""
         now = self._clock.steady()
         if self.state is State.ARMED and self._wanted is not None:
             # After a late call it is as if it had been in time: no jump.
@@ -150,12 +155,12 @@ class Gate:
             )
             self._output = Drive(steering, speed)
         self._ticked = now
-        return write_manual(self._clock.wall(), to_manual(self._output))
+        return write_drive(self._clock.wall(), self._profile.command, self._output)
 
     def neutral(self) -> bytes:
-        """Close for good and return the ManualControl of a car that stands."""
+        """Close for good and return the message of a car that stands."""
         self._come_to_a_stand(State.STOPPED)
-        return write_manual(self._clock.wall(), to_manual(NEUTRAL))
+        return write_drive(self._clock.wall(), self._profile.command, NEUTRAL)
 
     def status(self) -> bytes:
         """Return the GateStatus now."""
@@ -210,14 +215,17 @@ class Gate:
 
     def _check_stamp(self, stamp: int) -> None:
         age = self._clock.wall() - stamp
-        if age > MOST_AGE:
+        if age > self._profile.topics[Role.COMMAND].max_age_ns:
             raise Rejected(Reason.STALE)
         if age < -MOST_AHEAD:
             raise Rejected(Reason.FUTURE)
 
     def _check_signature(self, role: Role, payload: bytes, attachment: bytes) -> None:
         known = self._verifier
-        if known is not None and known.signer(topic_of(self._car, role), payload, attachment) != self._station:
+        if (
+            known is not None
+            and known.signer(self._profile.topic_of(self._car, role), payload, attachment) != self._station
+        ):
             raise Rejected(Reason.SIGNATURE)
 
     def _check_values(self, command: Command) -> None:

@@ -16,7 +16,7 @@ from coopenv.cars.gate.codec import write_bool
 from coopenv.cars.gate.core import PERIOD, Clock, Gate, State
 from coopenv.cars.keys import LONGEST_IDENTITY, Signer, is_identity
 from coopenv.cars.limits import USUAL, Limits
-from coopenv.cars.topics import TOPICS, Role, presence_of, topic_of
+from coopenv.cars.profile import SVEA, CarProfile, Role, presence_of
 from coopenv.cars.transport.base import Arrival, Transport
 from coopenv.cars.transport.endpoints import SECURE, address_of
 
@@ -33,7 +33,9 @@ LAST_NEUTRALS = 5  # that the car gets before the gate goes
 class Link:
     """A gate and its connection; whoever holds it calls `tick` every 50 ms, from one thread."""
 
-    def __init__(self, gate: Gate, car: str, transport: Transport, signer: Signer | None = None) -> None:
+    def __init__(
+        self, gate: Gate, car: str, transport: Transport, signer: Signer | None = None, profile: CarProfile = SVEA
+    ) -> None:
         """Listen, and announce the car.
 
         Args:
@@ -41,9 +43,11 @@ class Link:
             car: its name.
             transport: stays the caller's, who closes it.
             signer: signs the status, as the car; None: it is not signed.
+            profile: make of the car.
         """
         self._gate, self._transport, self._signer = gate, transport, signer
-        self._topics = {role: topic_of(car, role) for role in TOPICS}
+        self._profile = profile
+        self._topics = {role: profile.topic_of(car, role) for role in Role}
         self._lock = threading.Lock()
         self._ticks = 0
         self._own = secrets.token_bytes(16)  # marks what comes back to us: it must not stop a car that is armed again
@@ -54,7 +58,7 @@ class Link:
         transport.announce(presence_of(car))
 
     def tick(self) -> bytes:
-        """Send the car's command, and every 0.2 s the status; return the command, a ManualControl."""
+        """Send the car's command, and every 0.2 s the status; return the command."""
         with self._lock:
             payload = self._gate.tick()
         self._send(Role.MANUAL, payload)
@@ -97,7 +101,7 @@ class Link:
             self.news.set()
 
     def _send(self, role: Role, payload: bytes, attachment: bytes = b"") -> None:
-        topic = TOPICS[role]
+        topic = self._profile.topics[role]
         self._transport.publish(self._topics[role], payload, attachment, urgent=topic.urgent, reliable=topic.reliable)
 
 
@@ -130,6 +134,11 @@ class Settings:
     station: str = "station"
     fleet: Deployment | None = None  # of the file, if there is one
 
+    @property
+    def profile(self) -> CarProfile:
+        """Make of the car."""
+        return SVEA if self.fleet is None else self.fleet.profile
+
     @classmethod
     def of(cls, car: str, path: Path | None) -> Settings:
         """Return the settings for a car by a deployment file, or the usual ones.
@@ -145,7 +154,7 @@ class Settings:
 
         read = load_deployment(path)
         keys = None if read.security.keys is None else read.folder / read.security.keys
-        return cls(read.car(car).name, read.gate_connect, read.safety.limits, keys, read.security.identity, read)
+        return cls(read.car(car).name, read.gate_connect, read.limits, keys, read.security.identity, read)
 
     def changed(self, limits: Mapping[str, Any], **values: Any) -> Settings:
         """Return these settings with others in place of some; None leaves one as it is.
@@ -155,7 +164,7 @@ class Settings:
         """
         bounds = replace(self.limits, **{name: value for name, value in limits.items() if value is not None})
         rest = {name: value for name, value in values.items() if value is not None}
-        return replace(self, limits=bounds.check(), **rest)
+        return replace(self, limits=bounds.check(self.profile.hardest), **rest)
 
     def check_place(self, off_board: bool) -> None:
         """Refuse a router that is not on the car, where neutral would get lost with the link; `off_board` allows it.

@@ -1,9 +1,10 @@
-"""The authors' names and types on the wire, those of `coopenv.cars.topics` for whoever uses it.
+"""The authors' names and types on the wire, those of the profile for whoever uses it.
 
 What has a counterpart goes out under the authors' name as a ROS 1 message. If that loses something (an estimate becomes
 a position alone) or there is none, it goes out under our own name as well, as CDR, to be heard by other coopenv ends.
 """
 
+import math
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -13,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.actuation import from_manual, to_lowlevel
 from coopenv.cars.codec import decode, decode_ros1, empty, encode, encode_ros1, make, ros1, ros2
 from coopenv.cars.deployment import Car, DeploymentError
-from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.gate.codec import read_drive
+from coopenv.cars.profile import SVEA, CarProfile, CommandMessage, Drive, Role
 from coopenv.cars.transport.base import Arrival, Callback, Transport, matcher
 
 
@@ -58,11 +59,22 @@ def _value(store: Any, node: Any, value: Any) -> Any:
     return [_value(store, of[0], element) for element in value]
 
 
-def low_level(message: Any) -> Any:
-    """Return a ManualControl as the lli_ctrl that does the same, steering to the left positive on both."""
-    wanted = to_lowlevel(from_manual(message.y, message.z, message.aux3))
-    numbers = (wanted.steering, wanted.velocity, wanted.trans_diff, wanted.ctrl)
-    return ros1().types["svea_msgs/msg/lli_ctrl"](*numbers)
+PER_PERCENT = 1.27  # of the whole numbers of lli_ctrl
+DEAD_BAND = 15.0  # % of the speed controller's range about zero in which the wheels do not turn
+LOW_GEAR = 0b111000  # bits 0-2: high gear, front and rear differential locked; 3-5: which of them to change
+
+
+def low_level(drive: Drive, command: CommandMessage) -> Any:
+    """Return the lli_ctrl (Teensy) of a finite command, with the dead band of the speed controller leapt over.
+
+    Steering to the left is positive. Speeds are cut to whole per cent, as the car's own interface does.
+    """
+    steering = 100.0 * command.share(command.steering, drive.steering)
+    speed: float = math.trunc(100.0 * command.share(command.speed, drive.speed))
+    if speed:
+        speed = speed * (100.0 - DEAD_BAND) / 100.0 + math.copysign(DEAD_BAND, speed)
+    kind = ros1().types["svea_msgs/msg/lli_ctrl"]
+    return kind(round(PER_PERCENT * steering), round(PER_PERCENT * speed), LOW_GEAR, 0)
 
 
 @dataclass(frozen=True)
@@ -71,19 +83,19 @@ class Counterpart:
 
     name: str  # with {agent}, the agent's number, or {car}, the car's name
     type: str  # of ROS 1
-    convert: Callable[[Any], Any] = to_ros1  # from our message to theirs
+    convert: Callable[[Any], Any] | None = to_ros1  # from our message to theirs; None: `low_level`
     exact: bool = True  # nothing is lost, and the way back is `to_ros2`; else it is only for them
 
 
 COUNTERPARTS = {
-    Role.DETECTIONS: Counterpart("agent{agent}/pixy_node/objectsInfo", TOPICS[Role.DETECTIONS].type),
-    Role.BEARINGS: Counterpart("agent{agent}/pixy_landmark_detection/objectsBearing", TOPICS[Role.BEARINGS].type),
-    Role.CAMERA_INFO: Counterpart("agent{agent}/pixy_node/camera_info", TOPICS[Role.CAMERA_INFO].type),
-    Role.WHEEL: Counterpart("agent{agent}/actuation_twist", TOPICS[Role.WHEEL].type),
-    Role.TRUTH: Counterpart("qualisys/{car}/odom", TOPICS[Role.TRUTH].type),
-    Role.POINT: Counterpart("agent{agent}/riccatiPoint", TOPICS[Role.POINT].type),
-    Role.ESTIMATE: Counterpart("agent{agent}/riccatiPoint", TOPICS[Role.POINT].type, point_of, exact=False),
-    Role.MANUAL: Counterpart("agent{agent}/lli/ctrl_request", "svea_msgs/msg/lli_ctrl", low_level, exact=False),
+    Role.DETECTIONS: Counterpart("agent{agent}/pixy_node/objectsInfo", SVEA.topics[Role.DETECTIONS].type),
+    Role.BEARINGS: Counterpart("agent{agent}/pixy_landmark_detection/objectsBearing", SVEA.topics[Role.BEARINGS].type),
+    Role.CAMERA_INFO: Counterpart("agent{agent}/pixy_node/camera_info", SVEA.topics[Role.CAMERA_INFO].type),
+    Role.WHEEL: Counterpart("agent{agent}/actuation_twist", SVEA.topics[Role.WHEEL].type),
+    Role.TRUTH: Counterpart("qualisys/{car}/odom", SVEA.topics[Role.TRUTH].type),
+    Role.POINT: Counterpart("agent{agent}/riccatiPoint", SVEA.topics[Role.POINT].type),
+    Role.ESTIMATE: Counterpart("agent{agent}/riccatiPoint", SVEA.topics[Role.POINT].type, point_of, exact=False),
+    Role.MANUAL: Counterpart("agent{agent}/lli/ctrl_request", "svea_msgs/msg/lli_ctrl", None, exact=False),
 }
 """By role. Commands are not among them: they go to the gate, and what the gate has let through to the low level."""
 
@@ -96,9 +108,12 @@ class Route:
     ours: str  # ROS 2 type
     name: str
     theirs: Counterpart
+    command: CommandMessage  # of the topic `manual`
 
     def out(self, payload: bytes) -> bytes:
         """Return ROS 1 bytes for CDR bytes. Raises CoopenvError: they are no such message."""
+        if self.theirs.convert is None:
+            return encode_ros1(low_level(read_drive(payload, self.command), self.command))
         return encode_ros1(self.theirs.convert(decode(payload, self.ours)))
 
     def back(self, payload: bytes) -> bytes:
@@ -112,13 +127,19 @@ class Route:
             self.back(translated)
 
 
-def routes_of(car: Car) -> tuple[Route, ...]:
+def routes_of(car: Car, profile: CarProfile = SVEA) -> tuple[Route, ...]:
     """Return those of a car. Raises DeploymentError: it has no number."""
     agent = car.agent_number
     if agent is None:
         raise DeploymentError(f"cars: {car.name}: agent is missing: the N of agentN in the authors' names (or marker)")
     return tuple(
-        Route(topic_of(car.name, role), TOPICS[role].type, other.name.format(agent=agent, car=car.name), other)
+        Route(
+            profile.topic_of(car.name, role),
+            profile.topics[role].type,
+            other.name.format(agent=agent, car=car.name),
+            other,
+            profile.command,
+        )
         for role, other in COUNTERPARTS.items()
     )
 

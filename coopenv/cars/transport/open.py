@@ -9,7 +9,7 @@ from coopenv.cars.transport.zenoh import Certificates
 
 
 def open_transport(deployment: Deployment, timeout: float = 2.0) -> Transport:
-    """Connect to the network of a fleet; topics are those of `coopenv.cars.topics` on every kind of network.
+    """Connect to the network of a fleet; topics are those of the profile on every kind of network.
 
     Args:
         deployment: says where, how and with which certificates.
@@ -38,7 +38,9 @@ def _translated(connect: Callable[[dict[str, str]], Transport], deployment: Depl
     """Return a connection to the authors' cars under our names."""
     from coopenv.cars.transport.authors import Authors, routes_of
 
-    routes = [route for car in deployment.cars for route in routes_of(car)]  # before anything is opened
+    routes = [
+        route for car in deployment.cars for route in routes_of(car, deployment.profile)
+    ]  # before anything is opened
     return Authors(connect({route.name: route.theirs.type for route in routes}), routes)
 
 

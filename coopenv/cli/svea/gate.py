@@ -42,7 +42,7 @@ def gate(
     arming. Clocks of car and station must agree to 50 ms (chrony). What the gate rejects is counted in its status,
     fleet/CAR/coopenv/gate.
 
-    Limits beyond 1.53 m/s, 0.5236 rad, 2 m/s^2 and 4 rad/s are refused.
+    Limits beyond those of the make are refused: for SVEA 1.53 m/s, 0.5236 rad, 2 m/s^2 and 4 rad/s.
     """
     from coopenv.base import interrupts
     from coopenv.cars.gate.core import Gate
@@ -61,7 +61,8 @@ def gate(
         print("warning: without --keys whoever reaches the router can drive this car", file=sys.stderr)
     transport = given.open()
     try:
-        link = Link(Gate(car, given.limits, CLOCK, verifier, given.station), car, transport, signer)
+        decides = Gate(car, given.limits, CLOCK, verifier, given.station, given.profile)
+        link = Link(decides, car, transport, signer, given.profile)
         interrupts.note(f"{car} is in neutral")
         if hasattr(signal, "SIGHUP"):  # a terminal that is closed ends the gate, too, but not before the car stands
             signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))

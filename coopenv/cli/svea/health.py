@@ -27,11 +27,11 @@ def health(
     """
     from coopenv.base.errors import CoopenvError
     from coopenv.cars.gate.process import Settings
-    from coopenv.cars.topics import Role, topic_of
+    from coopenv.cars.profile import Role
 
     given = Settings.of(car, deployment).changed({}, connect=connect and (connect,))
     given.check_place(off_board)
-    topic, transport = topic_of(given.car, Role.GATE), given.open()
+    topic, transport = given.profile.topic_of(given.car, Role.GATE), given.open()
     try:
         status = next_status(transport, topic, patience)
     finally:
@@ -50,7 +50,7 @@ def next_status(transport: "Transport", topic: str, patience: float) -> Any | No
 
     from coopenv.base.errors import CoopenvError
     from coopenv.cars.codec import MOST_BYTES, decode
-    from coopenv.cars.topics import TOPICS, Role
+    from coopenv.cars.profile import GATE_TYPES, Role
     from coopenv.cars.transport.base import Arrival
 
     heard, until = Queue[bytes](MOST_WAITING), time.monotonic() + patience
@@ -65,5 +65,5 @@ def next_status(transport: "Transport", topic: str, patience: float) -> Any | No
         while True:
             payload = heard.get(timeout=max(until - time.monotonic(), 0.0))
             with suppress(CoopenvError):
-                return decode(payload, TOPICS[Role.GATE].type)
+                return decode(payload, GATE_TYPES[Role.GATE])
     return None

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.backend.assembler import LATE, SILENT, Assembler
+from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.binding import Binding, bind
-from coopenv.cars.backend.neighbours import STALE
 from coopenv.cars.backend.tracks import LONGEST_GAP
 from coopenv.cars.deployment import Car
+from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.samples import Detections, Pose, Report, Sample, Twist, Value
-from coopenv.cars.topics import Role
 from coopenv.observers.recording import Sensed
 from coopenv.scenario import Scenario
 from tests.helpers.builders import landmark, scenario, vehicle
@@ -25,6 +24,7 @@ from tests.helpers.paths import Path
 MS = 1_000_000
 START = 1_000_000_000_000
 LANDMARKS = {"A": (3.0, 1.0, 0.4), "B": (4.0, -1.0, 0.2), "C": (5.0, 0.5, 0.3)}
+LATE, SILENT, STALE = (SVEA.topics[role].max_age_ns for role in (Role.DETECTIONS, Role.ODOMETRY, Role.ESTIMATE))
 MARKERS = {"A": 1, "B": 2, "C": 3}
 LEVER = np.array([0.3, 0.0, 0.2])
 TO_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])

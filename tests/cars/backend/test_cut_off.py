@@ -20,7 +20,7 @@ from coopenv.base.errors import DataError, DataWarning
 from coopenv.cars.backend.drive import Drive, is_drive
 from coopenv.cars.bags.files import BagFile
 from coopenv.cars.codec import encode, make
-from coopenv.cars.topics import STOPPED_TOPIC, Role, presence_of, topic_of
+from coopenv.cars.profile import STOPPED_TOPIC, SVEA, Role, presence_of
 from coopenv.runs.command import execute, report
 from coopenv.runs.links import links_report
 from coopenv.runs.rollouts import Rollout
@@ -44,7 +44,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, dict[
 
             def press_after_a_while() -> str:
                 if run.ticks_recorded > 120:
-                    hub.connect().publish(topic_of("svea7", Role.STOP), encode(make("std_msgs/msg/Bool", data=True)))
+                    hub.connect().publish(
+                        SVEA.topic_of("svea7", Role.STOP), encode(make("std_msgs/msg/Bool", data=True))
+                    )
                 return ""
 
             result = execute("lab", run, folder / "out", log, {}, None, None, False, press_after_a_while)
@@ -73,10 +75,10 @@ def test_what_explains_a_stop_is_on_the_tape(recorded: Any) -> None:
         messages = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages()]
     for car in ("svea7", "svea1"):
         for role in (Role.GATE, Role.STATE, Role.REMOTE, Role.BATTERY, Role.CAMERA_INFO, Role.COMMAND, Role.ARM):
-            assert counts.get(f"/{topic_of(car, role)}"), role
+            assert counts.get(f"/{SVEA.topic_of(car, role)}"), role
         assert counts[f"/{presence_of(car)}"] == 1
-    assert counts[f"/{topic_of('svea7', Role.STOP)}"] > 1
-    gates = [m.state for topic, m in messages if topic == f"/{topic_of('svea7', Role.GATE)}"]
+    assert counts[f"/{SVEA.topic_of('svea7', Role.STOP)}"] > 1
+    gates = [m.state for topic, m in messages if topic == f"/{SVEA.topic_of('svea7', Role.GATE)}"]
     assert gates.index("disarmed") < gates.index("armed") < gates.index("stopped")
     ((reason, car),) = [(m.reason, m.car) for topic, m in messages if topic == f"/{STOPPED_TOPIC}"]
     assert (reason, car) == (REASON, "svea7")

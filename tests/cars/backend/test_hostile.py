@@ -17,7 +17,7 @@ from coopenv.cars.backend.station import MOST_WAITING, Station
 from coopenv.cars.codec import MOST_BYTES, empty, encode, header, make
 from coopenv.cars.deployment import Car, Sensors
 from coopenv.cars.keys import Signer, Verifier
-from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Arrival, Hub
 from coopenv.scenario import load_scenario
 
@@ -75,35 +75,35 @@ def test_nothing_that_comes_stops_the_ticks_or_stays_in_memory() -> None:
     assert sum(sum(counts.values()) for counts in intake.rejected.values()) > 0.3 * COUNT
     assert grown < 300_000
     wheel = make(
-        TOPICS[Role.WHEEL].type,
+        SVEA.topics[Role.WHEEL].type,
         header=header(now + 10**10),
         twist=empty("geometry_msgs/msg/TwistWithCovariance"),
     )
     wheel.twist.twist.linear.x = 0.25
-    arrival = Arrival(topic_of("svea7", Role.WHEEL), encode(wheel), now + 10**10)
+    arrival = Arrival(SVEA.topic_of("svea7", Role.WHEEL), encode(wheel), now + 10**10)
     [sample] = intake.samples(arrival)
     assembler.put(sample)
     assert assembler.tick(COUNT, now + 10**10).velocity[0, 0] == pytest.approx(0.25)
 
 
 def _kinds() -> dict[Role, str]:
-    return {role: topic.type for role, topic in TOPICS.items()}
+    return {role: topic.type for role, topic in SVEA.topics.items()}
 
 
 def _topics(role: Role) -> set[str]:
-    return {topic_of(car.name, role) for car in CARS}
+    return {SVEA.topic_of(car.name, role) for car in CARS}
 
 
 def test_a_message_that_is_too_long_is_not_looked_at() -> None:
     intake = Intake(binding(), Sensors())
-    topic = topic_of("svea7", Role.DETECTIONS)
+    topic = SVEA.topic_of("svea7", Role.DETECTIONS)
     assert not list(intake.samples(Arrival(topic, b"\x00\x01\x00\x00" + bytes(MOST_BYTES), 0)))
     assert intake.rejected["svea7"] == {Role.DETECTIONS.value: 1}
 
 
 def test_a_flood_of_one_topic_takes_nobody_elses_place() -> None:
     hub = Hub()
-    flooded, other = topic_of("svea7", Role.IMU), topic_of("svea1", Role.WHEEL)
+    flooded, other = SVEA.topic_of("svea7", Role.IMU), SVEA.topic_of("svea1", Role.WHEEL)
     station = Station(hub.connect(), (flooded, other), None, {})
     network = hub.connect()
     network.publish(other, b"x")
@@ -118,11 +118,11 @@ def test_a_flood_of_one_topic_takes_nobody_elses_place() -> None:
 def test_what_others_have_not_signed_is_dropped_and_counted(tmp_path: Path) -> None:
     keys = {name: Ed25519PrivateKey.generate() for name in ("svea1", "svea7", "mallory")}
     verifier = Verifier({name: key.public_key() for name, key in keys.items() if name != "mallory"})
-    topic, hub = topic_of("svea1", Role.ESTIMATE), Hub()
+    topic, hub = SVEA.topic_of("svea1", Role.ESTIMATE), Hub()
     station = Station(hub.connect(), (topic,), verifier, {topic: ("svea1", "station")})
-    network, payload = hub.connect(), encode(empty(TOPICS[Role.ESTIMATE].type))
+    network, payload = hub.connect(), encode(empty(SVEA.topics[Role.ESTIMATE].type))
     genuine = Signer("svea1", keys["svea1"]).sign(topic, payload)
-    elsewhere = Signer("svea1", keys["svea1"]).sign(topic_of("svea7", Role.ESTIMATE), payload)
+    elsewhere = Signer("svea1", keys["svea1"]).sign(SVEA.topic_of("svea7", Role.ESTIMATE), payload)
     for signature in (
         b"",
         genuine[:-1],
@@ -141,12 +141,12 @@ def test_replayed_messages_of_others_count_once() -> None:
     bound = binding("svea1")
     intake, assembler, now = Intake(bound, Sensors()), Assembler(bound), 10**12
     assembler.begin(now)
-    topic = topic_of("svea7", Role.ESTIMATE)
+    topic = SVEA.topic_of("svea7", Role.ESTIMATE)
 
     def say(stamp: int, received: int) -> Any:
         pose = empty("geometry_msgs/msg/PoseWithCovariance")
         pose.pose.orientation.w = 1.0
-        message = make(TOPICS[Role.ESTIMATE].type, header=header(stamp), pose=pose)
+        message = make(SVEA.topics[Role.ESTIMATE].type, header=header(stamp), pose=pose)
         for sample in intake.samples(Arrival(topic, encode(message), received)):
             assembler.put(sample)
 

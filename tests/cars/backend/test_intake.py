@@ -12,7 +12,7 @@ from coopenv.cars.backend.binding import bind
 from coopenv.cars.codec import encode
 from coopenv.cars.deployment import Car, Sensors
 from coopenv.cars.fake.messages import imu, wheel
-from coopenv.cars.topics import Role, topic_of
+from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Arrival
 from coopenv.scenario import load_scenario
 
@@ -38,7 +38,7 @@ def test_the_wheels_turn_rate_counts_only_without_a_gyro(odometry: Any, turned: 
         if k % 20 == 3:
             spoken.append((Role.WHEEL, wheel(now, "svea7", 0.2, 0.3, (0.0, 0.0))))
         for role, message in spoken:
-            for sample in intake.samples(Arrival(topic_of("svea7", role), encode(message), now)):
+            for sample in intake.samples(Arrival(SVEA.topic_of("svea7", role), encode(message), now)):
                 assembler.put(sample)
         if k % 50 == 0 and k > 0:
             R = assembler.tick(k // 50, now).rotation[0]

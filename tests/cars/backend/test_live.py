@@ -19,7 +19,7 @@ from coopenv.cars.backend.backend import Svea
 from coopenv.cars.backend.drive import Drive
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.fake.car import Fake
-from coopenv.cars.topics import Role, topic_of
+from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Arrival, Hub
 from tests.helpers.cars import OVERTAKING, PATIENT, cars, fakes, send_fault, write_fleet
 
@@ -75,7 +75,7 @@ def test_armed_cars_drive_and_know_where_they_are(lab: Any) -> None:
 
 def test_nobody_drives_without_being_armed(lab: Any) -> None:
     path, hub, made = lab
-    commands = listen(hub, topic_of("*", Role.COMMAND))
+    commands = listen(hub, SVEA.topic_of("*", Role.COMMAND))
     env = env_of(cars(path, hub))
     try:
         _, infos = env.reset(seed=3)
@@ -288,7 +288,7 @@ def test_a_car_that_somebody_has_stopped_is_released_on_purpose(lab: Any, tmp_pa
     try:
         env.reset(options={"arm": True, "release": True})
         drive(env, 5)
-        hub.connect().publish(topic_of("svea1", Role.STOP), encode(make("std_msgs/msg/Bool", data=True)))
+        hub.connect().publish(SVEA.topic_of("svea1", Role.STOP), encode(make("std_msgs/msg/Bool", data=True)))
         drive(env, 60)
         assert not env.agents
         for _ in range(2):
@@ -317,7 +317,7 @@ def test_who_takes_the_remote_control_drives_alone(lab: Any, rssi: int, pulses: 
         drive(env, 5)
         channels = np.array(pulses, dtype=np.uint16)
         moved = make("mavros_msgs/msg/RCIn", header=header(time.time_ns()), rssi=rssi, channels=channels)
-        hub.connect().publish(topic_of("svea1", Role.REMOTE), encode(moved))
+        hub.connect().publish(SVEA.topic_of("svea1", Role.REMOTE), encode(moved))
         infos = drive(env, 40)
         assert not env.agents and infos["vehicle_2"]["car"]["stopped"] == why
     finally:
@@ -330,7 +330,7 @@ def test_an_emergency_stop_of_anybody_ends_the_episode(lab: Any) -> None:
     try:
         env.reset(seed=0, options={"arm": True})
         drive(env, 5)
-        hub.connect().publish(topic_of("svea7", Role.STOP), encode(make("std_msgs/msg/Bool", data=True)))
+        hub.connect().publish(SVEA.topic_of("svea7", Role.STOP), encode(make("std_msgs/msg/Bool", data=True)))
         infos = drive(env, 60)
         assert not env.agents and infos["vehicle_1"]["car"]["stopped"] == "svea7: its gate is stopped"
     finally:

@@ -18,12 +18,12 @@ from coopenv.cars.deployment import Safety
 from coopenv.cars.gate.core import Clock, Gate
 from coopenv.cars.gate.process import Link
 from coopenv.cars.limits import USUAL
+from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.samples import Pose, Sample, Twist
-from coopenv.cars.topics import Role, topic_of
 from coopenv.cars.transport.base import Arrival, Hub
 from tests.helpers.processes import wait_until
 
-WHEEL = topic_of("a", Role.WHEEL)
+WHEEL = SVEA.topic_of("a", Role.WHEEL)
 MS = 1_000_000
 BEGIN = 10**15
 
@@ -123,7 +123,7 @@ class Yard:
             link.tell()
 
     def stop(self, car: str) -> None:
-        self.hub.connect().publish(topic_of(car, Role.STOP), encode(make("std_msgs/msg/Bool", data=True)))
+        self.hub.connect().publish(SVEA.topic_of(car, Role.STOP), encode(make("std_msgs/msg/Bool", data=True)))
 
 
 @pytest.fixture
@@ -193,10 +193,10 @@ def test_who_has_stopped_a_car_is_known(yard: Yard) -> None:
 
 def test_what_a_gate_has_said_before_is_not_believed_again(yard: Yard) -> None:
     heard: list[Arrival] = []
-    yard.hub.connect().subscribe(topic_of("a", Role.GATE), heard.append)
+    yard.hub.connect().subscribe(SVEA.topic_of("a", Role.GATE), heard.append)
     yard.gates.begin()
     yard.tell()
-    first, topic = heard[0], topic_of("a", Role.GATE)
+    first, topic = heard[0], SVEA.topic_of("a", Role.GATE)
     before = yard.gates.states["a"]
     yard.hub.connect().publish(topic, first.payload)
     assert yard.gates.states["a"] == before and yard.gates.dropped["a"]["out of order"] == 1

@@ -13,7 +13,7 @@ from coopenv.cars.backend.status import StatusBoard
 from coopenv.cars.codec import encode, header, make
 from coopenv.cars.deployment import Remote
 from coopenv.cars.fake import messages
-from coopenv.cars.topics import Role, topic_of
+from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Hub
 
 CAR = "svea7"
@@ -28,7 +28,7 @@ class Talk:
         self.network = self.hub.connect()
 
     def say(self, role: Role, message: Any) -> None:
-        self.network.publish(topic_of(CAR, role), encode(message))
+        self.network.publish(SVEA.topic_of(CAR, role), encode(message))
 
     def remote(self, *pulses: int, rssi: int = 200, age: float = 0.0) -> None:
         channels = np.array(pulses or (1500,) * 8, dtype=np.uint16)
@@ -67,7 +67,7 @@ def test_a_car_that_has_not_told_of_itself_is_not_armed(left_out: Role) -> None:
                 say()
             elif old:
                 say(**old)
-        assert topic_of(CAR, left_out) in talk.board.obstacle(CAR)
+        assert SVEA.topic_of(CAR, left_out) in talk.board.obstacle(CAR)
 
 
 def test_what_has_been_said_counts_for_two_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -77,7 +77,7 @@ def test_what_has_been_said_counts_for_two_seconds(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(status.time, "monotonic", lambda: now + 1.5)
     assert talk.board.obstacle(CAR) == talk.board.happened(CAR) == ""
     monkeypatch.setattr(status.time, "monotonic", lambda: now + 2.5)
-    assert talk.board.obstacle(CAR).endswith(topic_of(CAR, Role.STATE))
+    assert talk.board.obstacle(CAR).endswith(SVEA.topic_of(CAR, Role.STATE))
     assert talk.board.happened(CAR)
 
 

@@ -20,12 +20,12 @@ from rosbags.highlevel import AnyReader
 from coopenv.base.errors import OutputError
 from coopenv.cars.backend.drive import ATTACHMENT, NAME, PRESENCE, Tape, Taped
 from coopenv.cars.codec import TICK, empty, encode, header, make
-from coopenv.cars.topics import STOPPED_TOPIC, TICK_TOPIC, TOPICS, Role, topic_of
+from coopenv.cars.profile import STOPPED_TOPIC, SVEA, TICK_TOPIC, Role
 from coopenv.cars.transport.base import Hub
 from tests.helpers.processes import DEADLOCK, start
 
-WHEEL, FRAMES = topic_of("svea7", Role.WHEEL), topic_of("svea7", Role.DETECTIONS)
-TYPES = {WHEEL: TOPICS[Role.WHEEL].type, FRAMES: TOPICS[Role.DETECTIONS].type}
+WHEEL, FRAMES = SVEA.topic_of("svea7", Role.WHEEL), SVEA.topic_of("svea7", Role.DETECTIONS)
+TYPES = {WHEEL: SVEA.topics[Role.WHEEL].type, FRAMES: SVEA.topics[Role.DETECTIONS].type}
 
 
 @pytest.fixture
@@ -77,8 +77,13 @@ def test_the_mcap_library_reads_it(written: Path) -> None:
 def test_what_goes_out_comes_aside_or_is_there_is_on_tape(tmp_path: Path) -> None:
     hub, heard, read = Hub(), [], []
     hub.connect().subscribe(WHEEL, heard.append)
-    state, stop, wheels = (topic_of("svea7", role) for role in (Role.STATE, Role.STOP, Role.WHEEL))
-    types = {**TYPES, state: TOPICS[Role.STATE].type, stop: TOPICS[Role.STOP].type, "fleet/alive/svea7": PRESENCE}
+    state, stop, wheels = (SVEA.topic_of("svea7", role) for role in (Role.STATE, Role.STOP, Role.WHEEL))
+    types = {
+        **TYPES,
+        state: SVEA.topics[Role.STATE].type,
+        stop: SVEA.topics[Role.STOP].type,
+        "fleet/alive/svea7": PRESENCE,
+    }
     tape = Tape(tmp_path / "drive.mcap", b"{}", types)
     taped = Taped(hub.connect(), tape, {state}, {stop})
     for topic in (state, wheels):

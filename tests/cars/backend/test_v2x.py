@@ -11,9 +11,9 @@ from coopenv.backends.base import Told
 from coopenv.cars.backend.assembler import Assembler
 from coopenv.cars.backend.neighbours import estimate_message, report_message
 from coopenv.cars.codec import decode, encode
+from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.readings import read
 from coopenv.cars.samples import Sample
-from coopenv.cars.topics import TOPICS, Role
 from coopenv.estimation.rotations import exp_so3
 from coopenv.observers.contract import Message
 from tests.cars.backend.test_assembler import MS, START, binding
@@ -31,7 +31,7 @@ def told() -> Told:
 
 @pytest.mark.parametrize(("role", "write"), [(Role.ESTIMATE, estimate_message), (Role.REPORT, report_message)])
 def test_what_one_says_is_where_the_other_hears_it(role: Role, write: Any) -> None:
-    message = decode(encode(write(told(), START, ORIGIN)), TOPICS[role].type)
+    message = decode(encode(write(told(), START, ORIGIN)), SVEA.topics[role].type)
     place = getattr(message.pose, "pose", message.pose).position
     np.testing.assert_allclose([place.x, place.y, place.z], PLACE + ORIGIN)  # as in the laboratory's coordinates
     assembler = Assembler(binding(2, only="car1", map={"origin": ORIGIN.tolist()}))

@@ -13,7 +13,7 @@ from coopenv.backends.base import Command
 from coopenv.backends.simulated import Simulated
 from coopenv.cars.codec import stamp_of
 from coopenv.cars.deployment import Sensors
-from coopenv.cars.topics import Role
+from coopenv.cars.profile import Role
 from coopenv.scenario import load_scenario
 from tests.helpers.fakes import CROSSING, EXACT, OVERTAKING, Stage
 

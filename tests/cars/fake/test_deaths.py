@@ -17,7 +17,7 @@ import coopenv
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.backend.opening import open_svea
 from coopenv.cars.codec import decode
-from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Arrival
 from coopenv.cars.transport.zenoh import open_zenoh
 from tests.helpers.cars import OVERTAKING
@@ -59,8 +59,8 @@ class Fleet:
         self.manual: dict[str, list[tuple[float, float]]] = {car: [] for car in self.cars}
         self.commands: list[float] = []
         for car in self.cars:
-            self.ear.subscribe(topic_of(car, Role.MANUAL), lambda arrival, car=car: self._keep(car, arrival))  # type: ignore[misc]
-            self.ear.subscribe(topic_of(car, Role.COMMAND), lambda _: self.commands.append(time.monotonic()))
+            self.ear.subscribe(SVEA.topic_of(car, Role.MANUAL), lambda arrival, car=car: self._keep(car, arrival))  # type: ignore[misc]
+            self.ear.subscribe(SVEA.topic_of(car, Role.COMMAND), lambda _: self.commands.append(time.monotonic()))
 
     def launch(self, *command: str) -> Any:
         process = start(command, self.folder)
@@ -74,7 +74,7 @@ class Fleet:
         return process
 
     def _keep(self, car: str, arrival: Arrival) -> None:
-        z = float(decode(arrival.payload, TOPICS[Role.MANUAL].type).z)
+        z = float(decode(arrival.payload, SVEA.topics[Role.MANUAL].type).z)
         self.manual[car].append((time.monotonic(), z))
 
     def moves(self, car: str) -> bool:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from coopenv.cars.codec import encode, make, stamp_of
 from coopenv.cars.fake.faults import KINDS, Fault, FaultError, Faults, fault_topic, parse_fault
-from coopenv.cars.topics import Role, topic_of
+from coopenv.cars.profile import SVEA, Role
 from tests.helpers.fakes import EXACT, OVERTAKING, Stage
 
 
@@ -141,7 +141,7 @@ def test_every_kind_can_be_asked_for_and_nonsense_is_told(stage: Stage) -> None:
     assert not stage.complaints
     ask(stage, "melt")
     stage.network.publish(fault_topic("svea7"), b"\1\2")
-    stage.network.publish(topic_of("svea7", Role.MANUAL), b"nonsense")
+    stage.network.publish(SVEA.topic_of("svea7", Role.MANUAL), b"nonsense")
     stage.run(0.01)
     assert len(stage.complaints) == 3
     assert "unknown fault 'melt'" in stage.complaints[0]

@@ -13,7 +13,7 @@ from coopenv.cars.backend.binding import bind
 from coopenv.cars.backend.opening import scenario_of
 from coopenv.cars.deployment import DeploymentError, load_deployment
 from coopenv.cars.fake.fleet import FakesError, fakes, free_port
-from coopenv.cars.topics import presence_of
+from coopenv.cars.profile import presence_of
 from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cli import app
 from tests.helpers.processes import ROOT, mentioning, wait_until

@@ -19,7 +19,7 @@ from coopenv.cars.codec import decode, encode, make
 from coopenv.cars.fake.fleet import open_fake, run
 from coopenv.cars.keys import load_signer, load_verifier, make_keys
 from coopenv.cars.limits import Limits
-from coopenv.cars.topics import RESET_TOPIC, TOPICS, Role, presence_of, topic_of
+from coopenv.cars.profile import RESET_TOPIC, SVEA, Role, presence_of
 from coopenv.cars.transport.base import Arrival, Hub, Transport
 from coopenv.cars.transport.zenoh import open_zenoh
 from coopenv.cli import app
@@ -50,11 +50,11 @@ class Ears:
         self.last: dict[Role, Any] = {}
         self.there = False
         for role in (Role.TRUTH, Role.WHEEL, Role.DETECTIONS, Role.MANUAL):
-            transport.subscribe(topic_of(car, role), self._keep(role))
+            transport.subscribe(SVEA.topic_of(car, role), self._keep(role))
         transport.watch(presence_of(car), lambda _, there: setattr(self, "there", there))
 
     def _keep(self, role: Role) -> Callable[[Arrival], None]:
-        return lambda arrival: self.last.__setitem__(role, decode(arrival.payload, TOPICS[role].type))
+        return lambda arrival: self.last.__setitem__(role, decode(arrival.payload, SVEA.topics[role].type))
 
     @property
     def place(self) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from coopenv.cars.codec import ros1, ros2
-from coopenv.cars.topics import TOPICS
+from coopenv.cars.profile import SVEA
 
 MD5 = {
     "svea_msgs/msg/lli_ctrl": "f4c1d25e08fe7c24fca84a1ec3ad2a96",
@@ -34,4 +34,4 @@ def test_hashes_of_ros2_are_the_published_ones(kind: str) -> None:
 
 
 def test_every_topic_has_a_type() -> None:
-    assert {topic.type for topic in TOPICS.values()} <= set(ros2().types)
+    assert {topic.type for topic in SVEA.topics.values()} <= set(ros2().types)

@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from coopenv.cars.codec import MOST_BYTES, empty, encode
-from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Arrival
 from coopenv.cli.svea.health import next_status
 
-TOPIC = topic_of("svea7", Role.GATE)
+TOPIC = SVEA.topic_of("svea7", Role.GATE)
 
 
 class Crowded:
@@ -29,7 +29,7 @@ class Crowded:
 
 
 def status() -> bytes:
-    return encode(empty(TOPICS[Role.GATE].type))
+    return encode(empty(SVEA.topics[Role.GATE].type))
 
 
 def heard(payloads: Iterator[bytes]) -> Any:

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from coopenv import CoopenvError
 from coopenv.cars import codec
+from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.readings import read
 from coopenv.cars.samples import Calibration, Detections, Pose, Report, Status, Twist
-from coopenv.cars.topics import TOPICS, Role
 from coopenv.estimation.lens import distort
 
 pytest.importorskip("rosbags", reason="needs the extra 'svea'")
@@ -307,4 +307,4 @@ def test_every_topic_of_a_car_that_is_no_command_can_be_read() -> None:
     from coopenv.cars.readings import READERS
 
     commands = {Role.COMMAND, Role.ARM, Role.GATE, Role.STOP, Role.MANUAL}
-    assert all(topic.type in READERS[role] for role, topic in TOPICS.items() if role not in commands)
+    assert all(topic.type in READERS[role] for role, topic in SVEA.topics.items() if role not in commands)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from coopenv.cars.topics import TOPICS, Role, presence_of, topic_of
+from coopenv.cars.profile import SVEA, Role, presence_of
 from coopenv.cars.transport.base import matcher
 
 NAMES = {
@@ -27,18 +27,18 @@ NAMES = {
 @pytest.mark.parametrize("role", NAMES)
 def test_names_types_and_ages_are_those_agreed(role: Role) -> None:
     name, kind, age = NAMES[role]
-    assert topic_of("svea7", role) == name
-    assert (TOPICS[role].type, TOPICS[role].max_age) == (kind, age)
+    assert SVEA.topic_of("svea7", role) == name
+    assert (SVEA.topics[role].type, SVEA.topics[role].max_age) == (kind, age)
 
 
 def test_commands_overtake_and_a_stop_waits_rather_than_is_lost() -> None:
-    assert TOPICS[Role.COMMAND].urgent
-    assert TOPICS[Role.STOP].urgent
-    assert TOPICS[Role.STOP].reliable
+    assert SVEA.topics[Role.COMMAND].urgent
+    assert SVEA.topics[Role.STOP].urgent
+    assert SVEA.topics[Role.STOP].reliable
 
 
 def test_no_two_topics_have_one_name() -> None:
-    names = [topic_of(car, role) for car in ("svea1", "svea7") for role in TOPICS]
+    names = [SVEA.topic_of(car, role) for car in ("svea1", "svea7") for role in SVEA.topics]
     assert len(set(names)) == len(names)
 
 

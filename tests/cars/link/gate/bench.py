@@ -6,12 +6,12 @@ from typing import Any
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from coopenv.cars.actuation import Drive, from_manual
 from coopenv.cars.codec import decode, stamp_of
+from coopenv.cars.gate.codec import read_drive
 from coopenv.cars.gate.core import PERIOD, Clock, Gate, Reason
 from coopenv.cars.keys import Signer, Verifier
 from coopenv.cars.limits import Limits
-from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.profile import SVEA, Drive, Role
 from tests.cars.link.gate import messages
 
 CAR = "svea7"
@@ -37,7 +37,7 @@ class Bench:
         self.steady += duration
 
     def send(self, role: Role, payload: bytes, signer: Signer | None = STATION) -> Reason | None:
-        attachment = b"" if signer is None else signer.sign(topic_of(CAR, role), payload)
+        attachment = b"" if signer is None else signer.sign(SVEA.topic_of(CAR, role), payload)
         return self.gate.arrive(role, payload, attachment)
 
     def arm(self, session: str = "s1", nonce: str | None = None, armed: bool = True, age: int = 0) -> Reason | None:
@@ -63,14 +63,14 @@ class Bench:
         return self.send(Role.STOP, messages.stop(value), None)
 
     def status(self) -> Any:
-        return decode(self.gate.status(), TOPICS[Role.GATE].type)
+        return decode(self.gate.status(), SVEA.topics[Role.GATE].type)
 
     def tick(self) -> Drive:
         """Return what the car is told after one more period."""
         self.wait(PERIOD)
-        message = decode(self.gate.tick(), TOPICS[Role.MANUAL].type)
-        assert stamp_of(message) == self.wall
-        return from_manual(float(message.y), float(message.z), float(message.aux3))
+        payload = self.gate.tick()
+        assert stamp_of(decode(payload, SVEA.topics[Role.MANUAL].type)) == self.wall
+        return read_drive(payload, SVEA.command)
 
     def drive(self, ticks: int, **fields: Any) -> Drive:
         """Return what the car is told after some commands, one per tick."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from random import Random
 
 from coopenv.cars.keys import Signer
-from coopenv.cars.topics import Role, topic_of
+from coopenv.cars.profile import SVEA, Role
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR, MS
 
@@ -33,13 +33,13 @@ def messages_of_strangers(
     unknown = Signer("mallory", stranger._key)
 
     def signed(role: Role, payload: bytes, signer: Signer = station) -> Message:
-        return role, payload, signer.sign(topic_of(CAR, role), payload)
+        return role, payload, signer.sign(SVEA.topic_of(CAR, role), payload)
 
     def command(stamp: int = 0, sequence: int = 0, session: str = session, steering: float = 0.1) -> bytes:
         return messages.command(now() + stamp, session, last + 1 + sequence, steering, 0.3)
 
     fresh = command()
-    good = station.sign(topic_of(CAR, Role.COMMAND), command(sequence=1))  # of another message
+    good = station.sign(SVEA.topic_of(CAR, Role.COMMAND), command(sequence=1))  # of another message
     stale = [signed(Role.COMMAND, command(-random.randrange(200 * MS, 10**12))) for _ in range(50)]
     ahead = [signed(Role.COMMAND, command(random.randrange(10**11, 10**13), 10**6)) for _ in range(50)]
     replayed = [signed(Role.COMMAND, command(0, -1 - random.randrange(last + 1))) for _ in range(50)]

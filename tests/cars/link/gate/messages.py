@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from coopenv.cars.codec import encode, header, make
-from coopenv.cars.topics import TOPICS, Role
+from coopenv.cars.profile import SVEA, Role
 
 
 def command(stamp: int, session: str, sequence: int, steering: float = 0.1, speed: float = 0.2) -> bytes:
@@ -13,13 +13,13 @@ def command(stamp: int, session: str, sequence: int, steering: float = 0.1, spee
 def framed_command(stamp: int, frame: str, fields: tuple[float, float, float, float, float]) -> bytes:
     names = ("steering_angle", "steering_angle_velocity", "speed", "acceleration", "jerk")
     drive = make("ackermann_msgs/msg/AckermannDrive", **dict(zip(names, fields, strict=True)))
-    return encode(make(TOPICS[Role.COMMAND].type, header=header(stamp, frame), drive=drive))
+    return encode(make(SVEA.topics[Role.COMMAND].type, header=header(stamp, frame), drive=drive))
 
 
 def arm(stamp: int, session: str, nonce: str, armed: bool = True) -> bytes:
     fields = {"session": session, "nonce": nonce, "armed": armed}
-    return encode(make(TOPICS[Role.ARM].type, header=header(stamp), **fields))
+    return encode(make(SVEA.topics[Role.ARM].type, header=header(stamp), **fields))
 
 
 def stop(value: bool = True) -> bytes:
-    return encode(make(TOPICS[Role.STOP].type, data=value))
+    return encode(make(SVEA.topics[Role.STOP].type, data=value))

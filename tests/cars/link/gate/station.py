@@ -12,10 +12,10 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from coopenv.cars.actuation import Drive, from_manual
 from coopenv.cars.codec import decode
+from coopenv.cars.gate.codec import read_drive
 from coopenv.cars.keys import Signer
-from coopenv.cars.topics import TOPICS, Role, presence_of, topic_of
+from coopenv.cars.profile import SVEA, Drive, Role, presence_of
 from coopenv.cars.transport.base import Arrival, Transport
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR
@@ -68,18 +68,18 @@ class Station:
         self.statuses, self.outputs, self.stops = 0, deque[tuple[float, Drive]](maxlen=1000), 0
         self.present = False
         self.session, self.sequence = "", 0
-        transport.subscribe(topic_of(CAR, Role.GATE), self._hear)
-        transport.subscribe(topic_of(CAR, Role.MANUAL), self._see)
-        transport.subscribe(topic_of(CAR, Role.STOP), self._halt)
+        transport.subscribe(SVEA.topic_of(CAR, Role.GATE), self._hear)
+        transport.subscribe(SVEA.topic_of(CAR, Role.MANUAL), self._see)
+        transport.subscribe(SVEA.topic_of(CAR, Role.STOP), self._halt)
         transport.watch(presence_of("*"), self._watch)
 
     def _hear(self, arrival: Arrival) -> None:
-        self.status, self.statuses = decode(arrival.payload, TOPICS[Role.GATE].type), self.statuses + 1
+        self.status, self.statuses = decode(arrival.payload, SVEA.topics[Role.GATE].type), self.statuses + 1
 
     def _see(self, arrival: Arrival) -> None:
-        message = decode(arrival.payload, TOPICS[Role.MANUAL].type)
+        drive = read_drive(arrival.payload, SVEA.command)
         with self._lock:
-            self.outputs.append((time.monotonic(), from_manual(float(message.y), float(message.z))))
+            self.outputs.append((time.monotonic(), drive))
 
     def _halt(self, _arrival: Arrival) -> None:
         self.stops += 1
@@ -97,12 +97,14 @@ class Station:
         return int(dict(zip(self.status.rejections, self.status.counts, strict=True))[reason])
 
     def send(self, role: Role, payload: bytes) -> None:
-        topic = topic_of(CAR, role)
+        topic = SVEA.topic_of(CAR, role)
         attachment = b"" if self._signer is None else self._signer.sign(topic, payload)
-        self._transport.publish(topic, payload, attachment, urgent=TOPICS[role].urgent, reliable=TOPICS[role].reliable)
+        self._transport.publish(
+            topic, payload, attachment, urgent=SVEA.topics[role].urgent, reliable=SVEA.topics[role].reliable
+        )
 
     def send_raw(self, role: Role, payload: bytes, attachment: bytes) -> None:
-        self._transport.publish(topic_of(CAR, role), payload, attachment, reliable=True)
+        self._transport.publish(SVEA.topic_of(CAR, role), payload, attachment, reliable=True)
 
     def arm(self, session: str) -> None:
         """Arm the gate, and wait until it says that it is."""

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import asdict, astuple
+from dataclasses import astuple
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from coopenv.base.errors import CoopenvError
-from coopenv.cars.actuation import Manual
 from coopenv.cars.codec import decode, encode, header, make
 from coopenv.cars.gate.codec import (
     Malformed,
@@ -22,15 +20,16 @@ from coopenv.cars.gate.codec import (
     read_bool,
     read_command,
     write_bool,
-    write_manual,
+    write_drive,
     write_status,
 )
-from coopenv.cars.topics import TOPICS, Role
+from coopenv.cars.profile import SVEA, Drive, Role
 from tests.cars.link.gate.messages import arm, framed_command, stop
 
 TEXT = st.text(st.characters(codec="utf-8"), max_size=12)
 STAMP = st.integers(0, 2**31 * 10**9 - 1)
 FLOAT = st.floats(width=32)
+USUAL = st.floats(-1e6, 1e6, width=32)
 COUNT = st.integers(0, 2**64 - 1)
 
 
@@ -43,7 +42,7 @@ def test_commands_are_read_as_they_were_written(stamp: int, frame: str, fields: 
 
 @given(STAMP, TEXT, TEXT, TEXT, st.booleans())
 def test_armings_are_read_as_they_were_written(stamp: int, frame: str, session: str, nonce: str, armed: bool) -> None:
-    message = make(TOPICS[Role.ARM].type, header=header(stamp, frame), session=session, nonce=nonce, armed=armed)
+    message = make(SVEA.topics[Role.ARM].type, header=header(stamp, frame), session=session, nonce=nonce, armed=armed)
     assert astuple(read_arm(encode(message))) == (stamp, frame, session, nonce, armed)
 
 
@@ -53,13 +52,21 @@ def test_stops_are_those_of_rosbags(value: bool) -> None:
     assert read_bool(stop(value)) is value
 
 
-@given(STAMP, st.lists(FLOAT, min_size=12, max_size=12), st.integers(0, 2**16 - 1), st.integers(0, 255))
+@given(
+    STAMP,
+    st.lists(USUAL, min_size=12, max_size=12),
+    st.integers(0, 2**16 - 1),
+    st.integers(0, 255),
+)
 def test_manual_control_is_that_of_rosbags(stamp: int, numbers: list[float], buttons: int, extensions: int) -> None:
-    fields = Manual(*numbers[:4], buttons, buttons // 2, extensions, *numbers[4:])
-    payload = write_manual(stamp, fields)
-    assert payload == encode(make(TOPICS[Role.MANUAL].type, header=header(stamp), **asdict(fields)))
-    read = decode(payload, TOPICS[Role.MANUAL].type)
-    assert all(math.isnan(v) or getattr(read, k) == v for k, v in asdict(fields).items())
+    given = iter([*numbers[:4], buttons, buttons // 2, extensions, *numbers[4:]])
+    neutral = {name: (kind, next(given)) for name, (kind, _) in SVEA.command.neutral.items()}
+    message, drive = SVEA.command.model_copy(update={"neutral": neutral}), Drive(0.1, -0.2)
+    fields = message.values(drive)
+    payload = write_drive(stamp, message, drive)
+    assert payload == encode(make(SVEA.topics[Role.MANUAL].type, header=header(stamp), **fields))
+    read = decode(payload, SVEA.topics[Role.MANUAL].type)
+    assert all(getattr(read, k) == pytest.approx(v, rel=1e-6) for k, v in fields.items())
 
 
 @given(STAMP, TEXT, TEXT, TEXT, COUNT, COUNT, st.dictionaries(TEXT, COUNT, max_size=5))
@@ -70,8 +77,8 @@ def test_the_status_is_that_of_rosbags(
     fields: dict[str, Any] = {"session": session, "nonce": nonce, "state": state}
     fields |= {"accepted": accepted, "last_sequence": last}
     fields |= {"rejections": list(counts), "counts": np.array(list(counts.values()), dtype=np.uint64)}
-    assert payload == encode(make(TOPICS[Role.GATE].type, header=header(stamp), **fields))
-    read = decode(payload, TOPICS[Role.GATE].type)
+    assert payload == encode(make(SVEA.topics[Role.GATE].type, header=header(stamp), **fields))
+    read = decode(payload, SVEA.topics[Role.GATE].type)
     assert dict(zip(read.rejections, read.counts.tolist(), strict=True)) == counts
 
 
@@ -88,7 +95,7 @@ def test_every_other_length_is_refused(read: Callable[[bytes], Any], role: Role,
         with pytest.raises(Malformed):
             read(payload[:length])
         with pytest.raises(CoopenvError):
-            decode(payload[:length], TOPICS[role].type)
+            decode(payload[:length], SVEA.topics[role].type)
     for more in range(1, 4):  # padding that some writers add
         assert read(payload + bytes(more)) == read(payload)
     with pytest.raises(Malformed, match="too long"):
@@ -103,7 +110,7 @@ def test_bytes_are_read_as_rosbags_reads_them_or_refused(what: Any, raw: bytes, 
         found = read(payload)
     except Malformed:
         return
-    other = decode(payload, TOPICS[role].type)
+    other = decode(payload, SVEA.topics[role].type)
     if role is Role.STOP:
         assert found is bool(other.data)
     else:

@@ -10,12 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coopenv.cars.actuation import NEUTRAL, Drive
-from coopenv.cars.gate.core import MOST_AGE, MOST_AHEAD, TIMEOUT, Reason, State
+from coopenv.cars.gate.core import MOST_AHEAD, TIMEOUT, Reason, State
 from coopenv.cars.limits import Limits
-from coopenv.cars.topics import Role
+from coopenv.cars.profile import NEUTRAL, SVEA, Drive, Role
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import LIMITS, MS, OTHER, STATION, Bench
+
+MOST_AGE = SVEA.topics[Role.COMMAND].max_age_ns
 
 
 def armed(**options: Any) -> Bench:

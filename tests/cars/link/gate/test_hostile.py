@@ -6,8 +6,8 @@ import tracemalloc
 from collections import Counter
 from random import Random
 
-from coopenv.cars.actuation import NEUTRAL
 from coopenv.cars.gate.core import Reason, State
+from coopenv.cars.profile import NEUTRAL
 from tests.cars.link.gate.bench import OTHER, STATION, Bench
 from tests.cars.link.gate.hostile import messages_of_strangers
 

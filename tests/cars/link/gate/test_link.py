@@ -7,11 +7,10 @@ from collections.abc import Callable
 
 import pytest
 
-from coopenv.cars.actuation import NEUTRAL
 from coopenv.cars.codec import decode
 from coopenv.cars.gate.core import Gate
 from coopenv.cars.gate.process import CLOCK, Link, run
-from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.profile import NEUTRAL, SVEA, Role
 from coopenv.cars.transport.base import Hub
 from tests.cars.link.gate import messages
 from tests.cars.link.gate.bench import CAR, LIMITS
@@ -41,7 +40,7 @@ def test_a_tick_sends_what_it_returns() -> None:
     assert station.present
     payloads = [link.tick() for _ in range(9)]
     assert (len(station.outputs), station.statuses) == (9, 3)
-    assert decode(payloads[-1], TOPICS[Role.MANUAL].type).z == 500.0
+    assert decode(payloads[-1], SVEA.topics[Role.MANUAL].type).z == 500.0
 
 
 def test_news_is_told_at_once_and_its_own_stops_do_not_stop_it_again() -> None:
@@ -52,7 +51,7 @@ def test_news_is_told_at_once_and_its_own_stops_do_not_stop_it_again() -> None:
     link.tell()
     assert station.status.state == "stopped" and station.stops == 2 and not link.news.is_set()
     repeated: list[tuple[bytes, bytes]] = []
-    link._transport.subscribe(topic_of(CAR, Role.STOP), lambda a: repeated.append((a.payload, a.attachment)))
+    link._transport.subscribe(SVEA.topic_of(CAR, Role.STOP), lambda a: repeated.append((a.payload, a.attachment)))
     link.tell()
     station.send(Role.ARM, messages.arm(time.time_ns(), "s", station.status.nonce))
     station.send_raw(Role.STOP, *repeated[0])  # on its way since before the arming

@@ -13,9 +13,8 @@ from random import Random
 
 import pytest
 
-from coopenv.cars.actuation import NEUTRAL
 from coopenv.cars.keys import load_signer, load_verifier, make_keys
-from coopenv.cars.topics import Role
+from coopenv.cars.profile import NEUTRAL, Role
 from coopenv.cars.transport.zenoh import LEASE, open_zenoh
 from coopenv.cli import main
 from tests.cars.link.gate import messages

@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 
 from coopenv.cars.codec import decode, decode_ros1, empty, encode, encode_ros1, header, make
 from coopenv.cars.deployment import Car, DeploymentError
+from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.readings import read
 from coopenv.cars.samples import Pose
-from coopenv.cars.topics import TOPICS, Role, topic_of
 from coopenv.cars.transport.authors import COUNTERPARTS, Authors, routes_of, to_ros1
 from coopenv.cars.transport.base import Arrival, Hub, Local
 
 CAR = Car(name="svea1", agent=7)
 STAMP = 3_000_000_004
 POINT = struct.pack("<IIII", 0, 3, 4, 3) + b"map" + struct.pack("<3d", 1.5, -2.0, 0.25)
-ESTIMATE, HEARD = topic_of("svea1", Role.ESTIMATE), topic_of("svea1", Role.POINT)
+ESTIMATE, HEARD = SVEA.topic_of("svea1", Role.ESTIMATE), SVEA.topic_of("svea1", Role.POINT)
 
 
 def ends() -> tuple[Authors, Local, list[Arrival]]:
@@ -60,7 +60,7 @@ def test_a_riccati_point_is_a_position_without_orientation_or_covariance() -> No
     plain.publish("agent7/riccatiPoint", struct.pack("<I", 77) + POINT[4:], b"signed")
     plain.publish("agent8/riccatiPoint", POINT)
     assert [(a.topic, a.attachment) for a in heard] == [(HEARD, b"signed")]
-    message = decode(heard[0].payload, TOPICS[Role.POINT].type)
+    message = decode(heard[0].payload, SVEA.topics[Role.POINT].type)
     told = read(Role.POINT, message)
     assert isinstance(told, Pose)
     np.testing.assert_array_equal(told.position, [1.5, -2.0, 0.25])
@@ -82,9 +82,9 @@ def test_what_the_gate_lets_through_is_what_the_low_level_takes(
     y: float, z: float, steering: int, velocity: int
 ) -> None:
     authors, _, heard = ends()
-    message = empty(TOPICS[Role.MANUAL].type)
+    message = empty(SVEA.topics[Role.MANUAL].type)
     message.y, message.z, message.aux3 = y, z, 1000.0
-    authors.publish(topic_of("svea1", Role.MANUAL), encode(message))
+    authors.publish(SVEA.topic_of("svea1", Role.MANUAL), encode(message))
     sent = {arrival.topic: arrival.payload for arrival in heard}["agent7/lli/ctrl_request"]
     assert struct.unpack("<bb", sent[:2]) == (steering, velocity)
     assert len(sent) == 4
@@ -92,8 +92,8 @@ def test_what_the_gate_lets_through_is_what_the_low_level_takes(
 
 def test_commands_reach_the_low_level_only_through_the_gate() -> None:
     authors, _, heard = ends()
-    topic = topic_of("svea1", Role.COMMAND)
-    authors.publish(topic, encode(empty(TOPICS[Role.COMMAND].type)), b"signed")
+    topic = SVEA.topic_of("svea1", Role.COMMAND)
+    authors.publish(topic, encode(empty(SVEA.topics[Role.COMMAND].type)), b"signed")
     assert [(arrival.topic, arrival.attachment) for arrival in heard] == [(topic, b"signed")]
 
 
@@ -139,11 +139,11 @@ def test_exact_counterparts_come_back_as_the_bytes_they_were(data: st.DataObject
     receiver = Authors(plain, routes_of(CAR))
     heard: list[Arrival] = []
     receiver.subscribe("fleet/**", heard.append)
-    sent = encode(filled(TOPICS[role].type, data.draw))
-    sender.publish(topic_of("svea1", role), sent, b"signed")
+    sent = encode(filled(SVEA.topics[role].type, data.draw))
+    sender.publish(SVEA.topic_of("svea1", role), sent, b"signed")
     assert [arrival.topic for arrival in on_the_wire] == [NAMES[role]]
-    assert decode_ros1(on_the_wire[0].payload, TOPICS[role].type).header.seq == 0
-    assert [(a.topic, a.payload, a.attachment) for a in heard] == [(topic_of("svea1", role), sent, b"signed")]
+    assert decode_ros1(on_the_wire[0].payload, SVEA.topics[role].type).header.seq == 0
+    assert [(a.topic, a.payload, a.attachment) for a in heard] == [(SVEA.topic_of("svea1", role), sent, b"signed")]
 
 
 def test_matrices_of_a_camera_keep_their_values() -> None:
@@ -159,10 +159,10 @@ def test_bytes_that_are_no_such_message_are_counted_and_go_no_further() -> None:
     back: list[Arrival] = []
     authors.subscribe(HEARD, back.append)
     plain.publish("agent7/riccatiPoint", b"junk")
-    authors.publish(topic_of("svea1", Role.WHEEL), b"junk")
+    authors.publish(SVEA.topic_of("svea1", Role.WHEEL), b"junk")
     assert not back
     assert [arrival.payload for arrival in heard] == [b"junk"]
-    assert authors.refused == {"agent7/riccatiPoint": 1, topic_of("svea1", Role.WHEEL): 1}
+    assert authors.refused == {"agent7/riccatiPoint": 1, SVEA.topic_of("svea1", Role.WHEEL): 1}
 
 
 def test_messages_of_ours_and_presences_pass_untouched() -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from coopenv.cars.codec import empty, encode
 from coopenv.cars.deployment import parse_deployment
-from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport.base import Arrival, LinkError
 from coopenv.cars.transport.nats import MOST_WAITING, open_nats
 from coopenv.cars.transport.open import open_transport
@@ -144,12 +144,12 @@ def test_a_deployment_reaches_cars_over_the_authors_wire(tmp_path: Path) -> None
     port = free_port()
     cars, network = [{"name": "svea1", "agent": 7}], {"kind": "nats", "connect": [f"nats/127.0.0.1:{port}"]}
     fleet = parse_deployment({"environment": "e", "cars": cars, "network": network}, tmp_path / "lab.toml")
-    bearings, gate = topic_of("svea1", Role.BEARINGS), topic_of("svea1", Role.GATE)
+    bearings, gate = SVEA.topic_of("svea1", Role.BEARINGS), SVEA.topic_of("svea1", Role.GATE)
     with nats_server(port, tmp_path):
         car, station = open_transport(fleet), open_transport(fleet)
         heard: list[Arrival] = []
         station.subscribe("fleet/svea1/**", heard.append)
-        sent = encode(empty(TOPICS[Role.BEARINGS].type))
+        sent = encode(empty(SVEA.topics[Role.BEARINGS].type))
         car.publish(bearings, sent, b"signed")
         car.publish(gate, b"status", reliable=True)
         wait_until(lambda: len(heard) == 2)

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from coopenv.base.errors import CoopenvError
 from coopenv.cars.codec import decode, decode_ros1, encode, header, make
 from coopenv.cars.deployment import parse_deployment
-from coopenv.cars.topics import TOPICS, Role, topic_of
+from coopenv.cars.profile import SVEA, Role
 from coopenv.cars.transport import ros1
 from coopenv.cars.transport.base import Arrival, LinkError
 from coopenv.cars.transport.endpoints import Address
@@ -156,15 +156,15 @@ def test_a_deployment_reaches_the_authors_stack(tmp_path: Path) -> None:
         network = {"kind": "ros1", "connect": [endpoint]}
         fleet = parse_deployment({"environment": "e", "cars": cars, "network": network}, tmp_path / "lab.toml")
         station = open_transport(fleet)
-        station.subscribe(topic_of("svea8", Role.POINT), heard.append)
+        station.subscribe(SVEA.topic_of("svea8", Role.POINT), heard.append)
         place = make("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0)
         message = encode(make("geometry_msgs/msg/PointStamped", header=header(5, "map"), point=place))
 
         def answered() -> bool:
-            station.publish(topic_of("svea7", Role.POINT), message)
+            station.publish(SVEA.topic_of("svea7", Role.POINT), message)
             return bool(heard)
 
         wait_until(answered)
         station.close()
-    told = decode(heard[0].payload, TOPICS[Role.POINT].type).point
+    told = decode(heard[0].payload, SVEA.topics[Role.POINT].type).point
     assert (told.x, told.y, told.z) == (3.0, 2.0, 1.0)

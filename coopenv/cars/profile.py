@@ -1,0 +1,249 @@
+"""The profile of a make of cars: topics, command message, limits and conditions. SVEA is the first make.
+
+A profile is a TOML file; `coopenv/cars/profiles` holds those that are shipped. A deployment file names its profile.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from coopenv.base.errors import CoopenvError, listed, shown, suggest
+from coopenv.cars.limits import Limits
+
+
+class Role(StrEnum):
+    """Content of a topic."""
+
+    DETECTIONS = "detections"  # blocks of the camera, pixels
+    BEARINGS = "bearings"  # of the camera, unit vectors from the target to the camera, optical frame
+    CAMERA_INFO = "camera_info"
+    ODOMETRY = "odometry"  # of the car's own filter
+    WHEEL = "wheel"
+    IMU = "imu"
+    ESTIMATE = "estimate"  # V2X
+    REPORT = "report"  # V2X, of the observer `robust`
+    POINT = "point"  # V2X of the authors: a position alone
+    TRUTH = "truth"  # motion capture
+    STATE = "state"  # of the autopilot
+    REMOTE = "remote"  # channels of the remote control
+    BATTERY = "battery"
+    COMMAND = "command"  # to the gate
+    ARM = "arm"  # to the gate
+    GATE = "gate"  # status of the gate
+    STOP = "stop"
+    MANUAL = "manual"  # from the gate to the car
+
+
+GATE_TYPES = {
+    Role.COMMAND: "ackermann_msgs/msg/AckermannDriveStamped",
+    Role.ARM: "coopenv_msgs/msg/Arm",
+    Role.GATE: "coopenv_msgs/msg/GateStatus",
+    Role.STOP: "std_msgs/msg/Bool",
+}
+"""Types between a station and a gate, the same for every make."""
+
+PREFIX = "fleet"
+TICK_TOPIC = "coopenv/tick"  # in files only
+STOPPED_TOPIC = "coopenv/stopped"  # in files only: why the watchdog stopped the cars
+RESET_TOPIC = "fleet/coopenv/reset"  # std_msgs/msg/Int64, a seed: fakes go to their start
+
+
+def presence_of(name: str) -> str:
+    """Return the key of the liveliness token of a car, its gate or an environment."""
+    return f"{PREFIX}/alive/{name}"
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """Motion command of a car."""
+
+    steering: float = 0.0  # rad, left is positive
+    speed: float = 0.0  # m/s, forward is positive
+
+
+NEUTRAL = Drive()
+
+Positive = Annotated[float, Field(gt=0.0, le=1e6)]
+Number = Annotated[float, Field(ge=-1e6, le=1e6)]
+TopicPattern = Annotated[str, Field(max_length=256, pattern=r"^([A-Za-z0-9_/~]|\{car\}|\{body\})+$")]
+
+
+class Section(BaseModel):
+    """A section of a file; unknown keys are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+class Topic(Section):
+    """A topic of a car."""
+
+    name: TopicPattern
+    """ROS name without the leading slash, which is the Zenoh key; `{car}` is the name of the car. Motion capture may
+    have `{body}`, its name for the car."""
+    type: str = Field(pattern=r"^\w+/msg/\w+$")
+    """ROS 2 type."""
+    max_age: Positive | None = None
+    """Age above which a message is not used, s (default: none)."""
+    urgent: bool = False
+    """Whether messages are sent at once and before others."""
+    reliable: bool = False
+    """Whether the sender waits instead of dropping messages."""
+    bag_names: tuple[TopicPattern, ...] = ()
+    """Further names in bags."""
+
+    @property
+    def max_age_ns(self) -> int:
+        """Age above which a message is not used, ns; 0 without one."""
+        return round(1e9 * (self.max_age or 0.0))
+
+
+class Channel(Section):
+    """One value of the command message: linear between neutral and full."""
+
+    field: str
+    """Field of the message."""
+    full: Positive
+    """Steering angle (rad, left is positive) or speed (m/s) at full."""
+    change: Number
+    """Change of the field from neutral to full."""
+
+    @field_validator("change")
+    @classmethod
+    def _is_not_zero(cls, change: float) -> float:
+        if change == 0.0:
+            raise ValueError("must not be 0")
+        return change
+
+
+FieldType = Literal["bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"]
+
+
+class CommandMessage(Section):
+    """Message from the gate to the car, a stamped one: a header, then numbers."""
+
+    neutral: dict[str, tuple[FieldType, Number]]
+    """Fields after the header in their order: type, and value of a standing car. Nested messages are written flat."""
+    steering: Channel
+    """Field of the steering angle."""
+    speed: Channel
+    """Field of the speed."""
+    most: float = Field(default=1.0, gt=0.0, le=1.0)
+    """Share of full that is sent at most, either way."""
+    timeout: Positive = 0.5
+    """Time without a message after which the car goes to neutral by itself, s (assumed by fake cars)."""
+
+    @model_validator(mode="after")
+    def _channels_have_fields(self) -> Self:
+        for name, channel in (("steering", self.steering), ("speed", self.speed)):
+            if not self.neutral.get(channel.field, ("", 0.0))[0].startswith("float"):
+                raise ValueError(f"{name}.field: {shown(channel.field)} is no float32 or float64 of neutral")
+        return self
+
+    def share(self, channel: Channel, value: float) -> float:
+        """Return a steering angle or a speed as a share of full, cut off at `most`."""
+        return min(max(value / channel.full, -self.most), self.most)
+
+    def values(self, drive: Drive) -> dict[str, float]:
+        """Return the fields of a finite command by name."""
+        found = {name: value for name, (_, value) in self.neutral.items()}
+        for channel, value in ((self.steering, drive.steering), (self.speed, drive.speed)):
+            found[channel.field] += channel.change * self.share(channel, value)
+        return found
+
+    def drive(self, values: Mapping[str, float]) -> Drive:
+        """Return the command of fields by name."""
+        steering, speed = (
+            (values[channel.field] - self.neutral[channel.field][1]) / channel.change * channel.full
+            for channel in (self.steering, self.speed)
+        )
+        return Drive(steering, speed)
+
+
+class Pulses(Section):
+    """Pulses of the remote control, us."""
+
+    neutral: int = 1500
+    """Pulse of a stick at rest."""
+    moved: int = 100
+    """Difference that counts as a moved stick or switch."""
+    shortest: int = 800
+    """Shortest pulse that is a signal."""
+    longest: int = 2200
+    """Longest pulse that is a signal."""
+
+
+class CarProfile(Section):
+    """What differs between makes of cars."""
+
+    topics: dict[Role, Topic]
+    """Topics by role; all roles are needed. A topic without a publisher does no harm unless it is a condition."""
+    command: CommandMessage
+    """Message on the topic `manual`."""
+    hardest: Limits
+    """Limits that no deployment can exceed: speed, m/s; steering, rad; acceleration, m/s^2; steering rate, rad/s."""
+    markers: tuple[int, int] = (1, 7)
+    """Smallest and largest number of a marker that the camera identifies."""
+    conditions: tuple[Literal["state", "remote", "battery"], ...] = ("state", "remote", "battery")
+    """Topics that a car must send before it is armed."""
+    pulses: Pulses = Pulses()
+    """Pulses of the remote control."""
+
+    @model_validator(mode="after")
+    def _has_all_topics(self) -> Self:
+        if missing := [role.value for role in Role if role not in self.topics]:
+            raise ValueError(f"topics: {listed(missing)} missing")
+        names = [self.topic_of("NAME", role) for role in Role]
+        if repeated := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"topics: two roles have the name {repeated}")
+        for role, kind in GATE_TYPES.items():
+            if self.topics[role].type != kind:
+                raise ValueError(f"topics.{role.value}.type: the gate has {kind}")
+        if any(self.topic_of("NAME", role) == self.topic_of("OTHER", role) for role in Role):
+            raise ValueError("topics: a name is without {car}")
+        return self
+
+    def topic_of(self, car: str, role: Role) -> str:
+        """Return the full name of a car's topic, which is its Zenoh key as well."""
+        return self.topics[role].name.format(car=car, body=car)
+
+
+FOLDER = Path(__file__).parent / "profiles"
+
+
+def load_profile(name: str, folder: Path = FOLDER) -> CarProfile:
+    """Read a profile.
+
+    Args:
+        name: of a shipped profile, or a TOML file.
+        folder: what the path of a file is relative to.
+
+    Raises:
+        CoopenvError: one line that names the file and the field.
+    """
+    path = folder / name if name.endswith(".toml") else FOLDER / f"{name}.toml"
+    known = sorted(file.stem for file in FOLDER.glob("*.toml"))
+    if not name.endswith(".toml") and name not in known:
+        raise CoopenvError(
+            f"unknown profile {shown(name)}{suggest(name, known)}; known: {listed(known)}, or a TOML file"
+        )
+    try:
+        raw: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        return CarProfile.model_validate(raw)
+    except OSError as error:
+        raise CoopenvError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except ValidationError as error:
+        from coopenv.scenario.base import one_line  # the gate of a car has no need of scenarios
+
+        raise CoopenvError(one_line(error, path.name, CarProfile)) from None
+    except ValueError as error:
+        raise CoopenvError(f"{path}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise CoopenvError(f"{path}: lists or tables stand too deep in one another") from None
+
+
+SVEA = load_profile("svea")
