@@ -48,10 +48,10 @@ def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
     """Fail a run that compiled too many Warp modules; counted once, by the process that controls the workers."""
     if hasattr(session.config, "workerinput"):
         return
-    from coopenv.world import kernel_cache, launch  # slow to load, and late enough for the variables above
+    from coopenv.world import launch
 
     launch.start_warp()
-    folders = [kernel_cache.cache_folder() / name for name in kernel_cache.modules()]
+    folders = [launch.cache_folder() / name for name in launch.modules()]
     compiled = sum(folder.stat().st_mtime > STARTED for folder in folders)
     session.config.stash[COMPILED] = compiled
     if exitstatus == pytest.ExitCode.OK and compiled > MODULES_AT_MOST:

@@ -118,7 +118,7 @@ def test_the_page_on_highway(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.slow
 def test_the_page_on_recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("foxglove", reason="needs the extra 'log'")
-    from coopenv.backends.mcap.topics import topics_of
+    from coopenv.backends.mcap.format import topics_of
 
     monkeypatch.chdir(tmp_path)
     _, recorded, replayed = run(DOCS / "replay.md")

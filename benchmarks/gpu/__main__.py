@@ -15,7 +15,7 @@ from benchmarks.gpu.table import put, section
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import check_file, writing
 from coopenv.base.installation import version
-from coopenv.world.precision import check_device
+from coopenv.world.model import check_device
 
 MINUTES = 8.5
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "benchmarks.md"

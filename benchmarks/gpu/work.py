@@ -21,7 +21,7 @@ from coopenv.api.engine import Engine
 from coopenv.base.errors import CoopenvError
 from coopenv.base.installation import versions
 from coopenv.scenario import load_scenario
-from coopenv.world.precision import check_device
+from coopenv.world.model import check_device
 
 ROOT = Path(__file__).resolve().parents[2]
 PROBE = 8

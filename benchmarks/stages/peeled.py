@@ -14,8 +14,7 @@ from coopenv.observers.registry import find_embedded
 from coopenv.observers.riccati.dead_reckoning import DEAD_RECKONING
 from coopenv.observers.runner import start_covariances
 from coopenv.scenario import load_scenario
-from coopenv.world.collision import referee
-from coopenv.world.dynamics import move
+from coopenv.world.dynamics import move, referee
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, sense_simulation
 from coopenv.world.odometry import measure_odometry
 from coopenv.world.v2x import transmit

@@ -1,6 +1,9 @@
-"""The batched core under every interface: worlds plus step results, with constant Python work per step."""
+"""The batched core under every interface: worlds plus step results, with constant Python work per step.
 
-from collections.abc import Iterator, Mapping
+The results of a step (observations, reward terms, judgements) are computed on the device.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -8,20 +11,76 @@ import numpy as np
 import warp as wp
 
 from coopenv.api.plugins import PlugIns
-from coopenv.api.report import Report
-from coopenv.api.reward import RewardFunction
-from coopenv.api.terms.layout import observation_layout
-from coopenv.api.terms.results import MEMORY
+from coopenv.api.reward import RewardFunction, Step, check_function, reward_of
+from coopenv.api.terms.layout import Layout, observation_layout
+from coopenv.api.terms.own import OwnTerms
+from coopenv.api.terms.results import MEMORY, results_struct, results_table, step_results
 from coopenv.backends.base import Backend
 from coopenv.backends.sources import simulation_of
 from coopenv.backends.tick_world import open_world
-from coopenv.base.errors import CoopenvError, told
+from coopenv.base.errors import CoopenvError, check_memory, told
 from coopenv.base.seeds import training_seed, world_keys
 from coopenv.scenario import Scenario
 from coopenv.world.embedded import HOST
-from coopenv.world.saved_state import has_begun
-from coopenv.world.state import overwrite, state_fields
-from coopenv.world.world import Keys
+from coopenv.world.launch import PerWorld
+from coopenv.world.model import device_memory
+from coopenv.world.state import allocate, has_begun, overwrite, size_of, state_fields
+from coopenv.world.world import Keys, World
+
+
+class Report:
+    """The arrays of the step results of a world, and what fills them."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        world: World,
+        layout: Layout,
+        reward: RewardFunction | None,
+        view: Callable[[str], np.ndarray],
+    ) -> None:
+        """Allocate the results and bind the scenario's terms.
+
+        Args:
+            scenario: names the terms.
+            world: whose state is reported.
+            layout: of the observation.
+            reward: in place of the scenario's weighted sum; on the CPU only.
+            view: returns fields of results and state on the host.
+
+        Raises:
+            CoopenvError: a term does not exist or fails, or the results would not fit into memory.
+        """
+        self._world, self._view, p = world, view, world.precision
+        terms = len(scenario.reward.by_name)
+        sizes = {"W": world.worlds, "N": world.model.vehicles, "D": layout.size, "K": terms}
+        needed = size_of(results_struct(p), sizes)
+        check_memory(needed, f"results of {world.worlds} worlds", device_memory(world.device))
+        self.results = allocate(results_struct(p), sizes, world.device)
+        self._own = OwnTerms(scenario, world, layout, self.results)
+        check_function(reward, world.device)
+        self._reward, self._step = reward, Step(view, scenario)
+        self._table = results_table(scenario, layout, world.device)
+
+    def end_episodes(self) -> None:
+        """End the episodes of vehicles that fulfil a condition of the user."""
+        self._own.end_episodes()
+
+    def fill(self, key: str, fresh: Any, chosen: Any) -> None:
+        """Compute the results of the worlds in `chosen` (W,); in those of `fresh` (W,) an episode has just begun."""
+        world = self._world
+        parts = [PerWorld(part) for part in (self._own.records, self.results, fresh, chosen)]
+        arguments = [world.model, PerWorld(world.state), self._table, *parts]
+        world.launch(key, step_results, arguments, inner=(world.model.vehicles,))
+        self._own.fill(key, fresh, chosen)
+        if world.device == "cpu":  # reading from a GPU would wait for it
+            self._own.check(self._view)
+
+    def reward_anew(self, fresh: Any) -> None:
+        """Replace the reward of the worlds that have not just been reset by that of a function in Python."""
+        if self._reward is not None:
+            earning = self._view("alive") & (fresh.numpy()[:, None] == 0)
+            self._view("reward")[...] = reward_of(self._reward, self._step, earning)
 
 
 class Engine:

@@ -8,9 +8,19 @@ from gymnasium import spaces
 from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 
-from coopenv.api.arguments import SETTINGS, ActionReader, check_choice, checked_options, world_number, world_parameters
+from coopenv.api.arguments import (
+    SETTINGS,
+    ActionReader,
+    InfoWriter,
+    Pictures,
+    check_choice,
+    checked_options,
+    state_space,
+    state_vector,
+    world_number,
+    world_parameters,
+)
 from coopenv.api.engine import Engine
-from coopenv.api.infos import InfoWriter, Pictures, state_space, state_vector
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
 from coopenv.backends.base import EPISODE_OVER, IGNORED_OPTIONS, Backend, Health
@@ -18,7 +28,7 @@ from coopenv.backends.sources import simulation_of
 from coopenv.base.errors import CoopenvError, shown, suggest
 from coopenv.base.seeds import world_keys
 from coopenv.scenario import Scenario
-from coopenv.world.presence import ABSENT
+from coopenv.world.reset import ABSENT
 
 Observations = dict[str, Any]
 Infos = dict[str, dict[str, Any]]
@@ -192,7 +202,7 @@ class CooperativeLocalisationEnv(ParallelEnv[str, Any, np.ndarray]):
         return self.engine.backend.health
 
     def state(self) -> np.ndarray:
-        """Return the truth and the estimates of all vehicles as one vector, see `coopenv.api.infos.state_vector`."""
+        """Return the truth and the estimates of all vehicles as one vector, see `state_vector`."""
         return state_vector(self.engine)
 
     def render(self) -> np.ndarray | None:

@@ -16,6 +16,7 @@ from coopenv.api.arguments import (
     SETTINGS,
     ArrayKind,
     Exchange,
+    Pictures,
     check_choice,
     checked_autoreset,
     checked_options,
@@ -23,7 +24,6 @@ from coopenv.api.arguments import (
     world_parameters,
 )
 from coopenv.api.engine import Engine
-from coopenv.api.infos import Pictures
 from coopenv.api.reward import RewardFunction
 from coopenv.api.terms.layout import Layout, action_space, dict_space, flat_space
 from coopenv.base.errors import CoopenvError

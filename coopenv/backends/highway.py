@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from coopenv.backends.moved import MovedWorld, Poses
+from coopenv.backends.cosimulation import MovedWorld, Poses
 from coopenv.backends.simulated import Simulated
 from coopenv.base.errors import CoopenvError, ScenarioError, listed, shown, suggest, told
 from coopenv.estimation.arrays import Array
 from coopenv.scenario import Scenario
 from coopenv.scenario.bodies import Road
 from coopenv.scenario.highway import Highway
-from coopenv.world.collision import UNDER_WAY
-from coopenv.world.command import ACCELERATION, SPEED, STEERING
+from coopenv.world.dynamics import ACCELERATION, SPEED, STEERING, UNDER_WAY
 
 
 class FollowedWorld(MovedWorld):
@@ -209,7 +208,7 @@ class Simulation:
         return self.poses()
 
     def drive(self, commands: Array, present: Array) -> Poses:
-        """Drive for one camera tick under commands (N, 3), see `coopenv.world.command`; traffic drives itself.
+        """Drive for one camera tick under commands (N, 3), see `coopenv.world.dynamics`; traffic drives itself.
 
         Those that are not present (N,) are taken off the road.
         """

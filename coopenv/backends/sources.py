@@ -61,7 +61,7 @@ def is_bag(name: str | Path, topics: str | Path | None = None) -> bool:
     if str(name).endswith(BAG_SUFFIXES):
         return True
     if str(name).endswith(LOG_SUFFIX):
-        from coopenv.backends.mcap.peek import metadata_names
+        from coopenv.backends.mcap.format import metadata_names
 
         metadata = metadata_names(name)
         if metadata is None or DRIVE in metadata:

@@ -7,20 +7,29 @@ from typing import Any, NoReturn, cast
 
 import numpy as np
 
-from coopenv.backends.base import Backend, Command, Conversing, Repeating, SensingWorld, Told, WorldBackend
-from coopenv.backends.replay.kernels import BY_RADIO, RECORDED, record_struct, true_twists
-from coopenv.backends.tick_checks import MEASURED, check_tick, is_sound
+from coopenv.backends.base import (
+    MEASURED,
+    Backend,
+    Command,
+    Conversing,
+    Repeating,
+    SensingWorld,
+    Told,
+    WorldBackend,
+    check_tick,
+    is_sound,
+)
+from coopenv.backends.replay_kernels import BY_RADIO, RECORDED, record_struct, true_twists
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.rotations import exp_se3
 from coopenv.observers.contract import Message, compiled_checks
-from coopenv.observers.kernel_world import views_of
+from coopenv.observers.kernel_observer import views_of
 from coopenv.observers.recording import Briefing, Sensed, Truth, is_due
 from coopenv.observers.registry import find_embedded
 from coopenv.observers.runner import start_covariances
 from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.embedded import HOST
-from coopenv.world.records import allocate, fields
-from coopenv.world.state import state_fields
+from coopenv.world.state import allocate, fields, state_fields
 from coopenv.world.world import Keys, Options
 
 

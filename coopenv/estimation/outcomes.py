@@ -1,6 +1,9 @@
-"""What a camera says of a target, and how an episode ends."""
+"""Codes that kernels and host share: what a camera sees of a target, how an episode ends, how a sender lies."""
 
+import math
 from enum import IntEnum
+
+import numpy as np
 
 
 class Sight(IntEnum):
@@ -26,3 +29,15 @@ class Outcome(IntEnum):
     def words(self) -> str:
         """The name in small letters: "under way", "arrived", "collided", "off route"."""
         return self.name.lower().replace("_", " ")
+
+
+HONEST, JUMP, DRIFT, REPLAY, COLLUDE = range(5)
+"""Values of `Model.fault.lie`."""
+
+KINDS = {"none": HONEST, "jump": JUMP, "drift": DRIFT, "replay": REPLAY, "collude": COLLUDE}
+UNIFORM_ROTATION = (math.pi**2 / 3.0 + 2.0) / 3.0
+"""rad^2 per axis, of a rotation uniform over SO(3)."""
+UNKNOWN_POSITION = 100.0
+"""m per axis, standard deviation of where a vehicle is that has lost all, about the landmarks' centre."""
+UNKNOWN = np.diag(np.repeat([UNIFORM_ROTATION, UNKNOWN_POSITION**2], 3))
+"""Covariance of the initial estimate of a vehicle that has started anew, LEFT coordinates."""

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from coopenv.base.errors import CoopenvError, told
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
+from coopenv.estimation.outcomes import UNKNOWN
 from coopenv.observers.contract import (
     Estimate,
     Factory,
@@ -26,7 +27,6 @@ from coopenv.observers.contract import (
 from coopenv.observers.interference import Interference
 from coopenv.observers.mailbox import Mailbox
 from coopenv.observers.recording import Briefing, Sensed
-from coopenv.world.fault_kinds import UNKNOWN
 
 
 class ObserverError(CoopenvError):

@@ -1,6 +1,6 @@
 """What a world's faults do to observers on the host: to their messages, their clocks, and to themselves.
 
-The world decides (`coopenv.world.faults`), so that observers in its kernels and on the host meet the same.
+The world decides (`coopenv.world.v2x`), so that observers in its kernels and on the host meet the same.
 """
 
 from collections.abc import Callable
@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coopenv.estimation.arrays import Array
+from coopenv.estimation.outcomes import REPLAY
 from coopenv.estimation.rotations import exp_so3
 from coopenv.observers.contract import Message
 from coopenv.scenario import Scenario
-from coopenv.world.fault_kinds import REPLAY
 
 FIELDS = ("told_shift", "told_turn")
 """Of the state, at every tick."""

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.estimation.metrics import orientation_error_deg
+from coopenv.estimation.outcomes import UNIFORM_ROTATION
 from coopenv.observers.contract import Factory, Gains, SensorNoise, Setup
 from coopenv.observers.group import Answer, Group, ObserverError, Tamper
 from coopenv.observers.recording import Briefing, Recording, Truth
 from coopenv.observers.registry import find
 from coopenv.scenario import Scenario
-from coopenv.world.fault_kinds import UNIFORM_ROTATION
 
 OBJECTS = 100_000
 """New ones after which Python looks for garbage while observers run."""

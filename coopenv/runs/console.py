@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
 
-from coopenv.world import kernel_cache
+from coopenv.world import launch
 from coopenv.world.launch import start_warp
 
 T = TypeVar("T")
@@ -114,11 +114,11 @@ class Progress:
 def compile_notice(log: Console) -> Iterator[None]:
     """Say what takes so long where Warp compiles kernels, or Numba functions, that are not in its cache."""
     start_warp()
-    before, functions, over = kernel_cache.modules(), _compiled_functions(), threading.Event()
+    before, functions, over = launch.modules(), _compiled_functions(), threading.Event()
 
     def watch() -> None:
         while not over.wait(COMPILE_NOTICE_AFTER):
-            if kernel_cache.modules() - before or _compiled_functions() > functions:
+            if launch.modules() - before or _compiled_functions() > functions:
                 log.print("compiling kernels (once per machine) ...")
                 return
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
+from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
-from coopenv.api.infos import outcome_words
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import replacing_folder
 from coopenv.policies import Policy, agents_for, load_policy

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.api.infos import outcome_words
+from coopenv.api.arguments import outcome_words
 from coopenv.base.installation import version
 from coopenv.estimation.guaranteed_rate import Rates, convergence_rates, least_mean
 from coopenv.estimation.metrics import CONVERGED, observability_of, summarise

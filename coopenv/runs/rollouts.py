@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from coopenv.api.arguments import outcome_words
 from coopenv.api.engine import Engine
-from coopenv.api.infos import outcome_words
 from coopenv.backends.base import EPISODE_OVER, Backend
 from coopenv.base.errors import CoopenvError
 from coopenv.estimation.outcomes import Sight

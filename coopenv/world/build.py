@@ -7,18 +7,188 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from coopenv.estimation.outcomes import Outcome
+from coopenv.estimation.lens import largest_radius
+from coopenv.estimation.outcomes import KINDS, Outcome
 from coopenv.scenario import Scenario
 from coopenv.scenario.base import rotation_of
 from coopenv.scenario.bodies import Landmark, Vehicle
-from coopenv.scenario.learning import FASTEST_PACE, Dynamics
-from coopenv.scenario.routes import compile_motion
+from coopenv.scenario.learning import FASTEST_PACE, PARAMETERS, Dynamics
+from coopenv.scenario.routes import compile_motion, even_points, followers, point_count
+from coopenv.scenario.sensing import Camera, Faults, Noise, Rates
 from coopenv.scenario.starts import agent_starts, neighbour_sets, processing_order
-from coopenv.world.build_draws import drawn_of, routes_of
-from coopenv.world.build_faults import fault_entries, fault_switches
-from coopenv.world.build_sensors import camera_entries, noise_entries
-from coopenv.world.model import BLIND, DRIVEN, IDEAL, PRESCRIBED, SENSED, STATIC, entry_struct, model_struct
-from coopenv.world.precision import Precision
+from coopenv.world.model import (
+    BLIND,
+    CONTINUE,
+    DRIVEN,
+    IDEAL,
+    LEAVE,
+    PARK,
+    PRESCRIBED,
+    SENSED,
+    STATIC,
+    Precision,
+    entry_struct,
+    model_struct,
+)
+
+AFTER_ARRIVAL = {"park": PARK, "leave": LEAVE, "continue": CONTINUE}
+
+
+def routes_of(scenario: Scenario) -> dict[str, Any]:
+    """Return the fields of `Routes` by name."""
+    origin, routes = np.array(scenario.map.origin), scenario.routes
+    number = {route.name: i for i, route in enumerate(routes)}
+    choices = [[number[name] for name in vehicle.routes] for vehicle in scenario.vehicles]
+    places = [vehicle.goal and vehicle.goal.position for vehicle in scenario.vehicles]
+    counts = [point_count(route) for route in routes]
+    points = np.zeros((len(routes), max(counts, default=0), 3))
+    for route, row in zip(routes, points, strict=True):
+        row[: point_count(route)] = even_points(route) - [*origin[:2], 0.0]
+    return {
+        "first": np.cumsum([0, *(len(own) for own in choices)]),
+        "choice": [i for own in choices for i in own],
+        "goal": [np.array(place) - origin if place else np.zeros(3) for place in places],
+        "points": max([*counts, 2]),
+        "count": counts,
+        "point": points,
+        **{name: [getattr(route, name) for route in routes] for name in ("lateral_spread", "wander", "start_spread")},
+        "height": -origin[2],
+    }
+
+
+def drawn_of(scenario: Scenario) -> dict[str, Any]:
+    """Return the fields of `Drawn` by name."""
+    agents: list[Landmark | Vehicle] = [*scenario.landmarks, *scenario.vehicles]
+    motions = [vehicle.motion for vehicle in scenario.vehicles]
+    drawn, hard = scenario.randomisation, scenario.difficulty
+    routes = scenario.routes
+    following = [[followers(vehicle, route, routes) for route in routes] for vehicle in scenario.vehicles]
+    counts = [len(next_ones) for of_vehicle in following for next_ones in of_vehicle]
+    ends = np.cumsum([0, *counts])
+    rows = np.arange(len(scenario.vehicles))[:, None] * len(routes) + np.arange(len(routes) + 1)
+    return {
+        "presence": [agent.presence for agent in agents],
+        "any_driven": int(scenario.driven),
+        "pace_spread": [agent.pace_spread for agent in agents],
+        "speed_spread": [motion.initial_speed_spread if motion.kind == "driven" else 0.0 for motion in motions],
+        **_groups(scenario),
+        **{name: [part.factors(key)[0] for key in PARAMETERS] for name, part in (("low", drawn), ("easy", hard))},
+        **{name: [part.factors(key)[1] for key in PARAMETERS] for name, part in (("high", drawn), ("hard", hard))},
+        "level": scenario.difficulty.number,
+        "after_arrival": int(AFTER_ARRIVAL[scenario.termination.after_arrival]),
+        "next_first": ends[rows],
+        "next_choice": [i for of_vehicle in following for next_ones in of_vehicle for i in next_ones],
+    }
+
+
+def _groups(scenario: Scenario) -> dict[str, Any]:
+    origin, groups = np.array(scenario.map.origin), scenario.landmark_groups
+    number = {group.name: i for i, group in enumerate(groups)}
+    areas = [(group, *area) for group in groups for area in group.parallelograms]
+    shares = [np.cumsum(group.weights) / np.sum(group.weights) for group in groups]
+    return {
+        "group": [-1 if mark.group is None else number[mark.group] for mark in scenario.landmarks],
+        "first_area": np.cumsum([0, *(len(group.parallelograms) for group in groups)]),
+        "area_share": np.concatenate([[], *shares]),
+        "area_corner": [np.array([*corner, group.height[0]]) - origin for group, corner, _, _ in areas],
+        "area_first_edge": [[*edge, 0.0] for _, _, edge, _ in areas],
+        "area_second_edge": [[*edge, 0.0] for _, _, _, edge in areas],
+        "height": [group.height[1] - group.height[0] for group in groups],
+    }
+
+
+def fault_entries(f: Faults, scenario: Scenario) -> dict[str, Any]:
+    """Return the values of the model's `Fault`."""
+    restart, corruption, lie = f.restart, f.corruption, f.lie
+    direction = np.zeros(3) if lie.direction is None else np.array(lie.direction) / np.linalg.norm(lie.direction)
+    return {
+        "clock": f.clock_offset,
+        "restart_chance": restart.chance,
+        "restart_time": restart.time,
+        "restart_spread": restart.time_spread,
+        "corruption": corruption.probability,
+        "corruption_start": corruption.start,
+        "corruption_size": corruption.size,
+        "corruption_turn": corruption.turn,
+        "lie": int(KINDS[lie.kind]),
+        "lie_chance": lie.chance,
+        "lie_start": lie.start,
+        "lie_spread": lie.start_spread,
+        "lie_size": lie.speed if lie.kind == "drift" else lie.offset,
+        "lie_replay": scenario.ticks_of_replay(lie.age),
+        "lie_direction": direction,
+        "lie_std": lie.std or 0.0,
+    }
+
+
+def fault_switches(scenario: Scenario) -> dict[str, int]:
+    """Return which faults any vehicle has, so that the others cost nothing."""
+    everybody = scenario.all_faults
+    return {
+        "clocks": int(any(f.clock_offset > 0.0 for f in everybody)),
+        "restarts": int(any(f.restart.chance > 0.0 for f in everybody)),
+        "alters": int(any(f.alters for f in everybody)),
+    }
+
+
+def camera_entries(c: Camera, noise: Noise) -> dict[str, Any]:
+    """Return the values of the model's `Camera`."""
+    on = float(noise.enabled)
+    same = ("position", "image_size", "focal_length", "principal_point")
+    return {
+        **{name: getattr(c, name) for name in same},
+        "rotation": c.to_body(),
+        "pinhole": int(c.model == "pinhole"),
+        **dict(zip(("k1", "k2", "p1", "p2", "k3"), c.distortion, strict=True)),
+        "max_radius": largest_radius(c.distortion),
+        "undistort": int(c.undistort),
+        "quantise": int(c.quantise),
+        "range": math.inf if c.range is None else c.range,
+        "miss": c.miss_probability,
+        "orientation_std": on * c.extrinsics_error,
+        "position_std": on * c.extrinsics_position_error,
+        "focal_std": on * c.focal_length_error,
+    }
+
+
+def noise_entries(n: Noise, rates: Rates) -> dict[str, Any]:
+    """Return the values of the model's `Noise`."""
+    on = float(n.enabled)
+    axis = np.array(n.bearing.axis) / np.linalg.norm(n.bearing.axis)
+    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    if abs(axis[2]) > 1 - 1e-12:
+        first = np.array([1.0, 0.0, 0.0])
+    first = first / np.linalg.norm(first)
+    return {
+        "velocity": on * _at_rate(n.velocity, n.odometry_rate, rates.odometry),
+        "angular_velocity": on * _at_rate(n.angular_velocity, n.odometry_rate, rates.odometry),
+        "bearing_paper": int(n.bearing.model == "paper"),
+        "bearing": on * _at_rate(n.bearing.scale, n.bearing.rate, rates.camera),
+        "axis": np.column_stack([first, np.cross(axis, first), axis]),
+        **_lasting(n),
+    }
+
+
+def _lasting(n: Noise) -> dict[str, Any]:
+    """Return the errors of the odometry that last."""
+    on, slip = float(n.enabled), n.slip
+    return {
+        "lasting": int(n.enabled and n.lasts),
+        "odometry_scale": on * n.odometry_scale,
+        "odometry_scale_walk": on * n.odometry_scale_walk,
+        "gyro_bias": on * np.broadcast_to(n.gyro_bias, 3),
+        "gyro_bias_walk": on * np.broadcast_to(n.gyro_bias_walk, 3),
+        "slip_rate": on * slip.rate,
+        "slip_duration": slip.duration,
+        "slip_size": slip.size,
+        "slip_angle": slip.angle,
+    }
+
+
+def _at_rate(std: float, stated: float | str, actual: float) -> float:
+    """Return the standard deviation per sample that keeps the density std^2 / stated rate."""
+    return std if isinstance(stated, str) else std * float(np.sqrt(actual / stated))
+
 
 GRAMIAN_RATE = 20.0
 """Hz at which the sliding Gramian is sampled: it says how the scene is seen over a second, not within a frame."""

@@ -11,8 +11,16 @@ import warp as wp
 from coopenv.estimation.outcomes import Sight
 from coopenv.estimation.so3 import exp_so3
 from coopenv.world.model import BLIND, IDEAL
-from coopenv.world.parameters import BEARING_NOISE, CAMERA_RANGE
-from coopenv.world.random import BEARING, gaussian_pair, pair, random_words, signed_uniform, uniform
+from coopenv.world.random import (
+    BEARING,
+    BEARING_NOISE,
+    CAMERA_RANGE,
+    gaussian_pair,
+    pair,
+    random_words,
+    signed_uniform,
+    uniform,
+)
 
 NOT_A_NEIGHBOUR = wp.constant(wp.uint8(Sight.NOT_A_NEIGHBOUR))
 VISIBLE = wp.constant(wp.uint8(Sight.VISIBLE))

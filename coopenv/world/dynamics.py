@@ -1,12 +1,223 @@
-"""The truth moves, by prescribed motion as a closed form, or as a kinematic bicycle with its actuators."""
+"""Commands, motion and contact of the true vehicles.
+
+A command is made once per decision from an action in [-1, 1] and the vehicle's limits. Its four entries follow ROS'
+AckermannDrive: target speed (m/s), steering angle (rad, positive to the left), largest change of speed (m/s^2), and the
+camera's pan angle (rad, positive to the left).
+
+A motion is prescribed in closed form, or a kinematic bicycle with its actuators. Contacts are boxes that touch
+(separating axes in the plane, and heights); an arrival is a goal within its radius.
+"""
 
 from typing import Any
 
 import warp as wp
 
+from coopenv.estimation.outcomes import Outcome
 from coopenv.estimation.so3 import increment, orthonormalise, rigid_motion
-from coopenv.world.command import ACCELERATION, PAN, SPEED, STEERING, command_in_force
-from coopenv.world.model import DRIVEN, PRESCRIBED
+from coopenv.world.model import CONTINUE, DRIVEN, LEAVE, PRESCRIBED
+from coopenv.world.route import draw_next_route, goal_distance, has_routes, is_past_end, place_on_route, route_length
+from coopenv.world.warp_internals import device_function
+
+UNDER_WAY = wp.constant(int(Outcome.UNDER_WAY))
+ARRIVED = wp.constant(int(Outcome.ARRIVED))
+COLLIDED = wp.constant(int(Outcome.COLLIDED))
+OFF_ROUTE = wp.constant(int(Outcome.OFF_ROUTE))
+
+
+@wp.func
+def separated_along(axis: Any, offset: Any, Ra: Any, ha: Any, Rb: Any, hb: Any) -> bool:
+    """Return whether a horizontal axis separates the footprints of two boxes."""
+    reach_a = ha[0] * wp.abs(axis[0] * Ra[0, 0] + axis[1] * Ra[1, 0])
+    reach_a += ha[1] * wp.abs(axis[0] * Ra[0, 1] + axis[1] * Ra[1, 1])
+    reach_b = hb[0] * wp.abs(axis[0] * Rb[0, 0] + axis[1] * Rb[1, 0])
+    reach_b += hb[1] * wp.abs(axis[0] * Rb[0, 1] + axis[1] * Rb[1, 1])
+    return wp.abs(axis[0] * offset[0] + axis[1] * offset[1]) > reach_a + reach_b
+
+
+@wp.func
+def boxes_touch(ca: Any, Ra: Any, ha: Any, cb: Any, Rb: Any, hb: Any) -> bool:
+    """Return whether two upright boxes overlap; false where a pose is not known (NaN)."""
+    offset = cb - ca
+    reach = wp.length(ha) + wp.length(hb)
+    if not (wp.abs(offset[2]) <= ha[2] + hb[2] and wp.dot(offset, offset) <= reach * reach):
+        return False
+    for k in range(2):
+        if separated_along(type(ca)(Ra[0, k], Ra[1, k], ha.dtype(0.0)), offset, Ra, ha, Rb, hb):
+            return False
+        if separated_along(type(ca)(Rb[0, k], Rb[1, k], ha.dtype(0.0)), offset, Ra, ha, Rb, hb):
+            return False
+    return True
+
+
+@device_function
+def touches_anything(model: Any, state: Any, world: int, vehicle: int) -> int:
+    """Return 1 when a vehicle's box overlaps a building or another body."""
+    return touches_one_of(model, state, world, vehicle, model.agents)
+
+
+@device_function
+def touches_one_of(model: Any, state: Any, world: int, vehicle: int, count: int) -> int:
+    """Return 1 when a vehicle's box overlaps a building or the body of another one of the first `count` agents."""
+    agent = model.landmarks + vehicle
+    half = model.scene.body_half[agent]
+    if half[0] <= half.dtype(0.0) or state.present[world, agent] == 0:
+        return 0
+    R = state.rotation[world, agent]
+    center = state.position[world, agent] + R * model.scene.body_center[agent]
+    for k in range(model.obstacles):
+        if boxes_touch(
+            center,
+            R,
+            half,
+            model.scene.obstacle_center[k],
+            model.scene.obstacle_rotation[k],
+            model.scene.obstacle_half[k],
+        ):
+            return 1
+    for other in range(count):
+        other_half = model.scene.body_half[other]
+        if other != agent and other_half[0] > half.dtype(0.0) and state.present[world, other] != 0:
+            other_R = state.rotation[world, other]
+            other_center = state.position[world, other] + other_R * model.scene.body_center[other]
+            if boxes_touch(center, R, half, other_center, other_R, other_half):
+                return 1
+    for k in range(model.traffic):
+        other_half = state.traffic_half[world, k]
+        if other_half[0] > half.dtype(0.0):
+            if boxes_touch(
+                center, R, half, state.traffic_position[world, k], state.traffic_rotation[world, k], other_half
+            ):
+                return 1
+    return 0
+
+
+@device_function
+def reaches_goal(model: Any, state: Any, world: int, vehicle: int) -> bool:
+    """Return whether a vehicle has a goal and is within its radius, or past the end of the route that it drew."""
+    radius = model.scene.goal_radius[vehicle]
+    if radius <= radius.dtype(0.0):
+        return False
+    if goal_distance(model, state, world, vehicle) < radius:
+        return True
+    return has_routes(model, vehicle) and is_past_end(model, state, world, vehicle, radius)
+
+
+@device_function
+def has_left_route(model: Any, state: Any, world: int, vehicle: int) -> bool:
+    """Return whether a vehicle is farther beside its route, or beyond an end of it, than is allowed.
+
+    It is looked at where a decision ends.
+    """
+    allowed = model.scene.off_route
+    if allowed <= allowed.dtype(0.0) or (state.tick[world] + 1) % model.ticks_per_decision != 0:
+        return False
+    p = state.position[world, model.landmarks + vehicle]
+    s, offset, _ = place_on_route(state, world, vehicle, p[0], p[1])
+    beyond = wp.max(s - route_length(state, world, vehicle), -s)
+    return wp.max(wp.abs(offset), beyond) > allowed
+
+
+@device_function
+def depart(model: Any, state: Any, world: int):
+    """Take the vehicles that have arrived off the scene, where they leave; called at the start of a tick."""
+    if model.drawn.after_arrival == LEAVE:
+        for vehicle in range(model.vehicles):
+            if state.ended[world, vehicle] == ARRIVED:
+                state.present[world, model.landmarks + vehicle] = 0
+
+
+@device_function
+def referee(model: Any, state: Any, world: int, vehicle: int):
+    """Mark contact, and end the vehicle's episode on a collision or an arrival that counts; or give it a new route."""
+    touching = touches_anything(model, state, world, vehicle)
+    ended = state.ended[world, vehicle]
+    if ended == UNDER_WAY:
+        if touching == 1 and model.scene.end_on_collision == 1:
+            ended = COLLIDED
+        elif model.scene.end_on_arrival == 1:
+            if reaches_goal(model, state, world, vehicle):
+                state.arrivals[world, vehicle] += 1
+                if model.drawn.after_arrival == CONTINUE:
+                    draw_next_route(model, state, world, vehicle)
+                else:
+                    ended = ARRIVED
+        if ended == UNDER_WAY and has_left_route(model, state, world, vehicle):
+            ended = OFF_ROUTE
+    state.collided[world, vehicle] = touching
+    state.ended[world, vehicle] = ended
+
+
+SPEED = wp.constant(0)
+STEERING = wp.constant(1)
+ACCELERATION = wp.constant(2)
+PAN = wp.constant(3)
+"""Entries of a command."""
+
+
+@wp.func
+def sanitised(level: Any):
+    """Return an entry of an action clipped to [-1, 1], zero where it is not finite."""
+    one = type(level)(1.0)
+    if wp.isfinite(level):
+        return wp.clamp(level, -one, one)
+    return type(level)(0.0)
+
+
+@wp.func
+def command_of(d: Any, first: Any, steering: Any, pan: Any):
+    """Return what the entries of an action in [-1, 1] ask of a vehicle with the dynamics `d`.
+
+    Where the first entry means an acceleration, the speed to reach is a limit of the vehicle: the highest or, to
+    brake, the lowest.
+    """
+    one = type(first)(1.0)
+    acceleration = d.max_acceleration
+    if d.acceleration_mode == 1:
+        acceleration = wp.abs(first * d.max_acceleration)
+        speed = wp.where(first < type(first)(0.0), d.min_speed, d.max_speed)
+    else:
+        span = (d.max_speed - d.min_speed) * type(first)(0.5)
+        speed = d.min_speed + (first + one) * span
+    return wp.vector(speed, steering * d.action_steering, acceleration, pan * d.pan_limit)
+
+
+@wp.func
+def gradually(d: Any, command: Any, before: Any, duration: Any):
+    """Return a command that differs from the one before by no more than is permitted in a decision's duration, s."""
+    step = command[ACCELERATION] * duration
+    turn = d.max_steering_rate * duration
+    command[SPEED] = wp.clamp(command[SPEED], before[SPEED] - step, before[SPEED] + step)
+    command[STEERING] = wp.clamp(command[STEERING], before[STEERING] - turn, before[STEERING] + turn)
+    return command
+
+
+@wp.func
+def decide(model: Any, state: Any, actions: Any, world: int):
+    """Turn the actions of a decision that begins into commands; who has ended is to stand."""
+    for vehicle in range(model.vehicles):
+        for k in range(model.action_size):
+            state.action[world, vehicle, k] = sanitised(actions[world, vehicle, k])
+        first = state.action[world, vehicle, 0]
+        pan = type(first)(0.0)
+        if model.action_size > 2:
+            pan = state.action[world, vehicle, 2]
+        command = command_of(model.dynamics[vehicle], first, state.action[world, vehicle, 1], pan)
+        if model.dynamics[vehicle].gated == 1:
+            duration = type(first)(model.camera_period) * type(first)(model.ticks_per_decision)
+            command = gradually(model.dynamics[vehicle], command, state.last_command[world, vehicle], duration)
+        if state.ended[world, vehicle] != UNDER_WAY:
+            command[SPEED] = type(first)(0.0)
+            command[ACCELERATION] = model.dynamics[vehicle].max_acceleration
+        state.command[world, vehicle] = command
+
+
+@wp.func
+def command_in_force(model: Any, state: Any, world: int, vehicle: int, tick: int):
+    """Return what the actuators follow during a tick: after a decision, the last command for the dead time."""
+    if (tick - 1) % model.ticks_per_decision < model.dynamics[vehicle].latency_ticks:
+        return state.last_command[world, vehicle]
+    return state.command[world, vehicle]
+
 
 LONGEST_SUBSTEP = wp.constant(wp.float64(0.0100001))  # s; the bicycle's twist is held over no longer than this
 
@@ -60,7 +271,7 @@ def first_order_lag(value: Any, target: Any, dt: Any, lag: Any, rate: Any):
 
 @wp.func
 def actuate(d: Any, speed: Any, steering: Any, command: Any, dt: Any):
-    """Return (speed, steering) after dt under a command and limits `d`, see `coopenv.world.command`."""
+    """Return (speed, steering) after dt under a command and limits `d`, see `coopenv.world.dynamics`."""
     wanted = command[SPEED]
     if wp.abs(wanted) < d.dead_band:
         wanted = type(wanted)(0.0)

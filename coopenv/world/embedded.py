@@ -11,14 +11,13 @@ import warp as wp
 
 from coopenv.estimation.coordinates import Coordinates
 from coopenv.world.camera import observe
-from coopenv.world.collision import depart, referee
-from coopenv.world.device_function import device_function
-from coopenv.world.dynamics import move
+from coopenv.world.dynamics import depart, move, referee
+from coopenv.world.model import Precision
 from coopenv.world.odometry import measure_odometry
-from coopenv.world.precision import Precision
 from coopenv.world.reset import reset_world
-from coopenv.world.saved_state import Rule
+from coopenv.world.state import Rule
 from coopenv.world.v2x import transmit
+from coopenv.world.warp_internals import device_function
 
 
 @wp.struct
@@ -84,13 +83,13 @@ class Embedded:
     """(model, state, memory, world, vehicle, now): take one camera tick `Now`; messages have been delivered."""
     start: Any
     """(model, state, memory, world, vehicle): begin an episode at the initial estimate, which stands in the state, its
-    covariance is `coopenv.world.faults.start_covariance` (LEFT coordinates); vehicles come leaders first. Called again
+    covariance is `coopenv.world.v2x.start_covariance` (LEFT coordinates); vehicles come leaders first. Called again
     for a vehicle that starts anew, see `[faults.restart]`."""
     send: Any
     """(model, state, memory, world, vehicle, tick): put on the air what the V2X pose estimate does not carry; called
     at every tick, after `start` as well."""
     memory: Any = Nothing
-    """A Warp struct whose arrays are declared with `coopenv.world.records.array`, the axes W (worlds) and N (vehicles)
+    """A Warp struct whose arrays are declared with `coopenv.world.state.array`, the axes W (worlds) and N (vehicles)
     first."""
     sizes: Mapping[str, int] = field(default_factory=dict, hash=False)
     """Lengths of axes by letter, besides those of the state (`coopenv.world.state.state_sizes`)."""

@@ -7,8 +7,8 @@ import warp as wp
 from coopenv.estimation.linalg import block3, cholesky6, join6, smallest_eigenvalue6
 from coopenv.estimation.so3 import identity3, quaternion_vector, skew
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
-from coopenv.world.device_function import device_function
 from coopenv.world.v2x import fresh
+from coopenv.world.warp_internals import device_function
 
 
 @wp.func

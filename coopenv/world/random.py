@@ -1,13 +1,17 @@
-"""Counter-based random numbers: Philox4x32-7 (Salmon, Moraes, Dror, Shaw, SC 2011).
+"""Counter-based random numbers (Philox4x32-7; Salmon, Moraes, Dror, Shaw, SC 2011) and the parameters of a world.
 
 A draw is a pure function of (seed, episode, index, subject, stream), so a world has the same noise whatever the
 batch size, the order of execution and the device. `index` is a tick or a sample number, `subject` packs the agents
 concerned, and `stream` is one of the constants below.
+
+Parameters of a world are factors: drawn at a reset, dependent on the difficulty, or set.
 """
 
 from typing import Any
 
 import warp as wp
+
+from coopenv.scenario.learning import PARAMETERS
 
 vec4u = wp.types.vector(4, wp.uint32)
 
@@ -153,3 +157,40 @@ def unit_vector(word0: wp.uint32, word1: wp.uint32, zero: Any):
     r = wp.sqrt(wp.max(one - z * z, zero.dtype(0.0)))
     angle = uniform(word1, one) * zero.dtype(6.283185307179586)
     return type(zero)(r * wp.cos(angle), r * wp.sin(angle), z)
+
+
+_NUMBER = {name: number for number, name in enumerate(PARAMETERS)}
+
+CAMERA_RANGE = wp.constant(_NUMBER["camera_range"])
+BEARING_NOISE = wp.constant(_NUMBER["bearing_noise"])
+ODOMETRY_NOISE = wp.constant(_NUMBER["odometry_noise"])
+ODOMETRY_SCALE = wp.constant(_NUMBER["odometry_scale"])
+GYRO_BIAS = wp.constant(_NUMBER["gyro_bias"])
+SLIP_RATE = wp.constant(_NUMBER["slip"])
+EXTRINSICS = wp.constant(_NUMBER["extrinsics"])
+INITIAL_ERROR = wp.constant(_NUMBER["initial_error"])
+LANDMARK_PRESENCE = wp.constant(_NUMBER["landmark_presence"])
+V2X_LOSS = wp.constant(_NUMBER["v2x_loss"])
+TRAFFIC_PACE = wp.constant(_NUMBER["traffic_pace"])
+WANDER = wp.constant(_NUMBER["wander"])
+"""Indices of the state's field `parameter`."""
+
+COUNT = wp.constant(len(PARAMETERS))
+NOT_SET = -1.0
+"""In the state's field `parameter_set`: the factor is drawn."""
+
+
+@wp.func
+def draw_parameters(model: Any, state: Any, world: int):
+    """Draw the factors of a world, but for those that somebody has set."""
+    level = state.difficulty[world]
+    one = type(level)(1.0)
+    for k in range(COUNT):
+        factor = state.parameter_set[world, k]
+        if factor < type(level)(0.0):
+            words = random_words(state.seed[world], state.episode[world], 0, k, PARAMETER)
+            low = model.drawn.low[k]
+            factor = low + (model.drawn.high[k] - low) * uniform(words[0], one)
+            easy = model.drawn.easy[k]
+            factor = factor * (easy + (model.drawn.hard[k] - easy) * level)
+        state.parameter[world, k] = factor

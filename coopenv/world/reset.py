@@ -1,4 +1,7 @@
-"""Start an episode: draw poses and initial estimates, take the first frame."""
+"""Start an episode: draw presence, poses and initial estimates, and take the first frame.
+
+An absent agent is neither seen nor a body. Presence is drawn at a reset and changed by vehicles that leave.
+"""
 
 from typing import Any
 
@@ -7,29 +10,73 @@ import warp as wp
 from coopenv.estimation.linalg import join6
 from coopenv.estimation.so3 import exp_so3, identity3, orthonormalise
 from coopenv.world.camera import NOT_A_NEIGHBOUR, observe
-from coopenv.world.collision import touches_anything, touches_one_of
-from coopenv.world.command import command_of
-from coopenv.world.draw_route import draw_route, go_straight, start_on_route
-from coopenv.world.dynamics import prescribe
-from coopenv.world.faults import draw_faults
-from coopenv.world.lasting_errors import draw_errors
+from coopenv.world.dynamics import command_of, prescribe, touches_anything, touches_one_of
 from coopenv.world.model import DRIVEN, PRESCRIBED
-from coopenv.world.parameters import INITIAL_ERROR, draw_parameters
-from coopenv.world.presence import draw_presence
+from coopenv.world.odometry import draw_errors
 from coopenv.world.random import (
+    INITIAL_ERROR,
     INITIAL_SPEED,
     LANDMARK,
+    LANDMARK_PRESENCE,
+    PRESENCE,
     RESET_ESTIMATE_ORIENTATION,
     RESET_ESTIMATE_POSITION,
     RESET_POSE,
+    TRAFFIC_PACE,
+    draw_parameters,
     on_cells,
     random_words,
     signed_uniform,
     uniform,
     unit_vector,
 )
-from coopenv.world.route import has_routes
-from coopenv.world.v2x import transmit
+from coopenv.world.route import draw_route, go_straight, has_routes, start_on_route
+from coopenv.world.v2x import draw_faults, transmit
+
+ABSENT = wp.constant(-1)
+"""Value of `ended` of a vehicle that is not there in this episode."""
+
+EVERY_VEHICLE = wp.constant(-1)
+"""As a subject of random numbers: all vehicles of a world."""
+
+
+@wp.func
+def draw_presence(model: Any, state: Any, world: int):
+    """Draw who is there in an episode, and the pace of each prescribed motion."""
+    one = type(model.routes.height)(1.0)
+    for agent in range(model.agents):
+        words = random_words(state.seed[world], state.episode[world], 0, agent, PRESENCE)
+        chance = model.drawn.presence[agent]
+        if agent < model.landmarks:
+            chance = chance * state.parameter[world, LANDMARK_PRESENCE]
+        state.present[world, agent] = wp.where(uniform(words[0], one) < chance, 1, 0)
+        pace = one
+        if model.motion.kind[agent] == PRESCRIBED:
+            pace = one + model.drawn.pace_spread[agent] * signed_uniform(words[1], one)
+            pace = pace * state.parameter[world, TRAFFIC_PACE]
+        state.pace[world, agent] = pace
+    keep_one_vehicle(model, state, world)
+    for vehicle in range(model.vehicles):
+        state.ended[world, vehicle] = wp.where(state.present[world, model.landmarks + vehicle] == 0, ABSENT, 0)
+
+
+@wp.func
+def keep_one_vehicle(model: Any, state: Any, world: int):
+    """Let one of the vehicles stay where all are absent: a driven one if there is any."""
+    candidates = int(0)
+    for agent in range(model.landmarks, model.agents):
+        if model.motion.kind[agent] == DRIVEN or model.drawn.any_driven == 0:
+            candidates += 1
+            if state.present[world, agent] != 0:
+                return
+    words = random_words(state.seed[world], state.episode[world], 0, EVERY_VEHICLE, PRESENCE)
+    chosen = wp.min(int(uniform(words[0], wp.float64(1.0)) * wp.float64(candidates)), candidates - 1)
+    for agent in range(model.landmarks, model.agents):
+        if model.motion.kind[agent] == DRIVEN or model.drawn.any_driven == 0:
+            if chosen == 0:
+                state.present[world, agent] = 1
+            chosen -= 1
+
 
 ATTEMPTS = wp.constant(16)
 """How often the start of a vehicle with routes is drawn until it touches nothing that is there already."""

@@ -3,35 +3,250 @@
 W worlds, A agents (landmarks first), N vehicles (as receivers, then as senders), M odometry samples a tick, S slots of
 the radio's outbox, B blocks of the sliding Gramian, P points of a route, Q parameters, U numbers of an action, Z bodies
 of the traffic.
+
+A field of a record states its axes once, a letter each, and is allocated by them. A table beside the struct states the
+rule that each field of a saved state must satisfy; all rules are checked before anything is restored.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
+from coopenv.base.errors import CoopenvError, shown
 from coopenv.base.format import LARGEST
 from coopenv.estimation.outcomes import Sight
+from coopenv.estimation.validity import are_covariances, are_rotations, are_unit_vectors, everywhere
 from coopenv.scenario.learning import MOST, PARAMETERS
-from coopenv.world.precision import Precision
-from coopenv.world.records import allocate, array, fields
-from coopenv.world.saved_state import (
-    ANYTHING,
-    COVARIANCE,
-    DIRECTION,
-    FLAG,
-    NUMBER,
-    ODOMETRY_SAMPLES,
-    ROTATION,
-    ROUTE_COUNT,
-    ROUTE_DRAWN,
-    TICK,
-    Rule,
-    numbers,
-    whole,
+from coopenv.world.model import Precision
+
+
+def array(axes: str, dtype: Any) -> Any:
+    """Return the annotation of a struct's field: an array with these axes, a letter each, for example "WN"."""
+    annotation: Any = wp.array(dtype=dtype, ndim=len(axes))
+    annotation.axes = axes
+    return annotation
+
+
+def extended(record: Any, name: str, doc: str, **more: Any) -> Any:
+    """Return a struct with the fields of another one and more, declared with `array`."""
+    annotations = {**{field: var.type for field, var in record.vars.items()}, **more}
+    return wp.struct(
+        type(name, (), {"__doc__": doc, "__module__": record.cls.__module__, "__annotations__": annotations})
+    )
+
+
+def fields(record: Any) -> dict[str, Any]:
+    """Return the arrays that a record's struct declares with `array`, by name: annotations with `axes` and `dtype`."""
+    return {name: var.type for name, var in record.vars.items() if hasattr(var.type, "axes")}
+
+
+def size_of(record: Any, sizes: Mapping[str, int]) -> int:
+    """Return how many bytes a record's arrays take."""
+    arrays = fields(record).values()
+    return sum(math.prod(sizes[a] for a in x.axes) * int(wp.types.type_size_in_bytes(x.dtype)) for x in arrays)
+
+
+def allocate(record: Any, sizes: Mapping[str, int], device: str, shared: str = "") -> Any:
+    """Return a record of zeros of a struct whose fields are declared with `array`; `sizes` are lengths by letter.
+
+    Along the axis `shared`, where it comes second, all indices stand for one and the same row: whoever needs the rows
+    of one vehicle alone can then index them by the vehicle without room for the others'.
+    """
+    result = record()
+    for name, field in fields(record).items():
+        shape = [sizes[axis] for axis in field.axes]
+        if shared and field.axes[1:2] == shared:
+            row = wp.zeros([shape[0], 1, *shape[2:]], dtype=field.dtype, device=device)
+            setattr(result, name, repeated(row, 1, shape[1]))
+        else:
+            setattr(result, name, wp.zeros(shape, dtype=field.dtype, device=device))
+    return result
+
+
+class Part:
+    """One field of the entries of an array of structs, read and written as an array of its own."""
+
+    def __init__(self, array: Any, path: tuple[str, ...]) -> None:
+        self._array, self._path = array, path
+
+    def numpy(self) -> np.ndarray:
+        """Return it on the host, without a copy on the CPU."""
+        return self._of(self._array.numpy())
+
+    def assign(self, values: np.ndarray) -> None:
+        """Overwrite it."""
+        host = self._array.numpy()
+        self._of(host)[...] = values
+        if not self._array.device.is_cpu:
+            self._array.assign(host)
+
+    def _of(self, host: np.ndarray) -> np.ndarray:
+        for name in self._path:
+            host = host[name]
+        return host
+
+
+def parts(record: Any, struct: Any) -> dict[str, Any]:
+    """Return the arrays of a record by name, and of arrays of structs every field by a name with dots."""
+    arrays = {name: getattr(record, name) for name in fields(struct)}
+    paths = [(name, path) for name, array in arrays.items() for path in _paths(array.numpy().dtype)]
+    return {".".join((name, *path)): Part(arrays[name], path) if path else arrays[name] for name, path in paths}
+
+
+def _paths(dtype: np.dtype) -> Iterator[tuple[str, ...]]:
+    """Yield the way to every field of a structured type that has no fields itself."""
+    if dtype.names is None:
+        yield ()
+    for name in dtype.names or ():
+        yield from ((name, *path) for path in _paths(dtype[name]))
+
+
+def repeated(row: Any, axis: int, count: int) -> Any:
+    """Return an array that has one entry along an axis as one that seems to have it `count` times."""
+    shape, strides = list(row.shape), list(row.strides)
+    shape[axis], strides[axis] = count, 0
+    result: Any = wp.array(ptr=row.ptr, shape=tuple(shape), strides=tuple(strides), dtype=row.dtype, device=row.device)
+    result.row = row  # owns the memory
+    return result
+
+
+Array = NDArray[Any]
+Mask = NDArray[np.bool_]
+Fields = Mapping[str, Array]
+
+TOLERANCE = {np.dtype(np.float32): 1e-4, np.dtype(np.float64): 1e-6}
+"""How far rotations and directions may be off in a precision."""
+LEAST_EIGENVALUE = {np.dtype(np.float32): -1e-4, np.dtype(np.float64): -1e-9}
+"""Least eigenvalue of the correlations of a covariance, after rounding in a precision."""
+
+
+class Rule(NamedTuple):
+    """What every element of a field must be."""
+
+    must_be: str  # in words, for errors
+    holds: Callable[[Array, Fields, Any], Mask]
+    """Returns which elements are so, from the field's values, all fields, and the model."""
+    axes: int = 0  # how many of the last axes make up an element: 1 for vectors, 2 for matrices
+    used: str = ""
+    """Field that says which elements count, by flags or by how many along the last axis; empty: all do. The others must
+    be finite."""
+    of_truth: bool = False  # whether it is truth, which a recording may not know: NaN
+
+
+def whole(low: int, high: int | str) -> Rule:
+    """Return the rule of numbers within bounds; `high` may be a field of one number per world, or one of the model."""
+
+    def holds(values: Array, fields: Fields, model: Any) -> Mask:
+        most: Any = high
+        if isinstance(high, str):
+            of_world = fields[high].reshape(-1, *(1,) * (values.ndim - 1)) if high in fields else None
+            most = getattr(model, high) if of_world is None else of_world
+        return np.asarray((values >= low) & (values <= most))
+
+    return Rule(f"in {low} .. {high}", holds)
+
+
+def numbers(largest: float = LARGEST) -> Rule:
+    """Return the rule of finite numbers of at most a size."""
+    return Rule(f"finite and at most {largest:g}", lambda values, fields, model: np.abs(values) <= largest)
+
+
+def _odometry_samples(values: Array, fields: Fields, model: Any) -> Mask:
+    """Return which counts are those of the tick, at which sample m has been taken if m / rate is not later."""
+    due = fields["tick"][:, None] * (model.camera_period * model.odometry_rate)
+    return np.asarray((values >= 0) & (np.abs(values - due) <= 2.0))
+
+
+ANYTHING = Rule("anything", lambda values, fields, model: np.ones(values.shape, dtype=bool))
+FLAG = whole(0, 1)
+NUMBER = numbers()
+TICK = whole(-1, "tick")  # a tick of the past or the present one; -1: never
+ODOMETRY_SAMPLES = Rule("as many as at this tick", _odometry_samples)
+ROUTE_COUNT = Rule(
+    "0, or how many points a route may have",
+    lambda values, fields, model: (values == 0) | ((values >= 2) & (values <= model.routes.points)),
 )
+ROUTE_DRAWN = Rule(
+    "a number of a route, or -1",
+    lambda values, fields, model: (values >= -1) & (values < max(model.routes.count.size, 1)),
+)
+DIRECTION = Rule(
+    "a unit vector, or zero",
+    lambda values, fields, model: are_unit_vectors(values, TOLERANCE[values.dtype]) | everywhere(values == 0.0, -1),
+    axes=1,
+)
+ROTATION = Rule("a rotation", lambda values, fields, model: are_rotations(values, TOLERANCE[values.dtype]), axes=2)
+COVARIANCE = Rule(
+    "a covariance", lambda values, fields, model: are_covariances(values, LEAST_EIGENVALUE[values.dtype]), axes=2
+)
+
+
+def checked_state(
+    values: Mapping[str, Any], arrays: Mapping[str, Any], rules: Mapping[str, Rule], model: Any, knows_truth: bool
+) -> dict[str, Array]:
+    """Return copies of what a state holds, in the types of the Warp arrays, by name, that it is to be written to.
+
+    Numbers of a field without a rule have to be finite; `knows_truth` says whether the truth is always there.
+
+    Raises:
+        CoopenvError: a field is missing, has another shape or type, or an element is not what its rule says.
+    """
+    fields = {name: _converted(name, values, target.numpy()) for name, target in arrays.items()}
+    begun = has_begun(fields["start_rotation"])
+    for name, array in fields.items():
+        rule = rules.get(name) or (NUMBER if array.dtype.kind == "f" else ANYTHING)
+        valid = _valid(array, rule, fields, model, knows_truth)
+        valid[~begun] |= _elements(array[~begun] == 0, rule)
+        if not valid.all():
+            index = tuple(np.argwhere(~valid)[0].tolist())
+            value = f": {shown(array[index].item())}" if array[index].ndim == 0 else ""
+            raise CoopenvError(f"state: field '{name}' at {index}{value} is not {rule.must_be}")
+    return fields
+
+
+def has_begun(start_rotation: Array) -> Mask:
+    """Return (W,) which worlds have been reset; before that, their fields are zero."""
+    return np.asarray(start_rotation.reshape(len(start_rotation), -1).any(axis=1))
+
+
+def _converted(name: str, values: Mapping[str, Any], like: Array) -> Array:
+    if name not in values:
+        raise CoopenvError(f"state: field '{name}' is missing")
+    try:
+        given = np.asarray(values[name])
+        if given.shape != like.shape:
+            raise CoopenvError(f"state: field '{name}' has shape {given.shape}, expected {like.shape}")
+        kinds = "fiu" if like.dtype.kind == "f" else "iub"
+        with np.errstate(over="ignore"):
+            array = np.array(given, dtype=like.dtype, order="C") if given.dtype.kind in kinds else None
+    except (TypeError, ValueError, OverflowError) as error:
+        raise CoopenvError(f"state: field '{name}': {error}") from None
+    if array is None or (like.dtype.kind != "f" and (array != given).any()):
+        raise CoopenvError(f"state: field '{name}' of {given.dtype} does not fit into {like.dtype}")
+    return array
+
+
+def _elements(mask: Array, rule: Rule) -> Mask:
+    """Return of which elements a mask of numbers holds."""
+    return everywhere(mask, *range(-rule.axes, 0))
+
+
+def _valid(array: Array, rule: Rule, fields: Fields, model: Any, knows_truth: bool) -> Mask:
+    """Return which elements of a field are what they must be, do not count, or are not known."""
+    valid = rule.holds(array, fields, model)
+    if rule.used:
+        used = fields[rule.used]
+        if used.ndim < valid.ndim:
+            used = np.arange(valid.shape[-1]) < used[..., None]
+        valid = valid | ((used == 0) & _elements(np.isfinite(array), rule))
+    if rule.of_truth and not knows_truth:
+        valid = valid | _elements(np.isnan(array), rule)
+    return valid
 
 
 @cache
@@ -48,7 +263,7 @@ def state_struct(p: Precision) -> Any:
         tick: array("W", wp.int32)  # camera ticks since the reset
         exhausted: array("W", wp.int32)  # 1: its source has no more ticks, the episode is over
 
-        parameter: array("WQ", scalar)  # factors, see `coopenv.world.parameters`
+        parameter: array("WQ", scalar)  # factors, see `coopenv.world.random`
         parameter_set: array("WQ", scalar)  # by whoever resets, for all episodes to come; negative: drawn
         difficulty: array("W", scalar)  # in [0, 1], of the episodes to come
         present: array("WA", wp.int32)  # 1: in the scene now; landmarks keep their place on the map
@@ -133,9 +348,9 @@ def state_struct(p: Precision) -> Any:
 
 
 LASTING_ERRORS = ("odometry_scale", "gyro_bias", "slip", "camera_turn", "camera_shift")
-"""Fields with the true errors of a vehicle's sensors, see `coopenv.world.lasting_errors`; beside `camera_focal`."""
+"""Fields with the true errors of a vehicle's sensors, see `coopenv.world.odometry`; beside `camera_focal`."""
 FAULTS = ("clock", "restart_tick", "lie_tick")
-"""Fields with what goes wrong with a vehicle's clock, computer and messages, see `coopenv.world.faults`."""
+"""Fields with what goes wrong with a vehicle's clock, computer and messages, see `coopenv.world.v2x`."""
 
 VALID: dict[str, Rule] = {
     "seed": ANYTHING,

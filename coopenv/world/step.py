@@ -10,17 +10,15 @@ from typing import Any
 
 import warp as wp
 
-from coopenv.world.command import decide as make_commands
-from coopenv.world.device_function import device_function
+from coopenv.world.dynamics import decide as make_commands
 from coopenv.world.embedded import Embedded, Now, Source, regular_tick
-from coopenv.world.faults import forget_everything
 from coopenv.world.launch import module_kernels, near_inlining
-from coopenv.world.model import model_struct
-from coopenv.world.precision import Precision
+from coopenv.world.model import Precision, model_struct
 from coopenv.world.quality import sample_gramian
 from coopenv.world.state import state_struct
 from coopenv.world.v2x import broadcast as broadcast_estimate
-from coopenv.world.v2x import deliver
+from coopenv.world.v2x import deliver, forget_everything
+from coopenv.world.warp_internals import device_function
 
 Kernels = dict[str, wp.Kernel]
 """By name."""

@@ -1,13 +1,204 @@
-"""V2X: pose estimates travel with delay, period, loss and limited range."""
+"""V2X: pose estimates travel with delay, period, loss and limited range; faults change what is sent.
+
+Faults of computers, clocks and messages are drawn at a reset. With all of them off, nothing is drawn and nothing is
+changed. A message has two times besides that of its sending: that of its content (`content_tick`, earlier where the
+sender replays) and its time stamp (`stamp`), wrong by the clocks' offsets.
+"""
 
 from typing import Any
 
 import warp as wp
 
-from coopenv.world.device_function import device_function
-from coopenv.world.faults import alter, as_told, content_tick, stamp
-from coopenv.world.parameters import V2X_LOSS
-from coopenv.world.random import RADIO, pair, random_words, uniform
+from coopenv.estimation.linalg import join6
+from coopenv.estimation.outcomes import COLLUDE, DRIFT, HONEST, JUMP, REPLAY
+from coopenv.estimation.so3 import exp_so3, identity3
+from coopenv.world.camera import marker_position
+from coopenv.world.random import (
+    CLOCK,
+    CORRUPTION,
+    LIE,
+    RADIO,
+    RESTART,
+    V2X_LOSS,
+    gaussian_pair,
+    pair,
+    random_words,
+    signed_uniform,
+    uniform,
+)
+from coopenv.world.warp_internals import device_function
+
+NEVER = wp.constant(-1)
+MOST_CLOCK_TICKS = wp.constant(1.0e8)
+
+
+@wp.func
+def draw_faults(model: Any, state: Any, world: int, vehicle: int):
+    """Draw what goes wrong with a vehicle in an episode."""
+    o = type(state.told_shift[world, vehicle])()
+    state.clock[world, vehicle] = 0
+    state.restart_tick[world, vehicle] = NEVER
+    state.lie_tick[world, vehicle] = NEVER
+    state.lie_vector[world, vehicle] = o
+    state.told_shift[world, vehicle] = o
+    state.told_turn[world, vehicle] = o
+    if model.clocks == 1:
+        draw_clock(model, state, world, vehicle, o)
+    if model.restarts == 1:
+        draw_restart(model, state, world, vehicle, o)
+    if model.fault[vehicle].lie != HONEST:
+        draw_lie(model, state, world, vehicle, o)
+
+
+@wp.func
+def draw_clock(model: Any, state: Any, world: int, vehicle: int, o: Any):
+    """Draw by how many ticks a vehicle's clock is ahead."""
+    words = random_words(state.seed[world], state.episode[world], 0, vehicle, CLOCK)
+    off, _ = gaussian_pair(words[0], words[1], o.dtype(1.0))
+    ticks = wp.round(off * model.fault[vehicle].clock * o.dtype(model.camera_rate))
+    most = o.dtype(MOST_CLOCK_TICKS)
+    state.clock[world, vehicle] = int(wp.clamp(ticks, -most, most))
+
+
+@wp.func
+def draw_restart(model: Any, state: Any, world: int, vehicle: int, o: Any):
+    """Draw at which tick, the first one of a decision, a vehicle starts anew."""
+    fault = model.fault[vehicle]
+    one = o.dtype(1.0)
+    words = random_words(state.seed[world], state.episode[world], 0, vehicle, RESTART)
+    if uniform(words[0], one) < fault.restart_chance:
+        time = wp.float64(fault.restart_time + fault.restart_spread * uniform(words[1], one))
+        ticks = wp.min(time * model.camera_rate, wp.float64(model.horizon_ticks) + wp.float64(1.0))
+        decisions = int(wp.ceil(ticks / wp.float64(model.ticks_per_decision) - wp.float64(1.0e-6)))
+        state.restart_tick[world, vehicle] = 1 + model.ticks_per_decision * wp.max(decisions, 1)
+
+
+@wp.func
+def draw_lie(model: Any, state: Any, world: int, vehicle: int, o: Any):
+    """Draw from which tick a vehicle lies, and what it adds to its position, m or m/s; of all that collude the same."""
+    fault = model.fault[vehicle]
+    one = o.dtype(1.0)
+    subject = wp.where(fault.lie == COLLUDE, model.vehicles, vehicle)
+    words = random_words(state.seed[world], state.episode[world], 0, subject, LIE)
+    if uniform(words[0], one) < fault.lie_chance:
+        time = wp.float64(fault.lie_start + fault.lie_spread * uniform(words[1], one))
+        ticks = wp.min(time * model.camera_rate, wp.float64(model.horizon_ticks) + wp.float64(1.0))
+        state.lie_tick[world, vehicle] = int(wp.ceil(ticks - wp.float64(1.0e-6)))
+        direction = fault.lie_direction
+        if wp.length_sq(direction) == o[0]:
+            angle = o.dtype(6.283185307179586) * uniform(words[2], one)
+            direction = type(o)(wp.cos(angle), wp.sin(angle), o[0])
+        state.lie_vector[world, vehicle] = fault.lie_size * direction
+
+
+@wp.func
+def is_lying(state: Any, world: int, vehicle: int, tick: int) -> bool:
+    """Return whether what a vehicle sends at a tick is a lie."""
+    return state.lie_tick[world, vehicle] >= 0 and tick >= state.lie_tick[world, vehicle]
+
+
+@wp.func
+def alter(model: Any, state: Any, world: int, vehicle: int, tick: int):
+    """Decide by what the pose that a vehicle broadcasts at a tick differs from its estimate."""
+    if model.alters == 0:
+        return
+    fault = model.fault[vehicle]
+    shift = type(state.told_shift[world, vehicle])()
+    turn = type(shift)()
+    one = shift.dtype(1.0)
+    if is_lying(state, world, vehicle, tick):
+        if fault.lie == JUMP or fault.lie == COLLUDE:
+            shift = state.lie_vector[world, vehicle]
+        if fault.lie == DRIFT:
+            since = wp.float64(tick - state.lie_tick[world, vehicle]) * model.camera_period
+            shift = state.lie_vector[world, vehicle] * shift.dtype(since)
+    if fault.corruption > one - one and wp.float64(tick) * model.camera_period >= wp.float64(fault.corruption_start):
+        words = random_words(state.seed[world], state.episode[world], tick, vehicle, CORRUPTION)
+        if uniform(words[3], one) < fault.corruption:
+            more = random_words(state.seed[world], state.episode[world], tick, vehicle, CORRUPTION + wp.uint32(1))
+            for axis in range(3):
+                shift[axis] += fault.corruption_size * signed_uniform(words[axis], one)
+                turn[axis] += fault.corruption_turn * signed_uniform(more[axis], one)
+    state.told_shift[world, vehicle] = shift
+    state.told_turn[world, vehicle] = turn
+
+
+@wp.func
+def as_told(model: Any, state: Any, world: int, vehicle: int, R: Any, position: Any):
+    """Return the pose that a vehicle broadcasts at this tick in place of (R, position), in their precision."""
+    told_R = R
+    told = position
+    if model.alters == 1:
+        told = position + type(position)(state.told_shift[world, vehicle])
+        turn = type(position)(state.told_turn[world, vehicle])
+        if wp.length_sq(turn) > turn.dtype(0.0):
+            told_R = R * exp_so3(turn)
+    return told_R, told
+
+
+@wp.func
+def claimed_std(model: Any, state: Any, world: int, vehicle: int, tick: int):
+    """Return what a liar claims to know its pose by, rad and m; 0: what it knows."""
+    std = model.fault[vehicle].lie_std
+    if model.alters == 0 or not is_lying(state, world, vehicle, tick):
+        std = type(std)(0.0)
+    return std
+
+
+@wp.func
+def content_tick(model: Any, state: Any, world: int, sender: int, sent: int) -> int:
+    """Return the tick of whose message another message, sent at some tick, has the content."""
+    if model.alters == 1 and model.fault[sender].lie == REPLAY and is_lying(state, world, sender, sent):
+        old = wp.max(sent - model.fault[sender].lie_replay, 0)
+        if state.outbox_tick[world, sender, old % model.radio.slots] == old:
+            return old
+    return sent
+
+
+@wp.func
+def stamp(model: Any, state: Any, world: int, receiver: int, sender: int, sent: int, tick: int) -> int:
+    """Return when a message that arrives at a tick was sent, as the receiver believes: both have clocks."""
+    if model.clocks == 0:
+        return sent
+    return wp.clamp(sent + state.clock[world, sender] - state.clock[world, receiver], 0, tick)
+
+
+@wp.func
+def forget_everything(model: Any, state: Any, world: int, vehicle: int):
+    """Leave a vehicle that starts anew with what its computer knows by itself: it may be anywhere near the landmarks.
+
+    Its estimate is amid them, in the map's axes; nothing has been heard.
+    """
+    o = type(state.told_shift[world, vehicle])()
+    i3 = identity3(o)
+    middle = type(o)()
+    for landmark in range(model.landmarks):
+        middle += marker_position(model, state, world, landmark) / o.dtype(model.landmarks)
+    state.estimate_rotation[world, vehicle] = i3
+    state.estimate_position[world, vehicle] = middle
+    none = i3 - i3
+    state.covariance[world, vehicle] = join6(model.observer.p1 * i3, none, none, model.observer.p2 * i3)
+    state.corrected_tick[world, vehicle] = state.tick[world]
+    state.nis_dof[world, vehicle] = 0
+    for sender in range(model.vehicles):
+        state.inbox_tick[world, vehicle, sender] = -1
+        state.inbox_stamp[world, vehicle, sender] = -1
+
+
+@wp.func
+def has_restarted(model: Any, state: Any, world: int, vehicle: int) -> bool:
+    """Return whether a vehicle has started anew in this episode, before the next tick."""
+    begun = state.restart_tick[world, vehicle]
+    return model.restarts == 1 and begun > 0 and state.tick[world] + 1 >= begun
+
+
+@wp.func
+def start_covariance(model: Any, state: Any, world: int, vehicle: int):
+    """Return the covariance of the estimate that a vehicle's observer starts from, LEFT coordinates, rad and m."""
+    row = vehicle
+    if has_restarted(model, state, world, vehicle):
+        row = model.vehicles + vehicle
+    return model.start.covariance[row]
 
 
 @device_function

@@ -7,18 +7,27 @@ import numpy as np
 import warp as wp
 
 from coopenv.base.errors import CoopenvError, check_memory
+from coopenv.estimation.outcomes import UNKNOWN
 from coopenv.scenario import Scenario
 from coopenv.scenario.learning import PARAMETERS
 from coopenv.world.build import build_model
 from coopenv.world.embedded import HOST, SIMULATED, Embedded, Nothing, Source
-from coopenv.world.fault_kinds import UNKNOWN
 from coopenv.world.launch import Launcher, PerWorld, default_threads
-from coopenv.world.model import mat66d
-from coopenv.world.parameters import NOT_SET
-from coopenv.world.precision import check_device, device_memory, precision
-from coopenv.world.records import allocate, parts, size_of
-from coopenv.world.saved_state import Rule, checked_state
-from coopenv.world.state import VALID, allocate_state, overwrite, state_fields, state_sizes, state_struct
+from coopenv.world.model import check_device, device_memory, mat66d, precision
+from coopenv.world.random import NOT_SET
+from coopenv.world.state import (
+    VALID,
+    Rule,
+    allocate,
+    allocate_state,
+    checked_state,
+    overwrite,
+    parts,
+    size_of,
+    state_fields,
+    state_sizes,
+    state_struct,
+)
 from coopenv.world.step import begin_kernel, fused_kernel, host_kernels, observer_kernels, source_kernels
 
 Keys = Sequence[int | None] | np.ndarray | None

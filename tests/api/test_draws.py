@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pettingzoo.test import parallel_api_test
 
-import coopenv.api.single_vehicle
+import coopenv.api.make
 from coopenv import CoopenvError
 from coopenv.api.parallel_env import CooperativeLocalisationEnv
 from coopenv.api.vector_env import CooperativeVectorEnv
@@ -51,7 +51,7 @@ def test_absent_vehicles_are_no_agents() -> None:
 
 
 def test_the_vehicle_of_a_single_environment_is_there() -> None:
-    env = coopenv.api.single_vehicle.SingleVehicleEnv(FOUR_WAY, vehicle="vehicle_3", overrides=HALF)
+    env = coopenv.api.make.SingleVehicleEnv(FOUR_WAY, vehicle="vehicle_3", overrides=HALF)
     for seed in range(12):
         _, info = env.reset(seed=seed)
         assert info["outcome"] == "under way"

@@ -15,7 +15,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from coopenv import CoopenvError, DataError, OutputError
-from coopenv.backends.mcap import messages, read_recording, write_recording
+from coopenv.backends.mcap import format, read_recording, write_recording
 from coopenv.backends.mrclam import load_dataset
 from coopenv.backends.mrclam.recording import recording_of
 from coopenv.cli import main
@@ -230,7 +230,7 @@ def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.Mon
             raise ImportError(name)
         return real(name, *rest, **options)
 
-    messages.codec.cache_clear()
+    format.codec.cache_clear()
     monkeypatch.setattr(builtins, "__import__", without)
     for act in (lambda: read_recording(tmp_path / "a.mcap"), lambda: write_recording(simulated(), tmp_path / "a.mcap")):
         with pytest.raises(CoopenvError, match=r"pip install '\.\[log\]'"):

@@ -9,10 +9,9 @@ import numpy as np
 import warp as wp
 
 from coopenv.world.launch import start_warp
-from coopenv.world.precision import precision
-from coopenv.world.records import allocate
+from coopenv.world.model import precision
 from coopenv.world.route import place_on_route, point_on_route
-from coopenv.world.state import state_struct
+from coopenv.world.state import allocate, state_struct
 from tests.helpers.warp_calls import DTYPES
 
 start_warp()

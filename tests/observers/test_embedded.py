@@ -20,7 +20,7 @@ from coopenv.observers.registry import find_embedded
 from coopenv.runs import record
 from coopenv.scenario.starts import neighbour_sets
 from coopenv.world.embedded import Embedded, send_nothing
-from coopenv.world.records import array
+from coopenv.world.state import array
 
 
 @wp.struct

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
-from coopenv.backends.replay.backend import Replay
+from coopenv.backends.replay import Replay
 from coopenv.base.errors import CoopenvError
 from coopenv.base.seeds import world_keys
 from coopenv.observers import Message, Recording, run

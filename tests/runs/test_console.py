@@ -12,7 +12,7 @@ from rich.console import Console
 from coopenv.estimation import compiled
 from coopenv.runs import console as module
 from coopenv.runs.console import Progress, compile_notice
-from coopenv.world import kernel_cache
+from coopenv.world import launch
 
 
 @pytest.fixture
@@ -99,15 +99,15 @@ def test_an_error_ends_the_lines(text: io.StringIO) -> None:
 def looks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[set[str]]:
     """Let kernels be kept in a folder of their own, with one in it, and return a list of what is found there."""
     looked: list[set[str]] = []
-    modules = kernel_cache.modules
+    modules = launch.modules
 
     def look() -> set[str]:
         looked.append(modules())
         return looked[-1]
 
     monkeypatch.setattr(module, "COMPILE_NOTICE_AFTER", 0.001)
-    monkeypatch.setattr(kernel_cache, "cache_folder", lambda: tmp_path)
-    monkeypatch.setattr(kernel_cache, "modules", look)
+    monkeypatch.setattr(launch, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(launch, "modules", look)
     (tmp_path / "wp_known_0123456").mkdir()
     return looked
 

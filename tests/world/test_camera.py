@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from coopenv.base.errors import ScenarioError
 from coopenv.estimation.outcomes import Sight
 from coopenv.world import camera
-from coopenv.world.model import entry_struct
-from coopenv.world.precision import precision
+from coopenv.world.model import entry_struct, precision
 from tests.helpers.builders import landmark, quaternion_wxyz, run, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES, WIDE, Calls
 from tests.oracles import geometry, philox

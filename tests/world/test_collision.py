@@ -10,11 +10,11 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from coopenv.estimation.outcomes import Outcome
-from coopenv.world import collision
+from coopenv.world import dynamics
 from tests.helpers.builders import command, constant, landmark, reset, run, scenario, start, vehicle
 from tests.helpers.warp_calls import DTYPES, Calls
 
-call = Calls(__name__, {collision.boxes_touch: "3 33 3 3 33 3 > b"})
+call = Calls(__name__, {dynamics.boxes_touch: "3 33 3 3 33 3 > b"})
 
 
 def overlap(ca: np.ndarray, Ra: np.ndarray, ha: np.ndarray, cb: np.ndarray, Rb: np.ndarray, hb: np.ndarray) -> float:
@@ -39,8 +39,8 @@ def test_upright_boxes_against_a_linear_programme(dtype: str) -> None:
     Ra, Rb = (Rotation.from_euler("z", y[:, None]).as_matrix() for y in yaw)
     ha, hb = rng.uniform(0.05, 1.2, (2, count, 3))
     depth = np.array([overlap(*x) for x in zip(ca, Ra, ha, cb, Rb, hb, strict=True)])
-    touching = call(collision.boxes_touch, dtype, ca, Ra, ha, cb, Rb, hb)
-    swapped = call(collision.boxes_touch, dtype, cb, Rb, hb, ca, Ra, ha)
+    touching = call(dynamics.boxes_touch, dtype, ca, Ra, ha, cb, Rb, hb)
+    swapped = call(dynamics.boxes_touch, dtype, cb, Rb, hb, ca, Ra, ha)
     clear = np.abs(depth) > 1e-5
     np.testing.assert_array_equal(touching[clear], (depth > 0)[clear])
     np.testing.assert_array_equal(swapped, touching)

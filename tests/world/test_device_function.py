@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from coopenv.world import launch
-from coopenv.world.device_function import device_function
+from coopenv.world.warp_internals import device_function
 
 
 @wp.struct

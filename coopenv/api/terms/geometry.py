@@ -12,10 +12,10 @@ from coopenv.world.camera import (
     project,
     segment_hits_box,
 )
-from coopenv.world.collision import ARRIVED
-from coopenv.world.device_function import device_function
+from coopenv.world.dynamics import ARRIVED
 from coopenv.world.route import place_on_route, point_on_route, route_length
 from coopenv.world.v2x import fresh
+from coopenv.world.warp_internals import device_function
 
 FASTEST = wp.constant(wp.float64(2.0))
 """Largest gain of progress per time, in multiples of the top speed (the inside of a bend is shorter)."""

@@ -23,10 +23,10 @@ from coopenv.estimation.outcomes import Outcome
 from coopenv.scenario import Scenario
 from coopenv.scenario.own_terms import record_count
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS, TERMINATION_CONDITIONS, Registry, Row
-from coopenv.world import kernel_cache
-from coopenv.world.collision import UNDER_WAY
+from coopenv.world import launch
+from coopenv.world.dynamics import UNDER_WAY
 from coopenv.world.launch import PerWorld, near_inlining
-from coopenv.world.records import allocate
+from coopenv.world.state import allocate
 from coopenv.world.world import World
 
 SECOND = {"vehicle": Target, "target": Target, "neighbour": Neighbour, "landmark": MapLandmark}
@@ -142,8 +142,8 @@ class OwnTerms:
         inputs = [a.value if isinstance(a, PerWorld) else a for a in arguments]
         dim = (1, 1, 1) if factory is field_kernel else (1, 1)
         try:
-            kernel_cache.launch(factory(term), dim=dim, inputs=inputs, device=device, record_cmd=True)
-        except kernel_cache.KernelCacheError:
+            launch.launch(factory(term), dim=dim, inputs=inputs, device=device, record_cmd=True)
+        except launch.KernelCacheError:
             raise
         except Exception as error:  # Warp raises various types
             said = " ".join(part for part in str(error).split("\n;") if 'function "apply"' not in part)

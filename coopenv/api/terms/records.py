@@ -18,12 +18,11 @@ from coopenv.api.terms.geometry import (
     route_from_estimate,
 )
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
-from coopenv.world.collision import UNDER_WAY
-from coopenv.world.command import ACCELERATION, SPEED, STEERING
-from coopenv.world.device_function import device_function
+from coopenv.world.dynamics import ACCELERATION, SPEED, STEERING, UNDER_WAY
 from coopenv.world.quality import position_covariance
 from coopenv.world.route import goal_distance, route_length
 from coopenv.world.v2x import fresh
+from coopenv.world.warp_internals import device_function
 
 NEVER = wp.constant(wp.float64(1.0e9))
 """Age without any measurement or message, s."""

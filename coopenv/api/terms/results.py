@@ -35,10 +35,9 @@ from coopenv.api.terms.values import (
 from coopenv.estimation.so3 import rotation_angle
 from coopenv.scenario import Scenario
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
-from coopenv.world.collision import UNDER_WAY
-from coopenv.world.device_function import device_function
+from coopenv.world.dynamics import UNDER_WAY
 from coopenv.world.launch import near_inlining
-from coopenv.world.precision import Precision
+from coopenv.world.model import Precision
 from coopenv.world.quality import (
     cholesky_of,
     gramian_smallest_eigenvalue,
@@ -48,9 +47,9 @@ from coopenv.world.quality import (
     position_variance,
     targets_in_view,
 )
-from coopenv.world.records import array
 from coopenv.world.route import remaining_way
-from coopenv.world.saved_state import FLAG, NUMBER, whole
+from coopenv.world.state import FLAG, NUMBER, array, whole
+from coopenv.world.warp_internals import device_function
 
 
 @cache

@@ -9,7 +9,7 @@ import warp as wp
 from coopenv.api.terms.geometry import FAR, closest_approach_driving, closest_approach_standing
 from coopenv.api.terms.records import Ego, MapLandmark, Neighbour, Target, Truth, log10
 from coopenv.scenario.terms import OBSERVATION_FIELDS, REWARD_TERMS
-from coopenv.world.collision import COLLIDED, OFF_ROUTE
+from coopenv.world.dynamics import COLLIDED, OFF_ROUTE
 
 DEGREES = wp.constant(57.29577951308232)
 EIGENVALUE_FLOOR = wp.constant(1.0e-9)

@@ -10,7 +10,7 @@ import numpy as np
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.type_aliases import RolloutBufferSamples
 
-from coopenv.api.infos import outcome_words
+from coopenv.api.arguments import outcome_words
 from coopenv.api.make import make_vec
 from coopenv.api.terms.layout import Layout
 from coopenv.api.vector_env import CooperativeVectorEnv, EpisodeSums

@@ -12,7 +12,7 @@ from pathlib import Path
 from mcap.records import Attachment, Channel, Chunk, DataEnd, McapRecord, Message, MessageIndex, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from coopenv.backends.mcap.peek import CUT_OFF, MAGIC, MENDED
+from coopenv.backends.mcap.format import CUT_OFF, MAGIC, MENDED
 from coopenv.backends.unpacking import Allowance
 from coopenv.base.errors import DataError, check_memory
 

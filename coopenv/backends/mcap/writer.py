@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.mcap.header import header_of
-from coopenv.backends.mcap.messages import (
+from coopenv.backends.mcap.format import (
     ATTACHMENT,
     CONTENTS,
     EXACT,
@@ -20,10 +19,13 @@ from coopenv.backends.mcap.messages import (
     LANDMARKS_TYPE,
     PAN,
     SHOWN,
+    Clock,
+    View,
     codec,
+    header_of,
+    ros_definition,
     topic,
 )
-from coopenv.backends.mcap.view import Clock, View, ros_definition
 from coopenv.base.errors import OutputError
 from coopenv.base.files import check_file, replacing_file
 from coopenv.base.installation import version

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from coopenv.backends.base import Capabilities, Episode, TickGenerator
-from coopenv.backends.mcap.messages import codec
-from coopenv.backends.mcap.peek import CUT_OFF, metadata_names
+from coopenv.backends.mcap.format import CUT_OFF, codec, metadata_names
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, OutputError
 from coopenv.base.files import writing
 from coopenv.base.installation import version

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from coopenv.backends.mcap.peek import CUT_OFF, MENDED, REPAIR, is_cut_off
+from coopenv.backends.mcap.format import CUT_OFF, MENDED, REPAIR, is_cut_off
 from coopenv.base.errors import CoopenvError, DataError, DataWarning, told
 from coopenv.cars import codec
 

@@ -11,7 +11,7 @@ from coopenv.cars.samples import Calibration
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.lens import distort
 from coopenv.scenario.sensing import Camera, Noise
-from coopenv.world.parameters import ODOMETRY_NOISE
+from coopenv.world.random import ODOMETRY_NOISE
 
 WHEEL_RATE, IMU_RATE, FILTER_RATE = 50.0, 100.0, 20.0
 """Hz"""

@@ -19,9 +19,9 @@ from coopenv.estimation.outcomes import Sight
 from coopenv.scenario import Scenario
 from coopenv.world.camera import observe
 from coopenv.world.dynamics import drive, prescribe
-from coopenv.world.lasting_errors import drift
 from coopenv.world.launch import PerWorld
 from coopenv.world.model import PRESCRIBED
+from coopenv.world.odometry import drift
 from coopenv.world.world import World
 
 

@@ -12,7 +12,7 @@ from coopenv.estimation.linalg import block3, join6, sheared, symmetric_part
 from coopenv.estimation.so3 import orthonormalise, skew
 from coopenv.observers.riccati.kernels import predict
 from coopenv.world.embedded import Embedded, send_nothing
-from coopenv.world.faults import start_covariance
+from coopenv.world.v2x import start_covariance
 
 
 @wp.func

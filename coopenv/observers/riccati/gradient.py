@@ -23,13 +23,11 @@ from coopenv.estimation.so3 import exp_so3, increment, orthonormalise
 from coopenv.observers.riccati.equations import accumulate_information, correct_kalman, predict_covariance, predict_pose
 from coopenv.scenario import Scenario
 from coopenv.scenario.starts import neighbour_sets, processing_order
-from coopenv.world import kernel_cache
+from coopenv.world import launch
 from coopenv.world.camera import VISIBLE, sight_of
-from coopenv.world.command import command_of
-from coopenv.world.dynamics import LONGEST_SUBSTEP, bicycle_step, prescribe, yaw_rate
+from coopenv.world.dynamics import LONGEST_SUBSTEP, bicycle_step, command_of, prescribe, yaw_rate
 from coopenv.world.launch import kernel
-from coopenv.world.model import PRESCRIBED
-from coopenv.world.precision import precision
+from coopenv.world.model import PRESCRIBED, precision
 from coopenv.world.world import World
 
 scalar, vec2, vec3, vec4, mat33, mat66 = (
@@ -300,7 +298,7 @@ class DifferentiableWorld:
         return truth, held, self._make(Belief, rotation=R, position=p, covariance=state.covariance.numpy())
 
     def _command(self, commands: list[Any], tick: int) -> Any:
-        """Return the command in force during a tick, see `coopenv.world.command.command_in_force`."""
+        """Return the command in force during a tick, see `coopenv.world.dynamics.command_in_force`."""
         decision, elapsed = divmod(tick - 1, self.scenario.ticks_per_decision)
         if elapsed >= self._latency:
             return commands[decision]
@@ -318,7 +316,7 @@ class DifferentiableWorld:
 
     def _estimate(self, truth: Any, held: Any, belief: Any, tick: int, turn: Any) -> Any:
         world, rate = self._world, self.scenario.rates.camera
-        kernel_cache.launch(
+        launch.launch(
             kernel(show_kernel, "float64"),
             dim=(world.worlds, world.model.agents),
             inputs=[world.model, truth, world.state, wp.float64(tick / rate)],
@@ -339,7 +337,7 @@ class DifferentiableWorld:
     def _launch(self, function: Any, arguments: list[Any], dim: Any = None) -> None:
         grid = (self._world.worlds, self._world.model.vehicles) if dim is None else dim
         compiled = kernel(function, "float64", differentiable=True)
-        kernel_cache.launch(compiled, dim=grid, inputs=arguments, device=self._world.device)
+        launch.launch(compiled, dim=grid, inputs=arguments, device=self._world.device)
 
 
 def tick_intervals(tick: int, camera: float, odometry: float) -> list[tuple[float, bool]]:

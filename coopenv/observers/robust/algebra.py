@@ -23,7 +23,7 @@ from coopenv.observers.robust.constants import (
     THIRD,
 )
 from coopenv.observers.robust.memory import Estimate, Pose, mat66d, vec2d, vec6d
-from coopenv.world.device_function import device_function
+from coopenv.world.warp_internals import device_function
 
 KNOWN_ANGLE_VARIANCE = KNOWN_ANGLE**2
 KNOWN_POSITION_VARIANCE = KNOWN_POSITION**2

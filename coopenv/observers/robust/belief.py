@@ -23,7 +23,7 @@ from coopenv.observers.robust.algebra import (
 from coopenv.observers.robust.constants import FORGET_TIME, SAME_TIME
 from coopenv.observers.robust.memory import ERRORS, MOUNTING, Anchor, Estimate, Member, Pose, mat66d
 from coopenv.world.camera import VISIBLE
-from coopenv.world.device_function import device_function
+from coopenv.world.warp_internals import device_function
 
 MAX_UNSEEN_TIME = FORGET_TIME + SAME_TIME
 

@@ -9,7 +9,7 @@ from coopenv.observers.robust.belief import apply_corrections, is_free, subtract
 from coopenv.observers.robust.constants import BEARING_GATE, MAX_LINEARISATIONS, RELINEARISATION_ANGLE
 from coopenv.observers.robust.measurements import across_line, linearise, project
 from coopenv.observers.robust.memory import Frame, mat66d, vec6d
-from coopenv.world.device_function import device_function
+from coopenv.world.warp_internals import device_function
 
 
 @device_function

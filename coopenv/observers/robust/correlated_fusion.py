@@ -25,7 +25,7 @@ from coopenv.observers.robust.propagation import lasting_noise
 from coopenv.observers.robust.sender_monitor import carry_evidence, drift_of, has_jumped, is_barred, judge, note_step
 from coopenv.observers.robust.tracklets import bit_of, depends_on_own, propagate_member
 from coopenv.world.camera import VISIBLE
-from coopenv.world.device_function import device_function
+from coopenv.world.warp_internals import device_function
 
 
 @device_function

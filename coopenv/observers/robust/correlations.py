@@ -21,8 +21,8 @@ from coopenv.estimation.so3 import exp_so3, skew
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.memory import Correlation, Known, Pose, Report, mat66d, mat66f, vec3d
 from coopenv.observers.robust.tracklets import arrived, clear_messages, depends_on_own, marker_jacobian, receive, send
-from coopenv.world.device_function import device_function
-from coopenv.world.faults import content_tick
+from coopenv.world.v2x import content_tick
+from coopenv.world.warp_internals import device_function
 
 
 @wp.func

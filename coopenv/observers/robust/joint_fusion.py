@@ -50,8 +50,8 @@ from coopenv.observers.robust.observer import OPTIONS, in_space, make_estimate, 
 from coopenv.observers.robust.propagation import increment_noise
 from coopenv.observers.robust.tracklets import bit_of, information_share, is_due, propagate_member, test_sender
 from coopenv.world.camera import VISIBLE
-from coopenv.world.device_function import device_function
 from coopenv.world.embedded import Embedded
+from coopenv.world.warp_internals import device_function
 
 
 @device_function

@@ -31,10 +31,9 @@ from coopenv.observers.robust.tracklets import (
     receive,
     told_report,
 )
-from coopenv.world.device_function import device_function
-from coopenv.world.faults import claimed_std, content_tick
-from coopenv.world.records import array, extended
-from coopenv.world.saved_state import FLAG, ROTATION, TICK, Rule, whole
+from coopenv.world.state import FLAG, ROTATION, TICK, Rule, array, extended, whole
+from coopenv.world.v2x import claimed_std, content_tick
+from coopenv.world.warp_internals import device_function
 
 
 @wp.struct

@@ -27,8 +27,8 @@ from coopenv.observers.robust.propagation import increment_noise, mounting_of, m
 from coopenv.observers.robust.sender_monitor import is_barred
 from coopenv.observers.robust.tracklets import only_returns
 from coopenv.world.camera import VISIBLE, body_bearing, marker_position
-from coopenv.world.device_function import device_function
 from coopenv.world.v2x import fresh
+from coopenv.world.warp_internals import device_function
 
 HALF_ACCELERATION = 0.5 * MAX_ACCELERATION
 UNIFORM_VARIANCE = THIRD

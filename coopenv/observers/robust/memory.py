@@ -12,9 +12,19 @@ import warp as wp
 from coopenv.base.format import LARGEST
 from coopenv.estimation.validity import are_covariances
 from coopenv.observers.robust.constants import MAX_CORRELATIONS, MAX_HYPOTHESES, MAX_MEMBERS, MAX_OFFENCES, STEPS
-from coopenv.world.device_function import device_function
-from coopenv.world.records import array, extended
-from coopenv.world.saved_state import COVARIANCE, FLAG, LEAST_EIGENVALUE, ROTATION, TICK, Rule, numbers, whole
+from coopenv.world.state import (
+    COVARIANCE,
+    FLAG,
+    LEAST_EIGENVALUE,
+    ROTATION,
+    TICK,
+    Rule,
+    array,
+    extended,
+    numbers,
+    whole,
+)
+from coopenv.world.warp_internals import device_function
 
 vec2d: Any = wp.vec2d
 vec3d: Any = wp.vec3d
@@ -272,7 +282,7 @@ def _others(rule: Rule) -> Rule:
 
 
 def rules_for(members: int) -> dict[str, Rule]:
-    """Return what a saved memory with so many members may hold, by field, see `coopenv.world.saved_state`."""
+    """Return what a saved memory with so many members may hold, by field, see `coopenv.world.state`."""
     flags = (
         "search.active outbox.valid inbox.valid belief.has_sample member.has_twist member.distrusted "
         "member.considered member.untold outbox.news inbox.news member.report.news member.report.valid line.fits "

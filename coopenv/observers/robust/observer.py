@@ -66,9 +66,9 @@ from coopenv.observers.robust.search import advance_search, begin_search, propag
 from coopenv.observers.robust.sender_monitor import forget_evidence, test_missed, test_words
 from coopenv.observers.robust.solution_separation import begin_told, separate
 from coopenv.observers.robust.tracklets import bit_of
-from coopenv.world.device_function import device_function
 from coopenv.world.embedded import Embedded
-from coopenv.world.faults import start_covariance
+from coopenv.world.v2x import start_covariance
+from coopenv.world.warp_internals import device_function
 
 
 @device_function

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from coopenv.estimation.arrays import Array
 from coopenv.observers.robust.constants import THIRD
 from coopenv.observers.robust.memory import mat33d, vec2d, vec3d
-from coopenv.world import kernel_cache
+from coopenv.world import launch
 from coopenv.world.launch import kernel, start_warp
 
 THIRD_TURN = 2.0943951023931953
@@ -307,5 +307,5 @@ def solve_p3p(bearings: Array, positions: Array) -> tuple[Array, Array, NDArray[
     R, camera, mask = np.full((len(b), 4, 3, 3), np.nan), np.full((len(b), 4, 3), np.nan), np.zeros((len(b), 4), bool)
     typed = ((b, mat33d), (z, mat33d), (R, mat33d), (camera, vec3d), (mask, wp.bool))
     views = [wp.array(array, dtype=dtype, device="cpu", copy=False) for array, dtype in typed]
-    kernel_cache.launch(kernel(p3p_kernel, "float64"), dim=len(b), inputs=views, device="cpu")
+    launch.launch(kernel(p3p_kernel, "float64"), dim=len(b), inputs=views, device="cpu")
     return R, camera, mask

@@ -19,7 +19,7 @@ from coopenv.observers.robust.constants import (
     VELOCITY_TIME,
 )
 from coopenv.observers.robust.memory import ERRORS, MOUNTING, Member, Pose, mat33d, mat66d, vec2d, vec3d
-from coopenv.world.device_function import device_function
+from coopenv.world.warp_internals import device_function
 
 
 @device_function

@@ -29,7 +29,7 @@ from coopenv.observers.robust.measurements import (
 )
 from coopenv.observers.robust.memory import Estimate, Frame, Hypothesis, Pose, Search, mat33d, mat66d
 from coopenv.observers.robust.p3p import camera_pose, solve_triangle
-from coopenv.world.device_function import device_function
+from coopenv.world.warp_internals import device_function
 
 
 @device_function

@@ -32,7 +32,7 @@ from coopenv.estimation.linalg import block3, symmetric_part
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.memory import Drift, Estimate, Frame, Report, Word, mat33d, mat66d, vec2d, vec3d
 from coopenv.observers.robust.tracklets import test_sender
-from coopenv.world.device_function import device_function
+from coopenv.world.warp_internals import device_function
 
 GROSS_VARIANCE = constants.GROSS_ERROR**2
 

@@ -44,7 +44,7 @@ from coopenv.observers.robust.memory import Alone, Estimate, Frame, Word, mat66d
 from coopenv.observers.robust.propagation import begin_errors, increment_noise, mounting_variances
 from coopenv.observers.robust.sender_monitor import distrust, forget_evidence
 from coopenv.world.camera import VISIBLE, body_bearing
-from coopenv.world.device_function import device_function
+from coopenv.world.warp_internals import device_function
 
 
 @device_function

@@ -16,8 +16,8 @@ from coopenv.estimation.so3 import skew
 from coopenv.observers.robust import algebra, constants
 from coopenv.observers.robust.belief import propagate
 from coopenv.observers.robust.memory import Estimate, Pose, Report, mat66f, vec3d
-from coopenv.world.device_function import device_function
-from coopenv.world.faults import as_told, claimed_std, content_tick
+from coopenv.world.v2x import as_told, claimed_std, content_tick
+from coopenv.world.warp_internals import device_function
 
 LEAST_TIME = constants.NEWS_TIME - constants.SAME_TIME
 

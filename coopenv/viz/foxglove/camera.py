@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.mcap.messages import codec
+from coopenv.backends.mcap.format import codec
 from coopenv.base.format import jsonable
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.lens import distort

@@ -13,7 +13,7 @@ from foxglove import messages as fox
 from matplotlib.colors import to_rgba
 from scipy.spatial.transform import Rotation
 
-from coopenv.backends.mcap.view import Clock
+from coopenv.backends.mcap.format import Clock
 from coopenv.estimation.arrays import Array
 from coopenv.estimation.map_covariance import covariance_in_map
 from coopenv.observers import Run

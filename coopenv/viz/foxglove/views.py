@@ -12,7 +12,7 @@ from coopenv.viz.style import vehicle_colour
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from coopenv.backends.mcap.view import View
+    from coopenv.backends.mcap.format import View
     from coopenv.observers import Run
     from coopenv.observers.recording import Recording
 
@@ -40,7 +40,7 @@ def views(recording: Recording, run: Run, *, start: float = 0.0, gain: bool = Fa
     check_installed()
     from foxglove import messages as fox
 
-    from coopenv.backends.mcap.view import Clock, View, ros_definition
+    from coopenv.backends.mcap.format import Clock, View, ros_definition
     from coopenv.viz.foxglove import camera, scene
     from coopenv.viz.foxglove.scene import Shown
 

@@ -15,7 +15,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 from coopenv import CoopenvError, DataError
-from coopenv.backends.mcap.peek import metadata_names
+from coopenv.backends.mcap.format import metadata_names
 from coopenv.backends.sources import Kind, is_bag, kind_of
 from coopenv.base.errors import DataWarning
 from coopenv.cars.bags import Bag

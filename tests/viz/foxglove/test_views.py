@@ -174,7 +174,7 @@ def test_lines_of_sight_end_where_the_measured_bearings_point(crossing: Any) -> 
 
 
 def test_estimates_have_the_covariance_in_the_maps_axes(crossing: Any) -> None:
-    from coopenv.backends.mcap.messages import codec
+    from coopenv.backends.mcap.format import codec
 
     made, result, log, _ = crossing
     P = covariance_in_map(result.coordinates, result.rotation, result.position, result.covariance)
@@ -264,7 +264,7 @@ def test_what_is_shown_costs_little(crossing: Any) -> None:
 
 
 def test_gain_matrices_are_no_covariances(tmp_path: Path) -> None:
-    from coopenv.backends.mcap.messages import codec
+    from coopenv.backends.mcap.format import codec
     from coopenv.viz.foxglove import views
 
     made, path = simulated("crossing_path", horizon=22.0), tmp_path / "gain.mcap"

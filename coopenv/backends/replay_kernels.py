@@ -18,16 +18,14 @@ from coopenv.world.camera import (
     marker_position,
     sight_of,
 )
-from coopenv.world.collision import depart, referee, touches_anything
+from coopenv.world.dynamics import depart, referee, touches_anything
 from coopenv.world.embedded import Source
-from coopenv.world.faults import draw_faults
-from coopenv.world.parameters import COUNT as PARAMETER_COUNT
-from coopenv.world.parameters import draw_parameters
-from coopenv.world.precision import Precision
-from coopenv.world.presence import draw_presence
-from coopenv.world.records import array, fields
-from coopenv.world.reset import believe, place_agent, place_vehicle
-from coopenv.world.v2x import transmit
+from coopenv.world.model import Precision
+from coopenv.world.random import COUNT as PARAMETER_COUNT
+from coopenv.world.random import draw_parameters
+from coopenv.world.reset import believe, draw_presence, place_agent, place_vehicle
+from coopenv.world.state import array, fields
+from coopenv.world.v2x import draw_faults, transmit
 
 BY_RADIO = wp.constant(-2)
 """In place of the ticks of sending of messages that a receiver heard: the scenario's radio decides."""

@@ -1,0 +1,325 @@
+"""The MCAP format of a recording: messages with their CDR codec, header, and topics for viewers.
+
+The tick of a message is its sequence number. Standard ROS 2 messages serve viewers; what is read back stands in
+messages of this project, in full precision. The header `recording.json` holds what is constant over a recording:
+setups, gains, noise, starts, scenario. `metadata_names` and `is_cut_off` look into a file without the MCAP library.
+"""
+
+import json
+import math
+import struct
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from coopenv.base.errors import CoopenvError, DataError
+from coopenv.base.format import jsonable
+from coopenv.observers.contract import Gains, SensorNoise, Setup
+from coopenv.observers.recording import Drawn, Recording
+from coopenv.scenario.base import Number, Part, Vector3, one_line
+from coopenv.scenario.files import parse_scenario
+from coopenv.scenario.own_terms import without_own_terms
+
+FORMAT = "coopenv recording 1"
+ATTACHMENT = "recording.json"
+LANDMARKS = "/landmarks"
+
+DEFINITIONS = {
+    "coopenv_msgs/msg/Odometry": """
+std_msgs/Header header
+float64[9] rotation  # increment over the tick, row by row: R <- R dR
+float64[3] translation  # m, body frame at the tick's start: p <- p + R dp
+float64[3] velocity  # m/s, last sample, body frame
+float64[3] angular_velocity  # rad/s
+""",
+    "coopenv_msgs/msg/Bearings": """
+std_msgs/Header header
+bool due  # a correction is due at this frame
+uint32[] targets  # landmarks first, then vehicles; see recording.json
+bool[] visible
+float64[] vectors  # x, y, z per target: unit vector camera -> target, body frame
+""",
+    "coopenv_msgs/msg/Inbox": """
+std_msgs/Header header
+int64[] tick_sent  # per sender: when the last message heard was sent; -1: none
+""",
+    "coopenv_msgs/msg/Pan": """
+std_msgs/Header header
+float64[1] angle  # rad, by which the camera is turned to the left
+""",
+    "coopenv_msgs/msg/Truth": """
+std_msgs/Header header
+float64[9] rotation  # body to map, row by row; NaN: not known
+float64[3] position  # m, map
+""",
+}
+
+PAN = {"pan": "coopenv_msgs/msg/Pan"}
+"""A further topic of a vehicle, where cameras pan."""
+
+EXACT = {
+    "increment": "coopenv_msgs/msg/Odometry",
+    "bearings": "coopenv_msgs/msg/Bearings",
+    "v2x": "coopenv_msgs/msg/Inbox",
+    "truth_exact": "coopenv_msgs/msg/Truth",
+}
+"""Topics of a vehicle that hold the recording, one message a tick."""
+
+CONTENTS = {
+    "increment": {name: name for name in ("rotation", "translation", "velocity", "angular_velocity")},
+    "bearings": {},
+    "pan": {"angle": "pan"},
+    "v2x": {"tick_sent": "inbox_tick"},
+    "truth_exact": {"rotation": "truth.rotation", "position": "truth.position"},
+}
+"""Topic to the entries of its messages that hold a vehicle's row of an array of the `Recording`; of bearings only those
+that there are hold any."""
+
+SHOWN = {"odometry": "nav_msgs/msg/Odometry", "truth": "geometry_msgs/msg/PoseStamped"}
+"""Topics of a vehicle that viewers understand: dead reckoning from the start, and the truth where it is known."""
+
+LANDMARKS_TYPE = "geometry_msgs/msg/PoseArray"
+"""Type of the topic `LANDMARKS`: positions in the map, one message whenever one has changed."""
+
+
+def topic(vehicle: str, name: str) -> str:
+    """Return the full name of a vehicle's topic."""
+    return f"/{vehicle}/{name}"
+
+
+@cache
+def codec() -> Any:
+    """Return the store of message types, with ours in it. Raises CoopenvError: the extra is not installed."""
+    try:
+        import mcap  # noqa: F401
+        from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    except ImportError:
+        raise CoopenvError("MCAP files need an extra: pip install '.[log]'") from None
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in DEFINITIONS.items():
+        store.register(get_types_from_msg(text, name))
+    return store
+
+
+Index = Annotated[int, Field(ge=0, lt=2**31)]
+
+Vector6 = tuple[Number, Number, Number, Number, Number, Number]
+Matrix3 = tuple[Vector3, Vector3, Vector3]
+Matrix6 = tuple[Vector6, Vector6, Vector6, Vector6, Vector6, Vector6]
+
+
+class NoiseHeader(Part):
+    """A `SensorNoise`."""
+
+    velocity: Number
+    angular_velocity: Number
+    odometry_period: Number
+    bearing: Number
+    image_axis: Vector3 | None
+    odometry_scale: Number = 0.0
+    odometry_scale_walk: Number = 0.0
+    gyro_bias: Vector3 = (0.0, 0.0, 0.0)
+    gyro_bias_walk: Vector3 = (0.0, 0.0, 0.0)
+    slip: tuple[Number, Number, Number, Number] = (0.0, 1.0, 0.0, 0.0)
+    camera_orientation: Number = 0.0
+    camera_position: Number = 0.0
+    focal_length: Number = 0.0
+    clock_offset: Number = 0.0
+
+
+class GainsHeader(Part):
+    """The `Gains` of one vehicle."""
+
+    k: Number
+    q: tuple[Number, ...]
+    V: tuple[Number, Number]
+    P0: tuple[Number, Number]
+    max_turn: Number
+
+
+class SetupHeader(Part):
+    """The `Setup` of one vehicle."""
+
+    vehicle: Index
+    name: str
+    target_names: tuple[str, ...]
+    landmarks: Index
+    targets: tuple[Index, ...]
+    lever_arm: Vector3
+    marker: Vector3
+    planar: bool
+    noise: NoiseHeader
+    gains: GainsHeader
+
+
+class DrawnHeader(Part):
+    """A `Drawn`."""
+
+    key: int
+    episode: int
+    parameters: tuple[Number, ...]
+
+
+class Header(Part):
+    """Everything of a `Recording` that does not change from tick to tick; `check_recording` knows what makes sense."""
+
+    ticks: int = Field(ge=1)
+    dt: Number
+    order: tuple[Index, ...]
+    period: int
+    staleness: Number | None
+    """s; none: messages are used for ever."""
+    setups: tuple[SetupHeader, ...] = Field(min_length=1)
+    start_rotation: tuple[Matrix3, ...]
+    start_position: tuple[Vector3, ...]
+    start_covariance: tuple[Matrix6, ...]
+    scenario: dict[str, Any] | None
+    drawn: DrawnHeader | None = None
+
+    @classmethod
+    def read(cls, text: bytes, where: str) -> Self:
+        """Return a header from its JSON. Raises DataError: it is no header; `where` begins the line."""
+        try:
+            return cls.model_validate_json(text, strict=True)
+        except ValidationError as error:
+            raise DataError(one_line(error, where, cls)) from None
+
+    def constants(self, where: str) -> dict[str, Any]:
+        """Return the arguments of a `Recording` that the header gives; a ScenarioError if its scenario is none."""
+        return {
+            "setups": tuple(_setup(setup) for setup in self.setups),
+            "order": self.order,
+            "dt": self.dt,
+            "period": self.period,
+            "staleness": math.inf if self.staleness is None else self.staleness,
+            "start_rotation": np.array(self.start_rotation),
+            "start_position": np.array(self.start_position),
+            "start_covariance": np.array(self.start_covariance),
+            "drawn": None if self.drawn is None else Drawn(**dict(self.drawn)),
+            "scenario": None if self.scenario is None else parse_scenario(without_own_terms(self.scenario), where),
+        }
+
+
+def header_of(recording: Recording) -> bytes:
+    """Return the header of a recording as JSON."""
+    values = jsonable({name: getattr(recording, name) for name in Header.model_fields})
+    if values["scenario"] is not None:
+        values["scenario"] = without_own_terms(values["scenario"])
+    return json.dumps(values, separators=(",", ":")).encode()
+
+
+def _setup(header: SetupHeader) -> Setup:
+    arrays = {
+        "targets": np.array(header.targets, np.int64),
+        "lever_arm": np.array(header.lever_arm),
+        "marker": np.array(header.marker),
+        "noise": SensorNoise(**dict(header.noise)),
+        "gains": Gains(**{**dict(header.gains), "q": np.array(header.gains.q)}),
+    }
+    return Setup(**{**dict(header), **arrays})
+
+
+MAGIC = b"\x89MCAP0\r\n"
+_METADATA, _ATTACHMENT, _HEADER = 0x0C, 0x09, 0x01
+MOST_RECORDS = 16
+
+CUT_OFF = "cut off, the end of the MCAP file is missing"
+REPAIR = "mcap recover"
+"""The tool that mends such a file."""
+MENDED = f"`{REPAIR}` mends it"
+
+
+def is_cut_off(path: Path) -> bool:
+    """Return whether a file begins as an MCAP file and does not end as one."""
+    with path.open("rb") as stream:
+        if stream.read(len(MAGIC)) != MAGIC:
+            return False
+        size = stream.seek(0, 2)
+        stream.seek(max(0, size - len(MAGIC)))
+        return size < 2 * len(MAGIC) or stream.read() != MAGIC
+
+
+def metadata_names(path: str | Path) -> frozenset[str] | None:
+    """Return the names of the metadata that stand before a file's data; None: it cannot be read or is no MCAP file."""
+    names = set()
+    try:
+        with Path(path).open("rb") as stream:
+            if stream.read(len(MAGIC)) != MAGIC:
+                return None
+            for _ in range(MOST_RECORDS):
+                kind, size = struct.unpack("<BQ", stream.read(9))
+                if kind == _METADATA:
+                    (length,) = struct.unpack("<I", stream.read(4))
+                    names.add(stream.read(min(length, 256)).decode("utf-8", "replace"))
+                    stream.seek(size - 4 - min(length, 256), 1)
+                elif kind in (_HEADER, _ATTACHMENT):
+                    stream.seek(size, 1)
+                else:
+                    break
+    except (OSError, ValueError, OverflowError, struct.error):  # cut off within its first records
+        return frozenset(names) if names else None
+    return frozenset(names)
+
+
+def topics_of(path: str | Path) -> list[str]:
+    """Return the names of the topics of a file, sorted.
+
+    Raises:
+        CoopenvError: the extra `log` is not installed.
+        DataError: no such file, or it is no MCAP file with an index.
+    """
+    codec()
+    from mcap.reader import make_reader
+
+    try:
+        cut_off = is_cut_off(Path(path))
+        with Path(path).open("rb") as stream:
+            summary = None if cut_off else make_reader(stream).get_summary()
+    except IsADirectoryError:
+        raise DataError(f"{path}: a folder; expected a log file (.mcap)") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except Exception as error:  # whatever the library raises at bytes that make no sense
+        raise DataError(f"{path}: no MCAP file with an index ({str(error) or type(error).__name__})") from None
+    if cut_off:
+        raise DataError(f"{path}: {CUT_OFF}; {MENDED}")
+    if summary is None:
+        raise DataError(f"{path}: an MCAP file without an index")
+    return sorted(channel.topic for channel in summary.channels.values())
+
+
+class View(NamedTuple):
+    """A topic with its messages."""
+
+    topic: str
+    schema: str
+    """Name of the type of its messages."""
+    schema_encoding: str
+    definition: bytes
+    """Of the type, in that encoding."""
+    encoding: str
+    """Of the messages."""
+    messages: Iterable[tuple[int, bytes]]
+    """(tick, contents), in the order of ticks."""
+
+
+class Clock(NamedTuple):
+    """When ticks were."""
+
+    dt: float
+    """s, between ticks."""
+    start: float = 0.0
+    """s since 1970, of tick 0."""
+
+    def nanoseconds(self, tick: int) -> int:
+        """Return the time of a tick, ns since 1970."""
+        return round(self.start * 1e9) + round(tick * self.dt * 1e9)
+
+
+def ros_definition(kind: str) -> bytes:
+    """Return the definition of a ROS 2 type as MCAP files hold it (`ros2msg`)."""
+    return str(codec().generate_msgdef(kind, ros_version=2)[0]).encode()
