@@ -24,6 +24,7 @@ VERSIONS = {
     "pinned": ("--constraint", "constraints.txt"),
     "lowest": ("--resolution", "lowest-direct"),
     "newest": ("--upgrade",),
+    "warp": ("--upgrade", "--override", "tests/newest_warp.txt"),
 }
 """Options of `uv pip install`."""
 CPU_FEATURES = "from numpy._core._multiarray_umath import __cpu_dispatch__ as names; print(*names)"
@@ -53,6 +54,7 @@ class Cell:
 CELLS = [
     Cell("lowest", "lowest versions that pyproject.toml allows", versions="lowest"),
     Cell("newest", "newest versions that pyproject.toml allows", "3.13", "newest"),
+    Cell("warp", "newest release of Warp, whatever pyproject.toml allows", "3.13", "warp"),
     Cell("python-3.12", "another Python; one worker", "3.12", parallel=False),
     Cell("haswell", "BLAS kernels of Haswell", environment={"OPENBLAS_CORETYPE": "Haswell"}),
     Cell("nehalem", "BLAS kernels of Nehalem", environment={"OPENBLAS_CORETYPE": "Nehalem"}),

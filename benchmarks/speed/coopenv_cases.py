@@ -16,6 +16,7 @@ from coopenv.api.make import make_vec, parallel_env
 from coopenv.api.vector_env import CooperativeVectorEnv
 from coopenv.scenario import Scenario
 from coopenv.world.launch import default_threads
+from coopenv.world.warp_internals import field_types
 
 SINGLE, BATCH = "ParallelEnv", "make_vec"
 BATCHES = (1, 32, 1024, 8192)
@@ -101,6 +102,6 @@ def array_bytes(engine: Engine) -> int:
     """Return the size of every array that has the world as leading axis."""
     world = engine.world
     records = [engine.results, world.state, world.memory]
-    fields = [getattr(record, name) for record in records for name in record._cls.vars]
+    fields = [getattr(record, name) for record in records for name in field_types(record)]
     arrays = [field for field in fields if isinstance(field, wp.array)]
     return sum(a.capacity for a in [*arrays, world.actions, world.mask])

@@ -24,6 +24,7 @@ from coopenv.world.launch import Launcher
 from coopenv.world.model import Precision, entry_struct, mat66d, model_struct, precision
 from coopenv.world.state import allocate, allocate_state, fields, repeated, state_fields, state_sizes
 from coopenv.world.step import observer_kernels
+from coopenv.world.warp_internals import struct_of
 
 
 def views_of(record: Any, declared: Mapping[str, Any], vehicle: int = 0) -> SimpleNamespace:
@@ -76,7 +77,7 @@ def model_of(setup: Setup, p: Precision) -> Any:
 
 def _for_everybody(entry: Any, count: int) -> Any:
     """Return the array in which every vehicle has the same entry."""
-    return repeated(wp.array([entry], dtype=entry._cls, device="cpu"), 0, count)
+    return repeated(wp.array([entry], dtype=struct_of(entry), device="cpu"), 0, count)
 
 
 PRECISION = "float64"

@@ -30,6 +30,7 @@ from coopenv.world.model import (
     entry_struct,
     model_struct,
 )
+from coopenv.world.warp_internals import field_types, scalar_of
 
 AFTER_ARRIVAL = {"park": PARK, "leave": LEAVE, "continue": CONTINUE}
 
@@ -221,10 +222,11 @@ def build_model(scenario: Scenario, p: Precision, device: str) -> Any:
 
 def _fill(struct: Any, values: Mapping[str, Any], device: str) -> None:
     """Write fields of a struct, each in the type that it is declared with."""
+    types = field_types(struct)
     for name, value in values.items():
-        kind = struct._cls.vars[name].type
+        kind = types[name]
         if isinstance(kind, wp.array):
-            scalar = getattr(kind.dtype, "_wp_scalar_type_", kind.dtype)
+            scalar = scalar_of(kind.dtype)
             data = np.ascontiguousarray(value, dtype=wp.dtype_to_numpy(scalar))
             empty = wp.zeros((0,) * kind.ndim, dtype=kind.dtype, device=device)
             value = wp.array(data, dtype=kind.dtype, ndim=kind.ndim, device=device) if data.size else empty

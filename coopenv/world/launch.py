@@ -26,7 +26,7 @@ import warp as wp
 from coopenv.base.errors import CoopenvError
 from coopenv.base.files import lock
 from coopenv.base.installation import available_cores
-from coopenv.world.warp_internals import replay_of
+from coopenv.world.warp_internals import field_types, replay_of
 
 ATTEMPTS = 3
 """Attempts to load a module. The second builds it anew; a third is for two processes that mend the same one."""
@@ -223,7 +223,7 @@ class PerWorld:
         if isinstance(self.value, wp.array):
             return self.value[start:stop] if self.value.size > 0 else self.value  # Warp cannot slice what is empty
         part = type(self.value)()
-        for name in self.value._cls.vars:
+        for name in field_types(self.value):
             value = getattr(self.value, name)
             cut = isinstance(value, wp.array) and value.size > 0
             setattr(part, name, value[start:stop] if cut else value)

@@ -1,12 +1,11 @@
-"""Replay of recorded launches through Warp's private interface.
+"""All uses of Warp's private interface; `pyproject.toml` bounds the version of Warp because of them.
 
-`context._build_cpu_args_structs` packs the arguments of a launch, `command.hooks.forward` is the compiled kernel. Both
-are private, so that `pyproject.toml` bounds the version of Warp; without them `command.launch` does the same, slower.
-
-A record of arrays, the state for example, has some kilobytes, as every array has a descriptor. Warp hands functions
-copies of their arguments, which the compiler removes from small functions alone: in an observer of many functions they
-take a fifth of the time. Warp's references (`wp.ref`) are for arguments whose type is written down. Here types follow
-from the kernel, so that each overload gets its references when it is made.
+| function | private names | reason |
+|---|---|---|
+| `replay_of` | `context._build_cpu_args_structs`, `command.hooks.forward` | launch in a microsecond |
+| `device_function` | `Function.__class__`, `get_overload`, `overload.adj` | records by reference, uncopied |
+| `struct_of`, `field_types` | `StructInstance._cls`, `Struct.vars` | fields of a record by its instance |
+| `scalar_of` | `_wp_scalar_type_` | the NumPy type of an array of vectors |
 """
 
 import ctypes
@@ -31,7 +30,6 @@ def replay_of(command: Any) -> Callable[[], Any]:
     return call
 
 
-RECORDS = ("model", "state", "memory", "record", "results")  # names of arguments that are handed over by reference
 _REFERENCE: Any = wp.ref  # generic at run time only
 
 
@@ -42,24 +40,49 @@ class _ByReference(wp.Function):
         """Return the overload for types of arguments, see `wp.Function`."""
         overload: Any = super().get_overload(arg_types, kwarg_types)
         if overload is not None:
-            types = {name: _as_handed(name, kind) for name, kind in overload.input_types.items()}
+            types = {name: _as_handed(kind) for name, kind in overload.input_types.items()}
             if types != overload.input_types:
                 overload.input_types = types
                 overload.adj = type(overload.adj)(overload.func, types, source=overload.adj.source)
         return overload
 
 
-def _as_handed(name: str, kind: Any) -> Any:
-    is_record = name in RECORDS and hasattr(kind, "vars")  # a `wp.struct`
-    return _REFERENCE[kind] if is_record else kind
+def _as_handed(kind: Any) -> Any:
+    return _REFERENCE[kind] if _has_arrays(kind) else kind
+
+
+def _has_arrays(kind: Any) -> bool:
+    """Return whether a type is a `wp.struct` with arrays, its own or those of a struct in it."""
+    fields = getattr(kind, "vars", {}).values()
+    return any(isinstance(field.type, wp.array) or _has_arrays(field.type) for field in fields)
 
 
 def device_function(function: Callable[..., Any]) -> Any:
-    """Return what `wp.func` makes of a function, with arguments that are `RECORDS` by reference.
+    """Return what `wp.func` makes of a function, with structs of arrays by reference.
 
-    For functions that are large or call large ones. Not for those of which derivatives are taken: Warp has none of
+    Such a struct has some kilobytes, as every array has a descriptor. Warp hands functions copies of their arguments,
+    which the compiler removes from small functions alone; in an observer of many functions the copies take a fifth of
+    the time. Warp's references (`wp.ref`) need a type that is written down. Here types follow from the kernel, so that
+    each overload gets its references when it is made.
+
+    Meant for functions that are large or call large ones. Not for differentiated functions: Warp has no derivatives of
     references.
     """
     made = wp.func(function)
     made.__class__ = _ByReference
     return made
+
+
+def struct_of(record: Any) -> Any:
+    """Return the `wp.struct` of an instance."""
+    return record._cls
+
+
+def field_types(record: Any) -> dict[str, Any]:
+    """Return the types of the fields of an instance of a `wp.struct`, by name."""
+    return {name: field.type for name, field in struct_of(record).vars.items()}
+
+
+def scalar_of(kind: Any) -> Any:
+    """Return the scalar type of a vector or matrix type; a scalar type is returned unchanged."""
+    return getattr(kind, "_wp_scalar_type_", kind)

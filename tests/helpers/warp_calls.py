@@ -10,6 +10,7 @@ import warp as wp
 from numpy.typing import ArrayLike
 
 from coopenv.world.launch import start_warp
+from coopenv.world.warp_internals import scalar_of
 
 DTYPES = ("float64", "float32")
 WIDE = ("float64",)
@@ -91,7 +92,7 @@ def _type(word: str, dtype: str) -> Any:
 def _array(value: np.ndarray, kind: Any, count: int) -> wp.array:
     filled = np.broadcast_to(value, (count, *value.shape[1:]))
     return wp.array(
-        np.ascontiguousarray(filled, wp.dtype_to_numpy(getattr(kind, "_wp_scalar_type_", kind))),
+        np.ascontiguousarray(filled, wp.dtype_to_numpy(scalar_of(kind))),
         dtype=kind,
         device="cpu",
     )
